@@ -1,0 +1,1 @@
+"""gmem_jax: differentiable, batched simulation of waveform memory in granular packs."""

@@ -1,0 +1,23 @@
+"""The normal force: Hertz's elastic contact with viscous damping."""
+
+import jax
+import jax.numpy as jnp
+
+
+def hertz(
+    overlap: jax.Array, closing: jax.Array, touching: jax.Array, stiffness: float, damping_time: float
+) -> jax.Array:
+    """f_n = max(0, k p^1.5 + gamma p^0.5 dp/dt) with gamma = damping_time k (paper, Sec. II).
+
+    Args:
+        overlap: p where touching, any positive number elsewhere, in R.
+        closing: dp/dt, in R / t_c.
+        touching: mask; the force is zero elsewhere.
+        stiffness: k, in E R^0.5.
+        damping_time: gamma / k, in t_c.
+
+    Returns:
+        The repulsive force, in E R^2, in the shape of `overlap`.
+    """
+    force = stiffness * jnp.sqrt(overlap) * (overlap + damping_time * closing)
+    return jnp.where(touching & (force > 0.0), force, 0.0)

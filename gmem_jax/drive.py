@@ -1,0 +1,106 @@
+"""The walls of the experiment: compression u(t), shear gamma(u), and the stages they make up."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.signals import Signals
+from gmem_jax.state import Box, Scalar
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Motion:
+    """Prescribed walls during one stage: u runs linearly, the shear follows a waveform of u (paper, Sec. II).
+
+    L_x = X (1 - gamma/2), L_y = Y (1 + gamma/2) with X, Y = L0 (1 - (1 - sqrt(1 - delta0)) u); z does not move. The
+    box stays centred. Half of gamma on each axis is this project's reading of the paper.
+
+    Attributes:
+        lower: lower planes at u = 0, [3, 1].
+        upper: upper planes at u = 0, [3, 1].
+        delta0: areal compression at u = 1, scalar or [B].
+        start: u at the beginning of the stage.
+        stop: u at its end.
+        duration: in t_c.
+        gamma0: shear amplitude, scalar or [B].
+        signals: the waveforms of the replicas, or None for no shear; replica 0 is always the zero signal.
+    """
+
+    lower: jax.Array
+    upper: jax.Array
+    delta0: Scalar
+    start: Scalar
+    stop: Scalar
+    duration: Scalar
+    gamma0: Scalar = 0.0
+    signals: Signals | None = None
+
+    def compression(self, time: Scalar) -> Scalar:
+        """u at `time` since the start of the stage."""
+        return self.start + (self.stop - self.start) * (time / self.duration)
+
+    def _shear(self, u: Scalar) -> jax.Array:
+        if self.signals is None:
+            return jnp.zeros(1)
+        return self.gamma0 * jnp.concatenate([jnp.zeros(1), self.signals.shear(jnp.asarray(u))])
+
+    def box_at(self, time: jax.Array) -> Box:
+        """Planes and their velocities at `time` since the start of the stage, [3, B] (or [3, 1] without shear)."""
+
+        def lengths(moment: jax.Array) -> jax.Array:
+            u = self.compression(moment)
+            squeeze = 1.0 - (1.0 - jnp.sqrt(1.0 - self.delta0)) * u
+            half = 0.5 * self._shear(u)
+            scale = jnp.stack(jnp.broadcast_arrays(squeeze * (1.0 - half), squeeze * (1.0 + half), jnp.ones(1)))
+            return (self.upper - self.lower) * scale
+
+        now, rate = jax.jvp(lengths, (time,), (jnp.ones_like(time),))
+        centre = 0.5 * (self.lower + self.upper)
+        return Box(centre - 0.5 * now, centre + 0.5 * now, -0.5 * rate, 0.5 * rate)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a protocol.
+
+    Attributes:
+        name: as in the paper: rest, compress, hold, decompress, encode, store, readout.
+        start: u at its beginning.
+        stop: u at its end.
+        length: duration in units of t0.
+        sheared: whether the waveform is applied.
+    """
+
+    name: str
+    start: float
+    stop: float
+    length: float
+    sheared: bool = False
+
+    @property
+    def holds(self) -> bool:
+        """Whether the walls stand still."""
+        return self.start == self.stop
+
+
+def preparation_cycle(rest: float, hold: float) -> tuple[Stage, ...]:
+    """One compress/decompress cycle without shear: rest, compress, hold, decompress."""
+    return (
+        Stage("rest", 0.0, 0.0, rest),
+        Stage("compress", 0.0, 1.0, 1.0),
+        Stage("hold", 1.0, 1.0, hold),
+        Stage("decompress", 1.0, 0.0, 1.0),
+    )
+
+
+def memory_protocol(rest: float = 0.2, hold: float = 0.2, store: float = 2.0) -> tuple[Stage, ...]:
+    """The experiment of Sec. II, lengths in t0: a shear-free cycle, rest, encode, store, readout (6.6 t0 in all)."""
+    return (
+        *preparation_cycle(rest, hold),
+        Stage("rest-2", 0.0, 0.0, rest),
+        Stage("encode", 0.0, 1.0, 1.0, sheared=True),
+        Stage("store", 1.0, 1.0, store, sheared=True),
+        Stage("readout", 1.0, 0.0, 1.0),
+    )

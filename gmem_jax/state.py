@@ -1,0 +1,116 @@
+"""What evolves in time: grains, walls, contact histories; and the sticky status bits that guard a run.
+
+Replicas (B runs of one pack that differ in waveform or parameters) are always the last axis of an array.
+"""
+
+import enum
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+Scalar = float | jax.Array
+"""A parameter: one number, or an array that broadcasts against the replica axis [B]."""
+
+
+class Status(enum.IntFlag):
+    """Reasons to distrust a run. Bits are sticky and per replica; 0 is a clean run."""
+
+    STALE_PAIRS = 1
+    OUTSIDE_BOX = 2
+    NOT_FINITE = 4
+    NOT_AT_REST = 8
+    OVERLAP_RANGE = 16
+    STEP_TOO_LARGE = 32
+    CAPACITY = 64
+
+    @property
+    def fatal(self) -> bool:
+        """Whether the numbers of the run are meaningless (a pack not yet at rest is only noisy)."""
+        return bool(self & ~Status.NOT_AT_REST)
+
+
+SENTENCES = {
+    Status.STALE_PAIRS: "grains moved further than the neighbour list allows; use a larger skin",
+    Status.OUTSIDE_BOX: "a grain left the box; use a smaller time step or check the pack",
+    Status.NOT_FINITE: "a position or a force is not a finite number; use a smaller time step or check the pack",
+    Status.NOT_AT_REST: "a hold ended before the pack was at rest; use a longer hold or a hold drag",
+    Status.OVERLAP_RANGE: "an overlap exceeded the p_max of the friction law; use a larger p_max",
+    Status.STEP_TOO_LARGE: "the time step exceeds 0.5 t_c; use a smaller dt",
+    Status.CAPACITY: "the neighbour list overflowed its capacity; allocate it anew",
+}
+
+
+def explain(status: int) -> str:
+    """The set bits of `status` as one readable line ("ok" when none is set)."""
+    return "; ".join(text for bit, text in SENTENCES.items() if status & bit) or "ok"
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Grains:
+    """Centres, orientations and their derivatives, one entry per grain (R = E = rho = 1).
+
+    Attributes:
+        position: centres, [N, 3, B], in R.
+        quaternion: body-to-lab rotation (w, x, y, z), unit, [N, 4, B].
+        velocity: [N, 3, B], in R / t_c.
+        spin: angular velocity in the lab frame, [N, 3, B], in 1 / t_c.
+        acceleration: [N, 3, B], at the time of `position`.
+        spin_rate: angular acceleration, [N, 3, B], likewise.
+    """
+
+    position: jax.Array
+    quaternion: jax.Array
+    velocity: jax.Array
+    spin: jax.Array
+    acceleration: jax.Array
+    spin_rate: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Box:
+    """Six rigid planes and their velocities; [3, B] each (x, y, z), in R and R / t_c."""
+
+    lower: jax.Array
+    upper: jax.Array
+    lower_velocity: jax.Array
+    upper_velocity: jax.Array
+
+    @property
+    def lengths(self) -> jax.Array:
+        """Edge lengths, [3, B]."""
+        return self.upper - self.lower
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class State:
+    """Everything that evolves: a run resumes bit for bit from this and the walls' motion.
+
+    Attributes:
+        grains: see `Grains`.
+        history: what the friction law remembers of each candidate contact, a pytree with leaves [P, ..., B].
+        status: sticky bits of `Status`, int32 [B].
+    """
+
+    grains: Grains
+    history: Any
+    status: jax.Array
+
+    @property
+    def replicas(self) -> int:
+        """Number of replicas B."""
+        return int(self.status.shape[-1])
+
+
+def still_box(lower: jax.Array, upper: jax.Array) -> Box:
+    """Walls at rest; `lower` and `upper` are [3, B]."""
+    return Box(lower, upper, jnp.zeros_like(lower), jnp.zeros_like(upper))
+
+
+def replicate(tree: Any, replicas: int) -> Any:
+    """Repeat the single replica of every leaf ([..., 1] to [..., B])."""
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf, replicas, axis=-1), tree)
