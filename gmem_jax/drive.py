@@ -1,11 +1,12 @@
 """The walls of the experiment: compression u(t), shear gamma(u), and the stages they make up."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.signals import Signals
+from gmem_jax.signals import BINS, Signals
 from gmem_jax.state import Box, Scalar
 
 
@@ -61,6 +62,19 @@ class Motion:
         return Box(centre - 0.5 * now, centre + 0.5 * now, -0.5 * rate, 0.5 * rate)
 
 
+def clock(t0: Scalar, dt: Scalar, bins: int = BINS) -> tuple[Scalar, int | jax.Array]:
+    """The time step and the steps per bin of a ramp of duration t0: dt a little smaller, so that bins are whole.
+
+    Concrete arguments give a Python int of steps, and reverse-mode derivatives; traced ones (t0 or dt under
+    `jax.vmap`, say) a traced number, which runs but has forward-mode derivatives only.
+    """
+    if isinstance(t0, jax.core.Tracer) or isinstance(dt, jax.core.Tracer):
+        steps = jnp.ceil(t0 / (bins * dt) * (1.0 - 1e-12)).astype(jnp.int32)
+        return t0 / (bins * steps), steps
+    whole = max(1, math.ceil(float(t0) / (bins * float(dt)) * (1.0 - 1e-12)))
+    return float(t0) / (bins * whole), whole
+
+
 @dataclass(frozen=True)
 class Stage:
     """One stage of a protocol.
@@ -84,6 +98,11 @@ class Stage:
         """Whether the walls stand still."""
         return self.start == self.stop
 
+    @property
+    def bins(self) -> int:
+        """Length in bins of t0 / 256; a hold is rounded up to whole bins."""
+        return max(1, math.ceil(self.length * BINS - 1e-9))
+
 
 def preparation_cycle(rest: float, hold: float) -> tuple[Stage, ...]:
     """One compress/decompress cycle without shear: rest, compress, hold, decompress."""
@@ -95,12 +114,22 @@ def preparation_cycle(rest: float, hold: float) -> tuple[Stage, ...]:
     )
 
 
-def memory_protocol(rest: float = 0.2, hold: float = 0.2, store: float = 2.0) -> tuple[Stage, ...]:
-    """The experiment of Sec. II, lengths in t0: a shear-free cycle, rest, encode, store, readout (6.6 t0 in all)."""
-    return (
+def memory_protocol(
+    rest: float = 0.2, hold: float = 0.2, store: float = 2.0, second_readout: bool = False
+) -> tuple[Stage, ...]:
+    """The experiment of Sec. II, lengths in t0: a shear-free cycle, rest, encode, store, readout (6.6 t0 in all).
+
+    With `second_readout`, Sec. III's: another rest, compression, hold and readout (9 t0 in all).
+    """
+    first = (
         *preparation_cycle(rest, hold),
         Stage("rest-2", 0.0, 0.0, rest),
         Stage("encode", 0.0, 1.0, 1.0, sheared=True),
-        Stage("store", 1.0, 1.0, store, sheared=True),
+        Stage("store", 1.0, 1.0, store),
         Stage("readout", 1.0, 0.0, 1.0),
     )
+    if not second_readout:
+        return first
+    *again, last = preparation_cycle(rest, hold)
+    repeated = (replace(stage, name=f"{stage.name}-3") for stage in again)
+    return (*first, *repeated, replace(last, name="readout-2"))

@@ -233,7 +233,7 @@ def check(system: System, state: State, box: Box) -> State:
         jnp.where(slack(system.pairs, spheres, box) > 0.0, 0, int(Status.STALE_PAIRS))
         | jnp.where(outside, int(Status.OUTSIDE_BOX), 0)
         | jnp.where(jnp.isfinite(numbers), 0, int(Status.NOT_FINITE))
-    )
+    ).astype(jnp.int32)
     return replace(state, status=state.status | bits)
 
 

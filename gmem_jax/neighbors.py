@@ -195,7 +195,8 @@ def carry_history(history: Any, blank: Any, old: Pairs, new: Pairs) -> Any:
     def keys(pairs: Pairs) -> np.ndarray:
         real = np.asarray(pairs.valid)
         flat: np.ndarray = np.asarray(pairs.first) * spheres + np.asarray(pairs.second)
-        return flat[real]
+        listed: np.ndarray = flat[real]
+        return listed
 
     old_keys, new_keys = keys(old), keys(new)
     place = np.searchsorted(old_keys, new_keys)

@@ -38,8 +38,7 @@ def turn(quaternion: jax.Array, angle: jax.Array) -> jax.Array:
     new_w = w - dot(half, v)
     new_v = v + w * half + cross(half, v)
     turned = jnp.concatenate([new_w, new_v], axis=-2)
-    length: jax.Array = jnp.sqrt(jnp.sum(turned * turned, axis=-2, keepdims=True))
-    return turned / length
+    return turned * jax.lax.rsqrt(jnp.sum(turned * turned, axis=-2, keepdims=True))
 
 
 def uniform(key: jax.Array, count: int) -> jax.Array:
