@@ -38,10 +38,12 @@ def turn(quaternion: jax.Array, angle: jax.Array) -> jax.Array:
     new_w = w - dot(half, v)
     new_v = v + w * half + cross(half, v)
     turned = jnp.concatenate([new_w, new_v], axis=-2)
-    return turned * jax.lax.rsqrt(jnp.sum(turned * turned, axis=-2, keepdims=True))
+    unit: jax.Array = turned / jnp.sqrt(jnp.sum(turned * turned, axis=-2, keepdims=True))
+    return unit
 
 
 def uniform(key: jax.Array, count: int) -> jax.Array:
     """`count` unit quaternions, [count, 4], uniform over all orientations."""
     sample = jax.random.normal(key, (count, 4))
-    return sample / jnp.linalg.norm(sample, axis=1, keepdims=True)
+    unit: jax.Array = sample / jnp.linalg.norm(sample, axis=1, keepdims=True)
+    return unit

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from gmem_jax.contact.kinematics import Kinematics
 from gmem_jax.rotation import dot
+from gmem_jax.state import Scalar
 
 
 @runtime_checkable
@@ -31,6 +32,21 @@ class FrictionLaw(Protocol):
         Both must be exactly zero (the history as `init` gives it) where `kin.touching` is False.
         """
         ...
+
+
+@runtime_checkable
+class RangedLaw(Protocol):
+    """A law that is valid up to some overlap only, and says so."""
+
+    @property
+    def largest_overlap(self) -> Scalar:
+        """Largest overlap the law can represent; scalar or [B], in R."""
+        ...
+
+
+def largest_overlap(law: FrictionLaw) -> Scalar:
+    """Overlap beyond which a run with `law` is to be flagged (`Status.OVERLAP_RANGE`); infinite for most laws."""
+    return law.largest_overlap if isinstance(law, RangedLaw) else float("inf")
 
 
 def coulomb(trial: jax.Array, limit: jax.Array) -> tuple[jax.Array, jax.Array]:
