@@ -1,1 +1,60 @@
-"""gmem_jax: differentiable, batched simulation of waveform memory in granular packs."""
+"""gmem_jax: differentiable, batched simulation of waveform memory in granular packs.
+
+Units are R = E = rho = 1 (time in t_c = R sqrt(rho/E)); `Material` converts. Ask for 64-bit numbers first:
+``jax.config.update("jax_enable_x64", True)``.
+"""
+
+from gmem_jax.analysis import running_mean
+from gmem_jax.contact.frictionless import Frictionless
+from gmem_jax.contact.hooke import Hooke
+from gmem_jax.grain import Clump, clump, sphere, tetra
+from gmem_jax.material import Material
+from gmem_jax.memory import Recall, fidelity, gain, run_memory
+from gmem_jax.pack import Pack, stack
+from gmem_jax.prepare import Recipe, prepare
+from gmem_jax.run import RunFailedError
+from gmem_jax.signals import Bumps, Samples, Signals, six_signals, waveform
+from gmem_jax.state import Status, explain
+from gmem_jax.storage import (
+    FileFormatError,
+    list_packs,
+    load_pack,
+    load_recall,
+    load_waveforms,
+    save_pack,
+    save_recall,
+)
+
+__all__ = [
+    "Bumps",
+    "Clump",
+    "FileFormatError",
+    "Frictionless",
+    "Hooke",
+    "Material",
+    "Pack",
+    "Recall",
+    "Recipe",
+    "RunFailedError",
+    "Samples",
+    "Signals",
+    "Status",
+    "clump",
+    "explain",
+    "fidelity",
+    "gain",
+    "list_packs",
+    "load_pack",
+    "load_recall",
+    "load_waveforms",
+    "prepare",
+    "run_memory",
+    "running_mean",
+    "save_pack",
+    "save_recall",
+    "six_signals",
+    "sphere",
+    "stack",
+    "tetra",
+    "waveform",
+]

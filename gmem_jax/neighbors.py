@@ -4,6 +4,7 @@ The list is a half list in canonical (i, j) order. It is built on positions mapp
 the coming motion, so that only non-affine displacements use up its skin (a whole experiment needs about 0.2 R).
 """
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,6 +75,55 @@ def slack(pairs: Pairs, spheres: jax.Array, box: Box) -> jax.Array:
     return ratio * pairs.reach - 2.0 - 2.0 * deviation
 
 
+def tabulate(
+    found: np.ndarray,
+    reference: np.ndarray,
+    smallest: np.ndarray,
+    reach: float,
+    spheres_per_grain: int,
+    *,
+    capacity: int = 0,
+    per_sphere: int = 0,
+) -> Pairs:
+    """`Pairs` from sorted sphere pairs [2, n]: padded to capacity, with the incidence table.
+
+    Capacities too small for what was found are raised, with some to spare; the other arguments are fields of `Pairs`.
+    """
+    pairs, count = found.shape[1], reference.shape[0]
+    if pairs > capacity:
+        capacity = max(8, int(pairs * _SPARE))
+    owners = found.ravel()
+    rows = np.concatenate([np.arange(pairs), capacity + np.arange(pairs)])
+    order = np.argsort(owners, kind="stable")
+    owners, rows = owners[order], rows[order]
+    place = np.arange(2 * pairs) - np.searchsorted(owners, owners)
+    if pairs and place.max() >= per_sphere:
+        per_sphere = int(place.max()) + 3
+    incidence = np.full((count, max(1, per_sphere)), 2 * capacity, dtype=np.int32)
+    incidence[owners, place] = rows
+    padded = np.zeros((2, capacity), dtype=np.int32)
+    padded[:, :pairs] = found
+    grains = padded // spheres_per_grain
+    _, grain_pair = np.unique(grains[0].astype(np.int64) * count + grains[1], return_inverse=True)
+    return Pairs(
+        first=jnp.asarray(padded[0]),
+        second=jnp.asarray(padded[1]),
+        valid=jnp.asarray(np.arange(capacity) < pairs),
+        incidence=jnp.asarray(incidence),
+        grain_pair=jnp.asarray(grain_pair.astype(np.int32)),
+        reference=jnp.asarray(reference),
+        smallest=jnp.asarray(smallest),
+        reach=jnp.asarray(reach),
+    )
+
+
+def candidates(pairs: Pairs) -> np.ndarray:
+    """The listed sphere pairs without padding, [2, n]."""
+    real = np.asarray(pairs.valid)
+    listed: np.ndarray = np.stack([np.asarray(pairs.first)[real], np.asarray(pairs.second)[real]])
+    return listed
+
+
 class PairFinder:
     """Builds `Pairs` from a jax-md neighbour list whose capacities grow when they must, and never shrink.
 
@@ -123,10 +173,13 @@ class PairFinder:
     def _grain_pairs(self, centres: np.ndarray) -> np.ndarray:
         """Pairs (i < j) of grains whose centres [N, 3] are within the cutoff, [2, n]."""
         positions = jnp.asarray(centres)
-        if self._neighbors is not None:
-            self._neighbors = self._update(positions, self._neighbors)
-        if self._neighbors is None or bool(self._neighbors.did_buffer_overflow):
-            self._neighbors = self._fns.allocate(positions)
+        with warnings.catch_warnings():
+            # jax-md 0.2.29 scatters 64-bit indices into its 32-bit tables, and jax warns of it.
+            warnings.filterwarnings("ignore", message="scatter inputs have incompatible types")
+            if self._neighbors is not None:
+                self._neighbors = self._update(positions, self._neighbors)
+            if self._neighbors is None or bool(self._neighbors.did_buffer_overflow):
+                self._neighbors = self._fns.allocate(positions)
         found = np.sort(np.asarray(self._neighbors.idx), axis=0)
         return found[:, found[1] < len(centres)]
 
@@ -149,36 +202,17 @@ class PairFinder:
         pair, sphere_i, sphere_j = np.nonzero(distance < 2.0 + self.skin)
         found = np.stack([one[pair], other[pair]]) * self._spheres_per_grain + np.stack([sphere_i, sphere_j])
         found = found[:, np.lexsort((found[1], found[0]))]
-        return self._tabulate(found, reference, smallest)
-
-    def _tabulate(self, found: np.ndarray, reference: np.ndarray, smallest: np.ndarray) -> Pairs:
-        """Pad the sorted pairs [2, n] to capacity and build the incidence table."""
-        pairs, count = found.shape[1], reference.shape[0]
-        if pairs > self._capacity:
-            self._capacity = max(8, int(pairs * _SPARE))
-        owners = found.ravel()
-        rows = np.concatenate([np.arange(pairs), self._capacity + np.arange(pairs)])
-        order = np.argsort(owners, kind="stable")
-        owners, rows = owners[order], rows[order]
-        place = np.arange(2 * pairs) - np.searchsorted(owners, owners)
-        if pairs and place.max() >= self._per_sphere:
-            self._per_sphere = int(place.max()) + 3
-        incidence = np.full((count, max(1, self._per_sphere)), 2 * self._capacity, dtype=np.int32)
-        incidence[owners, place] = rows
-        padded = np.zeros((2, self._capacity), dtype=np.int32)
-        padded[:, :pairs] = found
-        grains = padded // self._spheres_per_grain
-        _, grain_pair = np.unique(grains[0].astype(np.int64) * count + grains[1], return_inverse=True)
-        return Pairs(
-            first=jnp.asarray(padded[0]),
-            second=jnp.asarray(padded[1]),
-            valid=jnp.asarray(np.arange(self._capacity) < pairs),
-            incidence=jnp.asarray(incidence),
-            grain_pair=jnp.asarray(grain_pair.astype(np.int32)),
-            reference=jnp.asarray(reference),
-            smallest=jnp.asarray(smallest),
-            reach=jnp.asarray(2.0 + self.skin),
+        pairs = tabulate(
+            found,
+            reference,
+            smallest,
+            2.0 + self.skin,
+            self._spheres_per_grain,
+            capacity=self._capacity,
+            per_sphere=self._per_sphere,
         )
+        self._capacity, self._per_sphere = pairs.capacity, int(pairs.incidence.shape[-1])
+        return pairs
 
 
 def carry_history(history: Any, blank: Any, old: Pairs, new: Pairs) -> Any:
@@ -192,13 +226,7 @@ def carry_history(history: Any, blank: Any, old: Pairs, new: Pairs) -> Any:
     """
     spheres = np.int64(old.reference.shape[0])
 
-    def keys(pairs: Pairs) -> np.ndarray:
-        real = np.asarray(pairs.valid)
-        flat: np.ndarray = np.asarray(pairs.first) * spheres + np.asarray(pairs.second)
-        listed: np.ndarray = flat[real]
-        return listed
-
-    old_keys, new_keys = keys(old), keys(new)
+    old_keys, new_keys = (one * spheres + other for one, other in (candidates(old), candidates(new)))
     place = np.searchsorted(old_keys, new_keys)
     place = np.minimum(place, max(0, old_keys.size - 1))
     known = (old_keys[place] == new_keys) if old_keys.size else np.zeros(new_keys.size, dtype=bool)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.grain import Clump
-from gmem_jax.neighbors import PairFinder, Pairs
+from gmem_jax.neighbors import PairFinder, Pairs, candidates, tabulate
 from gmem_jax.state import Box, Grains, still_box
 
 SKIN = 0.3
@@ -71,23 +71,12 @@ def smallest_box(lower: np.ndarray, upper: np.ndarray, delta0: float) -> np.ndar
     return lengths
 
 
-def find_pairs(
-    clump: Clump,
-    position: np.ndarray,
-    quaternion: np.ndarray,
-    box: Box,
-    delta0: float,
-    *,
-    skin: float = SKIN,
-    capacity: int = 0,
-    per_sphere: int = 0,
-) -> Pairs:
+def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: Box, delta0: float) -> Pairs:
     """The candidate contacts of a whole experiment on a pack (positions [N, 3], quaternions [N, 4])."""
     smallest = smallest_box(np.asarray(box.lower)[:, 0], np.asarray(box.upper)[:, 0], delta0)
     still = jnp.zeros((*np.shape(position), 1))
     grains = Grains(jnp.asarray(position)[..., None], jnp.asarray(quaternion)[..., None], still, still, still, still)
-    finder = PairFinder(clump, smallest, skin, capacity=capacity, per_sphere=per_sphere)
-    return finder(grains, clump, box, smallest)
+    return PairFinder(clump, smallest, SKIN)(grains, clump, box, smallest)
 
 
 def stack(packs: Sequence[Pack]) -> Pack:
@@ -108,18 +97,20 @@ def stack(packs: Sequence[Pack]) -> Pack:
     capacity = max(pack.pairs.capacity for pack in packs)
     per_sphere = max(pack.pairs.incidence.shape[-1] for pack in packs)
     name = "+".join(pack.name for pack in packs)
-    padded = []
-    for pack in packs:
-        pairs = find_pairs(
-            pack.clump,
-            np.asarray(pack.position),
-            np.asarray(pack.quaternion),
-            pack.box,
-            float(pack.delta0),
-            skin=float(pack.pairs.reach) - 2.0,
-            capacity=capacity,
-            per_sphere=per_sphere,
-        )
-        padded.append(replace(pack, pairs=pairs, name=name, record="{}"))
+    padded = [replace(pack, pairs=_widen(pack, capacity, per_sphere), name=name, record="{}") for pack in packs]
     stacked: Pack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
     return stacked
+
+
+def _widen(pack: Pack, capacity: int, per_sphere: int) -> Pairs:
+    """The pack's own candidates in larger tables."""
+    pairs = pack.pairs
+    return tabulate(
+        candidates(pairs),
+        np.asarray(pairs.reference),
+        np.asarray(pairs.smallest),
+        float(pairs.reach),
+        pack.clump.spheres,
+        capacity=capacity,
+        per_sphere=per_sphere,
+    )

@@ -29,21 +29,22 @@ class LayeredHistory:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Mindlin:
-    """f_e is the integral of f(q) over q from 0 to sqrt(p), where df = k dsigma; what lies beyond is forgotten (App. D.2).
+    """f_e is the integral of f(q) over 0 < q < sqrt(p), where df = k dsigma; f beyond is forgotten (App. D.2).
 
     f(q) is the elastic force per unit of q in the ring of contact area that was attached when sqrt(p) passed q. It is
     kept on Q points a spacing dq = sqrt(p_max) / (Q - 1) apart: with x = sqrt(p) / dq and the outermost ring
     jp = floor(x), f_e = dq sum_j w_j f_j over j <= jp. The dashpot is f_d = damping_time k p^0.5 dsigma/dt, and
     |f_e + f_d| <= mu f_n; a sliding contact gives up the same f in all its rings.
 
-    The variants differ in how the outermost ring, which the contact fills in part only, is counted:
+    The variants differ in the outermost ring, which the contact fills in part only:
 
-    - "exact": w_j = 1 and w_jp = x - jp, so that the stiffness dq sum w_j is sqrt(p) to the last digit. Filling the
-      ring at constant sigma adds force, of relative order 1 / Q, and a cycle of p within one ring can create energy.
-    - "averaged": the same weights, but while the ring fills, its f_jp is diluted: the force in it stays. This is M1
-      within the ring. No cycle creates energy, and the error of f_e is confined to the outermost ring.
-    - "paper": the weights of App. D.2, w_0 less by 1/2. The stiffness sqrt(p) - dq/2 would be negative below
-      x = 1/2, where this variant has no spring at all.
+    - "averaged": w_j = 1 and w_jp = x - jp, so that the stiffness dq sum w_j is sqrt(p) to the last digit. While the
+      ring fills, its f_jp is diluted: the force in it stays. So no path whatever can extract energy, and f_e is in
+      error by what is in one ring, or by dq^2.
+    - "exact": the same weights without the dilution. Filling the ring adds force that nobody put in, so that f_e is
+      in error by dq, and a cycle of p within one ring can create energy.
+    - "paper": as "exact", but w_0 less by 1/2, the weights of App. D.2. The stiffness sqrt(p) - dq/2 would be
+      negative below x = 1/2; there this variant has no spring at all.
 
     Attributes:
         mu: friction coefficient; scalar or [B].
@@ -52,7 +53,7 @@ class Mindlin:
         p_max: largest overlap that the points cover, in R. Packs of the paper reach 0.16 at u = 1. Beyond it the
             outermost ring is extrapolated and a run is flagged (`Status.OVERLAP_RANGE`).
         points: Q, at least 2.
-        variant: "exact", "averaged" or "paper".
+        variant: "averaged", "exact" or "paper".
 
     Raises:
         ValueError: if `points` or `variant` is none of these.
@@ -63,13 +64,13 @@ class Mindlin:
     damping_time: Scalar = Material().tangential_damping
     p_max: Scalar = 0.2
     points: int = field(default=100, metadata={"static": True})
-    variant: Literal["exact", "averaged", "paper"] = field(default="exact", metadata={"static": True})
+    variant: Literal["averaged", "exact", "paper"] = field(default="averaged", metadata={"static": True})
 
     def __post_init__(self) -> None:
         if self.points < 2:
             raise ValueError(f"Mindlin.points must be at least 2, got {self.points}")
-        if self.variant not in ("exact", "averaged", "paper"):
-            raise ValueError(f"Mindlin.variant must be 'exact', 'averaged' or 'paper', got {self.variant!r}")
+        if self.variant not in ("averaged", "exact", "paper"):
+            raise ValueError(f"Mindlin.variant must be 'averaged', 'exact' or 'paper', got {self.variant!r}")
 
     @property
     def largest_overlap(self) -> Scalar:
@@ -109,8 +110,7 @@ class Mindlin:
         """Layers whose force w f stays while w grows."""
         known = history.overlap > 0.0
         reached = jnp.where(known, jnp.sqrt(jnp.where(known, history.overlap, 1.0)) / self.spacing, 0.0)
-        points = jnp.arange(self.points)[:, None, None]
-        filled = jnp.clip(reached[:, None] - points, 0.0, 1.0)
+        _, filled, _ = self.weights(reached)
         grows = filled < weight
         return layers * jnp.where(grows, filled / jnp.where(grows, weight, 1.0), 1.0)
 

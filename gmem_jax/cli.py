@@ -1,0 +1,245 @@
+"""The `gmem` command. Exit code 0: done; 2: bad input, said in one line; 1: the run failed."""
+
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from typer.exceptions import TyperException
+
+from gmem_jax import grain, plot, report, storage
+from gmem_jax.config import RecallConfig
+from gmem_jax.dynamics import Sample
+from gmem_jax.memory import run_memory
+from gmem_jax.prepare import Recipe, prepare
+from gmem_jax.provenance import provenance
+from gmem_jax.run import Progress as Report
+from gmem_jax.run import RunFailedError
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, help="Waveform memory in granular packs.")
+log = Console(stderr=True, highlight=False)
+out = Console(highlight=False)
+
+Output = Annotated[Path, typer.Option("-o", "--output", help="File to write.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; logs go to stderr.")]
+
+
+class InputError(ValueError):
+    """Bad input, in words for the command line."""
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Report]:
+    """A progress bar on a terminal; a line per stage elsewhere."""
+    if not log.is_terminal:
+        stages: list[str] = []
+
+        def line(stage: str, moment: float, fraction: float) -> None:
+            if stages[-1:] != [stage]:
+                stages.append(stage)
+                log.print(f"{fraction:5.0%}  {stage} (t = {moment:.0f} t_c)")
+
+        yield line
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Progress(*columns, TextColumn("ETA"), TimeRemainingColumn(), console=log) as bar:
+        task = bar.add_task("compiling", total=1.0)
+        yield lambda stage, moment, fraction: bar.update(
+            task, completed=fraction, description=f"{stage}, t = {moment:.0f} t_c"
+        )
+
+
+def _writable(path: Path, name: str = "--output") -> Path:
+    """`path`, once it is sure that it can be written: a long run must not end in a refused file."""
+    folder = path.parent
+    if path.is_dir():
+        raise InputError(f"{name} {path}: is a folder; name a file")
+    if not folder.is_dir():
+        raise InputError(f"{name} {path}: folder {folder} does not exist")
+    try:
+        with storage.atomic(folder / ".gmem-probe") as probe:
+            probe.touch()
+        (folder / ".gmem-probe").unlink()
+    except OSError as error:
+        raise InputError(f"{name} {path}: cannot write there ({error.strerror})") from error
+    return path
+
+
+def _emit(as_json: bool, result: Any, *tables: Any) -> None:
+    if as_json:
+        sys.stdout.write(json.dumps(result) + "\n")
+    else:
+        for table in tables:
+            out.print(table)
+
+
+@app.command()
+def info(as_json: AsJson = False) -> None:
+    """Versions, devices, backend and shipped packs."""
+    facts = {
+        **provenance(),
+        "devices": [f"{d.platform}: {d.device_kind}" for d in jax.devices()],
+        "packs": storage.list_packs(),
+    }
+    lines = [f"{key}: {value}" for key, value in facts["versions"].items()]
+    lines += [f"commit: {facts['commit']}", f"backend: {facts['backend']} (plain JAX, the definition)"]
+    lines += [f"device: {device}" for device in facts["devices"]]
+    lines += ["shipped packs: " + ", ".join(facts["packs"])]
+    _emit(as_json, facts, "\n".join(lines))
+
+
+@app.command("prepare")
+def prepare_command(
+    output: Output,
+    grains: Annotated[int, typer.Option(help="Number of grains N.")] = 325,
+    shape: Annotated[str, typer.Option(help="tetra or sphere.")] = "tetra",
+    overlap: Annotated[float, typer.Option(help="Overlap O of a tetra grain, in [0, 1).")] = 0.6,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 1,
+    delta0: Annotated[float, typer.Option(help="Areal compression of the cycles and of the experiment.")] = 0.05,
+    t0: Annotated[float, typer.Option(help="Duration of one compression, t_c.")] = 1.8e3,
+    dt: Annotated[float, typer.Option(help="Largest time step, t_c.")] = 0.3,
+    name: Annotated[str, typer.Option(help="Name of the pack; default from grain, size and seed.")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Prepare a pack: gas, pressure, frictionless cycles, rest."""
+    if shape not in ("tetra", "sphere"):
+        raise InputError(f"--shape must be tetra or sphere, got {shape!r}")
+    clump = grain.tetra(overlap) if shape == "tetra" else grain.sphere()
+    recipe = Recipe(grains=grains, seed=seed, delta0=delta0, t0=t0, dt=dt)
+    _writable(output)
+    began = time.perf_counter()
+    stages: dict[str, Sample] = {}
+    with _progress() as progress:
+        pack = prepare(recipe, clump, name=name, progress=progress, log=stages)
+    storage.save_pack(output, pack, stages)
+    seconds = time.perf_counter() - began
+    rest = pack.info["at_rest"]
+    log.print(f"at rest: largest grain speed {rest['largest_speed']:.1e} R/t_c; wrote {output} in {seconds:.0f} s")
+    result = {"pack": pack.name, "output": str(output), "seconds": seconds, "status": 0, **rest}
+    _emit(as_json, result, report.pack_table(pack))
+
+
+def _run(config: RecallConfig, data: Path, picture: Path | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
+    pack, signals = storage.load_pack(config.pack), config.waveforms()
+    began = time.perf_counter()
+    with _progress() as progress:
+        recall = jax.block_until_ready(run_memory(pack, signals, progress=progress, **config.arguments()))
+    resolved = config.resolved(pack, time.perf_counter() - began)
+    storage.save_recall(data, recall, resolved)
+    if picture is not None:
+        plot.recall_figure(picture, recall, resolved["delta0"], config.gamma0, config.pack)
+    log.print(f"wrote {data}" + (f" and {picture}" if picture else ""))
+    return {**report.summary(recall, resolved), "seconds": resolved["seconds"], "output": str(data)}, resolved
+
+
+@app.command("recall")
+def recall_command(
+    pack: Annotated[str, typer.Argument(help="A pack file, or the name of a shipped pack.")],
+    output: Output = Path("recall.h5"),
+    signals: Annotated[str, typer.Option(help="six, or a .csv (a column per signal) or .npy file of samples.")] = "six",
+    friction: Annotated[str, typer.Option(help="Friction law: hooke.")] = "hooke",
+    mu: Annotated[float, typer.Option(help="Friction coefficient.")] = 1.0,
+    stiffness: Annotated[float, typer.Option(help="k_H, in E R.")] = 0.145,
+    delta0: Annotated[float | None, typer.Option(help="Areal compression; default the pack's own.")] = None,
+    gamma0: Annotated[float, typer.Option(help="Shear amplitude.")] = 1e-3,
+    t0: Annotated[float, typer.Option(help="Duration of one compression, t_c (the paper's is 18000).")] = 1.8e3,
+    dt: Annotated[float, typer.Option(help="Largest time step, t_c.")] = 0.3,
+    background: Annotated[str, typer.Option(help="sub0, sub2 or sub2-bl.")] = "sub0",
+    rest: Annotated[float, typer.Option(help="Rests at u = 0, in t0.")] = 0.2,
+    hold: Annotated[float, typer.Option(help="Holds at u = 1, in t0.")] = 0.2,
+    store: Annotated[float, typer.Option(help="Storage, in t0.")] = 2.0,
+    hold_drag: Annotated[float | None, typer.Option(help="Drag in holds, 1/t_c; default 0.05 if t0 < 18000.")] = None,
+    picture: Annotated[bool, typer.Option(help="Also draw it, beside the output.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Store waveforms in a pack and recall them."""
+    given = {key: value for key, value in locals().items() if key in RecallConfig.model_fields}
+    config = RecallConfig(**given)
+    _writable(output)
+    row, resolved = _run(config, output, output.with_suffix(".png") if picture else None)
+    _emit(as_json, row, report.recall_table([row], resolved))
+
+
+@app.command()
+def demo(
+    packs: Annotated[str, typer.Option(help="all, or names of shipped packs, separated by commas.")] = "",
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write to.")] = Path("gmem-demo"),
+    mu: Annotated[float, typer.Option(help="Friction coefficient.")] = 1.0,
+    as_json: AsJson = False,
+) -> None:
+    """The main job: six waveforms stored in a shipped pack and recalled; table, recall.h5 and recall.png."""
+    shipped = storage.list_packs()
+    default = [name for name in shipped if name.startswith("tetra-325")]
+    names = default if packs == "all" else packs.split(",") if packs else default[:1]
+    unknown = [name for name in names if name not in shipped]
+    if unknown:
+        raise InputError(f"--packs {unknown[0]}: no such shipped pack; there are {', '.join(shipped)}")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--output {output}: cannot make this folder ({error.strerror})") from error
+    _writable(output / "recall.h5")
+    rows = []
+    for name in names:
+        log.print(f"pack {name}")
+        stem = "recall" if len(names) == 1 else f"recall-{name}"
+        config = RecallConfig(pack=name, mu=mu)
+        row, resolved = _run(config, output / f"{stem}.h5", output / f"{stem}.png")
+        rows.append(row)
+    means = {key: report.spread([row[key] for row in rows])[0] for key in ("gain", "fidelity")}
+    total = {"status": max(row["status"] for row in rows), "seconds": sum(row["seconds"] for row in rows)}
+    _emit(as_json, {**means, **total, "packs": rows}, report.recall_table(rows, resolved))
+
+
+@app.command()
+def show(
+    file: Annotated[Path, typer.Argument(help="A pack or a recall file, or the name of a shipped pack.")],
+    as_json: AsJson = False,
+) -> None:
+    """What a file holds."""
+    if str(file) in storage.list_packs() or storage.schema_of(file) == storage.PACK_SCHEMA:
+        pack = storage.load_pack(file)
+        facts = {"pack": pack.name, "grains": pack.grains, "ringing_period": float(pack.ringing_period), **pack.info}
+        _emit(as_json, facts, report.pack_table(pack))
+        return
+    recall, configuration = storage.load_recall(file)
+    row = report.summary(recall, configuration)
+    _emit(as_json, {**row, "configuration": configuration}, report.recall_table([row], configuration))
+
+
+def _first_problem(error: ValidationError) -> str:
+    """One line of the first thing pydantic objects to."""
+    problem = error.errors()[0]
+    option = "--" + "-".join(str(part).replace("_", "-") for part in problem["loc"])
+    return f"{option}: {problem['msg'].lower()}, got {problem['input']!r}"
+
+
+def main() -> None:
+    """Entry point of the `gmem` command."""
+    jax.config.update("jax_enable_x64", True)
+    try:
+        code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except TyperException as error:
+        problem = error.format_message()
+    except ValidationError as error:
+        problem = _first_problem(error)
+    except (ValueError, OSError) as error:
+        problem = " ".join(str(error).split())
+    except RunFailedError as error:
+        log.print(f"gmem: the run failed: {error}", style="red", soft_wrap=True)
+        sys.exit(1)
+    except (KeyboardInterrupt, typer.Abort):
+        log.print("gmem: interrupted")
+        sys.exit(130)
+    log.print(f"gmem: {problem}", style="red", soft_wrap=True, markup=False)
+    sys.exit(2)

@@ -1,0 +1,73 @@
+"""The validated configuration of a recall, as given on the command line and stored with the result."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from gmem_jax.contact.friction import FrictionLaw
+from gmem_jax.contact.hooke import Hooke
+from gmem_jax.material import Material
+from gmem_jax.pack import Pack
+from gmem_jax.provenance import provenance
+from gmem_jax.signals import Signals, six_signals, waveform
+from gmem_jax.storage import load_waveforms
+
+
+class RecallConfig(BaseModel):
+    """One `gmem recall`: times in t_c (lengths of holds in t0), stiffness in E R."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    pack: str
+    signals: str = "six"
+    friction: Literal["hooke"] = "hooke"
+    mu: float = Field(1.0, ge=0.0)
+    stiffness: float = Field(0.145, gt=0.0)
+    delta0: float | None = Field(None, gt=0.0, lt=0.5)
+    gamma0: float = Field(1e-3, gt=0.0, lt=0.5)
+    t0: float = Field(1.8e3, gt=0.0)
+    dt: float = Field(0.3, gt=0.0, le=0.5)
+    background: Literal["sub0", "sub2", "sub2-bl"] = "sub0"
+    rest: float = Field(0.2, ge=0.0)
+    hold: float = Field(0.2, ge=0.0)
+    store: float = Field(2.0, ge=0.0)
+    hold_drag: float | None = Field(None, ge=0.0)
+
+    @field_validator("signals")
+    @classmethod
+    def _known_signals(cls, value: str) -> str:
+        if value != "six" and Path(value).suffix.lower() not in (".csv", ".npy"):
+            raise ValueError('must be "six" or a .csv or .npy file')
+        return value
+
+    def waveforms(self) -> Signals:
+        """The signals named; reads the file if it is one."""
+        return six_signals() if self.signals == "six" else waveform(load_waveforms(Path(self.signals)))
+
+    def law(self) -> FrictionLaw:
+        """The friction law."""
+        return Hooke(mu=self.mu, stiffness=self.stiffness)
+
+    def arguments(self) -> dict[str, Any]:
+        """Keyword arguments of `run_memory`."""
+        names = ("delta0", "gamma0", "t0", "dt", "background", "rest", "hold", "store", "hold_drag")
+        return {"friction": self.law(), **{name: getattr(self, name) for name in names}}
+
+    def resolved(self, pack: Pack, seconds: float) -> dict[str, Any]:
+        """All that is needed to repeat the run, for the file."""
+        return {
+            **self.model_dump(),
+            "delta0": self.delta0 if self.delta0 is not None else float(pack.delta0),
+            "grains": pack.grains,
+            "grain": {
+                "shape": pack.clump.shape,
+                "mass": float(pack.clump.mass),
+                "diameter": float(pack.clump.diameter),
+            },
+            "pack_record": pack.info,
+            "material": asdict(Material()),
+            "seconds": seconds,
+            **provenance(),
+        }

@@ -1,0 +1,133 @@
+"""Numbers as a person or a program wants to read them: tables beside the published points."""
+
+import csv
+import math
+from collections.abc import Sequence
+from importlib import resources
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from gmem_jax.analysis import inertial_number
+from gmem_jax.material import Material
+from gmem_jax.memory import Recall
+from gmem_jax.pack import Pack
+from gmem_jax.state import explain
+
+
+def published(file: str = "six_signals.csv", **conditions: str | float) -> list[dict[str, Any]]:
+    """Rows of a published table (numbers converted) in which every named column has the given value."""
+    text = (resources.files("gmem_jax") / "reference" / file).read_text()
+    rows = [{key: _number(cell) for key, cell in row.items()} for row in csv.DictReader(text.splitlines())]
+    return [row for row in rows if all(row[key] == value for key, value in conditions.items())]
+
+
+def _number(cell: str) -> str | float:
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
+
+
+def spread(values: Sequence[float]) -> tuple[float, float, float]:
+    """Mean, sample standard deviation and standard error (NaN for fewer than two values)."""
+    array = np.asarray(values, dtype=float)
+    deviation = float(array.std(ddof=1)) if array.size > 1 else math.nan
+    return float(array.mean()), deviation, deviation / math.sqrt(array.size)
+
+
+def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
+    """The numbers of one recall and its resolved configuration, for JSON output and `recall_table`."""
+    readout = recall.stages["readout"]
+    pressure = np.asarray(readout.pressure)
+    rate = (1.0 - math.sqrt(1.0 - configuration["delta0"])) / configuration["t0"]
+    grain = configuration["grain"]
+    inertial = inertial_number(rate, jnp.asarray(pressure[:, :2]).mean(), grain["mass"], grain["diameter"])
+    unit = Material().modulus
+    status = int(np.bitwise_or.reduce(np.asarray(recall.status)))
+    return {
+        "pack": configuration["pack"],
+        "grains": configuration["grains"],
+        "gain": float(recall.gain),
+        "fidelity": float(recall.fidelity),
+        "windowed_gain": float(recall.windowed_gain),
+        "windowed_fidelity": float(recall.windowed_fidelity),
+        "ringing_period": float(recall.window),
+        "residual_speed": float(np.max(np.asarray(recall.residual_speed))),
+        "inertial_number": float(inertial),
+        "filling": [float(np.asarray(readout.filling)[k, 0]) for k in (-1, 0)],
+        "coordination": [float(np.asarray(readout.coordination)[k, 0]) for k in (-1, 0)],
+        "pressure_pa": [float(pressure[k, :2, 0].mean() * unit) for k in (-1, 0)],
+        "largest_signal_pa": float(np.max(np.abs(np.asarray(recall.p_sig))) * unit),
+        "dt": float(recall.dt),
+        "status": status,
+        "status_text": explain(status),
+    }
+
+
+def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> Table:
+    """Gain and fidelity of recalls, raw and averaged over the ringing period, beside the published point.
+
+    Args:
+        rows: a `summary` for each pack; several get a line of mean and standard deviation.
+        configuration: resolved, of any of them.
+    """
+    table = Table(title="Recall of the waveforms")
+    for column in ("pack", "G", "F", "G over T1", "F over T1", "T1 / t_c", "residual speed", "status"):
+        table.add_column(column, justify="left" if column in ("pack", "status") else "right")
+    keys = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
+    for row in rows:
+        numbers = [f"{row[key]:.3f}" for key in keys]
+        residual = f"{row['residual_speed']:.0e}"
+        table.add_row(row["pack"], *numbers, f"{row['ringing_period']:.0f}", residual, row["status_text"])
+    if len(rows) > 1:
+        means = [spread([row[key] for row in rows]) for key in keys]
+        table.add_section()
+        table.add_row(f"mean ± SD of {len(rows)}", *(f"{mean:.3f} ± {sd:.3f}" for mean, sd, _ in means))
+    same = {key: configuration[key] for key in ("mu", "delta0", "gamma0")}
+    points = published(n_grains=float(configuration["grains"]), **same)
+    shape = configuration["grain"]["shape"]
+    kind, overlap = ("sphere", 1.0) if shape == "sphere" else _tetra(shape)
+    for point in (p for p in points if p["shape"] == kind and p["overlap"] == overlap):
+        table.add_section()
+        gain = f"{point['gain_mean']:.3f} ± {point['gain_sd']:.3f}"
+        fidelity = f"{point['fidelity_mean']:.3f} ± {point['fidelity_sd']:.3f}"
+        table.add_row(f"published, {point['n_packs']:.0f} packs", gain, fidelity)
+    return table
+
+
+def _tetra(shape: str) -> tuple[str, float]:
+    """Kind and overlap of a shape like "tetra(0.6)"; an overlap that matches nothing for other shapes."""
+    kind, _, rest = shape.partition("(")
+    return kind, float(rest.rstrip(")")) if kind == "tetra" else math.nan
+
+
+def pack_table(pack: Pack) -> Table:
+    """What a pack file holds."""
+    unit = Material().modulus
+    rest = pack.info.get("at_rest", {})
+    recipe = pack.info.get("recipe", {})
+    table = Table(title=f"Pack {pack.name}", show_header=False)
+    rows: list[tuple[str, str]] = [
+        ("grains", f"{pack.grains} {pack.clump.shape}"),
+        ("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)) + " R"),
+        ("cycled with delta0", f"{float(pack.delta0):g}"),
+        ("ringing period T1", f"{float(pack.ringing_period):.1f} t_c"),
+        ("candidate contacts", f"{int(np.asarray(pack.pairs.valid).sum())}"),
+    ]
+    if rest:
+        pressures = ", ".join(f"{p * unit / 1e3:.2f}" for p in rest["pressure"])
+        rows += [
+            ("filling phi", f"{rest['filling']:.4f}"),
+            ("coordination Z", f"{rest['coordination']:.2f}"),
+            ("contacts per grain", f"{rest['contacts']:.2f}"),
+            ("p_x, p_y, p_z", f"{pressures} kPa"),
+            ("largest speed", f"{rest['largest_speed']:.1e} R/t_c"),
+        ]
+    if recipe:
+        rows.append(("seed", str(recipe["seed"])))
+    for key, value in rows:
+        table.add_row(key, value)
+    return table
