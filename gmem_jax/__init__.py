@@ -10,7 +10,7 @@ from gmem_jax.contact.hooke import Hooke
 from gmem_jax.grain import Clump, clump, sphere, tetra
 from gmem_jax.material import Material
 from gmem_jax.memory import Recall, fidelity, gain, run_memory
-from gmem_jax.pack import Pack, stack
+from gmem_jax.pack import Pack, pack_from, stack
 from gmem_jax.prepare import Recipe, prepare
 from gmem_jax.run import RunFailedError
 from gmem_jax.signals import Bumps, Samples, Signals, six_signals, waveform
@@ -47,6 +47,7 @@ __all__ = [
     "load_pack",
     "load_recall",
     "load_waveforms",
+    "pack_from",
     "prepare",
     "run_memory",
     "running_mean",

@@ -137,8 +137,11 @@ def _run(config: RecallConfig, data: Path, picture: Path | None) -> tuple[dict[s
     storage.save_recall(data, recall, resolved)
     if picture is not None:
         plot.recall_figure(picture, recall, resolved["delta0"], config.gamma0, config.pack)
-    log.print(f"wrote {data}" + (f" and {picture}" if picture else ""))
-    return {**report.summary(recall, resolved), "seconds": resolved["seconds"], "output": str(data)}, resolved
+    log.print(f"wrote {data}" + (f" and {picture}" if picture else ""), soft_wrap=True)
+    row = {**report.summary(recall, resolved), "seconds": resolved["seconds"], "output": str(data)}
+    if row["status"]:
+        log.print(f"warning: {row['status_text']}", style="yellow", soft_wrap=True)
+    return row, resolved
 
 
 @app.command("recall")

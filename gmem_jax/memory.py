@@ -105,7 +105,8 @@ def _refuse_open_waveforms(signals: Signals) -> None:
     """The walls are unsheared at u = 0 and u = 1; a waveform that is not would make them jump."""
     if _traced(signals):
         return
-    ends = np.asarray(signals.shear(jnp.asarray([0.0, 1.0])))
+    with jax.ensure_compile_time_eval():
+        ends = np.asarray(signals.shear(jnp.asarray([0.0, 1.0])))
     if not np.all(np.isfinite(ends)) or np.max(np.abs(ends)) > 1e-9:
         raise ValueError(f"waveforms must vanish at u = 0 and u = 1; found {np.abs(ends).max():g} there")
 
@@ -180,7 +181,7 @@ def run_memory(
     state = replicate(state, _width(friction, delta0, step))
     stages = memory_protocol(rest, hold, store, second_readout=background != "sub0")
     stepper: _Inline | Runner
-    if _traced(pack, signals, friction, gamma0, delta0, t0, dt, hold_drag):
+    if isinstance(state.status, jax.core.Tracer) or _traced(signals, gamma0, delta0, t0, dt, hold_drag):
         stepper = _Inline(system, state, step)
     else:
         stepper = _on_host(system, state, pack, delta0, step, progress)

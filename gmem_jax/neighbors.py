@@ -90,8 +90,8 @@ def tabulate(
     Capacities too small for what was found are raised, with some to spare; the other arguments are fields of `Pairs`.
     """
     pairs, count = found.shape[1], reference.shape[0]
-    if pairs > capacity:
-        capacity = max(8, int(pairs * _SPARE))
+    if pairs > capacity or capacity == 0:
+        capacity = max(8, int(pairs * _SPARE))  # a gas may have no candidates, but arrays need rows
     owners = found.ravel()
     rows = np.concatenate([np.arange(pairs), capacity + np.arange(pairs)])
     order = np.argsort(owners, kind="stable")

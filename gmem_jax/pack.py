@@ -79,6 +79,12 @@ def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: 
     return PairFinder(clump, smallest, SKIN)(grains, clump, box, smallest)
 
 
+def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: str = "") -> Pack:
+    """The same box and grain with other centres [N, 3] and orientations [N, 4], and their own neighbour list."""
+    pairs = find_pairs(pack.clump, np.asarray(position), np.asarray(quaternion), pack.box, float(pack.delta0))
+    return replace(pack, position=position, quaternion=quaternion, pairs=pairs, name=name or pack.name)
+
+
 def stack(packs: Sequence[Pack]) -> Pack:
     """Packs of one size and grain as one `Pack` with a leading axis on every array, for `jax.vmap`.
 

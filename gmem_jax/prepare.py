@@ -18,7 +18,7 @@ from gmem_jax.dynamics import Sample, System, accelerate, start
 from gmem_jax.grain import Clump, tetra
 from gmem_jax.material import Material
 from gmem_jax.neighbors import PairFinder
-from gmem_jax.pack import SKIN, Pack, find_pairs, smallest_box
+from gmem_jax.pack import Pack, find_pairs, smallest_box
 from gmem_jax.piston import BLOCK, Pressed, Servo, largest_speed, press
 from gmem_jax.provenance import provenance
 from gmem_jax.ringing import ringing_period
@@ -26,6 +26,8 @@ from gmem_jax.run import Progress, RunFailedError, Runner, compiled, refuse, req
 from gmem_jax.state import Grains, still_box
 
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
+CYCLE_SKIN = 0.5  # in R; frictionless grains turn freely, so a list lasts only some 50 t_c
+CYCLE_CHUNK = 8  # bins per compiled call during the cycles
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
 DENSE = 0.68  # filling that the pressed pack reaches, which decides the lattice that ends as a cube
 
@@ -191,7 +193,7 @@ class _Preparation:
         recipe, runner = self.recipe, self.runner
         lower, upper = runner.box.lower, runner.box.upper
         smallest = smallest_box(np.asarray(lower)[:, 0], np.asarray(upper)[:, 0], recipe.delta0)
-        runner.finder, runner.skin = None, SKIN
+        runner.finder, runner.skin, runner.chunk = None, CYCLE_SKIN, CYCLE_CHUNK
         runner.smallest = smallest
         runner.rebuild()
         for number in range(1, recipe.cycles + 1):

@@ -14,7 +14,7 @@ from gmem_jax.analysis import inertial_number
 from gmem_jax.material import Material
 from gmem_jax.memory import Recall
 from gmem_jax.pack import Pack
-from gmem_jax.state import explain
+from gmem_jax.state import Status, explain
 
 
 def published(file: str = "six_signals.csv", **conditions: str | float) -> list[dict[str, Any]]:
@@ -63,6 +63,7 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "largest_signal_pa": float(np.max(np.abs(np.asarray(recall.p_sig))) * unit),
         "dt": float(recall.dt),
         "status": status,
+        "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
         "status_text": explain(status),
     }
 
@@ -75,13 +76,13 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
         configuration: resolved, of any of them.
     """
     table = Table(title="Recall of the waveforms")
-    for column in ("pack", "G", "F", "G over T1", "F over T1", "T1 / t_c", "residual speed", "status"):
+    for column in ("pack", "G", "F", "G over T1", "F over T1", "T1", "residual", "status"):
         table.add_column(column, justify="left" if column in ("pack", "status") else "right")
     keys = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
     for row in rows:
         numbers = [f"{row[key]:.3f}" for key in keys]
         residual = f"{row['residual_speed']:.0e}"
-        table.add_row(row["pack"], *numbers, f"{row['ringing_period']:.0f}", residual, row["status_text"])
+        table.add_row(row["pack"], *numbers, f"{row['ringing_period']:.0f}", residual, row["status_names"])
     if len(rows) > 1:
         means = [spread([row[key] for row in rows]) for key in keys]
         table.add_section()

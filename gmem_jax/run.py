@@ -83,6 +83,7 @@ class Runner:
         finder: rebuilds the pairs; made when first needed if not given.
         skin: of that neighbour list, in R.
         smallest: smallest box of the motion to come, [3], for the neighbour list.
+        chunk: bins per compiled call; halved where the list does not last as long.
         progress: see `Progress`.
         time: simulated time so far, in t_c.
         work: work done so far, in replica-steps; `total_work` is all there is to do.
@@ -95,6 +96,7 @@ class Runner:
     finder: PairFinder | None = None
     skin: float = 0.3
     smallest: np.ndarray | None = None
+    chunk: int = CHUNK
     progress: Progress = silent
     time: float = 0.0
     work: float = 0.0
@@ -131,8 +133,8 @@ class Runner:
         """
         samples, done = [], 0
         while done < bins:
-            count = min(CHUNK, bins - done)
             while True:
+                count = min(self.chunk, bins - done)
                 state, sample = _advance(
                     self.system, self.state, motion, self.dt, first_bin=done, bins=count, steps=steps, drag=drag
                 )
@@ -150,8 +152,14 @@ class Runner:
         return joined
 
     def _renew(self, name: str) -> None:
-        """Rebuild a stale list before its chunk is redone; with a wider skin if that was just done."""
+        """Rebuild a stale list before its chunk is redone; if that was just done, shorten the chunk or widen the skin.
+
+        Frictionless grains turn and fly freely in their cages: what a list must allow for grows with the time it lasts.
+        """
         if self._rebuilt_at == (name, self.time):
+            if self.chunk > 1:
+                self.chunk = max(1, self.chunk // 4)
+                return
             self.skin *= 1.5
             self.finder = None
             if self.skin > 2.0:

@@ -1,0 +1,159 @@
+"""The `gmem` command as a user meets it: results, JSON, and one clear line for every kind of bad input."""
+
+import json
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax import cli
+
+PACK = Path(__file__).parent.parent / "data" / "tetra-27.h5"
+SHORT = ["--t0", "75", "--store", "0.1", "--rest", "0.1", "--hold", "0.1"]
+
+
+def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Run the command in this process; its exit code."""
+    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    return int(stop.value.code or 0)
+
+
+def test_help_and_info_work(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    assert gmem(monkeypatch) == 0
+    assert "recall" in capsys.readouterr().out
+    assert gmem(monkeypatch, "info", "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["versions"]["jax"] == "0.9.2"
+    assert "tetra-325-a" in facts["packs"]
+
+
+@pytest.mark.parametrize("command", ["prepare", "recall", "demo", "show", "info"])
+def test_every_command_has_help(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, command: str) -> None:
+    assert gmem(monkeypatch, command, "--help") == 0
+    assert "--json" in capsys.readouterr().out
+
+
+def test_a_recall_writes_data_and_picture_and_prints_json(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    target = tmp_path / "recall.h5"
+    assert gmem(monkeypatch, "recall", PACK, "-o", target, "--json", *SHORT) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert {"gain", "fidelity", "status", "seconds"} <= set(said)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["recall.h5", "recall.png"]
+    recall, configuration = gm.load_recall(target)
+    assert float(recall.fidelity) == said["fidelity"]
+    assert configuration["t0"] == 75.0
+    assert configuration["backend"] == "jax"
+    assert configuration["pack_record"]["recipe"]["seed"] == 1
+    with h5py.File(target) as file:
+        assert file["stages/readout/pressure"].shape == (256, 3, 7)
+    assert gmem(monkeypatch, "show", target) == 0
+    assert f"{said['fidelity']:.3f}" in capsys.readouterr().out
+
+
+def test_a_users_waveform_is_recalled(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    (tmp_path / "wave.csv").write_text("\n".join(str(x) for x in np.sin(np.linspace(0.1, 3.0, 9))))
+    arguments = ["--signals", tmp_path / "wave.csv", "-o", tmp_path / "out.h5", "--no-picture", "--json", *SHORT]
+    assert gmem(monkeypatch, "recall", PACK, *arguments) == 0
+    assert np.isfinite(json.loads(capsys.readouterr().out)["gain"])
+    recall, _ = gm.load_recall(tmp_path / "out.h5")
+    assert np.asarray(recall.p_sig).shape == (1, 256)
+
+
+def test_the_same_command_gives_the_same_numbers_bit_for_bit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    recalls = []
+    for name in ("one.h5", "two.h5"):
+        assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / name, "--no-picture", *SHORT) == 0
+        recalls.append(gm.load_recall(tmp_path / name)[0])
+    np.testing.assert_array_equal(recalls[0].p_sig, recalls[1].p_sig)
+
+
+def test_a_pack_file_is_shown_with_its_state(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    assert gmem(monkeypatch, "show", PACK) == 0
+    shown = capsys.readouterr().out
+    for words in ("27 tetra(0.6)", "filling phi", "coordination Z", "p_x, p_y, p_z"):
+        assert words in shown
+
+
+def bad_files(folder: Path) -> dict[str, Path]:
+    """Files with one thing wrong each."""
+    files = {name: folder / name for name in ("truncated.h5", "schema.h5", "nan.csv", "ragged.csv", "short.csv")}
+    files["truncated.h5"].write_bytes(PACK.read_bytes()[:2000])
+    with h5py.File(files["schema.h5"], "w") as file:
+        file.attrs["schema"] = "gmem-pack/99"
+    files["nan.csv"].write_text("0\nnan\n0\n")
+    files["ragged.csv"].write_text("0,1\n1\n")
+    files["short.csv"].write_text("1\n")
+    return files
+
+
+BAD = [
+    (["prepare", "--shape", "cube", "-o", "{out}"], "--shape must be tetra or sphere, got 'cube'"),
+    (["prepare", "--grains", "0", "-o", "{out}"], "grains must be at least 2, got 0"),
+    (["prepare", "--overlap", "1.0", "-o", "{out}"], "overlap must be in [0, 1), got 1"),
+    (["prepare", "--dt", "0.6", "-o", "{out}"], "dt must be in (0, 0.5] t_c, got 0.6"),
+    (["prepare", "-o", "/proc/nowhere/pack.h5"], "folder /proc/nowhere does not exist"),
+    (["prepare", "-o", "/proc/pack.h5"], "cannot write there"),
+    (["prepare", "--grains", "many", "-o", "{out}"], "many"),
+    (["prepare"], "Missing option"),
+    (["recall", "{pack}", "--mu", "-0.5", "-o", "{out}"], "--mu: input should be greater than or equal to 0, got -0.5"),
+    (["recall", "{pack}", "--dt", "0.7", "-o", "{out}"], "--dt: input should be less than or equal to 0.5, got 0.7"),
+    (["recall", "{pack}", "--signals", "seven", "-o", "{out}"], "--signals"),
+    (["recall", "{pack}", "--signals", "{nan.csv}", "-o", "{out}"], "sample 2 of signal 1 is not a finite number"),
+    (["recall", "{pack}", "--signals", "{ragged.csv}", "-o", "{out}"], "not a table of numbers"),
+    (["recall", "{pack}", "--signals", "{short.csv}", "-o", "{out}"], "at least 2 samples"),
+    (["recall", "{pack}", "--friction", "glue", "-o", "{out}"], "--friction"),
+    (["recall", "{truncated.h5}", "-o", "{out}"], "not a readable HDF5 file"),
+    (["recall", "{schema.h5}", "-o", "{out}"], "schema is 'gmem-pack/99', expected 'gmem-pack/1'"),
+    (["recall", "no-such-pack", "-o", "{out}"], "neither a file nor a shipped pack"),
+    (["recall", "{pack}", "-o", "/proc/recall.h5"], "cannot write there"),
+    (["demo", "--packs", "tetra-7"], "no such shipped pack"),
+    (["show", "nothing.h5"], "no such file"),
+    (["sing"], "No such command"),
+    (["recall", "{pack}", "--loud"], "No such option"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), BAD, ids=[" ".join(arguments[:4]) for arguments, _ in BAD])
+def test_bad_input_gets_one_clear_line_exit_code_2_and_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    tmp_path: Path,
+    arguments: list[str],
+    words: str,
+) -> None:
+    inputs = tmp_path / "inputs"
+    outputs = tmp_path / "outputs"
+    inputs.mkdir()
+    outputs.mkdir()
+    names = {"{pack}": PACK, "{out}": outputs / "out.h5"}
+    names |= {f"{{{name}}}": path for name, path in bad_files(inputs).items()}
+    monkeypatch.chdir(outputs)
+    assert gmem(monkeypatch, *(str(names.get(word, word)) for word in arguments)) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert len(said.err.strip().splitlines()) == 1
+    assert words in said.err
+    assert list(outputs.iterdir()) == []
+
+
+def test_a_run_that_breaks_down_exits_with_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    broken = gm.load_pack(PACK)
+    position = np.asarray(broken.position).copy()
+    position[0, 0] = float(broken.upper[0]) + 0.5  # a grain outside the box
+    gm.save_pack(tmp_path / "broken.h5", gm.pack_from(broken, position=position, quaternion=broken.quaternion))
+    assert gmem(monkeypatch, "recall", tmp_path / "broken.h5", "-o", tmp_path / "out.h5", *SHORT) == 1
+    assert "the run failed" in capsys.readouterr().err
+    assert not (tmp_path / "out.h5").exists()

@@ -1,0 +1,75 @@
+"""Gain, fidelity and background subtraction on made-up signals."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gmem_jax import analysis
+from gmem_jax.signals import bin_average, six_signals
+
+DELTA0, GAMMA0 = 0.05, 1e-3
+J = bin_average(six_signals())
+
+
+def test_a_scaled_integral_is_a_perfect_memory() -> None:
+    signal = 0.3 * DELTA0 * GAMMA0 * J
+    np.testing.assert_allclose(analysis.gain(signal, J, DELTA0, GAMMA0), 0.3, rtol=1e-14)
+    np.testing.assert_allclose(analysis.fidelity(signal, J, DELTA0, GAMMA0), 1.0, atol=1e-7)  # sqrt of round-off
+
+
+def test_fidelity_is_one_minus_the_sine_of_the_angle_to_the_template() -> None:
+    template = J / jnp.sqrt(jnp.sum(J * J))
+    other = jnp.roll(template, 40, axis=1)
+    other = other - template * jnp.sum(other * template)
+    other = other / jnp.sqrt(jnp.sum(other * other))
+    for angle in (0.1, 0.7, 1.4):
+        signal = np.cos(angle) * template + np.sin(angle) * other
+        np.testing.assert_allclose(analysis.fidelity(signal, J, DELTA0, GAMMA0), 1.0 - np.sin(angle), rtol=1e-12)
+
+
+def test_one_gain_serves_the_whole_set() -> None:
+    signal = DELTA0 * GAMMA0 * J * jnp.asarray([0.2, 0.2, 0.2, 0.2, 0.2, 0.8])[:, None]
+    assert 0.2 < float(analysis.gain(signal, J, DELTA0, GAMMA0)) < 0.8
+    assert float(analysis.fidelity(signal, J, DELTA0, GAMMA0)) < 0.9
+
+
+def test_a_readout_is_turned_to_ascending_u() -> None:
+    pressure = jnp.arange(4.0)[:, None, None] * jnp.asarray([2.0, 1.0, 0.0])[None, :, None]
+    np.testing.assert_array_equal(analysis.recalled(pressure), [[3.0, 2.0, 1.0, 0.0]])
+
+
+def test_backgrounds_subtract_what_they_say() -> None:
+    first = jnp.asarray([[1.0, 2.0, 4.0], [0.0, 5.0, 7.0]])
+    second = jnp.asarray([[1.0, 1.0, 1.0], [1.0, 1.0, 2.0]])
+    np.testing.assert_array_equal(analysis.subtract("sub0", first), [[1.0, -3.0, -3.0]])
+    np.testing.assert_array_equal(analysis.subtract("sub2", first, second), [[1.0, -4.0, -5.0]])
+    np.testing.assert_array_equal(analysis.subtract("sub2-bl", first, second), [[0.0, -2.0, 0.0]])
+
+
+def test_a_background_without_its_second_readout_is_refused() -> None:
+    with pytest.raises(ValueError, match="second readout"):
+        analysis.subtract("sub2", jnp.zeros((2, 4)))
+    with pytest.raises(ValueError, match="sub0, sub2, sub2-bl"):
+        analysis.subtract("nothing", jnp.zeros((2, 4)))
+
+
+def test_a_running_mean_over_one_period_removes_it_and_keeps_a_line() -> None:
+    bins, period = 256, 10.4
+    x = jnp.arange(bins) + 0.5
+    line, wave = 3.0 + 0.1 * x, jnp.sin(2.0 * jnp.pi * x / period)
+    smooth = analysis.running_mean(line + wave, period)
+    inner = slice(8, -8)  # nearer to the ends the window is one-sided
+    # Piecewise-constant sampling of the wave leaves about (pi / period)^2 / 6 of it.
+    np.testing.assert_allclose(smooth[inner], line[inner], atol=0.02)
+
+
+def test_a_running_mean_of_one_bin_changes_nothing() -> None:
+    series = jnp.asarray([[1.0, 5.0, 2.0, 8.0]])
+    np.testing.assert_allclose(analysis.running_mean(series, 1.0), series, rtol=1e-15)
+
+
+def test_inertial_number_of_the_papers_drive_is_below_4e_5() -> None:
+    rate = (1.0 - np.sqrt(0.95)) / 1.8e4
+    middle = 4.5e-3  # E; the background runs from 20 to 70 kPa
+    assert 3e-5 < float(analysis.inertial_number(rate, jnp.asarray(middle), 9.648, 2.98)) < 4e-5
+    np.testing.assert_allclose(analysis.inertial_number(2.0, jnp.asarray(4.0), 9.0, 1.0), 3.0)

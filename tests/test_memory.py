@@ -1,0 +1,169 @@
+"""The memory experiment on a pack of 27 grains with a shortened run: interfaces, transformations, derivatives."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax import run as host
+from gmem_jax.drive import Motion
+from gmem_jax.dynamics import System, start
+from gmem_jax.signals import BINS
+from gmem_jax.state import replicate
+
+PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+SHORT = {"t0": 75.0, "dt": 0.3, "store": 0.2}  # one step per bin: some 1,200 steps in all
+
+
+@pytest.fixture(scope="module")
+def pack() -> gm.Pack:
+    return gm.load_pack(PACK)
+
+
+@pytest.fixture(scope="module")
+def recall(pack: gm.Pack) -> gm.Recall:
+    return gm.run_memory(pack, gm.six_signals(), **SHORT)
+
+
+def two_bumps(amplitudes: jax.Array) -> gm.Bumps:
+    return gm.Bumps(amplitudes=amplitudes, centres=jnp.asarray([[0.3, 0.7]]), width=0.2)
+
+
+def test_a_recall_has_one_row_per_signal_and_a_clean_status(recall: gm.Recall) -> None:
+    assert recall.p_sig.shape == recall.J.shape == (6, BINS)
+    assert np.all(np.asarray(recall.status) & ~int(gm.Status.NOT_AT_REST) == 0)
+    assert np.isfinite(float(recall.gain))
+    assert list(recall.stages) == ["rest", "compress", "hold", "decompress", "rest-2", "encode", "store", "readout"]
+    assert recall.stages["compress"].pressure.shape == (BINS, 3, 1)
+    assert recall.stages["readout"].pressure.shape == (BINS, 3, 7)
+
+
+def test_gain_and_fidelity_follow_their_definitions(recall: gm.Recall) -> None:
+    signal, template = np.asarray(recall.p_sig), 0.05 * 1e-3 * np.asarray(recall.J)
+    gain = (signal * template).sum() / (template**2).sum()
+    miss = ((signal - gain * template) ** 2).sum() / (signal**2).sum()
+    np.testing.assert_allclose(float(recall.gain), gain, rtol=1e-12)
+    np.testing.assert_allclose(float(recall.fidelity), 1.0 - np.sqrt(miss), rtol=1e-12)
+
+
+def test_traced_and_host_runs_are_the_same_computation(pack: gm.Pack, recall: gm.Recall) -> None:
+    traced = jax.jit(lambda gamma0: gm.run_memory(pack, gm.six_signals(), gamma0=gamma0, **SHORT))(1e-3)
+    # The two are compiled differently; round-off of 1e-16 grows over some 1,200 steps of frictional contacts.
+    np.testing.assert_allclose(traced.p_sig, recall.p_sig, atol=1e-6 * np.abs(np.asarray(recall.p_sig)).max())
+
+
+def test_vmap_over_parameters_equals_one_run_at_a_time(pack: gm.Pack) -> None:
+    signals = two_bumps(jnp.asarray([[1.0, -1.0]]))
+
+    def run(mu: jax.Array, stiffness: jax.Array, gamma0: jax.Array) -> jax.Array:
+        return gm.fidelity(pack, signals, friction=gm.Hooke(mu=mu, stiffness=stiffness), gamma0=gamma0, **SHORT)
+
+    mu, stiffness, gamma0 = jnp.asarray([1.0, 0.4]), jnp.asarray([0.145, 0.1]), jnp.asarray([1e-3, 2e-3])
+    together = jax.jit(jax.vmap(run))(mu, stiffness, gamma0)
+    single = jax.jit(run)
+    apart = [single(*each) for each in zip(mu, stiffness, gamma0, strict=True)]
+    np.testing.assert_allclose(together, jnp.stack(apart), rtol=1e-6)
+    assert abs(float(together[0] - together[1])) > 1e-4
+
+
+def test_vmap_over_stacked_packs_equals_one_run_at_a_time(pack: gm.Pack) -> None:
+    mirrored = jnp.asarray([-1.0, -1.0, 1.0])  # the same pack turned half about z: another pack, the same physics
+    quaternion = pack.quaternion[:, jnp.asarray([3, 2, 1, 0])] * jnp.asarray([-1.0, -1.0, 1.0, 1.0])
+    turned = gm.pack_from(pack, position=pack.position * mirrored, quaternion=quaternion)
+    signals = two_bumps(jnp.asarray([[1.0, 1.0]]))
+    run = jax.jit(lambda one: gm.fidelity(one, signals, **SHORT))
+    together = jax.jit(jax.vmap(lambda one: gm.fidelity(one, signals, **SHORT)))(gm.stack([pack, turned]))
+    np.testing.assert_allclose(together, jnp.stack([run(pack), run(turned)]), rtol=1e-6)
+    np.testing.assert_allclose(together[0], together[1], rtol=1e-5)
+
+
+def test_stacking_packs_of_different_sizes_is_refused(pack: gm.Pack) -> None:
+    other = gm.pack_from(pack, position=pack.position[:-1], quaternion=pack.quaternion[:-1])
+    with pytest.raises(ValueError, match="one size"):
+        gm.stack([pack, other])
+
+
+def test_33_replicas_run_in_one_compiled_advance(pack: gm.Pack) -> None:
+    signals = gm.Bumps(jnp.linspace(-1.0, 1.0, 32)[:, None], jnp.full((32, 1), 0.5), 0.2)
+    system = System(pack.clump, gm.Hooke(), pack.pairs)
+    state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
+    state = replicate(state, 33)
+    motion = Motion(pack.lower[:, None], pack.upper[:, None], pack.delta0, 0.0, 1.0, 100.0, 1e-3, signals)
+    runner = host.Runner(system, state, pack.box, 0.3)
+    before = host._advance._cache_size()
+    runner.stage("encode", motion, bins=4 * host.CHUNK, steps=1)
+    assert host._advance._cache_size() == before + 1
+    assert runner.state.replicas == 33
+
+
+@pytest.mark.parametrize("background", ["sub2", "sub2-bl"])
+def test_a_second_readout_serves_as_background(pack: gm.Pack, background: str) -> None:
+    recall = gm.run_memory(pack, two_bumps(jnp.asarray([[1.0, 1.0]])), background=background, **SHORT)
+    assert list(recall.stages)[-1] == "readout-2"
+    if background == "sub2-bl":
+        np.testing.assert_allclose(np.asarray(recall.p_sig)[:, [0, -1]], 0.0, atol=1e-18)
+
+
+def test_fidelity_is_differentiable_by_amplitudes_and_friction(pack: gm.Pack) -> None:
+    def run(parameters: jax.Array) -> jax.Array:
+        friction = gm.Hooke(mu=parameters[2])
+        return gm.fidelity(pack, two_bumps(parameters[None, :2]), friction=friction, **SHORT)
+
+    at = jnp.asarray([1.0, -0.6, 0.8])
+    gradient = jax.jit(jax.grad(run))(at)
+    value = jax.jit(run)
+    for index in range(3):
+        step = 1e-5
+        up, down = (float(value(at.at[index].add(sign * step))) for sign in (1.0, -1.0))
+        # 1e-3: contacts that begin or end sliding between the two evaluations bend F by about this much.
+        np.testing.assert_allclose(float(gradient[index]), (up - down) / (2.0 * step), rtol=1e-3)
+
+
+def test_forward_and_reverse_derivatives_agree(pack: gm.Pack) -> None:
+    def run(amplitudes: jax.Array) -> jax.Array:
+        return gm.gain(pack, two_bumps(amplitudes[None]), **SHORT)
+
+    at = jnp.asarray([1.0, -0.6])
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(run))(at), jax.jit(jax.grad(run))(at), rtol=1e-8)
+
+
+def test_a_step_too_large_for_a_traced_run_gives_nan_and_says_so(pack: gm.Pack) -> None:
+    recall = jax.jit(lambda dt: gm.run_memory(pack, gm.six_signals(), t0=150.0, dt=dt, store=0.1))(0.6)
+    assert np.all(np.asarray(recall.status) & int(gm.Status.STEP_TOO_LARGE))
+    assert np.isnan(float(recall.fidelity))
+    assert "0.5 t_c" in gm.explain(int(recall.status[0]))
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ({"friction": gm.Hooke(mu=-0.1)}, "mu must not be negative"),
+        ({"dt": 0.6}, "dt must be at most 0.5"),
+        ({"t0": 0.0}, "t0 must be positive"),
+        ({"delta0": 1.0}, "delta0 must be in"),
+        ({"background": "sub9"}, "background must be one of"),
+        ({"store": -1.0}, "store must not be negative"),
+    ],
+)
+def test_impossible_numbers_are_refused_with_what_would_be_right(pack: gm.Pack, bad: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        gm.run_memory(pack, gm.six_signals(), **bad)
+
+
+def test_a_waveform_that_does_not_vanish_at_the_ends_is_refused(pack: gm.Pack) -> None:
+    open_end = gm.Bumps(jnp.ones((1, 1)), jnp.full((1, 1), 0.95), 0.2)
+    with pytest.raises(ValueError, match="vanish at u = 0 and u = 1"):
+        gm.run_memory(pack, open_end)
+
+
+def test_another_delta0_than_the_packs_own_warns(pack: gm.Pack) -> None:
+    with pytest.warns(UserWarning, match="was cycled with delta0"):
+        gm.run_memory(pack, two_bumps(jnp.ones((1, 2))), delta0=0.04, **SHORT)
+
+
+def test_single_precision_is_refused(pack: gm.Pack) -> None:
+    with jax.enable_x64(False), pytest.raises(ValueError, match="float64 is needed"):
+        gm.run_memory(pack, gm.six_signals())

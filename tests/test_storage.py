@@ -1,0 +1,120 @@
+"""Files are complete or absent, and say what is wrong with them."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax.storage import atomic
+
+PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+
+
+def test_a_pack_survives_the_file_bit_for_bit(tmp_path: Path) -> None:
+    pack = gm.load_pack(PACK)
+    gm.save_pack(tmp_path / "again.h5", pack)
+    again = gm.load_pack(tmp_path / "again.h5")
+    for key in ("position", "quaternion", "lower", "upper", "delta0", "ringing_period"):
+        np.testing.assert_array_equal(getattr(pack, key), getattr(again, key))
+    for key in ("first", "second", "valid", "incidence", "reference", "reach"):
+        np.testing.assert_array_equal(getattr(pack.pairs, key), getattr(again.pairs, key))
+    assert again.info == pack.info
+    assert again.clump.isotropic
+
+
+def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.h5"
+    broken.write_bytes(PACK.read_bytes()[:3000])
+    with pytest.raises(gm.FileFormatError, match="not a readable HDF5 file"):
+        gm.load_pack(broken)
+
+
+def test_another_schema_is_refused_and_named(tmp_path: Path) -> None:
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as file:
+        file.attrs["schema"] = "gmem-pack/99"
+    with pytest.raises(gm.FileFormatError, match="'gmem-pack/99', expected 'gmem-pack/1'"):
+        gm.load_pack(other)
+
+
+def test_a_file_without_its_data_is_refused(tmp_path: Path) -> None:
+    empty = tmp_path / "empty.h5"
+    with h5py.File(empty, "w") as file:
+        file.attrs["schema"] = "gmem-pack/1"
+    with pytest.raises(gm.FileFormatError, match="incomplete"):
+        gm.load_pack(empty)
+
+
+def test_a_pack_with_numbers_that_are_not_finite_is_refused(tmp_path: Path) -> None:
+    bad = tmp_path / "bad.h5"
+    bad.write_bytes(PACK.read_bytes())
+    with h5py.File(bad, "a") as file:
+        file["position"][0, 0] = np.nan
+    with pytest.raises(gm.FileFormatError, match="position"):
+        gm.load_pack(bad)
+
+
+def test_an_unknown_pack_name_lists_the_shipped_ones() -> None:
+    with pytest.raises(FileNotFoundError, match="tetra-325-a"):
+        gm.load_pack("no-such-pack")
+
+
+def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
+    def write() -> None:
+        with atomic(tmp_path / "file") as temporary:
+            temporary.write_text("half")
+            raise RuntimeError("disk on fire")
+
+    with pytest.raises(RuntimeError, match="disk on fire"):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_overwrite_keeps_the_old_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("old")
+
+    def write() -> None:
+        with atomic(tmp_path / "file") as temporary:
+            temporary.write_text("half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write()
+    assert (tmp_path / "file").read_text() == "old"
+
+
+def test_waveforms_are_read_from_csv_with_or_without_header_and_from_npy(tmp_path: Path) -> None:
+    samples = np.array([[0.0, 1.0, 0.5], [1.0, -1.0, 0.25]])
+    (tmp_path / "plain.csv").write_text("0,1\n1,-1\n0.5,0.25\n")
+    (tmp_path / "header.csv").write_text("one,two\n0,1\n1,-1\n0.5,0.25\n")
+    np.save(tmp_path / "both.npy", samples)
+    for name in ("plain.csv", "header.csv", "both.npy"):
+        np.testing.assert_array_equal(gm.load_waveforms(tmp_path / name), samples)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0,1\n1\n", "not a table"),
+        ("0.5\n", "at least 2 samples"),
+        ("0\nnan\n1\n", "sample 2 of signal 1 is not a finite"),
+        ("", "at least 2 samples"),
+        ("a\nb\nc\n", "not a table"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:loadtxt. input contained no data")
+def test_a_bad_waveform_file_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "bad.csv").write_text(text)
+    with pytest.raises(gm.FileFormatError, match=words):
+        gm.load_waveforms(tmp_path / "bad.csv")
+
+
+@pytest.mark.parametrize("name", [f"tetra-325-{letter}" for letter in "abcde"])
+def test_every_shipped_pack_is_at_rest_and_says_how_it_was_made(name: str) -> None:
+    pack = gm.load_pack(name)
+    assert pack.grains == 325
+    assert pack.info["recipe"]["seed"] == "abcde".index(name[-1]) + 1
+    assert pack.info["at_rest"]["largest_speed"] <= pack.info["recipe"]["quiet"]
+    assert 20.0 < float(pack.ringing_period) < 60.0
