@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from typer.exceptions import TyperException
 
-from gmem_jax import grain, plot, report, storage
+from gmem_jax import grain, native, plot, report, storage
 from gmem_jax.config import RecallConfig
 from gmem_jax.dynamics import Sample
 from gmem_jax.memory import run_memory
@@ -84,13 +84,15 @@ def _emit(as_json: bool, result: Any, *tables: Any) -> None:
 @app.command()
 def info(as_json: AsJson = False) -> None:
     """Versions, devices, backend and shipped packs."""
+    built, why = native.available()
     facts = {
         **provenance(),
         "devices": [f"{d.platform}: {d.device_kind}" for d in jax.devices()],
+        "backend": f"native ({why})" if built else f"jax (no native backend: {why})",
         "packs": storage.list_packs(),
     }
     lines = [f"{key}: {value}" for key, value in facts["versions"].items()]
-    lines += [f"commit: {facts['commit']}", f"backend: {facts['backend']} (plain JAX, the definition)"]
+    lines += [f"commit: {facts['commit']}", f"backend: {facts['backend']}"]
     lines += [f"device: {device}" for device in facts["devices"]]
     lines += ["shipped packs: " + ", ".join(facts["packs"])]
     _emit(as_json, facts, "\n".join(lines))
@@ -156,6 +158,7 @@ def recall_command(
     gamma0: Annotated[float, typer.Option(help="Shear amplitude.")] = 1e-3,
     t0: Annotated[float, typer.Option(help="Duration of one compression, t_c (the paper's is 18000).")] = 1.8e3,
     dt: Annotated[float, typer.Option(help="Largest time step, t_c.")] = 0.3,
+    backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",
     background: Annotated[str, typer.Option(help="sub0, sub2 or sub2-bl.")] = "sub0",
     rest: Annotated[float, typer.Option(help="Rests at u = 0, in t0.")] = 0.2,
     hold: Annotated[float, typer.Option(help="Holds at u = 1, in t0.")] = 0.2,

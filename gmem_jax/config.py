@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from gmem_jax import native
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.hooke import Hooke
 from gmem_jax.material import Material
@@ -29,6 +30,7 @@ class RecallConfig(BaseModel):
     gamma0: float = Field(1e-3, gt=0.0, lt=0.5)
     t0: float = Field(1.8e3, gt=0.0)
     dt: float = Field(0.3, gt=0.0, le=0.5)
+    backend: Literal["auto", "jax", "native"] = "auto"
     background: Literal["sub0", "sub2", "sub2-bl"] = "sub0"
     rest: float = Field(0.2, ge=0.0)
     hold: float = Field(0.2, ge=0.0)
@@ -52,7 +54,7 @@ class RecallConfig(BaseModel):
 
     def arguments(self) -> dict[str, Any]:
         """Keyword arguments of `run_memory`."""
-        names = ("delta0", "gamma0", "t0", "dt", "background", "rest", "hold", "store", "hold_drag")
+        names = ("delta0", "gamma0", "t0", "dt", "background", "backend", "rest", "hold", "store", "hold_drag")
         return {"friction": self.law(), **{name: getattr(self, name) for name in names}}
 
     def resolved(self, pack: Pack, seconds: float) -> dict[str, Any]:
@@ -70,4 +72,5 @@ class RecallConfig(BaseModel):
             "material": asdict(Material()),
             "seconds": seconds,
             **provenance(),
+            "backend": native.name(self.backend, self.law()),
         }

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import analysis
+from gmem_jax import analysis, native
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.hooke import Hooke
 from gmem_jax.drive import Motion, clock, memory_protocol
-from gmem_jax.dynamics import Sample, System, advance, start
+from gmem_jax.dynamics import Sample, System, start
 from gmem_jax.material import Material
 from gmem_jax.pack import SKIN, Pack, smallest_box
 from gmem_jax.run import Progress, Runner, require_x64, silent
@@ -66,9 +66,10 @@ class _Inline:
     system: System
     state: State
     dt: Scalar
+    backend: str
 
     def stage(self, name: str, motion: Motion, *, bins: int, steps: Any, drag: Any = 0.0) -> Sample:
-        self.state, sample = advance(
+        self.state, sample = native.pick(self.backend)(
             self.system, self.state, motion, jnp.asarray(self.dt), bins=bins, steps=steps, drag=drag
         )
         return sample
@@ -126,6 +127,7 @@ def run_memory(
     t0: Scalar = 1.8e3,
     dt: Scalar = 0.3,
     background: str = "sub0",
+    backend: str = "auto",
     rest: float = 0.2,
     hold: float = 0.2,
     store: float = 2.0,
@@ -148,6 +150,7 @@ def run_memory(
         t0: duration of one compression, in t_c. The paper's is 1.8e4.
         dt: largest time step, in t_c.
         background: "sub0", "sub2" or "sub2-bl"; the last two add a second readout.
+        backend: "jax", the definition; "native", C++ on CPUs; "auto", native where it is built and knows the law.
         rest: rests at u = 0, in t0.
         hold: holds at u = 1, in t0.
         store: storage, in t0.
@@ -182,9 +185,10 @@ def run_memory(
     stages = memory_protocol(rest, hold, store, second_readout=background != "sub0")
     stepper: _Inline | Runner
     if isinstance(state.status, jax.core.Tracer) or _traced(signals, gamma0, delta0, t0, dt, hold_drag):
-        stepper = _Inline(system, state, step)
+        stepper = _Inline(system, state, step, backend)
     else:
-        stepper = _on_host(system, state, pack, delta0, step, progress)
+        stepper = _on_host(system, state, pack, delta0, step)
+        stepper.backend, stepper.progress = backend, progress
         sheared = stages.index(next(stage for stage in stages if stage.sheared))
         widths = [state.replicas] * sheared + [signals.count + 1] * (len(stages) - sheared)
         stepper.total_work = float(sum(stage.bins * steps * width for stage, width in zip(stages, widths, strict=True)))
@@ -207,10 +211,10 @@ def run_memory(
     return _recall(pack, signals, samples, stepper.state.status, background, delta0, gamma0, t0, step)
 
 
-def _on_host(system: System, state: State, pack: Pack, delta0: Scalar, dt: Scalar, progress: Progress) -> Runner:
+def _on_host(system: System, state: State, pack: Pack, delta0: Scalar, dt: Scalar) -> Runner:
     deepest = float(np.max(np.asarray(delta0)))
     smallest = smallest_box(np.asarray(pack.lower), np.asarray(pack.upper), deepest)
-    return Runner(system, state, pack.box, dt, smallest=smallest, skin=SKIN, progress=progress)
+    return Runner(system, state, pack.box, dt, smallest=smallest, skin=SKIN)
 
 
 def _recall(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import rotation
+from gmem_jax import native, rotation
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.frictionless import Frictionless
 from gmem_jax.contact.hooke import Hooke
@@ -274,6 +274,7 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
         "simulated_time": runner.time,
         "at_rest": asdict(last),
         **provenance(),
+        "backend": native.name(runner.backend, friction),
     }
     return Pack(
         clump=clump,

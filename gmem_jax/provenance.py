@@ -37,12 +37,11 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **found}
 
 
-def provenance(backend: str = "jax") -> dict[str, Any]:
-    """Versions, git commit, backend of `advance` and the device it runs on."""
+def provenance() -> dict[str, Any]:
+    """Versions, git commit and device."""
     device = jax.devices()[0]
     return {
         "versions": versions(),
         "commit": _commit(),
-        "backend": backend,
         "device": f"{device.platform}: {device.device_kind}",
     }

@@ -4,6 +4,7 @@ Nothing here is physics; `dynamics.advance` is. A chunk that ends with a stale l
 rebuilt from the chunk's start, and the chunk is done again.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax import native
 from gmem_jax.drive import Motion
-from gmem_jax.dynamics import Sample, System, advance
+from gmem_jax.dynamics import Sample, System
 from gmem_jax.neighbors import PairFinder, carry_history
 from gmem_jax.state import Box, Scalar, State, Status, explain
 
@@ -63,7 +65,10 @@ def refuse(status: int, where: str) -> None:
         raise RunFailedError(f"{where}: {explain(status)}")
 
 
-_advance = compiled(advance, static_argnames=("bins", "steps"))
+@functools.cache
+def compiled_advance(backend: str) -> Callable[..., tuple[State, Sample]]:
+    """`advance` of a backend ("auto", "jax" or "native"), compiled once for the process."""
+    return compiled(native.pick(backend), static_argnames=("bins", "steps"))
 
 
 def worst(state: State) -> int:
@@ -84,6 +89,7 @@ class Runner:
         skin: of that neighbour list, in R.
         smallest: smallest box of the motion to come, [3], for the neighbour list.
         chunk: bins per compiled call; halved where the list does not last as long.
+        backend: of `advance`; see `native.pick`.
         progress: see `Progress`.
         time: simulated time so far, in t_c.
         work: work done so far, in replica-steps; `total_work` is all there is to do.
@@ -97,6 +103,7 @@ class Runner:
     skin: float = 0.3
     smallest: np.ndarray | None = None
     chunk: int = CHUNK
+    backend: str = "auto"
     progress: Progress = silent
     time: float = 0.0
     work: float = 0.0
@@ -131,11 +138,12 @@ class Runner:
         Raises:
             RunFailedError: if the numbers became meaningless.
         """
+        move = compiled_advance(self.backend)
         samples, done = [], 0
         while done < bins:
             while True:
                 count = min(self.chunk, bins - done)
-                state, sample = _advance(
+                state, sample = move(
                     self.system, self.state, motion, self.dt, first_bin=done, bins=count, steps=steps, drag=drag
                 )
                 status = worst(state)

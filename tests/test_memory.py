@@ -93,9 +93,10 @@ def test_33_replicas_run_in_one_compiled_advance(pack: gm.Pack) -> None:
     state = replicate(state, 33)
     motion = Motion(pack.lower[:, None], pack.upper[:, None], pack.delta0, 0.0, 1.0, 100.0, 1e-3, signals)
     runner = host.Runner(system, state, pack.box, 0.3)
-    before = host._advance._cache_size()
+    move = host.compiled_advance("auto")
+    before = move._cache_size()
     runner.stage("encode", motion, bins=4 * host.CHUNK, steps=1)
-    assert host._advance._cache_size() == before + 1
+    assert move._cache_size() == before + 1
     assert runner.state.replicas == 33
 
 

@@ -17,11 +17,11 @@ def led_contact(overlap: jax.Array, sliding: jax.Array, dt: Scalar) -> Kinematic
     """Kinematics of one contact that neither tumbles nor spins: n = z, sliding along x.
 
     Args:
-        overlap: p, scalar, in R.
-        sliding: tangential velocity, scalar, in R / t_c.
+        overlap: p, scalar or [B], in R.
+        sliding: tangential velocity, in the shape of `overlap`, in R / t_c.
         dt: time step, in t_c.
     """
-    p = jnp.reshape(overlap, (1, 1, 1))
+    p = jnp.reshape(overlap, (1, 1, -1))
     zero = jnp.zeros_like(p)
     touching = p > 0.0
     return Kinematics(
@@ -30,7 +30,7 @@ def led_contact(overlap: jax.Array, sliding: jax.Array, dt: Scalar) -> Kinematic
         safe_overlap=jnp.where(touching, p, 1.0),
         touching=touching,
         closing=zero,
-        sliding=jnp.concatenate([jnp.reshape(sliding, (1, 1, 1)), zero, zero], axis=1),
+        sliding=jnp.concatenate([jnp.reshape(sliding, (1, 1, -1)), zero, zero], axis=1),
         twist=zero,
         arm=1.0 - 0.5 * p,
         dt=jnp.asarray(dt),

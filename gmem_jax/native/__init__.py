@@ -1,0 +1,254 @@
+"""`advance` in C++ for CPUs, behind jax.ffi: the numbers of `gmem_jax.dynamics.advance`, several times faster.
+
+One call into the library runs all steps of one bin for all replicas; walls, checks and samples are computed in JAX,
+as in `dynamics.advance`. It works under `jax.jit`, `jax.vmap` and both modes of differentiation; derivatives are
+those of the plain JAX definition, along the trajectory of each bin redone in JAX.
+"""
+
+import ctypes
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from gmem_jax import dynamics
+from gmem_jax.contact.friction import FrictionLaw
+from gmem_jax.contact.frictionless import Frictionless
+from gmem_jax.contact.hooke import Hooke
+from gmem_jax.contact.mindlin import LayeredHistory, Mindlin
+from gmem_jax.contact.mindlin_rescaled import MindlinRescaled, RescaledHistory
+from gmem_jax.drive import Motion
+from gmem_jax.dynamics import Sample, System
+from gmem_jax.native.build import LIBRARY
+from gmem_jax.state import Box, Grains, Scalar, State
+
+Advance = Callable[..., tuple[State, Sample]]
+"""The signature of `gmem_jax.dynamics.advance`."""
+
+BACKENDS = ("auto", "jax", "native")
+
+_TARGET = "gmem_advance"
+_LAWS: tuple[type, ...] = (Frictionless, Hooke, MindlinRescaled, Mindlin)  # numbered as in problem.h
+_VARIANTS = ("exact", "averaged", "paper")
+_PART = 32  # steps per call where their number is not known when the program is compiled
+
+
+@functools.cache
+def _load() -> str:
+    """Load and register the library, once; returns why that failed ("" if it did not)."""
+    path = Path(__file__).parent / LIBRARY
+    if not path.exists():
+        return "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
+    try:
+        library = ctypes.CDLL(str(path))
+        jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(library.gmem_advance), platform="cpu")
+    except (OSError, AttributeError) as error:
+        return f"its library could not be loaded: {error}"
+    return ""
+
+
+def available() -> tuple[bool, str]:
+    """Whether the native backend can run here, and why not (or the instruction set it uses)."""
+    if reason := _load():
+        return False, reason
+    if jax.default_backend() != "cpu":
+        return False, f"it runs on CPUs, and JAX's default device is a {jax.default_backend()}"
+    library = ctypes.CDLL(str(Path(__file__).parent / LIBRARY))
+    library.gmem_instruction_set.restype = ctypes.c_char_p
+    return True, library.gmem_instruction_set().decode()
+
+
+def supports(law: FrictionLaw) -> bool:
+    """Whether the native backend knows this friction law (a user's own runs in plain JAX)."""
+    return type(law) in _LAWS
+
+
+def name(backend: str, law: FrictionLaw) -> str:
+    """What "auto" means here for this friction law: "jax" or "native"; the other names are themselves."""
+    if backend != "auto":
+        return backend
+    return "native" if available()[0] and supports(law) else "jax"
+
+
+def pick(backend: str = "auto") -> Advance:
+    """The `advance` of a backend.
+
+    Args:
+        backend: "jax"; "native"; or "auto", native where it is available and knows the friction law.
+
+    Raises:
+        ValueError: if the backend is unknown or not available.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
+    possible, reason = (False, "") if backend == "jax" else available()
+    if backend == "native" and not possible:
+        raise ValueError(f"the native backend is not available: {reason}")
+    if backend == "native":
+        return advance
+    return _where_supported if possible else dynamics.advance
+
+
+def _where_supported(system: System, state: State, *args: Any, **options: Any) -> tuple[State, Sample]:
+    chosen = advance if supports(system.friction) else dynamics.advance
+    return chosen(system, state, *args, **options)
+
+
+def advance(
+    system: System,
+    state: State,
+    motion: Motion,
+    dt: jax.Array,
+    *,
+    first_bin: Scalar = 0,
+    bins: int,
+    steps: Scalar,
+    drag: Scalar = 0.0,
+) -> tuple[State, Sample]:
+    """`gmem_jax.dynamics.advance` on the native backend; arguments and results as there.
+
+    Raises:
+        ValueError: if the backend is not available, does not know the friction law, or the state is not float64.
+    """
+    possible, reason = available()
+    if not possible:
+        raise ValueError(f"the native backend is not available: {reason}")
+    if not supports(system.friction):
+        raise ValueError(f"the native backend does not know the friction law {type(system.friction).__name__}")
+    if state.grains.position.dtype != jnp.float64:
+        raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
+    dt = jnp.asarray(dt)
+    replicas = state.replicas
+
+    def part(state: State, begun: jax.Array, count: int, limit: Scalar) -> tuple[State, jax.Array]:
+        """Up to `limit` of the next `count` steps, and the sum of their wall pressures."""
+        times = (jnp.reshape(begun + 1 + jnp.arange(count), (-1, *(1 for _ in dt.shape))) * dt).astype(dt.dtype)
+        boxes = jax.vmap(motion.box_at)(times)
+        boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, 3, replicas)), boxes)
+        numbers = (dt, jnp.asarray(drag))
+        limits = jnp.broadcast_to(jnp.asarray(limit, jnp.int32), (replicas,))
+        grains, history, total = _bin(system, state.grains, state.history, boxes, numbers, limits, begun)
+        return State(grains, history, state.status), total
+
+    def one_bin(state: State, bin_index: jax.Array) -> tuple[State, Sample]:
+        begun = bin_index * steps
+        if isinstance(steps, jax.core.Tracer):
+
+            def next_part(index: jax.Array, carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
+                state, total = carry
+                state, more = part(state, begun + index * _PART, _PART, jnp.minimum(steps - index * _PART, _PART))
+                return state, total + more
+
+            nothing = jnp.zeros((3, replicas), state.grains.position.dtype)
+            state, total = lax.fori_loop(0, (steps + _PART - 1) // _PART, next_part, (state, nothing))
+        else:
+            state, total = part(state, begun, int(steps), steps)
+        box = motion.box_at((begun + steps) * dt)
+        state = dynamics.check(system, state, box)
+        return state, dynamics.observe(system, state, box, total / steps)
+
+    return lax.scan(jax.checkpoint(one_bin), state, first_bin + jnp.arange(bins))
+
+
+_Result = tuple[Grains, Any, jax.Array]
+
+
+@functools.partial(jax.custom_jvp)
+def _bin(
+    system: System,
+    grains: Grains,
+    history: Any,
+    boxes: Box,
+    numbers: tuple[jax.Array, jax.Array],
+    limits: jax.Array,
+    begun: jax.Array,
+) -> _Result:
+    """The first `limits` [B] of the steps whose walls are `boxes` ([steps, 3, B]); `numbers` are (dt, drag).
+
+    Returns:
+        The grains, the history, and the sum over the steps of the wall pressures, [3, B].
+    """
+    law, pairs = system.friction, system.pairs
+    replicas = grains.position.shape[-1]
+    leaves = jax.tree.leaves(history)
+    walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
+    state = jax.tree.leaves(grains)
+    outputs = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in (*state, jnp.zeros((3, replicas)), *leaves)]
+    candidates = (pairs.first, pairs.second, pairs.valid, pairs.incidence)
+    arguments = [*state, *candidates, system.clump.offsets, _parameters(system, numbers, replicas), walls, limits]
+    results = jax.ffi.ffi_call(
+        _TARGET,
+        outputs,
+        vmap_method="expand_dims",
+        input_output_aliases={len(arguments) + leaf: len(state) + 1 + leaf for leaf in range(len(leaves))},
+    )(
+        *arguments,
+        *leaves,
+        law=_LAWS.index(type(law)),
+        variant=_VARIANTS.index(law.variant) if isinstance(law, Mindlin) else 0,
+        points=law.points if isinstance(law, Mindlin) else 0,
+        isotropic=int(system.clump.isotropic),
+        leaves=len(leaves),
+    )
+    moved = jax.tree.unflatten(jax.tree.structure(grains), results[: len(state)])
+    return moved, jax.tree.unflatten(jax.tree.structure(history), results[len(state) + 1 :]), results[len(state)]
+
+
+def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: int) -> jax.Array:
+    """What problem.h calls the rows of the parameter array, [rows, B]."""
+    law, clump, material = system.friction, system.clump, system.material
+    own: tuple[Any, ...] = (0.0, 0.0, 0.0, 1.0)
+    if isinstance(law, Hooke | MindlinRescaled | Mindlin):
+        own = (law.mu, law.stiffness, law.damping_time, law.spacing if isinstance(law, Mindlin) else 1.0)
+    solid = (material.normal_stiffness, material.normal_damping, material.wall_stiffness)
+    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own)
+    return jnp.stack([jnp.broadcast_to(jnp.asarray(row, jnp.float64), (replicas,)) for row in rows])
+
+
+def _plain_bin(
+    system: System,
+    grains: Grains,
+    history: Any,
+    boxes: Box,
+    numbers: tuple[jax.Array, jax.Array],
+    limits: jax.Array,
+    begun: jax.Array,
+) -> _Result:
+    """The definition of `_bin`, for its derivatives."""
+    dt, drag = numbers
+    alive = jnp.asarray(begun) >= 0
+    replicas = grains.position.shape[-1]
+
+    def one_step(carry: tuple[State, jax.Array], xs: tuple[jax.Array, Box]) -> tuple[tuple[State, jax.Array], None]:
+        state, total = carry
+        index, box = xs
+        moved, walls = dynamics.step(system, state, box, dt, drag, alive & (index >= 0))
+        after = moved, total + dynamics.wall_pressure(walls, box)
+        return jax.tree.map(lambda new, old: jnp.where(index < limits, new, old), after, carry), None
+
+    state = State(grains, history, jnp.zeros(replicas, jnp.int32))
+    total = jnp.zeros((3, replicas), grains.position.dtype)
+    steps = jnp.arange(boxes.lower.shape[0])
+    (state, total), _ = lax.scan(jax.checkpoint(one_step), (state, total), (steps, boxes))
+    return state.grains, state.history, total
+
+
+@functools.partial(_bin.defjvp, symbolic_zeros=True)
+def _bin_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
+    """The tangent of the plain definition, with respect to what is being differentiated and no more."""
+    leaves, structure = jax.tree.flatten(primals)
+    slopes = structure.flatten_up_to(tangents)
+    active = [place for place, slope in enumerate(slopes) if not isinstance(slope, jax.custom_derivatives.SymbolicZero)]
+
+    def plain(*varied: jax.Array) -> _Result:
+        filled = list(leaves)
+        for place, leaf in zip(active, varied, strict=True):
+            filled[place] = leaf
+        return _plain_bin(*jax.tree.unflatten(structure, filled))
+
+    _, slope = jax.jvp(plain, [leaves[place] for place in active], [slopes[place] for place in active])
+    return _bin(*primals), slope

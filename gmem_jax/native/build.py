@@ -1,0 +1,102 @@
+"""Compile the native backend: at install time (setup.py), or in place with ``python -m gmem_jax.native.build``.
+
+The library has no Python in it: one shared object whose symbols `gmem_jax.native` registers with XLA. The time step is
+compiled once per instruction set, and the best one that the CPU has is chosen when it runs. Only the standard library
+is imported here, because setup.py loads this file before the package exists.
+"""
+
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+LIBRARY = "libgmem.so"
+# No option here may reorder or contract arithmetic: a replica's numbers must not depend on how it is vectorised.
+FLAGS = ("-std=c++17", "-O3", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-pthread")
+INSTRUCTION_SETS = {
+    "baseline": (),
+    "avx2": ("-mavx2", "-mfma"),
+    "avx512": ("-mavx512f", "-mavx512dq", "-mavx512bw", "-mavx512vl", "-mfma", "-mprefer-vector-width=512"),
+}
+
+
+class BuildError(RuntimeError):
+    """The native backend could not be built; the message says why."""
+
+
+def compiler() -> list[str]:
+    """The C++ compiler: the environment's CXX, else the first of c++, g++ and clang++.
+
+    Raises:
+        BuildError: if there is none.
+    """
+    if os.environ.get("CXX"):
+        return shlex.split(os.environ["CXX"])
+    for name in ("c++", "g++", "clang++"):
+        if shutil.which(name):
+            return [name]
+    raise BuildError("no C++ compiler (c++, g++ or clang++) was found")
+
+
+def headers() -> Path:
+    """Where jaxlib keeps the headers of XLA's foreign function interface.
+
+    Raises:
+        BuildError: if jaxlib is not installed.
+    """
+    spec = find_spec("jaxlib")
+    if spec is None or spec.origin is None:
+        raise BuildError("jaxlib, whose headers are needed, is not installed")
+    return Path(spec.origin).parent / "include"
+
+
+def build(target: Path) -> None:
+    """Compile the library to the file `target`.
+
+    Raises:
+        BuildError: if there is no compiler, or it fails.
+    """
+    cxx, include = compiler(), headers()
+    x86 = platform.machine().lower() in ("x86_64", "amd64")
+    sets = INSTRUCTION_SETS if x86 else {"baseline": ()}
+    jobs = [("team.cc", "team.o", ()), ("handler.cc", "handler.o", ("-isystem", str(include)))]
+    jobs += [("kernel.cc", f"{name}.o", (f"-DGMEM_ISA={name}", *flags)) for name, flags in sets.items()]
+
+    def run(command: list[str]) -> None:
+        try:
+            subprocess.run(command, check=True, capture_output=True, text=True)
+        except subprocess.CalledProcessError as error:
+            lines = [line for line in error.stderr.splitlines() if "error" in line] or [str(error)]
+            raise BuildError(f"{cxx[0]} failed: {lines[0]}") from error
+        except OSError as error:
+            raise BuildError(f"{cxx[0]} did not run: {error}") from error
+
+    with tempfile.TemporaryDirectory() as folder:
+
+        def compile_one(job: tuple[str, str, tuple[str, ...]]) -> str:
+            source, name, flags = job
+            result = str(Path(folder) / name)
+            run([*cxx, *FLAGS, *flags, "-c", str(HERE / source), "-o", result])
+            return result
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            objects = list(pool.map(compile_one, jobs))
+        linked = Path(folder) / LIBRARY
+        run([*cxx, "-shared", "-pthread", *objects, "-o", str(linked)])
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(linked, target.with_suffix(".new"))
+        target.with_suffix(".new").replace(target)  # atomically: a running process may have the old one loaded
+
+
+if __name__ == "__main__":
+    try:
+        build(HERE / LIBRARY)
+    except BuildError as reason:
+        sys.exit(str(reason))

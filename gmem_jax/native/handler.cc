@@ -1,0 +1,295 @@
+// The XLA custom call: finds the replicas in the arguments, shares them out to blocks and threads.
+//
+// Every argument and result may have further leading axes, from jax.vmap: all have the same number of them, each of
+// size one or of the full size. Each index into them times each index of the innermost axis is a replica; replicas
+// with the same candidate list may share a block.
+
+#include "problem.h"
+#include "team.h"
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <cstdlib>
+#include <cstring>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <vector>
+
+#include "xla/ffi/api/ffi.h"
+
+namespace gmem {
+
+#if defined(__x86_64__)
+namespace avx512 { extern const Kernel kernel; }
+namespace avx2 { extern const Kernel kernel; }
+#endif
+namespace baseline { extern const Kernel kernel; }
+
+namespace {
+
+namespace ffi = xla::ffi;
+
+const Kernel& best_kernel() {
+  const char* wanted = std::getenv("GMEM_ISA");  // for tests: a lower instruction set than the best
+  const std::string limit = wanted ? wanted : "";
+#if defined(__x86_64__)
+  const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+  const bool avx512 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+                      __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
+  if (avx512 && limit != "avx2" && limit != "baseline") return avx512::kernel;
+  if (avx2 && limit != "baseline") return avx2::kernel;
+#endif
+  return baseline::kernel;
+}
+
+// Memory that outlives a call, so that the next one does not fault its pages in again.
+class ScratchPool {
+ public:
+  struct Piece {
+    std::unique_ptr<char[]> memory;
+    std::size_t bytes = 0;
+    void* aligned() const {
+      return reinterpret_cast<void*>((reinterpret_cast<std::uintptr_t>(memory.get()) + 63) / 64 * 64);
+    }
+  };
+
+  Piece take(std::size_t bytes) {
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      for (auto piece = free_.begin(); piece != free_.end(); ++piece) {
+        if (piece->bytes < bytes || piece->bytes > 2 * bytes) continue;
+        Piece found = std::move(*piece);
+        free_.erase(piece);
+        return found;
+      }
+    }
+    return {std::unique_ptr<char[]>(new char[bytes + 64]), bytes};
+  }
+
+  void give(Piece piece) {
+    std::lock_guard<std::mutex> lock(mutex_);
+    free_.push_back(std::move(piece));
+    std::size_t total = 0;
+    for (const Piece& kept : free_) total += kept.bytes;
+    while (total > kKept && !free_.empty()) {
+      total -= free_.front().bytes;
+      free_.erase(free_.begin());
+    }
+  }
+
+ private:
+  static constexpr std::size_t kKept = std::size_t{512} << 20;
+  std::mutex mutex_;
+  std::vector<Piece> free_;
+};
+
+ScratchPool& scratch_pool() {
+  static ScratchPool* pool = new ScratchPool;
+  return *pool;
+}
+
+// One argument or result: its data, and how far apart the entries of each leading axis are.
+struct Array {
+  char* data = nullptr;
+  std::vector<int64_t> shape;  // without the leading axes
+  std::vector<int64_t> step;   // of the leading axes, in elements; 0 where the array has size one
+
+  int64_t at(const std::vector<int64_t>& index) const {
+    int64_t offset = 0;
+    for (std::size_t axis = 0; axis < index.size(); ++axis) offset += index[axis] * step[axis];
+    return offset;
+  }
+};
+
+enum Argument { kFirst = kFields, kSecond, kValid, kIncidence, kOffsets, kParameterRows, kWallRows, kSteps, kHistoryIn };
+constexpr int kRanks[kHistoryIn] = {3, 3, 3, 3, 3, 3, 1, 1, 1, 2, 2, 2, 3, 1};
+constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
+
+Array view(const ffi::AnyBuffer& buffer, int leading) {
+  Array array;
+  array.data = static_cast<char*>(buffer.untyped_data());
+  const auto dims = buffer.dimensions();
+  array.shape.assign(dims.begin() + leading, dims.end());
+  array.step.resize(leading);
+  int64_t size = 1;
+  for (const int64_t n : array.shape) size *= n;
+  for (int axis = leading - 1; axis >= 0; --axis) {
+    array.step[axis] = dims[axis] == 1 ? 0 : size;
+    size *= dims[axis];
+  }
+  return array;
+}
+
+struct Job {
+  const Problem& problem;
+  const Kernel& kernel;
+  std::vector<Block> whole;   // W (or nearly so) replicas each
+  std::vector<Block> packed;  // one replica each
+};
+
+// Blocks one by one to single threads as long as that keeps all busy, then the rest to teams.
+void run_blocks(const Job& job, const std::vector<Block>& blocks, bool packed, int threads) {
+  const int count = static_cast<int>(blocks.size());
+  if (count == 0) return;
+  const int alone = threads > 1 ? count / threads * threads : count;
+  const int rest = count - alone;
+  const std::size_t bytes = job.kernel.scratch_bytes(job.problem, packed);
+  const auto run = [&](const Block& block, Team& team, int rank, void* scratch) {
+    job.kernel.run(job.problem, block, team, rank, scratch);
+  };
+  if (alone > 0) {
+    std::atomic<int> next{0};
+    run_ranks(std::min(threads, alone), [&](int) {
+      auto scratch = scratch_pool().take(bytes);
+      for (int i; (i = next.fetch_add(1)) < alone;) {
+        Team team(1);
+        run(blocks[i], team, 0, scratch.aligned());
+      }
+      scratch_pool().give(std::move(scratch));
+    });
+  }
+  if (rest > 0) {
+    // A thread is worth its barriers from some hundred contacts on.
+    const int useful = 1 + job.problem.pairs * (packed ? 1 : job.kernel.width) / 1024;
+    const int size = std::min({std::max(1, threads / rest), useful, Team::kMaxSize});
+    std::vector<std::unique_ptr<Team>> teams;
+    std::vector<ScratchPool::Piece> scratch;
+    for (int i = 0; i < rest; ++i) {
+      teams.emplace_back(new Team(size));
+      scratch.push_back(scratch_pool().take(bytes));
+    }
+    run_ranks(rest * size, [&](int rank) {
+      const int i = rank / size;
+      run(blocks[alone + i], *teams[i], rank % size, scratch[i].aligned());
+    });
+    for (auto& piece : scratch) scratch_pool().give(std::move(piece));
+  }
+}
+
+ffi::Error invalid(const std::string& what) { return ffi::Error::InvalidArgument("gmem_jax native: " + what); }
+
+ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
+                   ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  if (static_cast<int64_t>(args.size()) != kHistoryIn + leaves ||
+      static_cast<int64_t>(rets.size()) != kHistoryOut + leaves || leaves > kMaxHistory)
+    return invalid("wrong number of arguments or results");
+  std::vector<Array> in, out;
+  std::vector<int64_t> batch;
+  for (std::size_t i = 0; i < rets.size(); ++i) {
+    auto buffer = rets.get<ffi::AnyBuffer>(i);
+    if (!buffer.has_value()) return buffer.error();
+    if (i == 0) {
+      const auto dims = (*buffer)->dimensions();
+      if (dims.size() < 3) return invalid("positions need three axes");
+      batch.assign(dims.begin(), dims.end() - 3);
+    }
+    if ((*buffer)->element_type() != ffi::F64) return invalid("results must be float64");
+    out.push_back(view(**buffer, static_cast<int>(batch.size())));
+  }
+  for (std::size_t i = 0; i < args.size(); ++i) {
+    auto buffer = args.get<ffi::AnyBuffer>(i);
+    if (!buffer.has_value()) return buffer.error();
+    const bool integer = i == kFirst || i == kSecond || i == kIncidence || i == kSteps;
+    const auto wanted = i == kValid ? ffi::PRED : integer ? ffi::S32 : ffi::F64;
+    if (buffer->element_type() != wanted) return invalid("argument " + std::to_string(i) + " has the wrong type");
+    const std::size_t rank = i < kHistoryIn ? kRanks[i] : (i == kHistoryIn && law == 3 ? 4 : 3);
+    if (buffer->dimensions().size() != rank + batch.size())
+      return invalid("argument " + std::to_string(i) + " has the wrong number of axes");
+    in.push_back(view(*buffer, static_cast<int>(batch.size())));
+  }
+
+  const int64_t replicas = in[0].shape[2];
+  Problem problem{};
+  problem.law = static_cast<Law>(law);
+  problem.variant = static_cast<Variant>(variant);
+  problem.isotropic = isotropic != 0;
+  problem.points = static_cast<int>(points);
+  problem.grains = static_cast<int>(in[0].shape[0]);
+  problem.spheres_per_grain = static_cast<int>(in[kOffsets].shape[0]);
+  problem.pairs = static_cast<int>(in[kFirst].shape[0]);
+  problem.per_sphere = static_cast<int>(in[kIncidence].shape[1]);
+  problem.stride = replicas;
+  const int64_t rows = in[kWallRows].shape[0];
+  if (in[kParameterRows].shape[0] != kParameters || in[kWallRows].shape[1] != kWalls ||
+      in[kIncidence].shape[0] != problem.spheres() || in[kSteps].shape[0] != replicas)
+    return invalid("arguments do not fit each other");
+  problem.history_aliased = leaves > 0;
+  for (int64_t leaf = 0; leaf < leaves; ++leaf)
+    problem.history_aliased &= in[kHistoryIn + leaf].data == out[kHistoryOut + leaf].data;
+  std::vector<int32_t> owner(problem.spheres());
+  for (int s = 0; s < problem.spheres(); ++s) owner[s] = s / problem.spheres_per_grain;
+  problem.owner = owner.data();
+
+  // Collect the replicas by candidate list.
+  std::map<std::array<int64_t, 5>, std::size_t> known;
+  std::vector<std::unique_ptr<Pack>> packs;
+  std::vector<std::vector<Lane>> lanes;
+  std::vector<int64_t> index(batch.size(), 0);
+  int64_t entries = 1;
+  for (const int64_t n : batch) entries *= n;
+  for (int64_t entry = 0; entry < entries; ++entry) {
+    std::array<int64_t, 5> key;
+    for (int i = 0; i < 5; ++i) key[i] = in[kFirst + i].at(index);
+    const auto place = known.emplace(key, packs.size());
+    if (place.second) {
+      packs.emplace_back(new Pack{reinterpret_cast<const int32_t*>(in[kFirst].data) + key[0],
+                                  reinterpret_cast<const int32_t*>(in[kSecond].data) + key[1],
+                                  reinterpret_cast<const bool*>(in[kValid].data) + key[2],
+                                  reinterpret_cast<const int32_t*>(in[kIncidence].data) + key[3],
+                                  reinterpret_cast<const double*>(in[kOffsets].data) + key[4]});
+      lanes.emplace_back();
+    }
+    for (int64_t b = 0; b < replicas; ++b) {
+      const auto source = [&](const Array& a) { return reinterpret_cast<double*>(a.data) + a.at(index) + b; };
+      Lane lane{};
+      for (int f = 0; f < kFields; ++f) lane.grains_in[f] = source(in[f]), lane.grains_out[f] = source(out[f]);
+      for (int64_t leaf = 0; leaf < leaves; ++leaf) {
+        lane.history_in[leaf] = source(in[kHistoryIn + leaf]);
+        lane.history_out[leaf] = source(out[kHistoryOut + leaf]);
+      }
+      lane.parameters = source(in[kParameterRows]);
+      lane.walls = source(in[kWallRows]);
+      lane.pressure = source(out[kPressure]);
+      const int32_t steps = (reinterpret_cast<const int32_t*>(in[kSteps].data) + in[kSteps].at(index))[b];
+      lane.steps = static_cast<int>(std::min<int64_t>(std::max(steps, 0), rows));
+      lanes[place.first->second].push_back(lane);
+    }
+    for (int axis = static_cast<int>(batch.size()) - 1; axis >= 0 && ++index[axis] == batch[axis]; --axis) index[axis] = 0;
+  }
+
+  const Kernel& kernel = best_kernel();
+  Job job{problem, kernel, {}, {}};
+  for (std::size_t i = 0; i < packs.size(); ++i) {
+    const int count = static_cast<int>(lanes[i].size());
+    int done = 0;
+    // A vector that is half full is still cheaper than its replicas one by one.
+    for (; count - done > kernel.width / 2 || (count - done > 1 && kernel.width == 2); done += kernel.width)
+      job.whole.push_back({packs[i].get(), &lanes[i][done], std::min(kernel.width, count - done), false});
+    for (; done < count; ++done) job.packed.push_back({packs[i].get(), &lanes[i][done], 1, true});
+  }
+  const int wanted = thread_count();
+  const int threads = acquire_threads(wanted);
+  run_blocks(job, job.whole, false, threads);
+  run_blocks(job, job.packed, true, threads);
+  if (threads > 1) release_threads();
+  return ffi::Error::Success();
+}
+
+}  // namespace
+}  // namespace gmem
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_advance, gmem::advance,
+                              xla::ffi::Ffi::Bind()
+                                  .Attr<int64_t>("law")
+                                  .Attr<int64_t>("variant")
+                                  .Attr<int64_t>("points")
+                                  .Attr<int64_t>("isotropic")
+                                  .Attr<int64_t>("leaves")
+                                  .RemainingArgs()
+                                  .RemainingRets());
+
+// Name of the instruction set in use.
+extern "C" const char* gmem_instruction_set() { return gmem::best_kernel().name; }

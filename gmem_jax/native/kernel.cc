@@ -1,0 +1,68 @@
+// The time step for one instruction set; compiled once for each, with GMEM_ISA its name and the compiler's flags.
+
+#include "problem.h"
+#include "team.h"
+
+#include <cstring>
+
+#if defined(__SSE2__)
+#include <immintrin.h>
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+#endif
+
+namespace gmem {
+namespace GMEM_ISA {
+
+#include "simd.h"
+#include "vectors.h"
+#include "laws.h"
+#include "contact.h"
+#include "block.h"
+#include "marks.h"
+#include "replicas.h"
+#include "packed.h"
+
+// Calls `function` with the law of `problem` as a type.
+template <class Function>
+auto with_law(const Problem& problem, const Function& function) {
+  switch (problem.law) {
+    case Law::hooke: return function(Hooke{});
+    case Law::mindlin_rescaled: return function(Rescaled{});
+    case Law::mindlin:
+      switch (problem.variant) {
+        case Variant::averaged: return function(Layered<Variant::averaged>{});
+        case Variant::paper: return function(Layered<Variant::paper>{});
+        default: return function(Layered<Variant::exact>{});
+      }
+    default: return function(Frictionless{});
+  }
+}
+
+std::size_t scratch_bytes(const Problem& problem, bool packed) {
+  return with_law(problem, [&](auto law) {
+    Carver carver{nullptr};
+    using L = decltype(law);
+    return packed ? Engine<Packed<L>>::carve(problem, carver, nullptr)
+                  : Engine<Replicas<L>>::carve(problem, carver, nullptr);
+  });
+}
+
+void run(const Problem& problem, const Block& block, Team& team, int rank, void* scratch) {
+  with_law(problem, [&](auto law) {
+    using L = decltype(law);
+    if (block.packed) {
+      Engine<Packed<L>>(problem, block, team, rank, scratch).run();
+    } else {
+      Engine<Replicas<L>>(problem, block, team, rank, scratch).run();
+    }
+  });
+}
+
+#define GMEM_STRING2(name) #name
+#define GMEM_STRING(name) GMEM_STRING2(name)
+extern const Kernel kernel;
+const Kernel kernel = {GMEM_STRING(GMEM_ISA), W, scratch_bytes, run};
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

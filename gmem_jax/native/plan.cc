@@ -1,0 +1,171 @@
+#include "plan.h"
+
+#include <algorithm>
+#include <cstring>
+#include <deque>
+#include <mutex>
+#include <numeric>
+#include <tuple>
+
+namespace gmem {
+
+namespace {
+
+constexpr int kDomainCandidates = 1024;  // enough work to be worth a thread, and a third of a core's cache
+constexpr int kMaxDomains = 512;
+constexpr std::size_t kRemembered = 16;
+
+struct Point {
+  double x[3];
+  int grain;
+};
+
+// Recursive bisection across the longest side until a piece fits into a few cache lines.
+void bisect(Point* points, int count) {
+  if (count <= 4) return;
+  double low[3], high[3];
+  for (int axis = 0; axis < 3; ++axis) {
+    low[axis] = high[axis] = points[0].x[axis];
+    for (int i = 1; i < count; ++i) {
+      low[axis] = std::min(low[axis], points[i].x[axis]);
+      high[axis] = std::max(high[axis], points[i].x[axis]);
+    }
+  }
+  int axis = 0;
+  for (int other = 1; other < 3; ++other)
+    if (high[other] - low[other] > high[axis] - low[axis]) axis = other;
+  const int half = count / 2;
+  std::nth_element(points, points + half, points + count, [axis](const Point& a, const Point& b) {
+    return std::tie(a.x[axis], a.grain) < std::tie(b.x[axis], b.grain);
+  });
+  bisect(points, half);
+  bisect(points + half, count - half);
+}
+
+std::vector<int32_t> spatial_order(const List& list) {
+  std::vector<Point> points(list.grains);
+  const int spheres = list.spheres_per_grain;
+  for (int g = 0; g < list.grains; ++g) {
+    points[g].grain = g;
+    for (int axis = 0; axis < 3; ++axis) {
+      double sum = 0.0;
+      for (int k = 0; k < spheres; ++k) sum += list.reference[3 * (static_cast<std::size_t>(g) * spheres + k) + axis];
+      sum *= list.smallest[axis];
+      points[g].x[axis] = sum == sum ? sum : 0.0;  // not-a-numbers cannot be sorted
+    }
+  }
+  bisect(points.data(), list.grains);
+  std::vector<int32_t> order(list.grains);
+  for (int g = 0; g < list.grains; ++g) order[g] = points[g].grain;
+  return order;
+}
+
+std::shared_ptr<const PlanStore> make_plan(const List& list) {
+  auto store = std::make_shared<PlanStore>();
+  const int spheres = list.spheres_per_grain;
+  store->grain = spatial_order(list);
+  std::vector<int32_t> place(list.grains);
+  for (int g = 0; g < list.grains; ++g) place[store->grain[g]] = g;
+
+  std::vector<Candidate>& candidates = store->candidate;
+  for (int row = 0; row < list.rows; ++row) {
+    if (!list.valid[row]) {
+      store->padding_row.push_back(row);
+      continue;
+    }
+    const int i = list.first[row], j = list.second[row];
+    const int grain_i = place[i / spheres], grain_j = place[j / spheres];
+    candidates.push_back({grain_i * spheres + i % spheres, grain_j * spheres + j % spheres, grain_i, grain_j, -1, row});
+  }
+  const auto home = [](const Candidate& c) { return std::min(c.grain_one, c.grain_other); };
+  const auto away = [](const Candidate& c) { return std::max(c.grain_one, c.grain_other); };
+  std::sort(candidates.begin(), candidates.end(), [&](const Candidate& a, const Candidate& b) {
+    return std::make_tuple(home(a), away(a), a.row) < std::make_tuple(home(b), away(b), b.row);
+  });
+
+  // Domains end between grains.
+  const int count = static_cast<int>(candidates.size());
+  const int wanted = std::max(1, std::min(kMaxDomains, (count + kDomainCandidates / 2) / kDomainCandidates));
+  std::vector<int32_t> domain_of(list.grains);
+  store->domain_candidate.push_back(0);
+  int next = 0;
+  for (int g = 0; g < list.grains; ++g) {
+    domain_of[g] = static_cast<int>(store->domain_candidate.size()) - 1;
+    while (next < count && home(candidates[next]) == g) ++next;
+    const int64_t ended = static_cast<int>(store->domain_candidate.size());
+    if (ended < wanted && next >= ended * count / wanted) store->domain_candidate.push_back(next);
+  }
+  store->domain_candidate.push_back(count);
+
+  // Guests, numbered by the grain they act on so that it finds them together.
+  std::vector<int32_t> visits(list.grains + 1, 0);
+  const auto guest = [&](const Candidate& c) { return domain_of[home(c)] != domain_of[away(c)]; };
+  for (const Candidate& c : candidates) visits[away(c) + 1] += guest(c);
+  std::partial_sum(visits.begin(), visits.end(), visits.begin());
+  store->guest_start = visits;
+  for (Candidate& c : candidates)
+    if (guest(c)) c.guest = visits[away(c)]++;
+
+  store->plan = {count,
+                 static_cast<int>(store->domain_candidate.size()) - 1,
+                 store->guest_start.back(),
+                 static_cast<int>(store->padding_row.size()),
+                 store->grain.data(),
+                 candidates.data(),
+                 store->domain_candidate.data(),
+                 store->guest_start.data(),
+                 store->padding_row.data()};
+  return store;
+}
+
+// A copy of what a plan was made from.
+struct Key {
+  int grains, spheres_per_grain, rows;
+  std::vector<char> bytes;
+
+  explicit Key(const List& list) : grains(list.grains), spheres_per_grain(list.spheres_per_grain), rows(list.rows) {
+    visit(list, [this](const void* data, std::size_t size) {
+      const char* begin = static_cast<const char*>(data);
+      bytes.insert(bytes.end(), begin, begin + size);
+      return true;
+    });
+  }
+
+  bool matches(const List& list) const {
+    if (grains != list.grains || spheres_per_grain != list.spheres_per_grain || rows != list.rows) return false;
+    std::size_t at = 0;
+    return visit(list, [&](const void* data, std::size_t size) {
+      const bool same = std::memcmp(bytes.data() + at, data, size) == 0;
+      at += size;
+      return same;
+    });
+  }
+
+  template <class Function>
+  static bool visit(const List& list, const Function& function) {
+    const std::size_t rows = list.rows, spheres = static_cast<std::size_t>(list.grains) * list.spheres_per_grain;
+    return function(list.first, rows * sizeof(int32_t)) && function(list.second, rows * sizeof(int32_t)) &&
+           function(list.valid, rows * sizeof(bool)) && function(list.reference, 3 * spheres * sizeof(double)) &&
+           function(list.smallest, 3 * sizeof(double));
+  }
+};
+
+}  // namespace
+
+std::shared_ptr<const PlanStore> plan_for(const List& list) {
+  static std::mutex mutex;
+  static auto* known = new std::deque<std::pair<Key, std::shared_ptr<const PlanStore>>>;
+  {
+    std::lock_guard<std::mutex> lock(mutex);
+    for (const auto& entry : *known)
+      if (entry.first.matches(list)) return entry.second;
+  }
+  auto plan = make_plan(list);
+  Key key(list);
+  std::lock_guard<std::mutex> lock(mutex);
+  known->emplace_front(std::move(key), plan);
+  if (known->size() > kRemembered) known->pop_back();
+  return plan;
+}
+
+}  // namespace gmem

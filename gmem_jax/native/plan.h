@@ -1,0 +1,38 @@
+// How the contacts of a candidate list are ordered and shared out. A plan depends on the list alone - not on threads,
+// replicas or instruction sets - and fixes the order in which forces are summed.
+//
+// Grains are renumbered so that neighbours in space are neighbours in memory. They are divided into domains of about
+// equal numbers of candidates. A candidate belongs to the domain of its lower-numbered grain; one thread computes a
+// domain's contacts in order and adds the forces to that domain's grains at once. Forces on grains of other domains
+// ("guests") are stored, and added when the grain is moved.
+
+#pragma once
+
+#include "problem.h"
+
+#include <memory>
+#include <vector>
+
+namespace gmem {
+
+// The arrays of gmem_jax.neighbors.Pairs that a plan is made from.
+struct List {
+  int grains, spheres_per_grain, rows;
+  const int32_t* first;
+  const int32_t* second;
+  const bool* valid;
+  const double* reference;  // sphere centres in box coordinates, [S, 3]
+  const double* smallest;   // edge lengths of the box, [3]
+};
+
+// A plan and the memory it points to.
+struct PlanStore {
+  Plan plan;
+  std::vector<int32_t> grain, domain_candidate, guest_start, padding_row;
+  std::vector<Candidate> candidate;
+};
+
+// The plan of a list; that of a list seen lately is remembered.
+std::shared_ptr<const PlanStore> plan_for(const List& list);
+
+}  // namespace gmem

@@ -1,0 +1,95 @@
+// What a call is asked to do, in plain structures shared by the handler and the kernels of every instruction set.
+//
+// One call runs all steps of one bin for all replicas. Vectors of the CPU hold W doubles ("lanes"). A block of work
+// is either W replicas of one pack, or one replica whose grains and contacts fill the lanes.
+
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace gmem {
+
+enum class Law { frictionless = 0, hooke = 1, mindlin_rescaled = 2, mindlin = 3 };
+enum class Variant { exact = 0, averaged = 1, paper = 2 };
+
+// Rows of the parameter array; a law's own follow.
+enum Parameter { kDt, kDrag, kMass, kInertia, kNormalStiffness = kInertia + 3, kNormalDamping, kWallStiffness, kLaw };
+constexpr int kLawParameters = 4;  // mu, stiffness, damping time, spacing of Mindlin's points
+constexpr int kParameters = kLaw + kLawParameters;
+constexpr int kFields = 6;  // position, quaternion, velocity, spin, acceleration, spin rate
+constexpr int kWalls = 12;  // lower, upper, lower velocity, upper velocity
+constexpr int kMaxHistory = 2;
+constexpr int kMaxWidth = 8;
+
+// Sizes common to all replicas, and what they run.
+struct Problem {
+  Law law;
+  Variant variant;
+  bool isotropic;
+  bool history_aliased;   // the histories' results already hold the arguments
+  int points;             // Q of the Mindlin law
+  int grains;             // N
+  int spheres_per_grain;  // K
+  std::ptrdiff_t stride;  // doubles between two rows of an array: replicas B of the innermost axis
+
+  int spheres() const { return grains * spheres_per_grain; }
+};
+
+// A candidate contact, in the numbering of its plan. The force goes from sphere `one` to sphere `other`, as listed.
+struct Candidate {
+  int32_t one, other;              // spheres
+  int32_t grain_one, grain_other;  // their grains
+  int32_t guest;                   // where the force on the grain of another domain waits, or -1
+  int32_t row;                     // in the arrays of the call
+};
+
+// The candidate list, sorted for memory and threads; see plan.h. Grains and spheres are numbered anew.
+struct Plan {
+  int candidates;
+  int domains;
+  int guests;
+  int padding;                      // rows of the list without a candidate
+  const int32_t* grain;             // number in the call of each grain, [N]
+  const Candidate* candidate;       // by domain
+  const int32_t* domain_candidate;  // first candidate of each domain, [domains + 1]
+  const int32_t* guest_start;       // the guests of each grain: guest_start[g] to guest_start[g + 1], [N + 1]
+  const int32_t* padding_row;       // [padding]
+};
+
+struct Pack {
+  const Plan* plan;
+  const double* offsets;  // sphere centres in a grain, [K, 3]
+};
+
+// One replica: pointers to its first element; rows are `stride` apart.
+struct Lane {
+  const double* grains_in[kFields];
+  double* grains_out[kFields];
+  const double* history_in[kMaxHistory];
+  double* history_out[kMaxHistory];
+  const double* parameters;
+  const double* walls;
+  double* pressure;
+  int steps;
+};
+
+struct Block {
+  const Pack* pack;
+  const Lane* lanes;
+  int count;    // 1 to W
+  bool packed;  // the lanes of the CPU are grains and contacts of one replica
+};
+
+// The threads that share one block; see team.h.
+class Team;
+
+// A compiled instruction set.
+struct Kernel {
+  const char* name;
+  int width;
+  std::size_t (*scratch_bytes)(const Problem&, const Block&);
+  void (*run)(const Problem&, const Block&, Team&, int rank, void* scratch);
+};
+
+}  // namespace gmem

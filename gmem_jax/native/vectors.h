@@ -1,0 +1,63 @@
+// Three-vectors and rotations whose components are vectors of lanes. Included inside the instruction set's namespace.
+
+struct Vec {
+  V x, y, z;
+};
+
+inline Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+inline Vec operator-(Vec a, Vec b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Vec operator*(V s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
+inline Vec select(Mask m, Vec a, Vec b) { return {select(m, a.x, b.x), select(m, a.y, b.y), select(m, a.z, b.z)}; }
+inline Vec zero_unless(Mask m, Vec a) { return {zero_unless(m, a.x), zero_unless(m, a.y), zero_unless(m, a.z)}; }
+
+// s a + b
+inline Vec fma(V s, Vec a, Vec b) { return {fma(s, a.x, b.x), fma(s, a.y, b.y), fma(s, a.z, b.z)}; }
+// b - s a
+inline Vec fnma(V s, Vec a, Vec b) { return {fnma(s, a.x, b.x), fnma(s, a.y, b.y), fnma(s, a.z, b.z)}; }
+
+inline V dot(Vec a, Vec b) { return fma(a.z, b.z, fma(a.y, b.y, a.x * b.x)); }
+
+inline Vec cross(Vec a, Vec b) {
+  return {fms(a.y, b.z, a.z * b.y), fms(a.z, b.x, a.x * b.z), fms(a.x, b.y, a.y * b.x)};
+}
+
+// c + a x b
+inline Vec add_cross(Vec c, Vec a, Vec b) {
+  return {fma(a.y, b.z, fnma(a.z, b.y, c.x)), fma(a.z, b.x, fnma(a.x, b.z, c.y)), fma(a.x, b.y, fnma(a.y, b.x, c.z))};
+}
+
+inline Vec load_vec(const V* p) { return {p[0], p[1], p[2]}; }
+inline void store_vec(V* p, Vec a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
+
+struct Quaternion {
+  V w;
+  Vec v;
+};
+
+// Rotate by the small lab-frame angle (Cayley map) and normalise.
+inline Quaternion turn(Quaternion q, Vec angle) {
+  const Vec half = splat(0.5) * angle;
+  const V w = q.w - dot(half, q.v);
+  const Vec v = add_cross(fma(q.w, half, q.v), half, q.v);
+  const V norm = root(fma(w, w, dot(v, v)));
+  const V scale = splat(1.0) / norm;
+  return {w * scale, scale * v};
+}
+
+struct Matrix {
+  Vec row[3];
+};
+
+inline Vec operator*(const Matrix& m, Vec a) { return {dot(m.row[0], a), dot(m.row[1], a), dot(m.row[2], a)}; }
+
+inline Vec transposed(const Matrix& m, Vec a) { return fma(a.z, m.row[2], fma(a.y, m.row[1], a.x * m.row[0])); }
+
+// Lab components of body vectors.
+inline Matrix matrix(Quaternion q) {
+  const V one = splat(1.0), two = splat(2.0);
+  const V x = two * q.v.x, y = two * q.v.y, z = two * q.v.z;
+  const V xx = x * q.v.x, yy = y * q.v.y, zz = z * q.v.z;
+  const V xy = x * q.v.y, xz = x * q.v.z, yz = y * q.v.z;
+  const V wx = q.w * x, wy = q.w * y, wz = q.w * z;
+  return {{{one - (yy + zz), xy - wz, xz + wy}, {xy + wz, one - (xx + zz), yz - wx}, {xz - wy, yz + wx, one - (xx + yy)}}};
+}
