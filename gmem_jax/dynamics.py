@@ -230,7 +230,7 @@ def check(system: System, state: State, box: Box) -> State:
     outside = jnp.any((spheres < box.lower) | (spheres > box.upper), axis=(0, 1))
     numbers = grains.position.sum((0, 1)) + grains.acceleration.sum((0, 1)) + grains.spin_rate.sum((0, 1))
     bits = (
-        jnp.where(slack(system.pairs, spheres, box) > 0.0, 0, int(Status.STALE_PAIRS))
+        jnp.where(slack(system.pairs, spheres, box) <= 0.0, int(Status.STALE_PAIRS), 0)
         | jnp.where(outside, int(Status.OUTSIDE_BOX), 0)
         | jnp.where(jnp.isfinite(numbers), 0, int(Status.NOT_FINITE))
     ).astype(jnp.int32)

@@ -18,6 +18,7 @@ namespace GMEM_ISA {
 #include "vectors.h"
 #include "laws.h"
 #include "contact.h"
+#include "rows.h"
 #include "block.h"
 #include "marks.h"
 #include "replicas.h"
@@ -39,12 +40,12 @@ auto with_law(const Problem& problem, const Function& function) {
   }
 }
 
-std::size_t scratch_bytes(const Problem& problem, bool packed) {
+std::size_t scratch_bytes(const Problem& problem, const Block& block) {
   return with_law(problem, [&](auto law) {
     Carver carver{nullptr};
     using L = decltype(law);
-    return packed ? Engine<Packed<L>>::carve(problem, carver, nullptr)
-                  : Engine<Replicas<L>>::carve(problem, carver, nullptr);
+    return block.packed ? Engine<Packed<L>>::carve(problem, block, carver, nullptr)
+                        : Engine<Replicas<L>>::carve(problem, block, carver, nullptr);
   });
 }
 

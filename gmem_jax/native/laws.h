@@ -4,7 +4,6 @@ struct Contact {
   Mask touching;
   Vec normal;   // from i to j
   V overlap;    // 1 where apart, so that roots stay finite
-  V arm;
   Vec sliding;  // relative velocity of the surfaces in the tangent plane
   V cosine, sine;  // of the turn about the normal in this step
   V dt;

@@ -1,18 +1,18 @@
-// What both modes keep of each candidate contact beside forces and histories, and where a law's history lies in the
-// arrays of a call. Included inside the instruction set's namespace.
+// What both modes keep of each candidate beside forces and histories, and where a law's history lies in the arrays of
+// a call. Included inside the instruction set's namespace.
 
 struct Marks {
-  bool* touched;       // in any lane, at the last step: only then is there a force, and a history to forget
+  bool* touched;       // in any lane, at the last step: only then is there a history to forget
   int* reached;        // Mindlin: the last layer that is stored; those beyond are zero
   int* reached_first;  // ... and was at the beginning of the call
 };
 
 template <class Law>
-void carve_marks(const Problem& p, Carver& carver, Marks* marks) {
-  const std::size_t pairs = static_cast<std::size_t>(p.pairs) + 1;  // and a dummy
-  bool* touched = carver.take<bool>(pairs);
-  int* reached = carver.take<int>(Law::kLayered ? pairs : 0);
-  int* first = carver.take<int>(Law::kLayered ? pairs : 0);
+void carve_marks(const Plan& plan, Carver& carver, Marks* marks) {
+  const std::size_t count = static_cast<std::size_t>(plan.candidates) + 1;  // and a dummy
+  bool* touched = carver.take<bool>(count);
+  int* reached = carver.take<int>(Law::kLayered ? count : 0);
+  int* first = carver.take<int>(Law::kLayered ? count : 0);
   if (marks) *marks = {touched, reached, first};
 }
 
@@ -29,8 +29,8 @@ struct Place {
   std::ptrdiff_t row;
 };
 
-// Where number `q` of the history of contact `c` lies: leaf 0 is the force (or the layers), leaf 1 the overlap.
+// Where number `q` of the history in `row` of the list lies: leaf 0 is the force (or the layers), leaf 1 the overlap.
 template <class Law>
-Place place_of(std::ptrdiff_t c, int q) {
-  return q < Law::kVectors ? Place{0, c * Law::kVectors + q} : Place{1, c};
+Place place_of(std::ptrdiff_t row, int q) {
+  return q < Law::kVectors ? Place{0, row * Law::kVectors + q} : Place{1, row};
 }

@@ -1,43 +1,40 @@
-// One replica: each vector is one number of W grains or of W contacts. Spheres, forces and histories are rows of four
-// or eight doubles, which the contacts gather and turn into columns. Included inside the instruction set's namespace.
+// One replica: each vector is one number of W grains or of W contacts. What contacts look up is kept in rows of four
+// doubles besides. Included inside the instruction set's namespace; see `Engine` in block.h for how it is used.
+
+struct GrainRows {
+  Row position, velocity, spin, force, torque;
+};
 
 template <class Law>
 struct Packed {
-  using Row = double[4];
-
   const Problem& problem;
   const Block& block;
+  const Plan& plan;
   const Lane& lane;
-  Row* position;        // [S + 2]: sphere centres; the last two are far apart and fill up vectors
-  Row* velocity;        // [S + 2]
-  Row* spin;            // [N + 1]
-  V* centres;           // [units, K, 3], for the grains
-  double (*force)[8];   // [P + 1]: force on and torque about sphere i of each contact, where touched
-  Row* history;         // [P + 1]
-  double* layer;        // [P + 1, Q, 3] of the Mindlin law
+  V* hot;            // the engine's
+  Row* sphere;       // [S + 2]: centres; the last two are far apart and fill up vectors
+  GrainRows* grain;  // [N + 1]
+  Row* guest;        // [guests, 2]: force and torque
+  Row* history;      // [candidates + 1]
+  double* layer;     // [candidates + 1, Q, 3] of the Mindlin law
   Marks marks;
 
-  Packed(const Problem& problem, const Block& block) : problem(problem), block(block), lane(block.lanes[0]) {}
+  Packed(const Problem& problem, const Block& block)
+      : problem(problem), block(block), plan(*block.pack->plan), lane(block.lanes[0]) {}
 
   static int units(const Problem& p) { return (p.grains + W - 1) / W; }
   static int unit_of(int grain) { return grain / W; }
-  static int lane_of(int) { return 0; }
 
-  static std::size_t carve(const Problem& p, Carver& carver, Packed* mode) {
-    const std::size_t pairs = static_cast<std::size_t>(p.pairs) + 1;
-    const std::size_t grains = static_cast<std::size_t>(units(p)) * W, spheres = grains * p.spheres_per_grain + 2;
-    Row* position = carver.take<Row>(spheres);
-    Row* velocity = carver.take<Row>(spheres);
-    Row* spin = carver.take<Row>(grains + 1);
-    V* centres = carver.take<V>(static_cast<std::size_t>(units(p)) * p.spheres_per_grain * 3);
-    auto* force = carver.take<double[8]>(pairs);
-    Row* history = carver.take<Row>(Law::kHistory ? pairs : 0);
-    if (mode) {
-      mode->position = position, mode->velocity = velocity, mode->spin = spin, mode->centres = centres;
-      mode->force = force, mode->history = history;
-    }
-    carve_marks<Law>(p, carver, mode ? &mode->marks : nullptr);
-    double* layer = carver.take<double>(Law::kLayered ? pairs * p.points * 3 : 0);
+  static std::size_t carve(const Problem& p, const Plan& plan, Carver& carver, Packed* mode) {
+    const std::size_t candidates = static_cast<std::size_t>(plan.candidates) + 1;
+    const std::size_t grains = static_cast<std::size_t>(units(p)) * W;
+    Row* sphere = carver.take<Row>(grains * p.spheres_per_grain + 2);
+    GrainRows* grain = carver.take<GrainRows>(grains + 1);
+    Row* guest = carver.take<Row>(static_cast<std::size_t>(plan.guests) * 2);
+    Row* history = carver.take<Row>(Law::kHistory ? candidates : 0);
+    if (mode) mode->sphere = sphere, mode->grain = grain, mode->guest = guest, mode->history = history;
+    carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
+    double* layer = carver.take<double>(Law::kLayered ? candidates * p.points * 3 : 0);
     if (mode) mode->layer = layer;
     return carver.used;
   }
@@ -46,110 +43,115 @@ struct Packed {
 
   // --- copying in and out
 
-  void load_unit(int u, V* state) const {
-    for (int l = 0; l < W; ++l) {
-      const int g = u * W + l < problem.grains ? u * W + l : problem.grains - 1;
-      for (int f = 0; f < kFields; ++f)
-        for (int q = 0; q < kFieldSize[f]; ++q)
-          state[static_cast<std::size_t>(u) * kSlots + kFieldSlot[f] + q][l] =
-              lane.grains_in[f][(static_cast<std::ptrdiff_t>(g) * kFieldSize[f] + q) * problem.stride];
+  // Grain of lane l in unit u; the last vector is filled up with copies of the last grain, which nothing touches.
+  int grain_in(int u, int l) const { return u * W + l < problem.grains ? u * W + l : problem.grains - 1; }
+
+  void load_unit(int u, V* hot, V* cold) const {
+    for (int f = 0; f < kFields; ++f) {
+      const FieldPlace field = kField[f];
+      V* to = (field.hot ? hot + static_cast<std::size_t>(u) * kHot : cold + static_cast<std::size_t>(u) * kCold) + field.slot;
+      for (int l = 0; l < W; ++l) {
+        const std::ptrdiff_t from = static_cast<std::ptrdiff_t>(plan.grain[grain_in(u, l)]) * field.size;
+        for (int q = 0; q < field.size; ++q) to[q][l] = lane.grains_in[f][(from + q) * problem.stride];
+      }
     }
   }
 
-  void unload_unit(int u, const V* state, int) const {
-    for (int l = 0; l < W && u * W + l < problem.grains; ++l)
-      for (int f = 0; f < kFields; ++f)
-        for (int q = 0; q < kFieldSize[f]; ++q)
-          lane.grains_out[f][(static_cast<std::ptrdiff_t>(u * W + l) * kFieldSize[f] + q) * problem.stride] =
-              state[static_cast<std::size_t>(u) * kSlots + kFieldSlot[f] + q][l];
+  void unload_unit(int u, const V* hot, const V* cold, int) const {
+    for (int f = 0; f < kFields; ++f) {
+      const FieldPlace field = kField[f];
+      const V* from =
+          (field.hot ? hot + static_cast<std::size_t>(u) * kHot : cold + static_cast<std::size_t>(u) * kCold) + field.slot;
+      for (int l = 0; l < W && u * W + l < problem.grains; ++l) {
+        const std::ptrdiff_t to = static_cast<std::ptrdiff_t>(plan.grain[u * W + l]) * field.size;
+        for (int q = 0; q < field.size; ++q) lane.grains_out[f][(to + q) * problem.stride] = from[q][l];
+      }
+    }
   }
 
   void load_history(std::ptrdiff_t c) {
+    const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = true;
     for (int q = 0; q < Law::kHistory; ++q) {
-      const Place place = place_of<Law>(c, q);
+      const Place place = place_of<Law>(row, q);
       history[c][q] = lane.history_in[place.leaf][place.row * problem.stride];
     }
     if constexpr (Law::kLayered) {
       const int reached = layer_of(problem, lane, history[c][0]);
       marks.reached[c] = marks.reached_first[c] = reached;
-      const std::ptrdiff_t first = c * problem.points * 3;
-      for (int q = 0; q < 3 * (reached + 1); ++q) layer[first + q] = lane.history_in[0][(first + q) * problem.stride];
+      const std::ptrdiff_t from = row * problem.points * 3, to = c * problem.points * 3;
+      for (int q = 0; q < 3 * (reached + 1); ++q) layer[to + q] = lane.history_in[0][(from + q) * problem.stride];
     }
   }
 
   void unload_history(std::ptrdiff_t c, int) const {
+    const std::ptrdiff_t row = plan.candidate[c].row;
     for (int q = 0; q < Law::kHistory; ++q) {
-      const Place place = place_of<Law>(c, q);
+      const Place place = place_of<Law>(row, q);
       lane.history_out[place.leaf][place.row * problem.stride] = history[c][q];
     }
     if constexpr (Law::kLayered) {
-      const std::ptrdiff_t first = c * problem.points * 3;
+      const std::ptrdiff_t to = row * problem.points * 3, from = c * problem.points * 3;
       const int stored = 3 * (marks.reached[c] + 1);
       const int stale = 3 * (problem.history_aliased ? marks.reached_first[c] + 1 : problem.points);
-      for (int q = 0; q < stored; ++q) lane.history_out[0][(first + q) * problem.stride] = layer[first + q];
-      for (int q = stored; q < stale; ++q) lane.history_out[0][(first + q) * problem.stride] = 0.0;
+      for (int q = 0; q < stored; ++q) lane.history_out[0][(to + q) * problem.stride] = layer[from + q];
+      for (int q = stored; q < stale; ++q) lane.history_out[0][(to + q) * problem.stride] = 0.0;
     }
+  }
+
+  void unload_padding(int n, int) const {
+    const std::ptrdiff_t row = plan.padding_row[n];
+    for (int q = 0; q < Law::kHistory; ++q) {
+      const Place place = place_of<Law>(row, q);
+      lane.history_out[place.leaf][place.row * problem.stride] = 0.0;
+    }
+    if (Law::kLayered && !problem.history_aliased)
+      for (int q = 0; q < 3 * problem.points; ++q)
+        lane.history_out[0][(row * problem.points * 3 + q) * problem.stride] = 0.0;
   }
 
   int dummy_sphere() const { return units(problem) * W * problem.spheres_per_grain; }
   int dummy_grain() const { return units(problem) * W; }
 
   void load_dummies() {
-    for (int side = 0; side < 2; ++side) {
-      for (int q = 0; q < 4; ++q) position[dummy_sphere() + side][q] = velocity[dummy_sphere() + side][q] = 0.0;
-      position[dummy_sphere() + side][0] = 4.0 * side;
-    }
-    for (int q = 0; q < 4; ++q) spin[dummy_grain()][q] = 0.0;
-    if constexpr (Law::kHistory > 0)
-      for (int q = 0; q < 4; ++q) history[problem.pairs][q] = 0.0;
-    if constexpr (Law::kLayered) marks.reached[problem.pairs] = -1;
+    sphere[dummy_sphere()] = Row{};
+    sphere[dummy_sphere() + 1] = Row{4.0};
+    grain[dummy_grain()] = GrainRows{};
+    if constexpr (Law::kHistory > 0) history[plan.candidates] = Row{};
+    if constexpr (Law::kLayered) marks.reached[plan.candidates] = -1;
   }
 
   // --- what the grains tell the contacts, and the contacts the grains
 
-  static void put_rows(Row* rows, int stride, Vec a) {
-    for (int l = 0; l < W; ++l) rows[l * stride][0] = a.x[l], rows[l * stride][1] = a.y[l], rows[l * stride][2] = a.z[l];
-  }
-
-  void put_spin(int u, Vec a) { put_rows(spin + static_cast<std::size_t>(u) * W, 1, a); }
-
-  void put_sphere(int u, int k, Vec centre, Vec surface) {
+  void put_sphere(int u, int k, Vec centre) {
     const int spheres = problem.spheres_per_grain;
-    const std::size_t s = static_cast<std::size_t>(u) * W * spheres + k;
-    put_rows(position + s, spheres, centre);
-    put_rows(velocity + s, spheres, surface);
-    store_vec(centres + 3 * (static_cast<std::size_t>(u) * spheres + k), centre);
+    store_rows(sphere + static_cast<std::size_t>(u) * W * spheres + k, spheres, centre);
   }
 
-  Vec centre(int u, int k) const {
-    return load_vec(centres + 3 * (static_cast<std::size_t>(u) * problem.spheres_per_grain + k));
+  void put_grain(int u, Vec position, Vec velocity, Vec spin, Vec force, Vec torque) {
+    constexpr std::ptrdiff_t stride = sizeof(GrainRows) / sizeof(Row);
+    GrainRows* first = grain + static_cast<std::size_t>(u) * W;
+    store_rows(&first->position, stride, position);
+    store_rows(&first->velocity, stride, velocity);
+    store_rows(&first->spin, stride, spin);
+    store_rows(&first->force, stride, force);
+    store_rows(&first->torque, stride, torque);
   }
 
-  bool contact_sum(int u, int k, Vec& f, Vec& t) const {
-    alignas(64) double sums[W][8];
-    bool any = false;
+  void total_force(int u, Vec& force, Vec& torque) const {
+    Row f[W], t[W];
     for (int l = 0; l < W; ++l) {
-      for (int q = 0; q < 8; ++q) sums[l][q] = 0.0;
       const int g = u * W + l;
+      f[l] = grain[g].force;
+      t[l] = grain[g].torque;
       if (g >= problem.grains) continue;
-      const std::size_t s = static_cast<std::size_t>(g) * problem.spheres_per_grain + k;
-      const int32_t* row = block.pack->incidence + s * problem.per_sphere;
-      for (int column = 0; column < problem.per_sphere && row[column] < 2 * problem.pairs; ++column) {
-        const bool as_first = row[column] < problem.pairs;
-        const std::size_t c = as_first ? row[column] : row[column] - problem.pairs;
-        if (!marks.touched[c]) continue;
-        any = true;
-        const double* one = force[c];
-        for (int q = 0; q < 3; ++q) sums[l][q] += as_first ? one[q] : -one[q];
-        for (int q = 3; q < 6; ++q) sums[l][q] += one[q];
+      for (int n = plan.guest_start[g]; n < plan.guest_start[g + 1]; ++n) {
+        f[l] += guest[2 * static_cast<std::size_t>(n)];
+        t[l] += guest[2 * static_cast<std::size_t>(n) + 1];
       }
     }
-    for (int l = 0; l < W; ++l) {
-      f.x[l] = sums[l][0], f.y[l] = sums[l][1], f.z[l] = sums[l][2];
-      t.x[l] = sums[l][3], t.y[l] = sums[l][4], t.z[l] = sums[l][5];
-    }
-    return any;
+    force = columns(load_rows([&](int l) { return f + l; }));
+    torque = columns(load_rows([&](int l) { return t + l; }));
   }
 
   void add_walls(int u, double* sums, Vec lower, Vec upper) const {
@@ -192,101 +194,105 @@ struct Packed {
     }
   };
 
-  void forget(std::size_t c) {
-    marks.touched[c] = false;
-    for (int q = 0; q < Law::kHistory; ++q) history[c][q] = 0.0;
-    if constexpr (Law::kLayered) marks.reached[c] = -1;
-  }
-
-  // W sphere pairs and the differences of their rows.
-  struct Group {
-    int contact[W], one[W], other[W];
-    alignas(64) double difference[W][4];
-
-    void subtract(const Row* rows) {
-      for (int l = 0; l < W; ++l)
-        for (int q = 0; q < 4; ++q) difference[l][q] = rows[other[l]][q] - rows[one[l]][q];
-    }
-    void add(const Row* rows, const int* first, const int* second) {
-      for (int l = 0; l < W; ++l)
-        for (int q = 0; q < 4; ++q) difference[l][q] = rows[second[l]][q] + rows[first[l]][q];
-    }
-    Vec read() const {
-      Vec a;
-      columns(difference, a.x, a.y, a.z);
-      return a;
-    }
-  };
-
   // First find which candidates touch, then compute those, W at a time.
   void contacts(int first, int end, const V* parameter, const LawParameters& law) {
-    const Pack& pack = *block.pack;
-    int touching[kChunkPairs + W];
-    int count = 0;
-    for (int start = first; start < end; start += W) {
-      Group group;
-      for (int l = 0; l < W; ++l) {
-        const int c = start + l < end ? start + l : start;
-        group.one[l] = pack.first[c];
-        group.other[l] = pack.second[c];
-      }
-      group.subtract(position);
-      const Vec separation = group.read();
-      const unsigned near = bits_less(dot(separation, separation), splat(4.0));
-      for (int l = 0; l < W && start + l < end; ++l) {
-        const int c = start + l;
-        const bool touches = (near >> l & 1u) && pack.valid[c];
-        touching[count] = c;
-        count += touches;
-        if (touches) {
-          marks.touched[c] = true;
-        } else if (marks.touched[c]) {
-          forget(c);
+    constexpr int kBatch = 32 * W;
+    const Candidate* candidate = plan.candidate;
+    int touching[kBatch + W];
+    for (int batch = first; batch < end; batch += kBatch) {
+      const int batch_end = batch + kBatch < end ? batch + kBatch : end;
+      int count = 0;
+      for (int start = batch; start < batch_end; start += W) {
+        const auto number = [&](int l) { return start + l < batch_end ? start + l : start; };
+        const Vec separation = columns(load_rows([&](int l) { return sphere + candidate[number(l)].other; }) -
+                                       load_rows([&](int l) { return sphere + candidate[number(l)].one; }));
+        const unsigned near = bits_less(dot(separation, separation), splat(4.0));
+        for (int l = 0; l < W && start + l < batch_end; ++l) {
+          const int c = start + l;
+          const bool touches = near >> l & 1u;
+          if (marks.touched[c] && !touches) forget(c);
+          marks.touched[c] = touches;
+          touching[count] = c;
+          count += touches;
         }
       }
+      for (int start = 0; start < count; start += W) compute(touching + start, count - start, parameter, law);
     }
-    for (int start = 0; start < count; start += W) compute(touching + start, count - start, parameter, law);
+  }
+
+  void forget(std::size_t c) {
+    if constexpr (Law::kHistory > 0) history[c] = Row{};
+    if constexpr (Law::kLayered) marks.reached[c] = -1;
+    const int n = plan.candidate[c].guest;
+    if (n >= 0) guest[2 * static_cast<std::size_t>(n)] = guest[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
 
   void compute(const int* touching, int count, const V* parameter, const LawParameters& law) {
-    Group group;
-    int owner_one[W], owner_other[W];
+    Candidate pair[W];
+    int c[W];
     for (int l = 0; l < W; ++l) {
-      const bool real = l < count;
-      const int c = group.contact[l] = real ? touching[l] : problem.pairs;
-      group.one[l] = real ? block.pack->first[c] : dummy_sphere();
-      group.other[l] = real ? block.pack->second[c] : dummy_sphere() + 1;
-      owner_one[l] = real ? problem.owner[group.one[l]] : dummy_grain();
-      owner_other[l] = real ? problem.owner[group.other[l]] : dummy_grain();
+      c[l] = l < count ? touching[l] : plan.candidates;
+      pair[l] = l < count ? plan.candidate[c[l]]
+                          : Candidate{dummy_sphere(), dummy_sphere() + 1, dummy_grain(), dummy_grain(), -1, 0};
     }
-    group.subtract(position);
-    const Vec separation = group.read();
-    group.subtract(velocity);
-    const Vec surface = group.read();
-    group.add(spin, owner_one, owner_other);
-    const Vec spin_sum = group.read();
-    V memory[Law::kHistory + 1];
-    for (int q = 0; q < Law::kHistory; ++q)
-      for (int l = 0; l < W; ++l) memory[q][l] = history[group.contact[l]][q];
-    Vec f, t;
-    const V square = dot(separation, separation);
+    const auto one = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[pair[l].grain_one].*row); }); };
+    const auto other = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[pair[l].grain_other].*row); }); };
+    const Rows centre_one = load_rows([&](int l) { return sphere + pair[l].one; });
+    const Rows centre_other = load_rows([&](int l) { return sphere + pair[l].other; });
+    const Rows point = splat(0.5) * (centre_one + centre_other);
+    Meeting m;
+    m.separation = columns(centre_other - centre_one);
+    m.square = dot(m.separation, m.separation);
+    m.lever_one = columns(point - one(&GrainRows::position));
+    m.lever_other = columns(point - other(&GrainRows::position));
+    m.velocity = columns(other(&GrainRows::velocity) - one(&GrainRows::velocity));
+    m.spin_one = columns(one(&GrainRows::spin));
+    m.spin_other = columns(other(&GrainRows::spin));
+    V memory[4] = {};
+    if constexpr (Law::kHistory > 0) {
+      const Vec kept = columns(load_rows([&](int l) { return history + c[l]; }));
+      store_vec(memory, kept);
+      if constexpr (Law::kHistory == 4)
+        for (int l = 0; l < W; ++l) memory[3][l] = history[c[l]][3];
+    }
+    Push push;
     if constexpr (Law::kLayered) {
       Layers layers;
       layers.count = problem.points;
       for (int l = 0; l < W; ++l) {
-        layers.at[l] = layer + static_cast<std::size_t>(group.contact[l]) * problem.points * 3;
-        layers.last[l] = marks.reached + group.contact[l];
+        layers.at[l] = layer + static_cast<std::size_t>(c[l]) * problem.points * 3;
+        layers.last[l] = marks.reached + c[l];
       }
-      contact_force<Law>(separation, square, surface, spin_sum, parameter, law, memory, layers, f, t);
+      push = contact_push<Law>(m, parameter, law, memory, layers);
     } else {
       NoLayers none;
-      contact_force<Law>(separation, square, surface, spin_sum, parameter, law, memory, none, f, t);
+      push = contact_push<Law>(m, parameter, law, memory, none);
     }
-    for (int l = 0; l < W; ++l) {
-      double* row = force[group.contact[l]];
-      row[0] = f.x[l], row[1] = f.y[l], row[2] = f.z[l], row[3] = t.x[l], row[4] = t.y[l], row[5] = t.z[l];
+    if constexpr (Law::kHistory > 0) {
+      const Rows kept = rows_of(load_vec(memory));
+      for (int l = 0; l < W; ++l) {
+        Row row = row_of(kept, l);
+        if constexpr (Law::kHistory == 4) row[3] = memory[3][l];
+        history[c[l]] = row;
+      }
     }
-    for (int q = 0; q < Law::kHistory; ++q)
-      for (int l = 0; l < W; ++l) history[group.contact[l]][q] = memory[q][l];
+    const Rows force = rows_of(push.force), torque_one = rows_of(push.torque_one), torque_other = rows_of(push.torque_other);
+    Row f[W], t_one[W], t_other[W];
+    for (int l = 0; l < W; ++l)
+      f[l] = row_of(force, l), t_one[l] = row_of(torque_one, l), t_other[l] = row_of(torque_other, l);
+    for (int l = 0; l < W && l < count; ++l) add(pair[l], f[l], t_one[l], t_other[l]);
+  }
+
+  // The lower-numbered grain is at home in this domain, the other may be elsewhere.
+  void add(const Candidate& pair, Row force, Row torque_one, Row torque_other) {
+    GrainRows &one = grain[pair.grain_one], &other = grain[pair.grain_other];
+    const bool away_is_one = pair.grain_one > pair.grain_other;
+    if (pair.guest < 0 || !away_is_one) one.force += force, one.torque += torque_one;
+    if (pair.guest < 0 || away_is_one) other.force -= force, other.torque += torque_other;
+    if (pair.guest >= 0) {
+      Row* to = guest + 2 * static_cast<std::size_t>(pair.guest);
+      to[0] = away_is_one ? force : -force;
+      to[1] = away_is_one ? torque_one : torque_other;
+    }
   }
 };

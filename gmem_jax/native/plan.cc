@@ -13,7 +13,7 @@ namespace {
 
 constexpr int kDomainCandidates = 1024;  // enough work to be worth a thread, and a third of a core's cache
 constexpr int kMaxDomains = 512;
-constexpr std::size_t kRemembered = 16;
+constexpr std::size_t kRemembered = std::size_t{256} << 20;  // bytes
 
 struct Point {
   double x[3];
@@ -164,7 +164,12 @@ std::shared_ptr<const PlanStore> plan_for(const List& list) {
   Key key(list);
   std::lock_guard<std::mutex> lock(mutex);
   known->emplace_front(std::move(key), plan);
-  if (known->size() > kRemembered) known->pop_back();
+  std::size_t bytes = 0, keep = 0;
+  for (const auto& entry : *known) {
+    bytes += entry.first.bytes.size() + entry.second->candidate.size() * sizeof(Candidate);
+    if (keep == 0 || bytes <= kRemembered) ++keep;
+  }
+  known->resize(keep, known->front());
   return plan;
 }
 

@@ -5,15 +5,16 @@ template <class Law>
 struct Replicas {
   const Problem& problem;
   const Block& block;
-  bool adjacent;   // the lanes are W neighbours in every array of the call
-  V* sphere;       // [S, 6]: centre, its velocity
-  V* spin;         // [N, 3]
-  V* force;        // [P, 6]: force on and torque about sphere i of each contact, where touched
-  V* history;      // [P, Law::kHistory]
-  V* layer;        // [P, Q, 3] of the Mindlin law
+  const Plan& plan;
+  bool adjacent;  // the lanes are W neighbours in every array of the call
+  V* hot;         // the engine's
+  V* sphere;      // [S, 3]: centres
+  V* guest;       // [guests, 6]: force and torque
+  V* history;     // [candidates, Law::kHistory]
+  V* layer;       // [candidates, Q, 3] of the Mindlin law
   Marks marks;
 
-  Replicas(const Problem& problem, const Block& block) : problem(problem), block(block) {
+  Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
     adjacent = block.count == W;
     const Lane& a = block.lanes[0];
     for (int l = 1; l < block.count; ++l) {
@@ -28,17 +29,15 @@ struct Replicas {
 
   static int units(const Problem& p) { return p.grains; }
   static int unit_of(int grain) { return grain; }
-  static int lane_of(int l) { return l; }
 
-  static std::size_t carve(const Problem& p, Carver& carver, Replicas* mode) {
-    const std::size_t pairs = p.pairs;
-    V* sphere = carver.take<V>(static_cast<std::size_t>(p.spheres()) * 6);
-    V* spin = carver.take<V>(static_cast<std::size_t>(p.grains) * 3);
-    V* force = carver.take<V>(pairs * 6);
-    V* history = carver.take<V>(pairs * Law::kHistory);
-    if (mode) mode->sphere = sphere, mode->spin = spin, mode->force = force, mode->history = history;
-    carve_marks<Law>(p, carver, mode ? &mode->marks : nullptr);
-    V* layer = carver.take<V>(Law::kLayered ? pairs * p.points * 3 : 0);
+  static std::size_t carve(const Problem& p, const Plan& plan, Carver& carver, Replicas* mode) {
+    const std::size_t candidates = plan.candidates;
+    V* sphere = carver.take<V>(static_cast<std::size_t>(p.spheres()) * 3);
+    V* guest = carver.take<V>(static_cast<std::size_t>(plan.guests) * 6);
+    V* history = carver.take<V>(candidates * Law::kHistory);
+    if (mode) mode->sphere = sphere, mode->guest = guest, mode->history = history;
+    carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
+    V* layer = carver.take<V>(Law::kLayered ? candidates * p.points * 3 : 0);
     if (mode) mode->layer = layer;
     return carver.used;
   }
@@ -72,24 +71,32 @@ struct Replicas {
       if (block.lanes[l].steps == steps_done) pointer(block.lanes[l])[row * problem.stride] = a[l];
   }
 
-  void load_unit(int u, V* state) const {
-    for (int f = 0; f < kFields; ++f)
-      for (int q = 0; q < kFieldSize[f]; ++q)
-        state[static_cast<std::size_t>(u) * kSlots + kFieldSlot[f] + q] = read(
-            [f](const Lane& lane) { return lane.grains_in[f]; }, static_cast<std::ptrdiff_t>(u) * kFieldSize[f] + q);
+  void load_unit(int u, V* hot, V* cold) const {
+    for (int f = 0; f < kFields; ++f) {
+      const FieldPlace field = kField[f];
+      V* to = (field.hot ? hot + static_cast<std::size_t>(u) * kHot : cold + static_cast<std::size_t>(u) * kCold) + field.slot;
+      for (int q = 0; q < field.size; ++q)
+        to[q] = read([f](const Lane& lane) { return lane.grains_in[f]; },
+                     static_cast<std::ptrdiff_t>(plan.grain[u]) * field.size + q);
+    }
   }
 
-  void unload_unit(int u, const V* state, int steps_done) const {
-    for (int f = 0; f < kFields; ++f)
-      for (int q = 0; q < kFieldSize[f]; ++q)
-        write([f](const Lane& lane) { return lane.grains_out[f]; }, static_cast<std::ptrdiff_t>(u) * kFieldSize[f] + q,
-              state[static_cast<std::size_t>(u) * kSlots + kFieldSlot[f] + q], steps_done);
+  void unload_unit(int u, const V* hot, const V* cold, int steps_done) const {
+    for (int f = 0; f < kFields; ++f) {
+      const FieldPlace field = kField[f];
+      const V* from =
+          (field.hot ? hot + static_cast<std::size_t>(u) * kHot : cold + static_cast<std::size_t>(u) * kCold) + field.slot;
+      for (int q = 0; q < field.size; ++q)
+        write([f](const Lane& lane) { return lane.grains_out[f]; },
+              static_cast<std::ptrdiff_t>(plan.grain[u]) * field.size + q, from[q], steps_done);
+    }
   }
 
   void load_history(std::ptrdiff_t c) {
+    const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = true;
     for (int q = 0; q < Law::kHistory; ++q) {
-      const Place place = place_of<Law>(c, q);
+      const Place place = place_of<Law>(row, q);
       history[c * Law::kHistory + q] =
           read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row);
     }
@@ -100,58 +107,60 @@ struct Replicas {
         reached = of_lane > reached ? of_lane : reached;
       }
       marks.reached[c] = marks.reached_first[c] = reached;
-      const std::ptrdiff_t first = c * problem.points * 3;
+      const std::ptrdiff_t from = row * problem.points * 3, to = c * problem.points * 3;
       for (int q = 0; q < 3 * (reached + 1); ++q)
-        layer[first + q] = read([](const Lane& lane) { return lane.history_in[0]; }, first + q);
+        layer[to + q] = read([](const Lane& lane) { return lane.history_in[0]; }, from + q);
     }
   }
 
   void unload_history(std::ptrdiff_t c, int steps_done) const {
+    const std::ptrdiff_t row = plan.candidate[c].row;
     for (int q = 0; q < Law::kHistory; ++q) {
-      const Place place = place_of<Law>(c, q);
+      const Place place = place_of<Law>(row, q);
       write([place](const Lane& lane) { return lane.history_out[place.leaf]; }, place.row,
             history[c * Law::kHistory + q], steps_done);
     }
     if constexpr (Law::kLayered) {
-      const std::ptrdiff_t first = c * problem.points * 3;
+      const std::ptrdiff_t to = row * problem.points * 3, from = c * problem.points * 3;
       const auto out = [](const Lane& lane) { return lane.history_out[0]; };
       const int stored = 3 * (marks.reached[c] + 1);
       const int stale = 3 * (problem.history_aliased ? marks.reached_first[c] + 1 : problem.points);
-      for (int q = 0; q < stored; ++q) write(out, first + q, layer[first + q], steps_done);
-      for (int q = stored; q < stale; ++q) write(out, first + q, V{}, steps_done);
+      for (int q = 0; q < stored; ++q) write(out, to + q, layer[from + q], steps_done);
+      for (int q = stored; q < stale; ++q) write(out, to + q, V{}, steps_done);
     }
   }
+
+  void unload_padding(int n, int steps_done) const {
+    const std::ptrdiff_t row = plan.padding_row[n];
+    for (int q = 0; q < Law::kHistory; ++q) {
+      const Place place = place_of<Law>(row, q);
+      write([place](const Lane& lane) { return lane.history_out[place.leaf]; }, place.row, V{}, steps_done);
+    }
+    if (Law::kLayered && !problem.history_aliased)
+      for (int q = 0; q < 3 * problem.points; ++q)
+        write([](const Lane& lane) { return lane.history_out[0]; }, row * problem.points * 3 + q, V{}, steps_done);
+  }
+
+  void load_dummies() {}
 
   // --- what the grains tell the contacts, and the contacts the grains
 
-  void put_spin(int u, Vec a) { store_vec(spin + 3 * static_cast<std::size_t>(u), a); }
-
-  void put_sphere(int u, int k, Vec centre, Vec velocity) {
-    V* row = sphere + 6 * (static_cast<std::size_t>(u) * problem.spheres_per_grain + k);
-    store_vec(row, centre);
-    store_vec(row + 3, velocity);
+  void put_sphere(int u, int k, Vec centre) {
+    store_vec(sphere + 3 * (static_cast<std::size_t>(u) * problem.spheres_per_grain + k), centre);
   }
 
-  Vec centre(int u, int k) const {
-    return load_vec(sphere + 6 * (static_cast<std::size_t>(u) * problem.spheres_per_grain + k));
+  void put_grain(int u, Vec, Vec, Vec, Vec force, Vec torque) {
+    store_vec(hot + static_cast<std::size_t>(u) * kHot + kForce, force);
+    store_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque, torque);
   }
 
-  // Sum of the contacts of sphere k of unit u; false if it has none.
-  bool contact_sum(int u, int k, Vec& f, Vec& t) const {
-    const std::size_t s = static_cast<std::size_t>(u) * problem.spheres_per_grain + k;
-    const int32_t* row = block.pack->incidence + s * problem.per_sphere;
-    f = t = Vec{V{}, V{}, V{}};
-    bool any = false;
-    for (int column = 0; column < problem.per_sphere && row[column] < 2 * problem.pairs; ++column) {
-      const bool as_first = row[column] < problem.pairs;
-      const std::size_t c = as_first ? row[column] : row[column] - problem.pairs;
-      if (!marks.touched[c]) continue;
-      any = true;
-      const Vec one = load_vec(force + 6 * c);
-      f = as_first ? f + one : f - one;
-      t = t + load_vec(force + 6 * c + 3);
+  void total_force(int u, Vec& force, Vec& torque) const {
+    force = load_vec(hot + static_cast<std::size_t>(u) * kHot + kForce);
+    torque = load_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque);
+    for (int n = plan.guest_start[u]; n < plan.guest_start[u + 1]; ++n) {
+      force = force + load_vec(guest + 6 * static_cast<std::size_t>(n));
+      torque = torque + load_vec(guest + 6 * static_cast<std::size_t>(n) + 3);
     }
-    return any;
   }
 
   void add_walls(int, double* sums, Vec lower, Vec upper) const {
@@ -184,47 +193,66 @@ struct Replicas {
     void reached(int j) { *last = j; }
   };
 
-  void forget(std::size_t c) {
+  void contacts(int first, int end, const V* parameter, const LawParameters& law) {
+    const V contact_square = splat(4.0);
+    for (int c = first; c < end; ++c) {
+      const Candidate& pair = plan.candidate[c];
+      const Vec separation = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other)) -
+                             load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
+      if (bits_less(dot(separation, separation), contact_square)) {
+        marks.touched[c] = true;
+        compute(c, pair, parameter, law);
+      } else if (marks.touched[c]) {
+        forget(c, pair);
+      }
+    }
+  }
+
+  void forget(std::size_t c, const Candidate& pair) {
+    marks.touched[c] = false;
     for (int q = 0; q < Law::kHistory; ++q) history[c * Law::kHistory + q] = V{};
     if constexpr (Law::kLayered) marks.reached[c] = -1;
+    if (pair.guest >= 0)
+      for (int q = 0; q < 6; ++q) guest[6 * static_cast<std::size_t>(pair.guest) + q] = V{};
   }
 
-  // First find which candidates touch, then compute those: the processor can run ahead in a loop without surprises.
-  void contacts(int first, int end, const V* parameter, const LawParameters& law) {
-    const Pack& pack = *block.pack;
-    const V contact_square = splat(4.0);
-    int touching[kChunkPairs + 1], count = 0;
-    for (int c = first; c < end; ++c) {
-      const Vec separation = load_vec(sphere + 6 * static_cast<std::size_t>(pack.second[c])) -
-                             load_vec(sphere + 6 * static_cast<std::size_t>(pack.first[c]));
-      const bool touches = bits_less(dot(separation, separation), contact_square) && pack.valid[c];
-      if (marks.touched[c] && !touches) forget(c);
-      marks.touched[c] = touches;
-      touching[count] = c;
-      count += touches;
-    }
-    for (int n = 0; n < count; ++n) compute(touching[n], parameter, law);
-  }
-
-  void compute(std::size_t c, const V* parameter, const LawParameters& law) {
-    const int i = block.pack->first[c], j = block.pack->second[c];
-    const V *one = sphere + 6 * static_cast<std::size_t>(i), *other = sphere + 6 * static_cast<std::size_t>(j);
-    const Vec separation = load_vec(other) - load_vec(one);
-    const Vec velocity = load_vec(other + 3) - load_vec(one + 3);
-    const Vec spin_sum = load_vec(spin + 3 * problem.owner[j]) + load_vec(spin + 3 * problem.owner[i]);
+  void compute(std::size_t c, const Candidate& pair, const V* parameter, const LawParameters& law) {
+    V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
+    V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
+    const Vec centre_one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
+    const Vec centre_other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
+    const Vec point = splat(0.5) * (centre_one + centre_other);
+    Meeting m;
+    m.separation = centre_other - centre_one;
+    m.square = dot(m.separation, m.separation);
+    m.lever_one = point - load_vec(one + kPosition);
+    m.lever_other = point - load_vec(other + kPosition);
+    m.velocity = load_vec(other + kVelocity) - load_vec(one + kVelocity);
+    m.spin_one = load_vec(one + kSpin);
+    m.spin_other = load_vec(other + kSpin);
     V* memory = history + c * Law::kHistory;
-    Vec f, t;
-    const V square = dot(separation, separation);
+    Push push;
     if constexpr (Law::kLayered) {
       Layers layers{layer + c * problem.points * 3, marks.reached + c, problem.points};
-      contact_force<Law>(separation, square, velocity, spin_sum, parameter, law, memory, layers, f, t);
+      push = contact_push<Law>(m, parameter, law, memory, layers);
     } else {
       NoLayers none;
-      contact_force<Law>(separation, square, velocity, spin_sum, parameter, law, memory, none, f, t);
+      push = contact_push<Law>(m, parameter, law, memory, none);
     }
-    store_vec(force + 6 * c, f);
-    store_vec(force + 6 * c + 3, t);
+    // The lower-numbered grain is at home in this domain, the other may be elsewhere.
+    const bool away_is_one = pair.grain_one > pair.grain_other;
+    if (pair.guest < 0 || !away_is_one) {
+      store_vec(one + kForce, load_vec(one + kForce) + push.force);
+      store_vec(one + kTorque, load_vec(one + kTorque) + push.torque_one);
+    }
+    if (pair.guest < 0 || away_is_one) {
+      store_vec(other + kForce, load_vec(other + kForce) - push.force);
+      store_vec(other + kTorque, load_vec(other + kTorque) + push.torque_other);
+    }
+    if (pair.guest >= 0) {
+      V* to = guest + 6 * static_cast<std::size_t>(pair.guest);
+      store_vec(to, away_is_one ? push.force : Vec{-push.force.x, -push.force.y, -push.force.z});
+      store_vec(to + 3, away_is_one ? push.torque_one : push.torque_other);
+    }
   }
-
-  void load_dummies() {}
 };

@@ -99,19 +99,3 @@ inline double smallest(V a) {
   for (int l = 1; l < W; ++l) m = a[l] < m ? a[l] : m;
   return m;
 }
-
-// Turn W rows of four doubles into their columns x, y, z.
-inline void columns(const double (*rows)[4], V& x, V& y, V& z) {
-#if defined(__AVX512F__)
-  const V ab = load(rows[0]), cd = load(rows[2]), ef = load(rows[4]), gh = load(rows[6]);
-  const V p = __builtin_shufflevector(ab, cd, 0, 4, 8, 12, 1, 5, 9, 13);
-  const V q = __builtin_shufflevector(ef, gh, 0, 4, 8, 12, 1, 5, 9, 13);
-  const V r = __builtin_shufflevector(ab, cd, 2, 6, 10, 14, 2, 6, 10, 14);
-  const V s = __builtin_shufflevector(ef, gh, 2, 6, 10, 14, 2, 6, 10, 14);
-  x = __builtin_shufflevector(p, q, 0, 1, 2, 3, 8, 9, 10, 11);
-  y = __builtin_shufflevector(p, q, 4, 5, 6, 7, 12, 13, 14, 15);
-  z = __builtin_shufflevector(r, s, 0, 1, 2, 3, 8, 9, 10, 11);
-#else
-  for (int l = 0; l < W; ++l) x[l] = rows[l][0], y[l] = rows[l][1], z[l] = rows[l][2];
-#endif
-}

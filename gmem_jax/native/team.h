@@ -11,7 +11,7 @@ namespace gmem {
 // run of neighbours that stays the same from step to step, and helps the others when it is done.
 class Team {
  public:
-  enum Queue { kGrains, kPairs, kQueues };
+  enum Queue { kGrains, kContacts, kQueues };
   static constexpr int kMaxSize = 64;
 
   explicit Team(int size) : size_(size) {}

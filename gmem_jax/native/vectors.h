@@ -26,6 +26,9 @@ inline Vec add_cross(Vec c, Vec a, Vec b) {
   return {fma(a.y, b.z, fnma(a.z, b.y, c.x)), fma(a.z, b.x, fnma(a.x, b.z, c.y)), fma(a.x, b.y, fnma(a.y, b.x, c.z))};
 }
 
+// c - a x b
+inline Vec subtract_cross(Vec c, Vec a, Vec b) { return add_cross(c, b, a); }
+
 inline Vec load_vec(const V* p) { return {p[0], p[1], p[2]}; }
 inline void store_vec(V* p, Vec a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
 
