@@ -73,8 +73,3 @@ def running_mean(series: jax.Array, width: Scalar) -> jax.Array:
     low = jnp.clip(centre - 0.5 * width, 0.0, bins)
     high = jnp.clip(centre + 0.5 * width, 0.0, bins)
     return (cumulative(high) - cumulative(low)) / (high - low)
-
-
-def inertial_number(rate: Scalar, pressure: jax.Array, mass: Scalar, diameter: Scalar) -> jax.Array:
-    """I = rate sqrt(m / (D p)), the rate of strain over the rate at which a grain rearranges (R = E = rho = 1)."""
-    return rate * jnp.sqrt(mass / (diameter * pressure))

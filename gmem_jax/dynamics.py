@@ -53,6 +53,7 @@ class Sample:
         contacts: touching sphere pairs per grain times two, [B].
         filling: phi, volume of the grains over that of the box, [B].
         largest_overlap: deepest sphere-sphere contact at the end of the bin, [B], in R.
+        inertial_number: I = (strain rate of the x axis) sqrt(m / (D p)), p the mean of p_x and p_y, [B]; 0 without p.
     """
 
     pressure: jax.Array
@@ -63,6 +64,7 @@ class Sample:
     contacts: jax.Array
     filling: jax.Array
     largest_overlap: jax.Array
+    inertial_number: jax.Array
 
 
 def _apart(alive: jax.Array, function: Callable[..., Any], *args: Any) -> Any:
@@ -249,6 +251,10 @@ def observe(system: System, state: State, box: Box, pressure: jax.Array) -> Samp
     body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)
     energy = clump.mass * jnp.sum(grains.velocity**2, axis=1) + jnp.sum(clump.inertia[:, None] * body_spin**2, axis=1)
     lengths = jnp.broadcast_to(box.lengths, pressure.shape)
+    rate = jnp.abs(box.upper_velocity[0] - box.lower_velocity[0]) / lengths[0]
+    squeezing = 0.5 * (pressure[0] + pressure[1])
+    loaded = squeezing > 0.0
+    inertial = rate * jnp.sqrt(clump.mass / (clump.diameter * jnp.where(loaded, squeezing, 1.0)))
     return Sample(
         pressure=pressure,
         lengths=lengths,
@@ -258,6 +264,7 @@ def observe(system: System, state: State, box: Box, pressure: jax.Array) -> Samp
         contacts=2.0 * jnp.sum(touching, axis=0) / count,
         filling=count * clump.mass / jnp.prod(lengths, axis=0),
         largest_overlap=jnp.max(lax.stop_gradient(overlap), axis=0),
+        inertial_number=jnp.where(loaded, inertial, 0.0),
     )
 
 

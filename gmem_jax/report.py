@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
-from gmem_jax.analysis import inertial_number
 from gmem_jax.material import Material
 from gmem_jax.memory import Recall
 from gmem_jax.pack import Pack
@@ -42,9 +40,6 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
     """The numbers of one recall and its resolved configuration, for JSON output and `recall_table`."""
     readout = recall.stages["readout"]
     pressure = np.asarray(readout.pressure)
-    rate = (1.0 - math.sqrt(1.0 - configuration["delta0"])) / configuration["t0"]
-    grain = configuration["grain"]
-    inertial = inertial_number(rate, jnp.asarray(pressure[:, :2]).mean(), grain["mass"], grain["diameter"])
     unit = Material().modulus
     status = int(np.bitwise_or.reduce(np.asarray(recall.status)))
     return {
@@ -56,7 +51,7 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "windowed_fidelity": float(recall.windowed_fidelity),
         "ringing_period": float(recall.window),
         "residual_speed": float(np.max(np.asarray(recall.residual_speed))),
-        "inertial_number": float(inertial),
+        "inertial_number": float(np.max(np.asarray(readout.inertial_number))),
         "filling": [float(np.asarray(readout.filling)[k, 0]) for k in (-1, 0)],
         "coordination": [float(np.asarray(readout.coordination)[k, 0]) for k in (-1, 0)],
         "pressure_pa": [float(pressure[k, :2, 0].mean() * unit) for k in (-1, 0)],

@@ -66,10 +66,3 @@ def test_a_running_mean_over_one_period_removes_it_and_keeps_a_line() -> None:
 def test_a_running_mean_of_one_bin_changes_nothing() -> None:
     series = jnp.asarray([[1.0, 5.0, 2.0, 8.0]])
     np.testing.assert_allclose(analysis.running_mean(series, 1.0), series, rtol=1e-15)
-
-
-def test_inertial_number_of_the_papers_drive_is_below_4e_5() -> None:
-    rate = (1.0 - np.sqrt(0.95)) / 1.8e4
-    middle = 4.5e-3  # E; the background runs from 20 to 70 kPa
-    assert 3e-5 < float(analysis.inertial_number(rate, jnp.asarray(middle), 9.648, 2.98)) < 4e-5
-    np.testing.assert_allclose(analysis.inertial_number(2.0, jnp.asarray(4.0), 9.0, 1.0), 3.0)

@@ -41,6 +41,15 @@ def test_a_recall_has_one_row_per_signal_and_a_clean_status(recall: gm.Recall) -
     assert recall.stages["readout"].pressure.shape == (BINS, 3, 7)
 
 
+def test_the_inertial_number_is_that_of_the_ramp(pack: gm.Pack, recall: gm.Recall) -> None:
+    readout = recall.stages["readout"]
+    rate = (1.0 - np.sqrt(0.95)) / SHORT["t0"]  # of L0; L is up to 2.5 % smaller
+    pressure = np.asarray(readout.pressure)[:, :2].mean(axis=1)
+    expected = rate * np.sqrt(float(pack.clump.mass) / (float(pack.clump.diameter) * pressure))
+    np.testing.assert_allclose(readout.inertial_number, expected, rtol=0.03)
+    assert np.all(np.asarray(recall.stages["store"].inertial_number) == 0.0)
+
+
 def test_gain_and_fidelity_follow_their_definitions(recall: gm.Recall) -> None:
     signal, template = np.asarray(recall.p_sig), 0.05 * 1e-3 * np.asarray(recall.J)
     gain = (signal * template).sum() / (template**2).sum()
