@@ -28,7 +28,7 @@ $(VENV)/.installed: pyproject.toml $(BIN)/python
 	touch $@
 
 $(VENV)/.installed-dev: pyproject.toml $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable ".[dev]"
+	$(BIN)/python -m pip install --quiet --editable ".[dev,oracle]"
 	touch $@ $(VENV)/.installed
 
 clean:

@@ -7,6 +7,8 @@ Units are R = E = rho = 1 (time in t_c = R sqrt(rho/E)); `Material` converts. As
 from gmem_jax.analysis import running_mean
 from gmem_jax.contact.frictionless import Frictionless
 from gmem_jax.contact.hooke import Hooke
+from gmem_jax.contact.mindlin import Mindlin
+from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.grain import Clump, clump, sphere, tetra
 from gmem_jax.material import Material
 from gmem_jax.memory import Recall, fidelity, gain, run_memory
@@ -32,6 +34,8 @@ __all__ = [
     "Frictionless",
     "Hooke",
     "Material",
+    "Mindlin",
+    "MindlinRescaled",
     "Pack",
     "Recall",
     "Recipe",

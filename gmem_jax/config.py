@@ -9,6 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from gmem_jax import native
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.hooke import Hooke
+from gmem_jax.contact.mindlin import Mindlin
+from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.material import Material
 from gmem_jax.pack import Pack
 from gmem_jax.provenance import provenance
@@ -23,9 +25,11 @@ class RecallConfig(BaseModel):
 
     pack: str
     signals: str = "six"
-    friction: Literal["hooke"] = "hooke"
+    friction: Literal["hooke", "m1", "m2"] = "hooke"
     mu: float = Field(1.0, ge=0.0)
-    stiffness: float = Field(0.145, gt=0.0)
+    stiffness: float | None = Field(None, gt=0.0)
+    p_max: float = Field(0.2, gt=0.0)
+    points: int = Field(100, ge=3)
     delta0: float | None = Field(None, gt=0.0, lt=0.5)
     gamma0: float = Field(1e-3, gt=0.0, lt=0.5)
     t0: float = Field(1.8e3, gt=0.0)
@@ -50,7 +54,12 @@ class RecallConfig(BaseModel):
 
     def law(self) -> FrictionLaw:
         """The friction law."""
-        return Hooke(mu=self.mu, stiffness=self.stiffness)
+        own: dict[str, Any] = {} if self.stiffness is None else {"stiffness": self.stiffness}
+        if self.friction == "m1":
+            return MindlinRescaled(mu=self.mu, **own)
+        if self.friction == "m2":
+            return Mindlin(mu=self.mu, p_max=self.p_max, points=self.points, **own)
+        return Hooke(mu=self.mu, **own)
 
     def arguments(self) -> dict[str, Any]:
         """Keyword arguments of `run_memory`."""
@@ -68,6 +77,7 @@ class RecallConfig(BaseModel):
                 "mass": float(pack.clump.mass),
                 "diameter": float(pack.clump.diameter),
             },
+            "law": repr(self.law()),
             "pack_record": pack.info,
             "material": asdict(Material()),
             "seconds": seconds,

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gmem_jax.contact.friction import FrictionLaw
+from gmem_jax.contact.friction import FrictionLaw, largest_overlap
 from gmem_jax.contact.kinematics import kinematics
 from gmem_jax.contact.normal import hertz
 from gmem_jax.contact.wall import wall_forces
@@ -268,6 +268,15 @@ def observe(system: System, state: State, box: Box, pressure: jax.Array) -> Samp
     )
 
 
+def end_bin(system: System, state: State, box: Box, pressure: jax.Array) -> tuple[State, Sample]:
+    """Check the state at the end of a bin and take its sample; `pressure` is the bin's average, [3, B]."""
+    state = check(system, state, box)
+    sample = observe(system, state, box, pressure)
+    beyond = sample.largest_overlap > largest_overlap(system.friction)
+    bits = jnp.where(beyond, int(Status.OVERLAP_RANGE), 0).astype(jnp.int32)
+    return replace(state, status=state.status | bits), sample
+
+
 def advance(
     system: System,
     state: State,
@@ -307,8 +316,6 @@ def advance(
         done = bin_index * steps
         empty = jnp.zeros((3, state.replicas), state.grains.position.dtype)
         state, total, _ = lax.fori_loop(0, steps, jax.checkpoint(one_step), (state, empty, done))
-        box = motion.box_at((done + steps) * dt)
-        state = check(system, state, box)
-        return state, observe(system, state, box, total / steps)
+        return end_bin(system, state, motion.box_at((done + steps) * dt), total / steps)
 
     return lax.scan(jax.checkpoint(one_bin), state, first_bin + jnp.arange(bins))

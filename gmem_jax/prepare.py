@@ -26,6 +26,7 @@ from gmem_jax.run import Progress, RunFailedError, Runner, compiled, refuse, req
 from gmem_jax.state import Grains, still_box
 
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
+PRESSING = 2.0e4  # t_c that pressing and settling took at N = 325, for the progress bar
 CYCLE_SKIN = 0.5  # in R; frictionless grains turn freely, so a list lasts only some 50 t_c
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
@@ -145,7 +146,7 @@ class _Preparation:
         state = accelerate(system, replace(state, grains=grains), box)
         per_t0 = recipe.t0 / float(dt)
         cycle = 2.0 + recipe.rest + recipe.hold
-        expected = (recipe.gas_time + 3.0e3) / float(dt) + (recipe.cycles * cycle + recipe.rest) * per_t0
+        expected = (recipe.gas_time + PRESSING) / float(dt) + (recipe.cycles * cycle + recipe.rest) * per_t0
         self.runner = Runner(system, state, box, float(dt), finder, progress=progress, total_work=expected)
         self.log: dict[str, Sample] = {}
 

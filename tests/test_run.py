@@ -54,7 +54,7 @@ def test_a_broken_run_stops_and_names_the_stage() -> None:
     position = runner.state.grains.position.at[0, 0, 0].set(jnp.nan)
     runner.state = replace(runner.state, grains=replace(runner.state.grains, position=position))
     box = runner.box
-    with pytest.raises(gm.RunFailedError, match="doomed: .*not a finite number"):
+    with pytest.raises(gm.RunFailedError, match=r"doomed: .*not a finite number"):
         runner.stage("doomed", Motion(box.lower, box.upper, 0.0, 0.0, 0.0, 1.0), bins=1, steps=1)
 
 

@@ -110,6 +110,10 @@ class Mindlin:
             jnp.zeros((contacts, self.points, 3, replicas), dtype), jnp.zeros((contacts, 1, replicas), dtype)
         )
 
+    def outermost(self, x: jax.Array) -> jax.Array:
+        """The ring jp that a contact reaching to x = sqrt(p) / dq fills in part; a whole number, in the shape of x."""
+        return jnp.minimum(jnp.floor(x), self.points - 2)
+
     def weights(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """How each point counts in the force of a contact that reaches to x = sqrt(p) / dq > 0.
 
@@ -120,7 +124,7 @@ class Mindlin:
             Whether a point carries force, [P, Q, 1, B]; its weight; and the sum of the weights, [P, 1, B].
         """
         points = jnp.arange(self.points)[:, None, None]
-        outermost = jnp.minimum(jnp.floor(x), self.points - 2)[:, None]
+        outermost = self.outermost(x)[:, None]
         inside = points <= outermost
         weight = jnp.where(points == outermost, x[:, None] - outermost, 1.0)
         if self.variant != "paper":
@@ -128,27 +132,31 @@ class Mindlin:
         inside &= x[:, None] > 0.5
         return inside, jnp.where(inside, weight - 0.5 * (points == 0), 0.0), jnp.where(x > 0.5, x - 0.5, 1.0)
 
-    def _diluted(self, history: LayeredHistory, layers: jax.Array, weight: jax.Array) -> jax.Array:
-        """Layers whose force w f stays while w grows."""
+    def _diluted(self, history: LayeredHistory, layers: jax.Array, x: jax.Array) -> jax.Array:
+        """The layers after the contact grew to x: the force w f of the ring that was partly filled stays."""
         known = history.overlap > 0.0
         reached = jnp.where(known, jnp.sqrt(jnp.where(known, history.overlap, 1.0)) / self.spacing, 0.0)
-        _, filled, _ = self.weights(reached)
+        ring = self.outermost(reached)
+        filled, weight = reached - ring, jnp.where(self.outermost(x) > ring, 1.0, x - ring)
         grows = filled < weight
-        return layers * jnp.where(grows, filled / jnp.where(grows, weight, 1.0), 1.0)
+        dilution = jnp.where(grows, filled / jnp.where(grows, weight, 1.0), 1.0)
+        points = jnp.arange(self.points)[:, None, None]
+        return layers * jnp.where(points == ring[:, None], dilution[:, None], 1.0)
 
     def __call__(
         self, kin: Kinematics, normal_force: jax.Array, history: LayeredHistory
     ) -> tuple[jax.Array, LayeredHistory]:
         """Tangential force on sphere i and the new history; see `FrictionLaw`."""
         root = jnp.sqrt(kin.safe_overlap)
-        inside, weight, total = self.weights(root / self.spacing)
+        x = root / self.spacing
+        inside, weight, total = self.weights(x)
         inside &= kin.touching[:, None]
         half_step = (0.5 * self.stiffness * kin.dt) * kin.sliding
         dashpot = (self.stiffness * self.damping_time) * root * kin.sliding
 
         layers = transport_layers(history.layers, kin)
         if self.variant == "averaged":
-            layers = self._diluted(history, layers, weight)
+            layers = self._diluted(history, layers, x)
         layers = jnp.where(inside, layers + half_step[:, None], 0.0)
         trial = self.spacing * jnp.sum(weight * layers, axis=1) + dashpot
         force, _ = coulomb(trial, self.mu * normal_force)

@@ -19,8 +19,8 @@ from gmem_jax import dynamics
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.frictionless import Frictionless
 from gmem_jax.contact.hooke import Hooke
-from gmem_jax.contact.mindlin import LayeredHistory, Mindlin
-from gmem_jax.contact.mindlin_rescaled import MindlinRescaled, RescaledHistory
+from gmem_jax.contact.mindlin import Mindlin
+from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.drive import Motion
 from gmem_jax.dynamics import Sample, System
 from gmem_jax.native.build import LIBRARY
@@ -147,9 +147,7 @@ def advance(
             state, total = lax.fori_loop(0, (steps + _PART - 1) // _PART, next_part, (state, nothing))
         else:
             state, total = part(state, begun, int(steps), steps)
-        box = motion.box_at((begun + steps) * dt)
-        state = dynamics.check(system, state, box)
-        return state, dynamics.observe(system, state, box, total / steps)
+        return dynamics.end_bin(system, state, motion.box_at((begun + steps) * dt), total / steps)
 
     return lax.scan(jax.checkpoint(one_bin), state, first_bin + jnp.arange(bins))
 
@@ -241,7 +239,7 @@ def _plain_bin(
 def _bin_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
     """The tangent of the plain definition, with respect to what is being differentiated and no more."""
     leaves, structure = jax.tree.flatten(primals)
-    slopes = structure.flatten_up_to(tangents)
+    slopes = jax.tree.leaves(tangents)
     active = [place for place, slope in enumerate(slopes) if not isinstance(slope, jax.custom_derivatives.SymbolicZero)]
 
     def plain(*varied: jax.Array) -> _Result:

@@ -49,15 +49,19 @@ struct Engine {
   V* hot;         // [units, kHot]
   V* cold;        // [units, kCold]
   double* walls;  // partial sums, [chunks, 2, 3] in the mode's own layout
+  V* fastest;     // squares of the largest half-step velocity and spin, [chunks, 2]
   V parameter[kParameters];
   V inverse_mass, inverse_inertia[3];
+  double arm;           // of the outermost sphere of a grain
+  double travel = 0.0;  // how much closer any two spheres can have come since the call began
 
   static std::size_t carve(const Problem& p, const Block& block, Carver& carver, Engine* engine) {
     const std::size_t units = Mode::units(p);
     V* hot = carver.take<V>(units * kHot);
     V* cold = carver.take<V>(units * kCold);
     double* walls = carver.take<double>(static_cast<std::size_t>(chunks(p)) * 6 * W);
-    if (engine) engine->hot = hot, engine->cold = cold, engine->walls = walls;
+    V* fastest = carver.take<V>(static_cast<std::size_t>(chunks(p)) * 2);
+    if (engine) engine->hot = hot, engine->cold = cold, engine->walls = walls, engine->fastest = fastest;
     return Mode::carve(p, *block.pack->plan, carver, engine ? &engine->mode : nullptr);
   }
 
@@ -71,6 +75,12 @@ struct Engine {
     for (int row = 0; row < kParameters; ++row) parameter[row] = mode.per_lane(&Lane::parameters, row);
     inverse_mass = splat(1.0) / parameter[kMass];
     for (int axis = 0; axis < 3; ++axis) inverse_inertia[axis] = splat(1.0) / parameter[kInertia + axis];
+    arm = 0.0;
+    for (int k = 0; k < problem.spheres_per_grain; ++k) {
+      const double* body = block.pack->offsets + 3 * k;
+      const double length = __builtin_sqrt(body[0] * body[0] + body[1] * body[1] + body[2] * body[2]);
+      arm = length > arm ? length : arm;
+    }
   }
 
   WallState walls_at(int step) const {
@@ -80,7 +90,7 @@ struct Engine {
   }
 
   // First half of a step of unit u: positions, orientations and predicted velocities at its end, and wall forces.
-  void begin(int u, const WallState& box, double* wall_sums) {
+  void begin(int u, const WallState& box, double* wall_sums, V* speeds) {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
     const V dt = parameter[kDt], half_dt = splat(0.5) * dt;
@@ -92,6 +102,8 @@ struct Engine {
     const Quaternion orientation = turn({c[kQuaternion], load_vec(c + kQuaternion + 1)}, dt * half_spin);
     c[kQuaternion] = orientation.w;
     store_vec(c + kQuaternion + 1, orientation.v);
+    speeds[0] = max(speeds[0], dot(half_velocity, half_velocity));
+    speeds[1] = max(speeds[1], dot(half_spin, half_spin));
     store_vec(c + kAcceleration, half_velocity);
     store_vec(c + kSpinRate, half_spin);
     store_vec(h + kPosition, position);
@@ -130,7 +142,10 @@ struct Engine {
   Vec wall_force(Vec overlap, Vec closing) const {
     const V one = splat(1.0), zero{};
     const V stiffness = parameter[kWallStiffness], damping = parameter[kNormalDamping];
-    const auto axis = [&](V p, V c) { return hertz(p > zero, select(p > zero, p, one), c, stiffness, damping); };
+    const auto axis = [&](V p, V c) { 
+      const V safe = select(p > zero, p, one);
+      return hertz(p > zero, safe, root(safe), c, stiffness, damping);
+    };
     return {axis(overlap.x, closing.x), axis(overlap.y, closing.y), axis(overlap.z, closing.z)};
   }
 
@@ -166,22 +181,37 @@ struct Engine {
     team.share(Team::kGrains, rank, chunks(problem));
     for (int chunk; team.take(Team::kGrains, rank, &chunk);) {
       double* sums = walls + static_cast<std::size_t>(chunk) * 6 * W;
-      if (begins) std::memset(sums, 0, 6 * W * sizeof(double));
+      V* speeds = fastest + 2 * static_cast<std::size_t>(chunk);
+      if (begins) {
+        std::memset(sums, 0, 6 * W * sizeof(double));
+        speeds[0] = speeds[1] = V{};
+      }
       const int first = Mode::unit_of(chunk * kChunk), last = Mode::unit_of((chunk + 1) * kChunk);
       for (int u = first; u < last && u < Mode::units(problem); ++u) {
         if (ends) finish(u);
-        if (begins) begin(u, box, sums);
+        if (begins) begin(u, box, sums, speeds);
       }
     }
     team.barrier();
+    if (begins) add_travel();
+  }
+
+  // A sphere moves by at most dt (|v| + |spin| arm) in a step; two may approach each other by twice that.
+  void add_travel() {
+    V speed{}, spin{};
+    for (int chunk = 0; chunk < chunks(problem); ++chunk) {
+      speed = max(speed, fastest[2 * chunk]);
+      spin = max(spin, fastest[2 * chunk + 1]);
+    }
+    const V step = parameter[kDt] * fma(splat(arm), root(spin), root(speed));
+    travel += 2.0 * (1.0 + 1e-9) * largest(step);
   }
 
   void contacts() {
-    const LawParameters law{parameter[kLaw], parameter[kLaw + 1], parameter[kLaw + 2], parameter[kLaw + 3],
-                            splat(1.0) / parameter[kLaw + 3]};
+    const LawParameters law(parameter + kLaw, parameter[kDt]);
     team.share(Team::kContacts, rank, plan.domains);
     for (int domain; team.take(Team::kContacts, rank, &domain);)
-      mode.contacts(plan.domain_candidate[domain], plan.domain_candidate[domain + 1], parameter, law);
+      mode.contacts(plan.domain_candidate[domain], plan.domain_candidate[domain + 1], parameter, law, travel);
     team.barrier();
   }
 

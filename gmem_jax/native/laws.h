@@ -1,41 +1,101 @@
 // The contact laws, term by term those of gmem_jax/contact. Included inside the instruction set's namespace.
 
+// A contact under way. Its computation is cut into passes over a batch of contacts that fits into the nearest cache:
+// taken alone, a contact is a long chain of operations that wait for each other, more than the processor can look
+// ahead; in a pass it meets many short ones.
 struct Contact {
-  Mask touching;
-  Vec normal;   // from i to j
-  V overlap;    // 1 where apart, so that roots stay finite
-  Vec sliding;  // relative velocity of the surfaces in the tangent plane
-  V cosine, sine;  // of the turn about the normal in this step
-  V dt;
+  Vec normal;                  // from i to j; the separation of the centres at first
+  Vec sliding;                 // relative velocity of the surfaces in the tangent plane; all of it at first
+  Vec lever_one, lever_other;  // from the grains' centres to the contact point
+  Vec spin_sum;
+  Vec force;                   // tangential, on i
+  V overlap;                   // negative where apart
+  V root_overlap;              // of 1 where apart
+  V normal_force;
+  V turned;                    // half the angle by which the contact turns about its normal in this step
+  V square;                    // of the length to be inverted next
+  V inverse;
+  V before;                    // square of the force before it was flattened
+  V* history;
+
+  Mask touching() const { return overlap > V{}; }
+  V safe_overlap() const { return select(touching(), overlap, splat(1.0)); }
 };
 
+// 1 / sqrt(square) of a batch.
+inline void invert_roots(Contact* c, int count) {
+  for (int n = 0; n < count; ++n) c[n].inverse = inverse_root(c[n].square);
+}
+
+// A law's parameters, and products of them that every contact needs.
 struct LawParameters {
   V mu, stiffness, damping_time, spacing, inverse_spacing;
+  V half_step;  // stiffness dt / 2: what half a step of sliding adds to an elastic force
+  V dashpot;    // stiffness times damping time
+  V half_dt;
+
+  LawParameters(const V* rows, V dt)
+      : mu(rows[0]), stiffness(rows[1]), damping_time(rows[2]), spacing(rows[3]), inverse_spacing(splat(1.0) / rows[3]),
+        half_step(splat(0.5) * rows[1] * dt), dashpot(rows[1] * rows[2]), half_dt(splat(0.5) * dt) {}
 };
 
 // f = k p^1.5 + gamma p^0.5 dp/dt, never attractive.
-inline V hertz(Mask touching, V overlap, V closing, V stiffness, V damping_time) {
-  const V force = stiffness * root(overlap) * fma(damping_time, closing, overlap);
+GMEM_INLINE V hertz(Mask touching, V overlap, V root_overlap, V closing, V stiffness, V damping_time) {
+  const V force = stiffness * root_overlap * fma(damping_time, closing, overlap);
   return zero_unless(touching & (force > V{}), force);
 }
 
-// Carry a tangential force along: project, restore the magnitude, turn about the normal.
-inline Vec transport(const Contact& c, Vec force) {
-  const Vec flat = fnma(dot(force, c.normal), c.normal, force);
-  const V before = dot(force, force);
-  const V product = before * dot(flat, flat);
+// How a tangential force is carried along in this step: projected on the tangent plane with its magnitude restored,
+// and turned about the normal by the Cayley map, whose denominator is restored with the magnitude.
+struct Transport {
+  Vec normal;
+  V cosine, sine, denominator2;
+
+  GMEM_INLINE explicit Transport(const Contact& c) : normal(c.normal) {
+    const V one = splat(1.0), denominator = fma(c.turned, c.turned, one);
+    cosine = fnma(c.turned, c.turned, one);
+    sine = c.turned + c.turned;
+    denominator2 = denominator * denominator;
+  }
+
+  // First part: flattens `force`; returns the square whose inverse root the second part wants.
+  GMEM_INLINE V flatten(Vec& force, V& before) const {
+    const V along_normal = dot(force, normal);
+    before = dot(force, force);
+    force = fnma(along_normal, normal, force);
+    return (before * denominator2) * fnma(along_normal, along_normal, before);
+  }
+
   // Forces below 1e-70, whose squares would underflow, are not worth a magnitude.
-  const V stretch = select(product > splat(1e-280), before * inverse_root(product), splat(1.0));
-  const V along = stretch * c.cosine, across = stretch * c.sine;
-  return fma(across, cross(c.normal, flat), along * flat);
+  GMEM_INLINE Vec restore(Vec flat, V before, V square, V inverse) const {
+    const V scale = select(square > splat(1e-280), before * inverse, splat(1.0));
+    return fma(scale * sine, cross(normal, flat), (scale * cosine) * flat);
+  }
+};
+
+// Carry the force in the histories of a batch along, times `factor(contact)`, and add `push(contact)` times sliding.
+template <class Factor, class Push>
+inline void carry(Contact* c, int count, const Factor& factor, const Push& push) {
+  for (int n = 0; n < count; ++n) {
+    c[n].force = load_vec(c[n].history);
+    c[n].square = Transport(c[n]).flatten(c[n].force, c[n].before);
+  }
+  invert_roots(c, count);
+  for (int n = 0; n < count; ++n) {
+    const Vec carried = Transport(c[n]).restore(c[n].force, c[n].before, c[n].square, c[n].inverse);
+    c[n].force = fma(push(c[n]), c[n].sliding, factor(c[n], carried));
+  }
 }
 
-// The factor that takes a trial force back to the friction limit.
-inline V coulomb(Vec trial, V limit) {
-  const V square = dot(trial, trial), square_limit = limit * limit;
-  if (!bits_less(square_limit, square)) return splat(1.0);
-  const Mask slides = square > square_limit;
-  return select(slides, limit * inverse_root(select(slides, square, splat(1.0))), splat(1.0));
+// Take the trial forces of a batch back to the friction limit.
+inline void coulomb(Contact* c, int count, V mu) {
+  for (int n = 0; n < count; ++n) c[n].square = dot(c[n].force, c[n].force);
+  invert_roots(c, count);
+  for (int n = 0; n < count; ++n) {
+    const V limit = mu * c[n].normal_force;
+    const V scale = select(c[n].square > limit * limit, limit * c[n].inverse, splat(1.0));
+    c[n].force = zero_unless(c[n].touching(), scale * c[n].force);
+  }
 }
 
 struct Frictionless {
@@ -64,112 +124,118 @@ struct Layered {
   static constexpr Variant variant = variant_;
 };
 
-struct NoLayers {};
-
-inline Vec friction(Frictionless, const Contact&, V, const LawParameters&, V*, NoLayers&) { return {V{}, V{}, V{}}; }
-
-inline Vec friction(Hooke, const Contact& c, V normal_force, const LawParameters& law, V* history, NoLayers&) {
-  const V half = splat(0.5) * law.stiffness * c.dt;
-  const V damping = law.stiffness * law.damping_time;
-  const Vec elastic = fma(half, c.sliding, transport(c, load_vec(history)));
-  const Vec trial = fma(damping, c.sliding, elastic);
-  const Vec force = zero_unless(c.touching, coulomb(trial, law.mu * normal_force) * trial);
-  store_vec(history, zero_unless(c.touching, fma(half - damping, c.sliding, force)));
-  return force;
+GMEM_INLINE void friction(Frictionless, Contact* c, int count, const LawParameters&) {
+  for (int n = 0; n < count; ++n) c[n].force = Vec{V{}, V{}, V{}};
 }
 
-inline Vec friction(Rescaled, const Contact& c, V normal_force, const LawParameters& law, V* history, NoLayers&) {
+GMEM_INLINE void friction(Hooke, Contact* c, int count, const LawParameters& law) {
+  const V push = law.half_step + law.dashpot, rest = law.half_step - law.dashpot;
+  carry(c, count, [](const Contact&, Vec carried) { return carried; }, [&](const Contact&) { return push; });
+  coulomb(c, count, law.mu);
+  for (int n = 0; n < count; ++n)
+    store_vec(c[n].history, zero_unless(c[n].touching(), fma(rest, c[n].sliding, c[n].force)));
+}
+
+GMEM_INLINE void friction(Rescaled, Contact* c, int count, const LawParameters& law) {
   const V one = splat(1.0);
-  const Mask unloads = c.touching & (c.overlap < history[3]);
-  const V spring = law.stiffness * root(c.overlap);
-  const V half = splat(0.5) * c.dt * spring;
-  const V damping = law.damping_time * spring;
-  const V ratio = root(select(unloads, c.overlap, one) / select(unloads, history[3], one));
-  const Vec elastic = fma(half, c.sliding, ratio * transport(c, load_vec(history)));
-  const Vec trial = fma(damping, c.sliding, elastic);
-  const Vec force = zero_unless(c.touching, coulomb(trial, law.mu * normal_force) * trial);
-  store_vec(history, zero_unless(c.touching, fma(half - damping, c.sliding, force)));
-  history[3] = zero_unless(c.touching, c.overlap);
-  return force;
+  const V push = law.stiffness * (law.half_dt + law.damping_time), rest = law.stiffness * (law.half_dt - law.damping_time);
+  // sqrt(p / p_old) on unloading; sqrt(p) has been left in `root_overlap`.
+  const auto rescaled = [&](const Contact& now, Vec carried) {
+    const Mask unloads = now.touching() & (now.overlap < now.history[3]);
+    const V ratio = root(select(unloads, now.safe_overlap(), one) / select(unloads, now.history[3], one));
+    return ratio * carried;
+  };
+  carry(c, count, rescaled, [&](const Contact& now) { return push * now.root_overlap; });
+  coulomb(c, count, law.mu);
+  for (int n = 0; n < count; ++n) {
+    store_vec(c[n].history, zero_unless(c[n].touching(), fma(rest * c[n].root_overlap, c[n].sliding, c[n].force)));
+    c[n].history[3] = zero_unless(c[n].touching(), c[n].overlap);
+  }
 }
 
 // Where a contact stands in its rings: `x` rings reached, the outermost number `outer` filled in part.
 struct Reach {
   V x, outer;
-};
 
-inline Reach reach(V root_overlap, const LawParameters& law, int points) {
-  const V x = root_overlap * law.inverse_spacing;
-  const V last = splat(points - 2.0);
-  return {x, select(x < last, floor_of(select(x < last, x, V{})), last)};
-}
+  Reach(V root_overlap, const LawParameters& law, int points) : x(root_overlap * law.inverse_spacing) {
+    const V last = splat(points - 2.0);
+    outer = select(x < last, floor_of(select(x < last, x, V{})), last);
+  }
+};
 
 // How much point `j` counts, by "exact" weights.
 inline V weight(const Reach& r, V j) {
   return zero_unless(j <= r.outer, select(j < r.outer, splat(1.0), r.x - j));
 }
 
-// Layers: `get(j)`, `set(j, f)`; `reached()`: all layers beyond are zero, in `get` too; `reached(jmax)`.
+// One contact. `layers` has `get(j)`, zero beyond the layers that are stored; `set(j, f)`; `stored(j)`, what `set`
+// stored; and `keep(count)`, after which the others are zero.
 template <Variant variant, class Layers>
-inline Vec friction(Layered<variant>, const Contact& c, V normal_force, const LawParameters& law, V* history,
-                    Layers& layers) {
-  const V one = splat(1.0);
-  const V root_overlap = root(c.overlap);
-  const Reach now = reach(root_overlap, law, layers.points());
-  const Vec half_step = (splat(0.5) * law.stiffness * c.dt) * c.sliding;
-  const Vec dashpot = (law.stiffness * law.damping_time * root_overlap) * c.sliding;
-  Mask attached = c.touching;
+void friction(Layered<variant>, Contact& c, const LawParameters& law, Layers layers) {
+  const V one = splat(1.0), half = splat(0.5);
+  const Mask touching = c.touching();
+  const Transport transport(c);
+  const Reach now(c.root_overlap, law, layers.points());
+  const Vec half_step = law.half_step * c.sliding;
+  Mask attached = touching;
   V total = now.x;
   if (variant == Variant::paper) {
-    attached &= now.x > splat(0.5);
-    total = select(now.x > splat(0.5), now.x - splat(0.5), one);
+    attached &= now.x > half;
+    total = select(now.x > half, now.x - half, one);
   }
-  Reach before{V{}, V{}};
-  if (variant == Variant::averaged) before = reach(root(history[0]), law, layers.points());
+  const Reach before(variant == Variant::averaged ? root(c.history[0]) : V{}, law, layers.points());
 
-  // Rings below `plain` are whole in every lane, before and now, and need no masks.
-  const int end = static_cast<int>(largest(zero_unless(c.touching, now.outer))) + 1;
+  // Rings below `whole` are filled in every lane, before and now, and need no masks.
+  const int end = static_cast<int>(largest(zero_unless(touching, now.outer))) + 1;
   const bool all = !bits_less(zero_unless(attached, one), one);
-  int plain = all ? static_cast<int>(smallest(now.outer)) : 0;
-  if (variant == Variant::averaged) plain = plain < static_cast<int>(smallest(before.outer)) ? plain : static_cast<int>(smallest(before.outer));
+  int whole = all ? static_cast<int>(smallest(now.outer)) : 0;
+  if (variant == Variant::averaged) {
+    const int whole_before = static_cast<int>(smallest(before.outer));
+    whole = whole < whole_before ? whole : whole_before;
+  }
+  constexpr int kLayers = 8;  // taken along together, for the same reason as contacts
+  Vec f[kLayers];
+  V squared[kLayers], product[kLayers], inverse[kLayers];
   Vec sum{V{}, V{}, V{}};
-  int j = 0;
-  if (variant == Variant::paper && plain > 0) {
-    const Vec f = transport(c, layers.get(0)) + half_step;
-    layers.set(0, f);
-    sum = splat(0.5) * f;
-    j = 1;
-  }
-  for (; j < plain; ++j) {
-    const Vec f = transport(c, layers.get(j)) + half_step;
-    layers.set(j, f);
-    sum = sum + f;
-  }
-  for (; j < end; ++j) {
-    const V at = splat(j);
-    V w = weight(now, at);
-    Vec f = transport(c, layers.get(j));
-    if (variant == Variant::averaged) {
-      const V filled = weight(before, at);
-      const Mask grows = filled < w;
-      f = select(grows, filled / select(grows, w, one), one) * f;
+  for (int first = 0; first < end; first += kLayers) {
+    const int count = end - first < kLayers ? end - first : kLayers;
+    for (int n = 0; n < count; ++n) {
+      f[n] = layers.get(first + n);
+      product[n] = transport.flatten(f[n], squared[n]);
     }
-    if (variant == Variant::paper && j == 0) w = w - splat(0.5);
-    const Mask inside = attached & (at <= now.outer);
-    f = zero_unless(inside, f + half_step);
-    layers.set(j, f);
-    sum = fma(zero_unless(inside, w), f, sum);
+    for (int n = 0; n < count; ++n) inverse[n] = inverse_root(product[n]);
+    for (int n = 0; n < count; ++n) {
+      const int j = first + n;
+      const V at = splat(j);
+      Vec carried = transport.restore(f[n], squared[n], product[n], inverse[n]);
+      if (j < whole) {
+        carried = carried + half_step;
+        sum = variant == Variant::paper && j == 0 ? half * carried : sum + carried;
+      } else {
+        V w = weight(now, at);
+        if (variant == Variant::averaged) {  // the force in a ring that fills stays
+          const V filled = weight(before, at);
+          const Mask grows = filled < w;
+          carried = select(grows, filled / select(grows, w, one), one) * carried;
+        }
+        if (variant == Variant::paper && j == 0) w = w - half;
+        const Mask inside = attached & (at <= now.outer);
+        carried = zero_unless(inside, carried + half_step);
+        sum = fma(zero_unless(inside, w), carried, sum);
+      }
+      layers.set(j, carried);
+    }
   }
-  const Vec trial = fma(law.spacing, sum, dashpot);
-  const V scale = coulomb(trial, law.mu * normal_force);
-  const Vec force = scale * trial;
-  const Vec correction = fma(V{} + one / (law.spacing * total), force - trial, half_step);
-  for (j = 0; j < plain; ++j) layers.set(j, layers.get_now(j) + correction);
+  const Vec trial = fma(law.spacing, sum, (law.dashpot * c.root_overlap) * c.sliding);
+  c.force = trial;
+  coulomb(&c, 1, law.mu);
+  const Vec correction = fma(one / (law.spacing * total), c.force - trial, half_step);
+  int j = 0;
+  for (; j < whole; ++j) layers.set(j, layers.stored(j) + correction);
   for (; j < end; ++j) {
     const Mask inside = attached & (splat(j) <= now.outer);
-    layers.set(j, zero_unless(inside, layers.get_now(j) + correction));
+    layers.set(j, zero_unless(inside, layers.stored(j) + correction));
   }
-  layers.reached(end - 1);
-  history[0] = zero_unless(c.touching, c.overlap);
-  return zero_unless(c.touching, force);
+  layers.keep(end);
+  c.history[0] = zero_unless(touching, c.overlap);
 }

@@ -3,6 +3,7 @@
 
 struct Marks {
   bool* touched;       // in any lane, at the last step: only then is there a history to forget
+  double* wake;        // the travel at which it may next touch: until then it need not be looked at
   int* reached;        // Mindlin: the last layer that is stored; those beyond are zero
   int* reached_first;  // ... and was at the beginning of the call
 };
@@ -11,9 +12,10 @@ template <class Law>
 void carve_marks(const Plan& plan, Carver& carver, Marks* marks) {
   const std::size_t count = static_cast<std::size_t>(plan.candidates) + 1;  // and a dummy
   bool* touched = carver.take<bool>(count);
+  double* wake = carver.take<double>(count);
   int* reached = carver.take<int>(Law::kLayered ? count : 0);
   int* first = carver.take<int>(Law::kLayered ? count : 0);
-  if (marks) *marks = {touched, reached, first};
+  if (marks) *marks = {touched, wake, reached, first};
 }
 
 // The last layer that an overlap fills, and one more: its root may differ from JAX's in the last digit.

@@ -72,6 +72,7 @@ struct Packed {
   void load_history(std::ptrdiff_t c) {
     const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = true;
+    marks.wake[c] = 0.0;
     for (int q = 0; q < Law::kHistory; ++q) {
       const Place place = place_of<Law>(row, q);
       history[c][q] = lane.history_in[place.leaf][place.row * problem.stride];
@@ -181,7 +182,7 @@ struct Packed {
         if (j <= *last[l]) f.x[l] = at[l][3 * j], f.y[l] = at[l][3 * j + 1], f.z[l] = at[l][3 * j + 2];
       return f;
     }
-    Vec get_now(int j) const {
+    Vec stored(int j) const {
       Vec f;
       for (int l = 0; l < W; ++l) f.x[l] = at[l][3 * j], f.y[l] = at[l][3 * j + 1], f.z[l] = at[l][3 * j + 2];
       return f;
@@ -189,102 +190,144 @@ struct Packed {
     void set(int j, Vec f) {
       for (int l = 0; l < W; ++l) at[l][3 * j] = f.x[l], at[l][3 * j + 1] = f.y[l], at[l][3 * j + 2] = f.z[l];
     }
-    void reached(int j) {
-      for (int l = 0; l < W; ++l) *last[l] = j;
+    void keep(int kept) {
+      for (int l = 0; l < W; ++l) *last[l] = kept - 1;
     }
   };
 
-  // First find which candidates touch, then compute those, W at a time.
-  void contacts(int first, int end, const V* parameter, const LawParameters& law) {
+  // Find which candidates touch, then compute those.
+  void contacts(int first, int end, const V* parameter, const LawParameters& law, double travel) {
     constexpr int kBatch = 32 * W;
+    Group group[kBatch / W];
+    Contact contact[kBatch / W];
+    V memory[kBatch / W][4];
     const Candidate* candidate = plan.candidate;
-    int touching[kBatch + W];
+    int touching[kBatch + 1];
     for (int batch = first; batch < end; batch += kBatch) {
       const int batch_end = batch + kBatch < end ? batch + kBatch : end;
-      int count = 0;
-      for (int start = batch; start < batch_end; start += W) {
-        const auto number = [&](int l) { return start + l < batch_end ? start + l : start; };
-        const Vec separation = columns(load_rows([&](int l) { return sphere + candidate[number(l)].other; }) -
-                                       load_rows([&](int l) { return sphere + candidate[number(l)].one; }));
-        const unsigned near = bits_less(dot(separation, separation), splat(4.0));
-        for (int l = 0; l < W && start + l < batch_end; ++l) {
-          const int c = start + l;
-          const bool touches = near >> l & 1u;
-          if (marks.touched[c] && !touches) forget(c);
-          marks.touched[c] = touches;
+      int awake = 0, count = 0;
+      for (int c = batch; c < batch_end; ++c) {
+        touching[awake] = c;
+        awake += !(marks.wake[c] > travel);  // also where it is not a number
+      }
+      for (int start = 0; start < awake; start += W) {
+        const auto pair = [&](int l) -> const Candidate& {
+          return plan.candidate[touching[start + l < awake ? start + l : start]];
+        };
+        const Vec separation = columns(load_rows([&](int l) { return sphere + pair(l).other; }) -
+                                       load_rows([&](int l) { return sphere + pair(l).one; }));
+        const V square = dot(separation, separation);
+        const unsigned near = bits_less(square, splat(4.0));
+        for (int l = 0; l < W && start + l < awake; ++l) {
+          const int c = touching[start + l];
           touching[count] = c;
-          count += touches;
+          if (near >> l & 1u) {
+            marks.touched[c] = true;
+            ++count;
+          } else {
+            if (marks.touched[c]) forget(c);
+            marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(square[l]) - 2.0);
+          }
         }
       }
-      for (int start = 0; start < count; start += W) compute(touching + start, count - start, parameter, law);
+      const int groups = (count + W - 1) / W;
+      for (int n = 0; n < groups; ++n) {
+        group[n] = group_of(touching + n * W, count - n * W);
+        contact[n].history = memory[n];
+        read_history(group[n], memory[n]);
+        meet(meeting(group[n]), contact[n]);
+      }
+      close(contact, groups, parameter);
+      if constexpr (Law::kLayered) {
+        for (int n = 0; n < groups; ++n) friction(Law{}, contact[n], law, layers_of(group[n]));
+      } else {
+        friction(Law{}, contact, groups, law);
+      }
+      for (int n = 0; n < groups; ++n) {
+        write_history(group[n], memory[n]);
+        add(group[n], push(contact[n]));
+      }
     }
   }
 
   void forget(std::size_t c) {
+    marks.touched[c] = false;
     if constexpr (Law::kHistory > 0) history[c] = Row{};
     if constexpr (Law::kLayered) marks.reached[c] = -1;
     const int n = plan.candidate[c].guest;
     if (n >= 0) guest[2 * static_cast<std::size_t>(n)] = guest[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
 
-  void compute(const int* touching, int count, const V* parameter, const LawParameters& law) {
-    Candidate pair[W];
+  // W contacts; where there are fewer, the rest are dummies far apart.
+  struct Group {
+    int count;
     int c[W];
+    Candidate pair[W];
+  };
+
+  Group group_of(const int* touching, int count) const {
+    Group g;
+    g.count = count < W ? count : W;
     for (int l = 0; l < W; ++l) {
-      c[l] = l < count ? touching[l] : plan.candidates;
-      pair[l] = l < count ? plan.candidate[c[l]]
-                          : Candidate{dummy_sphere(), dummy_sphere() + 1, dummy_grain(), dummy_grain(), -1, 0};
+      g.c[l] = l < count ? touching[l] : plan.candidates;
+      g.pair[l] = l < count ? plan.candidate[g.c[l]]
+                            : Candidate{dummy_sphere(), dummy_sphere() + 1, dummy_grain(), dummy_grain(), -1, 0};
     }
-    const auto one = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[pair[l].grain_one].*row); }); };
-    const auto other = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[pair[l].grain_other].*row); }); };
-    const Rows centre_one = load_rows([&](int l) { return sphere + pair[l].one; });
-    const Rows centre_other = load_rows([&](int l) { return sphere + pair[l].other; });
+    return g;
+  }
+
+  GMEM_INLINE Meeting meeting(const Group& g) const {
+    const auto one = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); }); };
+    const auto other = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_other].*row); }); };
+    const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l].one; });
+    const Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l].other; });
     const Rows point = splat(0.5) * (centre_one + centre_other);
-    Meeting m;
-    m.separation = columns(centre_other - centre_one);
-    m.square = dot(m.separation, m.separation);
-    m.lever_one = columns(point - one(&GrainRows::position));
-    m.lever_other = columns(point - other(&GrainRows::position));
-    m.velocity = columns(other(&GrainRows::velocity) - one(&GrainRows::velocity));
-    m.spin_one = columns(one(&GrainRows::spin));
-    m.spin_other = columns(other(&GrainRows::spin));
-    V memory[4] = {};
-    if constexpr (Law::kHistory > 0) {
-      const Vec kept = columns(load_rows([&](int l) { return history + c[l]; }));
-      store_vec(memory, kept);
-      if constexpr (Law::kHistory == 4)
-        for (int l = 0; l < W; ++l) memory[3][l] = history[c[l]][3];
-    }
-    Push push;
-    if constexpr (Law::kLayered) {
-      Layers layers;
-      layers.count = problem.points;
-      for (int l = 0; l < W; ++l) {
-        layers.at[l] = layer + static_cast<std::size_t>(c[l]) * problem.points * 3;
-        layers.last[l] = marks.reached + c[l];
-      }
-      push = contact_push<Law>(m, parameter, law, memory, layers);
-    } else {
-      NoLayers none;
-      push = contact_push<Law>(m, parameter, law, memory, none);
-    }
+    return {columns(centre_other - centre_one),
+            columns(point - one(&GrainRows::position)),
+            columns(point - other(&GrainRows::position)),
+            columns(other(&GrainRows::velocity) - one(&GrainRows::velocity)),
+            columns(one(&GrainRows::spin)),
+            columns(other(&GrainRows::spin))};
+  }
+
+  void read_history(const Group& g, V* memory) const {
+    if constexpr (Law::kHistory > 0) store_vec(memory, columns(load_rows([&](int l) { return history + g.c[l]; })));
+    if constexpr (Law::kHistory > 3)
+      for (int l = 0; l < W; ++l) memory[3][l] = history[g.c[l]][3];
+  }
+
+  void write_history(const Group& g, const V* memory) {
     if constexpr (Law::kHistory > 0) {
       const Rows kept = rows_of(load_vec(memory));
       for (int l = 0; l < W; ++l) {
         Row row = row_of(kept, l);
-        if constexpr (Law::kHistory == 4) row[3] = memory[3][l];
-        history[c[l]] = row;
+        if constexpr (Law::kHistory > 3) row[3] = memory[3][l];
+        history[g.c[l]] = row;
       }
     }
-    const Rows force = rows_of(push.force), torque_one = rows_of(push.torque_one), torque_other = rows_of(push.torque_other);
+  }
+
+  Layers layers_of(const Group& g) {
+    Layers layers;
+    layers.count = problem.points;
+    for (int l = 0; l < W; ++l) {
+      layers.at[l] = layer + static_cast<std::size_t>(g.c[l]) * problem.points * 3;
+      layers.last[l] = marks.reached + g.c[l];
+    }
+    return layers;
+  }
+
+  GMEM_INLINE void add(const Group& g, const Push& push) {
+    const Rows force = rows_of(push.force);
+    const Rows torque_one = rows_of(push.torque_one), torque_other = rows_of(push.torque_other);
     Row f[W], t_one[W], t_other[W];
     for (int l = 0; l < W; ++l)
       f[l] = row_of(force, l), t_one[l] = row_of(torque_one, l), t_other[l] = row_of(torque_other, l);
-    for (int l = 0; l < W && l < count; ++l) add(pair[l], f[l], t_one[l], t_other[l]);
+    for (int l = 0; l < g.count; ++l) add(g.pair[l], f[l], t_one[l], t_other[l]);
   }
 
   // The lower-numbered grain is at home in this domain, the other may be elsewhere.
-  void add(const Candidate& pair, Row force, Row torque_one, Row torque_other) {
+  GMEM_INLINE void add(const Candidate& pair, Row force, Row torque_one, Row torque_other) {
     GrainRows &one = grain[pair.grain_one], &other = grain[pair.grain_other];
     const bool away_is_one = pair.grain_one > pair.grain_other;
     if (pair.guest < 0 || !away_is_one) one.force += force, one.torque += torque_one;

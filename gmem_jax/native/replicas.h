@@ -95,6 +95,7 @@ struct Replicas {
   void load_history(std::ptrdiff_t c) {
     const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = true;
+    marks.wake[c] = 0.0;
     for (int q = 0; q < Law::kHistory; ++q) {
       const Place place = place_of<Law>(row, q);
       history[c * Law::kHistory + q] =
@@ -187,25 +188,64 @@ struct Replicas {
     int count;
 
     int points() const { return count; }
-    Vec get(int j) const { return j <= *last ? load_vec(at + 3 * j) : Vec{V{}, V{}, V{}}; }
-    Vec get_now(int j) const { return load_vec(at + 3 * j); }
+    Vec get(int j) const { return j <= *last ? stored(j) : Vec{V{}, V{}, V{}}; }
+    Vec stored(int j) const { return load_vec(at + 3 * j); }
     void set(int j, Vec f) { store_vec(at + 3 * j, f); }
-    void reached(int j) { *last = j; }
+    void keep(int kept) { *last = kept - 1; }
   };
 
-  void contacts(int first, int end, const V* parameter, const LawParameters& law) {
+  // Find which candidates touch, then compute those.
+  void contacts(int first, int end, const V* parameter, const LawParameters& law, double travel) {
+    constexpr int kLook = 256, kBatch = GMEM_BATCH;
+    int touching[kLook + 1];
+    Contact contact[kBatch];
+    for (int look = first; look < end; look += kLook) {
+      const int count = find(look, look + kLook < end ? look + kLook : end, touching, travel);
+      for (int batch = 0; batch < count; batch += kBatch)
+        compute(touching + batch, count - batch < kBatch ? count - batch : kBatch, contact, parameter, law);
+    }
+  }
+
+  int find(int first, int end, int* touching, double travel) {
     const V contact_square = splat(4.0);
+    int awake = 0, count = 0;
     for (int c = first; c < end; ++c) {
+      touching[awake] = c;
+      awake += !(marks.wake[c] > travel);  // also where it is not a number
+    }
+    for (int n = 0; n < awake; ++n) {
+      const int c = touching[n];
       const Candidate& pair = plan.candidate[c];
       const Vec separation = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other)) -
                              load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
-      if (bits_less(dot(separation, separation), contact_square)) {
+      const V square = dot(separation, separation);
+      touching[count] = c;
+      if (bits_less(square, contact_square)) {
         marks.touched[c] = true;
-        compute(c, pair, parameter, law);
-      } else if (marks.touched[c]) {
-        forget(c, pair);
+        ++count;
+      } else {
+        if (marks.touched[c]) forget(c, pair);
+        marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(smallest(square)) - 2.0);
       }
     }
+    return count;
+  }
+
+  void compute(const int* touching, int count, Contact* contact, const V* parameter, const LawParameters& law) {
+    for (int n = 0; n < count; ++n) {
+      contact[n].history = history + static_cast<std::size_t>(touching[n]) * Law::kHistory;
+      meet(meeting(plan.candidate[touching[n]]), contact[n]);
+    }
+    close(contact, count, parameter);
+    if constexpr (Law::kLayered) {
+      for (int n = 0; n < count; ++n) {
+        const std::size_t c = touching[n];
+        friction(Law{}, contact[n], law, Layers{layer + c * problem.points * 3, marks.reached + c, problem.points});
+      }
+    } else {
+      friction(Law{}, contact, count, law);
+    }
+    for (int n = 0; n < count; ++n) add(plan.candidate[touching[n]], push(contact[n]));
   }
 
   void forget(std::size_t c, const Candidate& pair) {
@@ -216,30 +256,24 @@ struct Replicas {
       for (int q = 0; q < 6; ++q) guest[6 * static_cast<std::size_t>(pair.guest) + q] = V{};
   }
 
-  void compute(std::size_t c, const Candidate& pair, const V* parameter, const LawParameters& law) {
-    V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
-    V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
+  GMEM_INLINE Meeting meeting(const Candidate& pair) const {
+    const V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
+    const V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
     const Vec centre_one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
     const Vec centre_other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
     const Vec point = splat(0.5) * (centre_one + centre_other);
-    Meeting m;
-    m.separation = centre_other - centre_one;
-    m.square = dot(m.separation, m.separation);
-    m.lever_one = point - load_vec(one + kPosition);
-    m.lever_other = point - load_vec(other + kPosition);
-    m.velocity = load_vec(other + kVelocity) - load_vec(one + kVelocity);
-    m.spin_one = load_vec(one + kSpin);
-    m.spin_other = load_vec(other + kSpin);
-    V* memory = history + c * Law::kHistory;
-    Push push;
-    if constexpr (Law::kLayered) {
-      Layers layers{layer + c * problem.points * 3, marks.reached + c, problem.points};
-      push = contact_push<Law>(m, parameter, law, memory, layers);
-    } else {
-      NoLayers none;
-      push = contact_push<Law>(m, parameter, law, memory, none);
-    }
-    // The lower-numbered grain is at home in this domain, the other may be elsewhere.
+    return {centre_other - centre_one,
+            point - load_vec(one + kPosition),
+            point - load_vec(other + kPosition),
+            load_vec(other + kVelocity) - load_vec(one + kVelocity),
+            load_vec(one + kSpin),
+            load_vec(other + kSpin)};
+  }
+
+  // The lower-numbered grain is at home in this domain, the other may be elsewhere.
+  GMEM_INLINE void add(const Candidate& pair, const Push& push) {
+    V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
+    V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
     const bool away_is_one = pair.grain_one > pair.grain_other;
     if (pair.guest < 0 || !away_is_one) {
       store_vec(one + kForce, load_vec(one + kForce) + push.force);
@@ -251,7 +285,7 @@ struct Replicas {
     }
     if (pair.guest >= 0) {
       V* to = guest + 6 * static_cast<std::size_t>(pair.guest);
-      store_vec(to, away_is_one ? push.force : Vec{-push.force.x, -push.force.y, -push.force.z});
+      store_vec(to, away_is_one ? push.force : -push.force);
       store_vec(to + 3, away_is_one ? push.torque_one : push.torque_other);
     }
   }

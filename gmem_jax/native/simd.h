@@ -3,6 +3,8 @@
 //
 // Included by kernel.cc inside the namespace of one instruction set.
 
+#define GMEM_INLINE inline __attribute__((always_inline))
+
 #if defined(__AVX512F__)
 constexpr int W = 8;
 #elif defined(__AVX__)
@@ -63,23 +65,14 @@ inline unsigned bits_less(V a, V b) {
 }
 #endif
 
-// 1 / sqrt(a) of a positive normal number to about an ulp: an integer guess (3 %) and four Newton steps. Cheaper
-// than the divider, which takes some 40 cycles for a root and a quotient of eight lanes and cannot overlap them.
-inline V inverse_root(V a) {
-#ifdef GMEM_IEEE
-  return splat(1.0) / root(a);
-#elif defined(GMEM_RSQRT14)
-  V y = (V)_mm512_rsqrt14_pd((__m512d)a);
-  const V half = splat(0.5), h = half * a;
-  for (int step = 0; step < 2; ++step) y = fma(y, fnma(h * y, y, half), y);
-  return y;
+#ifdef GMEM_RSQRT14
+constexpr int kNewtonSteps = 2;
+inline V guess_inverse_root(V a) { return (V)_mm512_rsqrt14_pd((__m512d)a); }
 #else
-  V y = (V)(0x5FE6EB50C7B537A9 - ((Mask)a >> 1));
-  const V half = splat(0.5), h = half * a;
-  for (int step = 0; step < 4; ++step) y = fma(y, fnma(h * y, y, half), y);
-  return y;
+// 1 / sqrt(a) of a positive normal number to 3 %, from its bits.
+constexpr int kNewtonSteps = 4;
+inline V guess_inverse_root(V a) { return (V)(0x5FE6EB50C7B537A9 - ((Mask)a >> 1)); }
 #endif
-}
 
 // Largest integer not above a, for 0 <= a < 2^51.
 inline V floor_of(V a) {
@@ -98,4 +91,13 @@ inline double smallest(V a) {
   double m = a[0];
   for (int l = 1; l < W; ++l) m = a[l] < m ? a[l] : m;
   return m;
+}
+
+// 1 / sqrt(a) of a positive normal number to about an ulp, by Newton's method: the divider would take some 35 cycles
+// for the root and the quotient of eight lanes, and does not overlap them.
+inline V inverse_root(V a) {
+  const V half = splat(0.5), h = half * a;
+  V y = guess_inverse_root(a);
+  for (int step = 0; step < kNewtonSteps; ++step) y = fma(y, fnma(h * y, y, half), y);
+  return y;
 }

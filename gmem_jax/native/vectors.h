@@ -6,8 +6,8 @@ struct Vec {
 
 inline Vec operator+(Vec a, Vec b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 inline Vec operator-(Vec a, Vec b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Vec operator-(Vec a) { return {-a.x, -a.y, -a.z}; }
 inline Vec operator*(V s, Vec a) { return {s * a.x, s * a.y, s * a.z}; }
-inline Vec select(Mask m, Vec a, Vec b) { return {select(m, a.x, b.x), select(m, a.y, b.y), select(m, a.z, b.z)}; }
 inline Vec zero_unless(Mask m, Vec a) { return {zero_unless(m, a.x), zero_unless(m, a.y), zero_unless(m, a.z)}; }
 
 // s a + b
@@ -25,9 +25,6 @@ inline Vec cross(Vec a, Vec b) {
 inline Vec add_cross(Vec c, Vec a, Vec b) {
   return {fma(a.y, b.z, fnma(a.z, b.y, c.x)), fma(a.z, b.x, fnma(a.x, b.z, c.y)), fma(a.x, b.y, fnma(a.y, b.x, c.z))};
 }
-
-// c - a x b
-inline Vec subtract_cross(Vec c, Vec a, Vec b) { return add_cross(c, b, a); }
 
 inline Vec load_vec(const V* p) { return {p[0], p[1], p[2]}; }
 inline void store_vec(V* p, Vec a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }

@@ -1,0 +1,162 @@
+"""Small deterministic scenes, and compiled runs of them, shared by the tests of the core."""
+
+import functools
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax import dynamics
+from gmem_jax.contact.hooke import Hooke
+from gmem_jax.drive import Motion
+from gmem_jax.grain import Clump, sphere, tetra
+from gmem_jax.material import Material
+from gmem_jax.neighbors import PairFinder, Pairs, slack, sphere_centres, tabulate
+from gmem_jax.rotation import uniform
+from gmem_jax.state import Box, Grains, State, replicate, still_box
+
+ELASTIC = Material(normal_damping=0.0)
+SPHERE = sphere()
+FREE = still_box(jnp.full((3, 1), -15.0), jnp.full((3, 1), 15.0))  # walls out of everybody's way
+
+cached_tetra = functools.lru_cache(tetra)
+accelerate = jax.jit(dynamics.accelerate)
+
+
+def column(values) -> jax.Array:
+    """Values of one replica, with its trailing axis added."""
+    return jnp.asarray(values, dtype=float)[..., None]
+
+
+def orientations(count: int, seed: int = 0) -> np.ndarray:
+    """Random unit quaternions, [count, 4]."""
+    return np.asarray(uniform(jax.random.PRNGKey(seed), count))
+
+
+def make_grains(position, quaternion=None, velocity=None, spin=None) -> Grains:
+    """Grains of one replica from [N, 3] and [N, 4] arrays; what is not given is zero (or the identity)."""
+    zero = np.zeros(np.shape(position))
+    upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(zero), 1))
+    given = (
+        position,
+        upright if quaternion is None else quaternion,
+        zero if velocity is None else velocity,
+        zero if spin is None else spin,
+    )
+    return Grains(*(column(part) for part in (*given, zero, zero)))
+
+
+def blank_state(system: dynamics.System, grains: Grains) -> State:
+    """A state with untouched histories and a clean status."""
+    replicas = grains.position.shape[-1]
+    history = system.friction.init(system.pairs.capacity, replicas, grains.position.dtype)
+    return State(grains, history, jnp.zeros(replicas, jnp.int32))
+
+
+def all_pairs(clump: Clump, count: int, capacity: int = 8) -> Pairs:
+    """Every pair of spheres of `count` grains, for scenes too small to need a search."""
+    grain = np.arange(count * clump.spheres) // clump.spheres
+    found = np.stack(np.nonzero(grain[:, None] < grain))
+    blank = np.zeros((len(grain), 3))
+    return tabulate(found, blank, np.ones(3), np.inf, clump.spheres, capacity=capacity)
+
+
+def scene(
+    clump: Clump,
+    position,
+    quaternion=None,
+    velocity=None,
+    spin=None,
+    *,
+    friction=None,
+    material: Material | None = None,
+    box: Box = FREE,
+    replicas: int = 1,
+) -> tuple[dynamics.System, State, Box]:
+    """A few grains in a box, every pair of them listed, with their accelerations."""
+    grains = make_grains(position, quaternion, velocity, spin)
+    friction = Hooke() if friction is None else friction
+    pairs = all_pairs(clump, len(position))
+    system = dynamics.System(clump, friction, pairs, Material() if material is None else material)
+    state = accelerate(system, replicate(blank_state(system, grains), replicas), box)
+    return system, state, box
+
+
+@functools.partial(jax.jit, static_argnames="bins")
+def advance(system, state, motion, dt, first_bin=0, *, bins, steps, drag=0.0):
+    """`dynamics.advance`, compiled."""
+    return dynamics.advance(system, state, motion, dt, first_bin=first_bin, bins=bins, steps=steps, drag=drag)
+
+
+@jax.jit
+def coast(system, state, box, dt, steps, drag=0.0):
+    """The state after `steps` steps between walls at rest."""
+    alive = steps >= 0
+    return jax.lax.fori_loop(0, steps, lambda _, s: dynamics.step(system, s, box, dt, drag, alive)[0], state)
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def record(system, state, motion, dt, *, count):
+    """`count` steps; returns (states after each step, wall forces [count, 2, 3, B], boxes), with a leading time axis.
+
+    `dt` may be [B] if the walls stand still (they keep the first replica's time).
+    """
+
+    def one(state, box):
+        state, walls = dynamics.step(system, state, box, dt, 0.0, jnp.all(state.status >= 0))
+        return state, (state, walls)
+
+    boxes = jax.vmap(motion.box_at)((1 + jnp.arange(count)) * jnp.ravel(dt)[0])
+    _, (states, walls) = jax.lax.scan(one, state, boxes)
+    return states, walls, boxes
+
+
+def still(box: Box) -> Motion:
+    """Walls that do not move."""
+    return Motion(box.lower, box.upper, 0.0, 0.0, 0.0, 1.0)
+
+
+CLUSTER_EDGE = 7.6  # of the box of the 27 grains: 2e-3 E and overlaps of 0.1 R, as in a pack at u = 0
+
+
+@functools.lru_cache
+def _settled_cluster() -> Grains:
+    """27 grains relaxed without friction from a lattice, with a drag, until they rest."""
+    edge = CLUSTER_EDGE
+    lattice = (np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) * edge / 3.0
+    box = still_box(jnp.zeros((3, 1)), jnp.full((3, 1), edge))
+    grains = make_grains(lattice, orientations(27))
+    pairs = PairFinder(cached_tetra(), np.full(3, edge), skin=1.5)(grains, cached_tetra(), box)
+    system = dynamics.System(cached_tetra(), Hooke(mu=0.0), pairs)
+    state = coast(system, blank_state(system, grains), box, 0.3, 10000, 0.1)
+    assert float(slack(pairs, sphere_centres(state.grains, cached_tetra()), box)[0]) > 0.0
+    still_grains = {name: jnp.zeros((27, 3, 1)) for name in ("velocity", "spin")}
+    return replace(state.grains, **still_grains)
+
+
+@functools.lru_cache
+def _cluster_pairs(skin: float) -> Pairs:
+    grains, box = _settled_cluster(), cluster_box()
+    return PairFinder(cached_tetra(), np.asarray(box.lengths)[:, 0], skin)(grains, cached_tetra(), box)
+
+
+def cluster_box() -> Box:
+    """The box of `cluster27`."""
+    return still_box(jnp.zeros((3, 1)), jnp.full((3, 1), CLUSTER_EDGE))
+
+
+def cluster27(friction=None, replicas: int = 1, skin: float = 0.5, material: Material | None = None):
+    """A pack in miniature: 27 tetrahedra at rest under pressure, with friction on and blank histories."""
+    friction = Hooke() if friction is None else friction
+    system = dynamics.System(
+        cached_tetra(), friction, _cluster_pairs(skin), Material() if material is None else material
+    )
+    grains = _settled_cluster()
+    state = accelerate(system, replicate(blank_state(system, grains), replicas), cluster_box())
+    return system, state, cluster_box()
+
+
+def squeeze(box: Box, duration: float, delta0: float = 0.05, gamma0=0.0, signals=None) -> Motion:
+    """Compression of `box` from u = 0 to 1."""
+    return Motion(box.lower, box.upper, delta0, 0.0, 1.0, duration, gamma0, signals)
