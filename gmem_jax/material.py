@@ -39,7 +39,7 @@ class Material:
                 raise ValueError(f"Material.{name} must be positive, got {getattr(self, name)}")
         if not -1.0 < self.poisson <= 0.5:
             raise ValueError(f"Material.poisson must be in (-1, 0.5], got {self.poisson}")
-        if self.normal_damping < 0.0 or self.tangential_damping < 0.0:
+        if not (self.normal_damping >= 0.0 and self.tangential_damping >= 0.0):
             raise ValueError("Material damping times must not be negative")
 
     @property

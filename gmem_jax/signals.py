@@ -148,7 +148,7 @@ def waveform(samples: jax.typing.ArrayLike) -> Samples:
     if not isinstance(values, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(values))):
         raise ValueError("a waveform sample is not a finite number")
     values = jnp.atleast_2d(values)
-    values = values.astype(jnp.result_type(values.dtype, jnp.float32))
+    values = values.astype(jnp.result_type(values.dtype, float))
     return Samples(nodes=jnp.pad(values, ((0, 0), (1, 1))))
 
 

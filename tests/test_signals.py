@@ -7,6 +7,9 @@ import pytest
 
 from gmem_jax.signals import Bumps, bin_average, six_signals, waveform
 
+SIX = six_signals()
+SHEAR = jax.jit(lambda signals, u: signals.shear(u))
+INTEGRAL = jax.jit(lambda signals, u: signals.integral(u))
 TABLE = [
     ([0.3], [1.0]),
     ([0.7], [1.0]),
@@ -17,12 +20,12 @@ TABLE = [
 ]
 FINE = jnp.linspace(0.0, 1.0, 40_001)
 WAVE = np.random.default_rng(0).normal(size=(2, 9))
-SETS = {"six signals": six_signals(), "samples": waveform(WAVE)}
+SETS = {"six signals": SIX, "samples": waveform(WAVE)}
 
 
 def cumulative(signals) -> np.ndarray:
     """The integral of `shear` on FINE by Simpson's rule, from 0 to every second point."""
-    y = np.asarray(signals.shear(FINE))
+    y = np.asarray(SHEAR(signals, FINE))
     h = float(FINE[1])
     return np.cumsum(h / 3.0 * (y[:-2:2] + 4.0 * y[1:-1:2] + y[2::2]), axis=0)
 
@@ -30,9 +33,9 @@ def cumulative(signals) -> np.ndarray:
 @pytest.mark.parametrize("row", range(6))
 def test_each_signal_has_its_amplitudes_at_its_bump_centres_and_is_zero_between(row):
     centres, heights = TABLE[row]
-    values = np.asarray(six_signals().shear(jnp.asarray(centres)))[:, row]
+    values = np.asarray(SHEAR(SIX, jnp.asarray(centres)))[:, row]
     np.testing.assert_allclose(values, heights, rtol=1e-15)
-    everywhere = np.asarray(six_signals().shear(FINE))[:, row]
+    everywhere = np.asarray(SHEAR(SIX, FINE))[:, row]
     outside = np.all(np.abs(np.asarray(FINE)[:, None] - np.array(centres)) > 0.1 + 1e-12, axis=1)
     assert np.all(everywhere[outside] == 0.0)
     assert np.abs(everywhere).max() == pytest.approx(np.abs(heights).max(), rel=1e-8)  # and peaks nowhere else
@@ -40,11 +43,11 @@ def test_each_signal_has_its_amplitudes_at_its_bump_centres_and_is_zero_between(
 
 def test_a_bump_is_half_a_period_of_a_cosine():
     u = jnp.asarray([0.25, 0.3 + 0.2 / 3.0])  # a quarter and a third of the width off centre
-    np.testing.assert_allclose(six_signals().shear(u)[:, 0], np.cos(np.pi * np.array([0.25, 1.0 / 3.0])), rtol=1e-13)
+    np.testing.assert_allclose(SHEAR(SIX, u)[:, 0], np.cos(np.pi * np.array([0.25, 1.0 / 3.0])), rtol=1e-13)
 
 
 def test_signals_with_separate_bumps_are_orthogonal():
-    values = np.asarray(six_signals().shear(FINE))
+    values = np.asarray(SHEAR(SIX, FINE))
     assert np.all(values[:, 0] * values[:, 1] == 0.0)
     overlap = values.T @ values / len(FINE)
     assert abs(overlap[2, 3]) < 1e-15  # sum and difference of equal bumps
@@ -55,7 +58,7 @@ def test_signals_with_separate_bumps_are_orthogonal():
 def test_the_integral_is_the_integral_of_the_shear(name):
     signals = SETS[name]
     # Simpson across the kink at a bump's edge errs by its jump of slope (pi / du) times h^2 / 6 at most: 2e-9.
-    np.testing.assert_allclose(signals.integral(FINE)[2::2], cumulative(signals), atol=4e-9)
+    np.testing.assert_allclose(INTEGRAL(signals, FINE)[2::2], cumulative(signals), atol=4e-9)
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -63,46 +66,47 @@ def test_the_slope_of_the_integral_is_the_shear(name):
     signals = SETS[name]
     u = jnp.asarray([0.11, 0.26, 0.333, 0.55, 0.79])
     _, slope = jax.jvp(signals.integral, (u,), (jnp.ones(5),))
-    np.testing.assert_allclose(slope, signals.shear(u), atol=1e-13)
+    np.testing.assert_allclose(slope, SHEAR(signals, u), atol=1e-13)
 
 
 @pytest.mark.parametrize("name", SETS)
 def test_signals_and_integrals_start_at_zero_and_shear_ends_at_zero(name):
     signals = SETS[name]
     ends = jnp.asarray([0.0, 1.0])
-    assert np.all(np.asarray(signals.shear(ends)) == 0.0)
-    assert np.all(np.asarray(signals.integral(ends))[0] == 0.0)
+    assert np.all(np.asarray(SHEAR(signals, ends)) == 0.0)
+    assert np.all(np.asarray(INTEGRAL(signals, ends))[0] == 0.0)
 
 
 @pytest.mark.parametrize("width", [0.2, 0.05])
 def test_a_single_bump_integrates_to_two_widths_over_pi(width):
     bump = Bumps(jnp.ones((1, 1)), jnp.full((1, 1), 0.4), width)
-    assert float(bump.integral(jnp.asarray(1.0))[0]) == pytest.approx(2.0 * width / np.pi, rel=1e-14)
-    assert float(bump.integral(jnp.asarray(0.4))[0]) == pytest.approx(width / np.pi, rel=1e-14)
+    assert float(INTEGRAL(bump, jnp.asarray(1.0))[0]) == pytest.approx(2.0 * width / np.pi, rel=1e-14)
+    assert float(INTEGRAL(bump, jnp.asarray(0.4))[0]) == pytest.approx(width / np.pi, rel=1e-14)
 
 
 def test_a_bump_cut_by_the_end_of_the_range_integrates_from_zero():
     bump = Bumps(jnp.ones((1, 1)), jnp.zeros((1, 1)), 0.2)  # centred on u = 0: half of it is inside
-    assert float(bump.integral(jnp.asarray(0.0))[0]) == 0.0
-    assert float(bump.integral(jnp.asarray(1.0))[0]) == pytest.approx(0.2 / np.pi, rel=1e-14)
+    # The compiler may compute the two halves of the difference apart: round-off.
+    assert abs(float(INTEGRAL(bump, jnp.asarray(0.0))[0])) < 1e-16
+    assert float(INTEGRAL(bump, jnp.asarray(1.0))[0]) == pytest.approx(0.2 / np.pi, rel=1e-14)
 
 
 def test_samples_pass_through_their_nodes():
     nodes = jnp.arange(1, 10) / 10.0
     # The place of a node is rounded to a few ulp of 10, times a slope of about 10 per unit of u.
-    np.testing.assert_allclose(waveform(WAVE).shear(nodes).T, WAVE, atol=1e-13)
+    np.testing.assert_allclose(SHEAR(waveform(WAVE), nodes).T, WAVE, atol=1e-13)
 
 
 def test_samples_reproduce_a_straight_line_between_inner_nodes():
     inner = jnp.asarray([0.31, 0.42, 0.58])  # two intervals away from the ends, where the line drops to zero
     signals = waveform(2.0 - 3.0 * np.arange(1, 10) / 10.0)
-    np.testing.assert_allclose(signals.shear(inner)[:, 0], 2.0 - 3.0 * np.asarray(inner), rtol=1e-12)
+    np.testing.assert_allclose(SHEAR(signals, inner)[:, 0], 2.0 - 3.0 * np.asarray(inner), rtol=1e-12)
 
 
 def test_samples_converge_to_a_smooth_waveform_at_third_order():
     def error(n: int) -> float:
         smooth = waveform(np.sin(np.pi * np.arange(1, n + 1) / (n + 1)) ** 2)
-        return float(np.abs(smooth.shear(FINE)[:, 0] - np.sin(np.pi * np.asarray(FINE)) ** 2).max())
+        return float(np.abs(SHEAR(smooth, FINE)[:, 0] - np.sin(np.pi * np.asarray(FINE)) ** 2).max())
 
     # Catmull-Rom: third order inside. sin^2 has no slope at the ends, so the one-sided slopes there do less well.
     assert np.log2(error(31) / error(63)) > 1.9
@@ -119,8 +123,8 @@ def test_one_row_of_samples_is_one_signal_and_several_are_several():
     assert waveform([1.0, 2.0, 3.0]).count == 1
     assert waveform(np.ones((4, 3))).count == 4
     assert six_signals().count == 6
-    assert waveform(np.ones((4, 3))).shear(jnp.zeros((5, 2))).shape == (5, 2, 4)
-    assert six_signals().integral(jnp.zeros((5, 2))).shape == (5, 2, 6)
+    assert SHEAR(waveform(np.ones((4, 3))), jnp.zeros((5, 2))).shape == (5, 2, 4)
+    assert INTEGRAL(SIX, jnp.zeros((5, 2))).shape == (5, 2, 6)
 
 
 @pytest.mark.parametrize("samples", [1.0, [1.0], np.ones((2, 2, 2)), np.ones((0, 4))])
@@ -135,10 +139,9 @@ def test_samples_that_are_not_finite_are_refused(bad):
         waveform([0.0, bad, 0.0])
 
 
-@pytest.mark.xfail(strict=True, reason="waveform turns integers into float32")
 def test_integer_samples_are_as_good_as_floats():
     whole, real = waveform([1, 2, -4]), waveform([1.0, 2.0, -4.0])
-    np.testing.assert_allclose(whole.integral(FINE), real.integral(FINE), atol=1e-15)
+    np.testing.assert_allclose(INTEGRAL(whole, FINE), INTEGRAL(real, FINE), atol=1e-15)
 
 
 def test_samples_can_be_differentiated():
@@ -154,8 +157,8 @@ def test_samples_can_be_differentiated():
 def test_bins_hold_the_average_of_the_integral_not_its_samples():
     averaged = np.asarray(bin_average(six_signals()))
     assert averaged.shape == (6, 256)
-    bins = np.asarray(six_signals().integral((jnp.arange(256 * 200) + 0.5) / (256 * 200))).reshape(256, 200, 6)
+    bins = np.asarray(INTEGRAL(SIX, (jnp.arange(256 * 200) + 0.5) / (256 * 200))).reshape(256, 200, 6)
     # Midpoint rule on 16 points: (1/4096)^2 / 24 times the steepest slope of I, pi / du = 16.
     np.testing.assert_allclose(averaged, bins.mean(axis=1).T, atol=5e-8)
-    middle = np.asarray(six_signals().integral((jnp.arange(256) + 0.5) / 256)).T
+    middle = np.asarray(INTEGRAL(SIX, (jnp.arange(256) + 0.5) / 256)).T
     assert np.abs(averaged - middle).max() > 1e-6

@@ -110,41 +110,50 @@ struct Engine {
     store_vec(h + kVelocity, velocity);
     store_vec(h + kSpin, spin);
 
-    const Vec nothing{V{}, V{}, V{}};
-    Vec force = nothing, torque = nothing, on_lower = nothing, on_upper = nothing;
     const Matrix rotation = matrix(orientation);
-    const V one = splat(1.0);
-    bool touched = false;
+    const V reach = splat(1.0 + arm);
+    const bool near = bits_less(V{}, deepest({reach, reach, reach}, position, box)) != 0;
+    WallForces on{};
     for (int k = 0; k < problem.spheres_per_grain; ++k) {
       const double* body = block.pack->offsets + 3 * k;
-      const Vec arm = rotation * Vec{splat(body[0]), splat(body[1]), splat(body[2])};
-      const Vec centre = position + arm;
+      const Vec lever = rotation * Vec{splat(body[0]), splat(body[1]), splat(body[2])};
+      const Vec centre = position + lever;
       mode.put_sphere(u, k, centre);
-      const Vec lower = Vec{one, one, one} - (centre - box.lower);
-      const Vec upper = Vec{one, one, one} - (box.upper - centre);
-      const V deepest = max(max(max(lower.x, upper.x), max(lower.y, upper.y)), max(lower.z, upper.z));
-      if (!bits_less(V{}, deepest)) continue;
-      touched = true;
-      const Vec surface = add_cross(velocity, spin, arm);
-      const Vec low = wall_force(lower, box.lower_velocity - surface);
-      const Vec up = wall_force(upper, surface - box.upper_velocity);
-      on_lower = on_lower + low;
-      on_upper = on_upper + up;
-      force = force + (low - up);
-      torque = add_cross(torque, arm, low - up);
+      if (near) touch_walls(centre, lever, add_cross(velocity, spin, lever), box, on);
     }
-    mode.put_grain(u, position, velocity, spin, force, torque);
-    if (touched) mode.add_walls(u, wall_sums, on_lower, on_upper);
+    mode.put_grain(u, position, velocity, spin, on.force, on.torque);
+    if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
   }
 
-  static V max(V a, V b) { return select(a > b, a, b); }
+  struct WallForces {
+    Vec force, torque;  // on a grain
+    Vec lower, upper;   // on the walls, as magnitudes
+  };
+
+  // Largest overlap with any wall of a sphere of radius `reach` around `centre`.
+  static V deepest(Vec reach, Vec centre, const WallState& box) {
+    const Vec lower = reach - (centre - box.lower), upper = reach - (box.upper - centre);
+    return max(max(max(lower.x, upper.x), max(lower.y, upper.y)), max(lower.z, upper.z));
+  }
+
+  void touch_walls(Vec centre, Vec lever, Vec velocity, const WallState& box, WallForces& on) const {
+    const V one = splat(1.0);
+    if (!bits_less(V{}, deepest({one, one, one}, centre, box))) return;
+    const Vec lower = Vec{one, one, one} - (centre - box.lower), upper = Vec{one, one, one} - (box.upper - centre);
+    const Vec low = wall_force(lower, box.lower_velocity - velocity);
+    const Vec up = wall_force(upper, velocity - box.upper_velocity);
+    on.lower = on.lower + low;
+    on.upper = on.upper + up;
+    on.force = on.force + (low - up);
+    on.torque = add_cross(on.torque, lever, low - up);
+  }
 
   Vec wall_force(Vec overlap, Vec closing) const {
-    const V one = splat(1.0), zero{};
-    const V stiffness = parameter[kWallStiffness], damping = parameter[kNormalDamping];
-    const auto axis = [&](V p, V c) { 
-      const V safe = select(p > zero, p, one);
-      return hertz(p > zero, safe, root(safe), c, stiffness, damping);
+    const auto axis = [&](V p, V c) {
+      const Mask touching = p > V{};
+      if (!bits_less(V{}, p)) return V{};
+      const V safe = select(touching, p, splat(1.0));
+      return hertz(touching, safe, root(safe), c, parameter[kWallStiffness], parameter[kNormalDamping]);
     };
     return {axis(overlap.x, closing.x), axis(overlap.y, closing.y), axis(overlap.z, closing.z)};
   }

@@ -9,9 +9,9 @@ struct Meeting {
   Vec spin_one, spin_other;
 };
 
-GMEM_INLINE void meet(const Meeting& m, Contact& c) {
+GMEM_INLINE void meet(const Meeting& m, V square, Contact& c) {
   c.normal = m.separation;
-  c.square = dot(m.separation, m.separation);
+  c.square = square;
   c.sliding = add_cross(add_cross(m.velocity, m.spin_other, m.lever_other), m.lever_one, m.spin_one);
   c.lever_one = m.lever_one;
   c.lever_other = m.lever_other;

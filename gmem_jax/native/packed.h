@@ -235,7 +235,8 @@ struct Packed {
         group[n] = group_of(touching + n * W, count - n * W);
         contact[n].history = memory[n];
         read_history(group[n], memory[n]);
-        meet(meeting(group[n]), contact[n]);
+        const Meeting m = meeting(group[n]);
+        meet(m, dot(m.separation, m.separation), contact[n]);
       }
       close(contact, groups, parameter);
       if constexpr (Law::kLayered) {

@@ -7,6 +7,7 @@ struct Replicas {
   const Block& block;
   const Plan& plan;
   bool adjacent;  // the lanes are W neighbours in every array of the call
+  bool together;  // they all have the same number of steps
   V* hot;         // the engine's
   V* sphere;      // [S, 3]: centres
   V* guest;       // [guests, 6]: force and torque
@@ -16,9 +17,11 @@ struct Replicas {
 
   Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
     adjacent = block.count == W;
+    together = true;
     const Lane& a = block.lanes[0];
     for (int l = 1; l < block.count; ++l) {
       const Lane& b = block.lanes[l];
+      together &= b.steps == a.steps;
       for (int f = 0; f < kFields; ++f)
         adjacent &= b.grains_in[f] == a.grains_in[f] + l && b.grains_out[f] == a.grains_out[f] + l;
       for (int leaf = 0; leaf < kMaxHistory; ++leaf)
@@ -64,9 +67,7 @@ struct Replicas {
   // Only lanes that have done all their steps.
   template <class Pointer>
   void write(const Pointer& pointer, std::ptrdiff_t row, V a, int steps_done) const {
-    int ends = 0;
-    for (int l = 0; l < block.count; ++l) ends += block.lanes[l].steps == steps_done;
-    if (adjacent && ends == W) return store(pointer(block.lanes[0]) + row * problem.stride, a);
+    if (adjacent && together) return store(pointer(block.lanes[0]) + row * problem.stride, a);
     for (int l = 0; l < block.count; ++l)
       if (block.lanes[l].steps == steps_done) pointer(block.lanes[l])[row * problem.stride] = a[l];
   }
@@ -194,48 +195,43 @@ struct Replicas {
     void keep(int kept) { *last = kept - 1; }
   };
 
-  // Find which candidates touch, then compute those.
   void contacts(int first, int end, const V* parameter, const LawParameters& law, double travel) {
-    constexpr int kLook = 256, kBatch = GMEM_BATCH;
-    int touching[kLook + 1];
-    Contact contact[kBatch];
-    for (int look = first; look < end; look += kLook) {
-      const int count = find(look, look + kLook < end ? look + kLook : end, touching, travel);
-      for (int batch = 0; batch < count; batch += kBatch)
-        compute(touching + batch, count - batch < kBatch ? count - batch : kBatch, contact, parameter, law);
-    }
-  }
-
-  int find(int first, int end, int* touching, double travel) {
+    constexpr int kLook = 256, kBatch = 8;
     const V contact_square = splat(4.0);
-    int awake = 0, count = 0;
-    for (int c = first; c < end; ++c) {
-      touching[awake] = c;
-      awake += !(marks.wake[c] > travel);  // also where it is not a number
-    }
-    for (int n = 0; n < awake; ++n) {
-      const int c = touching[n];
-      const Candidate& pair = plan.candidate[c];
-      const Vec separation = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other)) -
-                             load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
-      const V square = dot(separation, separation);
-      touching[count] = c;
-      if (bits_less(square, contact_square)) {
+    int awake[kLook + 1], touching[kBatch];
+    Contact contact[kBatch];
+    int count = 0;
+    for (int look = first; look < end; look += kLook) {
+      const int look_end = look + kLook < end ? look + kLook : end;
+      int found = 0;
+      for (int c = look; c < look_end; ++c) {
+        awake[found] = c;
+        found += !(marks.wake[c] > travel);  // also where it is not a number
+      }
+      for (int n = 0; n < found; ++n) {
+        const int c = awake[n];
+        const Candidate& pair = plan.candidate[c];
+        const Vec one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
+        const Vec other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
+        const V square = dot(other - one, other - one);
+        if (!bits_less(square, contact_square)) {
+          if (marks.touched[c]) forget(c, pair);
+          marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(smallest(square)) - 2.0);
+          continue;
+        }
         marks.touched[c] = true;
-        ++count;
-      } else {
-        if (marks.touched[c]) forget(c, pair);
-        marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(smallest(square)) - 2.0);
+        meet(meeting(pair, one, other), square, contact[count]);
+        contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
+        touching[count++] = c;
+        if (count < kBatch) continue;
+        compute(touching, count, contact, parameter, law);
+        count = 0;
       }
     }
-    return count;
+    compute(touching, count, contact, parameter, law);
   }
 
   void compute(const int* touching, int count, Contact* contact, const V* parameter, const LawParameters& law) {
-    for (int n = 0; n < count; ++n) {
-      contact[n].history = history + static_cast<std::size_t>(touching[n]) * Law::kHistory;
-      meet(meeting(plan.candidate[touching[n]]), contact[n]);
-    }
     close(contact, count, parameter);
     if constexpr (Law::kLayered) {
       for (int n = 0; n < count; ++n) {
@@ -256,11 +252,9 @@ struct Replicas {
       for (int q = 0; q < 6; ++q) guest[6 * static_cast<std::size_t>(pair.guest) + q] = V{};
   }
 
-  GMEM_INLINE Meeting meeting(const Candidate& pair) const {
+  GMEM_INLINE Meeting meeting(const Candidate& pair, Vec centre_one, Vec centre_other) const {
     const V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
     const V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
-    const Vec centre_one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
-    const Vec centre_other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
     const Vec point = splat(0.5) * (centre_one + centre_other);
     return {centre_other - centre_one,
             point - load_vec(one + kPosition),

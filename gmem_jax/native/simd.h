@@ -28,12 +28,14 @@ inline V fma(V a, V b, V c) { return (V)_mm512_fmadd_pd((__m512d)a, (__m512d)b, 
 inline V fms(V a, V b, V c) { return (V)_mm512_fmsub_pd((__m512d)a, (__m512d)b, (__m512d)c); }
 inline V fnma(V a, V b, V c) { return (V)_mm512_fnmadd_pd((__m512d)a, (__m512d)b, (__m512d)c); }
 inline V root(V a) { return (V)_mm512_sqrt_pd((__m512d)a); }
+inline V max(V a, V b) { return (V)_mm512_max_pd((__m512d)a, (__m512d)b); }
 inline unsigned bits_less(V a, V b) { return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LT_OQ); }
 #elif defined(__AVX__) && defined(__FMA__)
 inline V fma(V a, V b, V c) { return (V)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c); }
 inline V fms(V a, V b, V c) { return (V)_mm256_fmsub_pd((__m256d)a, (__m256d)b, (__m256d)c); }
 inline V fnma(V a, V b, V c) { return (V)_mm256_fnmadd_pd((__m256d)a, (__m256d)b, (__m256d)c); }
 inline V root(V a) { return (V)_mm256_sqrt_pd((__m256d)a); }
+inline V max(V a, V b) { return (V)_mm256_max_pd((__m256d)a, (__m256d)b); }
 inline unsigned bits_less(V a, V b) {
   return _mm256_movemask_pd(_mm256_cmp_pd((__m256d)a, (__m256d)b, _CMP_LT_OQ));
 }
@@ -42,17 +44,20 @@ inline V fma(V a, V b, V c) { return a * b + c; }
 inline V fms(V a, V b, V c) { return a * b - c; }
 inline V fnma(V a, V b, V c) { return c - a * b; }
 inline V root(V a) { return (V)_mm_sqrt_pd((__m128d)a); }
+inline V max(V a, V b) { return (V)_mm_max_pd((__m128d)a, (__m128d)b); }
 inline unsigned bits_less(V a, V b) { return _mm_movemask_pd(_mm_cmplt_pd((__m128d)a, (__m128d)b)); }
 #elif defined(__aarch64__)
 inline V fma(V a, V b, V c) { return (V)vfmaq_f64((float64x2_t)c, (float64x2_t)a, (float64x2_t)b); }
 inline V fms(V a, V b, V c) { return fma(a, b, -c); }
 inline V fnma(V a, V b, V c) { return (V)vfmsq_f64((float64x2_t)c, (float64x2_t)a, (float64x2_t)b); }
 inline V root(V a) { return (V)vsqrtq_f64((float64x2_t)a); }
+inline V max(V a, V b) { return a > b ? a : b; }
 inline unsigned bits_less(V a, V b) { return (a[0] < b[0] ? 1u : 0u) | (a[1] < b[1] ? 2u : 0u); }
 #else
 inline V fma(V a, V b, V c) { return a * b + c; }
 inline V fms(V a, V b, V c) { return a * b - c; }
 inline V fnma(V a, V b, V c) { return c - a * b; }
+inline V max(V a, V b) { return a > b ? a : b; }
 inline V root(V a) {
   V r;
   for (int l = 0; l < W; ++l) r[l] = __builtin_sqrt(a[l]);
@@ -63,15 +68,6 @@ inline unsigned bits_less(V a, V b) {
   for (int l = 0; l < W; ++l) bits |= (a[l] < b[l] ? 1u : 0u) << l;
   return bits;
 }
-#endif
-
-#ifdef GMEM_RSQRT14
-constexpr int kNewtonSteps = 2;
-inline V guess_inverse_root(V a) { return (V)_mm512_rsqrt14_pd((__m512d)a); }
-#else
-// 1 / sqrt(a) of a positive normal number to 3 %, from its bits.
-constexpr int kNewtonSteps = 4;
-inline V guess_inverse_root(V a) { return (V)(0x5FE6EB50C7B537A9 - ((Mask)a >> 1)); }
 #endif
 
 // Largest integer not above a, for 0 <= a < 2^51.
@@ -93,11 +89,16 @@ inline double smallest(V a) {
   return m;
 }
 
-// 1 / sqrt(a) of a positive normal number to about an ulp, by Newton's method: the divider would take some 35 cycles
-// for the root and the quotient of eight lanes, and does not overlap them.
+// 1 / sqrt(a) of a positive normal number to about an ulp. The divider would take some 35 cycles for the root and the
+// quotient of eight lanes, and does not overlap them; and the approximate roots of some CPUs differ from others'.
 inline V inverse_root(V a) {
-  const V half = splat(0.5), h = half * a;
-  V y = guess_inverse_root(a);
-  for (int step = 0; step < kNewtonSteps; ++step) y = fma(y, fnma(h * y, y, half), y);
-  return y;
+  const V one = splat(1.0);
+  // From the bits of a, to 3.5 %; then by the best cubic for that interval, to 8e-7; then by a Taylor series.
+  V y = (V)(0x5FE6E8EAE1500000 - ((Mask)a >> 1));
+  V r = fnma(a * y, y, one);
+  V p = fma(splat(0.3139020622967821), r, splat(0.37627395776434536));
+  p = fma(p, r, splat(0.4999984446460111));
+  y = y * fma(p, r, splat(0.9999992598857359));
+  r = fnma(a * y, y, one);
+  return fma(y * r, fma(splat(0.375), r, splat(0.5)), y);
 }
