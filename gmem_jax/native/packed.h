@@ -195,68 +195,69 @@ struct Packed {
     }
   };
 
-  // Find which candidates touch, then compute those.
   void contacts(int first, int end, const V* parameter, const LawParameters& law, double travel) {
-    constexpr int kBatch = 32 * W;
-    Group group[kBatch / W];
-    Contact contact[kBatch / W];
-    V memory[kBatch / W][4];
-    const Candidate* candidate = plan.candidate;
-    int touching[kBatch + 1];
-    for (int batch = first; batch < end; batch += kBatch) {
-      const int batch_end = batch + kBatch < end ? batch + kBatch : end;
-      int awake = 0, count = 0;
-      for (int c = batch; c < batch_end; ++c) {
-        touching[awake] = c;
-        awake += !(marks.wake[c] > travel);  // also where it is not a number
+    constexpr int kLook = 256, kBatch = 8 * W;
+    int awake[kLook + 1], touching[kBatch];
+    int count = 0;
+    for (int look = first; look < end; look += kLook) {
+      const int look_end = look + kLook < end ? look + kLook : end;
+      int found = 0;
+      for (int c = look; c < look_end; ++c) {
+        awake[found] = c;
+        found += !(marks.wake[c] > travel);  // also where it is not a number
       }
-      for (int start = 0; start < awake; start += W) {
-        const auto pair = [&](int l) -> const Candidate& {
-          return plan.candidate[touching[start + l < awake ? start + l : start]];
-        };
-        const Vec separation = columns(load_rows([&](int l) { return sphere + pair(l).other; }) -
-                                       load_rows([&](int l) { return sphere + pair(l).one; }));
-        const V square = dot(separation, separation);
-        const unsigned near = bits_less(square, splat(4.0));
-        for (int l = 0; l < W && start + l < awake; ++l) {
-          const int c = touching[start + l];
-          touching[count] = c;
-          if (near >> l & 1u) {
-            marks.touched[c] = true;
-            ++count;
-          } else {
-            if (marks.touched[c]) forget(c);
-            marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(square[l]) - 2.0);
-          }
-        }
+      for (int n = 0; n < found; ++n) {
+        const int c = awake[n];
+        if (!marks.touched[c] && !touches(c, travel)) continue;
+        touching[count++] = c;
+        if (count < kBatch) continue;
+        compute(touching, count, parameter, law);
+        count = 0;
       }
-      const int groups = (count + W - 1) / W;
-      for (int n = 0; n < groups; ++n) {
-        group[n] = group_of(touching + n * W, count - n * W);
-        contact[n].history = memory[n];
-        read_history(group[n], memory[n]);
-        const Meeting m = meeting(group[n]);
-        meet(m, dot(m.separation, m.separation), contact[n]);
-      }
-      close(contact, groups, parameter);
-      if constexpr (Law::kLayered) {
-        for (int n = 0; n < groups; ++n) friction(Law{}, contact[n], law, layers_of(group[n]));
-      } else {
-        friction(Law{}, contact, groups, law);
-      }
-      for (int n = 0; n < groups; ++n) {
-        write_history(group[n], memory[n]);
-        add(group[n], push(contact[n]));
-      }
+    }
+    compute(touching, count, parameter, law);
+  }
+
+  // Whether a candidate that did not touch at the last step does now, by the same arithmetic as in vectors.
+  bool touches(std::size_t c, double travel) {
+    const Row d = sphere[plan.candidate[c].other] - sphere[plan.candidate[c].one];
+    const double square = fma_one(d[2], d[2], fma_one(d[1], d[1], d[0] * d[0]));
+    if (square < 4.0) return marks.touched[c] = true;
+    marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(square) - 2.0);
+    return false;
+  }
+
+  void compute(const int* touching, int count, const V* parameter, const LawParameters& law) {
+    constexpr int kGroups = 8;
+    Group group[kGroups];
+    Contact contact[kGroups];
+    V memory[kGroups][4];
+    const int groups = (count + W - 1) / W;
+    for (int n = 0; n < groups; ++n) {
+      group[n] = group_of(touching + n * W, count - n * W);
+      contact[n].history = memory[n];
+      read_history(group[n], memory[n]);
+      const Meeting m = meeting(group[n]);
+      meet(m, dot(m.separation, m.separation), contact[n]);
+    }
+    close(contact, groups, parameter);
+    for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
+    if constexpr (Law::kLayered) {
+      for (int n = 0; n < groups; ++n) friction(Law{}, contact[n], law, layers_of(group[n]));
+    } else {
+      friction(Law{}, contact, groups, law);
+    }
+    for (int n = 0; n < groups; ++n) {
+      write_history(group[n], memory[n]);
+      add(group[n], push(contact[n]));
     }
   }
 
-  void forget(std::size_t c) {
-    marks.touched[c] = false;
-    if constexpr (Law::kHistory > 0) history[c] = Row{};
-    if constexpr (Law::kLayered) marks.reached[c] = -1;
-    const int n = plan.candidate[c].guest;
-    if (n >= 0) guest[2 * static_cast<std::size_t>(n)] = guest[2 * static_cast<std::size_t>(n) + 1] = Row{};
+  // Contacts that have come apart: the laws give them no force and a blank history.
+  void forget_apart(const Group& g, V overlap) {
+    if (!bits_less(overlap, splat(1e-300))) return;
+    for (int l = 0; l < g.count; ++l)
+      if (!(overlap[l] > 0.0)) marks.touched[g.c[l]] = false;
   }
 
   // W contacts; where there are fewer, the rest are dummies far apart.

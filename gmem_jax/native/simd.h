@@ -70,6 +70,15 @@ inline unsigned bits_less(V a, V b) {
 }
 #endif
 
+// a b + c of one lane.
+inline double fma_one(double a, double b, double c) {
+#if defined(__FMA__) || defined(__aarch64__)
+  return __builtin_fma(a, b, c);
+#else
+  return a * b + c;
+#endif
+}
+
 // Largest integer not above a, for 0 <= a < 2^51.
 inline V floor_of(V a) {
   const V big = splat(6755399441055744.0);  // 1.5 * 2^52
