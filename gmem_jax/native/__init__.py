@@ -23,7 +23,6 @@ from gmem_jax.contact.mindlin import Mindlin
 from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.drive import Motion
 from gmem_jax.dynamics import Sample, System
-from gmem_jax.native.build import LIBRARY
 from gmem_jax.state import Box, Grains, Scalar, State
 
 Advance = Callable[..., tuple[State, Sample]]
@@ -37,10 +36,16 @@ _VARIANTS = ("exact", "averaged", "paper")
 _PART = 32  # steps per call where their number is not known when the program is compiled
 
 
+def _path() -> Path:
+    from gmem_jax.native.build import LIBRARY  # here, so that ``python -m gmem_jax.native.build`` loads it only once
+
+    return Path(__file__).parent / LIBRARY
+
+
 @functools.cache
 def _load() -> str:
     """Load and register the library, once; returns why that failed ("" if it did not)."""
-    path = Path(__file__).parent / LIBRARY
+    path = _path()
     if not path.exists():
         return "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
     try:
@@ -57,7 +62,7 @@ def available() -> tuple[bool, str]:
         return False, reason
     if jax.default_backend() != "cpu":
         return False, f"it runs on CPUs, and JAX's default device is a {jax.default_backend()}"
-    library = ctypes.CDLL(str(Path(__file__).parent / LIBRARY))
+    library = ctypes.CDLL(str(_path()))
     library.gmem_instruction_set.restype = ctypes.c_char_p
     return True, library.gmem_instruction_set().decode()
 
@@ -176,7 +181,7 @@ def _bin(
     walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
     state = jax.tree.leaves(grains)
     outputs = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in (*state, jnp.zeros((3, replicas)), *leaves)]
-    candidates = (pairs.first, pairs.second, pairs.valid, pairs.incidence)
+    candidates = (pairs.first, pairs.second, pairs.valid, pairs.reference, pairs.smallest)
     arguments = [*state, *candidates, system.clump.offsets, _parameters(system, numbers, replicas), walls, limits]
     results = jax.ffi.ffi_call(
         _TARGET,

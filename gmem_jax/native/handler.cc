@@ -4,6 +4,7 @@
 // size one or of the full size. Each index into them times each index of the innermost axis is a replica; replicas
 // with the same candidate list may share a block.
 
+#include "plan.h"
 #include "problem.h"
 #include "team.h"
 
@@ -104,8 +105,9 @@ struct Array {
   }
 };
 
-enum Argument { kFirst = kFields, kSecond, kValid, kIncidence, kOffsets, kParameterRows, kWallRows, kSteps, kHistoryIn };
-constexpr int kRanks[kHistoryIn] = {3, 3, 3, 3, 3, 3, 1, 1, 1, 2, 2, 2, 3, 1};
+enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kOffsets, kParameterRows, kWallRows, kSteps,
+                kHistoryIn };
+constexpr int kRanks[kHistoryIn] = {3, 3, 3, 3, 3, 3, 1, 1, 1, 2, 1, 2, 2, 3, 1};
 constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
 
 Array view(const ffi::AnyBuffer& buffer, int leading) {
@@ -123,38 +125,30 @@ Array view(const ffi::AnyBuffer& buffer, int leading) {
   return array;
 }
 
-struct Job {
-  const Problem& problem;
-  const Kernel& kernel;
-  std::vector<Block> whole;   // W (or nearly so) replicas each
-  std::vector<Block> packed;  // one replica each
-};
-
 // Blocks one by one to single threads as long as that keeps all busy, then the rest to teams.
-void run_blocks(const Job& job, const std::vector<Block>& blocks, bool packed, int threads) {
+void run_blocks(const Problem& problem, const Kernel& kernel, const std::vector<Block>& blocks, int threads) {
   const int count = static_cast<int>(blocks.size());
   if (count == 0) return;
-  const int alone = threads > 1 ? count / threads * threads : count;
-  const int rest = count - alone;
-  const std::size_t bytes = job.kernel.scratch_bytes(job.problem, packed);
-  const auto run = [&](const Block& block, Team& team, int rank, void* scratch) {
-    job.kernel.run(job.problem, block, team, rank, scratch);
-  };
+  const int alone = count / threads * threads, rest = count - alone;
+  std::size_t bytes = 0;
+  int domains = 0;
+  for (const Block& block : blocks) {
+    bytes = std::max(bytes, kernel.scratch_bytes(problem, block));
+    domains = std::max(domains, block.pack->plan->domains);
+  }
   if (alone > 0) {
     std::atomic<int> next{0};
     run_ranks(std::min(threads, alone), [&](int) {
       auto scratch = scratch_pool().take(bytes);
       for (int i; (i = next.fetch_add(1)) < alone;) {
         Team team(1);
-        run(blocks[i], team, 0, scratch.aligned());
+        kernel.run(problem, blocks[i], team, 0, scratch.aligned());
       }
       scratch_pool().give(std::move(scratch));
     });
   }
   if (rest > 0) {
-    // A thread is worth its barriers from some hundred contacts on.
-    const int useful = 1 + job.problem.pairs * (packed ? 1 : job.kernel.width) / 1024;
-    const int size = std::min({std::max(1, threads / rest), useful, Team::kMaxSize});
+    const int size = std::min({threads / rest, domains, Team::kMaxSize});
     std::vector<std::unique_ptr<Team>> teams;
     std::vector<ScratchPool::Piece> scratch;
     for (int i = 0; i < rest; ++i) {
@@ -163,7 +157,7 @@ void run_blocks(const Job& job, const std::vector<Block>& blocks, bool packed, i
     }
     run_ranks(rest * size, [&](int rank) {
       const int i = rank / size;
-      run(blocks[alone + i], *teams[i], rank % size, scratch[i].aligned());
+      kernel.run(problem, blocks[alone + i], *teams[i], rank % size, scratch[i].aligned());
     });
     for (auto& piece : scratch) scratch_pool().give(std::move(piece));
   }
@@ -192,7 +186,7 @@ ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotrop
   for (std::size_t i = 0; i < args.size(); ++i) {
     auto buffer = args.get<ffi::AnyBuffer>(i);
     if (!buffer.has_value()) return buffer.error();
-    const bool integer = i == kFirst || i == kSecond || i == kIncidence || i == kSteps;
+    const bool integer = i == kFirst || i == kSecond || i == kSteps;
     const auto wanted = i == kValid ? ffi::PRED : integer ? ffi::S32 : ffi::F64;
     if (buffer->element_type() != wanted) return invalid("argument " + std::to_string(i) + " has the wrong type");
     const std::size_t rank = i < kHistoryIn ? kRanks[i] : (i == kHistoryIn && law == 3 ? 4 : 3);
@@ -209,37 +203,35 @@ ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotrop
   problem.points = static_cast<int>(points);
   problem.grains = static_cast<int>(in[0].shape[0]);
   problem.spheres_per_grain = static_cast<int>(in[kOffsets].shape[0]);
-  problem.pairs = static_cast<int>(in[kFirst].shape[0]);
-  problem.per_sphere = static_cast<int>(in[kIncidence].shape[1]);
   problem.stride = replicas;
   const int64_t rows = in[kWallRows].shape[0];
   if (in[kParameterRows].shape[0] != kParameters || in[kWallRows].shape[1] != kWalls ||
-      in[kIncidence].shape[0] != problem.spheres() || in[kSteps].shape[0] != replicas)
+      in[kReference].shape[0] != problem.spheres() || in[kSteps].shape[0] != replicas)
     return invalid("arguments do not fit each other");
   problem.history_aliased = leaves > 0;
   for (int64_t leaf = 0; leaf < leaves; ++leaf)
     problem.history_aliased &= in[kHistoryIn + leaf].data == out[kHistoryOut + leaf].data;
-  std::vector<int32_t> owner(problem.spheres());
-  for (int s = 0; s < problem.spheres(); ++s) owner[s] = s / problem.spheres_per_grain;
-  problem.owner = owner.data();
 
   // Collect the replicas by candidate list.
-  std::map<std::array<int64_t, 5>, std::size_t> known;
+  constexpr int kOfPack = 6;  // arguments that belong to a pack
+  std::map<std::array<int64_t, kOfPack>, std::size_t> known;
+  std::vector<std::shared_ptr<const PlanStore>> plans;
   std::vector<std::unique_ptr<Pack>> packs;
   std::vector<std::vector<Lane>> lanes;
   std::vector<int64_t> index(batch.size(), 0);
   int64_t entries = 1;
   for (const int64_t n : batch) entries *= n;
   for (int64_t entry = 0; entry < entries; ++entry) {
-    std::array<int64_t, 5> key;
-    for (int i = 0; i < 5; ++i) key[i] = in[kFirst + i].at(index);
+    std::array<int64_t, kOfPack> key;
+    for (int i = 0; i < kOfPack; ++i) key[i] = in[kFirst + i].at(index);
     const auto place = known.emplace(key, packs.size());
     if (place.second) {
-      packs.emplace_back(new Pack{reinterpret_cast<const int32_t*>(in[kFirst].data) + key[0],
-                                  reinterpret_cast<const int32_t*>(in[kSecond].data) + key[1],
-                                  reinterpret_cast<const bool*>(in[kValid].data) + key[2],
-                                  reinterpret_cast<const int32_t*>(in[kIncidence].data) + key[3],
-                                  reinterpret_cast<const double*>(in[kOffsets].data) + key[4]});
+      const auto doubles = [&](Argument i) { return reinterpret_cast<const double*>(in[i].data) + key[i - kFirst]; };
+      const auto integers = [&](Argument i) { return reinterpret_cast<const int32_t*>(in[i].data) + key[i - kFirst]; };
+      const bool* valid = reinterpret_cast<const bool*>(in[kValid].data) + key[kValid - kFirst];
+      plans.push_back(plan_for({problem.grains, problem.spheres_per_grain, static_cast<int>(in[kFirst].shape[0]),
+                                integers(kFirst), integers(kSecond), valid, doubles(kReference), doubles(kSmallest)}));
+      packs.emplace_back(new Pack{&plans.back()->plan, doubles(kOffsets)});
       lanes.emplace_back();
     }
     for (int64_t b = 0; b < replicas; ++b) {
@@ -261,19 +253,18 @@ ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotrop
   }
 
   const Kernel& kernel = best_kernel();
-  Job job{problem, kernel, {}, {}};
+  std::vector<Block> whole, packed;
   for (std::size_t i = 0; i < packs.size(); ++i) {
     const int count = static_cast<int>(lanes[i].size());
     int done = 0;
-    // A vector that is half full is still cheaper than its replicas one by one.
-    for (; count - done > kernel.width / 2 || (count - done > 1 && kernel.width == 2); done += kernel.width)
-      job.whole.push_back({packs[i].get(), &lanes[i][done], std::min(kernel.width, count - done), false});
-    for (; done < count; ++done) job.packed.push_back({packs[i].get(), &lanes[i][done], 1, true});
+    // Replicas side by side share much work: a vector that is half full is cheaper than they are one by one.
+    for (; 2 * (count - done) >= kernel.width; done += kernel.width)
+      whole.push_back({packs[i].get(), &lanes[i][done], std::min(kernel.width, count - done), false});
+    for (; done < count; ++done) packed.push_back({packs[i].get(), &lanes[i][done], 1, true});
   }
-  const int wanted = thread_count();
-  const int threads = acquire_threads(wanted);
-  run_blocks(job, job.whole, false, threads);
-  run_blocks(job, job.packed, true, threads);
+  const int threads = acquire_threads(thread_count());
+  run_blocks(problem, kernel, whole, threads);
+  run_blocks(problem, kernel, packed, threads);
   if (threads > 1) release_threads();
   return ffi::Error::Success();
 }

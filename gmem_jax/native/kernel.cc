@@ -49,7 +49,29 @@ std::size_t scratch_bytes(const Problem& problem, const Block& block) {
   });
 }
 
+// Takes numbers too small for a full mantissa as zero, as XLA's own threads do: every thread must do the same.
+class FlushDenormals {
+ public:
+#if defined(__SSE2__)
+  FlushDenormals() : saved_(_mm_getcsr()) { _mm_setcsr(saved_ | 0x8040); }
+  ~FlushDenormals() { _mm_setcsr(saved_); }
+
+ private:
+  unsigned saved_;
+#elif defined(__aarch64__)
+  FlushDenormals() {
+    asm volatile("mrs %0, fpcr" : "=r"(saved_));
+    asm volatile("msr fpcr, %0" : : "r"(saved_ | (std::uint64_t{1} << 24)));
+  }
+  ~FlushDenormals() { asm volatile("msr fpcr, %0" : : "r"(saved_)); }
+
+ private:
+  std::uint64_t saved_;
+#endif
+};
+
 void run(const Problem& problem, const Block& block, Team& team, int rank, void* scratch) {
+  const FlushDenormals flush;
   with_law(problem, [&](auto law) {
     using L = decltype(law);
     if (block.packed) {

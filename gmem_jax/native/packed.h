@@ -71,8 +71,8 @@ struct Packed {
 
   void load_history(std::ptrdiff_t c) {
     const std::ptrdiff_t row = plan.candidate[c].row;
-    marks.touched[c] = true;
-    marks.wake[c] = 0.0;
+    marks.touched[c] = false;
+    marks.wake[c] = -1.0;  // not looked at yet
     for (int q = 0; q < Law::kHistory; ++q) {
       const Place place = place_of<Law>(row, q);
       history[c][q] = lane.history_in[place.leaf][place.row * problem.stride];
@@ -195,6 +195,13 @@ struct Packed {
     }
   };
 
+  // W contacts; where there are fewer, the rest are dummies far apart.
+  struct Group {
+    int count;
+    int c[W];
+    Candidate pair[W];
+  };
+
   void contacts(int first, int end, const V* parameter, const LawParameters& law, double travel) {
     constexpr int kLook = 256, kBatch = 8 * W;
     int awake[kLook + 1], touching[kBatch];
@@ -223,8 +230,16 @@ struct Packed {
     const Row d = sphere[plan.candidate[c].other] - sphere[plan.candidate[c].one];
     const double square = fma_one(d[2], d[2], fma_one(d[1], d[1], d[0] * d[0]));
     if (square < 4.0) return marks.touched[c] = true;
+    if (marks.wake[c] < 0.0) blank(c);
     marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(square) - 2.0);
     return false;
+  }
+
+  void blank(std::size_t c) {
+    if constexpr (Law::kHistory > 0) history[c] = Row{};
+    if constexpr (Law::kLayered) marks.reached[c] = -1;
+    const int n = plan.candidate[c].guest;
+    if (n >= 0) guest[2 * static_cast<std::size_t>(n)] = guest[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
 
   void compute(const int* touching, int count, const V* parameter, const LawParameters& law) {
@@ -253,19 +268,12 @@ struct Packed {
     }
   }
 
-  // Contacts that have come apart: the laws give them no force and a blank history.
+  // Contacts that have come apart in this step: the laws give them no force and a blank history.
   void forget_apart(const Group& g, V overlap) {
     if (!bits_less(overlap, splat(1e-300))) return;
     for (int l = 0; l < g.count; ++l)
       if (!(overlap[l] > 0.0)) marks.touched[g.c[l]] = false;
   }
-
-  // W contacts; where there are fewer, the rest are dummies far apart.
-  struct Group {
-    int count;
-    int c[W];
-    Candidate pair[W];
-  };
 
   Group group_of(const int* touching, int count) const {
     Group g;

@@ -89,9 +89,9 @@ void Team::barrier() {
     phase_.store(phase + 1, std::memory_order_release);
     return;
   }
-  // Spin for about as long as a phase of a small pack takes; then let others have the CPU.
+  // Spin for some microseconds; then the others may need this CPU.
   for (int spins = 0; phase_.load(std::memory_order_acquire) == phase; ++spins) {
-    if (spins < 4000) {
+    if (spins < 200) {
       pause();
     } else {
       std::this_thread::yield();
