@@ -1,0 +1,99 @@
+"""The native backend gives the numbers of the definition, for every law, alone or in a batch."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax import dynamics, native
+from gmem_jax.drive import Motion
+from gmem_jax.dynamics import Sample, System, start
+from gmem_jax.state import State, replicate
+
+BUILT, REASON = native.available()
+pytestmark = pytest.mark.skipif(not BUILT, reason=REASON)
+
+PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
+LAWS = [gm.Frictionless(), gm.Hooke(mu=0.5), gm.MindlinRescaled(mu=0.5), gm.Mindlin(mu=0.5, points=20)]
+
+
+def compress(advance: native.Advance, law: object, replicas: int) -> tuple[State, Sample]:
+    """1,000 steps of a sheared compression by 5 %: contacts form, slide, roll and break."""
+    system = System(PACK.clump, law, PACK.pairs)
+    state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
+    heights = jnp.linspace(-1.0, 1.0, max(1, replicas - 1))[:, None]
+    shear = gm.Bumps(heights, jnp.full_like(heights, 0.5), 0.8) if replicas > 1 else None
+    motion = Motion(PACK.lower[:, None], PACK.upper[:, None], 0.05, 0.0, 1.0, 300.0, 1e-2, shear)
+    return jax.jit(lambda s: advance(system, s, motion, 0.3, bins=10, steps=100))(replicate(state, replicas))
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: type(law).__name__)
+@pytest.mark.parametrize("replicas", [1, 9])
+def test_native_and_plain_jax_agree_to_the_growth_of_round_off(law: object, replicas: int) -> None:
+    plain, plain_sample = compress(dynamics.advance, law, replicas)
+    fast, fast_sample = compress(native.advance, law, replicas)
+    # Positions are of order 10 and carry 1e-15; contacts amplify differences some 1e4-fold in 1,000 steps at most.
+    np.testing.assert_allclose(fast.grains.position, plain.grains.position, atol=1e-10)
+    largest = float(jnp.abs(plain_sample.pressure).max())
+    np.testing.assert_allclose(fast_sample.pressure, plain_sample.pressure, atol=1e-9 * largest)
+    for one, other in zip(jax.tree.leaves(fast.history), jax.tree.leaves(plain.history), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-8 * float(jnp.abs(other).max()))
+    np.testing.assert_array_equal(fast.status, plain.status)
+
+
+def test_a_replica_is_bitwise_the_same_in_any_place_of_a_batch() -> None:
+    system = System(PACK.clump, gm.Hooke(), PACK.pairs)
+    state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
+    heights = jnp.asarray([0.3, -1.0, 1.0, 0.5, 0.1, -0.2, 0.7, 0.9, -0.4, 0.6, 0.2])
+
+    def run(order: list[int]) -> np.ndarray:
+        chosen = heights[jnp.asarray(order)][:, None]
+        signals = gm.Bumps(chosen, jnp.full_like(chosen, 0.5), 0.8)
+        motion = Motion(PACK.lower[:, None], PACK.upper[:, None], 0.05, 0.0, 1.0, 300.0, 1e-2, signals)
+        moved = jax.jit(lambda s: native.advance(system, s, motion, 0.3, bins=2, steps=100))
+        return np.asarray(moved(replicate(state, len(order) + 1))[0].grains.position)
+
+    everyone = run(list(range(11)))
+    few = run([7, 2])
+    np.testing.assert_array_equal(everyone[..., 8], few[..., 1])
+    np.testing.assert_array_equal(everyone[..., 3], few[..., 2])
+
+
+def test_derivatives_are_those_of_the_definition() -> None:
+    def end(advance: native.Advance, mu: jax.Array) -> jax.Array:
+        system = System(PACK.clump, gm.Hooke(mu=mu), PACK.pairs)
+        state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
+        motion = Motion(PACK.lower[:, None], PACK.upper[:, None], 0.05, 0.0, 1.0, 60.0)
+        _, sample = advance(system, state, motion, 0.3, bins=2, steps=100)
+        return 1e3 * jnp.sum(sample.pressure[-1])
+
+    mu = jnp.asarray(0.3)
+    for derivative in (jax.grad, jax.jacfwd):
+        fast, plain = (
+            jax.jit(derivative(lambda m, a=advance: end(a, m)))(mu) for advance in (native.advance, dynamics.advance)
+        )
+        assert abs(float(plain)) > 1e-3
+        np.testing.assert_allclose(fast, plain, rtol=1e-8)
+
+
+def test_vmap_makes_lanes() -> None:
+    def end(mu: jax.Array) -> jax.Array:
+        return compress(native.advance, gm.Hooke(mu=mu), 1)[0].grains.position
+
+    together = jax.vmap(end)(jnp.asarray([0.2, 0.7]))
+    np.testing.assert_allclose(together[1], end(jnp.asarray(0.7)), atol=1e-10)
+
+
+def test_unknown_backends_and_laws_are_refused() -> None:
+    with pytest.raises(ValueError, match="auto, jax, native"):
+        native.pick("fortran")
+    assert native.pick("jax") is dynamics.advance
+
+    class Own(gm.Hooke):
+        """A law the library has not seen."""
+
+    with pytest.raises(ValueError, match="does not know the friction law Own"):
+        compress(native.advance, Own(), 1)
