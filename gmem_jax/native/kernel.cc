@@ -4,6 +4,7 @@
 #include "team.h"
 
 #include <cstring>
+#include <type_traits>
 
 #if defined(__SSE2__)
 #include <immintrin.h>
@@ -17,6 +18,7 @@ namespace GMEM_ISA {
 #include "simd.h"
 #include "vectors.h"
 #include "laws.h"
+#include "layers.h"
 #include "contact.h"
 #include "rows.h"
 #include "block.h"
@@ -24,28 +26,26 @@ namespace GMEM_ISA {
 #include "replicas.h"
 #include "packed.h"
 
-// Calls `function` with the law of `problem` as a type.
+// Calls `function` with the engine for this law and block.
 template <class Function>
-auto with_law(const Problem& problem, const Function& function) {
+auto with_engine(const Problem& problem, const Block& block, const Function& function) {
+  const auto with_mode = [&](auto law) {
+    using L = decltype(law);
+    return block.packed ? function(static_cast<Engine<Packed<L>>*>(nullptr))
+                        : function(static_cast<Engine<Replicas<L>>*>(nullptr));
+  };
   switch (problem.law) {
-    case Law::hooke: return function(Hooke{});
-    case Law::mindlin_rescaled: return function(Rescaled{});
-    case Law::mindlin:
-      switch (problem.variant) {
-        case Variant::averaged: return function(Layered<Variant::averaged>{});
-        case Variant::paper: return function(Layered<Variant::paper>{});
-        default: return function(Layered<Variant::exact>{});
-      }
-    default: return function(Frictionless{});
+    case Law::hooke: return with_mode(Hooke{});
+    case Law::mindlin_rescaled: return with_mode(Rescaled{});
+    case Law::mindlin: return function(static_cast<Engine<Packed<Layered>>*>(nullptr));
+    default: return with_mode(Frictionless{});
   }
 }
 
 std::size_t scratch_bytes(const Problem& problem, const Block& block) {
-  return with_law(problem, [&](auto law) {
+  return with_engine(problem, block, [&](auto engine) {
     Carver carver{nullptr};
-    using L = decltype(law);
-    return block.packed ? Engine<Packed<L>>::carve(problem, block, carver, nullptr)
-                        : Engine<Replicas<L>>::carve(problem, block, carver, nullptr);
+    return std::remove_pointer_t<decltype(engine)>::carve(problem, block, carver, nullptr);
   });
 }
 
@@ -72,13 +72,8 @@ class FlushDenormals {
 
 void run(const Problem& problem, const Block& block, Team& team, int rank, void* scratch) {
   const FlushDenormals flush;
-  with_law(problem, [&](auto law) {
-    using L = decltype(law);
-    if (block.packed) {
-      Engine<Packed<L>>(problem, block, team, rank, scratch).run();
-    } else {
-      Engine<Replicas<L>>(problem, block, team, rank, scratch).run();
-    }
+  with_engine(problem, block, [&](auto engine) {
+    std::remove_pointer_t<decltype(engine)>(problem, block, team, rank, scratch).run();
   });
 }
 

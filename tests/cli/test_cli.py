@@ -104,7 +104,7 @@ BAD = [
     (["prepare", "--dt", "0.6", "-o", "{out}"], "dt must be in (0, 0.5] t_c, got 0.6"),
     (["prepare", "-o", "/proc/nowhere/pack.h5"], "folder /proc/nowhere does not exist"),
     (["prepare", "-o", "/proc/pack.h5"], "cannot write there"),
-    (["prepare", "--grains", "many", "-o", "{out}"], "many"),
+    (["prepare", "--grains", "many", "-o", "{out}"], "'--grains': Input should be a valid integer"),
     (["prepare"], "Missing option"),
     (["recall", "{pack}", "--mu", "-0.5", "-o", "{out}"], "--mu: input should be greater than or equal to 0, got -0.5"),
     (["recall", "{pack}", "--dt", "0.7", "-o", "{out}"], "--dt: input should be less than or equal to 0.5, got 0.7"),
