@@ -242,8 +242,9 @@ struct Packed {
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
     if constexpr (Law::kLayered) {
       for (int n = 0; n < groups; ++n)
-        friction(Law{}, contact[n], group[n].count, law, problem.points, problem.variant,
-                 [&](int l) { return layers_at(group[n].c[l]); });
+        LayeredFriction(contact[n], group[n].count, law, problem.points, problem.variant).run([&](int l) {
+          return layers_at(group[n].c[l]);
+        });
     } else {
       friction(Law{}, contact, groups, law);
     }
