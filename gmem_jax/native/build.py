@@ -66,7 +66,8 @@ def build(target: Path) -> None:
     cxx, include = compiler(), headers()
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     sets = INSTRUCTION_SETS if x86 else {"baseline": ()}
-    jobs = [("team.cc", "team.o", ()), ("plan.cc", "plan.o", ()), ("handler.cc", "handler.o", ("-isystem", str(include)))]
+    jobs: list[tuple[str, str, tuple[str, ...]]] = [("team.cc", "team.o", ()), ("plan.cc", "plan.o", ())]
+    jobs.append(("handler.cc", "handler.o", ("-isystem", str(include))))
     jobs += [("kernel.cc", f"{name}.o", (f"-DGMEM_ISA={name}", *flags)) for name, flags in sets.items()]
 
     def run(command: list[str]) -> None:

@@ -4,7 +4,6 @@
 #include "team.h"
 
 #include <cstring>
-#include <type_traits>
 
 #if defined(__SSE2__)
 #include <immintrin.h>
@@ -18,7 +17,6 @@ namespace GMEM_ISA {
 #include "simd.h"
 #include "vectors.h"
 #include "laws.h"
-#include "layers.h"
 #include "contact.h"
 #include "rows.h"
 #include "block.h"
@@ -26,26 +24,28 @@ namespace GMEM_ISA {
 #include "replicas.h"
 #include "packed.h"
 
-// Calls `function` with the engine for this law and block.
+// Calls `function` with the law of `problem` as a type.
 template <class Function>
-auto with_engine(const Problem& problem, const Block& block, const Function& function) {
-  const auto with_mode = [&](auto law) {
-    using L = decltype(law);
-    return block.packed ? function(static_cast<Engine<Packed<L>>*>(nullptr))
-                        : function(static_cast<Engine<Replicas<L>>*>(nullptr));
-  };
+auto with_law(const Problem& problem, const Function& function) {
   switch (problem.law) {
-    case Law::hooke: return with_mode(Hooke{});
-    case Law::mindlin_rescaled: return with_mode(Rescaled{});
-    case Law::mindlin: return function(static_cast<Engine<Packed<Layered>>*>(nullptr));
-    default: return with_mode(Frictionless{});
+    case Law::hooke: return function(Hooke{});
+    case Law::mindlin_rescaled: return function(Rescaled{});
+    case Law::mindlin:
+      switch (problem.variant) {
+        case Variant::averaged: return function(Layered<Variant::averaged>{});
+        case Variant::paper: return function(Layered<Variant::paper>{});
+        default: return function(Layered<Variant::exact>{});
+      }
+    default: return function(Frictionless{});
   }
 }
 
 std::size_t scratch_bytes(const Problem& problem, const Block& block) {
-  return with_engine(problem, block, [&](auto engine) {
+  return with_law(problem, [&](auto law) {
     Carver carver{nullptr};
-    return std::remove_pointer_t<decltype(engine)>::carve(problem, block, carver, nullptr);
+    using L = decltype(law);
+    return block.packed ? Engine<Packed<L>>::carve(problem, block, carver, nullptr)
+                        : Engine<Replicas<L>>::carve(problem, block, carver, nullptr);
   });
 }
 
@@ -72,8 +72,13 @@ class FlushDenormals {
 
 void run(const Problem& problem, const Block& block, Team& team, int rank, void* scratch) {
   const FlushDenormals flush;
-  with_engine(problem, block, [&](auto engine) {
-    std::remove_pointer_t<decltype(engine)>(problem, block, team, rank, scratch).run();
+  with_law(problem, [&](auto law) {
+    using L = decltype(law);
+    if (block.packed) {
+      Engine<Packed<L>>(problem, block, team, rank, scratch).run();
+    } else {
+      Engine<Replicas<L>>(problem, block, team, rank, scratch).run();
+    }
   });
 }
 

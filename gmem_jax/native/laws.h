@@ -116,10 +116,12 @@ struct Rescaled {
   static constexpr bool kLayered = false;
 };
 
+template <Variant variant_>
 struct Layered {
   static constexpr int kHistory = 1;  // overlap; the layers are kept apart
   static constexpr int kVectors = 0;
   static constexpr bool kLayered = true;
+  static constexpr Variant variant = variant_;
 };
 
 GMEM_INLINE void friction(Frictionless, Contact* c, int count, const LawParameters&) {
@@ -149,4 +151,91 @@ GMEM_INLINE void friction(Rescaled, Contact* c, int count, const LawParameters& 
     store_vec(c[n].history, zero_unless(c[n].touching(), fma(rest * c[n].root_overlap, c[n].sliding, c[n].force)));
     c[n].history[3] = zero_unless(c[n].touching(), c[n].overlap);
   }
+}
+
+// Where a contact stands in its rings: `x` rings reached, the outermost number `outer` filled in part.
+struct Reach {
+  V x, outer;
+
+  Reach(V root_overlap, const LawParameters& law, int points) : x(root_overlap * law.inverse_spacing) {
+    const V last = splat(points - 2.0);
+    outer = select(x < last, floor_of(select(x < last, x, V{})), last);
+  }
+};
+
+// How much point `j` counts, by "exact" weights.
+inline V weight(const Reach& r, V j) {
+  return zero_unless(j <= r.outer, select(j < r.outer, splat(1.0), r.x - j));
+}
+
+// One contact. `layers` has `get(j)`, zero beyond the layers that are stored; `set(j, f)`; `stored(j)`, what `set`
+// stored; and `keep(count)`, after which the others are zero.
+template <Variant variant, class Layers>
+void friction(Layered<variant>, Contact& c, const LawParameters& law, Layers layers) {
+  const V one = splat(1.0), half = splat(0.5);
+  const Mask touching = c.touching();
+  const Transport transport(c);
+  const Reach now(c.root_overlap, law, layers.points());
+  const Vec half_step = law.half_step * c.sliding;
+  Mask attached = touching;
+  V total = now.x;
+  if (variant == Variant::paper) {
+    attached &= now.x > half;
+    total = select(now.x > half, now.x - half, one);
+  }
+  const Reach before(variant == Variant::averaged ? root(c.history[0]) : V{}, law, layers.points());
+
+  // Rings below `whole` are filled in every lane, before and now, and need no masks.
+  const int end = static_cast<int>(largest(zero_unless(touching, now.outer))) + 1;
+  const bool all = !bits_less(zero_unless(attached, one), one);
+  int whole = all ? static_cast<int>(smallest(now.outer)) : 0;
+  if (variant == Variant::averaged) {
+    const int whole_before = static_cast<int>(smallest(before.outer));
+    whole = whole < whole_before ? whole : whole_before;
+  }
+  constexpr int kLayers = 8;  // taken along together, for the same reason as contacts
+  Vec f[kLayers];
+  V squared[kLayers], product[kLayers], inverse[kLayers];
+  Vec sum{V{}, V{}, V{}};
+  for (int first = 0; first < end; first += kLayers) {
+    const int count = end - first < kLayers ? end - first : kLayers;
+    for (int n = 0; n < count; ++n) {
+      f[n] = layers.get(first + n);
+      product[n] = transport.flatten(f[n], squared[n]);
+    }
+    for (int n = 0; n < count; ++n) inverse[n] = inverse_root(product[n]);
+    for (int n = 0; n < count; ++n) {
+      const int j = first + n;
+      const V at = splat(j);
+      Vec carried = transport.restore(f[n], squared[n], product[n], inverse[n]);
+      if (j < whole) {
+        carried = carried + half_step;
+        sum = variant == Variant::paper && j == 0 ? half * carried : sum + carried;
+      } else {
+        V w = weight(now, at);
+        if (variant == Variant::averaged) {  // the force in a ring that fills stays
+          const V filled = weight(before, at);
+          const Mask grows = filled < w;
+          carried = select(grows, filled / select(grows, w, one), one) * carried;
+        }
+        if (variant == Variant::paper && j == 0) w = w - half;
+        const Mask inside = attached & (at <= now.outer);
+        carried = zero_unless(inside, carried + half_step);
+        sum = fma(zero_unless(inside, w), carried, sum);
+      }
+      layers.set(j, carried);
+    }
+  }
+  const Vec trial = fma(law.spacing, sum, (law.dashpot * c.root_overlap) * c.sliding);
+  c.force = trial;
+  coulomb(&c, 1, law.mu);
+  const Vec correction = fma(one / (law.spacing * total), c.force - trial, half_step);
+  int j = 0;
+  for (; j < whole; ++j) layers.set(j, layers.stored(j) + correction);
+  for (; j < end; ++j) {
+    const Mask inside = attached & (splat(j) <= now.outer);
+    layers.set(j, zero_unless(inside, layers.stored(j) + correction));
+  }
+  layers.keep(end);
+  c.history[0] = zero_unless(touching, c.overlap);
 }

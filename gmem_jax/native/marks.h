@@ -4,8 +4,8 @@
 struct Marks {
   bool* touched;       // in any lane, at the last step: only then is there a history to forget
   double* wake;        // the travel at which it may next touch: until then it need not be looked at
-  int* stored;         // Mindlin: how many layers are stored; those beyond are zero
-  int* stored_first;   // ... and were at the beginning of the call
+  int* reached;        // Mindlin: the last layer that is stored; those beyond are zero
+  int* reached_first;  // ... and was at the beginning of the call
 };
 
 template <class Law>
@@ -13,16 +13,17 @@ void carve_marks(const Plan& plan, Carver& carver, Marks* marks) {
   const std::size_t count = static_cast<std::size_t>(plan.candidates) + 1;  // and a dummy
   bool* touched = carver.take<bool>(count);
   double* wake = carver.take<double>(count);
-  int* stored = carver.take<int>(Law::kLayered ? count : 0);
+  int* reached = carver.take<int>(Law::kLayered ? count : 0);
   int* first = carver.take<int>(Law::kLayered ? count : 0);
-  if (marks) *marks = {touched, wake, stored, first};
+  if (marks) *marks = {touched, wake, reached, first};
 }
 
-// Layers that an overlap fills, and one more: its root may differ from JAX's in the last digit.
-inline int layers_of(const Problem& p, const Lane& lane, double overlap) {
-  if (!(overlap > 0.0)) return 0;
-  const double reached = __builtin_sqrt(overlap) / lane.parameters[(kLaw + 3) * p.stride] + 2.0;
-  return static_cast<int>(reached < p.points ? reached : p.points);
+// The last layer that an overlap fills, and one more: its root may differ from JAX's in the last digit.
+inline int layer_of(const Problem& p, const Lane& lane, double overlap) {
+  if (!(overlap > 0.0)) return -1;
+  const double last = p.points - 1.0;
+  const double reached = __builtin_sqrt(overlap) / lane.parameters[(kLaw + 3) * p.stride] + 1.0;
+  return static_cast<int>(reached < last ? reached : last);
 }
 
 struct Place {

@@ -16,7 +16,7 @@ struct Packed {
   GrainRows* grain;  // [N + 1]
   Row* guest;        // [guests, 2]: force and torque
   Row* history;      // [candidates + 1]
-  double* layer;     // [candidates + 1, 3, Q in whole tiles] of the Mindlin law
+  double* layer;     // [candidates + 1, Q, 3] of the Mindlin law
   Marks marks;
 
   Packed(const Problem& problem, const Block& block)
@@ -34,7 +34,7 @@ struct Packed {
     Row* history = carver.take<Row>(Law::kHistory ? candidates : 0);
     if (mode) mode->sphere = sphere, mode->grain = grain, mode->guest = guest, mode->history = history;
     carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
-    double* layer = carver.take<double>(Law::kLayered ? candidates * 3 * whole_tiles(p.points) : 0);
+    double* layer = carver.take<double>(Law::kLayered ? candidates * p.points * 3 : 0);
     if (mode) mode->layer = layer;
     return carver.used;
   }
@@ -78,13 +78,10 @@ struct Packed {
       history[c][q] = lane.history_in[place.leaf][place.row * problem.stride];
     }
     if constexpr (Law::kLayered) {
-      const Layers to = layers_at(c);
-      const int layers = layers_of(problem, lane, history[c][0]);
-      *to.stored = marks.stored_first[c] = whole_tiles(layers);
-      for (int j = 0; j < *to.stored; ++j)
-        for (int q = 0; q < 3; ++q)
-          to.at[q * to.row + j] =
-              j < layers ? lane.history_in[0][((row * problem.points + j) * 3 + q) * problem.stride] : 0.0;
+      const int reached = layer_of(problem, lane, history[c][0]);
+      marks.reached[c] = marks.reached_first[c] = reached;
+      const std::ptrdiff_t from = row * problem.points * 3, to = c * problem.points * 3;
+      for (int q = 0; q < 3 * (reached + 1); ++q) layer[to + q] = lane.history_in[0][(from + q) * problem.stride];
     }
   }
 
@@ -95,12 +92,11 @@ struct Packed {
       lane.history_out[place.leaf][place.row * problem.stride] = history[c][q];
     }
     if constexpr (Law::kLayered) {
-      const Layers from = layers_at(c);
-      const int stale = problem.history_aliased ? marks.stored_first[c] : problem.points;
-      for (int j = 0; j < problem.points && (j < *from.stored || j < stale); ++j)
-        for (int q = 0; q < 3; ++q)
-          lane.history_out[0][((row * problem.points + j) * 3 + q) * problem.stride] =
-              j < *from.stored ? from.at[q * from.row + j] : 0.0;
+      const std::ptrdiff_t to = row * problem.points * 3, from = c * problem.points * 3;
+      const int stored = 3 * (marks.reached[c] + 1);
+      const int stale = 3 * (problem.history_aliased ? marks.reached_first[c] + 1 : problem.points);
+      for (int q = 0; q < stored; ++q) lane.history_out[0][(to + q) * problem.stride] = layer[from + q];
+      for (int q = stored; q < stale; ++q) lane.history_out[0][(to + q) * problem.stride] = 0.0;
     }
   }
 
@@ -123,6 +119,7 @@ struct Packed {
     sphere[dummy_sphere() + 1] = Row{4.0};
     grain[dummy_grain()] = GrainRows{};
     if constexpr (Law::kHistory > 0) history[plan.candidates] = Row{};
+    if constexpr (Law::kLayered) marks.reached[plan.candidates] = -1;
   }
 
   // --- what the grains tell the contacts, and the contacts the grains
@@ -173,10 +170,30 @@ struct Packed {
 
   // --- contacts
 
-  Layers layers_at(std::size_t c) const {
-    const int row = whole_tiles(problem.points);
-    return {layer + c * 3 * row, row, marks.stored + c};
-  }
+  struct Layers {
+    double* at[W];
+    int* last[W];
+    int count;
+
+    int points() const { return count; }
+    Vec get(int j) const {
+      Vec f{V{}, V{}, V{}};
+      for (int l = 0; l < W; ++l)
+        if (j <= *last[l]) f.x[l] = at[l][3 * j], f.y[l] = at[l][3 * j + 1], f.z[l] = at[l][3 * j + 2];
+      return f;
+    }
+    Vec stored(int j) const {
+      Vec f;
+      for (int l = 0; l < W; ++l) f.x[l] = at[l][3 * j], f.y[l] = at[l][3 * j + 1], f.z[l] = at[l][3 * j + 2];
+      return f;
+    }
+    void set(int j, Vec f) {
+      for (int l = 0; l < W; ++l) at[l][3 * j] = f.x[l], at[l][3 * j + 1] = f.y[l], at[l][3 * j + 2] = f.z[l];
+    }
+    void keep(int kept) {
+      for (int l = 0; l < W; ++l) *last[l] = kept - 1;
+    }
+  };
 
   // W contacts; where there are fewer, the rest are dummies far apart.
   struct Group {
@@ -220,7 +237,7 @@ struct Packed {
 
   void blank(std::size_t c) {
     if constexpr (Law::kHistory > 0) history[c] = Row{};
-    if constexpr (Law::kLayered) marks.stored[c] = 0;
+    if constexpr (Law::kLayered) marks.reached[c] = -1;
     const int n = plan.candidate[c].guest;
     if (n >= 0) guest[2 * static_cast<std::size_t>(n)] = guest[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
@@ -241,10 +258,7 @@ struct Packed {
     close(contact, groups, parameter);
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
     if constexpr (Law::kLayered) {
-      for (int n = 0; n < groups; ++n)
-        LayeredFriction(contact[n], group[n].count, law, problem.points, problem.variant).run([&](int l) {
-          return layers_at(group[n].c[l]);
-        });
+      for (int n = 0; n < groups; ++n) friction(Law{}, contact[n], law, layers_of(group[n]));
     } else {
       friction(Law{}, contact, groups, law);
     }
@@ -301,6 +315,16 @@ struct Packed {
         history[g.c[l]] = row;
       }
     }
+  }
+
+  Layers layers_of(const Group& g) {
+    Layers layers;
+    layers.count = problem.points;
+    for (int l = 0; l < W; ++l) {
+      layers.at[l] = layer + static_cast<std::size_t>(g.c[l]) * problem.points * 3;
+      layers.last[l] = marks.reached + g.c[l];
+    }
+    return layers;
   }
 
   GMEM_INLINE void add(const Group& g, const Push& push) {

@@ -3,8 +3,6 @@
 
 template <class Law>
 struct Replicas {
-  static_assert(!Law::kLayered, "Mindlin's layers fill the lanes by themselves");
-
   const Problem& problem;
   const Block& block;
   const Plan& plan;
@@ -14,6 +12,7 @@ struct Replicas {
   V* sphere;      // [S, 3]: centres
   V* guest;       // [guests, 6]: force and torque
   V* history;     // [candidates, Law::kHistory]
+  V* layer;       // [candidates, Q, 3] of the Mindlin law
   Marks marks;
 
   Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
@@ -41,6 +40,8 @@ struct Replicas {
     V* history = carver.take<V>(candidates * Law::kHistory);
     if (mode) mode->sphere = sphere, mode->guest = guest, mode->history = history;
     carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
+    V* layer = carver.take<V>(Law::kLayered ? candidates * p.points * 3 : 0);
+    if (mode) mode->layer = layer;
     return carver.used;
   }
 
@@ -101,6 +102,17 @@ struct Replicas {
       history[c * Law::kHistory + q] =
           read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row);
     }
+    if constexpr (Law::kLayered) {
+      int reached = -1;
+      for (int l = 0; l < block.count; ++l) {
+        const int of_lane = layer_of(problem, block.lanes[l], history[c][l]);
+        reached = of_lane > reached ? of_lane : reached;
+      }
+      marks.reached[c] = marks.reached_first[c] = reached;
+      const std::ptrdiff_t from = row * problem.points * 3, to = c * problem.points * 3;
+      for (int q = 0; q < 3 * (reached + 1); ++q)
+        layer[to + q] = read([](const Lane& lane) { return lane.history_in[0]; }, from + q);
+    }
   }
 
   void unload_history(std::ptrdiff_t c, int steps_done) const {
@@ -110,6 +122,14 @@ struct Replicas {
       write([place](const Lane& lane) { return lane.history_out[place.leaf]; }, place.row,
             history[c * Law::kHistory + q], steps_done);
     }
+    if constexpr (Law::kLayered) {
+      const std::ptrdiff_t to = row * problem.points * 3, from = c * problem.points * 3;
+      const auto out = [](const Lane& lane) { return lane.history_out[0]; };
+      const int stored = 3 * (marks.reached[c] + 1);
+      const int stale = 3 * (problem.history_aliased ? marks.reached_first[c] + 1 : problem.points);
+      for (int q = 0; q < stored; ++q) write(out, to + q, layer[from + q], steps_done);
+      for (int q = stored; q < stale; ++q) write(out, to + q, V{}, steps_done);
+    }
   }
 
   void unload_padding(int n, int steps_done) const {
@@ -118,6 +138,9 @@ struct Replicas {
       const Place place = place_of<Law>(row, q);
       write([place](const Lane& lane) { return lane.history_out[place.leaf]; }, place.row, V{}, steps_done);
     }
+    if (Law::kLayered && !problem.history_aliased)
+      for (int q = 0; q < 3 * problem.points; ++q)
+        write([](const Lane& lane) { return lane.history_out[0]; }, row * problem.points * 3 + q, V{}, steps_done);
   }
 
   void load_dummies() {}
@@ -160,6 +183,18 @@ struct Replicas {
 
   // --- contacts
 
+  struct Layers {
+    V* at;
+    int* last;
+    int count;
+
+    int points() const { return count; }
+    Vec get(int j) const { return j <= *last ? stored(j) : Vec{V{}, V{}, V{}}; }
+    Vec stored(int j) const { return load_vec(at + 3 * j); }
+    void set(int j, Vec f) { store_vec(at + 3 * j, f); }
+    void keep(int kept) { *last = kept - 1; }
+  };
+
   void contacts(int first, int end, const V* parameter, const LawParameters& law, double travel) {
     constexpr int kLook = 256, kBatch = 8;
     const V contact_square = splat(4.0);
@@ -198,13 +233,21 @@ struct Replicas {
 
   void compute(const int* touching, int count, Contact* contact, const V* parameter, const LawParameters& law) {
     close(contact, count, parameter);
-    friction(Law{}, contact, count, law);
+    if constexpr (Law::kLayered) {
+      for (int n = 0; n < count; ++n) {
+        const std::size_t c = touching[n];
+        friction(Law{}, contact[n], law, Layers{layer + c * problem.points * 3, marks.reached + c, problem.points});
+      }
+    } else {
+      friction(Law{}, contact, count, law);
+    }
     for (int n = 0; n < count; ++n) add(plan.candidate[touching[n]], push(contact[n]));
   }
 
   void forget(std::size_t c, const Candidate& pair) {
     marks.touched[c] = false;
     for (int q = 0; q < Law::kHistory; ++q) history[c * Law::kHistory + q] = V{};
+    if constexpr (Law::kLayered) marks.reached[c] = -1;
     if (pair.guest >= 0)
       for (int q = 0; q < 6; ++q) guest[6 * static_cast<std::size_t>(pair.guest) + q] = V{};
   }
