@@ -109,6 +109,7 @@ def prepare_command(
     t0: Annotated[float, typer.Option(help="Duration of one compression, t_c.")] = 1.8e3,
     dt: Annotated[float, typer.Option(help="Largest time step, t_c.")] = 0.3,
     name: Annotated[str, typer.Option(help="Name of the pack; default from grain, size and seed.")] = "",
+    backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",
     as_json: AsJson = False,
 ) -> None:
     """Prepare a pack: gas, pressure, frictionless cycles, rest."""
@@ -120,7 +121,7 @@ def prepare_command(
     began = time.perf_counter()
     stages: dict[str, Sample] = {}
     with _progress() as progress:
-        pack = prepare(recipe, clump, name=name, progress=progress, log=stages)
+        pack = prepare(recipe, clump, name=name, backend=backend, progress=progress, log=stages)
     storage.save_pack(output, pack, stages)
     seconds = time.perf_counter() - began
     rest = pack.info["at_rest"]

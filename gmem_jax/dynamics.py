@@ -203,6 +203,32 @@ def wall_pressure(walls: jax.Array, box: Box) -> jax.Array:
     return (walls[0] + walls[1]) / (2.0 * area)
 
 
+def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
+    """One step for each of the boxes.
+
+    Args:
+        system: the system.
+        state: at time t.
+        boxes: the walls at t + dt, t + 2 dt, ...; leaves [steps, 3, B].
+        dt: scalar or [B].
+        drag: see `step`.
+
+    Returns:
+        The state after them, and the sum over the steps of the wall pressures, [3, B].
+    """
+
+    def one_step(carry: tuple[State, jax.Array], xs: tuple[jax.Array, Box]) -> tuple[tuple[State, jax.Array], None]:
+        state, total = carry
+        index, box = xs
+        state, walls = step(system, state, box, jnp.asarray(dt), drag, index >= 0)
+        return (state, total + wall_pressure(walls, box)), None
+
+    total = jnp.zeros((3, state.replicas), state.grains.position.dtype)
+    count = jnp.arange(boxes.lower.shape[0])
+    (state, total), _ = lax.scan(one_step, (state, total), (count, boxes))
+    return state, total
+
+
 def start(system: System, position: jax.Array, quaternion: jax.Array, box: Box) -> State:
     """Grains at rest at `position` [N, 3, B], `quaternion` [N, 4, B], with blank histories and their accelerations."""
     still = jnp.zeros_like(position)

@@ -1,14 +1,18 @@
 """The +z wall under pressure: a speed-limited servo, and the free flight of the gas (a servo of zero speed)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gmem_jax.dynamics import System, check, step, wall_pressure
+from gmem_jax.dynamics import System, check
 from gmem_jax.neighbors import slack, sphere_centres
 from gmem_jax.state import Box, Scalar, State
+
+March = Callable[..., tuple[State, jax.Array]]
+"""The signature of `gmem_jax.dynamics.march`."""
 
 BLOCK = 8  # steps between two looks at the neighbour list: grains may fly freely here
 
@@ -41,7 +45,7 @@ class Pressed:
     Attributes:
         state: the grains.
         box: the walls.
-        pressure: p_z of the last step, [1].
+        pressure: p_z averaged over the last block, [1].
         blocks: blocks of `BLOCK` steps done by the last call.
         settled: whether pressure and speed are within the servo's bounds.
         crowded: whether the neighbour list must be rebuilt before going on.
@@ -60,32 +64,37 @@ def largest_speed(state: State) -> jax.Array:
     return jnp.sqrt(jnp.max(jnp.sum(state.grains.velocity**2, axis=1)))
 
 
-def press(system: System, pressed: Pressed, servo: Servo, dt: Scalar, drag: Scalar, blocks: int) -> Pressed:
+def press(
+    system: System, pressed: Pressed, servo: Servo, dt: Scalar, drag: Scalar, blocks: int, march: March
+) -> Pressed:
     """Run up to `blocks` blocks of steps; stop early when settled, when the list needs a rebuild, or on a status bit.
 
-    The list is left early enough that it is complete throughout: the next block is allowed for at the speed of the
-    fastest sphere.
+    The wall moves steadily during a block, at a speed set by p_z averaged over the one before. The list is left early
+    enough that it is complete throughout: the next block is allowed for at the speed of the fastest sphere.
     """
     reach = jnp.sqrt(jnp.max(jnp.sum(system.clump.offsets**2, axis=1)))
-
-    def one_step(index: jax.Array, now: Pressed) -> Pressed:
-        velocity = jnp.clip(servo.gain * (now.pressure / servo.target - 1.0), -servo.speed, servo.speed)
-        climb = jnp.zeros_like(now.box.upper).at[2].set(velocity)
-        box = Box(now.box.lower, now.box.upper + dt * climb, jnp.zeros_like(climb), climb)
-        state, walls = step(system, now.state, box, jnp.asarray(dt), drag, index >= 0)
-        return replace(now, state=state, box=box, pressure=wall_pressure(walls, box)[2])
+    times = dt * jnp.arange(1.0, BLOCK + 1.0)[:, None, None]
 
     def block(now: Pressed) -> Pressed:
-        now = lax.fori_loop(0, BLOCK, one_step, now)
-        state = check(system, now.state, now.box)
+        velocity = jnp.clip(servo.gain * (now.pressure / servo.target - 1.0), -servo.speed, servo.speed)
+        climb = jnp.zeros_like(now.box.upper).at[2].set(velocity)
+        still = jnp.zeros_like(climb)
+        boxes = Box(
+            now.box.lower + 0.0 * times, now.box.upper + times * climb, still + 0.0 * times, climb + 0.0 * times
+        )
+        state, total = march(system, now.state, boxes, dt, drag)
+        box = jax.tree.map(lambda leaf: leaf[-1], boxes)
+        state = check(system, state, box)
         fastest = largest_speed(state)
         spin = jnp.sqrt(jnp.max(jnp.sum(state.grains.spin**2, axis=1)))
         ahead = 2.0 * BLOCK * dt * (1.2 * (fastest + reach * spin) + servo.speed)
-        room = jnp.min(slack(system.pairs, sphere_centres(state.grains, system.clump), now.box))
-        met = jnp.max(jnp.abs(now.pressure / servo.target - 1.0)) < servo.error
-        return replace(
-            now,
+        room = jnp.min(slack(system.pairs, sphere_centres(state.grains, system.clump), box))
+        pressure = total[2] / BLOCK
+        met = jnp.max(jnp.abs(pressure / servo.target - 1.0)) < servo.error
+        return Pressed(
             state=state,
+            box=box,
+            pressure=pressure,
             blocks=now.blocks + 1,
             settled=met & (fastest < servo.quiet),
             crowded=room < ahead,

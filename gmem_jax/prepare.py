@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import native, rotation
+from gmem_jax import dynamics, native, rotation
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.frictionless import Frictionless
 from gmem_jax.contact.hooke import Hooke
@@ -26,13 +26,13 @@ from gmem_jax.run import Progress, RunFailedError, Runner, compiled, refuse, req
 from gmem_jax.state import Grains, still_box
 
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
-PRESSING = 2.0e4  # t_c that pressing and settling took at N = 325, for the progress bar
+SETTLING = 6.0e3  # t_c that coming to rest under the piston took at N = 325 to 3,267, for the progress bar
 CYCLE_SKIN = 0.5  # in R; frictionless grains turn freely, so a list lasts only some 50 t_c
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
 DENSE = 0.68  # filling that the pressed pack reaches, which decides the lattice that ends as a cube
 
-_press = compiled(press, static_argnames="blocks")
+_press = compiled(press, static_argnames=("blocks", "march"))
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,8 @@ class Recipe:
         cycles: number of compress/decompress cycles.
         rest: rests at u = 0, in t0.
         hold: hold at u = 1, in t0.
-        drag: viscous drag once the piston has met its pressure, and whenever the walls stand still, 1 / t_c.
+        drag: viscous drag once the piston has met its pressure, and whenever the walls stand still, 1 / t_c. More of it
+            comes to rest later: soft frictionless modes are then overdamped.
         settled_speed: largest grain speed at which the piston is fixed, in R / t_c.
         quiet: largest grain speed of the finished pack, in R / t_c.
         pressure_error: relative error of p_z at which the piston is fixed.
@@ -75,7 +76,7 @@ class Recipe:
     cycles: int = 2
     rest: float = 0.2
     hold: float = 0.2
-    drag: float = 0.05
+    drag: float = 0.01
     settled_speed: float = 1.0e-5
     quiet: float = 1.0e-6
     pressure_error: float = 0.01
@@ -132,7 +133,7 @@ def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array
 class _Preparation:
     """One preparation on its way: a `Runner` with one replica and no friction."""
 
-    def __init__(self, recipe: Recipe, clump: Clump, material: Material, progress: Progress) -> None:
+    def __init__(self, recipe: Recipe, clump: Clump, material: Material, backend: str, progress: Progress) -> None:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
         self.recipe = recipe
         box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
@@ -146,8 +147,13 @@ class _Preparation:
         state = accelerate(system, replace(state, grains=grains), box)
         per_t0 = recipe.t0 / float(dt)
         cycle = 2.0 + recipe.rest + recipe.hold
-        expected = (recipe.gas_time + PRESSING) / float(dt) + (recipe.cycles * cycle + recipe.rest) * per_t0
-        self.runner = Runner(system, state, box, float(dt), finder, progress=progress, total_work=expected)
+        fall = float(lengths[2]) * (1.0 - recipe.filling / DENSE) / min(recipe.piston_speed, recipe.piston_gain)
+        expected = (recipe.gas_time + fall + SETTLING) / float(dt) + (recipe.cycles * cycle + recipe.rest) * per_t0
+        native.pick(backend)  # refuses an unknown one before anything is computed
+        self.march = native.march if native.name(backend, system.friction) == "native" else dynamics.march
+        self.runner = Runner(
+            system, state, box, float(dt), finder, backend=backend, progress=progress, total_work=expected
+        )
         self.log: dict[str, Sample] = {}
 
     def press(self, name: str, servo: Servo, duration: float, drag: float) -> Pressed:
@@ -158,7 +164,7 @@ class _Preparation:
         pressed = Pressed(runner.state, runner.box, jnp.zeros(1), jnp.asarray(0), no, no)
         left = math.ceil(duration / block)
         while left > 0:
-            pressed = _press(runner.system, pressed, servo, runner.dt, drag, blocks=min(CALL, left))
+            pressed = _press(runner.system, pressed, servo, runner.dt, drag, blocks=min(CALL, left), march=self.march)
             refuse(worst(pressed.state), name)
             runner.state, runner.box = pressed.state, pressed.box
             done = int(pressed.blocks)
@@ -224,6 +230,7 @@ def prepare(
     material: Material | None = None,
     friction: FrictionLaw | None = None,
     name: str = "",
+    backend: str = "auto",
     progress: Progress = silent,
     log: dict[str, Sample] | None = None,
     **changes: Any,
@@ -236,6 +243,7 @@ def prepare(
         material: the elastic solid.
         friction: law under which the ringing period of the finished pack is measured; default `Hooke()`.
         name: of the pack; default from grain, size and seed.
+        backend: "auto", "jax" or "native".
         progress: told about every chunk.
         log: filled with the samples of every cycle stage, if given.
         **changes: fields of the recipe that differ, for example ``prepare(grains=64, seed=3)``.
@@ -247,7 +255,7 @@ def prepare(
     require_x64()
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = grain or tetra(), material or Material()
-    preparation = _Preparation(recipe, clump, material, progress)
+    preparation = _Preparation(recipe, clump, material, backend, progress)
     preparation.compact()
     preparation.cycle()
     if log is not None:

@@ -44,6 +44,18 @@ def test_native_and_plain_jax_agree_to_the_growth_of_round_off(law: object, repl
     np.testing.assert_array_equal(fast.status, plain.status)
 
 
+def test_a_march_is_an_advance_without_samples() -> None:
+    system = System(PACK.clump, gm.Hooke(), PACK.pairs)
+    state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
+    motion = Motion(PACK.lower[:, None], PACK.upper[:, None], 0.05, 0.0, 1.0, 300.0)
+    boxes = jax.vmap(motion.box_at)(0.3 * jnp.arange(1.0, 101.0))
+    advanced, sample = dynamics.advance(system, state, motion, 0.3, bins=1, steps=100)
+    for march in (dynamics.march, native.march):
+        marched, total = jax.jit(march)(system, state, boxes, 0.3, 0.0)
+        np.testing.assert_allclose(marched.grains.position, advanced.grains.position, atol=1e-12)
+        np.testing.assert_allclose(total / 100, sample.pressure[0], rtol=1e-9)
+
+
 def test_a_replica_is_bitwise_the_same_in_any_place_of_a_batch() -> None:
     system = System(PACK.clump, gm.Hooke(), PACK.pairs)
     state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)

@@ -103,6 +103,30 @@ def _where_supported(system: System, state: State, *args: Any, **options: Any) -
     return chosen(system, state, *args, **options)
 
 
+def _require(system: System, state: State) -> None:
+    """Raise if this backend cannot run them.
+
+    Raises:
+        ValueError: if the backend is not available, does not know the friction law, or the state is not float64.
+    """
+    possible, reason = available()
+    if not possible:
+        raise ValueError(f"the native backend is not available: {reason}")
+    if not supports(system.friction):
+        raise ValueError(f"the native backend does not know the friction law {type(system.friction).__name__}")
+    if state.grains.position.dtype != jnp.float64:
+        raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
+
+
+def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
+    """`gmem_jax.dynamics.march` on the native backend; arguments, results and errors as of `advance`."""
+    _require(system, state)
+    steps = jnp.full(state.replicas, boxes.lower.shape[0], jnp.int32)
+    numbers = (jnp.asarray(dt), jnp.asarray(drag))
+    grains, history, total = _bin(system, state.grains, state.history, boxes, numbers, steps, jnp.asarray(0))
+    return State(grains, history, state.status), total
+
+
 def advance(
     system: System,
     state: State,
@@ -119,13 +143,7 @@ def advance(
     Raises:
         ValueError: if the backend is not available, does not know the friction law, or the state is not float64.
     """
-    possible, reason = available()
-    if not possible:
-        raise ValueError(f"the native backend is not available: {reason}")
-    if not supports(system.friction):
-        raise ValueError(f"the native backend does not know the friction law {type(system.friction).__name__}")
-    if state.grains.position.dtype != jnp.float64:
-        raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
+    _require(system, state)
     dt = jnp.asarray(dt)
     replicas = state.replicas
 
