@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from typer.exceptions import TyperException
 
-from gmem_jax import grain, native, plot, report, storage
+from gmem_jax import bench, grain, native, plot, report, storage
 from gmem_jax.config import RecallConfig
 from gmem_jax.dynamics import Sample
 from gmem_jax.memory import run_memory
@@ -223,6 +223,41 @@ def show(
     recall, configuration = storage.load_recall(file)
     row = report.summary(recall, configuration)
     _emit(as_json, {**row, "configuration": configuration}, report.recall_table([row], configuration))
+
+
+@app.command("bench")
+def bench_command(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for bench.json and bench.md.")] = Path("bench"),
+    packs: Annotated[str, typer.Option(help="Packs, separated by commas; default one of each shipped size.")] = "",
+    laws: Annotated[str, typer.Option(help="Friction laws among H, M1, M2, separated by commas.")] = "H,M1,M2",
+    replicas: Annotated[str, typer.Option(help="Numbers of replicas, separated by commas.")] = "1,8,16,32",
+    with_lammps: Annotated[bool, typer.Option("--lammps/--no-lammps", help="Measure LAMMPS beside us.")] = True,
+    baseline: Annotated[Path | None, typer.Option(help="A bench.json to compare with.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what a grain-step costs: native backend, plain JAX and LAMMPS, side by side."""
+    shipped = [f"tetra-{size}-a" for size in (325, 1024, 3267)]
+    names = packs.split(",") if packs else [name for name in shipped if name in storage.list_packs()]
+    chosen = laws.split(",")
+    if unknown := [law for law in chosen if law not in bench.LAWS]:
+        raise InputError(f"--laws {unknown[0]}: no such law; there are {', '.join(bench.LAWS)}")
+    counts = replicas.split(",")
+    if not all(count.isdigit() and int(count) > 0 for count in counts):
+        raise InputError(f"--replicas {replicas}: must be positive whole numbers, separated by commas")
+    before = json.loads(baseline.read_text()) if baseline else None
+    _writable(output.parent / "bench.json" if not output.is_dir() else output / "bench.json")
+    with _progress() as progress:
+        result = bench.run(
+            storage.load_pack,
+            names,
+            laws=chosen,
+            replicas=[int(count) for count in counts],
+            with_lammps=with_lammps,
+            say=lambda what, fraction: progress(what, 0.0, fraction),
+        )
+    text = bench.markdown(result, before)
+    bench.save(output, result, text)
+    _emit(as_json, {**result, "status": 0}, text)
 
 
 def _first_problem(error: ValidationError) -> str:

@@ -66,7 +66,7 @@ def refuse(status: int, where: str) -> None:
 
 
 @functools.cache
-def compiled_advance(backend: str) -> Callable[..., tuple[State, Sample]]:
+def compiled_advance(backend: str) -> Any:
     """`advance` of a backend ("auto", "jax" or "native"), compiled once for the process."""
     return compiled(native.pick(backend), static_argnames=("bins", "steps"))
 

@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
-import lammps_run
 import numpy as np
 import pytest
 import scenes
 
 import gmem_jax as gm
-from gmem_jax import dynamics
+from gmem_jax import dynamics, lammps
 from gmem_jax.contact.kinematics import kinematics
 from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.contact.normal import hertz
@@ -27,7 +26,7 @@ from gmem_jax.rotation import cross, dot
 from gmem_jax.run import compiled
 from gmem_jax.state import Box
 
-REASON = lammps_run.missing()
+REASON = lammps.missing()
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
 
 MATERIAL = gm.Material()
@@ -71,10 +70,10 @@ def forces_on_a_path(law, path, spin, duration, steps):
 def two_spheres(folder, law, dt, variables, displacement, velocity, start=(0.0, 0.0, 2.0)):
     """Script of two spheres of which the second is led; its displacement and velocity are formulas of `variables`."""
     still = np.zeros((2, 3))
-    scene = lammps_run.Scene.free(gm.sphere(), [[0.0, 0.0, 0.0], start], [[1.0, 0.0, 0.0, 0.0]] * 2, still, still)
+    scene = lammps.Scene.free(gm.sphere(), [[0.0, 0.0, 0.0], start], [[1.0, 0.0, 0.0, 0.0]] * 2, still, still)
     lines = [
-        *lammps_run.write_scene(scene, folder),
-        *lammps_run.pair_lines(law, MATERIAL, float(gm.sphere().mass)),
+        *lammps.write_scene(scene, folder),
+        *lammps.pair_lines(law, MATERIAL, float(gm.sphere().mass)),
         f"timestep {dt!r}",
         "group one id 1",
         "group two id 2",
@@ -110,7 +109,7 @@ def test_an_oblique_load_and_unload_agrees_once_lammps_is_extrapolated_to_dt_0(l
         folder = tmp_path / str(steps)
         folder.mkdir()
         script = two_spheres(folder, law, duration / steps, variables, displacement, velocity)
-        run = lammps_run.run(script, folder, steps=steps, every=steps // 500, per_grain=1)
+        run = lammps.run(script, folder, steps=steps, every=steps // 500, per_grain=1)
         theirs[steps] = run.force[1:, 0]
     ours = forces_on_a_path(law, path, lambda t: jnp.zeros(3), duration, 4000)[7::8]
     scale = np.abs(ours).max()
@@ -146,7 +145,7 @@ def test_a_tumbling_stuck_pair_carries_its_force_around(law, tmp_path):
     script = two_spheres(tmp_path, law, duration / steps, variables, displacement, velocity, start=(0.0, 0.0, distance))
     # The spin at which LAMMPS' surfaces, at the full radius, do not slide on each other.
     script += [f"run {steps}", f"set group all omega 0 {rate * (1.0 - 0.5 * overlap)!r} 0"]
-    theirs = lammps_run.run(script, tmp_path, steps=steps, every=steps, per_grain=1).force[-1, 0]
+    theirs = lammps.run(script, tmp_path, steps=steps, every=steps, per_grain=1).force[-1, 0]
     ours = forces_on_a_path(law, path, spin, 2.0 * duration, 2 * steps)[[steps - 1, -1]]
     scale = np.linalg.norm(ours[1])
     assert np.linalg.norm(ours[1] - ours[0]) > 0.5 * scale
@@ -211,11 +210,11 @@ class Comparison:
             for name in ("position", "quaternion", "velocity", "spin")
         ]
         planes = (getattr(self.planes, field) for field in ("lower", "upper", "lower_velocity", "upper_velocity"))
-        scene = lammps_run.Scene(self.system.clump, *grains, *planes)
+        scene = lammps.Scene(self.system.clump, *grains, *planes)
         folder.mkdir()
-        script = lammps_run.scene_script(scene, self.system.friction, MATERIAL, dt, folder)
+        script = lammps.scene_script(scene, self.system.friction, MATERIAL, dt, folder)
         per_grain = self.system.clump.spheres
-        run = lammps_run.run(script, folder, steps=steps, every=steps // frames, per_grain=per_grain)
+        run = lammps.run(script, folder, steps=steps, every=steps // frames, per_grain=per_grain)
         return run.position[1:], run.velocity[1:], run.spin[1:], np.abs(run.walls[1:])
 
 

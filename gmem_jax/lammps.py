@@ -22,6 +22,7 @@ from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.grain import Clump
 from gmem_jax.material import Material
 from gmem_jax.rotation import matrix
+from gmem_jax.state import Scalar
 
 OUTPUT = "id x y z vx vy vz omegax omegay omegaz fx fy fz"
 
@@ -99,13 +100,15 @@ class Scene:
     ) -> "Scene":
         """Grains without walls."""
         none, still = np.full(3, np.inf), np.zeros(3)
-        arrays = (np.asarray(a, dtype=float) for a in (position, quaternion, velocity, spin))
-        return cls(clump, *arrays, -none, none, still, still)
+        where, turned, moving, turning = (np.asarray(a, dtype=float) for a in (position, quaternion, velocity, spin))
+        return cls(clump, where, turned, moving, turning, -none, none, still, still)
 
     @property
     def rotations(self) -> np.ndarray:
         """Body-to-lab matrices, [N, 3, 3]."""
-        return np.asarray(matrix(jnp.asarray(self.quaternion)[..., None])[..., 0])
+        stacked = np.asarray(matrix(jnp.asarray(self.quaternion)[..., None]))
+        rotations: np.ndarray = stacked[..., 0]
+        return rotations
 
     @property
     def spheres(self) -> np.ndarray:
@@ -113,7 +116,7 @@ class Scene:
         return self.position[:, None] + np.einsum("nij,kj->nki", self.rotations, np.asarray(self.clump.offsets))
 
 
-def _number(value: float) -> str:
+def _number(value: Scalar) -> str:
     return f"{float(value):.17g}"
 
 
