@@ -106,14 +106,14 @@ class Scene:
     @property
     def rotations(self) -> np.ndarray:
         """Body-to-lab matrices, [N, 3, 3]."""
-        stacked = np.asarray(matrix(jnp.asarray(self.quaternion)[..., None]))
-        rotations: np.ndarray = stacked[..., 0]
-        return rotations
+        return np.array(matrix(jnp.asarray(self.quaternion)[..., None])[..., 0], dtype=float)
 
     @property
     def spheres(self) -> np.ndarray:
         """Sphere centres, [N, K, 3]."""
-        return self.position[:, None] + np.einsum("nij,kj->nki", self.rotations, np.asarray(self.clump.offsets))
+        arms = np.einsum("nij,kj->nki", self.rotations, np.asarray(self.clump.offsets))
+        centres: np.ndarray = self.position[:, None] + arms
+        return centres
 
 
 def _number(value: Scalar) -> str:
