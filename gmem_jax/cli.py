@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
+import psutil
 import typer
 from pydantic import ValidationError
 from rich.console import Console
@@ -18,7 +19,7 @@ from typer.exceptions import TyperException
 from gmem_jax import bench, grain, native, plot, report, storage
 from gmem_jax.config import RecallConfig
 from gmem_jax.dynamics import Sample
-from gmem_jax.memory import run_memory
+from gmem_jax.memory import default_batch, run_memory
 from gmem_jax.prepare import Recipe, prepare
 from gmem_jax.provenance import provenance
 from gmem_jax.run import Progress as Report
@@ -134,10 +135,18 @@ def _run(config: RecallConfig, data: Path, picture: Path | None) -> tuple[dict[s
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
     pack, signals = storage.load_pack(config.pack), config.waveforms()
     began = time.perf_counter()
+    folder = data.with_name(f"{data.name}.parts")
+    free = psutil.virtual_memory().available
+    batch = config.batch or storage.Parts.key_of(folder).get("batch") or default_batch(pack, config.law(), free)
+    parts = storage.Parts(folder, config.key(pack, batch))
+    if parts.finished():
+        log.print(f"going on from {parts.folder}: {parts.finished()} finished parts", soft_wrap=True)
     with _progress() as progress:
-        recall = jax.block_until_ready(run_memory(pack, signals, progress=progress, **config.arguments()))
+        options = {**config.arguments(), "batch": batch, "keep": parts, "progress": progress}
+        recall = jax.block_until_ready(run_memory(pack, signals, **options))
     resolved = config.resolved(pack, time.perf_counter() - began)
     storage.save_recall(data, recall, resolved)
+    parts.discard()
     if picture is not None:
         plot.recall_figure(picture, recall, resolved["delta0"], config.gamma0, config.pack)
     log.print(f"wrote {data}" + (f" and {picture}" if picture else ""), soft_wrap=True)
@@ -167,6 +176,7 @@ def recall_command(
     hold: Annotated[float, typer.Option(help="Holds at u = 1, in t0.")] = 0.2,
     store: Annotated[float, typer.Option(help="Storage, in t0.")] = 2.0,
     hold_drag: Annotated[float | None, typer.Option(help="Drag in holds, 1/t_c; default 0.05 if t0 < 18000.")] = None,
+    batch: Annotated[int | None, typer.Option(help="Signals run together; default what fits the free memory.")] = None,
     picture: Annotated[bool, typer.Option(help="Also draw it, beside the output.")] = True,
     as_json: AsJson = False,
 ) -> None:

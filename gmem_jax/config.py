@@ -1,9 +1,12 @@
 """The validated configuration of a recall, as given on the command line and stored with the result."""
 
+import hashlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal
 
+import jax
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from gmem_jax import native
@@ -40,6 +43,7 @@ class RecallConfig(BaseModel):
     hold: float = Field(0.2, ge=0.0)
     store: float = Field(2.0, ge=0.0)
     hold_drag: float | None = Field(None, ge=0.0)
+    batch: int | None = Field(None, ge=1)
 
     @field_validator("signals")
     @classmethod
@@ -65,6 +69,14 @@ class RecallConfig(BaseModel):
         """Keyword arguments of `run_memory`."""
         names = ("delta0", "gamma0", "t0", "dt", "background", "backend", "rest", "hold", "store", "hold_drag")
         return {"friction": self.law(), **{name: getattr(self, name) for name in names}}
+
+    def key(self, pack: Pack, batch: int) -> dict[str, Any]:
+        """What the numbers of the run depend on, and no more: for parts of a run that may be resumed."""
+        fields = self.model_dump(exclude={"pack", "batch", "backend"})
+        content = hashlib.sha256(b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(pack))).hexdigest()
+        facts = provenance()
+        same = {"versions": facts["versions"], "commit": facts["commit"]}
+        return {**fields, "batch": batch, "pack": content, "backend": native.name(self.backend, self.law()), **same}
 
     def resolved(self, pack: Pack, seconds: float) -> dict[str, Any]:
         """All that is needed to repeat the run, for the file."""

@@ -1,7 +1,9 @@
 """The memory experiment: encode, store, recall (paper, Secs. II and III; spec, section 5)."""
 
+import itertools
 import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -11,18 +13,32 @@ import numpy as np
 from gmem_jax import analysis, native
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.hooke import Hooke
-from gmem_jax.drive import Motion, clock, memory_protocol
+from gmem_jax.drive import Motion, Stage, clock, memory_protocol
 from gmem_jax.dynamics import Sample, System, start
 from gmem_jax.material import Material
 from gmem_jax.pack import SKIN, Pack, smallest_box
-from gmem_jax.run import Progress, Runner, require_x64, silent
-from gmem_jax.signals import BINS, Signals, bin_average
+from gmem_jax.run import CHUNK, Progress, Runner, require_x64, silent
+from gmem_jax.signals import BINS, Signals, bin_average, part
 from gmem_jax.state import Scalar, State, Status, replicate
 
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
 REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than this part of the walls' speed
+COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
+GRAIN_BYTES = 800  # of a grain's own numbers and its spheres'
 LARGEST_STEP = 0.5  # t_c; the stiffest mode has a period near 10 t_c
+
+
+Samples = dict[str, Sample]
+"""Samples of stages by name."""
+
+Keep = Callable[[str, Callable[[], Any]], Any]
+"""Gives the part of a run of that name: as kept earlier, or by running it."""
+
+
+def forget(name: str, run: Callable[[], Any]) -> Any:
+    """Run every part, keep none."""
+    return run()
 
 
 @jax.tree_util.register_dataclass
@@ -55,7 +71,7 @@ class Recall:
     window: jax.Array
     residual_speed: jax.Array
     status: jax.Array
-    stages: dict[str, Sample]
+    stages: Samples
     dt: Scalar
 
 
@@ -133,6 +149,8 @@ def run_memory(
     store: float = 2.0,
     hold_drag: Scalar | None = None,
     material: Material | None = None,
+    batch: int | None = None,
+    keep: Keep = forget,
     progress: Progress = silent,
 ) -> Recall:
     """Store S waveforms in S copies of a pack and recall them; a further copy stores none.
@@ -156,6 +174,8 @@ def run_memory(
         store: storage, in t0.
         hold_drag: viscous drag while the walls stand still, 1 / t_c; default 0.05 for t0 below the paper's, else 0.
         material: the elastic solid.
+        batch: signals that run together; default all of them. Ignored inside a transformation.
+        keep: asked for every finished part of a long run, so that it can be resumed (see `storage.Parts`).
         progress: told about every chunk.
 
     Raises:
@@ -168,6 +188,8 @@ def run_memory(
     delta0 = pack.delta0 if delta0 is None else delta0
     _refuse_bad_numbers(friction, t0=t0, dt=dt, gamma0=gamma0, delta0=delta0, rest=rest, hold=hold, store=store)
     _refuse_open_waveforms(signals)
+    if batch is not None and batch < 1:
+        raise ValueError(f"batch must be at least 1, got {batch}")
     if background not in analysis.BACKGROUNDS:
         raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {background!r}")
     if not own and not _traced(delta0, pack) and not np.allclose(np.asarray(delta0), np.asarray(pack.delta0)):
@@ -183,32 +205,111 @@ def run_memory(
     state = start(system, pack.position[:, :, None], pack.quaternion[:, :, None], pack.box)
     state = replicate(state, _width(friction, delta0, step))
     stages = memory_protocol(rest, hold, store, second_readout=background != "sub0")
-    stepper: _Inline | Runner
+    drive = _Drive(pack, delta0, gamma0, step, steps, hold_drag)
     if isinstance(state.status, jax.core.Tracer) or _traced(signals, gamma0, delta0, t0, dt, hold_drag):
-        stepper = _Inline(system, state, step, backend)
+        inline = _Inline(system, state, step, backend)
+        samples = drive.play(inline, prefix(stages))
+        inline.state = _fan_out(inline.state, signals)
+        samples |= drive.play(inline, stages[len(prefix(stages)) :], signals)
+        status = inline.state.status
     else:
-        stepper = _on_host(system, state, pack, delta0, step)
-        stepper.backend, stepper.progress = backend, progress
-        sheared = stages.index(next(stage for stage in stages if stage.sheared))
-        widths = [state.replicas] * sheared + [signals.count + 1] * (len(stages) - sheared)
-        stepper.total_work = float(sum(stage.bins * steps * width for stage, width in zip(stages, widths, strict=True)))
-    samples: dict[str, Sample] = {}
-    for stage in stages:
-        if stage.sheared and stepper.state.replicas == 1:
-            stepper.state = replicate(stepper.state, signals.count + 1)  # what came before is common to all signals
-        motion = Motion(
-            lower=pack.box.lower,
-            upper=pack.box.upper,
-            delta0=delta0,
-            start=stage.start,
-            stop=stage.stop,
-            duration=stage.bins * steps * step,
-            gamma0=gamma0 if stage.sheared else 0.0,
-            signals=signals if stage.sheared else None,
-        )
-        drag = hold_drag if stage.holds else 0.0
-        samples[stage.name] = stepper.stage(stage.name, motion, bins=stage.bins, steps=steps, drag=drag)
-    return _recall(pack, signals, samples, stepper.state.status, background, delta0, gamma0, t0, step)
+        runner = _on_host(system, state, pack, delta0, step)
+        runner.backend, runner.progress = backend, progress
+        samples, status = _in_batches(drive, runner, stages, signals, batch or signals.count, keep)
+    return _recall(pack, signals, samples, status, background, delta0, gamma0, t0, step)
+
+
+def prefix(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+    """The stages before the first sheared one: common to all signals, and run once."""
+    return tuple(itertools.takewhile(lambda stage: not stage.sheared, stages))
+
+
+def _fan_out(state: State, signals: Signals) -> State:
+    """A replica for the zero signal and one for each of the others."""
+    copies: State = replicate(state, signals.count + 1) if state.replicas == 1 else state
+    return copies
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """The numbers of the walls' motion, common to all stages and signals."""
+
+    pack: Pack
+    delta0: Scalar
+    gamma0: Scalar
+    dt: Scalar
+    steps: Any
+    hold_drag: Scalar
+
+    def play(self, stepper: _Inline | Runner, stages: tuple[Stage, ...], signals: Signals | None = None) -> Samples:
+        """Run the stages one after the other."""
+        samples: Samples = {}
+        for stage in stages:
+            motion = Motion(
+                lower=self.pack.box.lower,
+                upper=self.pack.box.upper,
+                delta0=self.delta0,
+                start=stage.start,
+                stop=stage.stop,
+                duration=stage.bins * self.steps * self.dt,
+                gamma0=self.gamma0 if stage.sheared else 0.0,
+                signals=signals if stage.sheared else None,
+            )
+            drag = self.hold_drag if stage.holds else 0.0
+            samples[stage.name] = stepper.stage(stage.name, motion, bins=stage.bins, steps=self.steps, drag=drag)
+        return samples
+
+
+def _in_batches(
+    drive: _Drive, runner: Runner, stages: tuple[Stage, ...], signals: Signals, batch: int, keep: Keep
+) -> tuple[Samples, jax.Array]:
+    """The prefix once, then the signals in batches, each with a zero signal of its own; samples and status of all.
+
+    A batch depends on nothing but the state after the prefix, so that batches kept by an earlier run can be used.
+
+    Raises:
+        ValueError: if the parameters differ between replicas, which is for a single batch only.
+    """
+    common = prefix(stages)
+    rest = stages[len(common) :]
+    count, width = signals.count, runner.state.replicas
+    if width > 1 and batch < count:
+        raise ValueError("parameters with a value for each replica need all signals in one batch")
+    starts = range(0, count, batch)
+    before, after = (sum(stage.bins * drive.steps for stage in some) for some in (common, rest))
+    runner.total_work = float(before * width + after * (count + len(starts)))
+    samples: Samples
+    samples, runner.system, runner.state = keep(
+        "prefix", lambda: (drive.play(runner, common), runner.system, runner.state)
+    )
+    runner = replace(runner, work=float(before * width), finder=None, skin=SKIN, chunk=CHUNK)
+    parts: list[tuple[Samples, jax.Array]] = []
+    for number, first in enumerate(starts):
+        few = part(signals, first, min(first + batch, count))
+
+        def run_batch(few: Signals = few) -> tuple[Samples, jax.Array]:
+            own = replace(runner, state=_fan_out(runner.state, few))
+            return drive.play(own, rest, few), own.state.status
+
+        parts.append(keep(f"batch-{number:04d}", run_batch))
+        runner.work = float(before * width + after * (min(first + batch, count) + number + 1))
+    joined, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
+    return samples | joined, status
+
+
+def _join(first: Any, *others: Any) -> np.ndarray:
+    """Replicas of several batches, innermost; the zero signal of the first stands for all."""
+    return np.concatenate([np.asarray(first), *(np.asarray(other)[..., 1:] for other in others)], axis=-1)
+
+
+def default_batch(pack: Pack, friction: FrictionLaw, available: int) -> int:
+    """Signals that may run together in half of the `available` bytes; at most 63, which with the zero signal fill
+    whole vectors of every CPU, and lose little when a run is interrupted.
+    """
+    history = jax.eval_shape(lambda: friction.init(pack.pairs.capacity, 1, jnp.zeros(()).dtype))
+    contacts = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(history))
+    replica = COPIES * (contacts + GRAIN_BYTES * pack.grains)
+    return int(max(1, min(63, 0.5 * available / replica - 1)))
 
 
 def _on_host(system: System, state: State, pack: Pack, delta0: Scalar, dt: Scalar) -> Runner:
@@ -220,7 +321,7 @@ def _on_host(system: System, state: State, pack: Pack, delta0: Scalar, dt: Scala
 def _recall(
     pack: Pack,
     signals: Signals,
-    samples: dict[str, Sample],
+    samples: Samples,
     status: jax.Array,
     background: str,
     delta0: Scalar,

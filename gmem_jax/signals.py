@@ -18,7 +18,7 @@ BINS = 256  # bins of u in the paper: the resolution of every recorded signal
 
 @runtime_checkable
 class Signals(Protocol):
-    """A set of S waveforms."""
+    """A set of S waveforms: a pytree whose arrays with a leading axis of length S belong to one signal each."""
 
     @property
     def count(self) -> int:
@@ -32,6 +32,16 @@ class Signals(Protocol):
     def integral(self, u: jax.Array) -> jax.Array:
         """J_s(u), the integral of I_s from 0 to u, [..., S]."""
         ...
+
+
+def part(signals: Signals, first: int, last: int) -> Signals:
+    """Signals number `first` to `last` - 1 of a set, as a set."""
+
+    def rows(leaf: jax.Array) -> jax.Array:
+        return leaf[first:last] if jnp.ndim(leaf) > 0 and jnp.shape(leaf)[0] == signals.count else leaf
+
+    chosen: Signals = jax.tree.map(rows, signals)
+    return chosen
 
 
 @jax.tree_util.register_dataclass

@@ -5,8 +5,10 @@ A file is written under a temporary name, flushed to disk, and renamed: what car
 
 import json
 import os
+import pickle
+import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from importlib import resources
@@ -14,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -204,6 +207,56 @@ def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
     with _reading(path, RECALL_SCHEMA) as file:
         values = {entry.name: file[entry.name][()] for entry in fields(Recall) if entry.name != "stages"}
         return Recall(**values, stages=_read_samples(file["stages"])), json.loads(file.attrs["configuration"])
+
+
+class Parts:
+    """Finished parts of a long run, in a folder beside its output: what `run_memory` takes as `keep`.
+
+    Args:
+        folder: made if it is missing.
+        key: what the parts depend on; stored with them.
+
+    Raises:
+        FileFormatError: if the folder holds parts of another run.
+        OSError: if it cannot be written.
+    """
+
+    def __init__(self, folder: Path, key: dict[str, Any]) -> None:
+        self.folder = Path(folder)
+        self.folder.mkdir(exist_ok=True)
+        found, wanted = self.key_of(self.folder), json.loads(json.dumps(key))
+        other = [name for name in wanted if found and found.get(name) != wanted[name]]
+        if other:
+            raise FileFormatError(
+                f"{self.folder}: holds parts of an interrupted run with another {other[0]} "
+                f"({found.get(other[0])!r}, now {wanted[other[0]]!r}); remove it, or choose another output"
+            )
+        with atomic(self.folder / "run.json") as temporary:
+            temporary.write_text(json.dumps(wanted, indent=1))
+
+    @staticmethod
+    def key_of(folder: Path) -> dict[str, Any]:
+        """The key stored in a folder of parts; empty if there is none."""
+        card = Path(folder) / "run.json"
+        key: dict[str, Any] = json.loads(card.read_text()) if card.is_file() else {}
+        return key
+
+    def __call__(self, name: str, run: Callable[[], Any]) -> Any:
+        """The part of that name, its arrays as numpy arrays: read if it is there, else run and stored."""
+        path = self.folder / f"{name}.pickle"
+        if not path.is_file():
+            result = jax.tree.map(np.asarray, run())
+            with atomic(path) as temporary:
+                temporary.write_bytes(pickle.dumps(result))
+        return pickle.loads(path.read_bytes())
+
+    def finished(self) -> int:
+        """Number of parts there are."""
+        return len(list(self.folder.glob("*.pickle")))
+
+    def discard(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder)
 
 
 def load_waveforms(path: Path) -> np.ndarray:

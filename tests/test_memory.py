@@ -11,8 +11,10 @@ import gmem_jax as gm
 from gmem_jax import run as host
 from gmem_jax.drive import Motion
 from gmem_jax.dynamics import System, start
+from gmem_jax.memory import forget
 from gmem_jax.signals import BINS
 from gmem_jax.state import replicate
+from gmem_jax.storage import Parts
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 SHORT = {"t0": 75.0, "dt": 0.3, "store": 0.2}  # one step per bin: some 1,200 steps in all
@@ -177,3 +179,34 @@ def test_another_delta0_than_the_packs_own_warns(pack: gm.Pack) -> None:
 def test_single_precision_is_refused(pack: gm.Pack) -> None:
     with jax.enable_x64(False), pytest.raises(ValueError, match="float64 is needed"):
         gm.run_memory(pack, gm.six_signals())
+
+
+def test_batches_are_one_run_and_can_be_resumed(pack: gm.Pack, recall: gm.Recall, tmp_path: Path) -> None:
+    def some(batch: int, parts: Parts | None = None) -> gm.Recall:
+        return gm.run_memory(pack, gm.six_signals(), batch=batch, keep=parts or forget, **SHORT)
+
+    undisturbed = some(4)
+    # A batch's replicas see the same forces in the same order; XLA's vector code differs with their number.
+    np.testing.assert_allclose(undisturbed.p_sig, recall.p_sig, atol=1e-6 * float(jnp.abs(recall.p_sig).max()))
+    assert undisturbed.status.shape == recall.status.shape == (7,)
+    assert undisturbed.stages["readout"].pressure.shape == recall.stages["readout"].pressure.shape
+
+    class KilledError(Exception):
+        """In place of a signal that cannot be caught."""
+
+    class Dying(Parts):
+        def __call__(self, name: str, run: object) -> object:
+            if name == "batch-0001":
+                raise KilledError
+            return super().__call__(name, run)
+
+    with pytest.raises(KilledError):
+        some(4, Dying(tmp_path / "parts", {"batch": 4}))
+    left = Parts(tmp_path / "parts", {"batch": 4})
+    assert left.finished() == 2
+    for one, other in zip(jax.tree.leaves(some(4, left)), jax.tree.leaves(undisturbed), strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(gm.FileFormatError, match=r"another batch \(4, now 5\)"):
+        Parts(tmp_path / "parts", {"batch": 5})
+    left.discard()
+    assert not (tmp_path / "parts").exists()
