@@ -4,6 +4,7 @@ The list is a half list in canonical (i, j) order. It is built on positions mapp
 the coming motion, so that only non-affine displacements use up its skin (a whole experiment needs about 0.2 R).
 """
 
+import functools
 import warnings
 from dataclasses import dataclass
 from typing import Any
@@ -30,7 +31,8 @@ class Pairs:
         valid: False for padding, [P].
         incidence: for each sphere the rows of its contacts in the stack (as i: c; as j: P + c; padding: 2 P), [S, C].
         grain_pair: number of the grain pair each candidate belongs to, [P].
-        reference: sphere centres in box coordinates (0 to 1) when the list was built, [S, 3].
+        reference: sphere centres in box coordinates (0 to 1) when the list was built, [S, 3, B], or [S, 3, 1] for
+            replicas that had not parted yet.
         smallest: edge lengths of the box the distances were measured in, [3].
         reach: largest centre distance listed there, 2 R + skin.
     """
@@ -69,7 +71,7 @@ def slack(pairs: Pairs, spheres: jax.Array, box: Box) -> jax.Array:
     part of their motion, and the non-affine part brings them together by at most twice the largest deviation.
     """
     lengths = box.lengths
-    affine = box.lower + pairs.reference[:, :, None] * lengths
+    affine = box.lower + pairs.reference * lengths
     deviation = jnp.sqrt(jnp.max(jnp.sum((spheres - affine) ** 2, axis=1), axis=0))
     ratio = jnp.minimum(1.0, jnp.min(lengths / pairs.smallest[:, None], axis=0))
     return ratio * pairs.reach - 2.0 - 2.0 * deviation
@@ -84,21 +86,23 @@ def tabulate(
     *,
     capacity: int = 0,
     per_sphere: int = 0,
+    spare: float = _SPARE,
 ) -> Pairs:
     """`Pairs` from sorted sphere pairs [2, n]: padded to capacity, with the incidence table.
 
-    Capacities too small for what was found are raised, with some to spare; the other arguments are fields of `Pairs`.
+    Capacities too small for what was found are raised, and then allocated `spare` times over (1 for a list that is
+    not expected to be rebuilt: padding costs as much as candidates do); the other arguments are fields of `Pairs`.
     """
     pairs, count = found.shape[1], reference.shape[0]
     if pairs > capacity or capacity == 0:
-        capacity = max(8, int(pairs * _SPARE))  # a gas may have no candidates, but arrays need rows
+        capacity = max(8, int(pairs * spare))  # a gas may have no candidates, but arrays need rows
     owners = found.ravel()
     rows = np.concatenate([np.arange(pairs), capacity + np.arange(pairs)])
     order = np.argsort(owners, kind="stable")
     owners, rows = owners[order], rows[order]
     place = np.arange(2 * pairs) - np.searchsorted(owners, owners)
     if pairs and place.max() >= per_sphere:
-        per_sphere = int(place.max()) + 3
+        per_sphere = int(place.max() * spare) + 1
     incidence = np.full((count, max(1, per_sphere)), 2 * capacity, dtype=np.int32)
     incidence[owners, place] = rows
     padded = np.zeros((2, capacity), dtype=np.int32)
@@ -183,25 +187,34 @@ class PairFinder:
         found = np.sort(np.asarray(self._neighbors.idx), axis=0)
         return found[:, found[1] < len(centres)]
 
+    def _keys(self, mapped: np.ndarray) -> np.ndarray:
+        """Pairs i < j of spheres of different grains within reach, of centres [S, 3], as sorted numbers i S + j."""
+        spheres = np.int64(len(mapped))
+        mapped = mapped.reshape(-1, self._spheres_per_grain, 3)
+        one, other = self._grain_pairs(mapped.mean(axis=1))
+        distance = np.linalg.norm(mapped[one][:, :, None] - mapped[other][:, None, :], axis=-1)
+        pair, sphere_i, sphere_j = np.nonzero(distance < 2.0 + self.skin)
+        first, second = (side[pair] * self._spheres_per_grain for side in (one, other))
+        keys: np.ndarray = np.sort((first + sphere_i) * spheres + second + sphere_j)
+        return keys
+
     def __call__(self, grains: Grains, clump: Clump, box: Box, smallest: np.ndarray | None = None) -> Pairs:
-        """The candidate list of `grains` in `box`; replicas share it through their mean positions.
+        """The candidate list of `grains` in `box`, which holds what any of the replicas needs.
 
         Args:
             grains: the grains.
             clump: their shape.
-            box: the walls now (the first replica's count).
+            box: the walls now.
             smallest: edge lengths of the smallest box of the coming motion, [3]; default the present box.
         """
-        lower = np.asarray(box.lower)[:, 0]
-        lengths = np.asarray(box.lengths)[:, 0]
-        smallest = lengths if smallest is None else np.minimum(smallest, lengths)
-        reference = (np.mean(np.asarray(sphere_centres(grains, clump)), axis=-1) - lower) / lengths
-        mapped = (reference * smallest).reshape(-1, self._spheres_per_grain, 3)
-        one, other = self._grain_pairs(mapped.mean(axis=1))
-        distance = np.linalg.norm(mapped[one][:, :, None] - mapped[other][:, None, :], axis=-1)
-        pair, sphere_i, sphere_j = np.nonzero(distance < 2.0 + self.skin)
-        found = np.stack([one[pair], other[pair]]) * self._spheres_per_grain + np.stack([sphere_i, sphere_j])
-        found = found[:, np.lexsort((found[1], found[0]))]
+        lengths = np.asarray(box.lengths)
+        smallest = lengths[:, 0] if smallest is None else np.minimum(smallest, lengths[:, 0])
+        reference = (np.asarray(sphere_centres(grains, clump)) - np.asarray(box.lower)) / lengths
+        if np.all(reference == reference[..., :1]):
+            reference = reference[..., :1]
+        spheres = reference.shape[0]
+        keys = [self._keys(reference[..., b] * smallest) for b in range(reference.shape[-1])]
+        found = np.stack(np.divmod(functools.reduce(np.union1d, keys), spheres))
         pairs = tabulate(
             found,
             reference,

@@ -129,7 +129,8 @@ def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None) -
             clump.create_dataset(key, data=np.asarray(getattr(pack.clump, key)))
         pairs = file.create_group("pairs")
         pairs.create_dataset("candidates", data=candidates(pack.pairs))
-        for key in ("reference", "smallest", "reach"):
+        pairs.create_dataset("reference", data=np.asarray(pack.pairs.reference)[..., 0])
+        for key in ("smallest", "reach"):
             pairs.create_dataset(key, data=np.asarray(getattr(pack.pairs, key)))
         if stages:
             _write_samples(file.create_group("stages"), stages)
@@ -167,7 +168,7 @@ def load_pack(source: str | Path) -> Pack:
     for key, array in arrays.items():
         if not np.all(np.isfinite(array)):
             raise FileFormatError(f"{path}: {key} holds numbers that are not finite")
-    pairs = tabulate(found, reference, smallest, float(reach), clump.spheres)
+    pairs = tabulate(found, reference[..., None], smallest, float(reach), clump.spheres, spare=1.0)
     return Pack(
         clump=clump, pairs=pairs, name=title, record=record, **{key: jnp.asarray(a) for key, a in arrays.items()}
     )

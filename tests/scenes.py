@@ -58,7 +58,7 @@ def all_pairs(clump: Clump, count: int, capacity: int = 8) -> Pairs:
     """Every pair of spheres of `count` grains, for scenes too small to need a search."""
     grain = np.arange(count * clump.spheres) // clump.spheres
     found = np.stack(np.nonzero(grain[:, None] < grain))
-    blank = np.zeros((len(grain), 3))
+    blank = np.zeros((len(grain), 3, 1))
     return tabulate(found, blank, np.ones(3), np.inf, clump.spheres, capacity=capacity)
 
 

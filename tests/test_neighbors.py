@@ -120,17 +120,21 @@ def test_capacities_grow_when_needed_never_shrink_and_lose_nothing():
 
 def test_a_given_capacity_is_kept_when_it_suffices():
     found = np.array([[0, 0, 1], [1, 2, 2]])
-    pairs = tabulate(found, np.zeros((3, 3)), np.ones(3), 2.4, 1, capacity=50, per_sphere=7)
+    pairs = tabulate(found, np.zeros((3, 3, 1)), np.ones(3), 2.4, 1, capacity=50, per_sphere=7)
     assert (pairs.capacity, pairs.incidence.shape) == (50, (3, 7))
 
 
-def test_replicas_share_the_list_of_their_mean_positions():
+def test_the_list_of_replicas_is_the_union_of_their_own():
     one, other = random_grains(SPHERE, (9.0, 12.0, 10.0), 0), random_grains(SPHERE, (9.0, 12.0, 10.0), 1)
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=-1), one, other)
-    mean = jax.tree.map(lambda a, b: 0.5 * (a + b), one, other)
     box = still_box(jnp.zeros((3, 1)), jnp.asarray([[9.0], [12.0], [10.0]]))
     finder = PairFinder(SPHERE, np.array([9.0, 12.0, 10.0]), 0.4)
-    np.testing.assert_array_equal(candidates(finder(both, SPHERE, box)), candidates(finder(mean, SPHERE, box)))
+    listed = finder(both, SPHERE, box)
+    alone = [{tuple(pair) for pair in candidates(finder(grains, SPHERE, box)).T} for grains in (one, other)]
+    assert {tuple(pair) for pair in candidates(listed).T} == alone[0] | alone[1]
+    assert len(alone[0] - alone[1]) > 10
+    # However far apart the replicas are, each has its whole skin.
+    np.testing.assert_allclose(slack(listed, sphere_centres(both, SPHERE), box), 0.4, atol=1e-12)
 
 
 @pytest.mark.parametrize("skin", [0.0, -0.1, float("nan")])
@@ -141,7 +145,7 @@ def test_a_skin_that_is_not_positive_is_refused(skin):
 
 def test_histories_move_by_pair_and_newcomers_start_blank():
     def listing(found, capacity):
-        return tabulate(np.array(found).T, np.zeros((5, 3)), np.ones(3), 2.4, 1, capacity=capacity)
+        return tabulate(np.array(found).T, np.zeros((5, 3, 1)), np.ones(3), 2.4, 1, capacity=capacity)
 
     old = listing([(0, 1), (0, 3), (1, 2), (2, 4)], 6)
     new = listing([(0, 2), (0, 3), (1, 2), (1, 4), (2, 4), (3, 4)], 8)
@@ -154,8 +158,8 @@ def test_histories_move_by_pair_and_newcomers_start_blank():
 
 
 def test_carrying_to_and_from_an_empty_list_gives_blanks():
-    none = tabulate(np.zeros((2, 0), int), np.zeros((5, 3)), np.ones(3), 2.4, 1, capacity=4)
-    some = tabulate(np.array([[0], [1]]), np.zeros((5, 3)), np.ones(3), 2.4, 1, capacity=4)
+    none = tabulate(np.zeros((2, 0), int), np.zeros((5, 3, 1)), np.ones(3), 2.4, 1, capacity=4)
+    some = tabulate(np.array([[0], [1]]), np.zeros((5, 3, 1)), np.ones(3), 2.4, 1, capacity=4)
     ones, blank = jnp.ones((4, 3, 1)), jnp.full((4, 3, 1), 7.0)
     np.testing.assert_array_equal(carry_history(ones, blank, none, some), blank)
     np.testing.assert_array_equal(carry_history(ones, blank, some, none), blank)
@@ -164,7 +168,7 @@ def test_carrying_to_and_from_an_empty_list_gives_blanks():
 def test_a_gas_too_thin_for_any_candidate_can_still_be_observed():
     box = still_box(jnp.zeros((3, 1)), jnp.full((3, 1), 20.0))
     grains = make_grains([[5.0, 5.0, 5.0], [15.0, 15.0, 15.0]])
-    pairs = tabulate(np.zeros((2, 0), int), np.zeros((2, 3)), np.full(3, 20.0), 2.4, 1)
+    pairs = tabulate(np.zeros((2, 0), int), np.zeros((2, 3, 1)), np.full(3, 20.0), 2.4, 1)
     system = dynamics.System(SPHERE, Hooke(), pairs)
     sample = jax.jit(dynamics.observe)(system, blank_state(system, grains), box, jnp.zeros((3, 1)))
     assert candidates(pairs).shape == (2, 0)

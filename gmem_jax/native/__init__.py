@@ -199,7 +199,7 @@ def _bin(
     walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
     state = jax.tree.leaves(grains)
     outputs = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in (*state, jnp.zeros((3, replicas)), *leaves)]
-    candidates = (pairs.first, pairs.second, pairs.valid, pairs.reference, pairs.smallest)
+    candidates = (pairs.first, pairs.second, pairs.valid, pairs.reference[..., 0], pairs.smallest)
     arguments = [*state, *candidates, system.clump.offsets, _parameters(system, numbers, replicas), walls, limits]
     results = jax.ffi.ffi_call(
         _TARGET,
