@@ -109,3 +109,30 @@ def test_unknown_backends_and_laws_are_refused() -> None:
 
     with pytest.raises(ValueError, match="does not know the friction law Own"):
         compress(native.advance, Own(), 1)
+
+
+@pytest.mark.parametrize("replicas", [1, 9])
+@pytest.mark.parametrize("law", [gm.Hooke(), gm.Mindlin(points=20)], ids=lambda law: type(law).__name__)
+def test_any_number_of_threads_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch, law: object, replicas: int) -> None:
+    pack = gm.load_pack("tetra-325-a")  # large enough for the threads to share one replica's contacts
+    system = System(pack.clump, law, pack.pairs)
+    state = replicate(start(system, pack.position[..., None], pack.quaternion[..., None], pack.box), replicas)
+    motion = Motion(pack.lower[:, None], pack.upper[:, None], 0.05, 0.0, 1.0, 300.0)
+    run = jax.jit(lambda s: native.advance(system, s, motion, 0.3, bins=2, steps=30))
+
+    def end(threads: int) -> list[jax.Array]:
+        monkeypatch.setenv("GMEM_THREADS", str(threads))
+        return jax.tree.leaves(jax.block_until_ready(run(state)))
+
+    alone = end(1)
+    for threads in (2, 5):
+        for one, other in zip(end(threads), alone, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("instructions", ["baseline", "avx2"])
+def test_every_instruction_set_agrees_to_round_off(monkeypatch: pytest.MonkeyPatch, instructions: str) -> None:
+    best, _ = compress(native.advance, gm.Hooke(mu=0.5), 9)
+    monkeypatch.setenv("GMEM_ISA", instructions)
+    other, _ = compress(native.advance, gm.Hooke(mu=0.5), 9)
+    np.testing.assert_allclose(other.grains.position, best.grains.position, atol=1e-10)

@@ -1,0 +1,85 @@
+"""The benchmark measures what it says, notices backends that disagree, and prints its ratios."""
+
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax import bench, native
+from gmem_jax.bench import Row
+from gmem_jax.neighbors import sphere_centres
+
+PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+
+
+@pytest.fixture(scope="module")
+def pack() -> gm.Pack:
+    return gm.load_pack(PACK)
+
+
+def test_a_row_is_a_measurement_whose_result_backends_share(pack: gm.Pack) -> None:
+    rows = [bench.measure(pack, "jax", "H", 2, seconds=0.0)]
+    assert rows[0].grains == 27
+    assert 0.0 < rows[0].us < 1e3
+    assert rows[0].compile_s > 0.0
+    if native.available()[0]:
+        rows.append(bench.measure(pack, "native", "H", 2, seconds=0.0))
+        assert bench.disagreements(rows) == []
+    wrong = [*rows[:1], replace(rows[0], engine="native", p_xy=rows[0].p_xy * (1.0 + 1e-3))]
+    assert "N = 27, 2 replicas" in bench.disagreements(wrong)[0]
+
+
+def test_tiles_keep_their_contacts(pack: gm.Pack) -> None:
+    large = bench.tile(pack, (2, 1, 1))
+    assert large.grains == 54
+    assert float(large.upper[0]) == pytest.approx(2.0 * float(pack.upper[0] - pack.lower[0]))
+    found = {tuple(p) for p in np.stack([large.pairs.first, large.pairs.second])[:, np.asarray(large.pairs.valid)].T}
+    shift = 27 * pack.clump.spheres
+    # The list of the copies is made for the box as it is, the pack's for the smallest of its experiment.
+    centres = np.asarray(sphere_centres(_at_rest(pack), pack.clump))[..., 0]
+    touching = {
+        (i, j)
+        for i, j in zip(np.asarray(pack.pairs.first), np.asarray(pack.pairs.second), strict=True)
+        if np.linalg.norm(centres[i] - centres[j]) < 2.0 and i != j
+    }
+    assert touching
+    assert touching <= found
+    assert {(i + shift, j + shift) for i, j in touching} <= found
+
+
+def _at_rest(pack: gm.Pack) -> object:
+    system, state, *_ = bench.encode(pack, gm.Hooke(), 1)
+    assert system.pairs is pack.pairs
+    return state.grains
+
+
+def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
+    rows = [
+        Row("native", "H", 325, 8, 0.05, 1.0),
+        Row("native", "H", 325, 1, 0.15, 1.0),
+        Row("lammps", "H", 325, 1, 0.8, note="1 core"),
+        Row("lammps", "H", 325, 2, 0.4, note="2 serial runs side by side"),
+        Row("lammps", "H", 325, 1, 0.45, note="2 ranks"),
+    ]
+    facts = {"commit": "0123456789ab", "versions": {"jax": "0"}, "processor": "P", "instruction_set": "avx2"}
+    growth = [asdict(Row("native", "H", n, b, us)) for n, us in ((325, 0.1), (650, 0.13)) for b in (1, 8)]
+    result = {
+        **facts,
+        "lammps": "L",
+        "rows": [asdict(row) for row in rows],
+        "growth": growth,
+        "bytes_per_grain_replica": {"H": 1500.0},
+    }
+    before = {"rows": [asdict(replace(row, us=2.0 * row.us)) for row in rows]}
+    text = bench.markdown(result, before)
+    assert "| H | 325 | native | 8 | 0.0500 | 8.0 | 1.0 | 2.00 |" in text
+    assert "| H | 325 | native | 1 | 0.1500 | 3.0 | 1.0 | 2.00 |" in text
+    assert "| 650 | 0.1300 | 1.30 | 0.1300 | 1.30 |" in text
+    assert "H 1.50 kB" in text
+
+
+def test_large_histories_are_left_out(pack: gm.Pack) -> None:
+    assert bench.fits(pack, "H", 32)
+    assert not bench.fits(pack, "M2", 1_000_000)
