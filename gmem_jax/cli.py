@@ -147,11 +147,19 @@ def _run(config: RecallConfig, data: Path, picture: Path | None) -> tuple[dict[s
     return row, resolved
 
 
+def _tables(row: dict[str, Any], resolved: dict[str, Any]) -> list[Any]:
+    """What to print of one recall."""
+    more = [report.backgrounds_table(row)] if "backgrounds" in row else []
+    return [report.recall_table([row], resolved), *more]
+
+
 @app.command("recall")
 def recall_command(
     pack: Annotated[str, typer.Argument(help="A pack file, or the name of a shipped pack.")],
     output: Output = Path("recall.h5"),
-    signals: Annotated[str, typer.Option(help="six, or a .csv (a column per signal) or .npy file of samples.")] = "six",
+    signals: Annotated[
+        str, typer.Option(help="six; words:L, all words of L bits; or a .csv (a column per signal) or .npy file.")
+    ] = "six",
     friction: Annotated[str, typer.Option(help="Friction law: hooke (H), m1 or m2 (Mindlin).")] = "hooke",
     mu: Annotated[float, typer.Option(help="Friction coefficient.")] = 1.0,
     stiffness: Annotated[float | None, typer.Option(help="k_H in E R, or k_M in E R^0.5; default the law's.")] = None,
@@ -175,7 +183,7 @@ def recall_command(
     config = RecallConfig(**given)
     _writable(output)
     row, resolved = _run(config, output, output.with_suffix(".png") if picture else None)
-    _emit(as_json, row, report.recall_table([row], resolved))
+    _emit(as_json, row, *_tables(row, resolved))
 
 
 @app.command()
@@ -222,7 +230,7 @@ def show(
         return
     recall, configuration = storage.load_recall(file)
     row = report.summary(recall, configuration)
-    _emit(as_json, {**row, "configuration": configuration}, report.recall_table([row], configuration))
+    _emit(as_json, {**row, "configuration": configuration}, *_tables(row, configuration))
 
 
 @app.command("bench")

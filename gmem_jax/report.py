@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
+import jax
 import numpy as np
 from rich.table import Table
 
+from gmem_jax import analysis
 from gmem_jax.material import Material
 from gmem_jax.memory import Recall
 from gmem_jax.pack import Pack
@@ -29,7 +31,7 @@ def _number(cell: str) -> str | float:
         return cell
 
 
-def spread(values: Sequence[float]) -> tuple[float, float, float]:
+def spread(values: Sequence[float] | jax.Array) -> tuple[float, float, float]:
     """Mean, sample standard deviation and standard error (NaN for fewer than two values)."""
     array = np.asarray(values, dtype=float)
     deviation = float(array.std(ddof=1)) if array.size > 1 else math.nan
@@ -60,7 +62,40 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "status": status,
         "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
         "status_text": explain(status),
+        **second_readout(recall, configuration),
     }
+
+
+def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
+    """Every background's gain and fidelity, and what the second readout still holds; {} for a run without one.
+
+    "second_readout" has mean and standard error over the S signals of the correlation with J and of the gain. Words
+    are sums of few bits, so that their errors are not independent: the spread over packs is the better measure.
+    """
+    if "readout-2" not in recall.stages:
+        return {}
+    first, second = (analysis.recalled(recall.stages[name].pressure) for name in ("readout", "readout-2"))
+    scale = configuration["delta0"], configuration["gamma0"]
+    pairs = analysis.backgrounds(first, second, recall.J, *scale)
+    rows = {name: {"gain": float(gain), "fidelity": float(fidelity)} for name, (gain, fidelity) in pairs.items()}
+    correlation, left = (spread(values) for values in analysis.remembered_after(second, recall.J, *scale))
+    rest = {"correlation": correlation[0], "correlation_se": correlation[2], "gain": left[0], "gain_se": left[2]}
+    return {"backgrounds": rows, "second_readout": rest}
+
+
+def backgrounds_table(row: dict[str, Any]) -> Table:
+    """Gain and fidelity by each background, and what the second readout still holds, from one `summary`."""
+    left = row["second_readout"]
+    caption = (
+        f"second readout: correlation with J {left['correlation']:.3f} ± {left['correlation_se']:.3f}, "
+        f"gain {left['gain']:.4f} ± {left['gain_se']:.4f} (mean ± SE over signals)"
+    )
+    table = Table(title="By background", caption=caption)
+    for column in ("background", "G", "F"):
+        table.add_column(column, justify="left" if column == "background" else "right")
+    for name, values in row["backgrounds"].items():
+        table.add_row(name.upper(), f"{values['gain']:.3f}", f"{values['fidelity']:.3f}")
+    return table
 
 
 def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> Table:
