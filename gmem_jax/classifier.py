@@ -67,7 +67,7 @@ class Recipe:
     @property
     def classes(self) -> int:
         """Number of words S."""
-        return 2**self.bits
+        return 1 << self.bits
 
     @property
     def combinations(self) -> int:
@@ -201,7 +201,9 @@ def _loss(net: Net, inputs: jax.Array, word: jax.Array) -> jax.Array:
     return jnp.mean(optax.softmax_cross_entropy_with_integer_labels(_logits(net, inputs), word))
 
 
-def advance(net: Net, data: Examples, seed: jax.typing.ArrayLike, first: jax.typing.ArrayLike, count: int) -> Any:
+def advance(
+    net: Net, data: Examples, seed: jax.typing.ArrayLike, first: jax.typing.ArrayLike, count: int
+) -> tuple[Net, jax.Array]:
     """`count` steps of plain SGD from step number `first`; the net after them and the mean loss during them.
 
     A step depends on its number and the seed alone, so that training can be broken off and taken up anywhere.
@@ -209,7 +211,7 @@ def advance(net: Net, data: Examples, seed: jax.typing.ArrayLike, first: jax.typ
     optimiser = optax.sgd(net.recipe.rate)  # plain: its state is empty
     key = jax.random.fold_in(jax.random.key(seed), 2)
 
-    def step(net: Net, number: jax.Array) -> tuple[Net, jax.Array]:
+    def step(net: Net, number: Any) -> tuple[Net, jax.Array]:
         inputs, word = data.training(jax.random.fold_in(key, number))
         loss, slope = jax.value_and_grad(_loss)(net, inputs, word)
         change, _ = optimiser.update(slope, optimiser.init(net))

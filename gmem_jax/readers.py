@@ -58,9 +58,9 @@ def nearest_template(signals: jax.typing.ArrayLike, templates: jax.typing.ArrayL
 
     def unit(rows: jax.typing.ArrayLike) -> np.ndarray:
         array = np.asarray(rows)
-        return array / np.linalg.norm(array, axis=1, keepdims=True)
+        return np.asarray(array / np.linalg.norm(array, axis=1, keepdims=True))
 
-    return np.argmax(unit(signals) @ unit(templates).T, axis=1)
+    return np.asarray(np.argmax(unit(signals) @ unit(templates).T, axis=1))
 
 
 def linear_decoder(signals: jax.typing.ArrayLike, *, seed: int = 0) -> np.ndarray:
@@ -83,7 +83,7 @@ def linear_decoder(signals: jax.typing.ArrayLike, *, seed: int = 0) -> np.ndarra
     for part in np.array_split(order, min(FOLDS, len(values))):
         others = np.setdiff1d(order, part)
         read[part] = values[part] @ _ridge(values[others], target[others]) > 0.0
-    return read @ (1 << np.arange(bits)[::-1])
+    return np.asarray(read @ (1 << np.arange(bits)[::-1]))
 
 
 def _ridge(values: np.ndarray, target: np.ndarray) -> np.ndarray:

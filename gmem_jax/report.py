@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from gmem_jax import analysis
+from gmem_jax import analysis, classifier, readers
 from gmem_jax.material import Material
 from gmem_jax.memory import Recall
 from gmem_jax.pack import Pack
@@ -127,6 +127,66 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
         fidelity = f"{point['fidelity_mean']:.3f}\n± {point['fidelity_sd']:.3f}"
         table.add_row(f"published ({point['n_packs']:.0f})", gain, fidelity)
     return table
+
+
+def reading(stored: readers.Stored, nets: Sequence[classifier.Training]) -> dict[str, Any]:
+    """How well the words of a recall are read: by the nets (mean and SD over training seeds) and by the baselines.
+
+    Accuracy, error rate of each bit and information (see `readers.information`) for every reader; for the nets over
+    all their readings together.
+    """
+    count = len(stored.signals)
+    answers = {
+        "net": np.stack([np.asarray(classifier.predict(training.net, stored.signals)) for training in nets]),
+        "nearest template": readers.nearest_template(stored.signals, stored.templates),
+        "linear decoder": readers.linear_decoder(stored.signals),
+    }
+    rows = {}
+    for name, read in answers.items():
+        table = readers.confusion(read, count)
+        right = np.atleast_1d(np.mean(read == np.arange(count), axis=-1))
+        mean, deviation, _ = spread(right.tolist())
+        rows[name] = {
+            "accuracy": mean,
+            "accuracy_sd": deviation if name == "net" and len(right) > 1 else None,
+            "bit_errors": readers.bit_errors(read).tolist(),
+            "information": readers.information(table),
+            "read": read.tolist(),
+        }
+    seeds = [
+        {
+            "seed": training.seed,
+            "accuracy": float(classifier.accuracy(training.net, stored.signals)),
+            "cross_entropy": float(classifier.cross_entropy(training.net, stored.signals)),
+            **{key: getattr(training, key) for key in ("validation", "examples", "finished", "step", "seconds")},
+        }
+        for training in nets
+    ]
+    return {"bits": stored.bits, "words": count, "background": stored.background, "readers": rows, "nets": seeds}
+
+
+def reading_tables(result: dict[str, Any]) -> list[Table]:
+    """The readers beside each other and the published accuracy, and the bits' error rates, from a `reading`."""
+    bits = result["bits"]
+    title = f"Reading {result['words']} words of {bits} bits ({result['background'].upper()})"
+    readers_table = Table(title=title, caption="information in bits, with one reading a word: see readers.information")
+    for column in ("reader", "accuracy", "plug-in", "bitwise", "Fano"):
+        readers_table.add_column(column, justify="left" if column == "reader" else "right")
+    errors_table = Table(title="Error rate of each bit, most significant first")
+    errors_table.add_column("reader")
+    for bit in range(bits):
+        errors_table.add_column(str(bit), justify="right")
+    for name, row in result["readers"].items():
+        deviation = "" if row["accuracy_sd"] is None else f" ± {row['accuracy_sd']:.3f}"
+        known = (f"{row['information'][key]:.2f}" for key in ("plug_in", "bitwise", "fano"))
+        label = f"{name} ({len(result['nets'])} seeds)" if name == "net" else name
+        readers_table.add_row(label, f"{row['accuracy']:.3f}{deviation}", *known)
+        errors_table.add_row(name, *(f"{error:.3f}" for error in row["bit_errors"]))
+    for point in published("binary_words.csv", word_bits=float(bits)):
+        readers_table.add_section()
+        said = f"{point['classifier_accuracy']:.3f} ± {point['classifier_accuracy_sd']:.3f}"
+        readers_table.add_row("published net (N = 10,240)", said)
+    return [readers_table, errors_table]
 
 
 def _tetra(shape: str) -> tuple[str, float]:
