@@ -1,0 +1,86 @@
+"""What figs. 13 and 14 share: packs, words, recalls on disk, and what they cost.
+
+Recalls are kept as HDF5 in the output folder, with their configuration, and are not run again when they are there.
+"""
+
+import argparse
+import math
+import time
+from pathlib import Path
+
+import gmem_jax as gm
+from gmem_jax import report
+from gmem_jax.config import RecallConfig
+
+SCALES = {"laptop": range(3, 7), "paper": range(3, 11)}
+LENGTH = 9.0  # t0 of an experiment with a second readout, 2.6 of it before the signals differ
+PAPER_GRAINS = 10_240
+TRIAL_T0 = 60.0  # t_c; a short recall that is timed
+
+
+def parser(doc: str, folder: str) -> argparse.ArgumentParser:
+    """Options of both figures."""
+    options = argparse.ArgumentParser(description=doc.splitlines()[0])
+    options.add_argument("--scale", choices=list(SCALES), default="laptop")
+    options.add_argument("--pack", nargs="+", help="shipped names or pack files; default those of the scale")
+    options.add_argument("--bits", nargs="+", type=int, help="lengths of the words; default those of the scale")
+    options.add_argument("--t0", type=float, help="duration of one compression, t_c; default 1800, paper 18000")
+    options.add_argument("-o", "--output", type=Path, default=Path(folder), help="folder to write to")
+    return options
+
+
+def chosen(options: argparse.Namespace) -> tuple[list[gm.Pack], list[int], float]:
+    """Packs, lengths of words and t0.
+
+    Raises:
+        SystemExit: if no pack of the scale is at hand.
+    """
+    paper = options.scale == "paper"
+    names = options.pack or [
+        name for name in gm.list_packs() if ("10240" in name if paper else name.startswith(("tetra-325", "tetra-1024")))
+    ]
+    if not names:
+        raise SystemExit(
+            f"no shipped pack of {PAPER_GRAINS} grains; make some with `gmem prepare --grains {PAPER_GRAINS} --seed 1 "
+            "-o pack.h5` and name them with --pack"
+        )
+    t0 = options.t0 or (1.8e4 if paper else 1.8e3)
+    return [gm.load_pack(name) for name in names], options.bits or list(SCALES[options.scale]), t0
+
+
+def announce(packs: list[gm.Pack], bits: list[int], t0: float) -> None:
+    """Say what it will cost, from a short recall that is timed."""
+    pack, trial = packs[0], gm.words(3)
+    gm.run_memory(pack, trial, t0=TRIAL_T0, background="sub2-bl")  # compiles
+    began = time.perf_counter()
+    gm.run_memory(pack, trial, t0=TRIAL_T0, background="sub2-bl")
+    seconds = time.perf_counter() - began
+    each = seconds / (pack.grains * (LENGTH - 2.6) * (trial.count + 1) * math.ceil(TRIAL_T0 / (256 * 0.3)) * 256)
+    steps = 256 * math.ceil(t0 / (256 * 0.3))
+    work = sum(one.grains * steps * (2.6 + (LENGTH - 2.6) * (2**length + 1)) for one in packs for length in bits)
+    hours = each * work / 3600.0
+    print(
+        f"{len(packs)} packs, words of {bits} bits: {work:.1e} grain-steps, at {1e6 * each:.2f} us about "
+        f"{hours:.1f} hours" + (f" ({hours / 24.0:.0f} days)" if hours > 48.0 else ""),
+        flush=True,
+    )
+
+
+def recall(pack: gm.Pack, bits: int, t0: float, folder: Path) -> dict:
+    """The summary of one recall of all words of a length, with its file's path; run only if it is not there yet."""
+    path = folder / f"recall-{pack.name}-words-{bits}-t0-{t0:g}.h5"
+    if not path.exists():
+        config = RecallConfig(pack=pack.name, signals=f"words:{bits}", background="sub2-bl", t0=t0)
+        began = time.perf_counter()
+        found = gm.run_memory(pack, gm.words(bits), **config.arguments())
+        gm.save_recall(path, found, config.resolved(pack, time.perf_counter() - began))
+    kept, configuration = gm.load_recall(path)
+    row = report.summary(kept, configuration)
+    left = row["second_readout"]
+    print(
+        f"{pack.name}  L = {bits}  "
+        + "  ".join(f"F({name}) = {values['fidelity']:.3f}" for name, values in row["backgrounds"].items())
+        + f"  second readout: correlation {left['correlation']:+.3f}, gain {left['gain']:+.4f}  {row['status_text']}",
+        flush=True,
+    )
+    return {**row, "bits": bits, "path": path}
