@@ -178,11 +178,12 @@ def _table(recipe: Recipe) -> jax.Array:
     signals = words(recipe.bits)
     mean = jnp.mean(jnp.abs(bin_average(signals)))
     steps = _ladder(jnp.arange(recipe.shifts), recipe.shifts) * recipe.shift * bit_width(recipe.bits)
+
+    def moved(step: jax.Array) -> jax.Array:
+        return (bin_average(replace(signals, centres=signals.centres + step)) / mean).astype(jnp.float32)
+
     # One shift after another: side by side they would need `shifts` times the memory of `bin_average`.
-    shifted = [
-        (bin_average(replace(signals, centres=signals.centres + step)) / mean).astype(jnp.float32) for step in steps
-    ]
-    return jnp.stack(shifted, axis=1)
+    return jnp.moveaxis(jax.lax.map(moved, steps), 0, 1)
 
 
 def initial(recipe: Recipe, seed: jax.typing.ArrayLike) -> Net:
