@@ -11,11 +11,13 @@ from pathlib import Path
 import gmem_jax as gm
 from gmem_jax import report
 from gmem_jax.config import RecallConfig
+from gmem_jax.signals import BINS
 
 SCALES = {"laptop": range(3, 7), "paper": range(3, 11)}
-LENGTH = 9.0  # t0 of an experiment with a second readout, 2.6 of it before the signals differ
+LENGTH = 9.0  # t0 of an experiment with a second readout ...
+COMMON = 2.6  # ... and of its beginning, which is run once for all signals
 PAPER_GRAINS = 10_240
-TRIAL_T0 = 60.0  # t_c; a short recall that is timed
+DT = 0.3  # t_c; the default time step
 
 
 def parser(doc: str, folder: str) -> argparse.ArgumentParser:
@@ -49,21 +51,26 @@ def chosen(options: argparse.Namespace) -> tuple[list[gm.Pack], list[int], float
 
 
 def announce(packs: list[gm.Pack], bits: list[int], t0: float) -> None:
-    """Say what it will cost, from a short recall that is timed."""
-    pack, trial = packs[0], gm.words(3)
-    gm.run_memory(pack, trial, t0=TRIAL_T0, background="sub2-bl")  # compiles
-    began = time.perf_counter()
-    gm.run_memory(pack, trial, t0=TRIAL_T0, background="sub2-bl")
-    seconds = time.perf_counter() - began
-    each = seconds / (pack.grains * (LENGTH - 2.6) * (trial.count + 1) * math.ceil(TRIAL_T0 / (256 * 0.3)) * 256)
-    steps = 256 * math.ceil(t0 / (256 * 0.3))
-    work = sum(one.grains * steps * (2.6 + (LENGTH - 2.6) * (2**length + 1)) for one in packs for length in bits)
-    hours = each * work / 3600.0
-    print(
-        f"{len(packs)} packs, words of {bits} bits: {work:.1e} grain-steps, at {1e6 * each:.2f} us about "
-        f"{hours:.1f} hours" + (f" ({hours / 24.0:.0f} days)" if hours > 48.0 else ""),
-        flush=True,
-    )
+    """Say what it will cost: from two fast recalls of three bits, with one and with three steps to a bin.
+
+    The difference is what steps cost, apart from what a run costs anyway; both are scaled to the work planned.
+    """
+
+    def seconds(steps: int) -> float:
+        began = time.perf_counter()
+        gm.run_memory(packs[0], gm.words(3), t0=steps * BINS * DT, dt=DT, background="sub2-bl")
+        return time.perf_counter() - began
+
+    for steps in (1, 3):
+        seconds(steps)  # compiles
+    one, three = seconds(1), seconds(3)
+    step = max(three - one, 0.0) / 2.0
+    each = one - step + step * math.ceil(t0 / (BINS * DT))
+    width = {length: COMMON + (LENGTH - COMMON) * (2**length + 1) for length in (3, *bits)}  # replicas times t0
+    share = sum(pack.grains / packs[0].grains * width[length] / width[3] for pack in packs for length in bits)
+    hours = each * share / 3600.0
+    long = f" ({hours / 24.0:.0f} days)" if hours > 48.0 else ""
+    print(f"{len(packs)} packs, words of {bits} bits, t0 = {t0:g}: about {hours:.2f} hours{long}", flush=True)
 
 
 def recall(pack: gm.Pack, bits: int, t0: float, folder: Path) -> dict:

@@ -149,7 +149,7 @@ def _run(config: RecallConfig, data: Path, picture: Path | None) -> tuple[dict[s
 
 def _tables(row: dict[str, Any], resolved: dict[str, Any]) -> list[Any]:
     """What to print of one recall."""
-    more = [report.backgrounds_table(row)] if "backgrounds" in row else []
+    more = [report.backgrounds_table(row), report.second_readout_lines(row)] if "backgrounds" in row else []
     return [report.recall_table([row], resolved), *more]
 
 

@@ -84,13 +84,8 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
 
 
 def backgrounds_table(row: dict[str, Any]) -> Table:
-    """Gain and fidelity by each background, and what the second readout still holds, from one `summary`."""
-    left = row["second_readout"]
-    caption = (
-        f"second readout: correlation with J {left['correlation']:.3f} ± {left['correlation_se']:.3f}, "
-        f"gain {left['gain']:.4f} ± {left['gain_se']:.4f} (mean ± SE over signals)"
-    )
-    table = Table(title="By background", caption=caption)
+    """Gain and fidelity by each background, from the `summary` of a recall with a second readout."""
+    table = Table(title="By background")
     for column in ("background", "G", "F"):
         table.add_column(column, justify="left" if column == "background" else "right")
     for name, values in row["backgrounds"].items():
@@ -98,35 +93,13 @@ def backgrounds_table(row: dict[str, Any]) -> Table:
     return table
 
 
-def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> Table:
-    """Gain and fidelity of recalls, raw and averaged over the ringing period, beside the published point.
-
-    Args:
-        rows: a `summary` for each pack; several get a line of mean and standard deviation.
-        configuration: resolved, of any of them.
-    """
-    table = Table(title="Recall of the waveforms")
-    for column in ("pack", "G", "F", "G over T1", "F over T1", "T1", "status"):
-        words = column in ("pack", "status")  # may wrap in a narrow terminal; numbers are never cut
-        table.add_column(column, justify="left" if words else "right", no_wrap=not words, overflow="fold")
-    keys = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
-    for row in rows:
-        numbers = [f"{row[key]:.3f}" for key in keys]
-        table.add_row(row["pack"], *numbers, f"{row['ringing_period']:.0f}", row["status_names"])
-    if len(rows) > 1:
-        means = [spread([row[key] for row in rows]) for key in keys]
-        table.add_section()
-        table.add_row(f"mean ± SD ({len(rows)})", *(f"{mean:.3f}\n± {sd:.3f}" for mean, sd, _ in means))
-    same = {key: configuration[key] for key in ("mu", "delta0", "gamma0")}
-    points = [] if configuration["friction"] != "hooke" else published(n_grains=float(configuration["grains"]), **same)
-    shape = configuration["grain"]["shape"]
-    kind, overlap = ("sphere", 1.0) if shape == "sphere" else _tetra(shape)
-    for point in (p for p in points if p["shape"] == kind and p["overlap"] == overlap):
-        table.add_section()
-        gain = f"{point['gain_mean']:.3f}\n± {point['gain_sd']:.3f}"
-        fidelity = f"{point['fidelity_mean']:.3f}\n± {point['fidelity_sd']:.3f}"
-        table.add_row(f"published ({point['n_packs']:.0f})", gain, fidelity)
-    return table
+def second_readout_lines(row: dict[str, Any]) -> str:
+    """What the second readout still holds, in words, from such a `summary`."""
+    left = row["second_readout"]
+    return (
+        f"second readout: correlation with J {left['correlation']:.3f} ± {left['correlation_se']:.3f},\n"
+        f"gain {left['gain']:.4f} ± {left['gain_se']:.4f} (mean ± SE over signals)"
+    )
 
 
 def reading(stored: readers.Stored, nets: Sequence[classifier.Training]) -> dict[str, Any]:
@@ -172,10 +145,10 @@ def reading_tables(result: dict[str, Any]) -> list[Table]:
     readers_table = Table(title=title, caption="information in bits, with one reading a word: see readers.information")
     for column in ("reader", "accuracy", "plug-in", "bitwise", "Fano"):
         readers_table.add_column(column, justify="left" if column == "reader" else "right")
-    errors_table = Table(title="Error rate of each bit, most significant first")
+    errors_table = Table(title="Error rate by bit")
     errors_table.add_column("reader")
     for bit in range(bits):
-        errors_table.add_column(str(bit), justify="right")
+        errors_table.add_column(f"{bit}" if bit else "0 (first)", justify="right")
     for name, row in result["readers"].items():
         deviation = "" if row["accuracy_sd"] is None else f" ± {row['accuracy_sd']:.3f}"
         known = (f"{row['information'][key]:.2f}" for key in ("plug_in", "bitwise", "fano"))
