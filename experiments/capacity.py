@@ -68,9 +68,10 @@ def announce(packs: list[gm.Pack], bits: list[int], t0: float) -> None:
     each = one - step + step * math.ceil(t0 / (BINS * DT))
     width = {length: COMMON + (LENGTH - COMMON) * (2**length + 1) for length in (3, *bits)}  # replicas times t0
     share = sum(pack.grains / packs[0].grains * width[length] / width[3] for pack in packs for length in bits)
-    hours = each * share / 3600.0
-    long = f" ({hours / 24.0:.0f} days)" if hours > 48.0 else ""
-    print(f"{len(packs)} packs, words of {bits} bits, t0 = {t0:g}: about {hours:.2f} hours{long}", flush=True)
+    minutes = each * share / 60.0
+    cost = f"{minutes:.1f} minutes" if minutes < 90.0 else f"{minutes / 60.0:.1f} hours"
+    long = f" ({minutes / 1440.0:.0f} days)" if minutes > 2880.0 else ""
+    print(f"{len(packs)} packs, words of {bits} bits, t0 = {t0:g}: about {cost}{long} of recalls", flush=True)
 
 
 def recall(pack: gm.Pack, bits: int, t0: float, folder: Path) -> dict:

@@ -28,7 +28,7 @@ def draw(path: Path, rows: list[tuple[gm.Signals, list[int], list[str]]]) -> Non
         for axis, number, name in zip(line, chosen, names, strict=True):
             axis.axhline(0.0, color="0.8", linewidth=0.8)
             axis.plot(u, shear[:, number], linewidth=1.2, label="I(u)")
-            axis.plot(u, scale * integral[:, number], linewidth=1.2, linestyle="--", label=f"{scale:.0f} J(u)")
+            axis.plot(u, scale * integral[:, number], linewidth=1.2, linestyle="--", label=f"{scale:.3g} J(u)")
             axis.set_title(name, fontsize=9)
         line[0].legend(fontsize=7, frameon=False)
     for axis in axes[-1]:

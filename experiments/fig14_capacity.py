@@ -39,7 +39,7 @@ def draw(path: Path, rows: list[dict]) -> None:
     for axis, kind, names in ((left, "fidelity", BACKGROUNDS), (right, "accuracy", READERS)):
         for grains, style in zip(sorted({row["grains"] for row in rows}), ("o-", "s--", "^:"), strict=False):
             lengths = sorted({row["bits"] for row in rows if row["grains"] == grains})
-            for name, colour in names.items():
+            for place, (name, colour) in enumerate(names.items()):
                 cells = [
                     report.spread(
                         [row[f"{kind} {name}"] for row in rows if (row["grains"], row["bits"]) == (grains, n)]
@@ -48,7 +48,16 @@ def draw(path: Path, rows: list[dict]) -> None:
                 ]
                 mean, error = np.array([cell[0] for cell in cells]), np.nan_to_num([cell[2] for cell in cells])
                 label = f"{name.upper() if kind == 'fidelity' else name}, N = {grains}"
-                axis.errorbar(lengths, mean, error, fmt=style, color=colour, capsize=3, markersize=4, label=label)
+                axis.errorbar(
+                    np.array(lengths) + 0.08 * (place - 1),
+                    mean,
+                    error,
+                    fmt=style,
+                    color=colour,
+                    capsize=3,
+                    markersize=4,
+                    label=label,
+                )
     points = report.published("binary_words.csv")
     length = [point["word_bits"] for point in points]
     for name, colour in BACKGROUNDS.items():
