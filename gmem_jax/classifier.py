@@ -180,7 +180,7 @@ def _table(recipe: Recipe) -> jax.Array:
     steps = _ladder(jnp.arange(recipe.shifts), recipe.shifts) * recipe.shift * bit_width(recipe.bits)
 
     def moved(step: jax.Array) -> jax.Array:
-        return (bin_average(replace(signals, centres=signals.centres + step)) / mean).astype(jnp.float32)
+        return jnp.asarray(bin_average(replace(signals, centres=signals.centres + step)) / mean, jnp.float32)
 
     # One shift after another: side by side they would need `shifts` times the memory of `bin_average`.
     return jnp.moveaxis(jax.lax.map(moved, steps), 0, 1)

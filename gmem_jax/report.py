@@ -102,6 +102,37 @@ def second_readout_lines(row: dict[str, Any]) -> str:
     )
 
 
+def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> Table:
+    """Gain and fidelity of recalls, raw and averaged over the ringing period, beside the published point.
+
+    Args:
+        rows: a `summary` for each pack; several get a line of mean and standard deviation.
+        configuration: resolved, of any of them.
+    """
+    table = Table(title="Recall of the waveforms")
+    for column in ("pack", "G", "F", "G over T1", "F over T1", "T1", "status"):
+        words = column in ("pack", "status")  # may wrap in a narrow terminal; numbers are never cut
+        table.add_column(column, justify="left" if words else "right", no_wrap=not words, overflow="fold")
+    keys = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
+    for row in rows:
+        numbers = [f"{row[key]:.3f}" for key in keys]
+        table.add_row(row["pack"], *numbers, f"{row['ringing_period']:.0f}", row["status_names"])
+    if len(rows) > 1:
+        means = [spread([row[key] for row in rows]) for key in keys]
+        table.add_section()
+        table.add_row(f"mean ± SD ({len(rows)})", *(f"{mean:.3f}\n± {sd:.3f}" for mean, sd, _ in means))
+    same = {key: configuration[key] for key in ("mu", "delta0", "gamma0")}
+    points = [] if configuration["friction"] != "hooke" else published(n_grains=float(configuration["grains"]), **same)
+    shape = configuration["grain"]["shape"]
+    kind, overlap = ("sphere", 1.0) if shape == "sphere" else _tetra(shape)
+    for point in (p for p in points if p["shape"] == kind and p["overlap"] == overlap):
+        table.add_section()
+        gain = f"{point['gain_mean']:.3f}\n± {point['gain_sd']:.3f}"
+        fidelity = f"{point['fidelity_mean']:.3f}\n± {point['fidelity_sd']:.3f}"
+        table.add_row(f"published ({point['n_packs']:.0f})", gain, fidelity)
+    return table
+
+
 def reading(stored: readers.Stored, nets: Sequence[classifier.Training]) -> dict[str, Any]:
     """How well the words of a recall are read: by the nets (mean and SD over training seeds) and by the baselines.
 
