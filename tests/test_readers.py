@@ -58,6 +58,24 @@ def test_a_left_out_word_has_no_influence_on_the_decoder_that_reads_it() -> None
     assert readers.linear_decoder(turned)[5] == 7 - 5
 
 
+def test_the_ridge_penalty_is_the_best_on_rows_really_left_out() -> None:
+    draws = np.random.default_rng(3)
+    values = draws.normal(size=(12, 5))
+    target = np.sign(values @ draws.normal(size=(5, 2)) + draws.normal(size=(12, 2)))
+    penalties = readers.PENALTIES * np.linalg.norm(values, 2) ** 2
+
+    def solved(rows: np.ndarray, penalty: float) -> np.ndarray:
+        return np.linalg.solve(values[rows].T @ values[rows] + penalty * np.eye(5), values[rows].T @ target[rows])
+
+    def error(penalty: float) -> float:
+        gaps = [target[k] - values[k] @ solved(np.delete(np.arange(12), k), penalty) for k in range(12)]
+        return float(np.mean(np.square(gaps)))
+
+    best = penalties[np.argmin([error(penalty) for penalty in penalties])]
+    assert penalties[0] < best < penalties[-1]
+    np.testing.assert_allclose(readers._ridge(values, target), solved(np.arange(12), best), rtol=1e-10)
+
+
 def test_confusion_counts_rows_of_stored_and_columns_of_read_words() -> None:
     table = readers.confusion([[0, 1, 2, 2], [0, 1, 2, 3]], 4)
     np.testing.assert_array_equal(table, [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 1, 1]])
