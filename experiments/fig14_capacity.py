@@ -103,7 +103,7 @@ def main() -> None:
         cells = [row for row in rows if row["bits"] == length]
         for key in (key for key in rows[0] if key.startswith(("fidelity", "accuracy", "second"))):
             mean, _, error = report.spread([row[key] for row in cells])
-            print(f"L = {length}  {key:28s} {mean:.3f} +- {error:.3f}  ({len(cells)} packs)")
+            print(f"L = {length}  {key:28s} {mean:.4f} +- {error:.4f}  ({len(cells)} packs)")
 
 
 if __name__ == "__main__":
