@@ -4,6 +4,7 @@ Units are R = E = rho = 1 (time in t_c = R sqrt(rho/E)); `Material` converts. As
 ``jax.config.update("jax_enable_x64", True)``.
 """
 
+from gmem_jax import classifier as classify
 from gmem_jax.analysis import running_mean
 from gmem_jax.contact.frictionless import Frictionless
 from gmem_jax.contact.hooke import Hooke
@@ -15,7 +16,7 @@ from gmem_jax.memory import Recall, fidelity, gain, run_memory
 from gmem_jax.pack import Pack, pack_from, stack
 from gmem_jax.prepare import Recipe, prepare
 from gmem_jax.run import RunFailedError
-from gmem_jax.signals import Bumps, Samples, Signals, six_signals, waveform
+from gmem_jax.signals import Bumps, Samples, Signals, six_signals, waveform, words
 from gmem_jax.state import Status, explain
 from gmem_jax.storage import (
     FileFormatError,
@@ -43,6 +44,7 @@ __all__ = [
     "Samples",
     "Signals",
     "Status",
+    "classify",
     "clump",
     "explain",
     "fidelity",
@@ -62,4 +64,5 @@ __all__ = [
     "stack",
     "tetra",
     "waveform",
+    "words",
 ]

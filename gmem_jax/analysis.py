@@ -57,6 +57,55 @@ def fidelity(signal: jax.Array, integral: jax.Array, delta0: Scalar, gamma0: Sca
     return 1.0 - jnp.sqrt(jnp.sum((signal - template) ** 2) / jnp.sum(signal * signal))
 
 
+def backgrounds(
+    first: jax.Array, second: jax.Array, integral: jax.Array, delta0: Scalar, gamma0: Scalar
+) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """Gain and fidelity of the set by each of `BACKGROUNDS`, from a run with a second readout.
+
+    Args:
+        first: p_xy of the readout, replica 0 the zero signal, [S + 1, bins], in E.
+        second: p_xy of the second readout, alike.
+        integral: J, [S, bins].
+        delta0: areal compression.
+        gamma0: shear amplitude; scalar or [S, 1].
+    """
+    signals = {name: subtract(name, first, second) for name in BACKGROUNDS}
+    return {
+        name: (gain(signal, integral, delta0, gamma0), fidelity(signal, integral, delta0, gamma0))
+        for name, signal in signals.items()
+    }
+
+
+def correlation(signal: jax.Array, integral: jax.Array) -> jax.Array:
+    """Correlation A.B / (|A| |B|) of each signal with its J, [S]; the inner product is that of gain and fidelity.
+
+    Args:
+        signal: [S, bins].
+        integral: J, [S, bins].
+    """
+    power = jnp.sum(signal * signal, axis=-1) * jnp.sum(integral * integral, axis=-1)
+    return jnp.sum(signal * integral, axis=-1) / jnp.sqrt(power)
+
+
+def remembered_after(
+    second: jax.Array, integral: jax.Array, delta0: Scalar, gamma0: Scalar
+) -> tuple[jax.Array, jax.Array]:
+    """What the second readout still holds of each signal: its correlation with J, and its gain, both [S].
+
+    The zero signal's second readout is subtracted, as in SUB0. Both are near zero where the first readout erased the
+    memory. The correlation alone can be large for a residue of no size: the gain says how large, beside the first's.
+
+    Args:
+        second: p_xy of the second readout, replica 0 the zero signal, [S + 1, bins], in E.
+        integral: J, [S, bins].
+        delta0: areal compression.
+        gamma0: shear amplitude; scalar or [S, 1].
+    """
+    residue = subtract("sub0", second)
+    template = delta0 * gamma0 * integral
+    return correlation(residue, integral), jnp.sum(template * residue, axis=-1) / jnp.sum(template * template, axis=-1)
+
+
 def running_mean(series: jax.Array, width: Scalar) -> jax.Array:
     """Mean over a window of `width` bins (need not be whole) along the last axis, [..., bins].
 

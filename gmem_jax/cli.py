@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from typer.exceptions import TyperException
 
-from gmem_jax import bench, grain, native, plot, report, storage
+from gmem_jax import bench, classifier, grain, native, plot, readers, report, storage
 from gmem_jax.config import RecallConfig
 from gmem_jax.dynamics import Sample
 from gmem_jax.memory import default_batch, run_memory
@@ -156,11 +156,19 @@ def _run(config: RecallConfig, data: Path, picture: Path | None) -> tuple[dict[s
     return row, resolved
 
 
+def _tables(row: dict[str, Any], resolved: dict[str, Any]) -> list[Any]:
+    """What to print of one recall."""
+    more = [report.backgrounds_table(row), report.second_readout_lines(row)] if "backgrounds" in row else []
+    return [report.recall_table([row], resolved), *more]
+
+
 @app.command("recall")
 def recall_command(
     pack: Annotated[str, typer.Argument(help="A pack file, or the name of a shipped pack.")],
     output: Output = Path("recall.h5"),
-    signals: Annotated[str, typer.Option(help="six, or a .csv (a column per signal) or .npy file of samples.")] = "six",
+    signals: Annotated[
+        str, typer.Option(help="six; words:L, all words of L bits; or a .csv (a column per signal) or .npy file.")
+    ] = "six",
     friction: Annotated[str, typer.Option(help="Friction law: hooke (H), m1 or m2 (Mindlin).")] = "hooke",
     mu: Annotated[float, typer.Option(help="Friction coefficient.")] = 1.0,
     stiffness: Annotated[float | None, typer.Option(help="k_H in E R, or k_M in E R^0.5; default the law's.")] = None,
@@ -185,7 +193,7 @@ def recall_command(
     config = RecallConfig(**given)
     _writable(output)
     row, resolved = _run(config, output, output.with_suffix(".png") if picture else None)
-    _emit(as_json, row, report.recall_table([row], resolved))
+    _emit(as_json, row, *_tables(row, resolved))
 
 
 @app.command()
@@ -232,7 +240,90 @@ def show(
         return
     recall, configuration = storage.load_recall(file)
     row = report.summary(recall, configuration)
-    _emit(as_json, {**row, "configuration": configuration}, report.recall_table([row], configuration))
+    _emit(as_json, {**row, "configuration": configuration}, *_tables(row, configuration))
+
+
+@contextlib.contextmanager
+def _training(budget: float) -> Iterator[classifier.Progress]:
+    """Loss and validation accuracy of a training: in a bar of its time on a terminal, a line every 10 s elsewhere."""
+
+    def words(training: classifier.Training) -> str:
+        passed = f"seed {training.seed}: step {training.step}, loss {training.loss:.3f}"
+        return f"{passed}, held-out accuracy {training.validation:.4f}"
+
+    began = time.perf_counter()
+    if not log.is_terminal:
+        last = began
+
+        def line(training: classifier.Training) -> None:
+            nonlocal last
+            if training.finished or time.perf_counter() - last > 10.0:
+                last = time.perf_counter()
+                log.print(words(training))
+
+        yield line
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("of the time budget"), TimeElapsedColumn())
+    with Progress(*columns, console=log) as bar:
+        task = bar.add_task("compiling", total=budget)
+        yield lambda training: bar.update(
+            task, completed=min(time.perf_counter() - began, budget), description=words(training)
+        )
+
+
+@app.command("classify")
+def classify_command(
+    recall: Annotated[Path, typer.Argument(help="A recall of binary words (gmem recall --signals words:L).")],
+    output: Output = Path("classify.json"),
+    seeds: Annotated[int, typer.Option(min=1, help="Nets to train, with seeds 0, 1, ...")] = 3,
+    budget: Annotated[float, typer.Option(min=0.0, help="Longest training of one net, seconds.")] = 300.0,
+    nets: Annotated[
+        Path | None,
+        typer.Option(help="Folder of trained nets, used and added to; default gmem-nets beside the recall."),
+    ] = None,
+    picture: Annotated[bool, typer.Option(help="Also draw the nets' confusion matrix, beside the output.")] = True,
+    as_json: AsJson = False,
+) -> None:
+    """Read recalled binary words: the paper's neural net, trained on inputs only, and two baselines.
+
+    A net depends on the length of the words and its seed, not on the recall: nets in the folder are used again, and
+    those that ran out of time are trained on.
+    """
+    kept, configuration = storage.load_recall(recall)
+    try:
+        stored = readers.stored_words(kept)
+    except ValueError as error:
+        raise InputError(f"{recall}: {error}; make one with gmem recall --signals words:L") from error
+    _writable(output)
+    folder = recall.parent / "gmem-nets" if nets is None else nets
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--nets {folder}: cannot make this folder ({error.strerror})") from error
+    log.print(f"{stored.bits}-bit words of pack {configuration['pack']}, background {stored.background.upper()}")
+    began = time.perf_counter()
+    trained = []
+    for seed in range(seeds):
+        file = _writable(folder / f"words-{stored.bits}-seed-{seed}.msgpack", "--nets")
+        with _training(budget) as progress:
+            one = classifier.train(
+                classifier.Recipe(stored.bits), seed, budget=budget, checkpoint=file, progress=progress
+            )
+        trained.append(one)
+        state = "trained" if one.finished else "out of time"
+        log.print(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}", soft_wrap=True)
+    result = report.reading(stored, trained)
+    seconds = time.perf_counter() - began
+    result = {"recall": str(recall), "pack": configuration["pack"], "status": 0, "seconds": seconds, **result}
+    with storage.atomic(output) as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    if picture:
+        net = result["readers"]["net"]
+        title = f"{configuration['pack']}, {stored.bits} bits: accuracy {net['accuracy']:.3f} ({seeds} nets)"
+        table = readers.confusion(net["read"], len(stored.signals))
+        plot.confusion_figure(output.with_suffix(".png"), table, title)
+    log.print(f"wrote {output}" + (f" and {output.with_suffix('.png')}" if picture else ""), soft_wrap=True)
+    _emit(as_json, result, *report.reading_tables(result))
 
 
 @app.command("bench")

@@ -17,7 +17,7 @@ from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.material import Material
 from gmem_jax.pack import Pack
 from gmem_jax.provenance import provenance
-from gmem_jax.signals import Signals, six_signals, waveform
+from gmem_jax.signals import LONGEST_WORD, Signals, six_signals, waveform, words
 from gmem_jax.storage import load_waveforms
 
 
@@ -48,13 +48,20 @@ class RecallConfig(BaseModel):
     @field_validator("signals")
     @classmethod
     def _known_signals(cls, value: str) -> str:
-        if value != "six" and Path(value).suffix.lower() not in (".csv", ".npy"):
-            raise ValueError('must be "six" or a .csv or .npy file')
+        kind, _, length = value.partition(":")
+        if kind == "words":
+            if not length.isdecimal() or not 1 <= int(length) <= LONGEST_WORD:
+                raise ValueError(f"words need a length from 1 to {LONGEST_WORD}, as in words:3")
+        elif value != "six" and Path(value).suffix.lower() not in (".csv", ".npy"):
+            raise ValueError('must be "six", "words:L" or a .csv or .npy file')
         return value
 
     def waveforms(self) -> Signals:
         """The signals named; reads the file if it is one."""
-        return six_signals() if self.signals == "six" else waveform(load_waveforms(Path(self.signals)))
+        if self.signals == "six":
+            return six_signals()
+        kind, _, length = self.signals.partition(":")
+        return words(int(length)) if kind == "words" else waveform(load_waveforms(Path(self.signals)))
 
     def law(self) -> FrictionLaw:
         """The friction law."""

@@ -47,3 +47,38 @@ def recall_figure(path: Path, recall: Recall, delta0: float, gamma0: float, titl
     with atomic(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130)
     plt.close(figure)
+
+
+def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:
+    """A confusion matrix [S, S]: word stored down, word read across, rows normalised.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    count = len(table)
+    bits = count.bit_length() - 1
+    figure, axes = plt.subplots(figsize=(5.6, 5.0))
+    share = table / table.sum(axis=1, keepdims=True)
+    image = axes.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, interpolation="nearest")
+    if count <= 32:
+        names = [f"{word:0{bits}b}" for word in range(count)]
+        size = 9 if count <= 8 else 6
+        axes.set_xticks(range(count), names, rotation=90, fontsize=size)
+        axes.set_yticks(range(count), names, fontsize=size)
+    if count <= 16:
+        for row, column in np.argwhere(share > 0.0):
+            tone = "white" if share[row, column] > 0.5 else "black"
+            axes.text(column, row, f"{share[row, column]:.2g}", ha="center", va="center", fontsize=7, color=tone)
+    axes.set_xlabel("word read")
+    axes.set_ylabel("word stored")
+    axes.set_title(title, fontsize=10)
+    figure.colorbar(image, label="part of the readings", shrink=0.8)
+    figure.tight_layout()
+    with atomic(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=130)
+    plt.close(figure)

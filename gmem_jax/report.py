@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
+import jax
 import numpy as np
 from rich.table import Table
 
+from gmem_jax import analysis, classifier, readers
 from gmem_jax.material import Material
 from gmem_jax.memory import Recall
 from gmem_jax.pack import Pack
@@ -29,7 +31,7 @@ def _number(cell: str) -> str | float:
         return cell
 
 
-def spread(values: Sequence[float]) -> tuple[float, float, float]:
+def spread(values: Sequence[float] | jax.Array) -> tuple[float, float, float]:
     """Mean, sample standard deviation and standard error (NaN for fewer than two values)."""
     array = np.asarray(values, dtype=float)
     deviation = float(array.std(ddof=1)) if array.size > 1 else math.nan
@@ -60,7 +62,44 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "status": status,
         "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
         "status_text": explain(status),
+        **second_readout(recall, configuration),
     }
+
+
+def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
+    """Every background's gain and fidelity, and what the second readout still holds; {} for a run without one.
+
+    "second_readout" has mean and standard error over the S signals of the correlation with J and of the gain. Words
+    are sums of few bits, so that their errors are not independent: the spread over packs is the better measure.
+    """
+    if "readout-2" not in recall.stages:
+        return {}
+    first, second = (analysis.recalled(recall.stages[name].pressure) for name in ("readout", "readout-2"))
+    scale = configuration["delta0"], configuration["gamma0"]
+    pairs = analysis.backgrounds(first, second, recall.J, *scale)
+    rows = {name: {"gain": float(gain), "fidelity": float(fidelity)} for name, (gain, fidelity) in pairs.items()}
+    correlation, left = (spread(values) for values in analysis.remembered_after(second, recall.J, *scale))
+    rest = {"correlation": correlation[0], "correlation_se": correlation[2], "gain": left[0], "gain_se": left[2]}
+    return {"backgrounds": rows, "second_readout": rest}
+
+
+def backgrounds_table(row: dict[str, Any]) -> Table:
+    """Gain and fidelity by each background, from the `summary` of a recall with a second readout."""
+    table = Table(title="By background")
+    for column in ("background", "G", "F"):
+        table.add_column(column, justify="left" if column == "background" else "right")
+    for name, values in row["backgrounds"].items():
+        table.add_row(name.upper(), f"{values['gain']:.3f}", f"{values['fidelity']:.3f}")
+    return table
+
+
+def second_readout_lines(row: dict[str, Any]) -> str:
+    """What the second readout still holds, in words, from such a `summary`."""
+    left = row["second_readout"]
+    return (
+        f"second readout: correlation with J {left['correlation']:.3f} ± {left['correlation_se']:.3f},\n"
+        f"gain {left['gain']:.4f} ± {left['gain_se']:.4f} (mean ± SE over signals)"
+    )
 
 
 def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> Table:
@@ -92,6 +131,66 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
         fidelity = f"{point['fidelity_mean']:.3f}\n± {point['fidelity_sd']:.3f}"
         table.add_row(f"published ({point['n_packs']:.0f})", gain, fidelity)
     return table
+
+
+def reading(stored: readers.Stored, nets: Sequence[classifier.Training]) -> dict[str, Any]:
+    """How well the words of a recall are read: by the nets (mean and SD over training seeds) and by the baselines.
+
+    Accuracy, error rate of each bit and information (see `readers.information`) for every reader; for the nets over
+    all their readings together.
+    """
+    count = len(stored.signals)
+    answers = {
+        "net": np.stack([np.asarray(classifier.predict(training.net, stored.signals)) for training in nets]),
+        "nearest template": readers.nearest_template(stored.signals, stored.templates),
+        "linear decoder": readers.linear_decoder(stored.signals),
+    }
+    rows = {}
+    for name, read in answers.items():
+        table = readers.confusion(read, count)
+        right = np.atleast_1d(np.mean(read == np.arange(count), axis=-1))
+        mean, deviation, _ = spread(right.tolist())
+        rows[name] = {
+            "accuracy": mean,
+            "accuracy_sd": deviation if name == "net" and len(right) > 1 else None,
+            "bit_errors": readers.bit_errors(read).tolist(),
+            "information": readers.information(table),
+            "read": read.tolist(),
+        }
+    seeds = [
+        {
+            "seed": training.seed,
+            "accuracy": float(classifier.accuracy(training.net, stored.signals)),
+            "cross_entropy": float(classifier.cross_entropy(training.net, stored.signals)),
+            **{key: getattr(training, key) for key in ("validation", "examples", "finished", "step", "seconds")},
+        }
+        for training in nets
+    ]
+    return {"bits": stored.bits, "words": count, "background": stored.background, "readers": rows, "nets": seeds}
+
+
+def reading_tables(result: dict[str, Any]) -> list[Table]:
+    """The readers beside each other and the published accuracy, and the bits' error rates, from a `reading`."""
+    bits = result["bits"]
+    title = f"Reading {result['words']} words of {bits} bits ({result['background'].upper()})"
+    readers_table = Table(title=title, caption="information in bits, with one reading a word: see readers.information")
+    for column in ("reader", "accuracy", "plug-in", "bitwise", "Fano"):
+        readers_table.add_column(column, justify="left" if column == "reader" else "right")
+    errors_table = Table(title="Error rate by bit")
+    errors_table.add_column("reader")
+    for bit in range(bits):
+        errors_table.add_column(f"{bit}" if bit else "0 (first)", justify="right")
+    for name, row in result["readers"].items():
+        deviation = "" if row["accuracy_sd"] is None else f" ± {row['accuracy_sd']:.3f}"
+        known = (f"{row['information'][key]:.2f}" for key in ("plug_in", "bitwise", "fano"))
+        label = f"{name} ({len(result['nets'])} seeds)" if name == "net" else name
+        readers_table.add_row(label, f"{row['accuracy']:.3f}{deviation}", *known)
+        errors_table.add_row(name, *(f"{error:.3f}" for error in row["bit_errors"]))
+    for point in published("binary_words.csv", word_bits=float(bits)):
+        readers_table.add_section()
+        said = f"{point['classifier_accuracy']:.3f} ± {point['classifier_accuracy_sd']:.3f}"
+        readers_table.add_row("published net (N = 10,240)", said)
+    return [readers_table, errors_table]
 
 
 def _tetra(shape: str) -> tuple[str, float]:

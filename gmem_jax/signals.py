@@ -4,6 +4,7 @@ A set of S signals is a pytree with two methods, `shear(u)` and `integral(u)`, e
 All waveforms vanish at u = 0 and u = 1, so that the box is unsheared outside the encoding ramp.
 """
 
+import functools
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -13,6 +14,8 @@ import numpy as np
 
 from gmem_jax.state import Scalar
 
+LONGEST_WORD = 12  # bits
+PAD = 2  # bits left free at either end of a word
 BINS = 256  # bins of u in the paper: the resolution of every recorded signal
 
 
@@ -143,6 +146,43 @@ def six_signals() -> Bumps:
     return Bumps(amplitudes=jnp.asarray(amplitudes), centres=jnp.asarray(centres), width=0.2)
 
 
+def word_bits(bits: int) -> np.ndarray:
+    """The bits of every word, most significant first, [2^bits, bits] of 0 and 1; row k holds the number k.
+
+    Raises:
+        ValueError: if `bits` is not a whole number from 1 to 12.
+    """
+    if isinstance(bits, bool) or not isinstance(bits, int | np.integer) or not 1 <= bits <= LONGEST_WORD:
+        raise ValueError(f"a word has 1 to {LONGEST_WORD} bits, got {bits!r}")
+    places = np.arange(bits - 1, -1, -1)
+    return np.arange(2**bits)[:, None] >> places & 1
+
+
+def words(bits: int) -> Bumps:
+    """All binary words of a length (App. A): J is a plateau of height +u_b / pi for a 1 and -u_b / pi for a 0.
+
+    A bit is u_b = 1 / (bits + 4) wide, two of these are left free at either end, and plateaus that differ are joined
+    by bumps of width u_b. Signal s, from 1 to 2^bits, is the number s - 1, its most significant bit at small u. The
+    scale is the paper's: amplitudes of 1 between bits, 1/2 at the ends, whatever the word.
+
+    Raises:
+        ValueError: if `bits` is not a whole number from 1 to 12.
+    """
+    value = word_bits(bits)
+    width = bit_width(bits)
+    level = np.pad(value - 0.5, ((0, 0), (1, 1)))  # a word begins and ends half-way between its two plateaus
+    amplitudes = np.diff(level, axis=1)
+    centres = (PAD + np.arange(bits + 1)) * width
+    return Bumps(
+        amplitudes=jnp.asarray(amplitudes), centres=jnp.asarray(np.tile(centres, (len(value), 1))), width=width
+    )
+
+
+def bit_width(bits: int) -> float:
+    """u_b, the width of a bit in u."""
+    return 1.0 / (bits + 2 * PAD)
+
+
 def waveform(samples: jax.typing.ArrayLike) -> Samples:
     """Any waveform from its samples.
 
@@ -162,6 +202,7 @@ def waveform(samples: jax.typing.ArrayLike) -> Samples:
     return Samples(nodes=jnp.pad(values, ((0, 0), (1, 1))))
 
 
+@functools.partial(jax.jit, static_argnames=("bins", "points"))  # fused: 4,096 words would fill the memory otherwise
 def bin_average(signals: Signals, bins: int = BINS, points: int = 16) -> jax.Array:
     """J_s averaged over each bin of u, [S, bins] (midpoint rule on `points` per bin)."""
     u = (jnp.arange(bins * points) + 0.5) / (bins * points)

@@ -66,3 +66,42 @@ def test_a_running_mean_over_one_period_removes_it_and_keeps_a_line() -> None:
 def test_a_running_mean_of_one_bin_changes_nothing() -> None:
     series = jnp.asarray([[1.0, 5.0, 2.0, 8.0]])
     np.testing.assert_allclose(analysis.running_mean(series, 1.0), series, rtol=1e-15)
+
+
+def test_every_background_is_reported_with_its_own_gain_and_fidelity() -> None:
+    signal = 0.3 * DELTA0 * GAMMA0 * J
+    ramp = jnp.linspace(0.0, 1.0, 256)
+    drift = 1e-6 * (0.4 + ramp)  # between the two readouts: SUB2 suffers from it, a line is all that SUB2-BL removes
+    first = jnp.concatenate([jnp.zeros((1, 256)), -signal]) + jnp.sin(ramp)
+    rows = analysis.backgrounds(first, jnp.broadcast_to(jnp.sin(ramp) + drift, first.shape), J, DELTA0, GAMMA0)
+    assert list(rows) == ["sub0", "sub2", "sub2-bl"]
+    np.testing.assert_allclose(rows["sub0"][1], 1.0, atol=1e-6)  # round-off of the background, of order 1, over 1e-6
+    np.testing.assert_allclose(rows["sub0"][0], 0.3, rtol=1e-9)
+    assert float(rows["sub2"][1]) < 0.9
+    # The line through the end bins also takes what J has left there, 2 du / pi of signals 1 to 3 and 6.
+    alone = analysis.subtract("sub2-bl", -jnp.concatenate([jnp.zeros((1, 256)), signal]), jnp.zeros((7, 256)))
+    np.testing.assert_allclose(rows["sub2-bl"][1], analysis.fidelity(alone, J, DELTA0, GAMMA0), rtol=1e-6)
+
+
+def test_correlation_is_the_cosine_between_signal_and_integral() -> None:
+    np.testing.assert_allclose(analysis.correlation(-3.0 * J, J), -np.ones(6), rtol=1e-14)
+    angle = 0.3
+    one = jnp.ones((1, 4)) / 2.0
+    other = jnp.asarray([[1.0, -1.0, 1.0, -1.0]])  # orthogonal to it
+    np.testing.assert_allclose(
+        analysis.correlation(jnp.cos(angle) * one + jnp.sin(angle) * other / 2.0, one), [np.cos(angle)], rtol=1e-14
+    )
+
+
+def test_what_is_left_after_the_first_readout_has_its_sign_and_its_size() -> None:
+    zero = jnp.sin(jnp.linspace(0.0, 3.0, 256))[None]
+    second = jnp.concatenate([zero, zero - 0.02 * DELTA0 * GAMMA0 * J])
+    correlation, left = analysis.remembered_after(second, J, DELTA0, GAMMA0)
+    np.testing.assert_allclose(left, 0.02 * np.ones(6), rtol=1e-7)  # round-off of a background of order 1 over 1e-7
+    np.testing.assert_allclose(correlation, np.ones(6), rtol=1e-12)
+
+
+def test_an_unrelated_second_readout_is_uncorrelated_with_the_integral() -> None:
+    noise = jnp.asarray(np.random.default_rng(0).normal(size=(7, 256)))
+    correlation, _ = analysis.remembered_after(noise, J, DELTA0, GAMMA0)
+    assert np.abs(correlation).max() < 4.0 / 16.0  # the correlation of white noise has an SD of 1 / sqrt(256)

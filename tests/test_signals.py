@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmem_jax.signals import Bumps, bin_average, six_signals, waveform
+from gmem_jax.signals import Bumps, bin_average, bit_width, six_signals, waveform, word_bits, words
 
 SIX = six_signals()
 SHEAR = jax.jit(lambda signals, u: signals.shear(u))
@@ -20,7 +20,7 @@ TABLE = [
 ]
 FINE = jnp.linspace(0.0, 1.0, 40_001)
 WAVE = np.random.default_rng(0).normal(size=(2, 9))
-SETS = {"six signals": SIX, "samples": waveform(WAVE)}
+SETS = {"six signals": SIX, "samples": waveform(WAVE), "words": words(3)}
 
 
 def cumulative(signals) -> np.ndarray:
@@ -162,3 +162,66 @@ def test_bins_hold_the_average_of_the_integral_not_its_samples():
     np.testing.assert_allclose(averaged, bins.mean(axis=1).T, atol=5e-8)
     middle = np.asarray(INTEGRAL(SIX, (jnp.arange(256) + 0.5) / 256)).T
     assert np.abs(averaged - middle).max() > 1e-6
+
+
+def spelt(number: int, bits: int) -> list[int]:
+    """The bits of a number, by the language's own formatting."""
+    return [int(digit) for digit in f"{number:0{bits}b}"]
+
+
+@pytest.mark.parametrize("bits", range(1, 13))
+def test_there_are_two_to_the_bits_words_most_significant_bit_first(bits):
+    assert words(bits).count == 2**bits
+    assert word_bits(bits).tolist() == [spelt(number, bits) for number in range(2**bits)]
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3, 6, 9])
+def test_every_bit_of_a_word_is_a_plateau_of_plus_or_minus_its_width_over_pi(bits):
+    u_b = 1.0 / (bits + 4)  # two bits of padding at either end
+    middles = (2.5 + np.arange(bits)) * u_b
+    plateaus = np.asarray(INTEGRAL(words(bits), jnp.asarray(middles))).T
+    signs = 2.0 * np.array([spelt(number, bits) for number in range(2**bits)]) - 1.0
+    np.testing.assert_allclose(plateaus, signs * u_b / np.pi, rtol=1e-13)
+    assert bit_width(bits) == u_b
+
+
+@pytest.mark.parametrize("bits", [1, 3, 7, 12])
+def test_words_begin_and_end_at_zero_and_stay_there_in_the_padding(bits):
+    u_b = 1.0 / (bits + 4)
+    quiet = jnp.asarray([0.0, u_b, 1.499 * u_b, 1.0 - 1.499 * u_b, 1.0 - u_b, 1.0])
+    signals = words(bits)
+    assert np.all(np.asarray(SHEAR(signals, quiet)) == 0.0)
+    assert np.abs(INTEGRAL(signals, quiet)).max() < 1e-15  # cancelling bumps: round-off of sums of order u_b
+    moving = jnp.asarray([1.501 * u_b, 1.0 - 1.501 * u_b])  # just inside the first and the last bump
+    assert np.all(np.asarray(SHEAR(signals, moving)) != 0.0)
+
+
+def by_hand(number: int, bits: int, u: np.ndarray) -> np.ndarray:
+    """I of one word after App. A, written out bump by bump."""
+    u_b, b = 1.0 / (bits + 4), spelt(number, bits)
+    bumps = [(2 * u_b, b[0] - 0.5), ((2 + bits) * u_b, 0.5 - b[-1])]
+    bumps += [((2 + k + 1) * u_b, b[k + 1] - b[k]) for k in range(bits - 1)]
+    total = np.zeros_like(u)
+    for centre, height in bumps:
+        inside = np.abs(u - centre) < 0.5 * u_b
+        total[inside] += height * np.cos(np.pi * (u[inside] - centre) / u_b)
+    return total
+
+
+@pytest.mark.parametrize(("bits", "number"), [(1, 0), (1, 1), (3, 5), (4, 6), (5, 0), (10, 0b1011001110)])
+def test_a_word_is_the_sum_of_bumps_of_appendix_a(bits, number):
+    u = np.linspace(0.0, 1.0, 3001)
+    # The argument of the cosine is rounded to a few ulp of u / u_b, some 10.
+    np.testing.assert_allclose(SHEAR(words(bits), jnp.asarray(u))[:, number], by_hand(number, bits, u), atol=1e-13)
+
+
+def test_a_word_and_its_complement_are_opposite_waveforms():
+    signals = words(5)
+    np.testing.assert_array_equal(signals.amplitudes, -signals.amplitudes[::-1])
+    np.testing.assert_array_equal(signals.centres, signals.centres[::-1])
+
+
+@pytest.mark.parametrize("bits", [0, 13, -1, 2.0, "3", True])
+def test_words_of_no_length_or_too_long_are_refused(bits):
+    with pytest.raises(ValueError, match="a word has 1 to 12 bits"):
+        words(bits)

@@ -10,6 +10,7 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax import cli
+from gmem_jax.config import RecallConfig
 
 PACK = Path(__file__).parent.parent / "data" / "tetra-27.h5"
 SHORT = ["--t0", "75", "--store", "0.1", "--rest", "0.1", "--hold", "0.1"]
@@ -32,7 +33,7 @@ def test_help_and_info_work(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     assert "tetra-325-a" in facts["packs"]
 
 
-@pytest.mark.parametrize("command", ["prepare", "recall", "demo", "show", "info", "bench"])
+@pytest.mark.parametrize("command", ["prepare", "recall", "classify", "demo", "show", "info", "bench"])
 def test_every_command_has_help(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, command: str) -> None:
     assert gmem(monkeypatch, command, "--help") == 0
     assert "--json" in capsys.readouterr().out
@@ -85,6 +86,73 @@ def test_a_pack_file_is_shown_with_its_state(monkeypatch: pytest.MonkeyPatch, ca
         assert words in shown
 
 
+@pytest.fixture(scope="module")
+def one_bit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recall of the two words of one bit, with a second readout."""
+    file = tmp_path_factory.mktemp("words") / "words.h5"
+    run = {"t0": 75.0, "store": 0.1, "rest": 0.1, "hold": 0.1}
+    config = RecallConfig(pack=str(PACK), signals="words:1", background="sub2-bl", **run)
+    pack = gm.load_pack(PACK)
+    recall = gm.run_memory(pack, config.waveforms(), **config.arguments())
+    gm.save_recall(file, recall, config.resolved(pack, 1.0))
+    return file
+
+
+def test_a_second_readout_is_shown_by_every_background(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, one_bit: Path
+) -> None:
+    assert gmem(monkeypatch, "show", one_bit, "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    assert list(said["backgrounds"]) == ["sub0", "sub2", "sub2-bl"]
+    assert said["backgrounds"]["sub2-bl"] == pytest.approx({key: said[key] for key in ("gain", "fidelity")}, rel=1e-9)
+    left = said["second_readout"]
+    assert set(left) == {"correlation", "correlation_se", "gain", "gain_se"}
+    assert all(np.isfinite(value) for value in left.values())
+    assert gmem(monkeypatch, "show", one_bit) == 0
+    shown = capsys.readouterr().out
+    for words in ("SUB0", "SUB2-BL", "second readout: correlation with J"):
+        assert words in shown
+
+
+def test_recalled_words_are_classified_and_the_nets_are_used_again(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, one_bit: Path
+) -> None:
+    target, nets = tmp_path / "read.json", tmp_path / "nets"
+    arguments = ["classify", one_bit, "-o", target, "--seeds", 2, "--budget", 60, "--nets", nets]
+    assert gmem(monkeypatch, *arguments, "--json") == 0
+    spoken = capsys.readouterr()
+    said = json.loads(spoken.out)
+    assert said == json.loads(target.read_text())
+    assert (said["bits"], said["background"], said["status"]) == (1, "sub2-bl", 0)
+    assert [net["finished"] for net in said["nets"]] == [True, True]
+    assert set(said["readers"]) == {"net", "nearest template", "linear decoder"}
+    mean = np.mean([net["accuracy"] for net in said["nets"]])
+    assert said["readers"]["net"]["accuracy"] == pytest.approx(mean)
+    assert "held-out accuracy" in spoken.err
+    assert "SUB2-BL" in spoken.err
+    assert sorted(path.name for path in nets.iterdir()) == ["words-1-seed-0.msgpack", "words-1-seed-1.msgpack"]
+    assert target.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    stamps = [path.stat().st_mtime_ns for path in sorted(nets.iterdir())]
+    assert gmem(monkeypatch, *arguments, "--no-picture") == 0
+    assert [path.stat().st_mtime_ns for path in sorted(nets.iterdir())] == stamps
+    assert "nearest template" in capsys.readouterr().out
+
+
+def test_a_recall_that_holds_no_words_cannot_be_classified(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    file = tmp_path / "six.h5"
+    assert gmem(monkeypatch, "recall", PACK, "-o", file, "--no-picture", *SHORT) == 0
+    capsys.readouterr()
+    assert gmem(monkeypatch, "classify", file, "-o", tmp_path / "out.json") == 2
+    said = capsys.readouterr()
+    assert (
+        "holds 6 signals that are not the words of one length; make one with gmem recall --signals words:L" in said.err
+    )
+    assert len(said.err.strip().splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["six.h5"]
+
+
 def bad_files(folder: Path) -> dict[str, Path]:
     """Files with one thing wrong each."""
     files = {name: folder / name for name in ("truncated.h5", "schema.h5", "nan.csv", "ragged.csv", "short.csv")}
@@ -119,6 +187,15 @@ BAD = [
     (["recall", "{pack}", "-o", "/proc/recall.h5"], "cannot write there"),
     (["demo", "--packs", "tetra-7"], "no such shipped pack"),
     (["show", "nothing.h5"], "no such file"),
+    (
+        ["recall", "{pack}", "--signals", "words:13", "-o", "{out}"],
+        "--signals: value error, words need a length from 1",
+    ),
+    (["recall", "{pack}", "--signals", "words", "-o", "{out}"], "words need a length from 1 to 12, as in words:3"),
+    (["classify", "{pack}", "-o", "{out}"], "schema is 'gmem-pack/1', expected 'gmem-recall/1'"),
+    (["classify", "{truncated.h5}", "-o", "{out}"], "not a readable HDF5 file"),
+    (["classify", "nothing.h5", "-o", "{out}"], "nothing.h5: no such file"),
+    (["classify", "nothing.h5", "--seeds", "0", "-o", "{out}"], "'--seeds'"),
     (["sing"], "No such command"),
     (["recall", "{pack}", "--loud"], "No such option"),
 ]
