@@ -80,7 +80,7 @@ def recall(pack: gm.Pack, bits: int, t0: float, folder: Path) -> dict:
     if not path.exists():
         config = RecallConfig(pack=pack.name, signals=f"words:{bits}", background="sub2-bl", t0=t0)
         began = time.perf_counter()
-        found = gm.run_memory(pack, gm.words(bits), **config.arguments())
+        found = gm.run_memory(pack, gm.words(bits), batch=63, **config.arguments())
         gm.save_recall(path, found, config.resolved(pack, time.perf_counter() - began))
     kept, configuration = gm.load_recall(path)
     row = report.summary(kept, configuration)
