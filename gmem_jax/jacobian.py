@@ -102,9 +102,7 @@ def exact(experiment: Experiment, *, law: bool = True, progress: Progress = sile
     return Jacobian(tuple(names), np.asarray(values), np.concatenate(p_sig), np.concatenate(p_xy))
 
 
-def differences(
-    experiment: Experiment, relative: float, *, law: bool = True, progress: Progress = silent
-) -> Jacobian:
+def differences(experiment: Experiment, relative: float, *, law: bool = True, progress: Progress = silent) -> Jacobian:
     """Central differences with steps of `relative` times each parameter (amplitudes: times 1), as replicas.
 
     Raises:

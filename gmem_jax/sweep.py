@@ -28,9 +28,7 @@ def _advance(
     for stage in stages:
         leg, parts = experiment.timing.leg(stage), []
         for first, bins in chunks(stage):
-            state, pressure = _part()(
-                experiment, state, leg, jnp.asarray(first), sheared=stage.sheared, bins=bins
-            )
+            state, pressure = _part()(experiment, state, leg, jnp.asarray(first), sheared=stage.sheared, bins=bins)
             refuse(worst(state), stage.name)
             parts.append(np.asarray(pressure))
             done += bins
