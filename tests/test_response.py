@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import design, response, sweep
+from gmem_jax import response, sweep
 from gmem_jax.experiment import chunks
 from gmem_jax.signals import BINS, bin_average
 
