@@ -119,8 +119,10 @@ class Experiment:
     def begin(self) -> State:
         """The pack at rest with friction switched on; one replica, or [S + 1] if parameters of the prefix are."""
         wide = any(jnp.ndim(leaf) for leaf in jax.tree.leaves((self.friction, self.compression)))
-        still = self.pack.position[..., None], self.pack.quaternion[..., None]
-        return start(self.system, *replicate(still, self.replicas if wide else 1), self.pack.box)
+        position, quaternion = replicate(
+            (self.pack.position[..., None], self.pack.quaternion[..., None]), self.replicas if wide else 1
+        )
+        return start(self.system, position, quaternion, self.pack.box)
 
     def fan_out(self, state: State) -> State:
         """One replica for every signal and one for the zero signal, if there is only one so far."""

@@ -43,7 +43,7 @@ def _piece(
     make: Make, theta: Any, moving: Moving, status: jax.Array, leg: Leg, first: jax.Array, *, sheared: bool, bins: int
 ) -> tuple[tuple[Moving, jax.Array], jax.Array]:
     """A chunk as a function of parameters and state: ((state, pressures), status)."""
-    state, pressure = make(theta).part(State(*moving, status), leg, first, sheared=sheared, bins=bins)
+    state, pressure = make(theta).part(State(moving[0], moving[1], status), leg, first, sheared=sheared, bins=bins)
     return ((state.grains, state.history), pressure), state.status
 
 
@@ -70,12 +70,13 @@ def _program(kind: str) -> Any:
 
         return jax.vjp(piece, theta, moving, has_aux=True)[1](slopes)
 
-    chosen = {"run": run, "push": push, "pull": pull}[kind]
+    programs: dict[str, Callable[..., Any]] = {"run": run, "push": push, "pull": pull}
+    chosen = programs[kind]
     return compiled(chosen, static_argnums=0, static_argnames=("sheared", "bins"))
 
 
 def _fan_out(make: Make, theta: Any, moving: Moving, status: jax.Array) -> Moving:
-    state = make(theta).fan_out(State(*moving, status))
+    state = make(theta).fan_out(State(moving[0], moving[1], status))
     return state.grains, state.history
 
 
@@ -164,7 +165,7 @@ def push(make: Make, theta: Any, direction: Any, *, progress: Progress = silent)
         else:
             (moving, pressure), status = chunk.call("run", make, theta)
             change = jnp.zeros_like(pressure)
-        refuse(worst(State(*moving, status)), stage.name)
+        refuse(worst(State(moving[0], moving[1], status)), stage.name)
         pressures.setdefault(stage.name, []).append(np.asarray(pressure))
         slopes.setdefault(stage.name, []).append(np.asarray(change))
         progress(stage.name, 0.0, (number + 1) / len(plan))
@@ -220,7 +221,7 @@ def value_and_grad(make: Make, theta: Any, loss: Loss = fidelity, *, progress: P
             status = jnp.broadcast_to(status, (experiment.replicas,))
         tape.append(_Chunk(stage, experiment.timing.leg(stage), first, bins, moving, status))
         (moving, pressure), status = tape[-1].call("run", make, theta)
-        refuse(worst(State(*moving, status)), stage.name)
+        refuse(worst(State(moving[0], moving[1], status)), stage.name)
         if stage.name == "readout":
             readout.append(pressure)
         progress(stage.name, 0.0, 0.02 * (number + 1) / len(plan))
