@@ -346,7 +346,7 @@ def design_command(
     output: Output = Path("designed.csv"),
     signals: SignalFile = "six",
     iterations: Annotated[int, typer.Option(min=1, help="Simulated corrections.")] = 6,
-    gain: Annotated[float | None, typer.Option(help="Wanted gain; default 0.8 of the untouched waveforms'.")] = None,
+    gain: Annotated[float | None, typer.Option(help="Wanted gain; default 0.55 of the untouched waveforms'.")] = None,
     friction: Law = "hooke",
     mu: Mu = 1.0,
     gamma0: Gamma0 = 1e-3,

@@ -102,7 +102,7 @@ def design_waveforms(
         iterations: simulated corrections.
         n: bumps of a designed waveform.
         width: of the bumps.
-        gain: wanted common gain; default 0.8 of the untouched waveforms' own, so that the bound leaves room.
+        gain: wanted common gain; default 0.55 of the untouched waveforms' own, so that the bound leaves room.
         damping: of the inverse, in parts of the largest singular value.
         optimiser: what makes a step of a preconditioned gradient; default plain descent with steps of 0.7.
         kernel: measured kernel on the same bumps; measured if not given.
@@ -118,7 +118,7 @@ def design_waveforms(
     unit = float(experiment.compression) * float(experiment.gamma0)
     original, _ = sweep.simulate(experiment, state)
     before = float(experiment.fidelity(original))
-    wanted = (0.8 * float(experiment.gain(original)) if gain is None else gain) * unit * target
+    wanted = (0.55 * float(experiment.gain(original)) if gain is None else gain) * unit * target
     kernel = memory_kernel(experiment.pack, n, width, state=state, experiment=experiment) if kernel is None else kernel
     progress("kernel measured", 0.0, 1.0 / (iterations + 2))
     inverses = np.repeat(_inverse(kernel.odd, damping)[None], len(target), axis=0)
