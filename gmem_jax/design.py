@@ -88,7 +88,7 @@ def design_waveforms(
     n: int = 17,
     width: float = 0.2,
     gain: float | None = None,
-    damping: float = 0.03,
+    damping: float = 0.015,
     optimiser: optax.GradientTransformation | None = None,
     kernel: MemoryKernel | None = None,
     state: State | None = None,
