@@ -10,11 +10,15 @@ from gmem_jax.contact.frictionless import Frictionless
 from gmem_jax.contact.hooke import Hooke
 from gmem_jax.contact.mindlin import Mindlin
 from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
+from gmem_jax.design import Design, design_waveforms
+from gmem_jax.experiment import Experiment, Timing
+from gmem_jax.gradient import value_and_grad
 from gmem_jax.grain import Clump, clump, sphere, tetra
 from gmem_jax.material import Material
 from gmem_jax.memory import Recall, fidelity, gain, run_memory
 from gmem_jax.pack import Pack, pack_from, stack
 from gmem_jax.prepare import Recipe, prepare
+from gmem_jax.response import MemoryKernel, memory_kernel
 from gmem_jax.run import RunFailedError
 from gmem_jax.signals import Bumps, Samples, Signals, six_signals, waveform, words
 from gmem_jax.state import Status, explain
@@ -26,15 +30,19 @@ from gmem_jax.storage import (
     load_waveforms,
     save_pack,
     save_recall,
+    save_waveforms,
 )
 
 __all__ = [
     "Bumps",
     "Clump",
+    "Design",
+    "Experiment",
     "FileFormatError",
     "Frictionless",
     "Hooke",
     "Material",
+    "MemoryKernel",
     "Mindlin",
     "MindlinRescaled",
     "Pack",
@@ -44,8 +52,10 @@ __all__ = [
     "Samples",
     "Signals",
     "Status",
+    "Timing",
     "classify",
     "clump",
+    "design_waveforms",
     "explain",
     "fidelity",
     "gain",
@@ -53,16 +63,19 @@ __all__ = [
     "load_pack",
     "load_recall",
     "load_waveforms",
+    "memory_kernel",
     "pack_from",
     "prepare",
     "run_memory",
     "running_mean",
     "save_pack",
     "save_recall",
+    "save_waveforms",
     "six_signals",
     "sphere",
     "stack",
     "tetra",
+    "value_and_grad",
     "waveform",
     "words",
 ]

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from typer.exceptions import TyperException
 
-from gmem_jax import bench, classifier, grain, native, plot, readers, report, storage
+from gmem_jax import bench, classifier, derive, grain, native, plot, readers, report, storage
 from gmem_jax.config import RecallConfig
 from gmem_jax.dynamics import Sample
 from gmem_jax.memory import default_batch, run_memory
@@ -359,6 +359,115 @@ def bench_command(
     text = bench.markdown(result, before)
     bench.save(output, result, text)
     _emit(as_json, {**result, "status": 0}, text)
+
+
+PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a shipped pack.")]
+SignalFile = Annotated[str, typer.Option(help="six, or a .csv (a column per signal) or .npy file of samples.")]
+Law = Annotated[str, typer.Option(help="Friction law: hooke (H), m1 or m2 (Mindlin).")]
+Mu = Annotated[float, typer.Option(help="Friction coefficient.")]
+Gamma0 = Annotated[float, typer.Option(help="Shear amplitude.")]
+T0 = Annotated[float, typer.Option(help="Duration of one compression, t_c.")]
+Hold = Annotated[float, typer.Option(help="Holds at u = 1, in t0.")]
+Rest = Annotated[float, typer.Option(help="Rests at u = 0, in t0.")]
+Store = Annotated[float, typer.Option(help="Storage, in t0.")]
+Picture = Annotated[bool, typer.Option(help="Also draw it, beside the output.")]
+
+
+def _given(values: dict[str, Any]) -> RecallConfig:
+    return RecallConfig(**{key: value for key, value in values.items() if key in RecallConfig.model_fields})
+
+
+@app.command("gradient")
+def gradient_command(
+    pack: PackName,
+    output: Output = Path("gradient.json"),
+    signals: SignalFile = "six",
+    friction: Law = "hooke",
+    mu: Mu = 1.0,
+    gamma0: Gamma0 = 1e-3,
+    t0: T0 = 1.8e3,
+    rest: Rest = 0.2,
+    hold: Hold = 0.2,
+    store: Store = 2.0,
+    picture: Picture = True,
+    as_json: AsJson = False,
+) -> None:
+    """Exact derivatives of the fidelity by waveforms, gamma0, mu and stiffness (reverse mode; minutes)."""
+    config = _given(locals())
+    _writable(output)
+    began = time.perf_counter()
+    with _progress() as progress:
+        result = derive.run_gradient(config, output.with_suffix(".png") if picture else None, progress)
+    result = {**result, "seconds": time.perf_counter() - began, "status": 0}
+    with storage.atomic(output) as temporary:
+        temporary.write_text(json.dumps({**result, "configuration": config.model_dump(), **provenance()}))
+    slopes = result["gradient"]
+    lines = [f"F = {result['fidelity']:.4f}"]
+    lines += [f"dF/d{name} = {slopes[name]:.5g}" for name in ("gamma0", "mu", "stiffness")]
+    for number, row in enumerate(slopes["waveform"]):
+        lines.append(f"dF/da of signal {number + 1}: " + " ".join(f"{value:.4g}" for value in row))
+    _emit(as_json, result, "\n".join(lines))
+
+
+@app.command("kernel")
+def kernel_command(
+    pack: PackName,
+    output: Output = Path("kernel.h5"),
+    signals: SignalFile = "six",
+    n: Annotated[int, typer.Option("-n", "--bumps", min=2, help="Basis waveforms.")] = 17,
+    width: Annotated[float, typer.Option(min=0.01, max=0.9, help="Width of the bumps, in u.")] = 0.2,
+    noise: Annotated[float, typer.Option(min=0.0, help="Noise in the recall, Pa RMS.")] = 1.0,
+    friction: Law = "hooke",
+    mu: Mu = 1.0,
+    gamma0: Gamma0 = 1e-3,
+    t0: T0 = 1.8e3,
+    rest: Rest = 0.2,
+    hold: Hold = 0.2,
+    store: Store = 2.0,
+    picture: Picture = True,
+    as_json: AsJson = False,
+) -> None:
+    """The linear memory kernel of a pack: singular values, resolution, capacity, and what it predicts."""
+    config = _given(locals())
+    _writable(output)
+    began = time.perf_counter()
+    drawn = output.with_suffix(".png") if picture else None
+    with _progress() as progress:
+        result = derive.run_kernel(config, output, drawn, n, width, noise, progress)
+    result = {**result, "seconds": time.perf_counter() - began, "status": 0}
+    keys = ("gain", "distance", "asymmetry", "resolution")
+    lines = [*(f"{key}: {result[key]:.3f}" for key in keys), f"values above {noise:g} Pa: {result['capacity']} of {n}"]
+    lines.append("superposition's error: " + " ".join(f"{value:.2%}" for value in result["prediction_error"]))
+    _emit(as_json, result, "\n".join(lines))
+
+
+@app.command("design")
+def design_command(
+    pack: PackName,
+    output: Output = Path("designed.csv"),
+    signals: SignalFile = "six",
+    iterations: Annotated[int, typer.Option(min=1, help="Simulated corrections.")] = 6,
+    gain: Annotated[float | None, typer.Option(help="Wanted gain; default 0.55 of the untouched waveforms'.")] = None,
+    friction: Law = "hooke",
+    mu: Mu = 1.0,
+    gamma0: Gamma0 = 1e-3,
+    t0: T0 = 1.8e3,
+    rest: Rest = 0.2,
+    hold: Hold = 0.2,
+    store: Store = 2.0,
+    picture: Picture = True,
+    as_json: AsJson = False,
+) -> None:
+    """Pre-distort waveforms so that the recall follows their integrals; writes a CSV for `gmem recall --signals`."""
+    config = _given(locals())
+    _writable(output)
+    began = time.perf_counter()
+    with _progress() as progress:
+        drawn = output.with_suffix(".png") if picture else None
+        result = derive.run_design(config, output, drawn, iterations, gain, progress)
+    result = {**result, "seconds": time.perf_counter() - began, "status": 0}
+    line = f"F of the recall with respect to the wanted J: {result['before']:.4f} -> {result['fidelity']:.4f}"
+    _emit(as_json, result, f"{line} (gain {result['gain']:.3f}); wrote {output}")
 
 
 def _first_problem(error: ValidationError) -> str:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gmem_jax import checkpoint
 from gmem_jax.contact.friction import FrictionLaw, largest_overlap
 from gmem_jax.contact.kinematics import kinematics
 from gmem_jax.contact.normal import hertz
@@ -344,4 +345,4 @@ def advance(
         state, total, _ = lax.fori_loop(0, steps, jax.checkpoint(one_step), (state, empty, done))
         return end_bin(system, state, motion.box_at((done + steps) * dt), total / steps)
 
-    return lax.scan(jax.checkpoint(one_bin), state, first_bin + jnp.arange(bins))
+    return checkpoint.scan(one_bin, state, first_bin + jnp.arange(bins))

@@ -202,8 +202,9 @@ def run_memory(
         hold_drag = jnp.where(jnp.asarray(t0) < 0.999 * PAPER_T0, HOLD_DRAG, 0.0)
     step, steps = clock(t0, dt)
     system = System(pack.clump, friction, pack.pairs, material or Material())
-    state = start(system, pack.position[:, :, None], pack.quaternion[:, :, None], pack.box)
-    state = replicate(state, _width(friction, delta0, step))
+    width = _width(friction, delta0, step)
+    position, quaternion = replicate((pack.position[..., None], pack.quaternion[..., None]), width)
+    state = start(system, position, quaternion, pack.box)
     stages = memory_protocol(rest, hold, store, second_readout=background != "sub0")
     drive = _Drive(pack, delta0, gamma0, step, steps, hold_drag)
     if isinstance(state.status, jax.core.Tracer) or _traced(signals, gamma0, delta0, t0, dt, hold_drag):

@@ -25,6 +25,7 @@ from gmem_jax.grain import Clump
 from gmem_jax.memory import Recall
 from gmem_jax.neighbors import candidates, tabulate
 from gmem_jax.pack import Pack
+from gmem_jax.signals import Samples
 
 PACK_SCHEMA = "gmem-pack/1"
 RECALL_SCHEMA = "gmem-recall/1"
@@ -290,3 +291,29 @@ def load_waveforms(path: Path) -> np.ndarray:
         where = np.argwhere(~np.isfinite(values))[0]
         raise FileFormatError(f"{path}: sample {where[1] + 1} of signal {where[0] + 1} is not a finite number")
     return values
+
+
+def save_waveforms(path: Path, signals: Samples) -> None:
+    """Write waveforms as a CSV that `load_waveforms` and `gmem recall --signals` read: a column for every signal.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    values = np.asarray(signals.nodes)[:, 1:-1].T
+    header = ",".join(f"signal_{number + 1}" for number in range(values.shape[1]))
+    with atomic(path) as temporary:
+        np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g")
+
+
+def save_arrays(path: Path, schema: str, configuration: dict[str, Any], **arrays: np.ndarray | float) -> None:
+    """Write named arrays with the configuration that made them.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    with atomic(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["schema"] = schema
+        file.attrs["configuration"] = json.dumps(configuration)
+        file.attrs["units"] = "R = E = rho = 1"
+        for name, array in arrays.items():
+            file.create_dataset(name, data=np.asarray(array))

@@ -210,3 +210,13 @@ def test_batches_are_one_run_and_can_be_resumed(pack: gm.Pack, recall: gm.Recall
         Parts(tmp_path / "parts", {"batch": 5})
     left.discard()
     assert not (tmp_path / "parts").exists()
+
+
+def test_friction_may_differ_between_replicas(pack: gm.Pack) -> None:
+    mus = jnp.asarray([1.0, 0.3, 1.0])
+    signals = two_bumps(jnp.asarray([[1.0, -0.5], [1.0, -0.5]]))
+    mixed = gm.run_memory(pack, signals, friction=gm.Hooke(mu=mus), **SHORT)
+    alone = gm.run_memory(pack, two_bumps(jnp.asarray([[1.0, -0.5]])), friction=gm.Hooke(mu=1.0), **SHORT)
+    # The second signal has the zero signal's mu, and so a recall of its own as in a run without the others.
+    np.testing.assert_allclose(mixed.p_sig[1], alone.p_sig[0], atol=1e-6 * float(jnp.abs(alone.p_sig).max()))
+    assert float(jnp.abs(mixed.p_sig[0] - mixed.p_sig[1]).max()) > 0.1 * float(jnp.abs(alone.p_sig).max())

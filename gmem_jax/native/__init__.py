@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gmem_jax import dynamics
+from gmem_jax import checkpoint, dynamics
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.frictionless import Frictionless
 from gmem_jax.contact.hooke import Hooke
@@ -172,7 +172,7 @@ def advance(
             state, total = part(state, begun, int(steps), steps)
         return dynamics.end_bin(system, state, motion.box_at((begun + steps) * dt), total / steps)
 
-    return lax.scan(jax.checkpoint(one_bin), state, first_bin + jnp.arange(bins))
+    return checkpoint.scan(one_bin, state, first_bin + jnp.arange(bins))
 
 
 _Result = tuple[Grains, Any, jax.Array]

@@ -33,7 +33,10 @@ def test_help_and_info_work(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     assert "tetra-325-a" in facts["packs"]
 
 
-@pytest.mark.parametrize("command", ["prepare", "recall", "classify", "demo", "show", "info", "bench"])
+COMMANDS = ["prepare", "recall", "classify", "gradient", "kernel", "design", "demo", "show", "info", "bench"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, command: str) -> None:
     assert gmem(monkeypatch, command, "--help") == 0
     assert "--json" in capsys.readouterr().out

@@ -1,0 +1,56 @@
+"""Pre-distorted waveforms for the six integrals on shipped packs: before and after, verified by run_memory.
+
+python experiments/design_waveforms.py [-o designed] [--packs tetra-325-a,tetra-325-b,tetra-325-c]
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import gmem_jax as gm
+from gmem_jax import analysis, plot_gradient, sweep
+
+
+def main() -> None:
+    """Design, verify and draw, pack by pack."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("designed"), help="folder to write to")
+    parser.add_argument("--packs", default="tetra-325-a,tetra-325-b,tetra-325-c")
+    parser.add_argument("--iterations", type=int, default=6)
+    arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_enable_x64", True)
+
+    histories = {}
+    for name in arguments.packs.split(","):
+        began = time.perf_counter()
+        pack = gm.load_pack(name)
+        experiment = gm.Experiment(pack, gm.six_signals())
+        state = sweep.prefix(experiment)
+        design = gm.design_waveforms(experiment, iterations=arguments.iterations, state=state)
+        seconds = time.perf_counter() - began
+        gm.save_waveforms(arguments.output / f"{name}.csv", design.signals)
+        again = gm.waveform(gm.load_waveforms(arguments.output / f"{name}.csv"))
+        recall = gm.run_memory(pack, again)  # another program than the design used
+        verified = analysis.fidelity(recall.p_sig, jnp.asarray(design.target), pack.delta0, 1e-3)
+        each = 1.0 - np.linalg.norm(
+            np.asarray(recall.p_sig) - design.gain * float(pack.delta0) * 1e-3 * design.target, axis=1
+        ) / np.linalg.norm(np.asarray(recall.p_sig), axis=1)
+        print(
+            f"{name}: F {design.before:.4f} -> {float(verified):.4f}, G {design.gain:.3f}, {seconds:.0f} s; by signal "
+            + " ".join(f"{value:.3f}" for value in each),
+            flush=True,
+        )
+        original, _ = sweep.simulate(experiment, state)
+        unit = float(pack.delta0) * 1e-3
+        plot_gradient.design_figure(arguments.output / f"{name}.png", design, np.asarray(original), unit, name)
+        histories[name] = design.history
+    plot_gradient.history_figure(arguments.output / "history.png", histories)
+
+
+if __name__ == "__main__":
+    main()

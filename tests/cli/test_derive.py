@@ -1,0 +1,51 @@
+"""`gmem gradient`, `gmem kernel` and `gmem design` as a user meets them, on shortened runs of 27 grains."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from test_cli import PACK, SHORT, gmem
+
+import gmem_jax as gm
+from gmem_jax import derive
+from gmem_jax.config import RecallConfig
+
+
+def test_kernel_and_design_write_what_they_say(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    target = tmp_path / "kernel.h5"
+    assert gmem(monkeypatch, "kernel", PACK, "-o", target, "--bumps", 5, "--width", 0.3, "--json", *SHORT) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert len(said["singular_values_pa"]) == said["n"] == 5
+    with h5py.File(target) as file:
+        assert file["kernel"].shape == (256, 5)
+        assert file.attrs["schema"] == derive.KERNEL_SCHEMA
+    waves = tmp_path / "designed.csv"
+    assert gmem(monkeypatch, "design", PACK, "-o", waves, "--iterations", 1, "--json", *SHORT) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert gm.load_waveforms(waves).shape[0] == 6
+    assert said["history"][0] == said["before"]
+    names = {"kernel.h5", "kernel.png", "designed.csv", "designed.png", "designed-history.png"}
+    assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_gradient_prints_finite_slopes_of_everything(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    waves = tmp_path / "one.csv"
+    gm.save_waveforms(waves, gm.waveform(np.sin(np.linspace(0.2, 3.0, 8))))
+    target = tmp_path / "gradient.json"
+    assert gmem(monkeypatch, "gradient", PACK, "-o", target, "--signals", waves, "--json", *SHORT) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert np.shape(said["gradient"]["waveform"]) == (1, 8)
+    assert all(np.all(np.isfinite(slope)) for slope in said["gradient"].values())
+    assert json.loads(target.read_text())["fidelity"] == said["fidelity"]
+    assert (tmp_path / "gradient.png").exists()
+
+
+def test_another_background_is_refused() -> None:
+    with pytest.raises(ValueError, match="sub0"):
+        derive.experiment_of(RecallConfig(pack=str(PACK), background="sub2"))

@@ -1,0 +1,162 @@
+"""Derivatives through whole, shortened experiments on 27 grains, and at the corners of the contact laws."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax import checkpoint, gradient, jacobian
+from gmem_jax.contact.kinematics import kinematics
+from gmem_jax.contact.normal import hertz
+
+PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+SHORT = gm.Timing(t0=75.0, dt=0.3, rest=0.1, hold=0.1, store=0.2)  # one step per bin: some 900 steps in all
+CENTRES = jnp.asarray([[0.3, 0.7]])
+
+
+@pytest.fixture(scope="module")
+def experiment() -> gm.Experiment:
+    bumps = gm.Bumps(jnp.asarray([[1.0, -0.6]]), CENTRES, 0.2)
+    return gm.Experiment(gm.load_pack(PACK), bumps, gm.Hooke(mu=0.8), timing=SHORT)
+
+
+@pytest.fixture(scope="module")
+def exact(experiment: gm.Experiment) -> jacobian.Jacobian:
+    return jacobian.exact(experiment)
+
+
+def by_everything(experiment: gm.Experiment) -> tuple[gradient.Make, dict[str, jax.Array]]:
+    def make(theta: Any) -> gm.Experiment:
+        law = gm.Hooke(mu=theta["mu"], stiffness=theta["stiffness"])
+        bumps = gm.Bumps(theta["amplitudes"], CENTRES, 0.2)
+        pack = gradient.replace(experiment.pack, position=theta["position"])
+        return gm.Experiment(pack, bumps, law, gamma0=theta["gamma0"], timing=SHORT)
+
+    theta = {
+        "amplitudes": jnp.asarray([[1.0, -0.6]]),
+        "gamma0": jnp.asarray(1e-3),
+        "mu": jnp.asarray(0.8),
+        "stiffness": jnp.asarray(0.145),
+        "position": experiment.pack.position,
+    }
+    return make, theta
+
+
+def test_nested_checkpoints_change_neither_values_nor_derivatives() -> None:
+    def run(start: jax.Array, scan: Any) -> jax.Array:
+        def body(x: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jnp.sin(x) + 0.1 * k, x * k
+
+        end, seen = scan(body, start, jnp.arange(12))
+        return end + jnp.sum(seen)
+
+    assert checkpoint.inner_length(12) == 3
+    assert checkpoint.inner_length(256) == 16
+    nested = jax.value_and_grad(lambda x: run(x, checkpoint.scan))(0.3)
+    plain = jax.value_and_grad(lambda x: run(x, jax.lax.scan))(0.3)
+    np.testing.assert_allclose(nested, plain, rtol=1e-14)
+
+
+def test_the_reverse_sweep_agrees_with_the_forward_one(experiment: gm.Experiment, exact: jacobian.Jacobian) -> None:
+    make, theta = by_everything(experiment)
+    found = gm.value_and_grad(make, theta)
+
+    def score(p_sig: jax.Array, amplitudes: jax.Array, gamma0: jax.Array) -> jax.Array:
+        signals = gm.Bumps(amplitudes, CENTRES, 0.2)
+        return gradient.replace(experiment, signals=signals, gamma0=gamma0).fidelity(p_sig)
+
+    at = (found.p_sig, theta["amplitudes"], theta["gamma0"])
+    through, direct, direct_gamma0 = jax.grad(score, argnums=(0, 1, 2))(*at)
+    forward = exact.p_sig @ np.asarray(through)[0]
+    forward[:2] += np.asarray(direct)[0]
+    forward[2] += float(direct_gamma0)
+    reverse = [*found.slope["amplitudes"][0], *(found.slope[name] for name in ("gamma0", "mu", "stiffness"))]
+    # Both are exact derivatives of one program; 900 steps of round-off leave about 1e-12.
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8)
+    assert found.slope["position"].shape == (27, 3)
+    assert np.all(np.isfinite(found.slope["position"]))
+    assert np.any(found.slope["position"] != 0.0)
+
+
+def test_the_exact_jacobian_agrees_with_central_differences(
+    experiment: gm.Experiment, exact: jacobian.Jacobian
+) -> None:
+    differences = jacobian.differences(experiment, 1e-5)
+    miss = jacobian.mismatch(exact, differences)
+    # Waveform and gamma0: no contact changes its kind within the step. mu and stiffness act from the first
+    # compression on, where 27 grains rearrange: contacts that begin to slide inside the step leave some 1e-4.
+    assert miss["amplitudes"] < 1e-5
+    assert miss["gamma0"] < 1e-5
+    assert miss["all"] < 1e-2
+
+
+def test_the_jacobian_by_gamma0_follows_from_that_by_the_amplitudes(exact: jacobian.Jacobian) -> None:
+    # Only the product gamma0 a_k enters: gamma0 dp/dgamma0 = sum_k a_k dp/da_k, to round-off.
+    euler = exact.values[:2] @ exact.p_sig[:2]
+    np.testing.assert_allclose(1e-3 * exact.p_sig[2], euler, atol=1e-9 * np.abs(euler).max())
+
+
+def test_what_acts_on_the_prefix_is_recognised(experiment: gm.Experiment) -> None:
+    make, theta = by_everything(experiment)
+    assert gradient.acts_on_prefix(make, theta)
+
+    def by_gamma0(gamma0: jax.Array) -> gm.Experiment:
+        return gradient.replace(experiment, gamma0=gamma0)
+
+    assert not gradient.acts_on_prefix(by_gamma0, jnp.asarray(1e-3))
+
+
+def test_a_jacobian_of_several_signals_is_refused(experiment: gm.Experiment) -> None:
+    several = gradient.replace(experiment, signals=gm.six_signals())
+    with pytest.raises(ValueError, match="one signal made of bumps"):
+        jacobian.exact(several)
+
+
+CORNERS = {
+    "no sliding": ([1.9, 0.0, 0.0], [0.0, 0.0, 0.0]),
+    "overlap zero": ([2.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
+    "first touch": ([2.0 - 1e-15, 0.0, 0.0], [-1e-3, 1e-3, 0.0]),
+    "apart": ([2.1, 0.0, 0.0], [1e-3, 0.0, 0.0]),
+    "sliding": ([1.9, 0.0, 0.0], [0.0, 10.0, 0.0]),
+    "separating so fast that the dashpot would pull": ([1.9, 0.0, 0.0], [10.0, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("law", [gm.Hooke(), gm.MindlinRescaled(), gm.Mindlin(points=5)], ids=["H", "M1", "M2"])
+@pytest.mark.parametrize("corner", CORNERS)
+def test_derivatives_are_finite_at_the_corners_of_the_laws(law: Any, corner: str) -> None:
+    separation, velocity = (jnp.asarray(v).reshape(1, 3, 1) for v in CORNERS[corner])
+    history = law.init(1, 1, jnp.float64)
+
+    def contact(separation: jax.Array, velocity: jax.Array, mu: jax.Array, history: Any) -> Any:
+        kin = kinematics(separation, velocity, jnp.zeros((1, 3, 1)), jnp.ones(1, bool), jnp.asarray(0.3))
+        normal = hertz(kin.safe_overlap, kin.closing, kin.touching, 0.62, 0.23)
+        return gradient.replace(law, mu=mu)(kin, normal, history)
+
+    arguments = (separation, velocity, jnp.asarray(0.5), history)
+    for jacobian_of in (jax.jacfwd, jax.jacrev):
+        slopes = jacobian_of(contact, argnums=(0, 1, 2, 3))(*arguments)
+        assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(slopes))
+
+
+@pytest.mark.parametrize("law", [gm.Hooke(), gm.MindlinRescaled(), gm.Mindlin(points=5)], ids=["H", "M1", "M2"])
+def test_at_the_coulomb_limit_the_derivative_is_that_of_one_side(law: Any) -> None:
+    def force(mu: jax.Array) -> jax.Array:
+        kin = kinematics(
+            jnp.asarray([1.9, 0.0, 0.0]).reshape(1, 3, 1),
+            jnp.asarray([0.0, 0.05, 0.0]).reshape(1, 3, 1),
+            jnp.zeros((1, 3, 1)),
+            jnp.ones(1, bool),
+            jnp.asarray(0.3),
+        )
+        normal = jnp.full((1, 1, 1), 0.01)
+        return gradient.replace(law, mu=mu)(kin, normal, law.init(1, 1, jnp.float64))[0][0, 1, 0]
+
+    limit = force(jnp.asarray(1e6)) / 0.01  # mu at which this contact just sticks
+    assert abs(float(jax.grad(force)(limit * (1.0 + 1e-9)))) == 0.0
+    np.testing.assert_allclose(float(jax.grad(force)(limit * (1.0 - 1e-9))), 0.01, rtol=1e-6)
+    assert float(jax.grad(force)(limit)) in (0.0, 0.01) or np.isclose(float(jax.grad(force)(limit)), 0.01)

@@ -1,0 +1,119 @@
+"""The memory kernel and designs, on made-up kernels and on a shortened run of 27 grains."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax import response, sweep
+from gmem_jax.experiment import chunks
+from gmem_jax.signals import BINS, bin_average
+
+PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+SHORT = gm.Timing(t0=75.0, dt=0.3, rest=0.1, hold=0.1, store=0.2)
+
+
+@pytest.fixture(scope="module")
+def experiment() -> gm.Experiment:
+    return gm.Experiment(gm.load_pack(PACK), gm.six_signals(), timing=SHORT)
+
+
+@pytest.fixture(scope="module")
+def kernel(experiment: gm.Experiment) -> gm.MemoryKernel:
+    return gm.memory_kernel(experiment.pack, 5, 0.3, experiment=experiment)
+
+
+def ideal(gain: float, n: int = 17) -> gm.MemoryKernel:
+    basis = response.bumps(np.eye(n), 0.2)
+    odd = gain * 0.05 * 1e-3 * np.asarray(bin_average(basis))
+    return gm.MemoryKernel(np.arange(BINS) / BINS, np.asarray(basis.centres[0]), 0.2, odd, 0.0 * odd, 1e-3, 0.05)
+
+
+def test_an_ideal_integral_is_at_distance_zero_and_has_its_gain() -> None:
+    kernel = ideal(0.3)
+    assert kernel.distance() < 1e-12
+    np.testing.assert_allclose(kernel.gain(), 0.3, rtol=1e-12)
+    assert kernel.asymmetry() == 0.0
+
+
+def test_an_ideal_integral_predicts_every_waveform_of_its_basis() -> None:
+    kernel, signals = ideal(0.3), gm.six_signals()
+    expected = 0.3 * 0.05 * 1e-3 * np.asarray(bin_average(signals))
+    # The six signals lie in the span of 17 bumps of width 0.2; the fine grid's sums leave some 1e-10.
+    np.testing.assert_allclose(kernel.predict(signals), expected, atol=1e-8 * expected.max())
+
+
+def test_singular_values_are_recalls_of_unit_waveforms() -> None:
+    kernel = ideal(0.3, n=2)
+    v = (np.arange(4096) + 0.5) / 4096
+    shapes = np.asarray(kernel.basis.shear(jnp.asarray(v)))
+    # Two bumps that do not overlap are orthogonal already.
+    unit = kernel.odd / np.sqrt((shapes**2).mean(axis=0))[:, None]
+    expected = np.linalg.svd(unit, compute_uv=False) / np.sqrt(BINS)
+    np.testing.assert_allclose(kernel.singular_values(), expected, rtol=1e-6)
+    assert kernel.capacity(0.5 * expected[1]) == 2
+    assert kernel.capacity(0.5 * (expected[0] + expected[1])) == 1
+
+
+def test_less_noise_means_finer_resolution() -> None:
+    kernel = ideal(0.3)
+    values = kernel.singular_values()
+    assert kernel.resolution(0.0) < kernel.resolution(0.5 * values[3]) < kernel.resolution(0.9 * values[0])
+
+
+def test_a_simulation_in_pieces_is_run_memory(experiment: gm.Experiment) -> None:
+    p_sig, _ = sweep.simulate(experiment)
+    timing = {"t0": 75.0, "dt": 0.3, "rest": 0.1, "hold": 0.1, "store": 0.2}
+    whole = gm.run_memory(experiment.pack, experiment.signals, **timing)
+    # Compiled in other pieces: round-off grows over some 900 steps of frictional contacts.
+    np.testing.assert_allclose(p_sig, whole.p_sig, atol=1e-6 * np.abs(np.asarray(whole.p_sig)).max())
+    np.testing.assert_allclose(float(experiment.fidelity(p_sig)), float(whole.fidelity), rtol=1e-4)
+
+
+def test_chunks_cover_a_stage_once(experiment: gm.Experiment) -> None:
+    for stage in (*experiment.timing.stages, *gm.Timing(store=0.23).stages):
+        covered = [bin for first, bins in chunks(stage) for bin in range(first, first + bins)]
+        assert covered == list(range(stage.bins))
+
+
+def test_odd_and_even_parts_add_up_to_the_recall_of_each_bump(
+    experiment: gm.Experiment, kernel: gm.MemoryKernel
+) -> None:
+    amplitudes = np.asarray([[0.0, 1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0, 0.0]])
+    signals = response.bumps(amplitudes, 0.3)
+    p_sig, _ = sweep.simulate(gm.Experiment(experiment.pack, signals, timing=SHORT))
+    np.testing.assert_allclose(kernel.predict(signals), p_sig, atol=1e-6 * np.abs(np.asarray(p_sig)).max())
+
+
+def test_designed_waveforms_stay_within_the_bound_and_survive_a_csv(
+    experiment: gm.Experiment, kernel: gm.MemoryKernel, tmp_path: Path
+) -> None:
+    found = gm.design_waveforms(experiment, iterations=2, n=5, width=0.3, kernel=kernel)
+    assert np.abs(np.asarray(found.signals.nodes)).max() <= 1.0 + 1e-6
+    assert found.history[0] == found.before
+    assert len(found.history) == 3
+    gm.save_waveforms(tmp_path / "designed.csv", found.signals)
+    again = gm.waveform(gm.load_waveforms(tmp_path / "designed.csv"))
+    np.testing.assert_array_equal(again.nodes, found.signals.nodes)
+
+
+def test_design_inverts_a_linear_memory_at_once(monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment) -> None:
+    kernel = ideal(0.3)
+    mixing = np.linalg.qr(np.random.default_rng(1).standard_normal((17, 17)))[0]
+    odd = (np.eye(17) + 0.3 * mixing) @ kernel.odd  # linear, but no integral
+    kernel = gm.MemoryKernel(kernel.u, kernel.centres, 0.2, odd, 0.0 * odd, 1e-3, 0.05)
+
+    def linear(run: gm.Experiment, *_: object) -> tuple[jnp.ndarray, dict]:
+        return jnp.asarray(kernel.coefficients(run.signals) @ odd), {}
+
+    monkeypatch.setattr(sweep, "simulate", linear)
+    found = gm.design_waveforms(experiment, kernel=kernel, iterations=3, gain=0.1, damping=1e-6, state=object())
+    assert found.before < 0.95
+    assert found.fidelity > 0.999  # the sampled waveform is a cubic through 127 nodes
+
+
+def test_a_kernel_of_one_bump_is_refused(experiment: gm.Experiment) -> None:
+    with pytest.raises(ValueError, match="at least 2"):
+        gm.memory_kernel(experiment.pack, 1)
