@@ -124,7 +124,7 @@ def measure(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float
 def measure_lammps(pack: Pack, law: str, *, steps: int = 1000) -> list[Row]:
     """LAMMPS on the same pack with its walls at rest: one core, serial runs side by side, and MPI ranks.
 
-    Its neighbour settings are tuned first. Law H has no dashpot there (see `lammps.pair_lines`).
+    Its neighbour settings are tuned first, and the better of two runs counts. Law H has no dashpot there (see `lammps.pair_lines`).
 
     Raises:
         ValueError: for law M2, which it does not have.
@@ -146,16 +146,22 @@ def measure_lammps(pack: Pack, law: str, *, steps: int = 1000) -> list[Row]:
             script = lammps.scene_script(scene, friction, material, 0.3, folder, skin=skin, every=every)
             return lammps.loop_seconds(script, folder, steps=count, ranks=ranks)
 
+    def best(run: Callable[[], float]) -> float:
+        return min(run(), run())
+
     setting = min(LAMMPS_LISTS, key=lambda setting: seconds(setting, max(100, steps // 4)))
     unit, many = 1e6 / (steps * pack.grains), cores()
     note = f"skin {setting[0]} R, every {setting[1]}"
-    rows = [Row("lammps", law, pack.grains, 1, unit * seconds(setting, steps), note=f"1 core, {note}")]
+    rows = [Row("lammps", law, pack.grains, 1, unit * best(lambda: seconds(setting, steps)), note=f"1 core, {note}")]
     if many > 1:
-        with ThreadPoolExecutor(many) as pool:
-            together = list(pool.map(lambda _: seconds(setting, steps), range(many)))
-        beside = unit * max(together) / many
+
+        def together() -> float:
+            with ThreadPoolExecutor(many) as pool:
+                return max(pool.map(lambda _: seconds(setting, steps), range(many)))
+
+        beside, ranks = unit * best(together) / many, unit * best(lambda: seconds(setting, steps, many))
         rows.append(Row("lammps", law, pack.grains, many, beside, note=f"{many} serial runs side by side"))
-        rows.append(Row("lammps", law, pack.grains, 1, unit * seconds(setting, steps, many), note=f"{many} ranks"))
+        rows.append(Row("lammps", law, pack.grains, 1, ranks, note=f"{many} ranks"))
     return rows
 
 
@@ -204,6 +210,9 @@ def _peak_memory(load: Callable[[str], Pack], name: str, backend: str, law: str,
     system, state, motion, dt, steps = encode(load(name), LAWS[law], replicas)
     move = compiled_advance(backend)
     jax.block_until_ready(move(system, state, motion, dt, bins=1, steps=steps))
+    status = Path("/proc/self/status")
+    if status.is_file():  # Linux lets ru_maxrss of a child begin with its parent's
+        return next(1024 * int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM"))
     unit = 1 if sys.platform == "darwin" else 1024
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
