@@ -124,7 +124,8 @@ def measure(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float
 def measure_lammps(pack: Pack, law: str, *, steps: int = 1000) -> list[Row]:
     """LAMMPS on the same pack with its walls at rest: one core, serial runs side by side, and MPI ranks.
 
-    Its neighbour settings are tuned first, and the better of two runs counts. Law H has no dashpot there (see `lammps.pair_lines`).
+    Its neighbour settings are tuned first, and the better of two runs counts. Law H has no dashpot there (see
+    `lammps.pair_lines`).
 
     Raises:
         ValueError: for law M2, which it does not have.
