@@ -2,8 +2,8 @@
 
 The recall is simulated anew in every iteration; only the direction of a step comes from a linear model, the memory
 kernel of the pack or central differences around the present waveforms. A step is handed to an optax optimiser as a
-preconditioned gradient. The exact gradient of `gradient.value_and_grad` points the same way at the price of some
-hundred native runs; differences with replicas cost two runs a parameter.
+preconditioned gradient. By unit costs the exact gradient of `gradient.value_and_grad` takes some hundred native runs;
+differences with replicas take two runs a parameter.
 """
 
 from dataclasses import dataclass, replace

@@ -1,5 +1,6 @@
 """The walls of the experiment: compression u(t), shear gamma(u), and the stages they make up."""
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -133,3 +134,9 @@ def memory_protocol(
     *again, last = preparation_cycle(rest, hold)
     repeated = (replace(stage, name=f"{stage.name}-3") for stage in again)
     return (*first, *repeated, replace(last, name="readout-2"))
+
+
+def split(stages: tuple[Stage, ...]) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
+    """The stages before the first sheared one, common to all signals and run once; and those from it on."""
+    common = tuple(itertools.takewhile(lambda stage: not stage.sheared, stages))
+    return common, stages[len(common) :]

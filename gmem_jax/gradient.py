@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.drive import Stage
+from gmem_jax.drive import Stage, split
 from gmem_jax.experiment import Experiment, Leg, chunks
 from gmem_jax.run import Progress, compiled, refuse, require_x64, silent, worst
 from gmem_jax.state import State
@@ -112,9 +112,10 @@ class _Chunk:
 
 def _plan(experiment: Experiment) -> tuple[list[tuple[Stage, int, int]], int]:
     """The chunks (stage, first bin, bins) of the experiment, and how many of them belong to the prefix."""
-    stages = experiment.timing.stages
-    plan = [(stage, first, bins) for stage in stages for first, bins in chunks(stage)]
-    return plan, next(number for number, (stage, _, _) in enumerate(plan) if stage.sheared)
+    common, sheared = (
+        [(stage, *piece) for stage in part for piece in chunks(stage)] for part in split(experiment.timing.stages)
+    )
+    return common + sheared, len(common)
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def push(make: Make, theta: Any, direction: Any, *, progress: Progress = silent)
     """Forward mode: the derivative of a whole experiment along `direction` (a pytree like theta).
 
     Several derivatives at once are replicas: repeat a signal as often as there are parameters, and let the direction
-    change another parameter in each (see `response.recall_jacobian`). That costs 3 runs in plain JAX; the shear-free
+    change another parameter in each (see `jacobian.exact`). That costs 3 runs in plain JAX; the shear-free
     prefix is not differentiated if no parameter acts on it.
 
     Raises:

@@ -1,6 +1,5 @@
 """The memory experiment: encode, store, recall (paper, Secs. II and III; spec, section 5)."""
 
-import itertools
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ import numpy as np
 from gmem_jax import analysis, native
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.hooke import Hooke
-from gmem_jax.drive import Motion, Stage, clock, memory_protocol
+from gmem_jax.drive import Motion, Stage, clock, memory_protocol, split
 from gmem_jax.dynamics import Sample, System, start
 from gmem_jax.material import Material
 from gmem_jax.pack import SKIN, Pack, smallest_box
@@ -209,20 +208,16 @@ def run_memory(
     drive = _Drive(pack, delta0, gamma0, step, steps, hold_drag)
     if isinstance(state.status, jax.core.Tracer) or _traced(signals, gamma0, delta0, t0, dt, hold_drag):
         inline = _Inline(system, state, step, backend)
-        samples = drive.play(inline, prefix(stages))
+        common, sheared = split(stages)
+        samples = drive.play(inline, common)
         inline.state = _fan_out(inline.state, signals)
-        samples |= drive.play(inline, stages[len(prefix(stages)) :], signals)
+        samples |= drive.play(inline, sheared, signals)
         status = inline.state.status
     else:
         runner = _on_host(system, state, pack, delta0, step)
         runner.backend, runner.progress = backend, progress
         samples, status = _in_batches(drive, runner, stages, signals, batch or signals.count, keep)
     return _recall(pack, signals, samples, status, background, delta0, gamma0, t0, step)
-
-
-def prefix(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
-    """The stages before the first sheared one: common to all signals, and run once."""
-    return tuple(itertools.takewhile(lambda stage: not stage.sheared, stages))
 
 
 def _fan_out(state: State, signals: Signals) -> State:
@@ -271,8 +266,7 @@ def _in_batches(
     Raises:
         ValueError: if the parameters differ between replicas, which is for a single batch only.
     """
-    common = prefix(stages)
-    rest = stages[len(common) :]
+    common, rest = split(stages)
     count, width = signals.count, runner.state.replicas
     if width > 1 and batch < count:
         raise ValueError("parameters with a value for each replica need all signals in one batch")

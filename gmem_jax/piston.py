@@ -73,15 +73,13 @@ def press(
     enough that it is complete throughout: the next block is allowed for at the speed of the fastest sphere.
     """
     reach = jnp.sqrt(jnp.max(jnp.sum(system.clump.offsets**2, axis=1)))
-    times = dt * jnp.arange(1.0, BLOCK + 1.0)[:, None, None]
+    times = dt * jnp.arange(1.0, BLOCK + 1.0)
 
     def block(now: Pressed) -> Pressed:
         velocity = jnp.clip(servo.gain * (now.pressure / servo.target - 1.0), -servo.speed, servo.speed)
         climb = jnp.zeros_like(now.box.upper).at[2].set(velocity)
-        still = jnp.zeros_like(climb)
-        boxes = Box(
-            now.box.lower + 0.0 * times, now.box.upper + times * climb, still + 0.0 * times, climb + 0.0 * times
-        )
+        still, (lower, upper) = jnp.zeros_like(climb), (now.box.lower, now.box.upper)
+        boxes = jax.vmap(lambda time: Box(lower, upper + time * climb, still, climb))(times)
         state, total = march(system, now.state, boxes, dt, drag)
         box = jax.tree.map(lambda leaf: leaf[-1], boxes)
         state = check(system, state, box)

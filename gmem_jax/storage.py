@@ -246,11 +246,12 @@ class Parts:
     def __call__(self, name: str, run: Callable[[], Any]) -> Any:
         """The part of that name, its arrays as numpy arrays: read if it is there, else run and stored."""
         path = self.folder / f"{name}.pickle"
-        if not path.is_file():
-            result = jax.tree.map(np.asarray, run())
-            with atomic(path) as temporary:
-                temporary.write_bytes(pickle.dumps(result))
-        return pickle.loads(path.read_bytes())
+        if path.is_file():
+            return pickle.loads(path.read_bytes())
+        result = jax.tree.map(np.asarray, run())
+        with atomic(path) as temporary:
+            temporary.write_bytes(pickle.dumps(result))
+        return result
 
     def finished(self) -> int:
         """Number of parts there are."""

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.drive import Stage
+from gmem_jax.drive import Stage, split
 from gmem_jax.experiment import Experiment, chunks
 from gmem_jax.run import Progress, compiled, refuse, require_x64, silent, worst
 from gmem_jax.state import State
@@ -38,13 +38,6 @@ def _advance(
     return state, pressures
 
 
-def split(experiment: Experiment) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
-    """The stages before the waveform, and those from the encoding on."""
-    stages = experiment.timing.stages
-    first = next(number for number, stage in enumerate(stages) if stage.sheared)
-    return stages[:first], stages[first:]
-
-
 def prefix(experiment: Experiment, *, progress: Progress = silent) -> State:
     """The state when encoding begins: the same for all waveforms.
 
@@ -52,7 +45,7 @@ def prefix(experiment: Experiment, *, progress: Progress = silent) -> State:
         RunFailedError: if the simulation broke down.
     """
     require_x64()
-    return _advance(experiment, experiment.begin(), split(experiment)[0], progress, (0.0, 0.1))[0]
+    return _advance(experiment, experiment.begin(), split(experiment.timing.stages)[0], progress, (0.0, 0.1))[0]
 
 
 def simulate(
@@ -72,5 +65,7 @@ def simulate(
         RunFailedError: if the simulation broke down.
     """
     state = prefix(experiment, progress=progress) if state is None else state
-    _, pressures = _advance(experiment, experiment.fan_out(state), split(experiment)[1], progress, (0.1, 1.0))
+    _, pressures = _advance(
+        experiment, experiment.fan_out(state), split(experiment.timing.stages)[1], progress, (0.1, 1.0)
+    )
     return experiment.recalled(jnp.asarray(pressures["readout"])), pressures

