@@ -11,7 +11,7 @@ import gmem_jax as gm
 from gmem_jax import run as host
 from gmem_jax.drive import Motion
 from gmem_jax.dynamics import System, start
-from gmem_jax.memory import forget
+from gmem_jax.memory import COPIES, GRAIN_BYTES, default_batch, forget
 from gmem_jax.signals import BINS
 from gmem_jax.state import replicate
 from gmem_jax.storage import Parts
@@ -220,3 +220,15 @@ def test_friction_may_differ_between_replicas(pack: gm.Pack) -> None:
     # The second signal has the zero signal's mu, and so a recall of its own as in a run without the others.
     np.testing.assert_allclose(mixed.p_sig[1], alone.p_sig[0], atol=1e-6 * float(jnp.abs(alone.p_sig).max()))
     assert float(jnp.abs(mixed.p_sig[0] - mixed.p_sig[1]).max()) > 0.1 * float(jnp.abs(alone.p_sig).max())
+
+
+def test_the_default_batch_fits_the_memory(pack: gm.Pack) -> None:
+    replica = COPIES * (pack.pairs.capacity * 3 * 8 + GRAIN_BYTES * pack.grains)
+    assert default_batch(pack, gm.Hooke(), 0) == 1
+    assert (
+        default_batch(pack, gm.Hooke(), 22 * replica) == 10
+    )  # half of it holds 11 replicas, one of them the zero signal
+    assert default_batch(pack, gm.Hooke(), 10**12) == 63
+    assert (
+        default_batch(pack, gm.Mindlin(points=100), 220 * replica) < 10 < default_batch(pack, gm.Hooke(), 220 * replica)
+    )
