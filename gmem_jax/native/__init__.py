@@ -1,13 +1,13 @@
 """`advance` in C++ for CPUs, behind jax.ffi: the numbers of `gmem_jax.dynamics.advance`, several times faster.
 
 One call into the library runs all steps of one bin for all replicas; walls, checks and samples are computed in JAX,
-as in `dynamics.advance`. It works under `jax.jit`, `jax.vmap` and both modes of differentiation; derivatives are
-those of the plain JAX definition, along the trajectory of each bin redone in JAX.
+as in `dynamics.advance`. It works under `jax.jit`, `jax.vmap` and both modes of differentiation, whose derivatives
+are computed in the library too; see `gmem_jax.native.derivatives`.
 """
 
 import ctypes
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ from gmem_jax.contact.mindlin import Mindlin
 from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.drive import Motion
 from gmem_jax.dynamics import Sample, System
+from gmem_jax.native import derivatives
+from gmem_jax.native.derivatives import Call
 from gmem_jax.state import Box, Grains, Scalar, State
 
 Advance = Callable[..., tuple[State, Sample]]
@@ -30,7 +32,6 @@ Advance = Callable[..., tuple[State, Sample]]
 
 BACKENDS = ("auto", "jax", "native")
 
-_TARGET = "gmem_advance"
 _LAWS: tuple[type, ...] = (Frictionless, Hooke, MindlinRescaled, Mindlin)  # numbered as in problem.h
 _VARIANTS = ("exact", "averaged", "paper")
 _PART = 32  # steps per call where their number is not known when the program is compiled
@@ -50,7 +51,8 @@ def _load() -> str:
         return "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
     try:
         library = ctypes.CDLL(str(path))
-        jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(library.gmem_advance), platform="cpu")
+        for target in derivatives.TARGETS:
+            jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
     except (OSError, AttributeError) as error:
         return f"its library could not be loaded: {error}"
     return ""
@@ -121,9 +123,8 @@ def _require(system: System, state: State) -> None:
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
     """`gmem_jax.dynamics.march` on the native backend; arguments, results and errors as of `advance`."""
     _require(system, state)
-    steps = jnp.full(state.replicas, boxes.lower.shape[0], jnp.int32)
     numbers = (jnp.asarray(dt), jnp.asarray(drag))
-    grains, history, total = _bin(system, state.grains, state.history, boxes, numbers, steps, jnp.asarray(0))
+    grains, history, total = _bin(system, state.grains, state.history, boxes, numbers, None, jnp.asarray(0))
     return State(grains, history, state.status), total
 
 
@@ -147,13 +148,13 @@ def advance(
     dt = jnp.asarray(dt)
     replicas = state.replicas
 
-    def part(state: State, begun: jax.Array, count: int, limit: Scalar) -> tuple[State, jax.Array]:
-        """Up to `limit` of the next `count` steps, and the sum of their wall pressures."""
+    def part(state: State, begun: jax.Array, count: int, limit: Scalar | None) -> tuple[State, jax.Array]:
+        """The next `count` steps, or only `limit` of them, and the sum of their wall pressures."""
         times = (jnp.reshape(begun + 1 + jnp.arange(count), (-1, *(1 for _ in dt.shape))) * dt).astype(dt.dtype)
         boxes = jax.vmap(motion.box_at)(times)
         boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, 3, replicas)), boxes)
         numbers = (dt, jnp.asarray(drag))
-        limits = jnp.broadcast_to(jnp.asarray(limit, jnp.int32), (replicas,))
+        limits = None if limit is None else jnp.broadcast_to(jnp.asarray(limit, jnp.int32), (replicas,))
         grains, history, total = _bin(system, state.grains, state.history, boxes, numbers, limits, begun)
         return State(grains, history, state.status), total
 
@@ -169,7 +170,7 @@ def advance(
             nothing = jnp.zeros((3, replicas), state.grains.position.dtype)
             state, total = lax.fori_loop(0, (steps + _PART - 1) // _PART, next_part, (state, nothing))
         else:
-            state, total = part(state, begun, int(steps), steps)
+            state, total = part(state, begun, int(steps), None)
         return dynamics.end_bin(system, state, motion.box_at((begun + steps) * dt), total / steps)
 
     return checkpoint.scan(one_bin, state, first_bin + jnp.arange(bins))
@@ -185,38 +186,53 @@ def _bin(
     history: Any,
     boxes: Box,
     numbers: tuple[jax.Array, jax.Array],
-    limits: jax.Array,
+    limits: jax.Array | None,
     begun: jax.Array,
 ) -> _Result:
-    """The first `limits` [B] of the steps whose walls are `boxes` ([steps, 3, B]); `numbers` are (dt, drag).
+    """The steps whose walls are `boxes` ([steps, 3, B]), or the first `limits` [B] of them; `numbers` are (dt, drag).
 
     Returns:
         The grains, the history, and the sum over the steps of the wall pressures, [3, B].
     """
-    law, pairs = system.friction, system.pairs
-    replicas = grains.position.shape[-1]
-    leaves = jax.tree.leaves(history)
-    walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
-    state = jax.tree.leaves(grains)
-    outputs = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in (*state, jnp.zeros((3, replicas)), *leaves)]
-    candidates = (pairs.first, pairs.second, pairs.valid, pairs.reference[..., 0], pairs.smallest)
-    arguments = [*state, *candidates, system.clump.offsets, _parameters(system, numbers, replicas), walls, limits]
-    results = jax.ffi.ffi_call(
-        _TARGET,
-        outputs,
-        vmap_method="expand_dims",
-        input_output_aliases={len(arguments) + leaf: len(state) + 1 + leaf for leaf in range(len(leaves))},
-    )(
-        *arguments,
-        *leaves,
+    steps, replicas = boxes.lower.shape[0], grains.position.shape[-1]
+    counts = jnp.full(replicas, steps, jnp.int32) if limits is None else limits
+    call = _call(system, grains, history, boxes, numbers)
+    fixed = _fixed(system, counts)
+    return _result(grains, history, derivatives.forward(call, fixed, _moving(system, grains, history, boxes, numbers)))
+
+
+def _call(system: System, *moving: Any) -> Call:
+    """What the library is told beside arrays."""
+    law = system.friction
+    layered = isinstance(law, Mindlin)
+    return Call(
         law=_LAWS.index(type(law)),
-        variant=_VARIANTS.index(law.variant) if isinstance(law, Mindlin) else 0,
-        points=law.points if isinstance(law, Mindlin) else 0,
+        variant=_VARIANTS.index(law.variant) if layered else 0,
+        points=law.points if layered else 0,
         isotropic=int(system.clump.isotropic),
-        leaves=len(leaves),
+        leaves=len(jax.tree.leaves(moving[1])),
     )
-    moved = jax.tree.unflatten(jax.tree.structure(grains), results[: len(state)])
-    return moved, jax.tree.unflatten(jax.tree.structure(history), results[len(state) + 1 :]), results[len(state)]
+
+
+def _fixed(system: System, steps: jax.Array) -> tuple[jax.Array, ...]:
+    """Arguments without derivatives."""
+    pairs = system.pairs
+    candidates = (pairs.first, pairs.second, pairs.valid, pairs.reference[..., 0], pairs.smallest)
+    return (*candidates, system.clump.offsets, steps)
+
+
+def _moving(
+    system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]
+) -> derivatives.Arrays:
+    """Arguments with derivatives."""
+    walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
+    parameters = _parameters(system, numbers, grains.position.shape[-1])
+    return derivatives.Arrays(jax.tree.leaves(grains), parameters, walls, jax.tree.leaves(history))
+
+
+def _result(grains: Grains, history: Any, results: derivatives.Results) -> _Result:
+    moved = jax.tree.unflatten(jax.tree.structure(grains), results.fields)
+    return moved, jax.tree.unflatten(jax.tree.structure(history), results.history), results.pressure
 
 
 def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: int) -> jax.Array:
@@ -236,10 +252,10 @@ def _plain_bin(
     history: Any,
     boxes: Box,
     numbers: tuple[jax.Array, jax.Array],
-    limits: jax.Array,
+    limits: jax.Array | None,
     begun: jax.Array,
 ) -> _Result:
-    """The definition of `_bin`, for its derivatives."""
+    """The definition of `_bin`, for derivatives that the library does not have."""
     dt, drag = numbers
     alive = jnp.asarray(begun) >= 0
     replicas = grains.position.shape[-1]
@@ -249,7 +265,8 @@ def _plain_bin(
         index, box = xs
         moved, walls = dynamics.step(system, state, box, dt, drag, alive & (index >= 0))
         after = moved, total + dynamics.wall_pressure(walls, box)
-        return jax.tree.map(lambda new, old: jnp.where(index < limits, new, old), after, carry), None
+        going = True if limits is None else index < limits
+        return jax.tree.map(lambda new, old: jnp.where(going, new, old), after, carry), None
 
     state = State(grains, history, jnp.zeros(replicas, jnp.int32))
     total = jnp.zeros((3, replicas), grains.position.dtype)
@@ -260,16 +277,30 @@ def _plain_bin(
 
 @functools.partial(_bin.defjvp, symbolic_zeros=True)
 def _bin_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
-    """The tangent of the plain definition, with respect to what is being differentiated and no more."""
+    """The tangent with respect to what is being differentiated and no more."""
     leaves, structure = jax.tree.flatten(primals)
     slopes = jax.tree.leaves(tangents)
-    active = [place for place, slope in enumerate(slopes) if not isinstance(slope, jax.custom_derivatives.SymbolicZero)]
+    active = [place for place, slope in enumerate(slopes) if not _is_zero(slope)]
+    varied, directions = [leaves[place] for place in active], [slopes[place] for place in active]
 
-    def plain(*varied: jax.Array) -> _Result:
-        filled = list(leaves)
+    def filled(varied: Sequence[jax.Array]) -> tuple[Any, ...]:
+        whole = list(leaves)
         for place, leaf in zip(active, varied, strict=True):
-            filled[place] = leaf
-        return _plain_bin(*jax.tree.unflatten(structure, filled))
+            whole[place] = leaf
+        rebuilt: tuple[Any, ...] = jax.tree.unflatten(structure, whole)
+        return rebuilt
 
-    _, slope = jax.jvp(plain, [leaves[place] for place in active], [slopes[place] for place in active])
-    return _bin(*primals), slope
+    system, limits = primals[0], primals[5]
+    of_system = tangents[0]
+    known = limits is None and all(map(_is_zero, jax.tree.leaves((of_system.pairs, of_system.clump.offsets))))
+    if not known:
+        _, slope = jax.jvp(lambda *varied: _plain_bin(*filled(varied)), varied, directions)
+        return _bin(*primals), slope
+    moving, along = jax.jvp(lambda *varied: _moving(*filled(varied)[:5]), varied, directions)
+    counts = jnp.full(moving.parameters.shape[-1], moving.walls.shape[0], jnp.int32)
+    change = derivatives.tangent(_call(*primals[:5]), _fixed(system, counts), moving, along)
+    return _bin(*primals), _result(primals[1], primals[2], change)
+
+
+def _is_zero(slope: Any) -> bool:
+    return isinstance(slope, jax.custom_derivatives.SymbolicZero)

@@ -165,10 +165,26 @@ void run_blocks(const Problem& problem, const Kernel& kernel, const std::vector<
 
 ffi::Error invalid(const std::string& what) { return ffi::Error::InvalidArgument("gmem_jax native: " + what); }
 
-ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                   ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  if (static_cast<int64_t>(args.size()) != kHistoryIn + leaves ||
-      static_cast<int64_t>(rets.size()) != kHistoryOut + leaves || leaves > kMaxHistory)
+// Arguments of the three tasks are those of the steps themselves, then, for derivatives, a number for each of the
+// results' or arguments' own; see `Task`.
+ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
+                ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  const std::vector<int> fields(kFields, 3);
+  std::vector<int> histories(leaves, 3);
+  if (law == static_cast<int64_t>(Law::mindlin) && leaves > 0) histories[0] = 4;
+  const auto join = [&](std::vector<int> ranks, std::initializer_list<int> more) {
+    ranks.insert(ranks.end(), more);
+    ranks.insert(ranks.end(), histories.begin(), histories.end());
+    return ranks;
+  };
+  const std::vector<int> inner = join(fields, {2}), outer = join(fields, {2, 3});
+  std::vector<int> argument_ranks = join({std::begin(kRanks), std::end(kRanks)}, {});
+  if (task != Task::forward) {
+    const std::vector<int>& more = task == Task::tangent ? outer : inner;
+    argument_ranks.insert(argument_ranks.end(), more.begin(), more.end());
+  }
+  const std::vector<int>& result_ranks = task == Task::adjoint ? outer : inner;
+  if (args.size() != argument_ranks.size() || rets.size() != result_ranks.size() || leaves > kMaxHistory)
     return invalid("wrong number of arguments or results");
   std::vector<Array> in, out;
   std::vector<int64_t> batch;
@@ -189,14 +205,14 @@ ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotrop
     const bool integer = i == kFirst || i == kSecond || i == kSteps;
     const auto wanted = i == kValid ? ffi::PRED : integer ? ffi::S32 : ffi::F64;
     if (buffer->element_type() != wanted) return invalid("argument " + std::to_string(i) + " has the wrong type");
-    const std::size_t rank = i < kHistoryIn ? kRanks[i] : (i == kHistoryIn && law == 3 ? 4 : 3);
-    if (buffer->dimensions().size() != rank + batch.size())
+    if (buffer->dimensions().size() != argument_ranks[i] + batch.size())
       return invalid("argument " + std::to_string(i) + " has the wrong number of axes");
     in.push_back(view(*buffer, static_cast<int>(batch.size())));
   }
 
   const int64_t replicas = in[0].shape[2];
   Problem problem{};
+  problem.task = task;
   problem.law = static_cast<Law>(law);
   problem.variant = static_cast<Variant>(variant);
   problem.isotropic = isotropic != 0;
@@ -208,7 +224,7 @@ ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotrop
   if (in[kParameterRows].shape[0] != kParameters || in[kWallRows].shape[1] != kWalls ||
       in[kReference].shape[0] != problem.spheres() || in[kSteps].shape[0] != replicas)
     return invalid("arguments do not fit each other");
-  problem.history_aliased = leaves > 0;
+  problem.history_aliased = task == Task::forward && leaves > 0;
   for (int64_t leaf = 0; leaf < leaves; ++leaf)
     problem.history_aliased &= in[kHistoryIn + leaf].data == out[kHistoryOut + leaf].data;
 
@@ -217,7 +233,7 @@ ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotrop
   std::map<std::array<int64_t, kOfPack>, std::size_t> known;
   std::vector<std::shared_ptr<const PlanStore>> plans;
   std::vector<std::unique_ptr<Pack>> packs;
-  std::vector<std::vector<Lane>> lanes;
+  std::vector<std::vector<Lane>> lanes, slopes;
   std::vector<int64_t> index(batch.size(), 0);
   int64_t entries = 1;
   for (const int64_t n : batch) entries *= n;
@@ -233,21 +249,38 @@ ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotrop
                                 integers(kFirst), integers(kSecond), valid, doubles(kReference), doubles(kSmallest)}));
       packs.emplace_back(new Pack{&plans.back()->plan, doubles(kOffsets)});
       lanes.emplace_back();
+      slopes.emplace_back();
     }
     for (int64_t b = 0; b < replicas; ++b) {
+      // Pointers to this replica in the next array of arguments, and of results.
+      std::size_t argument = 0, result = 0;
       const auto source = [&](const Array& a) { return reinterpret_cast<double*>(a.data) + a.at(index) + b; };
+      const auto next_argument = [&] { return source(in[argument++]); };
+      const auto next_result = [&] { return source(out[result++]); };
       Lane lane{};
-      for (int f = 0; f < kFields; ++f) lane.grains_in[f] = source(in[f]), lane.grains_out[f] = source(out[f]);
-      for (int64_t leaf = 0; leaf < leaves; ++leaf) {
-        lane.history_in[leaf] = source(in[kHistoryIn + leaf]);
-        lane.history_out[leaf] = source(out[kHistoryOut + leaf]);
-      }
+      for (int f = 0; f < kFields; ++f) lane.grains_in[f] = next_argument(), lane.grains_out[f] = next_result();
       lane.parameters = source(in[kParameterRows]);
       lane.walls = source(in[kWallRows]);
-      lane.pressure = source(out[kPressure]);
       const int32_t steps = (reinterpret_cast<const int32_t*>(in[kSteps].data) + in[kSteps].at(index))[b];
-      lane.steps = static_cast<int>(std::min<int64_t>(std::max(steps, 0), rows));
+      lane.steps = static_cast<int>(task == Task::forward ? std::min<int64_t>(std::max(steps, 0), rows) : rows);
+      argument = kHistoryIn;
+      for (int64_t leaf = 0; leaf < leaves; ++leaf) lane.history_in[leaf] = next_argument();
+      Lane slope = lane;
+      if (task != Task::forward)
+        for (int f = 0; f < kFields; ++f) slope.grains_in[f] = next_argument();
+      if (task == Task::tangent) slope.parameters = next_argument(), slope.walls = next_argument();
+      if (task == Task::adjoint) {
+        slope.pressure = next_argument();
+        slope.parameters_out = next_result(), slope.walls_out = next_result();
+      } else {
+        lane.pressure = slope.pressure = next_result();
+      }
+      for (int64_t leaf = 0; leaf < leaves; ++leaf) {
+        lane.history_out[leaf] = slope.history_out[leaf] = next_result();
+        if (task != Task::forward) slope.history_in[leaf] = next_argument();
+      }
       lanes[place.first->second].push_back(lane);
+      slopes[place.first->second].push_back(slope);
     }
     for (int axis = static_cast<int>(batch.size()) - 1; axis >= 0 && ++index[axis] == batch[axis]; --axis) index[axis] = 0;
   }
@@ -258,9 +291,9 @@ ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotrop
     const int count = static_cast<int>(lanes[i].size());
     int done = 0;
     // Replicas side by side share much work: a vector that is half full is cheaper than they are one by one.
-    for (; 2 * (count - done) >= kernel.width; done += kernel.width)
-      whole.push_back({packs[i].get(), &lanes[i][done], std::min(kernel.width, count - done), false});
-    for (; done < count; ++done) packed.push_back({packs[i].get(), &lanes[i][done], 1, true});
+    for (; 2 * (count - done) >= kernel.width || (task != Task::forward && done < count); done += kernel.width)
+      whole.push_back({packs[i].get(), &lanes[i][done], &slopes[i][done], std::min(kernel.width, count - done), false});
+    for (; done < count; ++done) packed.push_back({packs[i].get(), &lanes[i][done], nullptr, 1, true});
   }
   const int threads = acquire_threads(thread_count());
   run_blocks(problem, kernel, whole, threads);
@@ -269,18 +302,29 @@ ffi::Error advance(int64_t law, int64_t variant, int64_t points, int64_t isotrop
   return ffi::Error::Success();
 }
 
+template <Task task>
+ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
+                  ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  return call(task, law, variant, points, isotropic, leaves, args, rets);
+}
+
+auto binding() {
+  return ffi::Ffi::Bind()
+      .Attr<int64_t>("law")
+      .Attr<int64_t>("variant")
+      .Attr<int64_t>("points")
+      .Attr<int64_t>("isotropic")
+      .Attr<int64_t>("leaves")
+      .RemainingArgs()
+      .RemainingRets();
+}
+
 }  // namespace
 }  // namespace gmem
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_advance, gmem::advance,
-                              xla::ffi::Ffi::Bind()
-                                  .Attr<int64_t>("law")
-                                  .Attr<int64_t>("variant")
-                                  .Attr<int64_t>("points")
-                                  .Attr<int64_t>("isotropic")
-                                  .Attr<int64_t>("leaves")
-                                  .RemainingArgs()
-                                  .RemainingRets());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_advance, gmem::handle<gmem::Task::forward>, gmem::binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_tangent, gmem::handle<gmem::Task::tangent>, gmem::binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_adjoint, gmem::handle<gmem::Task::adjoint>, gmem::binding());
 
 // Name of the instruction set in use.
 extern "C" const char* gmem_instruction_set() { return gmem::best_kernel().name; }

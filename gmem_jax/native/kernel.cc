@@ -3,7 +3,10 @@
 #include "problem.h"
 #include "team.h"
 
+#include <cstdlib>
 #include <cstring>
+#include <new>
+#include <vector>
 
 #if defined(__SSE2__)
 #include <immintrin.h>
@@ -18,11 +21,33 @@ namespace GMEM_ISA {
 #include "vectors.h"
 #include "laws.h"
 #include "contact.h"
+#include "motion.h"
 #include "rows.h"
 #include "block.h"
 #include "marks.h"
 #include "replicas.h"
 #include "packed.h"
+
+namespace dual {
+#include "dual.h"
+#include "vectors.h"
+#include "laws.h"
+#include "contact.h"
+#include "motion.h"
+#include "block.h"
+#include "marks.h"
+#include "replicas.h"
+}  // namespace dual
+
+namespace taped {
+#include "tape.h"
+#include "vectors.h"
+#include "laws.h"
+#include "contact.h"
+#include "motion.h"
+}  // namespace taped
+
+#include "adjoint.h"
 
 // Calls `function` with the law of `problem` as a type.
 template <class Function>
@@ -40,12 +65,26 @@ auto with_law(const Problem& problem, const Function& function) {
   }
 }
 
-std::size_t scratch_bytes(const Problem& problem, const Block& block) {
+// Calls `function` with what does the work as a type in an `As`.
+template <class T>
+struct As {
+  using type = T;
+};
+
+template <class Function>
+auto with_worker(const Problem& problem, const Block& block, const Function& function) {
   return with_law(problem, [&](auto law) {
-    Carver carver{nullptr};
     using L = decltype(law);
-    return block.packed ? Engine<Packed<L>>::carve(problem, block, carver, nullptr)
-                        : Engine<Replicas<L>>::carve(problem, block, carver, nullptr);
+    if (problem.task == Task::tangent) return function(As<dual::Engine<dual::Replicas<L>>>{});
+    if (problem.task == Task::adjoint) return function(As<Adjoint<L>>{});
+    return block.packed ? function(As<Engine<Packed<L>>>{}) : function(As<Engine<Replicas<L>>>{});
+  });
+}
+
+std::size_t scratch_bytes(const Problem& problem, const Block& block) {
+  return with_worker(problem, block, [&](auto as) {
+    Carver carver{nullptr};
+    return decltype(as)::type::carve(problem, block, carver, nullptr);
   });
 }
 
@@ -72,14 +111,7 @@ class FlushDenormals {
 
 void run(const Problem& problem, const Block& block, Team& team, int rank, void* scratch) {
   const FlushDenormals flush;
-  with_law(problem, [&](auto law) {
-    using L = decltype(law);
-    if (block.packed) {
-      Engine<Packed<L>>(problem, block, team, rank, scratch).run();
-    } else {
-      Engine<Replicas<L>>(problem, block, team, rank, scratch).run();
-    }
-  });
+  with_worker(problem, block, [&](auto as) { typename decltype(as)::type(problem, block, team, rank, scratch).run(); });
 }
 
 #define GMEM_STRING2(name) #name

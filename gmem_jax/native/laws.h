@@ -98,32 +98,6 @@ inline void coulomb(Contact* c, int count, V mu) {
   }
 }
 
-struct Frictionless {
-  static constexpr int kHistory = 0;  // numbers remembered of a contact, beside Mindlin's layers
-  static constexpr int kVectors = 0;  // those of them that are components of forces
-  static constexpr bool kLayered = false;
-};
-
-struct Hooke {
-  static constexpr int kHistory = 3;
-  static constexpr int kVectors = 3;
-  static constexpr bool kLayered = false;
-};
-
-struct Rescaled {
-  static constexpr int kHistory = 4;  // force, overlap
-  static constexpr int kVectors = 3;
-  static constexpr bool kLayered = false;
-};
-
-template <Variant variant_>
-struct Layered {
-  static constexpr int kHistory = 1;  // overlap; the layers are kept apart
-  static constexpr int kVectors = 0;
-  static constexpr bool kLayered = true;
-  static constexpr Variant variant = variant_;
-};
-
 GMEM_INLINE void friction(Frictionless, Contact* c, int count, const LawParameters&) {
   for (int n = 0; n < count; ++n) c[n].force = Vec{V{}, V{}, V{}};
 }

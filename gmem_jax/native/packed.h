@@ -100,6 +100,11 @@ struct Packed {
     }
   }
 
+  void unload_pressure(Vec pressure, int) const {
+    const V p[3] = {pressure.x, pressure.y, pressure.z};
+    for (int axis = 0; axis < 3; ++axis) lane.pressure[axis * problem.stride] = p[axis][0];
+  }
+
   void unload_padding(int n, int) const {
     const std::ptrdiff_t row = plan.padding_row[n];
     for (int q = 0; q < Law::kHistory; ++q) {

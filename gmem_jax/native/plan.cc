@@ -109,8 +109,12 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
   for (const Candidate& c : candidates) visits[away(c) + 1] += guest(c);
   std::partial_sum(visits.begin(), visits.end(), visits.begin());
   store->guest_start = visits;
-  for (Candidate& c : candidates)
-    if (guest(c)) c.guest = visits[away(c)]++;
+  store->guest_sphere.resize(store->guest_start.back());
+  for (Candidate& c : candidates) {
+    if (!guest(c)) continue;
+    c.guest = visits[away(c)]++;
+    store->guest_sphere[c.guest] = away(c) == c.grain_one ? c.one : c.other;
+  }
 
   store->plan = {count,
                  static_cast<int>(store->domain_candidate.size()) - 1,
@@ -120,6 +124,7 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
                  candidates.data(),
                  store->domain_candidate.data(),
                  store->guest_start.data(),
+                 store->guest_sphere.data(),
                  store->padding_row.data()};
   return store;
 }

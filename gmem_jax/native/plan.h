@@ -28,7 +28,7 @@ struct List {
 // A plan and the memory it points to.
 struct PlanStore {
   Plan plan;
-  std::vector<int32_t> grain, domain_candidate, guest_start, padding_row;
+  std::vector<int32_t> grain, domain_candidate, guest_start, guest_sphere, padding_row;
   std::vector<Candidate> candidate;
 };
 

@@ -22,8 +22,40 @@ constexpr int kWalls = 12;  // lower, upper, lower velocity, upper velocity
 constexpr int kMaxHistory = 2;
 constexpr int kMaxWidth = 8;
 
+// The laws as types.
+struct Frictionless {
+  static constexpr int kHistory = 0;  // numbers remembered of a contact, beside Mindlin's layers
+  static constexpr int kVectors = 0;  // those of them that are components of forces
+  static constexpr bool kLayered = false;
+};
+
+struct Hooke {
+  static constexpr int kHistory = 3;
+  static constexpr int kVectors = 3;
+  static constexpr bool kLayered = false;
+};
+
+struct Rescaled {
+  static constexpr int kHistory = 4;  // force, overlap
+  static constexpr int kVectors = 3;
+  static constexpr bool kLayered = false;
+};
+
+template <Variant variant_>
+struct Layered {
+  static constexpr int kHistory = 1;  // overlap; the layers are kept apart
+  static constexpr int kVectors = 0;
+  static constexpr bool kLayered = true;
+  static constexpr Variant variant = variant_;
+};
+
+// What is wanted: all steps; their derivative along a direction; or, back from derivatives by all results, those by all
+// arguments.
+enum class Task { forward, tangent, adjoint };
+
 // Sizes common to all replicas, and what they run.
 struct Problem {
+  Task task;
   Law law;
   Variant variant;
   bool isotropic;
@@ -54,6 +86,7 @@ struct Plan {
   const Candidate* candidate;       // by domain
   const int32_t* domain_candidate;  // first candidate of each domain, [domains + 1]
   const int32_t* guest_start;       // the guests of each grain: guest_start[g] to guest_start[g + 1], [N + 1]
+  const int32_t* guest_sphere;      // that each guest acts on, [guests]
   const int32_t* padding_row;       // [padding]
 };
 
@@ -72,17 +105,34 @@ struct Lane {
   const double* walls;
   double* pressure;
   int steps;
+  // Only among the slopes of the adjoint, where "in" is by the results and "out" by the arguments:
+  double* parameters_out;
+  double* walls_out;
 };
 
 struct Block {
   const Pack* pack;
   const Lane* lanes;
-  int count;    // 1 to W
-  bool packed;  // the lanes of the CPU are grains and contacts of one replica
+  const Lane* slopes;  // the derivatives, where they are wanted
+  int count;           // 1 to W
+  bool packed;         // the lanes of the CPU are grains and contacts of one replica
 };
 
 // The threads that share one block; see team.h.
 class Team;
+
+// Hands out aligned pieces of the scratch memory; every thread of a team repeats the same sequence.
+struct Carver {
+  char* base;
+  std::size_t used = 0;
+
+  template <class T>
+  T* take(std::size_t count) {
+    T* piece = reinterpret_cast<T*>(base + used);
+    used += (count * sizeof(T) + 63) / 64 * 64;
+    return piece;
+  }
+};
 
 // A compiled instruction set.
 struct Kernel {

@@ -1,6 +1,14 @@
 // W replicas of a pack side by side: each vector is one number of one grain or contact. Included inside the
 // instruction set's namespace; see `Engine` in block.h for how it is used.
 
+// What the histories of the contacts were when a step looked at them; kept where the step is to be gone through backwards.
+struct Trace {
+  bool* touched = nullptr;  // [candidates]
+  V* history;               // [candidates, kHistory] of the law
+  V* layer;                 // [candidates, Q, 3]
+  int* reached;             // [candidates]
+};
+
 template <class Law>
 struct Replicas {
   const Problem& problem;
@@ -14,6 +22,7 @@ struct Replicas {
   V* history;     // [candidates, Law::kHistory]
   V* layer;       // [candidates, Q, 3] of the Mindlin law
   Marks marks;
+  Trace trace;
 
   Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
     adjacent = block.count == W;
@@ -45,31 +54,44 @@ struct Replicas {
     return carver.used;
   }
 
-  // A short block repeats its last replica.
-  const Lane& lane(int l) const { return block.lanes[l < block.count ? l : block.count - 1]; }
+  // Number `row` of an array in every lane; a short block repeats its last replica.
+  template <class Pointer>
+  Real gather(const Lane* lanes, const Pointer& pointer, std::ptrdiff_t row) const {
+    Real a;
+    for (int l = 0; l < W; ++l) a[l] = pointer(lanes[l < block.count ? l : block.count - 1])[row * problem.stride];
+    return a;
+  }
 
   V per_lane(const double* Lane::*array, std::ptrdiff_t row) const {
-    V a;
-    for (int l = 0; l < W; ++l) a[l] = (lane(l).*array)[row * problem.stride];
-    return a;
+    return of_lanes(block, [&](const Lane* lanes) {
+      return gather(lanes, [array](const Lane& lane) { return lane.*array; }, row);
+    });
   }
 
   // --- copying in and out
 
   template <class Pointer>
   V read(const Pointer& pointer, std::ptrdiff_t row) const {
-    if (adjacent) return load(pointer(block.lanes[0]) + row * problem.stride);
-    V a;
-    for (int l = 0; l < W; ++l) a[l] = pointer(lane(l))[row * problem.stride];
-    return a;
+    return of_lanes(block, [&](const Lane* lanes) {
+      return adjacent ? load(pointer(lanes[0]) + row * problem.stride) : gather(lanes, pointer, row);
+    });
   }
 
   // Only lanes that have done all their steps.
   template <class Pointer>
-  void write(const Pointer& pointer, std::ptrdiff_t row, V a, int steps_done) const {
-    if (adjacent && together) return store(pointer(block.lanes[0]) + row * problem.stride, a);
+  void write(const Pointer& pointer, std::ptrdiff_t row, V number, int steps_done) const {
+    const Real a = result(number);
+    const Lane* lanes = results(block);
+    if (adjacent && together) return store(pointer(lanes[0]) + row * problem.stride, a);
     for (int l = 0; l < block.count; ++l)
-      if (block.lanes[l].steps == steps_done) pointer(block.lanes[l])[row * problem.stride] = a[l];
+      if (block.lanes[l].steps == steps_done) pointer(lanes[l])[row * problem.stride] = a[l];
+  }
+
+  void unload_pressure(Vec pressure, int steps_done) const {
+    const V p[3] = {pressure.x, pressure.y, pressure.z};
+    for (int l = 0; l < block.count; ++l)
+      for (int axis = 0; axis < 3; ++axis)
+        if (block.lanes[l].steps == steps_done) results(block)[l].pressure[axis * problem.stride] = result(p[axis])[l];
   }
 
   void load_unit(int u, V* hot, V* cold) const {
@@ -195,6 +217,16 @@ struct Replicas {
     void keep(int kept) { *last = kept - 1; }
   };
 
+  void remember(std::size_t c) {
+    trace.touched[c] = true;
+    for (int q = 0; q < Law::kHistory; ++q) trace.history[c * Law::kHistory + q] = history[c * Law::kHistory + q];
+    if constexpr (Law::kLayered) {
+      trace.reached[c] = marks.reached[c];
+      const std::size_t first = c * problem.points * 3;
+      for (int q = 0; q < 3 * (marks.reached[c] + 1); ++q) trace.layer[first + q] = layer[first + q];
+    }
+  }
+
   void contacts(int first, int end, const V* parameter, const LawParameters& law, double travel) {
     constexpr int kLook = 256, kBatch = 8;
     const V contact_square = splat(4.0);
@@ -220,6 +252,7 @@ struct Replicas {
           continue;
         }
         marks.touched[c] = true;
+        if (trace.touched) remember(c);
         meet(meeting(pair, one, other), square, contact[count]);
         contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
         touching[count++] = c;

@@ -16,6 +16,7 @@ constexpr int W = 2;
 typedef double V __attribute__((vector_size(8 * W)));
 typedef double Unaligned __attribute__((vector_size(8 * W), aligned(8), may_alias));
 typedef decltype(V{} < V{}) Mask;  // all bits of a lane set or clear
+typedef V Real;                    // V is another kind of number where derivatives are taken
 
 inline V splat(double a) { return V{} + a; }
 inline V load(const double* p) { return *reinterpret_cast<const Unaligned*>(p); }
@@ -111,3 +112,11 @@ inline V inverse_root(V a) {
   r = fnma(a * y, y, one);
   return fma(y * r, fma(splat(0.375), r, splat(0.5)), y);
 }
+
+// How numbers are put together from the arrays of a block, and which of them are results; see dual.h.
+template <class Gather>
+inline V of_lanes(const Block& block, const Gather& gather) {
+  return gather(block.lanes);
+}
+inline Real result(V a) { return a; }
+inline const Lane* results(const Block& block) { return block.lanes; }

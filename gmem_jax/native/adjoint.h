@@ -1,0 +1,512 @@
+// Reverse mode: all steps of one block gone through forwards, then backwards. The physics is that of the other headers,
+// read with numbers that are recorded on a tape (namespace `taped`); here stands only who gets which derivative.
+// "Bar" x is the derivative of the final result by x.
+//
+// Grains and contacts are shared among the threads of a team as in the forward steps, and sums are taken in the same
+// fixed order. Included inside the instruction set's namespace.
+
+// Rows of what is kept, and of the bars, of one grain: at the beginning of a step ...
+enum StateRow { kStatePosition = 0, kStateQuaternion = 3, kStateVelocity = 7, kStateSpin = 10, kStateAcceleration = 13,
+                kStateSpinRate = 16, kState = 19 };
+// ... and midway, with the force and torque found there.
+enum MidRow { kMidPosition = 0, kMidQuaternion = 3, kMidVelocity = 7, kMidSpin = 10, kMidHalfVelocity = 13,
+              kMidHalfSpin = 16, kMidForce = 19, kMidTorque = 22, kMid = 25 };
+// What a contact adds to the bars of a grain of another domain.
+enum GuestRow { kGuestCentre = 0, kGuestPosition = 3, kGuestVelocity = 6, kGuestSpin = 9, kGuest = 12 };
+
+inline void add_vec(V* to, Vec a) { store_vec(to, load_vec(to) + a); }
+
+inline taped::Vec leaf(Vec a) { return {taped::leaf(a.x), taped::leaf(a.y), taped::leaf(a.z)}; }
+inline taped::Quaternion leaf(Quaternion q) { return {taped::leaf(q.w), leaf(q.v)}; }
+// Three numbers that were made leaves one after the other.
+inline Vec bars(int first) { return {taped::tape->bar(first), taped::tape->bar(first + 1), taped::tape->bar(first + 2)}; }
+inline void seed(taped::V a, V bar) {
+  if (a.index) taped::tape->bar(a.index) += bar;
+}
+inline void seed(taped::Vec a, Vec bar) { seed(a.x, bar.x), seed(a.y, bar.y), seed(a.z, bar.z); }
+
+struct TapedWalls {
+  int first;
+  taped::WallState box;
+
+  explicit TapedWalls(const WallState& w)
+      : first(taped::tape->size()), box{leaf(w.lower), leaf(w.upper), leaf(w.lower_velocity), leaf(w.upper_velocity)} {}
+
+  void add_bars(V* to) const {
+    for (int row = 0; row < kWalls; ++row) to[row] += taped::tape->bar(first + row);
+  }
+};
+
+struct TapedParameters {
+  int first;
+  taped::V row[kParameters];
+
+  explicit TapedParameters(const V* parameter) : first(taped::tape->size()) {
+    for (int r = 0; r < kParameters; ++r) row[r] = taped::leaf(parameter[r]);
+  }
+
+  void add_bars(V* to) const {
+    for (int r = 0; r < kParameters; ++r) to[r] += taped::tape->bar(first + r);
+  }
+};
+
+template <class Law>
+struct Adjoint {
+  Engine<Replicas<Law>> forward;
+  const Problem& problem;
+  const Block& block;
+  const Plan& plan;
+  Team& team;
+  const int rank, steps;
+  taped::Tape recorded;
+
+  V* state;      // [steps, N, kState]: at the beginning of each step
+  V* total;      // [steps, N, 6]: force and torque in it
+  Trace* trace;  // [steps]
+  V* state_bar;  // [N, kState]
+  V* mid_bar;    // [N, kMid]
+  V* sphere_bar;    // [S, 3]
+  V* guest_bar;     // [guests, kGuest]
+  V* history_bar;   // [candidates, kHistory and Mindlin's layers, 3 Q]
+  V* domain_bar;    // [domains, kParameters]
+  V* chunk_bar;     // [chunks, kParameters]
+  V* wall_bar;      // [chunks, kWalls], of one step
+
+  static std::size_t carve(const Problem& p, const Block& block, Carver& carver, Adjoint* to) {
+    using Forward = Engine<Replicas<Law>>;
+    Forward::carve(p, block, carver, to ? &to->forward : nullptr);
+    const Plan& plan = *block.pack->plan;
+    const std::size_t steps = block.lanes[0].steps, grains = p.grains, candidates = plan.candidates;
+    const std::size_t layers = Law::kLayered ? candidates * p.points * 3 : 0;
+    V* state = carver.take<V>(steps * grains * kState);
+    V* total = carver.take<V>(steps * grains * 6);
+    Trace* trace = carver.take<Trace>(steps);
+    for (std::size_t step = 0; step < steps; ++step) {
+      Trace t;
+      t.touched = carver.take<bool>(candidates + 1);
+      t.history = carver.take<V>(candidates * Law::kHistory);
+      t.layer = carver.take<V>(layers);
+      t.reached = carver.take<int>(Law::kLayered ? candidates : 0);
+      if (to) trace[step] = t;
+    }
+    V* state_bar = carver.take<V>(grains * kState);
+    V* mid_bar = carver.take<V>(grains * kMid);
+    V* sphere_bar = carver.take<V>(static_cast<std::size_t>(p.spheres()) * 3);
+    V* guest_bar = carver.take<V>(static_cast<std::size_t>(plan.guests) * kGuest);
+    V* history_bar = carver.take<V>(candidates * remembered(p));
+    V* domain_bar = carver.take<V>(static_cast<std::size_t>(plan.domains) * kParameters);
+    V* chunk_bar = carver.take<V>(static_cast<std::size_t>(Forward::chunks(p)) * kParameters);
+    V* wall_bar = carver.take<V>(static_cast<std::size_t>(Forward::chunks(p)) * kWalls);
+    if (to) {
+      to->state = state, to->total = total, to->trace = trace, to->state_bar = state_bar, to->mid_bar = mid_bar;
+      to->sphere_bar = sphere_bar, to->guest_bar = guest_bar, to->history_bar = history_bar;
+      to->domain_bar = domain_bar, to->chunk_bar = chunk_bar, to->wall_bar = wall_bar;
+    }
+    return carver.used;
+  }
+
+  Adjoint(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
+      : forward(problem, block, team, rank, scratch), problem(problem), block(block), plan(*block.pack->plan), team(team),
+        rank(rank), steps(block.lanes[0].steps) {
+    Carver carver{static_cast<char*>(scratch)};
+    carve(problem, block, carver, this);
+    forward.mode.hot = forward.hot;
+  }
+
+  // Numbers in the history of a contact.
+  static int remembered(const Problem& p) { return Law::kHistory + (Law::kLayered ? 3 * p.points : 0); }
+  V* history_of(std::size_t c) const { return history_bar + c * remembered(problem); }
+
+  int chunks() const { return forward.chunks(problem); }
+  V* of_grain(V* array, int u, int rows) const { return array + static_cast<std::size_t>(u) * rows; }
+
+  // Calls `each(u)` for this rank's grains.
+  template <class Each>
+  void for_grains(const Each& each) const {
+    for (int u = forward.share_begin(problem.grains); u < forward.share_begin(problem.grains, 1); ++u) each(u);
+  }
+
+  // Calls `each(chunk)` for the chunks of grains as the team shares them.
+  template <class Each>
+  void for_chunks(const Each& each) {
+    team.share(Team::kGrains, rank, chunks());
+    for (int chunk; team.take(Team::kGrains, rank, &chunk);) each(chunk);
+    team.barrier();
+  }
+
+  static Grain grain_of(const V* s) {
+    return {load_vec(s + kStatePosition), {s[kStateQuaternion], load_vec(s + kStateQuaternion + 1)},
+            load_vec(s + kStateVelocity), load_vec(s + kStateSpin),
+            load_vec(s + kStateAcceleration), load_vec(s + kStateSpinRate)};
+  }
+
+  // Between the rows of a state and where the forward steps keep them.
+  template <class Move>
+  void move_state(int u, V* s, const Move& move) const {
+    V* h = of_grain(forward.hot, u, kHot);
+    V* c = of_grain(forward.cold, u, kCold);
+    for (int q = 0; q < 3; ++q) {
+      move(s[kStatePosition + q], h[kPosition + q]);
+      move(s[kStateVelocity + q], h[kVelocity + q]);
+      move(s[kStateSpin + q], h[kSpin + q]);
+      move(s[kStateAcceleration + q], c[kAcceleration + q]);
+      move(s[kStateSpinRate + q], c[kSpinRate + q]);
+    }
+    for (int q = 0; q < 4; ++q) move(s[kStateQuaternion + q], c[kQuaternion + q]);
+  }
+
+  V* state_of(int step, int u) const { return of_grain(state + static_cast<std::size_t>(step) * problem.grains * kState, u, kState); }
+  V* total_of(int step, int u) const { return of_grain(total + static_cast<std::size_t>(step) * problem.grains * 6, u, 6); }
+
+  // --- forwards
+
+  void go_forward() {
+    forward.load();
+    for (int step = 0; step < steps; ++step) {
+      for_grains([&](int u) { move_state(u, state_of(step, u), [](V& kept, V now) { kept = now; }); });
+      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
+        trace[step].touched[c] = false;
+      team.barrier();
+      forward.grains(false, true, step);
+      forward.mode.trace = trace[step];
+      forward.contacts();
+      for_grains([&](int u) {
+        Vec force, torque;
+        forward.mode.total_force(u, force, torque);
+        store_vec(total_of(step, u), force);
+        store_vec(total_of(step, u) + 3, torque);
+      });
+      team.barrier();
+      forward.grains(true, false, 0);
+    }
+  }
+
+  // --- bars in and out
+
+  template <class Pointer>
+  void write(const Pointer& pointer, std::ptrdiff_t row, V a) const {
+    for (int l = 0; l < block.count; ++l) pointer(block.slopes[l])[row * problem.stride] = a[l];
+  }
+
+  // Calls `each(field, row in the arrays of the call, row of the state)` for the numbers of grain u.
+  template <class Each>
+  void for_fields(int u, const Each& each) const {
+    constexpr int sizes[kFields] = {3, 4, 3, 3, 3, 3};
+    for (int f = 0, first = 0; f < kFields; first += sizes[f++])
+      for (int q = 0; q < sizes[f]; ++q)
+        each(f, static_cast<std::ptrdiff_t>(plan.grain[u]) * sizes[f] + q, first + q);
+  }
+
+  // Calls `each(leaf, row in the arrays of the call, number)` for the history in `row` of the list.
+  template <class Each>
+  void for_history(std::ptrdiff_t row, const Each& each) const {
+    for (int q = 0; q < Law::kHistory; ++q) {
+      const Place place = place_of<Law>(row, q);
+      each(place.leaf, place.row, q);
+    }
+    for (int q = Law::kHistory; q < remembered(problem); ++q)
+      each(0, row * problem.points * 3 + q - Law::kHistory, q);
+  }
+
+  void load_bars() {
+    for_grains([&](int u) {
+      for_fields(u, [&](int f, std::ptrdiff_t row, int number) {
+        of_grain(state_bar, u, kState)[number] =
+            forward.mode.gather(block.slopes, [f](const Lane& lane) { return lane.grains_in[f]; }, row);
+      });
+    });
+    for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
+      for_history(plan.candidate[c].row, [&](int leaf, std::ptrdiff_t row, int q) {
+        history_of(c)[q] = forward.mode.gather(block.slopes, [leaf](const Lane& lane) { return lane.history_in[leaf]; }, row);
+      });
+    if (rank == 0) {
+      std::memset(domain_bar, 0, sizeof(V) * plan.domains * kParameters);
+      std::memset(chunk_bar, 0, sizeof(V) * chunks() * kParameters);
+    }
+    team.barrier();
+  }
+
+  void unload_bars() {
+    for_grains([&](int u) {
+      for_fields(u, [&](int f, std::ptrdiff_t row, int number) {
+        write([f](const Lane& lane) { return lane.grains_out[f]; }, row, of_grain(state_bar, u, kState)[number]);
+      });
+    });
+    for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
+      for_history(plan.candidate[c].row, [&](int leaf, std::ptrdiff_t row, int q) {
+        write([leaf](const Lane& lane) { return lane.history_out[leaf]; }, row, history_of(c)[q]);
+      });
+    for (int n = forward.share_begin(plan.padding); n < forward.share_begin(plan.padding, 1); ++n)
+      for_history(plan.padding_row[n], [&](int leaf, std::ptrdiff_t row, int) {
+        write([leaf](const Lane& lane) { return lane.history_out[leaf]; }, row, V{});
+      });
+    for (int r = 0; rank == 0 && r < kParameters; ++r) {
+      V sum{};
+      for (int domain = 0; domain < plan.domains; ++domain) sum += domain_bar[domain * kParameters + r];
+      for (int chunk = 0; chunk < chunks(); ++chunk) sum += chunk_bar[chunk * kParameters + r];
+      write([](const Lane& lane) { return lane.parameters_out; }, r, sum);
+    }
+    team.barrier();
+  }
+
+  // --- backwards
+
+  // The second half of a step, of one chunk of grains.
+  void end_back(int chunk, int step) {
+    recorded.rewind(1);
+    const TapedParameters parameter(forward.parameter);
+    const taped::GrainParameters constants(parameter.row);
+    const int mark = recorded.size();
+    for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
+      const Midway m = forward.midway(u);
+      const V* before = total_of(step, u);
+      const int first = recorded.size();
+      const taped::Midway midway{leaf(m.position), leaf(m.orientation), leaf(m.velocity),
+                                 leaf(m.spin), leaf(m.half_velocity), leaf(m.half_spin)};
+      const taped::Vec force = leaf(load_vec(before)), torque = leaf(load_vec(before + 3));
+      const taped::Grain g = end_step(constants, problem.isotropic, midway, force, torque);
+      const Grain bar = grain_of(of_grain(state_bar, u, kState));
+      seed(g.position, bar.position);
+      seed(g.orientation.w, bar.orientation.w);
+      seed(g.orientation.v, bar.orientation.v);
+      seed(g.velocity, bar.velocity);
+      seed(g.spin, bar.spin);
+      seed(g.acceleration, bar.acceleration);
+      seed(g.spin_rate, bar.spin_rate);
+      recorded.reverse(mark);
+      for (int q = 0; q < kMid; ++q) of_grain(mid_bar, u, kMid)[q] = recorded.bar(first + q);
+      for (int q = 0; q < 3 * problem.spheres_per_grain; ++q)
+        of_grain(sphere_bar, u, 3 * problem.spheres_per_grain)[q] = V{};
+      recorded.rewind(mark);
+    }
+    recorded.reverse(1);
+    parameter.add_bars(chunk_bar + static_cast<std::size_t>(chunk) * kParameters);
+  }
+
+  // Mindlin's layers of one contact, on the tape.
+  struct Layers {
+    const V* before;
+    int reached, count;
+    std::vector<int>* leaves;      // first of each layer that was stored
+    std::vector<taped::Vec>* now;  // what the law left
+
+    int points() const { return count; }
+    taped::Vec get(int j) const {
+      if (j > reached) return taped::Vec{taped::V{}, taped::V{}, taped::V{}};
+      leaves->push_back(taped::tape->size());
+      return leaf(load_vec(before + 3 * j));
+    }
+    taped::Vec stored(int j) const { return (*now)[j]; }
+    void set(int j, taped::Vec f) {
+      if (static_cast<int>(now->size()) <= j) now->resize(j + 1);
+      (*now)[j] = f;
+    }
+    void keep(int kept) { now->resize(kept); }
+  };
+
+  // The contacts of one domain.
+  void contacts_back(int domain, int step) {
+    constexpr int kBatch = Law::kLayered ? 1 : 4;
+    const Trace& seen = trace[step];
+    recorded.rewind(1);
+    const TapedParameters parameter(forward.parameter);
+    const taped::LawParameters law(parameter.row + kLaw, parameter.row[kDt]);
+    const int mark = recorded.size();
+    int batch[kBatch], count = 0;
+    for (int c = plan.domain_candidate[domain]; c < plan.domain_candidate[domain + 1]; ++c) {
+      if (!seen.touched[c]) {
+        forget(c);
+        continue;
+      }
+      batch[count++] = c;
+      if (count < kBatch) continue;
+      batch_back(batch, count, parameter.row, law, seen);
+      recorded.rewind(mark);
+      count = 0;
+    }
+    batch_back(batch, count, parameter.row, law, seen);
+    recorded.rewind(mark);
+    recorded.reverse(1);
+    parameter.add_bars(domain_bar + static_cast<std::size_t>(domain) * kParameters);
+  }
+
+  // A contact apart has a blank history, whatever it was before.
+  void forget(std::size_t c) {
+    for (int q = 0; q < remembered(problem); ++q) history_of(c)[q] = V{};
+    const int guest = plan.candidate[c].guest;
+    if (guest >= 0)
+      for (int q = 0; q < kGuest; ++q) of_grain(guest_bar, guest, kGuest)[q] = V{};
+  }
+
+  void batch_back(const int* batch, int count, const taped::V* parameter, const taped::LawParameters& law, const Trace& seen) {
+    constexpr int kMost = 4, kMeeting = 18;
+    taped::Contact contact[kMost];
+    taped::V memory[kMost][4];
+    int first[kMost];
+    const int mark = recorded.size();
+    for (int n = 0; n < count; ++n) {
+      const std::size_t c = batch[n];
+      const Candidate& pair = plan.candidate[c];
+      const Meeting m = forward.mode.meeting(pair, load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.one)),
+                                             load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.other)));
+      first[n] = recorded.size();
+      const taped::Meeting meeting{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
+                                   leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
+      for (int q = 0; q < Law::kHistory; ++q) memory[n][q] = taped::leaf(seen.history[c * Law::kHistory + q]);
+      meet(meeting, dot(meeting.separation, meeting.separation), contact[n]);
+      contact[n].history = memory[n];
+    }
+    close(contact, count, parameter);
+    std::vector<int> leaves;
+    std::vector<taped::Vec> now;
+    if constexpr (Law::kLayered) {
+      for (int n = 0; n < count; ++n) {
+        const std::size_t c = batch[n];
+        friction(Law{}, contact[n], law,
+                 Layers{seen.layer + c * problem.points * 3, seen.reached[c], problem.points, &leaves, &now});
+      }
+    } else {
+      friction(Law{}, contact, count, law);
+    }
+    for (int n = 0; n < count; ++n) {
+      const Candidate& pair = plan.candidate[batch[n]];
+      const taped::Push found = push(contact[n]);
+      const V* one = of_grain(mid_bar, pair.grain_one, kMid);
+      const V* other = of_grain(mid_bar, pair.grain_other, kMid);
+      seed(found.force, load_vec(one + kMidForce) - load_vec(other + kMidForce));
+      seed(found.torque_one, load_vec(one + kMidTorque));
+      seed(found.torque_other, load_vec(other + kMidTorque));
+      for (int q = 0; q < Law::kHistory; ++q)
+        seed(memory[n][q], history_of(batch[n])[q]);
+      for (std::size_t j = 0; j < now.size(); ++j) seed(now[j], load_vec(history_of(batch[n]) + Law::kHistory + 3 * j));
+    }
+    recorded.reverse(mark);
+    for (int n = 0; n < count; ++n) {
+      const std::size_t c = batch[n];
+      V* to = history_of(c);
+      for (int q = 0; q < Law::kHistory; ++q) to[q] = recorded.bar(first[n] + kMeeting + q);
+      for (int q = Law::kHistory; q < remembered(problem); ++q) to[q] = V{};
+      for (std::size_t j = 0; j < leaves.size(); ++j) store_vec(to + Law::kHistory + 3 * j, bars(leaves[j]));
+      share_out(plan.candidate[c], first[n]);
+    }
+  }
+
+  // The bars of a meeting go to the two grains and spheres it was made from.
+  void share_out(const Candidate& pair, int first) {
+    const Vec separation = bars(first), lever_one = bars(first + 3), lever_other = bars(first + 6);
+    const Vec velocity = bars(first + 9), spin_one = bars(first + 12), spin_other = bars(first + 15);
+    const Vec point = splat(0.5) * (lever_one + lever_other);
+    const bool away_is_one = pair.grain_one > pair.grain_other;
+    give(pair, !away_is_one, pair.one, pair.grain_one, {point - separation, -lever_one, -velocity, spin_one});
+    give(pair, away_is_one, pair.other, pair.grain_other, {point + separation, -lever_other, velocity, spin_other});
+  }
+
+  struct Given {
+    Vec centre, position, velocity, spin;
+  };
+
+  void give(const Candidate& pair, bool at_home, int sphere, int grain, const Given& bar) {
+    if (at_home || pair.guest < 0) {
+      add_vec(sphere_bar + 3 * static_cast<std::size_t>(sphere), bar.centre);
+      V* to = of_grain(mid_bar, grain, kMid);
+      add_vec(to + kMidPosition, bar.position);
+      add_vec(to + kMidVelocity, bar.velocity);
+      add_vec(to + kMidSpin, bar.spin);
+    } else {
+      V* to = of_grain(guest_bar, pair.guest, kGuest);
+      store_vec(to + kGuestCentre, bar.centre);
+      store_vec(to + kGuestPosition, bar.position);
+      store_vec(to + kGuestVelocity, bar.velocity);
+      store_vec(to + kGuestSpin, bar.spin);
+    }
+  }
+
+  // The first half of a step, of one chunk of grains; `on_wall` is the bar of the force on either wall of an axis.
+  void begin_back(int chunk, int step, Vec on_wall) {
+    recorded.rewind(1);
+    const TapedParameters parameter(forward.parameter);
+    const taped::GrainParameters constants(parameter.row);
+    const TapedWalls walls(forward.walls_at(step));
+    const int mark = recorded.size(), spheres = problem.spheres_per_grain;
+    for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
+      const V* s = state_of(step, u);
+      const Grain g = grain_of(s);
+      const int first = recorded.size();
+      const taped::Grain grain{leaf(g.position), leaf(g.orientation), leaf(g.velocity),
+                               leaf(g.spin), leaf(g.acceleration), leaf(g.spin_rate)};
+      const taped::Midway m = begin_step(constants, grain);
+      taped::WallForces on{};
+      V* of_spheres = of_grain(sphere_bar, u, 3 * spheres);
+      V* bar = of_grain(mid_bar, u, kMid);
+      take_guests(u, bar);
+      spheres_of(constants, m, block.pack->offsets, spheres, forward.arm, walls.box, on,
+                 [&](int k, taped::Vec centre) { seed(centre, load_vec(of_spheres + 3 * k)); });
+      seed(on.force, load_vec(bar + kMidForce));
+      seed(on.torque, load_vec(bar + kMidTorque));
+      seed(on.lower, on_wall);
+      seed(on.upper, on_wall);
+      seed(m.position, load_vec(bar + kMidPosition));
+      seed(m.orientation.w, bar[kMidQuaternion]);
+      seed(m.orientation.v, load_vec(bar + kMidQuaternion + 1));
+      seed(m.velocity, load_vec(bar + kMidVelocity));
+      seed(m.spin, load_vec(bar + kMidSpin));
+      seed(m.half_velocity, load_vec(bar + kMidHalfVelocity));
+      seed(m.half_spin, load_vec(bar + kMidHalfSpin));
+      recorded.reverse(mark);
+      for (int q = 0; q < kState; ++q) of_grain(state_bar, u, kState)[q] = recorded.bar(first + q);
+      recorded.rewind(mark);
+    }
+    recorded.reverse(1);
+    parameter.add_bars(chunk_bar + static_cast<std::size_t>(chunk) * kParameters);
+    V* to = wall_bar + static_cast<std::size_t>(chunk) * kWalls;
+    for (int row = 0; row < kWalls; ++row) to[row] = V{};
+    walls.add_bars(to);
+  }
+
+  void take_guests(int u, V* bar) {
+    for (int n = plan.guest_start[u]; n < plan.guest_start[u + 1]; ++n) {
+      const V* from = of_grain(guest_bar, n, kGuest);
+      add_vec(sphere_bar + 3 * static_cast<std::size_t>(plan.guest_sphere[n]), load_vec(from + kGuestCentre));
+      add_vec(bar + kMidPosition, load_vec(from + kGuestPosition));
+      add_vec(bar + kMidVelocity, load_vec(from + kGuestVelocity));
+      add_vec(bar + kMidSpin, load_vec(from + kGuestSpin));
+    }
+  }
+
+  void step_back(int step, Vec pressure_bar) {
+    for_grains([&](int u) { move_state(u, state_of(step, u), [](V kept, V& now) { now = kept; }); });
+    team.barrier();
+    forward.grains(false, true, step);
+    for_chunks([&](int chunk) { end_back(chunk, step); });
+    team.share(Team::kContacts, rank, plan.domains);
+    for (int domain; team.take(Team::kContacts, rank, &domain);) contacts_back(domain, step);
+    team.barrier();
+
+    recorded.rewind(1);
+    const TapedWalls walls(forward.walls_at(step));
+    const int first = recorded.size();
+    const taped::Vec force = leaf(forward.mode.sum_walls(forward.walls, chunks()));
+    seed(pressure(walls.box, force), pressure_bar);
+    recorded.reverse(1);
+    const Vec on_wall = bars(first);
+    V by_walls[kWalls] = {};
+    walls.add_bars(by_walls);
+    for_chunks([&](int chunk) { begin_back(chunk, step, on_wall); });
+    for (int row = 0; rank == 0 && row < kWalls; ++row) {
+      for (int chunk = 0; chunk < chunks(); ++chunk) by_walls[row] += wall_bar[chunk * kWalls + row];
+      write([](const Lane& lane) { return lane.walls_out; }, static_cast<std::ptrdiff_t>(step) * kWalls + row, by_walls[row]);
+    }
+  }
+
+  void run() {
+    taped::tape = &recorded;
+    go_forward();
+    load_bars();
+    V pressure_bar[3];
+    for (int axis = 0; axis < 3; ++axis)
+      pressure_bar[axis] = forward.mode.gather(block.slopes, [](const Lane& lane) { return lane.pressure; }, axis);
+    for (int step = steps - 1; step >= 0; --step) step_back(step, load_vec(pressure_bar));
+    unload_bars();
+    taped::tape = nullptr;
+  }
+};
