@@ -14,14 +14,14 @@ enum MidRow { kMidPosition = 0, kMidQuaternion = 3, kMidVelocity = 7, kMidSpin =
 // What a contact adds to the bars of a grain of another domain.
 enum GuestRow { kGuestCentre = 0, kGuestPosition = 3, kGuestVelocity = 6, kGuestSpin = 9, kGuest = 12 };
 
+using taped::leaf;
+
 inline void add_vec(V* to, Vec a) { store_vec(to, load_vec(to) + a); }
 
-inline taped::Vec leaf(Vec a) { return {taped::leaf(a.x), taped::leaf(a.y), taped::leaf(a.z)}; }
-inline taped::Quaternion leaf(Quaternion q) { return {taped::leaf(q.w), leaf(q.v)}; }
-// Three numbers that were made leaves one after the other.
-inline Vec bars(int first) { return {taped::tape->bar(first), taped::tape->bar(first + 1), taped::tape->bar(first + 2)}; }
+inline taped::Quaternion leaf(Quaternion q) { return {taped::leaf(q.w), taped::leaf(q.v)}; }
+inline Vec bars(int slot) { return load_vec(&taped::tape->bar(slot)); }
 inline void seed(taped::V a, V bar) {
-  if (a.index) taped::tape->bar(a.index) += bar;
+  if (a.slot) taped::tape->bar(a.slot) += bar;
 }
 inline void seed(taped::Vec a, Vec bar) { seed(a.x, bar.x), seed(a.y, bar.y), seed(a.z, bar.z); }
 
@@ -30,7 +30,7 @@ struct TapedWalls {
   taped::WallState box;
 
   explicit TapedWalls(const WallState& w)
-      : first(taped::tape->size()), box{leaf(w.lower), leaf(w.upper), leaf(w.lower_velocity), leaf(w.upper_velocity)} {}
+      : first(taped::tape->mark().slots), box{leaf(w.lower), leaf(w.upper), leaf(w.lower_velocity), leaf(w.upper_velocity)} {}
 
   void add_bars(V* to) const {
     for (int row = 0; row < kWalls; ++row) to[row] += taped::tape->bar(first + row);
@@ -41,7 +41,7 @@ struct TapedParameters {
   int first;
   taped::V row[kParameters];
 
-  explicit TapedParameters(const V* parameter) : first(taped::tape->size()) {
+  explicit TapedParameters(const V* parameter) : first(taped::tape->mark().slots) {
     for (int r = 0; r < kParameters; ++r) row[r] = taped::leaf(parameter[r]);
   }
 
@@ -253,14 +253,14 @@ struct Adjoint {
 
   // The second half of a step, of one chunk of grains.
   void end_back(int chunk, int step) {
-    recorded.rewind(1);
+    recorded.clear();
     const TapedParameters parameter(forward.parameter);
     const taped::GrainParameters constants(parameter.row);
-    const int mark = recorded.size();
+    const auto mark = recorded.mark();
     for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
       const Midway m = forward.midway(u);
       const V* before = total_of(step, u);
-      const int first = recorded.size();
+      const int first = recorded.mark().slots;
       const taped::Midway midway{leaf(m.position), leaf(m.orientation), leaf(m.velocity),
                                  leaf(m.spin), leaf(m.half_velocity), leaf(m.half_spin)};
       const taped::Vec force = leaf(load_vec(before)), torque = leaf(load_vec(before + 3));
@@ -279,7 +279,7 @@ struct Adjoint {
         of_grain(sphere_bar, u, 3 * problem.spheres_per_grain)[q] = V{};
       recorded.rewind(mark);
     }
-    recorded.reverse(1);
+    recorded.reverse({});
     parameter.add_bars(chunk_bar + static_cast<std::size_t>(chunk) * kParameters);
   }
 
@@ -293,7 +293,7 @@ struct Adjoint {
     int points() const { return count; }
     taped::Vec get(int j) const {
       if (j > reached) return taped::Vec{taped::V{}, taped::V{}, taped::V{}};
-      leaves->push_back(taped::tape->size());
+      leaves->push_back(taped::tape->mark().slots);
       return leaf(load_vec(before + 3 * j));
     }
     taped::Vec stored(int j) const { return (*now)[j]; }
@@ -306,27 +306,19 @@ struct Adjoint {
 
   // The contacts of one domain.
   void contacts_back(int domain, int step) {
-    constexpr int kBatch = Law::kLayered ? 1 : 4;
-    const Trace& seen = trace[step];
-    recorded.rewind(1);
+    recorded.clear();
     const TapedParameters parameter(forward.parameter);
     const taped::LawParameters law(parameter.row + kLaw, parameter.row[kDt]);
-    const int mark = recorded.size();
-    int batch[kBatch], count = 0;
+    const auto mark = recorded.mark();
     for (int c = plan.domain_candidate[domain]; c < plan.domain_candidate[domain + 1]; ++c) {
-      if (!seen.touched[c]) {
+      if (!trace[step].touched[c]) {
         forget(c);
         continue;
       }
-      batch[count++] = c;
-      if (count < kBatch) continue;
-      batch_back(batch, count, parameter.row, law, seen);
+      contact_back(c, parameter.row, law, trace[step]);
       recorded.rewind(mark);
-      count = 0;
     }
-    batch_back(batch, count, parameter.row, law, seen);
-    recorded.rewind(mark);
-    recorded.reverse(1);
+    recorded.reverse({});
     parameter.add_bars(domain_bar + static_cast<std::size_t>(domain) * kParameters);
   }
 
@@ -338,57 +330,44 @@ struct Adjoint {
       for (int q = 0; q < kGuest; ++q) of_grain(guest_bar, guest, kGuest)[q] = V{};
   }
 
-  void batch_back(const int* batch, int count, const taped::V* parameter, const taped::LawParameters& law, const Trace& seen) {
-    constexpr int kMost = 4, kMeeting = 18;
-    taped::Contact contact[kMost];
-    taped::V memory[kMost][4];
-    int first[kMost];
-    const int mark = recorded.size();
-    for (int n = 0; n < count; ++n) {
-      const std::size_t c = batch[n];
-      const Candidate& pair = plan.candidate[c];
-      const Meeting m = forward.mode.meeting(pair, load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.one)),
-                                             load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.other)));
-      first[n] = recorded.size();
-      const taped::Meeting meeting{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
-                                   leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
-      for (int q = 0; q < Law::kHistory; ++q) memory[n][q] = taped::leaf(seen.history[c * Law::kHistory + q]);
-      meet(meeting, dot(meeting.separation, meeting.separation), contact[n]);
-      contact[n].history = memory[n];
-    }
-    close(contact, count, parameter);
+  void contact_back(std::size_t c, const taped::V* parameter, const taped::LawParameters& law, const Trace& seen) {
+    constexpr int kMeeting = 18;
+    const auto mark = recorded.mark();
+    const Candidate& pair = plan.candidate[c];
+    const Meeting m = forward.mode.meeting(pair, load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.one)),
+                                           load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.other)));
+    const taped::Meeting meeting{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
+                                 leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
+    taped::V memory[4];
+    for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(seen.history[c * Law::kHistory + q]);
+    taped::Contact contact;
+    contact.history = memory;
+    meet(meeting, dot(meeting.separation, meeting.separation), contact);
+    close(&contact, 1, parameter);
     std::vector<int> leaves;
     std::vector<taped::Vec> now;
     if constexpr (Law::kLayered) {
-      for (int n = 0; n < count; ++n) {
-        const std::size_t c = batch[n];
-        friction(Law{}, contact[n], law,
-                 Layers{seen.layer + c * problem.points * 3, seen.reached[c], problem.points, &leaves, &now});
-      }
+      friction(Law{}, contact, law,
+               Layers{seen.layer + c * problem.points * 3, seen.reached[c], problem.points, &leaves, &now});
     } else {
-      friction(Law{}, contact, count, law);
+      friction(Law{}, &contact, 1, law);
     }
-    for (int n = 0; n < count; ++n) {
-      const Candidate& pair = plan.candidate[batch[n]];
-      const taped::Push found = push(contact[n]);
-      const V* one = of_grain(mid_bar, pair.grain_one, kMid);
-      const V* other = of_grain(mid_bar, pair.grain_other, kMid);
-      seed(found.force, load_vec(one + kMidForce) - load_vec(other + kMidForce));
-      seed(found.torque_one, load_vec(one + kMidTorque));
-      seed(found.torque_other, load_vec(other + kMidTorque));
-      for (int q = 0; q < Law::kHistory; ++q)
-        seed(memory[n][q], history_of(batch[n])[q]);
-      for (std::size_t j = 0; j < now.size(); ++j) seed(now[j], load_vec(history_of(batch[n]) + Law::kHistory + 3 * j));
-    }
+
+    const taped::Push found = push(contact);
+    const V* one = of_grain(mid_bar, pair.grain_one, kMid);
+    const V* other = of_grain(mid_bar, pair.grain_other, kMid);
+    V* bar = history_of(c);
+    seed(found.force, load_vec(one + kMidForce) - load_vec(other + kMidForce));
+    seed(found.torque_one, load_vec(one + kMidTorque));
+    seed(found.torque_other, load_vec(other + kMidTorque));
+    for (int q = 0; q < Law::kHistory; ++q) seed(memory[q], bar[q]);
+    for (std::size_t j = 0; j < now.size(); ++j) seed(now[j], load_vec(bar + Law::kHistory + 3 * j));
     recorded.reverse(mark);
-    for (int n = 0; n < count; ++n) {
-      const std::size_t c = batch[n];
-      V* to = history_of(c);
-      for (int q = 0; q < Law::kHistory; ++q) to[q] = recorded.bar(first[n] + kMeeting + q);
-      for (int q = Law::kHistory; q < remembered(problem); ++q) to[q] = V{};
-      for (std::size_t j = 0; j < leaves.size(); ++j) store_vec(to + Law::kHistory + 3 * j, bars(leaves[j]));
-      share_out(plan.candidate[c], first[n]);
-    }
+
+    for (int q = 0; q < Law::kHistory; ++q) bar[q] = recorded.bar(mark.slots + kMeeting + q);
+    for (int q = Law::kHistory; q < remembered(problem); ++q) bar[q] = V{};
+    for (std::size_t j = 0; j < leaves.size(); ++j) store_vec(bar + Law::kHistory + 3 * j, bars(leaves[j]));
+    share_out(pair, mark.slots);
   }
 
   // The bars of a meeting go to the two grains and spheres it was made from.
@@ -423,15 +402,16 @@ struct Adjoint {
 
   // The first half of a step, of one chunk of grains; `on_wall` is the bar of the force on either wall of an axis.
   void begin_back(int chunk, int step, Vec on_wall) {
-    recorded.rewind(1);
+    recorded.clear();
     const TapedParameters parameter(forward.parameter);
     const taped::GrainParameters constants(parameter.row);
     const TapedWalls walls(forward.walls_at(step));
-    const int mark = recorded.size(), spheres = problem.spheres_per_grain;
+    const auto mark = recorded.mark();
+    const int spheres = problem.spheres_per_grain;
     for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
       const V* s = state_of(step, u);
       const Grain g = grain_of(s);
-      const int first = recorded.size();
+      const int first = recorded.mark().slots;
       const taped::Grain grain{leaf(g.position), leaf(g.orientation), leaf(g.velocity),
                                leaf(g.spin), leaf(g.acceleration), leaf(g.spin_rate)};
       const taped::Midway m = begin_step(constants, grain);
@@ -456,7 +436,7 @@ struct Adjoint {
       for (int q = 0; q < kState; ++q) of_grain(state_bar, u, kState)[q] = recorded.bar(first + q);
       recorded.rewind(mark);
     }
-    recorded.reverse(1);
+    recorded.reverse({});
     parameter.add_bars(chunk_bar + static_cast<std::size_t>(chunk) * kParameters);
     V* to = wall_bar + static_cast<std::size_t>(chunk) * kWalls;
     for (int row = 0; row < kWalls; ++row) to[row] = V{};
@@ -482,12 +462,12 @@ struct Adjoint {
     for (int domain; team.take(Team::kContacts, rank, &domain);) contacts_back(domain, step);
     team.barrier();
 
-    recorded.rewind(1);
+    recorded.clear();
     const TapedWalls walls(forward.walls_at(step));
-    const int first = recorded.size();
+    const int first = recorded.mark().slots;
     const taped::Vec force = leaf(forward.mode.sum_walls(forward.walls, chunks()));
     seed(pressure(walls.box, force), pressure_bar);
-    recorded.reverse(1);
+    recorded.reverse({});
     const Vec on_wall = bars(first);
     V by_walls[kWalls] = {};
     walls.add_bars(by_walls);

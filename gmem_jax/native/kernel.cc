@@ -19,6 +19,7 @@ namespace GMEM_ISA {
 
 #include "simd.h"
 #include "vectors.h"
+#include "rotation.h"
 #include "laws.h"
 #include "contact.h"
 #include "motion.h"
@@ -31,6 +32,7 @@ namespace GMEM_ISA {
 namespace dual {
 #include "dual.h"
 #include "vectors.h"
+#include "rotation.h"
 #include "laws.h"
 #include "contact.h"
 #include "motion.h"
@@ -41,7 +43,7 @@ namespace dual {
 
 namespace taped {
 #include "tape.h"
-#include "vectors.h"
+#include "rotation.h"
 #include "laws.h"
 #include "contact.h"
 #include "motion.h"

@@ -1,64 +1,117 @@
-// Numbers that remember how they came about: a calculation with them can be gone through backwards, from derivatives
-// by its results to derivatives by its arguments ("bars"). Included inside a namespace of its own, ahead of what
-// calculates.
+// Numbers and vectors that remember how they came about: a calculation with them can be gone through backwards, from
+// derivatives by its results to derivatives by its arguments ("bars"). Included inside a namespace of its own, ahead of
+// what calculates, in place of vectors.h.
 
+using GVec = GMEM_ISA::Vec;
+
+enum class Operation : std::int32_t {
+  // of numbers
+  add, subtract, negate, multiply, divide, fma, fms, fnma, root, inverse_root, select,
+  // of vectors; `copy` puts three numbers together
+  vec_add, vec_subtract, vec_negate, scale, vec_fma, vec_fnma, dot, cross, add_cross, vec_select, copy
+};
+
+// What was calculated, in order. A slot holds one number; the slots of a vector follow each other.
 class Tape {
  public:
-  enum Operation : std::int32_t { kLeaf, kAdd, kSubtract, kNegate, kMultiply, kDivide, kFma, kFms, kFnma, kRoot,
-                                  kInverseRoot, kSelect };
+  struct Mark {
+    int nodes, slots;
+  };
 
-  Tape() { push(kLeaf, Real{}); }  // node 0 stands for all constants; its bar is of no interest
+  Tape() { slot(Real{}), slot(Real{}), slot(Real{}); }  // for all constants; their bars are of no interest
   ~Tape() { std::free(node_), std::free(value_), std::free(bar_); }
   Tape(const Tape&) = delete;
   Tape& operator=(const Tape&) = delete;
 
-  int size() const { return size_; }
-  void rewind(int size) { size_ = size; }
-  Real& bar(int index) { return bar_[index]; }
+  Mark mark() const { return {nodes_, slots_}; }
+  void rewind(Mark mark) { nodes_ = mark.nodes, slots_ = mark.slots; }
+  void clear() { rewind({0, 3}); }
+  Real& bar(int slot) { return bar_[slot]; }
 
-  int push(Operation operation, Real value, int a = 0, int b = 0, int c = 0) {
-    if (size_ == capacity_) grow();
-    node_[size_] = {operation, a, b, c};
-    value_[size_] = value;
-    bar_[size_] = Real{};
-    return size_++;
+  GMEM_INLINE int slot(Real value) {
+    if (__builtin_expect(slots_ + 3 > slot_capacity_, 0)) grow_slots();
+    value_[slots_] = value;
+    bar_[slots_] = Real{};
+    return slots_++;
   }
 
-  // From the bars of the last nodes to those of what they came from, down to node `first`.
-  void reverse(int first) {
-    for (int n = size_ - 1; n >= first; --n) {
-      const Node& node = node_[n];
-      const Real g = bar_[n];
-      Real &a = bar_[node.a], &b = bar_[node.b];
+  GMEM_INLINE int slot(const GVec& value) {
+    if (__builtin_expect(slots_ + 3 > slot_capacity_, 0)) grow_slots();
+    Real* v = value_ + slots_;
+    Real* b = bar_ + slots_;
+    v[0] = value.x, v[1] = value.y, v[2] = value.z;
+    b[0] = b[1] = b[2] = Real{};
+    slots_ += 3;
+    return slots_ - 3;
+  }
+
+  template <class Value>
+  GMEM_INLINE int push(Operation operation, const Value& value, int a, int b = 0, int c = 0) {
+    if (__builtin_expect(nodes_ == node_capacity_, 0)) grow_nodes();
+    const int result = slot(value);
+    node_[nodes_++] = {operation, result, a, b, c};
+    return result;
+  }
+
+  // Remember that the vector in `slot` is made of three numbers.
+  void copy(int slot, int x, int y, int z) {
+    if (nodes_ == node_capacity_) grow_nodes();
+    node_[nodes_++] = {Operation::copy, slot, x, y, z};
+  }
+
+  // From the bars of the last results to those of what they came from, back to `first`.
+  void reverse(Mark first) {
+    for (int n = nodes_ - 1; n >= first.nodes; --n) {
+      const Node node = node_[n];
+      const Real g = bar_[node.result];
+      Real* const a = bar_ + node.a;
+      Real* const b = bar_ + node.b;
+      Real* const c = bar_ + node.c;
+      const Real* const result = value_ + node.result;
       switch (node.operation) {
-        case kLeaf: break;
-        case kAdd: a += g, b += g; break;
-        case kSubtract: a += g, b -= g; break;
-        case kNegate: a -= g; break;
-        case kMultiply: product(node, g); break;
-        case kFma: product(node, g), bar_[node.c] += g; break;
-        case kFms: product(node, g), bar_[node.c] -= g; break;
-        case kFnma: product(node, -g), bar_[node.c] += g; break;
-        case kDivide: {
+        case Operation::add: *a += g, *b += g; break;
+        case Operation::subtract: *a += g, *b -= g; break;
+        case Operation::negate: *a -= g; break;
+        case Operation::multiply: product(node, g); break;
+        case Operation::fma: product(node, g), *c += g; break;
+        case Operation::fms: product(node, g), *c -= g; break;
+        case Operation::fnma: product(node, -g), *c += g; break;
+        case Operation::divide: {
           const Real by_a = g / value_[node.b];
-          a += by_a;
-          b = GMEM_ISA::fnma(by_a, value_[n], b);
+          *a += by_a;
+          *b = GMEM_ISA::fnma(by_a, *result, *b);
           break;
         }
-        case kRoot:  // at zero, where it has no derivative, zero
-          a += GMEM_ISA::zero_unless(value_[n] > Real{}, GMEM_ISA::splat(0.5) * g / value_[n]);
+        case Operation::root:  // at zero, where it has no derivative, zero
+          *a += GMEM_ISA::zero_unless(*result > Real{}, GMEM_ISA::splat(0.5) * g / *result);
           break;
-        case kInverseRoot: {
-          const Real y = value_[n];
-          a += guarded(g, GMEM_ISA::splat(-0.5) * (((g * y) * y) * y));
+        case Operation::inverse_root: {  // what is not wanted stays zero, even where its slope is infinite
+          const Real y = *result;
+          *a += GMEM_ISA::zero_unless(g != Real{}, GMEM_ISA::splat(-0.5) * (((g * y) * y) * y));
           break;
         }
-        case kSelect: {
+        case Operation::select: {
           const Mask m = (Mask)value_[node.c];
-          a += GMEM_ISA::zero_unless(m, g);
-          b += GMEM_ISA::zero_unless(~m, g);
+          *a += GMEM_ISA::zero_unless(m, g);
+          *b += GMEM_ISA::zero_unless(~m, g);
           break;
         }
+        case Operation::vec_add: add(a, vec_bar(node)), add(b, vec_bar(node)); break;
+        case Operation::vec_subtract: add(a, vec_bar(node)), add(b, -vec_bar(node)); break;
+        case Operation::vec_negate: add(a, -vec_bar(node)); break;
+        case Operation::scale: scaled(node, vec_bar(node)); break;
+        case Operation::vec_fma: scaled(node, vec_bar(node)), add(c, vec_bar(node)); break;
+        case Operation::vec_fnma: scaled(node, -vec_bar(node)), add(c, vec_bar(node)); break;
+        case Operation::dot: {
+          const GVec one = at(value_ + node.a), other = at(value_ + node.b);
+          put(a, GMEM_ISA::fma(g, other, at(a)));
+          put(b, GMEM_ISA::fma(g, one, at(b)));
+          break;
+        }
+        case Operation::cross: crossed(node, vec_bar(node)); break;
+        case Operation::add_cross: crossed(node, vec_bar(node)), add(c, vec_bar(node)); break;
+        case Operation::copy: *a += g, *b += bar_[node.result + 1], *c += bar_[node.result + 2]; break;
+        case Operation::vec_select: add(a, GMEM_ISA::zero_unless((Mask)value_[node.c], vec_bar(node))); break;
       }
     }
   }
@@ -66,33 +119,51 @@ class Tape {
  private:
   struct Node {
     Operation operation;
-    int a, b, c;
+    int result, a, b, c;
   };
+
+  static GVec at(const Real* p) { return GMEM_ISA::load_vec(p); }
+  static void put(Real* p, GVec a) { GMEM_ISA::store_vec(p, a); }
+  static void add(Real* to, GVec a) { put(to, at(to) + a); }
+  GVec vec_bar(const Node& node) const { return at(bar_ + node.result); }
 
   void product(const Node& node, Real g) {
     bar_[node.a] = GMEM_ISA::fma(g, value_[node.b], bar_[node.a]);
     bar_[node.b] = GMEM_ISA::fma(g, value_[node.a], bar_[node.b]);
   }
 
-  // A slope that is not wanted is zero, even where its factor is infinite.
-  static Real guarded(Real g, Real slope) { return GMEM_ISA::zero_unless(g != Real{}, slope); }
+  void scaled(const Node& node, GVec g) {
+    bar_[node.a] += GMEM_ISA::dot(g, at(value_ + node.b));
+    put(bar_ + node.b, GMEM_ISA::fma(value_[node.a], g, at(bar_ + node.b)));
+  }
 
-  void grow() {
-    const int capacity = capacity_ ? 2 * capacity_ : 4096;
-    grow(node_, capacity), grow(value_, capacity), grow(bar_, capacity);
-    capacity_ = capacity;
+  void crossed(const Node& node, GVec g) {
+    const GVec one = at(value_ + node.a), other = at(value_ + node.b);
+    put(bar_ + node.a, GMEM_ISA::add_cross(at(bar_ + node.a), other, g));
+    put(bar_ + node.b, GMEM_ISA::add_cross(at(bar_ + node.b), g, one));
+  }
+
+  __attribute__((noinline)) void grow_nodes() {
+    node_capacity_ = node_capacity_ ? 2 * node_capacity_ : 1024;
+    grow(node_, nodes_, node_capacity_);
+  }
+
+  __attribute__((noinline)) void grow_slots() {
+    slot_capacity_ = slot_capacity_ ? 2 * slot_capacity_ : 4096;
+    grow(value_, slots_, slot_capacity_);
+    grow(bar_, slots_, slot_capacity_);
   }
 
   template <class T>
-  void grow(T*& piece, int capacity) {
-    void* larger = std::aligned_alloc(64, sizeof(T) * capacity);
+  static void grow(T*& piece, int used, int capacity) {
+    void* larger = std::aligned_alloc(64, (sizeof(T) * capacity + 63) / 64 * 64);
     if (!larger) throw std::bad_alloc();
-    if (size_) std::memcpy(larger, piece, sizeof(T) * size_);
+    if (used) std::memcpy(larger, piece, sizeof(T) * used);
     std::free(piece);
     piece = static_cast<T*>(larger);
   }
 
-  int size_ = 0, capacity_ = 0;
+  int nodes_ = 0, slots_ = 0, node_capacity_ = 0, slot_capacity_ = 0;
   Node* node_ = nullptr;
   Real* value_ = nullptr;
   Real* bar_ = nullptr;
@@ -101,57 +172,52 @@ class Tape {
 // The tape on which this thread records.
 static thread_local Tape* tape __attribute__((tls_model("initial-exec"))) = nullptr;
 
-// A number on the tape, or a constant (index 0).
+// --- numbers
+
+// A number in a slot, or a constant (slot 0).
 struct V {
   Real value;
-  int index;
+  int slot;
   double operator[](int l) const { return value[l]; }
 };
 
-inline V leaf(Real value) { return {value, tape->push(Tape::kLeaf, value)}; }
-// The index of an operand whose value will be wanted.
-inline int kept(V a) { return a.index ? a.index : tape->push(Tape::kLeaf, a.value); }
+inline V leaf(Real value) { return {value, tape->slot(value)}; }
+// The slot of an operand whose value will be wanted.
+GMEM_INLINE int kept(V a) { return a.slot ? a.slot : tape->slot(a.value); }
 
 inline V splat(double a) { return {GMEM_ISA::splat(a), 0}; }
 inline V constant(Real a) { return {a, 0}; }
 
-inline V select(Mask m, V a, V b) {
+GMEM_INLINE V select(Mask m, V a, V b) {
   const Real value = m ? a.value : b.value;
-  if (!a.index && !b.index) return constant(value);
-  const int mask = tape->push(Tape::kLeaf, (Real)m);
-  return {value, tape->push(Tape::kSelect, value, a.index, b.index, mask)};
+  if (!a.slot && !b.slot) return constant(value);
+  return {value, tape->push(Operation::select, value, a.slot, b.slot, tape->slot((Real)m))};
 }
-inline V zero_unless(Mask m, V a) { return select(m, a, V{}); }
+GMEM_INLINE V zero_unless(Mask m, V a) { return select(m, a, V{}); }
 
-inline V operator+(V a, V b) {
-  const Real value = a.value + b.value;
-  return a.index || b.index ? V{value, tape->push(Tape::kAdd, value, a.index, b.index)} : constant(value);
+GMEM_INLINE V of_sum(Operation operation, Real value, V a, V b) {
+  return a.slot || b.slot ? V{value, tape->push(operation, value, a.slot, b.slot)} : constant(value);
 }
-inline V operator-(V a, V b) {
-  const Real value = a.value - b.value;
-  return a.index || b.index ? V{value, tape->push(Tape::kSubtract, value, a.index, b.index)} : constant(value);
-}
-inline V operator-(V a) { return a.index ? V{-a.value, tape->push(Tape::kNegate, -a.value, a.index)} : constant(-a.value); }
+GMEM_INLINE V operator+(V a, V b) { return of_sum(Operation::add, a.value + b.value, a, b); }
+GMEM_INLINE V operator-(V a, V b) { return of_sum(Operation::subtract, a.value - b.value, a, b); }
+GMEM_INLINE V operator-(V a) { return of_sum(Operation::negate, -a.value, a, V{}); }
 
-inline V of_product(Tape::Operation operation, Real value, V a, V b, V c) {
-  if (!a.index && !b.index && !c.index) return constant(value);
+GMEM_INLINE V of_product(Operation operation, Real value, V a, V b, V c) {
+  if (!a.slot && !b.slot && !c.slot) return constant(value);
   const int one = kept(a), other = kept(b);
-  return {value, tape->push(operation, value, one, other, c.index)};
+  return {value, tape->push(operation, value, one, other, c.slot)};
 }
-inline V operator*(V a, V b) { return of_product(Tape::kMultiply, a.value * b.value, a, b, V{}); }
-inline V operator/(V a, V b) { return of_product(Tape::kDivide, a.value / b.value, a, b, V{}); }
-inline V fma(V a, V b, V c) { return of_product(Tape::kFma, GMEM_ISA::fma(a.value, b.value, c.value), a, b, c); }
-inline V fms(V a, V b, V c) { return of_product(Tape::kFms, GMEM_ISA::fms(a.value, b.value, c.value), a, b, c); }
-inline V fnma(V a, V b, V c) { return of_product(Tape::kFnma, GMEM_ISA::fnma(a.value, b.value, c.value), a, b, c); }
+GMEM_INLINE V operator*(V a, V b) { return of_product(Operation::multiply, a.value * b.value, a, b, V{}); }
+GMEM_INLINE V operator/(V a, V b) { return of_product(Operation::divide, a.value / b.value, a, b, V{}); }
+GMEM_INLINE V fma(V a, V b, V c) { return of_product(Operation::fma, GMEM_ISA::fma(a.value, b.value, c.value), a, b, c); }
+GMEM_INLINE V fms(V a, V b, V c) { return of_product(Operation::fms, GMEM_ISA::fms(a.value, b.value, c.value), a, b, c); }
+GMEM_INLINE V fnma(V a, V b, V c) { return of_product(Operation::fnma, GMEM_ISA::fnma(a.value, b.value, c.value), a, b, c); }
 
-inline V root(V a) {
-  const Real value = GMEM_ISA::root(a.value);
-  return a.index ? V{value, tape->push(Tape::kRoot, value, a.index)} : constant(value);
+GMEM_INLINE V of_root(Operation operation, Real value, V a) {
+  return a.slot ? V{value, tape->push(operation, value, a.slot)} : constant(value);
 }
-inline V inverse_root(V a) {
-  const Real value = GMEM_ISA::inverse_root(a.value);
-  return a.index ? V{value, tape->push(Tape::kInverseRoot, value, a.index)} : constant(value);
-}
+GMEM_INLINE V root(V a) { return of_root(Operation::root, GMEM_ISA::root(a.value), a); }
+GMEM_INLINE V inverse_root(V a) { return of_root(Operation::inverse_root, GMEM_ISA::inverse_root(a.value), a); }
 
 inline Mask operator<(V a, V b) { return a.value < b.value; }
 inline Mask operator>(V a, V b) { return a.value > b.value; }
@@ -161,3 +227,60 @@ inline V max(V a, V b) { return constant(GMEM_ISA::max(a.value, b.value)); }  //
 inline double largest(V a) { return GMEM_ISA::largest(a.value); }
 inline double smallest(V a) { return GMEM_ISA::smallest(a.value); }
 inline V floor_of(V a) { return constant(GMEM_ISA::floor_of(a.value)); }
+
+// --- vectors
+
+struct Vec {
+  V x, y, z;
+
+  GVec value() const { return {x.value, y.value, z.value}; }
+  bool constant() const { return !x.slot && !y.slot && !z.slot; }
+};
+
+GMEM_INLINE Vec in_slots(const GVec& a, int slot) { return {{a.x, slot}, {a.y, slot + 1}, {a.z, slot + 2}}; }
+inline Vec leaf(GVec a) { return in_slots(a, tape->slot(a)); }
+inline Vec constant(GVec a) { return {constant(a.x), constant(a.y), constant(a.z)}; }
+
+// The first slot of a vector; one that was put together from numbers is copied.
+GMEM_INLINE int first_slot(const Vec& a) {
+  if (a.x.slot && a.y.slot == a.x.slot + 1 && a.z.slot == a.x.slot + 2) return a.x.slot;
+  const int slot = tape->slot(a.value());
+  if (!a.constant()) tape->copy(slot, a.x.slot, a.y.slot, a.z.slot);
+  return slot;
+}
+
+GMEM_INLINE Vec vec_of(Operation operation, GVec value, int a, int b = 0, int c = 0) {
+  return in_slots(value, tape->push(operation, value, a, b, c));
+}
+
+GMEM_INLINE Vec operator+(const Vec& a, const Vec& b) {
+  return vec_of(Operation::vec_add, a.value() + b.value(), first_slot(a), first_slot(b));
+}
+GMEM_INLINE Vec operator-(const Vec& a, const Vec& b) {
+  return vec_of(Operation::vec_subtract, a.value() - b.value(), first_slot(a), first_slot(b));
+}
+GMEM_INLINE Vec operator-(const Vec& a) { return vec_of(Operation::vec_negate, -a.value(), first_slot(a)); }
+GMEM_INLINE Vec operator*(V s, const Vec& a) { return vec_of(Operation::scale, s.value * a.value(), kept(s), first_slot(a)); }
+GMEM_INLINE Vec zero_unless(Mask m, const Vec& a) {
+  return vec_of(Operation::vec_select, GMEM_ISA::zero_unless(m, a.value()), first_slot(a), 0, tape->slot((Real)m));
+}
+GMEM_INLINE Vec fma(V s, const Vec& a, const Vec& b) {
+  return vec_of(Operation::vec_fma, GMEM_ISA::fma(s.value, a.value(), b.value()), kept(s), first_slot(a), first_slot(b));
+}
+GMEM_INLINE Vec fnma(V s, const Vec& a, const Vec& b) {
+  return vec_of(Operation::vec_fnma, GMEM_ISA::fnma(s.value, a.value(), b.value()), kept(s), first_slot(a), first_slot(b));
+}
+GMEM_INLINE V dot(const Vec& a, const Vec& b) {
+  const Real value = GMEM_ISA::dot(a.value(), b.value());
+  return {value, tape->push(Operation::dot, value, first_slot(a), first_slot(b))};
+}
+GMEM_INLINE Vec cross(const Vec& a, const Vec& b) {
+  return vec_of(Operation::cross, GMEM_ISA::cross(a.value(), b.value()), first_slot(a), first_slot(b));
+}
+GMEM_INLINE Vec add_cross(const Vec& c, const Vec& a, const Vec& b) {
+  return vec_of(Operation::add_cross, GMEM_ISA::add_cross(c.value(), a.value(), b.value()), first_slot(a), first_slot(b),
+                first_slot(c));
+}
+
+inline Vec load_vec(const V* p) { return {p[0], p[1], p[2]}; }
+inline void store_vec(V* p, const Vec& a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
