@@ -8,6 +8,9 @@ import jax
 from jax import lax
 
 
+SHORT = 32  # carries that one level may keep
+
+
 def inner_length(length: int) -> int:
     """The largest divisor of `length` that is not above its square root (1 for a prime)."""
     return next(part for part in range(math.isqrt(max(1, length)), 0, -1) if length % part == 0)
@@ -16,7 +19,8 @@ def inner_length(length: int) -> int:
 def scan(body: Callable[[Any, jax.Array], tuple[Any, Any]], carry: Any, xs: jax.Array) -> tuple[Any, Any]:
     """`jax.lax.scan` over xs [n] in blocks of blocks: reverse mode keeps about 2 sqrt(n) carries instead of n.
 
-    The price is one more evaluation of the body. Forward evaluation and forward mode are those of one scan.
+    The price is one more evaluation of the body, which short scans are spared. Forward evaluation and forward mode are
+    those of one scan.
 
     Args:
         body: as for `jax.lax.scan`.
@@ -24,7 +28,7 @@ def scan(body: Callable[[Any, jax.Array], tuple[Any, Any]], carry: Any, xs: jax.
         xs: as for `jax.lax.scan`, one array.
     """
     one = jax.checkpoint(body)
-    inner = inner_length(xs.shape[0])
+    inner = inner_length(xs.shape[0]) if xs.shape[0] > SHORT else 1
     if inner == 1:
         return lax.scan(one, carry, xs)
 

@@ -51,7 +51,7 @@ def test_nested_checkpoints_change_neither_values_nor_derivatives() -> None:
         def body(x: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
             return jnp.sin(x) + 0.1 * k, x * k
 
-        end, seen = scan(body, start, jnp.arange(12))
+        end, seen = scan(body, start, jnp.arange(48))
         return end + jnp.sum(seen)
 
     assert checkpoint.inner_length(12) == 3

@@ -75,23 +75,6 @@ def test_a_replica_is_bitwise_the_same_in_any_place_of_a_batch() -> None:
     np.testing.assert_array_equal(everyone[..., 3], few[..., 2])
 
 
-def test_derivatives_are_those_of_the_definition() -> None:
-    def end(advance: native.Advance, mu: jax.Array) -> jax.Array:
-        system = System(PACK.clump, gm.Hooke(mu=mu), PACK.pairs)
-        state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
-        motion = Motion(PACK.lower[:, None], PACK.upper[:, None], 0.05, 0.0, 1.0, 60.0)
-        _, sample = advance(system, state, motion, 0.3, bins=2, steps=100)
-        return 1e3 * jnp.sum(sample.pressure[-1])
-
-    mu = jnp.asarray(0.3)
-    for derivative in (jax.grad, jax.jacfwd):
-        fast, plain = (
-            jax.jit(derivative(lambda m, a=advance: end(a, m)))(mu) for advance in (native.advance, dynamics.advance)
-        )
-        assert abs(float(plain)) > 1e-3
-        np.testing.assert_allclose(fast, plain, rtol=1e-8)
-
-
 def test_vmap_makes_lanes() -> None:
     def end(mu: jax.Array) -> jax.Array:
         return compress(native.advance, gm.Hooke(mu=mu), 1)[0].grains.position

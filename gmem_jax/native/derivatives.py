@@ -87,34 +87,32 @@ def _shapes(call: Call, arguments: Sequence[Any]) -> tuple[Arrays, Results]:
 
 def forward(call: Call, fixed: Fixed, arrays: Arrays) -> Results:
     """All steps; not differentiable by itself."""
-    arguments = _arguments(fixed, arrays)
-    outputs = _shapes(call, arguments)[1]
-    results = jax.ffi.ffi_call(
-        "gmem_advance",
-        _flat(outputs),
-        vmap_method="expand_dims",
-        input_output_aliases={_FIELDS + 9 + leaf: _FIELDS + 1 + leaf for leaf in range(call.leaves)},
-    )(*arguments, **call._asdict())
-    return Results(results[:_FIELDS], results[_FIELDS], results[_FIELDS + 1 :])
+    return _results(_forward_p.bind(*_arguments(fixed, arrays), call=call))
 
 
 def tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> Results:
     """The derivative of `forward` along a direction, linear in it; the steps of all replicas are those of `walls`."""
-    results = _tangent_p.bind(*_arguments(fixed, arrays), *_flat(along), call=call)
-    return Results(results[:_FIELDS], results[_FIELDS], results[_FIELDS + 1 :])
+    return _results(_tangent_p.bind(*_arguments(fixed, arrays), *_flat(along), call=call))
+
+
+def _results(arrays: Sequence[jax.Array]) -> Results:
+    return Results(arrays[:_FIELDS], arrays[_FIELDS], arrays[_FIELDS + 1 :])
 
 
 def _flat(arrays: Arrays | Results) -> list[Any]:
     return jax.tree.leaves(tuple(arrays))
 
 
-def _primitive(target: str, outputs: Callable[[Call, Sequence[Any]], list[Any]]) -> Primitive:
+def _primitive(
+    target: str, outputs: Callable[[Call, Sequence[Any]], list[Any]], aliases: Callable[[Call], dict[int, int]]
+) -> Primitive:
     """A call into the library whose arguments may have leading axes, of size one where there is nothing to share out."""
     primitive = Primitive(target)
     primitive.multiple_results = True
 
     def run(*arguments: Any, call: Call) -> Any:
-        return jax.ffi.ffi_call(target, outputs(call, arguments))(*arguments, **call._asdict())
+        shapes = outputs(call, arguments)
+        return jax.ffi.ffi_call(target, shapes, input_output_aliases=aliases(call))(*arguments, **call._asdict())
 
     def abstract(*arguments: Any, call: Call) -> list[Any]:
         return [jax.core.ShapedArray(output.shape, output.dtype) for output in outputs(call, arguments)]
@@ -135,8 +133,22 @@ def _primitive(target: str, outputs: Callable[[Call, Sequence[Any]], list[Any]])
     return primitive
 
 
-_tangent_p = _primitive("gmem_tangent", lambda call, arguments: _flat(_shapes(call, arguments)[1]))
-_adjoint_p = _primitive("gmem_adjoint", lambda call, arguments: _flat(_shapes(call, arguments)[0]))
+def _of_results(call: Call, arguments: Sequence[Any]) -> list[Any]:
+    return _flat(_shapes(call, arguments)[1])
+
+
+def _of_arrays(call: Call, arguments: Sequence[Any]) -> list[Any]:
+    return _flat(_shapes(call, arguments)[0])
+
+
+def _in_place(call: Call) -> dict[int, int]:
+    """Histories, much the largest arrays, are updated where they are."""
+    return {_FIELDS + 9 + leaf: _FIELDS + 1 + leaf for leaf in range(call.leaves)}
+
+
+_forward_p = _primitive("gmem_advance", _of_results, _in_place)
+_tangent_p = _primitive("gmem_tangent", _of_results, lambda _: {})
+_adjoint_p = _primitive("gmem_adjoint", _of_arrays, lambda _: {})
 
 
 def _transpose(slopes: Sequence[Any], *arguments: Any, call: Call) -> list[Any]:
@@ -164,4 +176,5 @@ def _no_second(primals: Any, tangents: Any, **_: Any) -> Any:
     raise NotImplementedError("second derivatives are not in the native backend; use backend='jax'")
 
 
-ad.primitive_jvps[_tangent_p] = ad.primitive_jvps[_adjoint_p] = _no_second
+for _primitive_p in (_forward_p, _tangent_p, _adjoint_p):
+    ad.primitive_jvps[_primitive_p] = _no_second
