@@ -1,14 +1,17 @@
-"""The Jacobian of a recall by 16 amplitudes, gamma0, mu and k_H against central differences over step sizes.
+"""Derivatives through a whole experiment against central differences over step sizes, and forward against reverse.
 
 python experiments/gradient_check.py [-o gradient_check] [--pack tetra-325-a] [--t0 1800]
 
-Also the error against the horizon: the derivative of p_xy in every bin from the encoding on. At t0 = 1,800 t_c the
-exact Jacobian takes some twenty minutes on one core, each step size of the differences one minute.
+Three tables and one picture: the Jacobian of a recall by 16 amplitudes, gamma0, mu and k_H; the gradient of the
+fidelity of the six signals by their amplitudes, gamma0, mu and k_H, in both modes; and the error of the pressures'
+derivatives against the number of steps they have come through. At t0 = 1,800 t_c some fifteen minutes on two cores.
 """
 
 import argparse
 import csv
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +19,11 @@ import matplotlib
 import numpy as np
 
 import gmem_jax as gm
-from gmem_jax import jacobian
+from gmem_jax import gradient, jacobian, sweep
 
 AMPLITUDES = 16
 STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+SCALARS = ("gamma0", "mu", "stiffness")
 
 
 def waveform() -> gm.Bumps:
@@ -29,34 +33,120 @@ def waveform() -> gm.Bumps:
     return gm.Bumps(jnp.asarray([heights / np.abs(heights).max()]), jnp.asarray([centres]), 2.0 / (AMPLITUDES + 1))
 
 
-def horizon_error(exact: jacobian.Jacobian, other: jacobian.Jacobian) -> np.ndarray:
-    """|exact - other| / |other| of p_xy in every bin over the amplitudes, [bins]."""
-    one, two = exact.p_xy[:AMPLITUDES], other.p_xy[:AMPLITUDES]
-    error: np.ndarray = np.linalg.norm(one - two, axis=0) / np.linalg.norm(two, axis=0)
-    return error
+def say(stage: str, _: float, fraction: float) -> None:
+    """Progress in one line."""
+    print(f"\r{fraction:5.0%}  {stage:24}", end="\n" if fraction >= 1.0 else "", flush=True)
 
 
-def draw(path: Path, table: dict[float, dict[str, float]], horizons: dict[float, np.ndarray], steps: int) -> None:
+def check_jacobian(experiment: gm.Experiment) -> tuple[dict[float, dict[str, float]], dict[float, np.ndarray]]:
+    """Misses of the Jacobian by step size; and those of dp_xy / da in every bin from the encoding on."""
+    exact = jacobian.exact(experiment, progress=say)
+    table, by_bin = {}, {}
+    for step in STEPS:
+        other = jacobian.differences(experiment, step)
+        table[step] = jacobian.mismatch(exact, other)
+        one, two = exact.p_xy[:AMPLITUDES], other.p_xy[:AMPLITUDES]
+        by_bin[step] = np.linalg.norm(one - two, axis=0) / np.linalg.norm(two, axis=0)
+    return table, by_bin
+
+
+def check_prefix(experiment: gm.Experiment) -> dict[float, np.ndarray]:
+    """Misses of dp / d mu in every bin from the very beginning, by step size."""
+    law: Any = experiment.friction
+
+    def make(mu: Any) -> gm.Experiment:
+        return replace(experiment, friction=replace(law, mu=mu))
+
+    def joined(pressure: Any) -> np.ndarray:
+        return np.concatenate([np.asarray(pressure[name])[..., -1] for name in pressure])
+
+    exact = joined(gradient.push(make, jnp.asarray(law.mu), jnp.asarray(1.0), progress=say).slope)
+    by_bin = {}
+    for step in STEPS:
+        sides = []
+        for sign in (1.0, -1.0):
+            changed = make(law.mu * (1.0 + sign * step))
+            recall = gm.run_memory(
+                changed.pack, changed.signals, friction=changed.friction, t0=changed.timing.t0, gamma0=changed.gamma0
+            )
+            sides.append(joined({name: sample.pressure for name, sample in recall.stages.items()}))
+        slope = (sides[0] - sides[1]) / (2.0 * step * law.mu)
+        by_bin[step] = np.linalg.norm(exact - slope, axis=1) / np.linalg.norm(slope, axis=1)
+    return by_bin
+
+
+def check_fidelity(experiment: gm.Experiment) -> tuple[list[list[Any]], float]:
+    """Rows (parameter, exact, difference at each step) of dF; and how far forward and reverse mode are apart."""
+    signals, law = experiment.signals, experiment.friction
+    assert isinstance(signals, gm.Bumps)
+
+    def make(theta: Any) -> gm.Experiment:
+        friction = replace(law, mu=theta["mu"], stiffness=theta["stiffness"])  # type: ignore[type-var]
+        shapes = replace(signals, amplitudes=theta["amplitudes"])
+        return replace(experiment, signals=shapes, gamma0=theta["gamma0"], friction=friction)
+
+    chosen: Any = law
+    theta = {"amplitudes": signals.amplitudes, "gamma0": 1e-3, "mu": chosen.mu, "stiffness": chosen.stiffness}
+    theta = jax.tree.map(jnp.asarray, theta)
+    reverse = gm.value_and_grad(make, theta, progress=say)
+    toss = np.random.default_rng(0).normal(size=signals.amplitudes.shape)
+    direction = {"amplitudes": jnp.asarray(toss), **{name: theta[name] for name in SCALARS}}
+    pushed = gradient.push(make, theta, direction, progress=say)
+
+    def score(theta: Any, p_sig: jax.Array) -> jax.Array:
+        return make(theta).fidelity(p_sig)
+
+    _, forward = jax.jvp(score, (theta, pushed.p_sig), (direction, pushed.p_sig_slope))
+    back = sum(float(jnp.vdot(direction[name], reverse.slope[name])) for name in theta)
+
+    def fidelity(theta: Any) -> float:
+        changed = make(theta)
+        return float(changed.fidelity(sweep.simulate(changed)[0]))
+
+    along = {"amplitudes": {"amplitudes": direction["amplitudes"]}, **{name: {name: theta[name]} for name in SCALARS}}
+    rows: list[list[Any]] = []
+    for name, move in along.items():
+        exact = float(jnp.vdot(move[name], reverse.slope[name]))
+        differences = []
+        for step in STEPS:
+            up, down = ({**theta, name: theta[name] + sign * step * move[name]} for sign in (1.0, -1.0))
+            differences.append((fidelity(up) - fidelity(down)) / (2.0 * step))
+        rows.append([name, exact, *differences])
+    return rows, abs(back - float(forward)) / abs(float(forward))
+
+
+def draw(
+    path: Path,
+    table: dict[float, dict[str, float]],
+    sheared: dict[float, np.ndarray],
+    whole: dict[float, np.ndarray],
+    steps: int,
+) -> None:
     """Error against step size and against horizon."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3.9))
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(14, 3.9))
     for group in next(iter(table.values())):
         left.loglog(list(table), [row[group] for row in table.values()], "o-", markersize=4, label=group)
     left.axhline(0.01, color="0.7", linewidth=0.8)
     left.set(xlabel="relative step of the differences", ylabel="|exact - differences| / |differences|")
+    left.set_title("Jacobian of p_sig", fontsize=9)
     left.legend(fontsize=7, frameon=False)
-    for step, error in horizons.items():
-        right.loglog(steps * (1 + np.arange(error.size)), error, linewidth=0.8, label=f"step {step:g}")
-    right.set(xlabel="steps since the encoding began", ylabel="error of dp_xy / da")
-    right.legend(fontsize=7, frameon=False)
+    for axis, errors, since, what in (
+        (middle, sheared, "the encoding", "dp_xy / da"),
+        (right, whole, "the experiment", "dp / d mu"),
+    ):
+        for step, error in errors.items():
+            axis.loglog(steps * (1 + np.arange(error.size)), error, linewidth=0.8, label=f"step {step:g}")
+        axis.set(xlabel=f"steps since {since} began", ylabel=f"error of {what}")
+        axis.legend(fontsize=7, frameon=False)
     figure.tight_layout()
     figure.savefig(path, dpi=150)
 
 
 def main() -> None:
-    """Compute both, print and draw the comparison."""
+    """Compute all, print and draw the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("gradient_check"), help="folder to write to")
     parser.add_argument("--pack", default="tetra-325-a")
@@ -67,24 +157,25 @@ def main() -> None:
 
     timing = gm.Timing(t0=arguments.t0)
     experiment = gm.Experiment(gm.load_pack(arguments.pack), waveform(), timing=timing)
-    stages: list[str] = []
-
-    def say(stage: str, _: float, fraction: float) -> None:
-        if stages[-1:] != [stage]:
-            stages.append(stage)
-            print(f"{fraction:5.0%}  {stage}", flush=True)
-
-    exact = jacobian.exact(experiment, progress=say)
-    differences = {step: jacobian.differences(experiment, step) for step in STEPS}
-    table = {step: jacobian.mismatch(exact, other) for step, other in differences.items()}
-    with (arguments.output / "gradient_check.csv").open("w", newline="") as file:
+    table, sheared = check_jacobian(experiment)
+    with (arguments.output / "jacobian.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["step", *next(iter(table.values()))])
         for step, row in table.items():
             writer.writerow([step, *row.values()])
             print(f"{step:8.0e}  " + "  ".join(f"{group} {error:.1e}" for group, error in row.items()))
-    horizons = {step: horizon_error(exact, other) for step, other in differences.items()}
-    draw(arguments.output / "gradient_check.png", table, horizons, timing.steps)
+    whole = check_prefix(experiment)
+    draw(arguments.output / "gradient_check.png", table, sheared, whole, timing.steps)
+
+    rows, apart = check_fidelity(replace(experiment, signals=gm.six_signals()))
+    with (arguments.output / "fidelity.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["along", "exact", *(f"step {step:g}" for step in STEPS)])
+        writer.writerows(rows)
+    print("dF along (in parts of each parameter), exact, and by differences with steps " + " ".join(map(str, STEPS)))
+    for name, *numbers in rows:
+        print(f"{name:10}  " + "  ".join(f"{number:12.5e}" for number in numbers))
+    print(f"forward against reverse mode: {apart:.1e}")
 
 
 if __name__ == "__main__":
