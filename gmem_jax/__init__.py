@@ -10,7 +10,7 @@ from gmem_jax.contact.frictionless import Frictionless
 from gmem_jax.contact.hooke import Hooke
 from gmem_jax.contact.mindlin import Mindlin
 from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.design import Design, design_waveforms
+from gmem_jax.design import Design, Drive, design_drive, design_waveforms
 from gmem_jax.experiment import Experiment, Timing
 from gmem_jax.gradient import value_and_grad
 from gmem_jax.grain import Clump, clump, sphere, tetra
@@ -37,6 +37,7 @@ __all__ = [
     "Bumps",
     "Clump",
     "Design",
+    "Drive",
     "Experiment",
     "FileFormatError",
     "Frictionless",
@@ -55,6 +56,7 @@ __all__ = [
     "Timing",
     "classify",
     "clump",
+    "design_drive",
     "design_waveforms",
     "explain",
     "fidelity",

@@ -26,19 +26,22 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gmem_jax import lammps, native
+from gmem_jax import lammps, native, sweep
 from gmem_jax.contact.friction import FrictionLaw
 from gmem_jax.contact.hooke import Hooke
 from gmem_jax.contact.mindlin import Mindlin
 from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.drive import Motion, clock
 from gmem_jax.dynamics import System, start
+from gmem_jax.experiment import Experiment, Timing
+from gmem_jax.gradient import value_and_grad
 from gmem_jax.neighbors import PairFinder
 from gmem_jax.pack import SKIN, Pack, smallest_box
 from gmem_jax.provenance import provenance
+from gmem_jax.response import bumps
 from gmem_jax.rotation import matrix
 from gmem_jax.run import compiled_advance, worst
-from gmem_jax.signals import Bumps
+from gmem_jax.signals import Bumps, six_signals
 from gmem_jax.state import Grains, Status, explain, replicate, still_box
 
 LAWS: dict[str, Hooke | MindlinRescaled | Mindlin] = {"H": Hooke(), "M1": MindlinRescaled(), "M2": Mindlin()}
@@ -211,6 +214,11 @@ def _peak_memory(load: Callable[[str], Pack], name: str, backend: str, law: str,
     system, state, motion, dt, steps = encode(load(name), LAWS[law], replicas)
     move = compiled_advance(backend)
     jax.block_until_ready(move(system, state, motion, dt, bins=1, steps=steps))
+    return _peak_bytes()
+
+
+def _peak_bytes() -> int:
+    """Peak resident bytes of this process."""
     status = Path("/proc/self/status")
     if status.is_file():  # Linux lets ru_maxrss of a child begin with its parent's
         return next(1024 * int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM"))
@@ -225,6 +233,41 @@ def memory(load: Callable[[str], Pack], name: str, grains: int, backend: str, la
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             peaks.append(pool.submit(_peak_memory, load, name, backend, law, count).result())
     return (peaks[1] - peaks[0]) / (grains * (replicas - replicas // 2))
+
+
+def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int, t0: float) -> dict[str, float]:
+    jax.config.update("jax_enable_x64", True)
+    experiment = Experiment(load(name), six_signals(), timing=Timing(t0=t0, backend=backend))
+    amplitudes = jnp.asarray(np.random.default_rng(0).normal(scale=0.2, size=(6, values)))
+
+    def make(amplitudes: Any) -> Experiment:
+        return replace(experiment, signals=bumps(amplitudes, 0.2))
+
+    def seconds(run: Callable[[], Any]) -> float:
+        taken = []
+        for _ in range(2):  # the first compiles
+            began = time.perf_counter()
+            jax.block_until_ready(run())
+            taken.append(time.perf_counter() - began)
+        return min(taken)
+
+    forward = seconds(lambda: sweep.simulate(make(amplitudes)))
+    before = _peak_bytes()
+    reverse = seconds(lambda: value_and_grad(make, amplitudes).slope)
+    return {"forward_s": forward, "gradient_s": reverse, "forward_bytes": before, "gradient_bytes": _peak_bytes()}
+
+
+def gradient_cost(
+    load: Callable[[str], Pack], name: str, backend: str, *, values: int = 32, t0: float = T0
+) -> dict[str, float]:
+    """Seconds and peak memory of the gradient of F by `values` numbers of each of the six waveforms, whole experiment.
+
+    Returns:
+        "forward_s" of one run of the same replicas, "gradient_s", and the peak resident bytes of the process after
+        each; the process is a fresh one.
+    """
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(_gradient, load, name, backend, values, t0).result()
 
 
 def disagreements(rows: Sequence[Row], scale: float = 2e-3) -> list[str]:
@@ -262,7 +305,7 @@ def run(
         say: see `Say`.
 
     Returns:
-        The machine, rows, cost against N, bytes per grain and replica; see `markdown`.
+        The machine, rows, cost against N, bytes per grain and replica, cost of a gradient; see `markdown`.
 
     Raises:
         RuntimeError: if backends disagree.
@@ -298,6 +341,8 @@ def run(
     say("memory", 0.95)
     largest = max(loaded, key=lambda name: loaded[name].grains)
     use = {law: memory(load, largest, loaded[largest].grains, backends[0], law) for law in laws if law != "M2"}
+    say("gradient", 0.97)
+    gradient = gradient_cost(load, packs[0], backends[0])
     if wrong := disagreements(rows):
         raise RuntimeError("backends disagree: " + "; ".join(wrong))
     return {
@@ -308,6 +353,7 @@ def run(
         "rows": [asdict(row) for row in rows],
         "growth": [asdict(row) for row in growth],
         "bytes_per_grain_replica": use,
+        "gradient": {"grains": first.grains, **gradient},
     }
 
 
@@ -364,7 +410,16 @@ def markdown(result: dict[str, Any], baseline: dict[str, Any] | None = None) -> 
             f"| {eight['us']:.4f} | {eight['us'] / eights[0]['us']:.2f} |"
         )
     use = ", ".join(f"{law} {bytes_ / 1e3:.2f} kB" for law, bytes_ in result["bytes_per_grain_replica"].items())
-    return "\n".join([*lines, "", f"Memory per grain and replica: {use}.", ""])
+    lines += ["", f"Memory per grain and replica: {use}."]
+    if gradient := result.get("gradient"):
+        lines += [
+            "",
+            f"Gradient of F by 6 x 32 waveform values, whole experiment, N = {gradient['grains']}, t0 = {T0:g}: "
+            f"{gradient['gradient_s']:.1f} s, one forward run {gradient['forward_s']:.1f} s, "
+            f"ratio {gradient['gradient_s'] / gradient['forward_s']:.1f}; peak memory of the process "
+            f"{gradient['gradient_bytes'] / 1e9:.2f} GB, {gradient['forward_bytes'] / 1e9:.2f} GB before.",
+        ]
+    return "\n".join([*lines, ""])
 
 
 def _is_rival(rival: dict[str, Any], row: dict[str, Any]) -> bool:

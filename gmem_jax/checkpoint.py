@@ -7,7 +7,6 @@ from typing import Any
 import jax
 from jax import lax
 
-
 SHORT = 32  # carries that one level may keep
 
 

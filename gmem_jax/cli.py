@@ -446,8 +446,8 @@ def design_command(
     pack: PackName,
     output: Output = Path("designed.csv"),
     signals: SignalFile = "six",
-    iterations: Annotated[int, typer.Option(min=1, help="Simulated corrections.")] = 6,
-    gain: Annotated[float | None, typer.Option(help="Wanted gain; default 0.55 of the untouched waveforms'.")] = None,
+    iterations: Annotated[int, typer.Option(min=1, help="Corrections; each takes a Jacobian.")] = 3,
+    gain: Annotated[float | None, typer.Option(help="Wanted gain; default half of the untouched waveforms'.")] = None,
     friction: Law = "hooke",
     mu: Mu = 1.0,
     gamma0: Gamma0 = 1e-3,
@@ -458,7 +458,7 @@ def design_command(
     picture: Picture = True,
     as_json: AsJson = False,
 ) -> None:
-    """Pre-distort waveforms so that the recall follows their integrals; writes a CSV for `gmem recall --signals`."""
+    """Pre-distort waveforms so that the recall follows their integrals; writes a CSV for `gmem recall` (minutes)."""
     config = _given(locals())
     _writable(output)
     began = time.perf_counter()
@@ -468,6 +468,38 @@ def design_command(
     result = {**result, "seconds": time.perf_counter() - began, "status": 0}
     line = f"F of the recall with respect to the wanted J: {result['before']:.4f} -> {result['fidelity']:.4f}"
     _emit(as_json, result, f"{line} (gain {result['gain']:.3f}); wrote {output}")
+
+
+@app.command("tune")
+def tune_command(
+    packs: Annotated[str, typer.Argument(help="Pack files or names of shipped packs, separated by commas.")],
+    output: Output = Path("tuned.json"),
+    bounds: Annotated[
+        str, typer.Option(help="Lowest and highest value of gamma0, mu or stiffness, as in mu=0.5:2,gamma0=3e-4:3e-3.")
+    ] = "gamma0=3e-4:3e-3,mu=0.5:2,stiffness=0.07:0.29",
+    signals: SignalFile = "six",
+    iterations: Annotated[int, typer.Option(min=1, help="Steps; each 7 runs a pack.")] = 6,
+    friction: Law = "hooke",
+    mu: Mu = 1.0,
+    gamma0: Gamma0 = 1e-3,
+    t0: T0 = 1.8e3,
+    rest: Rest = 0.2,
+    hold: Hold = 0.2,
+    store: Store = 2.0,
+    picture: Picture = True,
+    as_json: AsJson = False,
+) -> None:
+    """Choose gamma0, mu and the friction stiffness within bounds so that the mean fidelity of packs grows."""
+    names, limits = packs.split(","), derive.parse_bounds(bounds)
+    config = _given({**locals(), "pack": names[0]})
+    _writable(output)
+    began = time.perf_counter()
+    drawn = output.with_suffix(".png") if picture else None
+    with _progress() as progress:
+        result = derive.run_tune(config, names, limits, output, drawn, iterations, progress)
+    result = {**result, "seconds": time.perf_counter() - began, "status": 0}
+    found = ", ".join(f"{name} = {value:.4g}" for name, value in result["values"].items())
+    _emit(as_json, result, f"mean F {result['before']:.4f} -> {result['fidelity']:.4f} with {found}; wrote {output}")
 
 
 def _first_problem(error: ValidationError) -> str:

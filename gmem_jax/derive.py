@@ -1,5 +1,6 @@
-"""What `gmem gradient`, `gmem kernel` and `gmem design` do, apart from reading the command line."""
+"""What `gmem gradient`, `gmem kernel`, `gmem design` and `gmem tune` do, apart from reading the command line."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,12 @@ from gmem_jax import design, gradient, plot_gradient, response, storage, sweep
 from gmem_jax.config import RecallConfig
 from gmem_jax.experiment import Experiment, Timing
 from gmem_jax.material import Material
+from gmem_jax.provenance import provenance
 from gmem_jax.run import Progress
 from gmem_jax.signals import Bumps, Samples
 
 KERNEL_SCHEMA = "gmem-kernel/1"
+DRIVE = ("gamma0", "mu", "stiffness")
 
 
 def experiment_of(config: RecallConfig) -> Experiment:
@@ -99,11 +102,10 @@ def run_design(
 ) -> dict[str, Any]:
     """Design waveforms for the integrals of the configuration's signals and write them as a CSV."""
     experiment = experiment_of(config)
-    state = sweep.prefix(experiment)
-    found = design.design_waveforms(experiment, iterations=iterations, gain=gain, state=state, progress=progress)
+    found = design.design_waveforms(experiment, iterations=iterations, gain=gain, progress=progress)
     storage.save_waveforms(output, found.signals)
     if picture is not None:
-        original, _ = sweep.simulate(experiment, state)
+        original, _ = sweep.simulate(experiment)
         unit = float(experiment.compression) * config.gamma0
         plot_gradient.design_figure(picture, found, np.asarray(original), unit, config.pack)
         plot_gradient.history_figure(picture.with_name(f"{picture.stem}-history.png"), {config.pack: found.history})
@@ -115,3 +117,50 @@ def run_design(
         "history": list(found.history),
         "output": str(output),
     }
+
+
+def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
+    """Bounds by name from "gamma0=3e-4:3e-3,mu=0.5:2".
+
+    Raises:
+        ValueError: if it does not read like that.
+    """
+    bounds = {}
+    for item in text.split(","):
+        name, _, span = item.partition("=")
+        low, _, high = span.partition(":")
+        try:
+            bounds[name.strip()] = float(low), float(high)
+        except ValueError:
+            raise ValueError(f"--bounds: {item!r} should read like mu=0.5:2") from None
+    if unknown := set(bounds) - set(DRIVE):
+        raise ValueError(f"--bounds: {min(unknown)!r} is none of {', '.join(DRIVE)}")
+    return bounds
+
+
+def run_tune(
+    config: RecallConfig,
+    packs: list[str],
+    bounds: dict[str, tuple[float, float]],
+    output: Path,
+    picture: Path | None,
+    iterations: int,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Choose drive parameters within bounds for several packs; writes them as JSON."""
+    experiments = [experiment_of(config.model_copy(update={"pack": name})) for name in packs]
+    found = design.design_drive(experiments, bounds, iterations=iterations, progress=progress)
+    result = {
+        "packs": packs,
+        "before": found.before,
+        "fidelity": found.fidelity,
+        "each": found.each.tolist(),
+        "values": found.values,
+        "history": [{**values, "fidelity": fidelity} for values, fidelity in found.history],
+        "output": str(output),
+    }
+    with storage.atomic(output) as temporary:
+        temporary.write_text(json.dumps({**result, "configuration": config.model_dump(), **provenance()}))
+    if picture is not None:
+        plot_gradient.history_figure(picture, {" ".join(packs): [value for _, value in found.history]})
+    return result

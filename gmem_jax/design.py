@@ -1,11 +1,11 @@
 """Inverse design: waveforms whose nonlinear recall follows wanted curves, and drives that recall best.
 
-The recall is simulated anew in every iteration; only the direction of a step comes from a linear model, the memory
-kernel of the pack or central differences around the present waveforms. A step is handed to an optax optimiser as a
-preconditioned gradient. By unit costs the exact gradient of `gradient.value_and_grad` takes some hundred native runs;
-differences with replicas take two runs a parameter.
+Waveforms are corrected by the exact Jacobian of the recall around the present ones: one tangent per amplitude, as
+replicas of one run (`gradient.push`). A damped Gauss-Newton step is handed to an optax optimiser as a preconditioned
+gradient, and simulated before it is accepted.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import jax
@@ -13,14 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from gmem_jax import analysis, sweep
+from gmem_jax import analysis, gradient, sweep
 from gmem_jax.experiment import Experiment
-from gmem_jax.response import FINE, MemoryKernel, bumps, memory_kernel
+from gmem_jax.gradient import with_parameters
+from gmem_jax.response import FINE, bumps
 from gmem_jax.run import Progress, silent
 from gmem_jax.signals import Samples, Signals, bin_average, waveform
-from gmem_jax.state import State
 
 NODES = 127  # samples of a designed waveform
+DAMPING = (0.01, 0.005)  # of the steps, in parts of the largest singular value; the last for all that follow
+FRACTIONS = (1.0, 0.5, 0.25)  # of a step that are tried
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class Design:
     """Waveforms found, and the way there.
 
     Attributes:
-        signals: the best waveforms, as samples, |I| <= 1.
+        signals: the waveforms, as samples, |I| <= 1.
         target: J that their recall should follow, averaged over bins, [S, 256].
         p_sig: their recall in a fresh run, [S, 256], in E.
         fidelity: F of that recall with respect to the target.
@@ -54,11 +56,19 @@ def bounded(amplitudes: np.ndarray, width: float) -> np.ndarray:
     return result
 
 
-def _inverse(jacobian: np.ndarray, damping: float) -> np.ndarray:
-    """Tikhonov's inverse of p = a @ jacobian: [256, n]; `damping` in parts of the largest singular value."""
+def _step(jacobian: np.ndarray, miss: np.ndarray, damping: float) -> np.ndarray:
+    """The change of amplitudes [n] whose recall comes nearest to `miss` [256] by a Jacobian [n, 256], damped."""
     left, values, right = np.linalg.svd(jacobian, full_matrices=False)
     filtered = values / (values**2 + (damping * values[0]) ** 2)
-    result: np.ndarray = right.T @ np.diag(filtered) @ left.T
+    result: np.ndarray = ((miss @ right.T) * filtered) @ left.T
+    return result
+
+
+def _fit(signals: Signals, n: int, width: float) -> np.ndarray:
+    """Amplitudes [S, n] of the bumps that come nearest to waveforms."""
+    v = (jnp.arange(FINE) + 0.5) / FINE
+    shapes, wanted = np.asarray(bumps(np.eye(n), width).shear(v)), np.asarray(signals.shear(v))
+    result: np.ndarray = np.linalg.lstsq(shapes, wanted, rcond=None)[0].T
     return result
 
 
@@ -68,83 +78,175 @@ def sampled(signals: Signals, nodes: int = NODES) -> Samples:
     return waveform(values)
 
 
-def local_jacobians(
-    experiment: Experiment, amplitudes: np.ndarray, width: float, state: State, step: float = 1e-3
-) -> np.ndarray:
-    """dp_sig / da of every signal by central differences, [S, n, 256]: 2 S n replicas."""
-    count, n = amplitudes.shape
-    shifts = step * np.concatenate([np.eye(n), -np.eye(n)])
-    rows = (amplitudes[:, None] + shifts).reshape(-1, n)
-    p_sig = np.asarray(sweep.simulate(replace(experiment, signals=bumps(rows, width)), state)[0])
-    both = p_sig.reshape(count, 2, n, -1)
-    result: np.ndarray = (both[:, 0] - both[:, 1]) / (2.0 * step)
-    return result
-
-
 def design_waveforms(
     experiment: Experiment,
     *,
-    iterations: int = 12,
+    iterations: int = 3,
     n: int = 17,
     width: float = 0.2,
     gain: float | None = None,
-    damping: float = 0.015,
     optimiser: optax.GradientTransformation | None = None,
-    kernel: MemoryKernel | None = None,
-    state: State | None = None,
-    refresh: int = 0,
     progress: Progress = silent,
 ) -> Design:
     """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
 
     Args:
         experiment: the pack, the drive, and the signals whose J are the targets.
-        iterations: simulated corrections.
+        iterations: corrections; each takes a Jacobian of n tangents a signal and up to three simulations.
         n: bumps of a designed waveform.
         width: of the bumps.
-        gain: wanted common gain; default 0.55 of the untouched waveforms' own, so that the bound leaves room.
-        damping: of the inverse, in parts of the largest singular value.
-        optimiser: what makes a step of a preconditioned gradient; default plain descent with steps of 0.7.
-        kernel: measured kernel on the same bumps; measured if not given.
-        state: what `sweep.prefix` gave.
-        refresh: differentiate anew around the present waveforms every so many iterations; 0 for never.
-        progress: told about every iteration.
+        gain: wanted common gain; default half of the untouched waveforms' own, so that the bound leaves room.
+        optimiser: what makes a step of a preconditioned gradient; default the whole step, shortened if the recall
+            gets worse.
+        progress: told about every chunk.
 
     Raises:
         RunFailedError: if a simulation broke down.
     """
-    state = sweep.prefix(experiment) if state is None else state
+    state = sweep.prefix(experiment)
     target = np.asarray(bin_average(experiment.signals))
     unit = float(experiment.compression) * float(experiment.gamma0)
     original, _ = sweep.simulate(experiment, state)
     before = float(experiment.fidelity(original))
-    wanted = (0.55 * float(experiment.gain(original)) if gain is None else gain) * unit * target
-    kernel = memory_kernel(experiment.pack, n, width, state=state, experiment=experiment) if kernel is None else kernel
-    progress("kernel measured", 0.0, 1.0 / (iterations + 2))
-    inverses = np.repeat(_inverse(kernel.odd, damping)[None], len(target), axis=0)
-    amplitudes = bounded(wanted @ inverses[0], width)
-    optimiser = optax.sgd(0.7) if optimiser is None else optimiser
+    gain = 0.5 * float(experiment.gain(original)) if gain is None else gain
+    wanted = gain * unit * target
+    amplitudes = bounded(_fit(experiment.signals, n, width) * gain / float(experiment.gain(original)), width)
+    optimiser = optax.sgd(1.0) if optimiser is None else optimiser
     memory = optimiser.init(jnp.asarray(amplitudes))
-    best, best_fidelity, history = amplitudes, -np.inf, [before]
+    count = len(target)
 
-    def score(p_sig: jax.Array) -> float:
-        return float(analysis.fidelity(p_sig, jnp.asarray(target), experiment.compression, experiment.gamma0))
+    def score(p_sig: np.ndarray) -> float:
+        found = jnp.asarray(p_sig)
+        return float(analysis.fidelity(found, jnp.asarray(target), experiment.compression, experiment.gamma0))
 
+    def recall(rows: np.ndarray) -> np.ndarray:
+        return np.asarray(sweep.simulate(replace(experiment, signals=bumps(rows, width)), state)[0])
+
+    def make(rows: jax.Array) -> Experiment:
+        return replace(experiment, signals=bumps(rows, width))
+
+    def jacobians(at: np.ndarray, begun: float, ended: float) -> np.ndarray:
+        """dp_sig / da of every signal, [S, n, 256]."""
+
+        def report(_: str, moment: float, fraction: float) -> None:
+            progress(f"F = {history[-1]:.4f}", moment, begun + (ended - begun) * fraction)
+
+        rows, directions = np.repeat(at, n, axis=0), np.tile(np.eye(n), (count, 1))
+        pushed = gradient.push(make, jnp.asarray(rows), jnp.asarray(directions), progress=report)
+        return np.asarray(pushed.p_sig_slope).reshape(count, n, -1)
+
+    p_sig = recall(amplitudes)
+    history = [before]
     for iteration in range(iterations):
-        if refresh and iteration % refresh == 0:
-            local = local_jacobians(experiment, amplitudes, width, state)
-            inverses = np.stack([_inverse(each, damping) for each in local])
-        p_sig, _ = sweep.simulate(replace(experiment, signals=bumps(amplitudes, width)), state)
+        damping = DAMPING[min(iteration, len(DAMPING) - 1)]
+        local = jacobians(amplitudes, iteration / iterations, (iteration + 1) / iterations)
+        steps = np.stack([_step(*pair, damping) for pair in zip(local, wanted - p_sig, strict=True)])
+        updates, memory = optimiser.update(jnp.asarray(-steps), memory, jnp.asarray(amplitudes))
+        tried = [bounded(amplitudes + fraction * np.asarray(updates), width) for fraction in FRACTIONS]
+        candidates = np.stack([amplitudes, *tried])
+        recalls = np.stack([p_sig, *recall(np.concatenate(tried)).reshape(len(tried), count, -1)])
+        chosen = np.linalg.norm(recalls - wanted, axis=2).argmin(axis=0), np.arange(count)
+        amplitudes, p_sig = candidates[chosen], recalls[chosen]
         history.append(score(p_sig))
-        if history[-1] > best_fidelity:
-            best, best_fidelity = amplitudes, history[-1]
-        progress(f"iteration {iteration + 1}: F = {history[-1]:.4f}", 0.0, (iteration + 2) / (iterations + 2))
-        miss = np.asarray(p_sig) - wanted
-        slope = jnp.asarray(np.einsum("sp,spn->sn", miss, inverses))
-        updates, memory = optimiser.update(slope, memory, jnp.asarray(amplitudes))
-        amplitudes = bounded(np.asarray(optax.apply_updates(jnp.asarray(amplitudes), updates)), width)
-    signals = sampled(bumps(best, width))
+    signals = sampled(bumps(amplitudes, width))
     fresh, _ = sweep.simulate(replace(experiment, signals=signals))
     found = analysis.gain(fresh, jnp.asarray(target), experiment.compression, experiment.gamma0)
     progress("verified", 0.0, 1.0)
-    return Design(signals, target, np.asarray(fresh), score(fresh), float(found), before, tuple(history))
+    return Design(signals, target, np.asarray(fresh), score(np.asarray(fresh)), float(found), before, tuple(history))
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Drive parameters found, and the way there.
+
+    Attributes:
+        values: of the best drive, by name.
+        fidelity: mean F over the packs, there.
+        each: F of every pack, there, [packs].
+        before: mean F of the drive that was begun with.
+        history: (values, mean F) after every iteration, the first drive first.
+    """
+
+    values: dict[str, float]
+    fidelity: float
+    each: np.ndarray
+    before: float
+    history: tuple[tuple[dict[str, float], float], ...]
+
+
+def design_drive(
+    experiments: Sequence[Experiment],
+    bounds: dict[str, tuple[float, float]],
+    *,
+    iterations: int = 6,
+    spread: float = 0.2,
+    optimiser: optax.GradientTransformation | None = None,
+    progress: Progress = silent,
+) -> Drive:
+    """Choose gamma0 and parameters of the friction law within bounds so that the mean fidelity of some packs grows.
+
+    F of one pack is rugged in mu and the stiffness: the exact derivative holds for changes of 1e-5 (see
+    experiments/gradient_check.py), because grains rearrange. What can be climbed is the slope on a coarser scale, from
+    central differences over +- `spread` of each logarithm, averaged over packs.
+
+    Args:
+        experiments: one for each pack, alike in all else; where they stand is the start.
+        bounds: lowest and highest value by name: "gamma0", "mu", "stiffness" (any of them).
+        iterations: steps; each costs 2 n + 1 runs a pack for n parameters.
+        spread: of the differences, in parts of each parameter.
+        optimiser: of the logarithms; default Adam with steps of 0.2.
+        progress: told about every run.
+
+    Raises:
+        ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
+        RunFailedError: if a simulation broke down.
+    """
+    if not experiments:
+        raise ValueError("a drive is designed for at least one pack")
+    names = list(bounds)
+    start = [_value(experiments[0], name) for name in names]
+    for name, value in zip(names, start, strict=True):
+        low, high = bounds[name]
+        if not 0.0 < low <= value <= high:
+            raise ValueError(
+                f"{name}: bounds must be positive and hold the first value {value:g}, got {low:g} to {high:g}"
+            )
+    lowest, highest = np.log([bounds[name] for name in names]).T
+    total, done = (iterations * (2 * len(names) + 1) + 1) * len(experiments), 0
+
+    def each(logs: np.ndarray) -> np.ndarray:
+        nonlocal done
+        found = []
+        for experiment in experiments:
+            changed = with_parameters(experiment, **dict(zip(names, np.exp(logs), strict=True)))
+            found.append(float(changed.fidelity(sweep.simulate(changed)[0])))
+            done += 1
+            progress(f"F = {np.mean(found):.4f}", 0.0, done / total)
+        return np.asarray(found)
+
+    optimiser = optax.adam(0.2) if optimiser is None else optimiser
+    logs = np.log(start)
+    memory = optimiser.init(jnp.asarray(logs))
+    best, found = logs, each(logs)
+    history = [(logs, float(found.mean()))]
+    for _ in range(iterations):
+        slope = np.zeros(len(names))
+        for place, step in enumerate(spread * np.eye(len(names))):
+            up, down = np.minimum(logs + step, highest), np.maximum(logs - step, lowest)
+            slope[place] = np.mean(each(up) - each(down)) / max(up[place] - down[place], 1e-12)
+        updates, memory = optimiser.update(jnp.asarray(-slope), memory, jnp.asarray(logs))
+        logs = np.clip(np.asarray(optax.apply_updates(jnp.asarray(logs), updates)), lowest, highest)
+        here = each(logs)
+        history.append((logs, float(here.mean())))
+        if here.mean() > found.mean():
+            best, found = logs, here
+
+    def named(logs: np.ndarray) -> dict[str, float]:
+        return {name: float(value) for name, value in zip(names, np.exp(logs), strict=True)}
+
+    way = tuple((named(logs), value) for logs, value in history)
+    return Drive(named(best), float(found.mean()), found, history[0][1], way)
+
+
+def _value(experiment: Experiment, name: str) -> float:
+    return float(getattr(experiment if hasattr(experiment, name) else experiment.friction, name))

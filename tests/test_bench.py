@@ -57,6 +57,7 @@ def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
         "rows": [asdict(row) for row in rows],
         "growth": growth,
         "bytes_per_grain_replica": {"H": 1500.0},
+        "gradient": {"grains": 325, "forward_s": 5.0, "gradient_s": 50.0, "forward_bytes": 1e9, "gradient_bytes": 2e9},
     }
     before = {"rows": [asdict(replace(row, us=2.0 * row.us)) for row in rows]}
     text = bench.markdown(result, before)
@@ -64,6 +65,13 @@ def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
     assert "| H | 325 | native | 1 | 0.1500 | 3.0 | 1.0 | 2.00 |" in text
     assert "| 650 | 0.1300 | 1.30 | 0.1300 | 1.30 |" in text
     assert "H 1.50 kB" in text
+    assert "ratio 10.0; peak memory of the process 2.00 GB, 1.00 GB before" in text
+
+
+def test_a_gradient_is_timed_in_a_process_of_its_own() -> None:
+    cost = bench.gradient_cost(gm.load_pack, str(PACK), "auto", values=2, t0=75.0)
+    assert 0.0 < cost["forward_s"] < cost["gradient_s"]
+    assert 1e7 < cost["forward_bytes"] <= cost["gradient_bytes"] < 1e10
 
 
 def test_large_histories_are_left_out(pack: gm.Pack) -> None:

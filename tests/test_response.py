@@ -1,13 +1,14 @@
 """The memory kernel and designs, on made-up kernels and on a shortened run of 27 grains."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import response, sweep
+from gmem_jax import gradient, response, sweep
 from gmem_jax.experiment import chunks
 from gmem_jax.signals import BINS, bin_average
 
@@ -87,19 +88,22 @@ def test_odd_and_even_parts_add_up_to_the_recall_of_each_bump(
     np.testing.assert_allclose(kernel.predict(signals), p_sig, atol=1e-6 * np.abs(np.asarray(p_sig)).max())
 
 
-def test_designed_waveforms_stay_within_the_bound_and_survive_a_csv(
-    experiment: gm.Experiment, kernel: gm.MemoryKernel, tmp_path: Path
+def test_designed_waveforms_improve_stay_within_the_bound_and_survive_a_csv(
+    experiment: gm.Experiment, tmp_path: Path
 ) -> None:
-    found = gm.design_waveforms(experiment, iterations=2, n=5, width=0.3, kernel=kernel)
+    found = gm.design_waveforms(experiment, iterations=2, n=5, width=0.3)
     assert np.abs(np.asarray(found.signals.nodes)).max() <= 1.0 + 1e-6
     assert found.history[0] == found.before
     assert len(found.history) == 3
+    assert found.history[-1] > found.before
+    # What is verified are samples of the bumps, joined by cubics.
+    np.testing.assert_allclose(found.fidelity, found.history[-1], atol=1e-3)
     gm.save_waveforms(tmp_path / "designed.csv", found.signals)
     again = gm.waveform(gm.load_waveforms(tmp_path / "designed.csv"))
     np.testing.assert_array_equal(again.nodes, found.signals.nodes)
 
 
-def test_design_inverts_a_linear_memory_at_once(monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment) -> None:
+def test_design_inverts_a_linear_memory(monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment) -> None:
     kernel = ideal(0.3)
     mixing = np.linalg.qr(np.random.default_rng(1).standard_normal((17, 17)))[0]
     odd = (np.eye(17) + 0.3 * mixing) @ kernel.odd  # linear, but no integral
@@ -108,10 +112,37 @@ def test_design_inverts_a_linear_memory_at_once(monkeypatch: pytest.MonkeyPatch,
     def linear(run: gm.Experiment, *_: object) -> tuple[jnp.ndarray, dict]:
         return jnp.asarray(kernel.coefficients(run.signals) @ odd), {}
 
+    def push(make: object, rows: jnp.ndarray, directions: jnp.ndarray, **_: object) -> SimpleNamespace:
+        return SimpleNamespace(p_sig_slope=directions @ odd)
+
     monkeypatch.setattr(sweep, "simulate", linear)
-    found = gm.design_waveforms(experiment, kernel=kernel, iterations=3, gain=0.1, damping=1e-6, state=object())
+    monkeypatch.setattr(sweep, "prefix", lambda _: None)
+    monkeypatch.setattr(gradient, "push", push)
+    found = gm.design_waveforms(experiment, iterations=4)
     assert found.before < 0.95
-    assert found.fidelity > 0.999  # the sampled waveform is a cubic through 127 nodes
+    assert found.fidelity > 0.995  # the steps are damped
+
+
+def test_a_drive_climbs_to_the_best_value_within_bounds(
+    monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment
+) -> None:
+    target = np.asarray(bin_average(experiment.signals))
+    off = np.random.default_rng(0).standard_normal(target.shape)
+
+    def rugged(run: gm.Experiment, *_: object) -> tuple[jnp.ndarray, dict]:
+        mu = float(run.friction.mu)
+        far = abs(np.log(mu / 0.6)) + 0.02 * np.sin(300.0 * mu)  # best at 0.6; its own derivative is of no use
+        return jnp.asarray(target + far * off * np.linalg.norm(target) / np.linalg.norm(off)), {}
+
+    monkeypatch.setattr(sweep, "simulate", rugged)
+    wide = gm.design_drive([experiment, experiment], {"mu": (0.3, 2.0)}, iterations=8)
+    assert abs(wide.values["mu"] - 0.6) < 0.1
+    assert wide.fidelity > wide.before
+    assert len(wide.history) == 9
+    narrow = gm.design_drive([experiment], {"mu": (0.8, 2.0)}, iterations=8)
+    np.testing.assert_allclose(narrow.values["mu"], 0.8, rtol=0.05)
+    with pytest.raises(ValueError, match="hold the first value"):
+        gm.design_drive([experiment], {"mu": (2.0, 3.0)})
 
 
 def test_a_kernel_of_one_bump_is_refused(experiment: gm.Experiment) -> None:

@@ -204,11 +204,10 @@ def _bin(
 def _call(system: System, *moving: Any) -> Call:
     """What the library is told beside arrays."""
     law = system.friction
-    layered = isinstance(law, Mindlin)
     return Call(
         law=_LAWS.index(type(law)),
-        variant=_VARIANTS.index(law.variant) if layered else 0,
-        points=law.points if layered else 0,
+        variant=_VARIANTS.index(law.variant) if isinstance(law, Mindlin) else 0,
+        points=law.points if isinstance(law, Mindlin) else 0,
         isotropic=int(system.clump.isotropic),
         leaves=len(jax.tree.leaves(moving[1])),
     )

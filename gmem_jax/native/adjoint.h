@@ -60,18 +60,19 @@ struct Adjoint {
   const int rank, steps;
   taped::Tape recorded;
 
-  V* state;      // [steps, N, kState]: at the beginning of each step
-  V* total;      // [steps, N, 6]: force and torque in it
-  Trace* trace;  // [steps]
-  V* state_bar;  // [N, kState]
-  V* mid_bar;    // [N, kMid]
-  V* sphere_bar;    // [S, 3]
-  V* guest_bar;     // [guests, kGuest]
-  V* history_bar;   // [candidates, kHistory and Mindlin's layers, 3 Q]
-  V* domain_bar;    // [domains, kParameters]
-  V* chunk_bar;     // [chunks, kParameters]
-  V* wall_bar;      // [chunks, kWalls], of one step
+  V* state;        // [steps, N, kState]: at the beginning of each step
+  V* total;        // [steps, N, 6]: force and torque in it
+  Trace* trace;    // [steps]
+  V* state_bar;    // [N, kState]
+  V* mid_bar;      // [N, kMid]
+  V* sphere_bar;   // [S, 3]
+  V* guest_bar;    // [guests, kGuest]
+  V* history_bar;  // [candidates, kHistory and Mindlin's layers, 3 Q]
+  V* domain_bar;   // [domains, kParameters]
+  V* chunk_bar;    // [chunks, kParameters]
+  V* wall_bar;     // [chunks, kWalls], of one step
 
+  // What is kept of every step is given room for all candidates; memory that contacts apart leave untouched is not used.
   static std::size_t carve(const Problem& p, const Block& block, Carver& carver, Adjoint* to) {
     using Forward = Engine<Replicas<Law>>;
     Forward::carve(p, block, carver, to ? &to->forward : nullptr);

@@ -1,8 +1,8 @@
 """Compile the native backend: at install time (setup.py), or in place with ``python -m gmem_jax.native.build``.
 
-The library has no Python in it: one shared object whose symbols `gmem_jax.native` registers with XLA. The time step is
-compiled once per instruction set, and the best one that the CPU has is chosen when it runs. Only the standard library
-is imported here, because setup.py loads this file before the package exists.
+The library has no Python in it: one shared object whose symbols `gmem_jax.native` registers with XLA. The time step and
+its derivatives are compiled once per instruction set, and the best one that the CPU has is chosen when it runs. Only
+the standard library is imported here, because setup.py loads this file before the package exists.
 """
 
 import os
@@ -68,7 +68,10 @@ def build(target: Path) -> None:
     sets = INSTRUCTION_SETS if x86 else {"baseline": ()}
     jobs: list[tuple[str, str, tuple[str, ...]]] = [("team.cc", "team.o", ()), ("plan.cc", "plan.o", ())]
     jobs.append(("handler.cc", "handler.o", ("-isystem", str(include))))
-    jobs += [("kernel.cc", f"{name}.o", (f"-DGMEM_ISA={name}", *flags)) for name, flags in sets.items()]
+    for name, flags in sets.items():
+        jobs.append(("kernel.cc", f"{name}.o", (f"-DGMEM_ISA={name}", *flags)))
+        derivatives = (f"-DGMEM_ISA={name}_derivatives", "-DGMEM_DERIVATIVES", "-O2", *flags)
+        jobs.append(("kernel.cc", f"{name}_derivatives.o", derivatives))
 
     def run(command: list[str]) -> None:
         try:

@@ -70,7 +70,7 @@ def _arguments(fixed: Fixed, arrays: Arrays) -> list[jax.Array]:
     return [*arrays.fields, *pack, arrays.parameters, arrays.walls, steps, *arrays.history]
 
 
-def _shapes(call: Call, arguments: Sequence[Any]) -> tuple[Arrays, Results]:
+def _shapes(call: Call, arguments: Sequence[Any]) -> tuple[list[Any], list[Any]]:
     """Shapes and types of what a call is differentiated by, and of its results, with the leading axes of all."""
     fields, parameters, walls = arguments[:_FIELDS], arguments[_FIELDS + 6], arguments[_FIELDS + 7]
     history = arguments[_FIELDS + 9 : _FIELDS + 9 + call.leaves]
@@ -80,9 +80,9 @@ def _shapes(call: Call, arguments: Sequence[Any]) -> tuple[Arrays, Results]:
     def whole(leaf: Any) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((*leading, *leaf.shape[axes:]), leaf.dtype)
 
-    by = Arrays([whole(f) for f in fields], whole(parameters), whole(walls), [whole(leaf) for leaf in history])
+    moving = [*map(whole, fields)], [*map(whole, history)]
     pressure = jax.ShapeDtypeStruct((*leading, 3, fields[0].shape[-1]), fields[0].dtype)
-    return by, Results(by.fields, pressure, by.history)
+    return [*moving[0], whole(parameters), whole(walls), *moving[1]], [*moving[0], pressure, *moving[1]]
 
 
 def forward(call: Call, fixed: Fixed, arrays: Arrays) -> Results:
@@ -92,21 +92,18 @@ def forward(call: Call, fixed: Fixed, arrays: Arrays) -> Results:
 
 def tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> Results:
     """The derivative of `forward` along a direction, linear in it; the steps of all replicas are those of `walls`."""
-    return _results(_tangent_p.bind(*_arguments(fixed, arrays), *_flat(along), call=call))
+    direction = [*along.fields, along.parameters, along.walls, *along.history]
+    return _results(_tangent_p.bind(*_arguments(fixed, arrays), *direction, call=call))
 
 
 def _results(arrays: Sequence[jax.Array]) -> Results:
     return Results(arrays[:_FIELDS], arrays[_FIELDS], arrays[_FIELDS + 1 :])
 
 
-def _flat(arrays: Arrays | Results) -> list[Any]:
-    return jax.tree.leaves(tuple(arrays))
-
-
 def _primitive(
     target: str, outputs: Callable[[Call, Sequence[Any]], list[Any]], aliases: Callable[[Call], dict[int, int]]
 ) -> Primitive:
-    """A call into the library whose arguments may have leading axes, of size one where there is nothing to share out."""
+    """A call into the library; its arguments may have leading axes, of size one where there is nothing to share out."""
     primitive = Primitive(target)
     primitive.multiple_results = True
 
@@ -134,11 +131,11 @@ def _primitive(
 
 
 def _of_results(call: Call, arguments: Sequence[Any]) -> list[Any]:
-    return _flat(_shapes(call, arguments)[1])
+    return _shapes(call, arguments)[1]
 
 
 def _of_arrays(call: Call, arguments: Sequence[Any]) -> list[Any]:
-    return _flat(_shapes(call, arguments)[0])
+    return _shapes(call, arguments)[0]
 
 
 def _in_place(call: Call) -> dict[int, int]:

@@ -16,6 +16,7 @@
 #include <map>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <string>
 #include <vector>
 
@@ -23,27 +24,33 @@
 
 namespace gmem {
 
+#define GMEM_DECLARE(name)                        \
+  namespace name { extern const Kernel kernel; } \
+  namespace name##_derivatives { extern const Kernel kernel; }
 #if defined(__x86_64__)
-namespace avx512 { extern const Kernel kernel; }
-namespace avx2 { extern const Kernel kernel; }
+GMEM_DECLARE(avx512)
+GMEM_DECLARE(avx2)
 #endif
-namespace baseline { extern const Kernel kernel; }
+GMEM_DECLARE(baseline)
 
 namespace {
 
 namespace ffi = xla::ffi;
 
-const Kernel& best_kernel() {
+const Kernel& best_kernel(Task task) {
+  const auto of_task = [task](const Kernel& steps, const Kernel& derivatives) -> const Kernel& {
+    return task == Task::forward ? steps : derivatives;
+  };
   const char* wanted = std::getenv("GMEM_ISA");  // for tests: a lower instruction set than the best
   const std::string limit = wanted ? wanted : "";
 #if defined(__x86_64__)
   const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
   const bool avx512 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
                       __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
-  if (avx512 && limit != "avx2" && limit != "baseline") return avx512::kernel;
-  if (avx2 && limit != "baseline") return avx2::kernel;
+  if (avx512 && limit != "avx2" && limit != "baseline") return of_task(avx512::kernel, avx512_derivatives::kernel);
+  if (avx2 && limit != "baseline") return of_task(avx2::kernel, avx2_derivatives::kernel);
 #endif
-  return baseline::kernel;
+  return of_task(baseline::kernel, baseline_derivatives::kernel);
 }
 
 // Memory that outlives a call, so that the next one does not fault its pages in again.
@@ -138,14 +145,16 @@ void run_blocks(const Problem& problem, const Kernel& kernel, const std::vector<
   }
   if (alone > 0) {
     std::atomic<int> next{0};
-    run_ranks(std::min(threads, alone), [&](int) {
-      auto scratch = scratch_pool().take(bytes);
+    const int ranks = std::min(threads, alone);
+    std::vector<ScratchPool::Piece> scratch;
+    for (int rank = 0; rank < ranks; ++rank) scratch.push_back(scratch_pool().take(bytes));
+    run_ranks(ranks, [&](int rank) {
       for (int i; (i = next.fetch_add(1)) < alone;) {
         Team team(1);
-        kernel.run(problem, blocks[i], team, 0, scratch.aligned());
+        kernel.run(problem, blocks[i], team, 0, scratch[rank].aligned());
       }
-      scratch_pool().give(std::move(scratch));
     });
+    for (auto& piece : scratch) scratch_pool().give(std::move(piece));
   }
   if (rest > 0) {
     const int size = std::min({threads / rest, domains, Team::kMaxSize});
@@ -285,7 +294,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
     for (int axis = static_cast<int>(batch.size()) - 1; axis >= 0 && ++index[axis] == batch[axis]; --axis) index[axis] = 0;
   }
 
-  const Kernel& kernel = best_kernel();
+  const Kernel& kernel = best_kernel(task);
   std::vector<Block> whole, packed;
   for (std::size_t i = 0; i < packs.size(); ++i) {
     const int count = static_cast<int>(lanes[i].size());
@@ -296,9 +305,15 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
     for (; done < count; ++done) packed.push_back({packs[i].get(), &lanes[i][done], nullptr, 1, true});
   }
   const int threads = acquire_threads(thread_count());
-  run_blocks(problem, kernel, whole, threads);
-  run_blocks(problem, kernel, packed, threads);
+  bool enough = true;
+  try {
+    run_blocks(problem, kernel, whole, threads);
+    run_blocks(problem, kernel, packed, threads);
+  } catch (const std::bad_alloc&) {
+    enough = false;
+  }
   if (threads > 1) release_threads();
+  if (!enough) return ffi::Error(ffi::ErrorCode::kResourceExhausted, "gmem_jax native: out of memory; use fewer replicas");
   return ffi::Error::Success();
 }
 
@@ -327,4 +342,4 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_tangent, gmem::handle<gmem::Task::tangent>, g
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_adjoint, gmem::handle<gmem::Task::adjoint>, gmem::binding());
 
 // Name of the instruction set in use.
-extern "C" const char* gmem_instruction_set() { return gmem::best_kernel().name; }
+extern "C" const char* gmem_instruction_set() { return gmem::best_kernel(gmem::Task::forward).name; }

@@ -1,4 +1,5 @@
-// The time step for one instruction set; compiled once for each, with GMEM_ISA its name and the compiler's flags.
+// The time step for one instruction set; compiled once for each, with GMEM_ISA the name of its namespace and the compiler's
+// flags, and once more with GMEM_DERIVATIVES for its derivatives.
 
 #include "problem.h"
 #include "team.h"
@@ -27,7 +28,8 @@ namespace GMEM_ISA {
 #include "block.h"
 #include "marks.h"
 #include "replicas.h"
-#include "packed.h"
+
+#ifdef GMEM_DERIVATIVES
 
 namespace dual {
 #include "dual.h"
@@ -50,6 +52,12 @@ namespace taped {
 }  // namespace taped
 
 #include "adjoint.h"
+
+#else
+
+#include "packed.h"
+
+#endif
 
 // Calls `function` with the law of `problem` as a type.
 template <class Function>
@@ -77,9 +85,11 @@ template <class Function>
 auto with_worker(const Problem& problem, const Block& block, const Function& function) {
   return with_law(problem, [&](auto law) {
     using L = decltype(law);
-    if (problem.task == Task::tangent) return function(As<dual::Engine<dual::Replicas<L>>>{});
-    if (problem.task == Task::adjoint) return function(As<Adjoint<L>>{});
+#ifdef GMEM_DERIVATIVES
+    return problem.task == Task::tangent ? function(As<dual::Engine<dual::Replicas<L>>>{}) : function(As<Adjoint<L>>{});
+#else
     return block.packed ? function(As<Engine<Packed<L>>>{}) : function(As<Engine<Replicas<L>>>{});
+#endif
   });
 }
 

@@ -46,6 +46,28 @@ def test_gradient_prints_finite_slopes_of_everything(
     assert (tmp_path / "gradient.png").exists()
 
 
+def test_tune_stays_within_bounds_and_says_what_it_found(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    target = tmp_path / "tuned.json"
+    options = ["--bounds", "gamma0=5e-4:2e-3", "--iterations", 1, "-o", target, "--json", *SHORT]
+    assert gmem(monkeypatch, "tune", f"{PACK},{PACK}", *options) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert 5e-4 <= said["values"]["gamma0"] <= 2e-3
+    assert said["fidelity"] >= said["before"] == said["history"][0]["fidelity"]
+    assert said["each"][0] == said["each"][1]
+    assert json.loads(target.read_text())["values"] == said["values"]
+    assert (tmp_path / "tuned.png").exists()
+
+
+@pytest.mark.parametrize("bounds", ["mu", "mu=1", "mu=a:b", "colour=1:2", "mu=2:3"])
+def test_bounds_that_make_no_sense_are_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, bounds: str
+) -> None:
+    assert gmem(monkeypatch, "tune", PACK, "--bounds", bounds, "-o", tmp_path / "t.json", *SHORT) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_another_background_is_refused() -> None:
     with pytest.raises(ValueError, match="sub0"):
         derive.experiment_of(RecallConfig(pack=str(PACK), background="sub2"))

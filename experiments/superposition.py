@@ -1,0 +1,137 @@
+"""What superposition knows: recalls predicted from a pack's memory kernel beside recalls that were simulated.
+
+python experiments/superposition.py [-o superposition] [--packs tetra-325-a,tetra-325-b,tetra-325-c] [--t0 1800]
+
+The six signals at several gamma0, all words of 3 to 5 bits, and (on the first pack) of 8 bits, which are classified
+too. "Linear" uses the odd part of the kernel alone, "both" the even part besides. Some twenty minutes on two cores.
+"""
+
+import argparse
+import csv
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib
+import numpy as np
+
+import gmem_jax as gm
+from gmem_jax import classify, sweep
+from gmem_jax.material import Material
+from gmem_jax.signals import bit_width
+
+GAMMAS = (1e-4, 3e-4, 1e-3, 3e-3)
+BITS = (3, 4, 5)
+LONG = 8
+
+
+def error(predicted: np.ndarray, simulated: np.ndarray) -> float:
+    """|predicted - simulated| / |simulated| over a set."""
+    return float(np.linalg.norm(predicted - simulated) / np.linalg.norm(simulated))
+
+
+def compare(experiment: gm.Experiment, state: Any, n: int, width: float) -> dict[str, Any]:
+    """Predictions of the experiment's signals from a kernel on n bumps that can form them, and their simulation."""
+    kernel = gm.memory_kernel(experiment.pack, n, width, state=state, experiment=experiment)
+    simulated = np.asarray(sweep.simulate(experiment, state)[0])
+    both, linear = kernel.predict(experiment.signals), kernel.predict(experiment.signals, even=False)
+    return {
+        "both": both,
+        "linear": linear,
+        "simulated": simulated,
+        "error_both": error(both, simulated),
+        "error_linear": error(linear, simulated),
+        "asymmetry": kernel.asymmetry(),
+    }
+
+
+def of_words(bits: int) -> tuple[int, float]:
+    """Number and width of bumps, half a width apart, among which are those that words are made of."""
+    width = bit_width(bits)
+    return round(2.0 / width) - 1, width
+
+
+def draw(path: Path, rows: list[list[Any]], six: dict[str, Any], title: str) -> None:
+    """The six recalls beside their predictions, and errors against gamma0 and against the number of bits."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 4, figsize=(14, 6))
+    pascal, u = Material().modulus, (np.arange(256) + 0.5) / 256
+    for number, axis in enumerate((*axes[0, :3], *axes[1, :3])):
+        axis.plot(u, pascal * six["simulated"][number], color="C0", label="simulated")
+        axis.plot(u, pascal * six["both"][number], "--", color="C3", label="superposition")
+        axis.plot(u, pascal * six["linear"][number], ":", color="0.5", label="odd part alone")
+        axis.set_title(f"signal {number + 1}", fontsize=9)
+    axes[0, 0].legend(fontsize=7, frameon=False)
+    axes[0, 0].set_ylabel("p_sig (Pa)")
+    axes[1, 0].set_ylabel("p_sig (Pa)")
+    for name in dict.fromkeys(row[0] for row in rows):
+        for axis, label, column in ((axes[0, 3], "six", 2), (axes[1, 3], "words", 1)):
+            chosen = [row for row in rows if row[0] == name and row[1].startswith(label)]
+            if label == "words":
+                axis.plot([int(row[1].split()[1]) for row in chosen], [row[4] for row in chosen], "o-", label=name)
+            else:
+                axis.loglog([row[column] for row in chosen], [row[4] for row in chosen], "o-", label=name)
+    axes[0, 3].set(xlabel="gamma0", ylabel="error of superposition, six signals")
+    axes[1, 3].set(xlabel="bits of the words", ylabel="error of superposition")
+    axes[1, 3].legend(fontsize=7, frameon=False)
+    figure.suptitle(title, fontsize=10)
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+
+
+def main() -> None:
+    """Measure, predict, simulate, classify and draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("superposition"), help="folder to write to")
+    parser.add_argument("--packs", default="tetra-325-a,tetra-325-b,tetra-325-c")
+    parser.add_argument("--t0", type=float, default=1.8e3)
+    parser.add_argument("--long", type=int, default=LONG, help="bits of the long words; 0 for none")
+    arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_enable_x64", True)
+
+    rows: list[list[Any]] = []
+    shown: dict[str, Any] = {}
+
+    def note(name: str, what: str, gamma0: float, found: dict[str, Any]) -> None:
+        rows.append([name, what, gamma0, found["error_linear"], found["error_both"], found["asymmetry"]])
+        print(f"{name}  {what:9}  gamma0 {gamma0:g}  error: linear {found['error_linear']:.4f}, "
+              f"both {found['error_both']:.4f}; |even| / |odd| {found['asymmetry']:.4f}", flush=True)  # fmt: skip
+
+    names = arguments.packs.split(",")
+    for name in names:
+        experiment = gm.Experiment(gm.load_pack(name), gm.six_signals(), timing=gm.Timing(t0=arguments.t0))
+        state = sweep.prefix(experiment)
+        for gamma0 in GAMMAS:
+            found = compare(replace(experiment, gamma0=gamma0), state, 17, 0.2)
+            note(name, "six", gamma0, found)
+            if name == names[0] and gamma0 == 1e-3:
+                shown = found
+        for bits in BITS:
+            found = compare(replace(experiment, signals=gm.words(bits)), state, *of_words(bits))
+            note(name, f"words {bits}", 1e-3, found)
+        if name == names[0] and arguments.long:
+            bits = arguments.long
+            found = compare(replace(experiment, signals=gm.words(bits)), state, *of_words(bits))
+            note(name, f"words {bits}", 1e-3, found)
+            began = time.perf_counter()
+            net = classify.train(classify.Recipe(bits=bits)).net
+            right = {key: float(classify.accuracy(net, found[key])) for key in ("simulated", "both", "linear")}
+            print(f"net of {bits} bits, trained in {time.perf_counter() - began:.0f} s; words recognised: "
+                  + ", ".join(f"{key} {value:.3f}" for key, value in right.items()), flush=True)  # fmt: skip
+            miss = np.linalg.norm(found["simulated"][:, None] - found["both"][None], axis=2)
+            template = float(np.mean(miss.argmin(axis=1) == np.arange(2**bits)))
+            print(f"nearest predicted recall of a simulated one is the right word: {template:.3f}", flush=True)
+    with (arguments.output / "superposition.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["pack", "signals", "gamma0", "error_linear", "error_both", "even_over_odd"])
+        writer.writerows(rows)
+    draw(arguments.output / "superposition.png", rows, shown, names[0])
+
+
+if __name__ == "__main__":
+    main()
