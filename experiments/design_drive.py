@@ -46,7 +46,10 @@ def main() -> None:
     def of_packs(names: str) -> list[gm.Experiment]:
         return [gm.Experiment(gm.load_pack(name), gm.six_signals()) for name in names.split(",")]
 
-    found = gm.design_drive(of_packs(arguments.packs), BOUNDS, iterations=arguments.iterations)
+    def say(what: str, _: float, fraction: float) -> None:
+        print(f"\r{fraction:5.0%}  {what:16}", end="\n" if fraction >= 1.0 else "", flush=True)
+
+    found = gm.design_drive(of_packs(arguments.packs), BOUNDS, iterations=arguments.iterations, progress=say)
     for values, mean in found.history:
         print("  ".join(f"{name} {value:.4g}" for name, value in values.items()), f" mean F {mean:.4f}", flush=True)
     result: dict[str, Any] = {"values": found.values, "each": found.each.tolist(), "history": found.history}

@@ -2,7 +2,7 @@
 
 python experiments/design_waveforms.py [-o designed] [--packs tetra-325-a,tetra-325-b,...]
 
-By default on the five packs of 325 grains; some seven minutes a pack on two cores.
+By default on the five packs of 325 grains; some ten minutes a pack on two cores.
 """
 
 import argparse
@@ -15,6 +15,11 @@ import numpy as np
 
 import gmem_jax as gm
 from gmem_jax import analysis, plot_gradient, sweep
+
+
+def say(what: str, _: float, fraction: float) -> None:
+    """Progress in one line."""
+    print(f"\r{fraction:5.0%}  {what:16}", end="\n" if fraction >= 1.0 else "", flush=True)
 
 
 def main() -> None:
@@ -32,7 +37,7 @@ def main() -> None:
         began = time.perf_counter()
         pack = gm.load_pack(name)
         experiment = gm.Experiment(pack, gm.six_signals())
-        design = gm.design_waveforms(experiment, iterations=arguments.iterations)
+        design = gm.design_waveforms(experiment, iterations=arguments.iterations, progress=say)
         seconds = time.perf_counter() - began
         gm.save_waveforms(arguments.output / f"{name}.csv", design.signals)
         again = gm.waveform(gm.load_waveforms(arguments.output / f"{name}.csv"))

@@ -139,9 +139,10 @@ def draw(
         (right, whole, "the experiment", "dp / d mu"),
     ):
         for step, error in errors.items():
-            axis.loglog(steps * (1 + np.arange(error.size)), error, linewidth=0.8, label=f"step {step:g}")
+            axis.semilogy(steps * (1 + np.arange(error.size)), error, linewidth=0.8, label=f"step {step:g}")
         axis.set(xlabel=f"steps since {since} began", ylabel=f"error of {what}")
-        axis.legend(fontsize=7, frameon=False)
+    middle.set_xscale("log")
+    middle.legend(fontsize=7, frameon=False)
     figure.tight_layout()
     figure.savefig(path, dpi=150)
 
