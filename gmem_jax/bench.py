@@ -353,7 +353,7 @@ def run(
         "rows": [asdict(row) for row in rows],
         "growth": [asdict(row) for row in growth],
         "bytes_per_grain_replica": use,
-        "gradient": {"grains": first.grains, **gradient},
+        "gradient": {"grains": first.grains, "commit": provenance()["commit"], **gradient},
     }
 
 
@@ -414,7 +414,8 @@ def markdown(result: dict[str, Any], baseline: dict[str, Any] | None = None) -> 
     if gradient := result.get("gradient"):
         lines += [
             "",
-            f"Gradient of F by 6 x 32 waveform values, whole experiment, N = {gradient['grains']}, t0 = {T0:g}: "
+            f"Gradient of F by 6 x 32 waveform values, whole experiment, N = {gradient['grains']}, t0 = {T0:g}, "
+            f"commit {(gradient['commit'] or 'unknown')[:9]}: "
             f"{gradient['gradient_s']:.1f} s, one forward run {gradient['forward_s']:.1f} s, "
             f"ratio {gradient['gradient_s'] / gradient['forward_s']:.1f}; peak memory of the process "
             f"{gradient['gradient_bytes'] / 1e9:.2f} GB, {gradient['forward_bytes'] / 1e9:.2f} GB before.",

@@ -187,14 +187,16 @@ def design_drive(
 
     F of one pack is rugged in mu and the stiffness: the exact derivative holds for changes of 1e-5 (see
     experiments/gradient_check.py), because grains rearrange. What can be climbed is the slope on a coarser scale, from
-    central differences over +- `spread` of each logarithm, averaged over packs.
+    central differences over +- `spread` of each logarithm, averaged over packs. The best drive that was simulated is
+    kept; where none is better than the present one, the spread is halved. The maximum of a rugged function is biased:
+    check the drive on other packs.
 
     Args:
         experiments: one for each pack, alike in all else; where they stand is the start.
         bounds: lowest and highest value by name: "gamma0", "mu", "stiffness" (any of them).
         iterations: steps; each costs 2 n + 1 runs a pack for n parameters.
-        spread: of the differences, in parts of each parameter.
-        optimiser: of the logarithms; default Adam with steps of 0.2.
+        spread: of the differences at first, in parts of each parameter.
+        optimiser: what makes a step of the logarithms of a gradient of length `spread`; default the gradient itself.
         progress: told about every run.
 
     Raises:
@@ -224,28 +226,33 @@ def design_drive(
             progress(f"F = {np.mean(found):.4f}", 0.0, done / total)
         return np.asarray(found)
 
-    optimiser = optax.adam(0.2) if optimiser is None else optimiser
+    optimiser = optax.sgd(1.0) if optimiser is None else optimiser
     logs = np.log(start)
     memory = optimiser.init(jnp.asarray(logs))
-    best, found = logs, each(logs)
+    found = each(logs)
     history = [(logs, float(found.mean()))]
     for _ in range(iterations):
+        seen: list[tuple[np.ndarray, np.ndarray]] = [(logs, found)]
         slope = np.zeros(len(names))
         for place, step in enumerate(spread * np.eye(len(names))):
-            up, down = np.minimum(logs + step, highest), np.maximum(logs - step, lowest)
-            slope[place] = np.mean(each(up) - each(down)) / max(up[place] - down[place], 1e-12)
-        updates, memory = optimiser.update(jnp.asarray(-slope), memory, jnp.asarray(logs))
-        logs = np.clip(np.asarray(optax.apply_updates(jnp.asarray(logs), updates)), lowest, highest)
-        here = each(logs)
-        history.append((logs, float(here.mean())))
-        if here.mean() > found.mean():
-            best, found = logs, here
+            sides = [np.clip(logs + sign * step, lowest, highest) for sign in (1.0, -1.0)]
+            up, down = (each(side) for side in sides)
+            slope[place] = np.mean(up - down) / max(sides[0][place] - sides[1][place], 1e-12)
+            seen += zip(sides, (up, down), strict=True)
+        # As long as the differences reach: the slope says nothing of what is further away.
+        along = -slope * spread / max(float(np.linalg.norm(slope)), 1e-12)
+        updates, memory = optimiser.update(jnp.asarray(along), memory, jnp.asarray(logs))
+        stepped = np.clip(np.asarray(optax.apply_updates(jnp.asarray(logs), updates)), lowest, highest)
+        seen.append((stepped, each(stepped)))
+        before, (logs, found) = logs, max(seen, key=lambda pair: float(pair[1].mean()))
+        spread = 0.5 * spread if logs is before else spread
+        history.append((logs, float(found.mean())))
 
     def named(logs: np.ndarray) -> dict[str, float]:
         return {name: float(value) for name, value in zip(names, np.exp(logs), strict=True)}
 
     way = tuple((named(logs), value) for logs, value in history)
-    return Drive(named(best), float(found.mean()), found, history[0][1], way)
+    return Drive(named(logs), float(found.mean()), found, history[0][1], way)
 
 
 def _value(experiment: Experiment, name: str) -> float:

@@ -57,7 +57,14 @@ def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
         "rows": [asdict(row) for row in rows],
         "growth": growth,
         "bytes_per_grain_replica": {"H": 1500.0},
-        "gradient": {"grains": 325, "forward_s": 5.0, "gradient_s": 50.0, "forward_bytes": 1e9, "gradient_bytes": 2e9},
+        "gradient": {
+            "grains": 325,
+            "commit": None,
+            "forward_s": 5.0,
+            "gradient_s": 50.0,
+            "forward_bytes": 1e9,
+            "gradient_bytes": 2e9,
+        },
     }
     before = {"rows": [asdict(replace(row, us=2.0 * row.us)) for row in rows]}
     text = bench.markdown(result, before)
