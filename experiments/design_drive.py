@@ -64,9 +64,11 @@ def main() -> None:
         pair: dict[str, list[float]] = {"default": [], "designed": []}
         for seed in map(int, arguments.seeds.split(",")):
             pack = gm.prepare(delta0=float(text), seed=seed, name=f"tetra-325-{seed}-delta0-{text}")
-            experiment = gm.Experiment(pack, gm.six_signals())
-            pair["default"].append(fidelity(experiment))
-            pair["designed"].append(fidelity(with_parameters(experiment, **found.values)))
+            for key, values in (("default", {}), ("designed", found.values)):
+                drive = with_parameters(gm.Experiment(pack, gm.six_signals()), **values)
+                # Here, because it makes the neighbour list anew where a deep compression needs it.
+                recall = gm.run_memory(pack, drive.signals, friction=drive.friction, gamma0=drive.gamma0, t0=1.8e3)
+                pair[key].append(float(recall.fidelity))
         result["delta0"][text] = pair
         print(f"delta0 {text}: " + ", ".join(f"{key} {mean_and_error(row)}" for key, row in pair.items()), flush=True)
     (arguments.output / "drive.json").write_text(json.dumps(result, indent=1))
