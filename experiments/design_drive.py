@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from console import say
 
 import gmem_jax as gm
 from gmem_jax import plot_gradient, sweep
@@ -45,9 +46,6 @@ def main() -> None:
 
     def of_packs(names: str) -> list[gm.Experiment]:
         return [gm.Experiment(gm.load_pack(name), gm.six_signals()) for name in names.split(",")]
-
-    def say(what: str, _: float, fraction: float) -> None:
-        print(f"\r{fraction:5.0%}  {what:16}", end="\n" if fraction >= 1.0 else "", flush=True)
 
     found = gm.design_drive(of_packs(arguments.packs), BOUNDS, iterations=arguments.iterations, progress=say)
     for values, mean in found.history:

@@ -12,14 +12,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from console import say
 
 import gmem_jax as gm
-from gmem_jax import analysis, plot_gradient, sweep
-
-
-def say(what: str, _: float, fraction: float) -> None:
-    """Progress in one line."""
-    print(f"\r{fraction:5.0%}  {what:16}", end="\n" if fraction >= 1.0 else "", flush=True)
+from gmem_jax import analysis, plot_gradient
 
 
 def main() -> None:
@@ -51,9 +47,8 @@ def main() -> None:
             + " ".join(f"{value:.3f}" for value in each),
             flush=True,
         )
-        original, _ = sweep.simulate(experiment)
         unit = float(pack.delta0) * 1e-3
-        plot_gradient.design_figure(arguments.output / f"{name}.png", design, np.asarray(original), unit, name)
+        plot_gradient.design_figure(arguments.output / f"{name}.png", design, unit, name)
         histories[name] = design.history
     plot_gradient.history_figure(arguments.output / "history.png", histories)
 

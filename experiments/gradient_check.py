@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from console import say
 
 import gmem_jax as gm
 from gmem_jax import gradient, jacobian, sweep
@@ -31,11 +32,6 @@ def waveform() -> gm.Bumps:
     centres = (np.arange(AMPLITUDES) + 1.0) / (AMPLITUDES + 1)
     heights = np.sin(2.0 * np.pi * centres) + 0.5 * np.sin(3.0 * np.pi * centres)
     return gm.Bumps(jnp.asarray([heights / np.abs(heights).max()]), jnp.asarray([centres]), 2.0 / (AMPLITUDES + 1))
-
-
-def say(stage: str, _: float, fraction: float) -> None:
-    """Progress in one line."""
-    print(f"\r{fraction:5.0%}  {stage:24}", end="\n" if fraction >= 1.0 else "", flush=True)
 
 
 def check_jacobian(experiment: gm.Experiment) -> tuple[dict[float, dict[str, float]], dict[float, np.ndarray]]:

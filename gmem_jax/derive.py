@@ -105,9 +105,8 @@ def run_design(
     found = design.design_waveforms(experiment, iterations=iterations, gain=gain, progress=progress)
     storage.save_waveforms(output, found.signals)
     if picture is not None:
-        original, _ = sweep.simulate(experiment)
         unit = float(experiment.compression) * config.gamma0
-        plot_gradient.design_figure(picture, found, np.asarray(original), unit, config.pack)
+        plot_gradient.design_figure(picture, found, unit, config.pack)
         plot_gradient.history_figure(picture.with_name(f"{picture.stem}-history.png"), {config.pack: found.history})
     return {
         "pack": config.pack,

@@ -13,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from gmem_jax import analysis, gradient, sweep
+from gmem_jax import gradient, sweep
 from gmem_jax.experiment import Experiment
 from gmem_jax.gradient import with_parameters
-from gmem_jax.response import FINE, bumps
+from gmem_jax.response import FINE, bumps, nearest
 from gmem_jax.run import Progress, silent
-from gmem_jax.signals import Samples, Signals, bin_average, waveform
+from gmem_jax.signals import Samples, Signals, waveform
 
 NODES = 127  # samples of a designed waveform
-DAMPING = (0.01, 0.005)  # of the steps, in parts of the largest singular value; the last for all that follow
+DAMPING = (0.01, 0.005)
 FRACTIONS = (1.0, 0.5, 0.25)  # of a step that are tried
 
 
@@ -35,7 +35,8 @@ class Design:
         p_sig: their recall in a fresh run, [S, 256], in E.
         fidelity: F of that recall with respect to the target.
         gain: G of that recall with respect to the target.
-        before: F of the untouched waveforms.
+        untouched: recall of the untouched waveforms, [S, 256], in E.
+        before: F of that.
         history: F after every iteration, the untouched waveforms first.
     """
 
@@ -44,6 +45,7 @@ class Design:
     p_sig: np.ndarray
     fidelity: float
     gain: float
+    untouched: np.ndarray
     before: float
     history: tuple[float, ...]
 
@@ -64,14 +66,6 @@ def _step(jacobian: np.ndarray, miss: np.ndarray, damping: float) -> np.ndarray:
     return result
 
 
-def _fit(signals: Signals, n: int, width: float) -> np.ndarray:
-    """Amplitudes [S, n] of the bumps that come nearest to waveforms."""
-    v = (jnp.arange(FINE) + 0.5) / FINE
-    shapes, wanted = np.asarray(bumps(np.eye(n), width).shear(v)), np.asarray(signals.shear(v))
-    result: np.ndarray = np.linalg.lstsq(shapes, wanted, rcond=None)[0].T
-    return result
-
-
 def sampled(signals: Signals, nodes: int = NODES) -> Samples:
     """The same waveforms as samples at u = k / (nodes + 1), as `gmem recall --signals` reads them."""
     values = signals.shear(jnp.arange(1, nodes + 1) / (nodes + 1)).T
@@ -85,6 +79,7 @@ def design_waveforms(
     n: int = 17,
     width: float = 0.2,
     gain: float | None = None,
+    damping: Sequence[float] = DAMPING,
     optimiser: optax.GradientTransformation | None = None,
     progress: Progress = silent,
 ) -> Design:
@@ -96,6 +91,8 @@ def design_waveforms(
         n: bumps of a designed waveform.
         width: of the bumps.
         gain: wanted common gain; default half of the untouched waveforms' own, so that the bound leaves room.
+        damping: of the steps one after the other, in parts of the Jacobian's largest singular value; the last for all
+            that follow.
         optimiser: what makes a step of a preconditioned gradient; default the whole step, shortened if the recall
             gets worse.
         progress: told about every chunk.
@@ -104,26 +101,22 @@ def design_waveforms(
         RunFailedError: if a simulation broke down.
     """
     state = sweep.prefix(experiment)
-    target = np.asarray(bin_average(experiment.signals))
-    unit = float(experiment.compression) * float(experiment.gamma0)
+    target = np.asarray(experiment.integral())
     original, _ = sweep.simulate(experiment, state)
-    before = float(experiment.fidelity(original))
-    gain = 0.5 * float(experiment.gain(original)) if gain is None else gain
-    wanted = gain * unit * target
-    amplitudes = bounded(_fit(experiment.signals, n, width) * gain / float(experiment.gain(original)), width)
+    before, own_gain = float(experiment.fidelity(original)), float(experiment.gain(original))
+    gain = 0.5 * own_gain if gain is None else gain
+    wanted = gain * float(experiment.compression) * float(experiment.gamma0) * target
+    basis = bumps(np.eye(n), width)
+    amplitudes = bounded(nearest(basis, experiment.signals) * gain / own_gain, width)
     optimiser = optax.sgd(1.0) if optimiser is None else optimiser
     memory = optimiser.init(jnp.asarray(amplitudes))
     count = len(target)
 
-    def score(p_sig: np.ndarray) -> float:
-        found = jnp.asarray(p_sig)
-        return float(analysis.fidelity(found, jnp.asarray(target), experiment.compression, experiment.gamma0))
+    def make(rows: jax.Array | np.ndarray) -> Experiment:
+        return replace(experiment, signals=bumps(rows, width))
 
     def recall(rows: np.ndarray) -> np.ndarray:
-        return np.asarray(sweep.simulate(replace(experiment, signals=bumps(rows, width)), state)[0])
-
-    def make(rows: jax.Array) -> Experiment:
-        return replace(experiment, signals=bumps(rows, width))
+        return np.asarray(sweep.simulate(make(rows), state)[0])
 
     def jacobians(at: np.ndarray, begun: float, ended: float) -> np.ndarray:
         """dp_sig / da of every signal, [S, n, 256]."""
@@ -138,21 +131,29 @@ def design_waveforms(
     p_sig = recall(amplitudes)
     history = [before]
     for iteration in range(iterations):
-        damping = DAMPING[min(iteration, len(DAMPING) - 1)]
         local = jacobians(amplitudes, iteration / iterations, (iteration + 1) / iterations)
-        steps = np.stack([_step(*pair, damping) for pair in zip(local, wanted - p_sig, strict=True)])
+        damped = damping[min(iteration, len(damping) - 1)]
+        steps = np.stack([_step(*pair, damped) for pair in zip(local, wanted - p_sig, strict=True)])
         updates, memory = optimiser.update(jnp.asarray(-steps), memory, jnp.asarray(amplitudes))
         tried = [bounded(amplitudes + fraction * np.asarray(updates), width) for fraction in FRACTIONS]
         candidates = np.stack([amplitudes, *tried])
         recalls = np.stack([p_sig, *recall(np.concatenate(tried)).reshape(len(tried), count, -1)])
         chosen = np.linalg.norm(recalls - wanted, axis=2).argmin(axis=0), np.arange(count)
         amplitudes, p_sig = candidates[chosen], recalls[chosen]
-        history.append(score(p_sig))
+        history.append(float(experiment.fidelity(jnp.asarray(p_sig))))
     signals = sampled(bumps(amplitudes, width))
     fresh, _ = sweep.simulate(replace(experiment, signals=signals))
-    found = analysis.gain(fresh, jnp.asarray(target), experiment.compression, experiment.gamma0)
     progress("verified", 0.0, 1.0)
-    return Design(signals, target, np.asarray(fresh), score(np.asarray(fresh)), float(found), before, tuple(history))
+    return Design(
+        signals=signals,
+        target=target,
+        p_sig=np.asarray(fresh),
+        fidelity=float(experiment.fidelity(fresh)),
+        gain=float(experiment.gain(fresh)),
+        untouched=np.asarray(original),
+        before=before,
+        history=tuple(history),
+    )
 
 
 @dataclass(frozen=True)

@@ -78,13 +78,12 @@ def history_figure(path: Path, histories: dict[str, Sequence[float]]) -> None:
     _save(path, figure)
 
 
-def design_figure(path: Path, design: Design, original: np.ndarray, unit: float, title: str) -> None:
+def design_figure(path: Path, design: Design, unit: float, title: str) -> None:
     """Designed waveforms, and their recall beside the targets and what the untouched waveforms gave.
 
     Args:
         path: file to write.
         design: the design, of S signals.
-        original: p_sig of the untouched waveforms, [S, 256], in E.
         unit: delta0 gamma0.
         title: over the picture.
 
@@ -100,7 +99,7 @@ def design_figure(path: Path, design: Design, original: np.ndarray, unit: float,
         axes[0, number].plot(nodes, np.asarray(design.signals.nodes[number]), color="C2")
         axes[0, number].set_title(f"signal {number + 1}", fontsize=9)
         low = axes[1, number]
-        low.plot(u, pascal * original[number], color="0.7", label="recall, untouched")
+        low.plot(u, pascal * design.untouched[number], color="0.7", label="recall, untouched")
         low.plot(u, pascal * design.p_sig[number], color="C0", label="recall, designed")
         low.plot(u, pascal * design.gain * unit * design.target[number], "--", color="C3", label="target")
         low.set_xlabel("u")

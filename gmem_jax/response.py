@@ -108,11 +108,8 @@ class MemoryKernel:
         return float(np.mean(widths))
 
     def coefficients(self, signals: Signals) -> np.ndarray:
-        """Amplitudes of the basis functions that come nearest to waveforms (least squares), [S, n]."""
-        v = (jnp.arange(FINE) + 0.5) / FINE
-        shapes, wanted = np.asarray(self.basis.shear(v)), np.asarray(signals.shear(v))
-        result: np.ndarray = np.linalg.lstsq(shapes, wanted, rcond=None)[0].T
-        return result
+        """Amplitudes of the basis functions that come nearest to waveforms, [S, n]."""
+        return nearest(self.basis, signals)
 
     def predict(self, signals: Signals, *, even: bool = True) -> np.ndarray:
         """p_sig of waveforms by superposition, [S, 256], in E, at the kernel's gamma0.
@@ -130,6 +127,14 @@ def bumps(amplitudes: np.ndarray | jax.Array, width: float) -> Bumps:
     """Waveforms of amplitudes [S, n] on n evenly spaced bumps that fill [0, 1]."""
     centres = np.linspace(0.5 * width, 1.0 - 0.5 * width, amplitudes.shape[1])
     return Bumps(jnp.asarray(amplitudes), jnp.broadcast_to(jnp.asarray(centres), amplitudes.shape), width)
+
+
+def nearest(basis: Signals, signals: Signals) -> np.ndarray:
+    """Amplitudes of n basis functions that come nearest to waveforms (least squares), [S, n]."""
+    v = (jnp.arange(FINE) + 0.5) / FINE
+    shapes, wanted = np.asarray(basis.shear(v)), np.asarray(signals.shear(v))
+    result: np.ndarray = np.linalg.lstsq(shapes, wanted, rcond=None)[0].T
+    return result
 
 
 def memory_kernel(

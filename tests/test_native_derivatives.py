@@ -123,6 +123,23 @@ def test_both_modes_agree_with_plain_jax(name: str, isotropic: bool) -> None:
     assert_close(fast, plain)
 
 
+def test_derivatives_through_200_steps_are_those_of_the_definition() -> None:
+    def last(advance: native.Advance, mu: jax.Array) -> jax.Array:
+        system = System(PACK.clump, gm.Hooke(mu=mu), PACK.pairs)
+        state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
+        walls = Motion(PACK.lower[:, None], PACK.upper[:, None], 0.05, 0.0, 1.0, 60.0)
+        _, sample = advance(system, state, walls, 0.3, bins=2, steps=100)
+        return 1e3 * jnp.sum(sample.pressure[-1])
+
+    mu = jnp.asarray(0.3)
+    for derivative in (jax.grad, jax.jacfwd):
+        fast, plain = (
+            jax.jit(derivative(lambda m, a=advance: last(a, m)))(mu) for advance in (native.advance, dynamics.advance)
+        )
+        assert abs(float(plain)) > 1e-3
+        np.testing.assert_allclose(fast, plain, rtol=1e-8)
+
+
 def test_vmap_and_grad_in_either_order() -> None:
     system, state = squeezed(LAWS["H"])
     theta = arguments(system, state)

@@ -118,9 +118,9 @@ def test_design_inverts_a_linear_memory(monkeypatch: pytest.MonkeyPatch, experim
     monkeypatch.setattr(sweep, "simulate", linear)
     monkeypatch.setattr(sweep, "prefix", lambda _: None)
     monkeypatch.setattr(gradient, "push", push)
-    found = gm.design_waveforms(experiment, iterations=4)
+    found = gm.design_waveforms(experiment, iterations=3, gain=0.1, damping=(1e-6,))
     assert found.before < 0.95
-    assert found.fidelity > 0.995  # the steps are damped
+    assert found.fidelity > 0.999  # the sampled waveform is a cubic through 127 nodes
 
 
 def test_a_drive_climbs_to_the_best_value_within_bounds(

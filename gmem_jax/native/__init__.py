@@ -196,12 +196,12 @@ def _bin(
     """
     steps, replicas = boxes.lower.shape[0], grains.position.shape[-1]
     counts = jnp.full(replicas, steps, jnp.int32) if limits is None else limits
-    call = _call(system, grains, history, boxes, numbers)
+    call = _call(system, history)
     fixed = _fixed(system, counts)
     return _result(grains, history, derivatives.forward(call, fixed, _moving(system, grains, history, boxes, numbers)))
 
 
-def _call(system: System, *moving: Any) -> Call:
+def _call(system: System, history: Any) -> Call:
     """What the library is told beside arrays."""
     law = system.friction
     return Call(
@@ -209,7 +209,7 @@ def _call(system: System, *moving: Any) -> Call:
         variant=_VARIANTS.index(law.variant) if isinstance(law, Mindlin) else 0,
         points=law.points if isinstance(law, Mindlin) else 0,
         isotropic=int(system.clump.isotropic),
-        leaves=len(jax.tree.leaves(moving[1])),
+        leaves=len(jax.tree.leaves(history)),
     )
 
 
@@ -297,7 +297,7 @@ def _bin_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Resu
         return _bin(*primals), slope
     moving, along = jax.jvp(lambda *varied: _moving(*filled(varied)[:5]), varied, directions)
     counts = jnp.full(moving.parameters.shape[-1], moving.walls.shape[0], jnp.int32)
-    change = derivatives.tangent(_call(*primals[:5]), _fixed(system, counts), moving, along)
+    change = derivatives.tangent(_call(system, primals[2]), _fixed(system, counts), moving, along)
     return _bin(*primals), _result(primals[1], primals[2], change)
 
 

@@ -5,7 +5,7 @@
 // Grains and contacts are shared among the threads of a team as in the forward steps, and sums are taken in the same
 // fixed order. Included inside the instruction set's namespace.
 
-// Rows of what is kept, and of the bars, of one grain: at the beginning of a step ...
+// Rows of what is kept, and of the bars, of one grain: at the beginning of a step, the fields in order ...
 enum StateRow { kStatePosition = 0, kStateQuaternion = 3, kStateVelocity = 7, kStateSpin = 10, kStateAcceleration = 13,
                 kStateSpinRate = 16, kState = 19 };
 // ... and midway, with the force and torque found there.
@@ -144,16 +144,10 @@ struct Adjoint {
   // Between the rows of a state and where the forward steps keep them.
   template <class Move>
   void move_state(int u, V* s, const Move& move) const {
-    V* h = of_grain(forward.hot, u, kHot);
-    V* c = of_grain(forward.cold, u, kCold);
-    for (int q = 0; q < 3; ++q) {
-      move(s[kStatePosition + q], h[kPosition + q]);
-      move(s[kStateVelocity + q], h[kVelocity + q]);
-      move(s[kStateSpin + q], h[kSpin + q]);
-      move(s[kStateAcceleration + q], c[kAcceleration + q]);
-      move(s[kStateSpinRate + q], c[kSpinRate + q]);
+    for (const FieldPlace& field : kField) {
+      V* at = (field.hot ? of_grain(forward.hot, u, kHot) : of_grain(forward.cold, u, kCold)) + field.slot;
+      for (int q = 0; q < field.size; ++q) move(*s++, at[q]);
     }
-    for (int q = 0; q < 4; ++q) move(s[kStateQuaternion + q], c[kQuaternion + q]);
   }
 
   V* state_of(int step, int u) const { return of_grain(state + static_cast<std::size_t>(step) * problem.grains * kState, u, kState); }
@@ -192,10 +186,9 @@ struct Adjoint {
   // Calls `each(field, row in the arrays of the call, row of the state)` for the numbers of grain u.
   template <class Each>
   void for_fields(int u, const Each& each) const {
-    constexpr int sizes[kFields] = {3, 4, 3, 3, 3, 3};
-    for (int f = 0, first = 0; f < kFields; first += sizes[f++])
-      for (int q = 0; q < sizes[f]; ++q)
-        each(f, static_cast<std::ptrdiff_t>(plan.grain[u]) * sizes[f] + q, first + q);
+    for (int f = 0, first = 0; f < kFields; first += kField[f++].size)
+      for (int q = 0; q < kField[f].size; ++q)
+        each(f, static_cast<std::ptrdiff_t>(plan.grain[u]) * kField[f].size + q, first + q);
   }
 
   // Calls `each(leaf, row in the arrays of the call, number)` for the history in `row` of the list.

@@ -169,6 +169,7 @@ def _transpose(slopes: Sequence[Any], *arguments: Any, call: Call) -> list[Any]:
 ad.primitive_transposes[_tangent_p] = _transpose
 
 
+# The library has the derivative of the steps and not that of the derivative, which plain JAX has.
 def _no_second(primals: Any, tangents: Any, **_: Any) -> Any:
     raise NotImplementedError("second derivatives are not in the native backend; use backend='jax'")
 
