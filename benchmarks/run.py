@@ -6,7 +6,7 @@ python benchmarks/run.py [options of gmem bench]
 import sys
 from pathlib import Path
 
-from gmem_jax.cli import main
+from gmem_jax.command.app import main
 
 HERE = Path(__file__).parent
 

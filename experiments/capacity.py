@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 
 import gmem_jax as gm
-from gmem_jax import report
-from gmem_jax.config import RecallConfig
-from gmem_jax.signals import BINS
+from gmem_jax.command.config import RecallConfig
+from gmem_jax.experiment.signals import BINS
+from gmem_jax.show import tables as report
 
 SCALES = {"laptop": range(3, 7), "paper": range(3, 11)}
 LENGTH = 9.0  # t0 of an experiment with a second readout ...

@@ -16,8 +16,9 @@ import numpy as np
 from console import say
 
 import gmem_jax as gm
-from gmem_jax import plot_gradient, sweep
-from gmem_jax.gradient import with_parameters
+from gmem_jax.derivatives.gradient import with_parameters
+from gmem_jax.experiment import walk as sweep
+from gmem_jax.show import figures_of_designs as plot_gradient
 
 BOUNDS = {"gamma0": (3e-4, 3e-3), "mu": (0.5, 2.0), "stiffness": (0.07, 0.29)}
 

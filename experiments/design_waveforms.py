@@ -15,7 +15,8 @@ import numpy as np
 from console import say
 
 import gmem_jax as gm
-from gmem_jax import analysis, plot_gradient
+from gmem_jax.experiment import analysis
+from gmem_jax.show import figures_of_designs as plot_gradient
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 
 import gmem_jax as gm
-from gmem_jax.plot import recall_figure
+from gmem_jax.show.figures import recall_figure
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ import jax
 import matplotlib
 
 import gmem_jax as gm
-from gmem_jax.report import spread
+from gmem_jax.show.tables import spread
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

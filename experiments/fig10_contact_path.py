@@ -11,9 +11,9 @@ import matplotlib
 import numpy as np
 
 import gmem_jax as gm
-from gmem_jax.contact.mindlin import Mindlin
-from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.contact.path import contact_path, polyline
+from gmem_jax.physics.contact.mindlin import Mindlin
+from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
+from gmem_jax.physics.contact.path import contact_path, polyline
 
 CORNERS = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0)])  # (p, sigma), in R
 POINTS = 200  # to a segment

@@ -11,8 +11,8 @@ import numpy as np
 from capacity import announce, chosen, parser, recall
 
 import gmem_jax as gm
-from gmem_jax.readers import stored_words
-from gmem_jax.report import published
+from gmem_jax.reading.readers import stored_words
+from gmem_jax.show.tables import published
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

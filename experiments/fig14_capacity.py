@@ -12,7 +12,8 @@ import numpy as np
 from capacity import announce, chosen, parser, recall
 
 import gmem_jax as gm
-from gmem_jax import readers, report
+from gmem_jax.reading import readers
+from gmem_jax.show import tables as report
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
-from gmem_jax.contact.mindlin import Mindlin
-from gmem_jax.contact.path import contact_path, polyline
+from gmem_jax.physics.contact.mindlin import Mindlin
+from gmem_jax.physics.contact.path import contact_path, polyline
 
 CORNERS = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0)])  # (p, sigma), in R
 POINTS = 1000  # to a segment

@@ -20,7 +20,8 @@ import numpy as np
 from console import say
 
 import gmem_jax as gm
-from gmem_jax import gradient, jacobian, sweep
+from gmem_jax.derivatives import gradient, jacobian
+from gmem_jax.experiment import walk as sweep
 
 AMPLITUDES = 16
 STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)

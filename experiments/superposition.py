@@ -18,9 +18,10 @@ import matplotlib
 import numpy as np
 
 import gmem_jax as gm
-from gmem_jax import classify, sweep
-from gmem_jax.material import Material
-from gmem_jax.signals import bit_width
+from gmem_jax import classify
+from gmem_jax.experiment import walk as sweep
+from gmem_jax.experiment.signals import bit_width
+from gmem_jax.physics.material import Material
 
 GAMMAS = (1e-4, 3e-4, 1e-3, 3e-3)
 BITS = (3, 4, 5)

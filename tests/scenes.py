@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import dynamics
-from gmem_jax.contact.hooke import Hooke
-from gmem_jax.drive import Motion
-from gmem_jax.grain import Clump, sphere, tetra
-from gmem_jax.material import Material
-from gmem_jax.neighbors import PairFinder, Pairs, slack, sphere_centres, tabulate
-from gmem_jax.rotation import uniform
-from gmem_jax.state import Box, Grains, State, replicate, still_box
+from gmem_jax.experiment.protocol import Motion
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.grain import Clump, sphere, tetra
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.pairs import PairFinder, Pairs, slack, sphere_centres, tabulate
+from gmem_jax.physics.rotation import uniform
+from gmem_jax.physics.state import Box, Grains, State, replicate, still_box
 
 ELASTIC = Material(normal_damping=0.0)
 SPHERE = sphere()

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmem_jax import analysis
-from gmem_jax.signals import bin_average, six_signals
+from gmem_jax.experiment import analysis
+from gmem_jax.experiment.signals import bin_average, six_signals
 
 DELTA0, GAMMA0 = 0.05, 1e-3
 J = bin_average(six_signals())

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import bench, native
-from gmem_jax.bench import Row
+from gmem_jax import native
+from gmem_jax.bench import measure as bench
+from gmem_jax.bench.measure import Row
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import classifier as classify
-from gmem_jax.signals import bin_average, words
+from gmem_jax.experiment.signals import bin_average, words
+from gmem_jax.reading import net as classify
 
 SMALL = classify.Recipe(2, hidden=(32, 32))
 PAPER = classify.Recipe(3)

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmem_jax.drive import Motion, memory_protocol, preparation_cycle
-from gmem_jax.signals import Bumps, six_signals
+from gmem_jax.experiment.protocol import Motion, memory_protocol, preparation_cycle
+from gmem_jax.experiment.signals import Bumps, six_signals
 
 LOWER = jnp.asarray([[1.0], [-2.0], [0.5]])
 UPPER = jnp.asarray([[9.0], [8.0], [12.5]])

@@ -23,14 +23,14 @@ from scenes import (
     still,
 )
 
-from gmem_jax import dynamics
-from gmem_jax.contact.hooke import Hooke
-from gmem_jax.grain import clump
-from gmem_jax.neighbors import PairFinder
-from gmem_jax.rotation import matrix
-from gmem_jax.run import compiled
-from gmem_jax.signals import Bumps
-from gmem_jax.state import Status, explain, replicate, still_box
+from gmem_jax.experiment.host import compiled
+from gmem_jax.experiment.signals import Bumps
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.grain import clump
+from gmem_jax.physics.pairs import PairFinder
+from gmem_jax.physics.rotation import matrix
+from gmem_jax.physics.state import Status, explain, replicate, still_box
 
 CHECK = jax.jit(dynamics.check)
 OBSERVE = jax.jit(dynamics.observe)

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import scenes
 
-from gmem_jax.contact.friction import FrictionLaw, largest_overlap
-from gmem_jax.contact.frictionless import Frictionless
-from gmem_jax.contact.hooke import Hooke
-from gmem_jax.contact.kinematics import kinematics, transport
-from gmem_jax.contact.mindlin import Mindlin, transport_layers
-from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.contact.normal import hertz
-from gmem_jax.contact.path import contact_path, lead_contact, led_contact, polyline
-from gmem_jax.material import Material
+from gmem_jax.physics.contact.friction import FrictionLaw, largest_overlap
+from gmem_jax.physics.contact.frictionless import Frictionless
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.kinematics import kinematics, transport
+from gmem_jax.physics.contact.mindlin import Mindlin, transport_layers
+from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
+from gmem_jax.physics.contact.normal import hertz
+from gmem_jax.physics.contact.path import contact_path, lead_contact, led_contact, polyline
+from gmem_jax.physics.material import Material
 
 LENGTH = 501
 STUCK = 1e6  # a friction coefficient that never slides

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import checkpoint, classify, gradient, jacobian, sweep
-from gmem_jax.contact.kinematics import kinematics
-from gmem_jax.contact.normal import hertz
+from gmem_jax import classify
+from gmem_jax.derivatives import gradient, jacobian
+from gmem_jax.experiment import checkpoint
+from gmem_jax.experiment import walk as sweep
+from gmem_jax.physics.contact.kinematics import kinematics
+from gmem_jax.physics.contact.normal import hertz
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 SHORT = gm.Timing(t0=75.0, dt=0.3, rest=0.1, hold=0.1, store=0.2)  # one step per bin: some 900 steps in all

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scenes import cached_tetra, orientations
 
-from gmem_jax.grain import clump, sphere, tetra
-from gmem_jax.rotation import matrix
+from gmem_jax.physics.grain import clump, sphere, tetra
+from gmem_jax.physics.rotation import matrix
 
 BALL = 4.0 * np.pi / 3.0
 BENT = np.array([[0.0, 0.0, 0.0], [1.1, 0.2, 0.0], [1.5, 1.2, 0.3], [0.4, 0.1, 1.3]])  # no symmetry at all

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gmem_jax.material import Material
+from gmem_jax.physics.material import Material
 
 
 def test_stiffnesses_are_those_of_the_specification():

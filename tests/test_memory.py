@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import run as host
-from gmem_jax.drive import Motion
-from gmem_jax.dynamics import System, start
-from gmem_jax.memory import COPIES, GRAIN_BYTES, default_batch, forget
-from gmem_jax.signals import BINS
-from gmem_jax.state import replicate
-from gmem_jax.storage import Parts
+from gmem_jax.experiment import host
+from gmem_jax.experiment.protocol import Motion
+from gmem_jax.experiment.recall import COPIES, GRAIN_BYTES, default_batch, forget
+from gmem_jax.experiment.signals import BINS
+from gmem_jax.files.storage import Parts
+from gmem_jax.physics.state import replicate
+from gmem_jax.physics.step import System, start
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 SHORT = {"t0": 75.0, "dt": 0.3, "store": 0.2}  # one step per bin: some 1,200 steps in all

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import dynamics, native
-from gmem_jax.drive import Motion
-from gmem_jax.dynamics import Sample, System, start
-from gmem_jax.state import State, replicate
+from gmem_jax import native
+from gmem_jax.experiment.protocol import Motion
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.state import State, replicate
+from gmem_jax.physics.step import Sample, System, start
 
 BUILT, REASON = native.available()
 # Without a C++ compiler there is no native backend to compare; plain JAX is then all there is.

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scenes import SPHERE, blank_state, cached_tetra, cluster27, make_grains, orientations, squeeze
 
-from gmem_jax import dynamics
-from gmem_jax.contact.hooke import Hooke
-from gmem_jax.neighbors import PairFinder, candidates, carry_history, slack, sphere_centres, tabulate
-from gmem_jax.state import still_box
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.pairs import PairFinder, candidates, carry_history, slack, sphere_centres, tabulate
+from gmem_jax.physics.state import still_box
 
 TETRA = cached_tetra()
 CENTRES = jax.jit(sphere_centres)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.prepare import lattice
+from gmem_jax.preparation.preparation import lattice
 
 TINY = gm.Recipe(grains=12, gas_time=500.0, t0=300.0, cycles=1)
 

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmem_jax import readers
-from gmem_jax.dynamics import Sample
-from gmem_jax.memory import Recall
-from gmem_jax.signals import bin_average, six_signals, word_bits, words
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.signals import bin_average, six_signals, word_bits, words
+from gmem_jax.physics.step import Sample
+from gmem_jax.reading import readers
 
 J = {bits: np.asarray(bin_average(words(bits))) for bits in (1, 3, 5)}
 

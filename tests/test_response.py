@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import gradient, response, sweep
-from gmem_jax.experiment import chunks
-from gmem_jax.signals import BINS, bin_average
+from gmem_jax.derivatives import gradient
+from gmem_jax.design import kernel as response
+from gmem_jax.experiment import walk as sweep
+from gmem_jax.experiment.experiment import chunks
+from gmem_jax.experiment.signals import BINS, bin_average
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 SHORT = gm.Timing(t0=75.0, dt=0.3, rest=0.1, hold=0.1, store=0.2)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scenes import column, orientations
 
-from gmem_jax.rotation import cross, dot, matrix, turn, uniform
+from gmem_jax.physics.rotation import cross, dot, matrix, turn, uniform
 
 AXIS = np.array([0.6, -0.48, 0.64])
 TURN, MATRIX = jax.jit(turn), jax.jit(matrix)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.drive import Motion
-from gmem_jax.dynamics import System, start
-from gmem_jax.neighbors import PairFinder
-from gmem_jax.run import Runner
-from gmem_jax.state import Status
+from gmem_jax.experiment.host import Runner
+from gmem_jax.experiment.protocol import Motion
+from gmem_jax.physics.pairs import PairFinder
+from gmem_jax.physics.state import Status
+from gmem_jax.physics.step import System, start
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmem_jax.signals import Bumps, bin_average, bit_width, six_signals, waveform, word_bits, words
+from gmem_jax.experiment.signals import Bumps, bin_average, bit_width, six_signals, waveform, word_bits, words
 
 SIX = six_signals()
 SHEAR = jax.jit(lambda signals, u: signals.shear(u))

@@ -1,4 +1,4 @@
-"""`advance` in C++ for CPUs, behind jax.ffi: the numbers of `gmem_jax.dynamics.advance`, several times faster.
+"""`advance` in C++ for CPUs, behind jax.ffi: the numbers of `gmem_jax.physics.step.advance`, several times faster.
 
 One call into the library runs all steps of one bin for all replicas; walls, checks and samples are computed in JAX,
 as in `dynamics.advance`. It works under `jax.jit`, `jax.vmap` and both modes of differentiation, whose derivatives
@@ -15,20 +15,21 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gmem_jax import checkpoint, dynamics
-from gmem_jax.contact.friction import FrictionLaw
-from gmem_jax.contact.frictionless import Frictionless
-from gmem_jax.contact.hooke import Hooke
-from gmem_jax.contact.mindlin import Mindlin
-from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.drive import Motion
-from gmem_jax.dynamics import Sample, System
+from gmem_jax.experiment import checkpoint
+from gmem_jax.experiment.protocol import Motion
 from gmem_jax.native import derivatives
 from gmem_jax.native.derivatives import Call
-from gmem_jax.state import Box, Grains, Scalar, State
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.frictionless import Frictionless
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.mindlin import Mindlin
+from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
+from gmem_jax.physics.state import Box, Grains, Scalar, State
+from gmem_jax.physics.step import Sample, System
 
 Advance = Callable[..., tuple[State, Sample]]
-"""The signature of `gmem_jax.dynamics.advance`."""
+"""The signature of `gmem_jax.physics.step.advance`."""
 
 BACKENDS = ("auto", "jax", "native")
 
@@ -121,7 +122,7 @@ def _require(system: System, state: State) -> None:
 
 
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
-    """`gmem_jax.dynamics.march` on the native backend; arguments, results and errors as of `advance`."""
+    """`gmem_jax.physics.step.march` on the native backend; arguments, results and errors as of `advance`."""
     _require(system, state)
     numbers = (jnp.asarray(dt), jnp.asarray(drag))
     grains, history, total = _bin(system, state.grains, state.history, boxes, numbers, None, jnp.asarray(0))
@@ -139,7 +140,7 @@ def advance(
     steps: Scalar,
     drag: Scalar = 0.0,
 ) -> tuple[State, Sample]:
-    """`gmem_jax.dynamics.advance` on the native backend; arguments and results as there.
+    """`gmem_jax.physics.step.advance` on the native backend; arguments and results as there.
 
     Raises:
         ValueError: if the backend is not available, does not know the friction law, or the state is not float64.

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import cli
-from gmem_jax.config import RecallConfig
+from gmem_jax.command import app as cli
+from gmem_jax.command.config import RecallConfig
 
 PACK = Path(__file__).parent.parent / "data" / "tetra-27.h5"
 SHORT = ["--t0", "75", "--store", "0.1", "--rest", "0.1", "--hold", "0.1"]

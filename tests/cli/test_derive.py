@@ -9,8 +9,8 @@ import pytest
 from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
-from gmem_jax import derive
-from gmem_jax.config import RecallConfig
+from gmem_jax.command import derive
+from gmem_jax.command.config import RecallConfig
 
 
 def test_kernel_and_design_write_what_they_say(

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
-ENTRY = "from gmem_jax.cli import main; main()"
+ENTRY = "from gmem_jax.command.app import main; main()"
 
 
 def recall(target: Path) -> subprocess.Popen:

@@ -18,13 +18,14 @@ import pytest
 import scenes
 
 import gmem_jax as gm
-from gmem_jax import dynamics, lammps
-from gmem_jax.contact.kinematics import kinematics
-from gmem_jax.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.contact.normal import hertz
-from gmem_jax.rotation import cross, dot
-from gmem_jax.run import compiled
-from gmem_jax.state import Box
+from gmem_jax.bench import lammps
+from gmem_jax.experiment.host import compiled
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.kinematics import kinematics
+from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
+from gmem_jax.physics.contact.normal import hertz
+from gmem_jax.physics.rotation import cross, dot
+from gmem_jax.physics.state import Box
 
 REASON = lammps.missing()
 # LAMMPS comes with the optional `oracle` extra, which `make test` installs; elsewhere it may not load.

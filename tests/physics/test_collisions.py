@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scenes import ELASTIC, FREE, SPHERE, column, record, scene, still
 
-from gmem_jax.contact.hooke import Hooke
-from gmem_jax.drive import Motion
-from gmem_jax.material import Material
-from gmem_jax.state import still_box
+from gmem_jax.experiment.protocol import Motion
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.state import still_box
 
 MASS, INERTIA = float(SPHERE.mass), float(SPHERE.inertia[0])
 K_N, K_W = Material().normal_stiffness, Material().wall_stiffness

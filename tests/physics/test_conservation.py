@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scenes import ELASTIC, cached_tetra, cluster27, coast, orientations, record, scene, squeeze
 
-from gmem_jax.contact.hooke import Hooke
-from gmem_jax.material import Material
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.material import Material
 
 TETRA = cached_tetra()
 MASS, INERTIA = float(TETRA.mass), float(TETRA.inertia[0])

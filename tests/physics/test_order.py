@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scenes import ELASTIC, cached_tetra, coast, orientations, scene
 
-from gmem_jax.contact.hooke import Hooke
-from gmem_jax.grain import sphere
-from gmem_jax.material import Material
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.grain import sphere
+from gmem_jax.physics.material import Material
 
 STEPS = (128, 192, 256, 384, 512, 768, 1024)
 REFERENCE = 16 * STEPS[-1]

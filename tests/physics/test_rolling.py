@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scenes import ELASTIC, SPHERE, coast, column, scene
 
-from gmem_jax.contact.hooke import Hooke
-from gmem_jax.contact.kinematics import kinematics, transport
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.kinematics import kinematics, transport
 
 OVERLAP = 0.05
 VALID = jnp.asarray([True])

@@ -1,0 +1,1 @@
+"""What a grain-step costs, here and in LAMMPS beside it."""

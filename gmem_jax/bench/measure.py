@@ -1,0 +1,439 @@
+"""What a grain-step costs, measured: native backend, plain JAX and LAMMPS in one run on one machine.
+
+The unit is the microsecond of wall time per grain-step (one grain, one time step, one replica), in the encode stage:
+moving walls, binning and list checks included. Results are checked in the same run: native and plain JAX must end at
+the same wall pressures.
+"""
+
+import functools
+import json
+import math
+import os
+import platform
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gmem_jax import native
+from gmem_jax.bench import lammps
+from gmem_jax.derivatives.gradient import value_and_grad
+from gmem_jax.design.kernel import bumps
+from gmem_jax.experiment import walk as sweep
+from gmem_jax.experiment.experiment import Experiment, Timing
+from gmem_jax.experiment.host import compiled_advance, worst
+from gmem_jax.experiment.pack import SKIN, Pack, smallest_box
+from gmem_jax.experiment.protocol import Motion, clock
+from gmem_jax.experiment.signals import Bumps, six_signals
+from gmem_jax.files.provenance import provenance
+from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.mindlin import Mindlin
+from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
+from gmem_jax.physics.pairs import PairFinder
+from gmem_jax.physics.rotation import matrix
+from gmem_jax.physics.state import Grains, Status, explain, replicate, still_box
+from gmem_jax.physics.step import System, start
+
+LAWS: dict[str, Hooke | MindlinRescaled | Mindlin] = {"H": Hooke(), "M1": MindlinRescaled(), "M2": Mindlin()}
+T0 = 1.8e3  # duration of the compression that is timed, t_c
+BINS = 4  # bins per timed call, so that checks and samples weigh as in a run
+AGREEMENT = 1e-8  # of the pressure, between backends: round-off grown over a few hundred steps
+LAMMPS_LISTS = ((0.1, 20), (0.2, 50), (0.2, 1000), (0.3, 1000))  # (skin in R, steps between checks) tried for LAMMPS
+Say = Callable[[str, float], None]
+"""Called with what is being measured and the fraction done."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement.
+
+    Attributes:
+        engine: "native", "jax" or "lammps".
+        law: "H", "M1" or "M2".
+        grains: number of grains.
+        replicas: replicas side by side, for LAMMPS processes side by side.
+        us: best wall time of a grain-step, in microseconds.
+        compile_s: seconds spent compiling, apart.
+        note: how LAMMPS was run, or what else is special.
+        p_xy: of the last replica at the end, in E; NaN where it cannot be compared.
+    """
+
+    engine: str
+    law: str
+    grains: int
+    replicas: int
+    us: float
+    compile_s: float = 0.0
+    note: str = ""
+    p_xy: float = float("nan")
+
+
+def processor() -> str:
+    """The processor's name, and how many cores this process may use."""
+    file = Path("/proc/cpuinfo")
+    lines = file.read_text().splitlines() if file.is_file() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.processor()}, {cores()} cores"
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def encode(pack: Pack, law: FrictionLaw, replicas: int) -> tuple[System, Any, Motion, float, int]:
+    """The start of an encode stage: system, state, motion, dt and steps per bin."""
+    step, steps = clock(T0, 0.3)
+    heights = jnp.linspace(-1.0, 1.0, max(1, replicas - 1))[:, None]
+    signals = Bumps(heights, jnp.full_like(heights, 0.1), 0.2) if replicas > 1 else None
+    system = System(pack.clump, law, pack.pairs)
+    state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
+    motion = Motion(pack.box.lower, pack.box.upper, pack.delta0, 0.0, 1.0, T0, 1e-3, signals)
+    return system, replicate(state, replicas), motion, float(step), int(steps)
+
+
+def measure(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 1.5) -> Row:
+    """Time `advance` of a backend; the best of as many calls as fit into about `seconds`, two at least."""
+    system, state, motion, dt, steps = encode(pack, LAWS[law], replicas)
+    began = time.perf_counter()
+    binary = compiled_advance(backend).lower(system, state, motion, dt, bins=BINS, steps=steps).compile()
+    compile_s = time.perf_counter() - began
+    final, sample = jax.block_until_ready(binary(system, state, motion, dt))  # warm-up
+    best, spent, calls = float("inf"), 0.0, 0
+    while calls < 2 or spent < seconds:
+        began = time.perf_counter()
+        final, sample = jax.block_until_ready(binary(system, state, motion, dt))
+        taken = time.perf_counter() - began
+        best, spent, calls = min(best, taken), spent + taken, calls + 1
+    if Status(worst(final)).fatal:
+        raise RuntimeError(f"{backend}, {law}, {pack.name}: {explain(worst(final))}")
+    pressure = np.asarray(sample.pressure)
+    cost = 1e6 * best / (BINS * steps * pack.grains * replicas)
+    return Row(
+        backend, law, pack.grains, replicas, cost, compile_s, p_xy=float(pressure[-1, 0, -1] - pressure[-1, 1, -1])
+    )
+
+
+def measure_lammps(pack: Pack, law: str, *, steps: int = 1000) -> list[Row]:
+    """LAMMPS on the same pack with its walls at rest: one core, serial runs side by side, and MPI ranks.
+
+    Its neighbour settings are tuned first, and the better of two runs counts. Law H has no dashpot there (see
+    `lammps.pair_lines`).
+
+    Raises:
+        ValueError: for law M2, which it does not have.
+    """
+    friction = LAWS[law]
+    if isinstance(friction, Mindlin):
+        raise ValueError("LAMMPS has no counterpart of M2")
+    if isinstance(friction, Hooke):
+        friction = replace(friction, damping_time=0.0)
+    still, none = np.zeros(3), np.zeros((pack.grains, 3))
+    quaternion, box = np.asarray(pack.quaternion), (np.asarray(pack.lower), np.asarray(pack.upper))
+    scene = lammps.Scene(pack.clump, np.asarray(pack.position), quaternion, none, none, *box, still, still)
+    material = System(pack.clump, friction, pack.pairs).material
+
+    def seconds(setting: tuple[float, int], count: int, ranks: int = 1) -> float:
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            skin, every = setting
+            script = lammps.scene_script(scene, friction, material, 0.3, folder, skin=skin, every=every)
+            return lammps.loop_seconds(script, folder, steps=count, ranks=ranks)
+
+    def best(run: Callable[[], float]) -> float:
+        return min(run(), run())
+
+    setting = min(LAMMPS_LISTS, key=lambda setting: seconds(setting, max(100, steps // 4)))
+    unit, many = 1e6 / (steps * pack.grains), cores()
+    note = f"skin {setting[0]} R, every {setting[1]}"
+    rows = [Row("lammps", law, pack.grains, 1, unit * best(lambda: seconds(setting, steps)), note=f"1 core, {note}")]
+    if many > 1:
+
+        def together() -> float:
+            with ThreadPoolExecutor(many) as pool:
+                return max(pool.map(lambda _: seconds(setting, steps), range(many)))
+
+        beside, ranks = unit * best(together) / many, unit * best(lambda: seconds(setting, steps, many))
+        rows.append(Row("lammps", law, pack.grains, many, beside, note=f"{many} serial runs side by side"))
+        rows.append(Row("lammps", law, pack.grains, 1, ranks, note=f"{many} ranks"))
+    return rows
+
+
+def tile(pack: Pack, times: tuple[int, int, int]) -> Pack:
+    """Copies of a pack of spheres or tetra grains side by side in one box, each the mirror image of its neighbours.
+
+    A rigid frictionless wall is a mirror plane, so the copies are at rest without it: a larger pack with the same
+    contacts, which shows what size alone costs.
+    """
+    lengths = np.asarray(pack.upper - pack.lower)
+    offsets = np.asarray(pack.clump.offsets)
+    across = offsets[0] - offsets[-1] if len(offsets) > 1 else np.array([1.0, 0.0, 0.0])
+    # A reflection that takes the grain to itself makes a rotation of every mirror image.
+    swap = np.eye(3) - 2.0 * np.outer(across, across) / (across @ across)
+    position = np.asarray(pack.position) - np.asarray(pack.lower)
+    turned = np.asarray(matrix(pack.quaternion[..., None]))[..., 0]
+    places, rotations = [], []
+    for cell in np.ndindex(*times):
+        odd = np.asarray(cell) % 2
+        places.append(np.where(odd, lengths - position, position) + np.asarray(cell) * lengths)
+        mirrored = (1.0 - 2.0 * odd)[:, None] * turned
+        rotations.append(mirrored @ swap if odd.sum() % 2 else mirrored)
+    quaternion = Rotation.from_matrix(np.concatenate(rotations)).as_quat(scalar_first=True)
+    upper = lengths * np.asarray(times)
+    box = still_box(jnp.zeros((3, 1)), jnp.asarray(upper)[:, None])
+    at = jnp.asarray(np.concatenate(places))[..., None]
+    still = jnp.zeros_like(at)
+    grains = Grains(at, jnp.asarray(quaternion)[..., None], still, still, still, still)
+    pairs = PairFinder(pack.clump, upper, SKIN)(
+        grains, pack.clump, box, smallest_box(np.zeros(3), upper, float(pack.delta0))
+    )
+    return replace(
+        pack,
+        position=at[..., 0],
+        quaternion=jnp.asarray(quaternion),
+        lower=jnp.zeros(3),
+        upper=jnp.asarray(upper),
+        pairs=pairs,
+        name=f"{pack.name} x {math.prod(times)}",
+    )
+
+
+def _peak_memory(load: Callable[[str], Pack], name: str, backend: str, law: str, replicas: int) -> int:
+    """Peak resident bytes of a fresh process that runs one call of `advance`."""
+    jax.config.update("jax_enable_x64", True)
+    system, state, motion, dt, steps = encode(load(name), LAWS[law], replicas)
+    move = compiled_advance(backend)
+    jax.block_until_ready(move(system, state, motion, dt, bins=1, steps=steps))
+    return _peak_bytes()
+
+
+def _peak_bytes() -> int:
+    """Peak resident bytes of this process."""
+    status = Path("/proc/self/status")
+    if status.is_file():  # Linux lets ru_maxrss of a child begin with its parent's
+        return next(1024 * int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+    unit = 1 if sys.platform == "darwin" else 1024
+    return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def memory(load: Callable[[str], Pack], name: str, grains: int, backend: str, law: str, replicas: int = 32) -> float:
+    """Bytes per grain and replica: growth of the peak from half to all of the replicas, each in its own process."""
+    peaks = []
+    for count in (replicas // 2, replicas):
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            peaks.append(pool.submit(_peak_memory, load, name, backend, law, count).result())
+    return (peaks[1] - peaks[0]) / (grains * (replicas - replicas // 2))
+
+
+def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int, t0: float) -> dict[str, float]:
+    jax.config.update("jax_enable_x64", True)
+    experiment = Experiment(load(name), six_signals(), timing=Timing(t0=t0, backend=backend))
+    amplitudes = jnp.asarray(np.random.default_rng(0).normal(scale=0.2, size=(6, values)))
+
+    def make(amplitudes: Any) -> Experiment:
+        return replace(experiment, signals=bumps(amplitudes, 0.2))
+
+    def seconds(run: Callable[[], Any]) -> float:
+        taken = []
+        for _ in range(2):  # the first compiles
+            began = time.perf_counter()
+            jax.block_until_ready(run())
+            taken.append(time.perf_counter() - began)
+        return min(taken)
+
+    forward = seconds(lambda: sweep.simulate(make(amplitudes)))
+    before = _peak_bytes()
+    reverse = seconds(lambda: value_and_grad(make, amplitudes).slope)
+    return {"forward_s": forward, "gradient_s": reverse, "forward_bytes": before, "gradient_bytes": _peak_bytes()}
+
+
+def gradient_cost(
+    load: Callable[[str], Pack], name: str, backend: str, *, values: int = 32, t0: float = T0
+) -> dict[str, float]:
+    """Seconds and peak memory of the gradient of F by `values` numbers of each of the six waveforms, whole experiment.
+
+    Returns:
+        "forward_s" of one run of the same replicas, "gradient_s", and the peak resident bytes of the process after
+        each; the process is a fresh one.
+    """
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(_gradient, load, name, backend, values, t0).result()
+
+
+def disagreements(rows: Sequence[Row], scale: float = 2e-3) -> list[str]:
+    """Cases in which native and plain JAX did not end at the same p_xy, relative to a pressure of `scale` in E."""
+    cases: dict[tuple[str, int, int], dict[str, float]] = {}
+    for row in rows:
+        if row.engine != "lammps":
+            cases.setdefault((row.law, row.grains, row.replicas), {})[row.engine] = row.p_xy
+    return [
+        f"{law}, N = {grains}, {replicas} replicas: p_xy {found['native']:.12e} native, {found['jax']:.12e} plain JAX"
+        for (law, grains, replicas), found in cases.items()
+        if len(found) == 2 and not abs(found["native"] - found["jax"]) < AGREEMENT * scale
+    ]
+
+
+def run(
+    load: Callable[[str], Pack],
+    packs: Sequence[str],
+    *,
+    laws: Sequence[str] = ("H", "M1", "M2"),
+    replicas: Sequence[int] = (1, 8, 16, 32),
+    with_lammps: bool = True,
+    sizes: Sequence[tuple[int, int, int]] = ((1, 1, 1), (2, 2, 1), (2, 2, 3), (4, 4, 2), (5, 5, 4)),
+    say: Say = lambda what, fraction: None,
+) -> dict[str, Any]:
+    """The whole table.
+
+    Args:
+        load: gives a pack by its name.
+        packs: their names; the first is also tiled to larger ones, and carries the plain-JAX comparison of M1 and M2.
+        laws: friction laws.
+        replicas: numbers of replicas.
+        with_lammps: measure LAMMPS too, if it can run here.
+        sizes: copies of the first pack along each axis, for the cost against N.
+        say: see `Say`.
+
+    Returns:
+        The machine, rows, cost against N, bytes per grain and replica, cost of a gradient; see `markdown`.
+
+    Raises:
+        RuntimeError: if backends disagree.
+    """
+    loaded = {name: load(name) for name in packs}
+    first = loaded[packs[0]]
+    backends = ["native", "jax"] if native.available()[0] else ["jax"]
+    absent = lammps.missing() if with_lammps else "not asked for"
+    plan: list[tuple[str, Callable[[], list[Row]]]] = []
+
+    def timed(pack: Pack, backend: str, law: str, count: int) -> tuple[str, Callable[[], list[Row]]]:
+        what = f"{backend}, {law}, N = {pack.grains}, {count} replicas"
+        return what, lambda: [measure(pack, backend, law, count)]
+
+    for pack in loaded.values():
+        for law in laws:
+            for count in replicas:
+                if fits(pack, law, count):
+                    plan += [
+                        timed(pack, backend, law, count) for backend in backends if _worth(pack, first, backend, law)
+                    ]
+            if absent is None and law in ("H", "M1"):
+                plan.append((f"LAMMPS, {law}, N = {pack.grains}", functools.partial(measure_lammps, pack, law)))
+    rows: list[Row] = []
+    for place, (what, job) in enumerate(plan):
+        say(what, 0.7 * place / len(plan))
+        rows += job()
+    growth = []
+    for place, times in enumerate(sizes):
+        tiled = first if times == (1, 1, 1) else tile(first, times)
+        say(f"cost against N: {tiled.grains}", 0.7 + 0.25 * place / len(sizes))
+        growth += [replace(measure(tiled, backends[0], "H", count), note="tiled") for count in (1, 8)]
+    say("memory", 0.95)
+    largest = max(loaded, key=lambda name: loaded[name].grains)
+    use = {law: memory(load, largest, loaded[largest].grains, backends[0], law) for law in laws if law != "M2"}
+    say("gradient", 0.97)
+    gradient = gradient_cost(load, packs[0], backends[0])
+    if wrong := disagreements(rows):
+        raise RuntimeError("backends disagree: " + "; ".join(wrong))
+    return {
+        **provenance(),
+        "processor": processor(),
+        "lammps": absent or "2025.7.22",
+        "instruction_set": native.available()[1],
+        "rows": [asdict(row) for row in rows],
+        "growth": [asdict(row) for row in growth],
+        "bytes_per_grain_replica": use,
+        "gradient": {"grains": first.grains, "commit": provenance()["commit"], **gradient},
+    }
+
+
+def fits(pack: Pack, law: str, replicas: int, share: float = 0.25) -> bool:
+    """Whether the contact histories of a case fit into `share` of the memory (Mindlin's are dense in XLA)."""
+    friction = LAWS[law]
+    points = friction.points if isinstance(friction, Mindlin) else 1
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return 3 * 8 * points * pack.pairs.capacity * replicas * 3 < share * total
+
+
+def _worth(pack: Pack, first: Pack, backend: str, law: str) -> bool:
+    """Plain JAX is timed in full only where a user would wait for it."""
+    return backend != "jax" or law == "H" or pack is first
+
+
+def _find(rows: Sequence[dict[str, Any]], **wanted: Any) -> dict[str, Any] | None:
+    return next((row for row in rows if all(row[key] == value for key, value in wanted.items())), None)
+
+
+def markdown(result: dict[str, Any], baseline: dict[str, Any] | None = None) -> str:
+    """The table as Markdown; with a baseline, every row has its ratio to it."""
+    commit = (result["commit"] or "unknown")[:9]
+    versions = result["versions"]
+    lines = [
+        f"{result['processor']} ({result['instruction_set']}), float64, jax {versions['jax']}, "
+        f"LAMMPS {result['lammps']}, commit {commit}",
+        "",
+        "Microseconds of wall time per grain-step, all cores of the machine.",
+        "",
+        "| law | N | engine | replicas | us | LAMMPS / this | compile, s | baseline / this |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    rows = result["rows"]
+    old = baseline["rows"] if baseline else []
+    for row in sorted(rows, key=lambda r: (r["law"], r["grains"], r["engine"], r["replicas"])):
+        rivals = [r["us"] for r in rows if _is_rival(r, row)]
+        rival = f"{min(rivals) / row['us']:.1f}" if rivals and row["engine"] != "lammps" else ""
+        same = {key: row[key] for key in ("engine", "law", "grains", "replicas")}
+        before = _find(old, **same, **({"note": row["note"]} if row["engine"] == "lammps" else {}))
+        ratio = f"{before['us'] / row['us']:.2f}" if before else ""
+        engine = f"LAMMPS, {row['note']}" if row["engine"] == "lammps" else row["engine"]
+        lines.append(
+            f"| {row['law']} | {row['grains']} | {engine} | {row['replicas']} | {row['us']:.4f} | {rival} "
+            f"| {row['compile_s']:.1f} | {ratio} |"
+        )
+    lines += ["", "Cost against size (law H; copies of one pack side by side):", ""]
+    lines += ["| N | 1 replica | growth | 8 replicas | growth |", "|---|---|---|---|---|"]
+    growth = result["growth"]
+    ones, eights = ([row for row in growth if row["replicas"] == count] for count in (1, 8))
+    for one, eight in zip(ones, eights, strict=True):
+        lines.append(
+            f"| {one['grains']} | {one['us']:.4f} | {one['us'] / ones[0]['us']:.2f} "
+            f"| {eight['us']:.4f} | {eight['us'] / eights[0]['us']:.2f} |"
+        )
+    use = ", ".join(f"{law} {bytes_ / 1e3:.2f} kB" for law, bytes_ in result["bytes_per_grain_replica"].items())
+    lines += ["", f"Memory per grain and replica: {use}."]
+    if gradient := result.get("gradient"):
+        lines += [
+            "",
+            f"Gradient of F by 6 x 32 waveform values, whole experiment, N = {gradient['grains']}, t0 = {T0:g}, "
+            f"commit {(gradient['commit'] or 'unknown')[:9]}: "
+            f"{gradient['gradient_s']:.1f} s, one forward run {gradient['forward_s']:.1f} s, "
+            f"ratio {gradient['gradient_s'] / gradient['forward_s']:.1f}; peak memory of the process "
+            f"{gradient['gradient_bytes'] / 1e9:.2f} GB, {gradient['forward_bytes'] / 1e9:.2f} GB before.",
+        ]
+    return "\n".join([*lines, ""])
+
+
+def _is_rival(rival: dict[str, Any], row: dict[str, Any]) -> bool:
+    """LAMMPS' best way to do the same: ranks for one replica, serial runs side by side for several."""
+    if (rival["engine"], rival["law"], rival["grains"]) != ("lammps", row["law"], row["grains"]):
+        return False
+    return "ranks" in rival["note"] if row["replicas"] == 1 else "side by side" in rival["note"] or cores() == 1
+
+
+def save(folder: Path, result: dict[str, Any], text: str) -> None:
+    """Write bench.json and bench.md to `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "bench.json").write_text(json.dumps(result, indent=1) + "\n")
+    (folder / "bench.md").write_text(text)

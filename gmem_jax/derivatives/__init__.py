@@ -1,0 +1,1 @@
+"""Derivatives of a whole experiment, in forward and in reverse mode."""

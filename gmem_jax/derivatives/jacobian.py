@@ -1,0 +1,164 @@
+"""The Jacobian of the recall of one signal: exact, with one replica for every parameter, and by central differences.
+
+The parameters are the amplitudes a_k of the signal, gamma0, and the friction law's mu and stiffness.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.derivatives import gradient
+from gmem_jax.experiment import walk as sweep
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.experiment.signals import Bumps
+
+LAW = ("mu", "stiffness")  # parameters that act on the prefix, and on the zero signal
+
+
+@dataclass(frozen=True)
+class Jacobian:
+    """Derivatives of one recalled signal.
+
+    Attributes:
+        names: of the parameters; "amplitude 1", ..., "gamma0", "mu", "stiffness".
+        values: of the parameters, [P].
+        p_sig: by each parameter, [P, 256], in E per unit of it.
+        p_xy: p_x - p_y of every bin from the encoding on, by each parameter, [P, bins], of the sheared replica.
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    p_sig: np.ndarray
+    p_xy: np.ndarray
+
+
+def _copies(bumps: Bumps, amplitudes: Any) -> Bumps:
+    """One signal's bumps with rows of amplitudes [R, n]."""
+    return Bumps(amplitudes, jnp.broadcast_to(bumps.centres, jnp.shape(amplitudes)), bumps.width)
+
+
+def _one_signal(experiment: Experiment) -> tuple[Bumps, np.ndarray]:
+    bumps = experiment.signals
+    if not isinstance(bumps, Bumps) or bumps.count != 1:
+        raise ValueError("a Jacobian is taken of one signal made of bumps")
+    return bumps, np.asarray(bumps.amplitudes)
+
+
+def _sheared(pressure: dict[str, np.ndarray]) -> np.ndarray:
+    """p_x - p_y of the stages from the encoding on, [replicas, bins]."""
+    joined = np.concatenate([pressure[name] for name in ("encode", "store", "readout")])
+    result: np.ndarray = (joined[:, 0] - joined[:, 1]).T
+    return result
+
+
+def exact(experiment: Experiment, *, law: bool = True, progress: Progress = silent) -> Jacobian:
+    """Forward mode, parameters as replicas; two runs, because mu and the stiffness act on the prefix too.
+
+    Args:
+        experiment: of one signal of n bumps.
+        law: whether to take derivatives by mu and stiffness also.
+        progress: told about every chunk.
+
+    Raises:
+        ValueError: if there is another number of signals, or they are not bumps.
+        RunFailedError: if the simulation broke down.
+    """
+    bumps, row = _one_signal(experiment)
+    n = row.shape[1]
+    rows = np.repeat(row, n + 1, axis=0)
+    theta = {"amplitudes": jnp.asarray(rows), "gamma0": jnp.full(n + 2, experiment.gamma0)}
+    direction = {
+        "amplitudes": jnp.asarray(np.eye(n + 1, n)),
+        "gamma0": jnp.zeros(n + 2).at[-1].set(1.0),
+    }
+
+    def by_drive(theta: Any) -> Experiment:
+        return replace(experiment, signals=_copies(bumps, theta["amplitudes"]), gamma0=theta["gamma0"])
+
+    share = 0.7 if law else 1.0
+    pushed = gradient.push(by_drive, theta, direction, progress=lambda s, t, f: progress(s, t, share * f))
+    names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
+    values = [*row[0], float(experiment.gamma0)]
+    p_sig, p_xy = [np.asarray(pushed.p_sig_slope)], [_sheared(pushed.slope)[1:]]
+    if law:
+        two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # replicas 0, 1: no signal; 2, 3: it
+        chosen: Any = experiment.friction
+        theta = {name: jnp.full(4, getattr(chosen, name)) for name in LAW}
+        direction = {"mu": jnp.asarray([1.0, 0.0, 1.0, 0.0]), "stiffness": jnp.asarray([0.0, 1.0, 0.0, 1.0])}
+
+        def by_law(theta: Any) -> Experiment:
+            return replace(experiment, signals=_copies(bumps, two), friction=replace(chosen, **theta))
+
+        pushed = gradient.push(by_law, theta, direction, progress=lambda s, t, f: progress(s, t, share + 0.3 * f))
+        readout = pushed.slope["readout"]
+        change = np.flip(readout[:, 0] - readout[:, 1], axis=0).T
+        p_sig.append(-(change[2:] - change[:2]))
+        p_xy.append(_sheared(pushed.slope)[2:])
+        names += LAW
+        values += [float(getattr(chosen, name)) for name in LAW]
+    return Jacobian(tuple(names), np.asarray(values), np.concatenate(p_sig), np.concatenate(p_xy))
+
+
+def differences(experiment: Experiment, relative: float, *, law: bool = True, progress: Progress = silent) -> Jacobian:
+    """Central differences with steps of `relative` times each parameter (amplitudes: times 1), as replicas.
+
+    Raises:
+        ValueError: if there is another number of signals, or they are not bumps.
+        RunFailedError: if the simulation broke down.
+    """
+    bumps, row = _one_signal(experiment)
+    n = row.shape[1]
+    steps = relative * np.vstack([np.eye(n), -np.eye(n), np.zeros((2, n))])
+    gamma0 = np.full(2 * n + 3, float(experiment.gamma0))
+    gamma0[-2:] *= [1.0 + relative, 1.0 - relative]
+    drive = replace(experiment, signals=_copies(bumps, jnp.asarray(row + steps)), gamma0=jnp.asarray(gamma0))
+    p_sig, pressure = sweep.simulate(drive, progress=progress)
+    recalled, p_xy = np.asarray(p_sig), _sheared(pressure)[1:]
+    widths = np.full((n + 1, 1), 2.0 * relative)
+    widths[n] *= float(experiment.gamma0)
+    up, down = [*range(n), 2 * n], [*range(n, 2 * n), 2 * n + 1]
+    slopes = [(recalled[up] - recalled[down]) / widths], [(p_xy[up] - p_xy[down]) / widths]
+    names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
+    values = [*row[0], float(experiment.gamma0)]
+    if law:
+        chosen: Any = experiment.friction
+        factor = {"mu": [1.0, -1.0, 0.0, 0.0], "stiffness": [0.0, 0.0, 1.0, -1.0]}
+        shifted = {
+            name: jnp.asarray(float(getattr(chosen, name)) * (1.0 + relative * np.tile(factor[name], 2)))
+            for name in LAW
+        }
+        rows = jnp.asarray(np.concatenate([np.zeros((3, n)), np.repeat(row, 4, axis=0)]))
+        other = replace(experiment, signals=_copies(bumps, rows), friction=replace(chosen, **shifted))
+        _, pressure = sweep.simulate(other, progress=progress)
+        readout = pressure["readout"]
+        change = np.flip(readout[:, 0] - readout[:, 1], axis=0).T
+        signal = -(change[4:] - change[:4])
+        p_xy = _sheared(pressure)[4:]
+        widths = 2.0 * relative * np.asarray([[float(getattr(chosen, name))] for name in LAW])
+        slopes[0].append((signal[[0, 2]] - signal[[1, 3]]) / widths)
+        slopes[1].append((p_xy[[0, 2]] - p_xy[[1, 3]]) / widths)
+        names += LAW
+        values += [float(getattr(chosen, name)) for name in LAW]
+    return Jacobian(tuple(names), np.asarray(values), np.concatenate(slopes[0]), np.concatenate(slopes[1]))
+
+
+def mismatch(one: Jacobian, other: Jacobian) -> dict[str, float]:
+    """|one - other| / |other| of every group of parameters, and of all with each parameter at its own scale."""
+    scale = np.abs(np.where(other.values == 0.0, 1.0, other.values))[:, None]
+    scale[: sum(name.startswith("amplitude") for name in other.names)] = 1.0
+    rows: dict[str, Sequence[int]] = {
+        "amplitudes": [k for k, name in enumerate(other.names) if name.startswith("amplitude")],
+        **{name: [k] for k, name in enumerate(other.names) if not name.startswith("amplitude")},
+        "all": range(len(other.names)),
+    }
+    return {
+        group: float(
+            np.linalg.norm((scale * (one.p_sig - other.p_sig))[list(chosen)])
+            / np.linalg.norm((scale * other.p_sig)[list(chosen)])
+        )
+        for group, chosen in rows.items()
+    }

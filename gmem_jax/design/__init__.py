@@ -1,0 +1,1 @@
+"""Better memories: the memory kernel of a pack, designed waveforms, tuned drives."""

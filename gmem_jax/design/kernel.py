@@ -1,0 +1,187 @@
+"""The memory kernel of a pack: how the recall depends on the waveform when the waveform is weak.
+
+p_sig(u) = int M(u, v) gamma(v) dv. The kernel is measured on n basis waveforms (half-cosine bumps of one width), each
+stored with both signs as replicas of one native run. Half the difference of the two recalls is
+the odd part, M; half the sum is the even part, which a linear memory would not have. Measured, both grow in proportion
+to a weak waveform: a pack answers a shear and its opposite differently, however small they are.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment import analysis
+from gmem_jax.experiment import walk as sweep
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.signals import BINS, Bumps, Signals, bin_average
+
+FINE = 2048  # points of v for inner products of basis functions
+
+
+@dataclass(frozen=True)
+class MemoryKernel:
+    """The recall of n basis waveforms, for unit amplitude.
+
+    Attributes:
+        u: centres of the bins, [256].
+        centres: of the bumps, [n].
+        width: of the bumps.
+        odd: half the difference of the recalls of each waveform and its opposite, [n, 256], in E.
+        even: half their sum, [n, 256].
+        gamma0: shear amplitude they were measured at.
+        delta0: areal compression.
+    """
+
+    u: np.ndarray
+    centres: np.ndarray
+    width: float
+    odd: np.ndarray
+    even: np.ndarray
+    gamma0: float
+    delta0: float
+
+    @property
+    def basis(self) -> Bumps:
+        """The n waveforms."""
+        return bumps(np.eye(self.centres.size), self.width)
+
+    def kernel(self) -> np.ndarray:
+        """M at (bins of u, centres in v), [256, n], in E: the response over the integral of the bump."""
+        area = np.asarray(self.basis.integral(jnp.asarray(1.0)))
+        result: np.ndarray = (self.odd / (self.gamma0 * area[:, None])).T
+        return result
+
+    def _orthonormal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Recalls [n, 256] of, and values on the fine grid [n, FINE] of, an orthonormal basis of the same space."""
+        v = (np.arange(FINE) + 0.5) / FINE
+        shapes = np.asarray(self.basis.shear(jnp.asarray(v))).T
+        values, vectors = np.linalg.eigh(shapes @ shapes.T / FINE)
+        whiten = vectors @ np.diag(values**-0.5) @ vectors.T
+        return whiten @ self.odd, whiten @ shapes
+
+    def singular_values(self) -> np.ndarray:
+        """RMS of p_sig (in E) for the best, second best, ... waveform of unit RMS, [n], falling."""
+        recalled, _ = self._orthonormal()
+        values: np.ndarray = np.linalg.svd(recalled, compute_uv=False) / np.sqrt(BINS)
+        return values
+
+    def gain(self) -> float:
+        """G of the ideal kernel G E delta0 (v < u) that is nearest to this one on the basis."""
+        ideal = bin_average(self.basis)
+        return float(analysis.gain(jnp.asarray(self.odd), ideal, self.delta0, self.gamma0))
+
+    def distance(self) -> float:
+        """|odd - ideal| / |odd| over the basis: 0 for a perfect integral, 1 for none; 1 - distance is like F."""
+        ideal = bin_average(self.basis)
+        return 1.0 - float(analysis.fidelity(jnp.asarray(self.odd), ideal, self.delta0, self.gamma0))
+
+    def asymmetry(self) -> float:
+        """|even| / |odd| over the basis: 0 for a linear memory."""
+        return float(np.linalg.norm(self.even) / np.linalg.norm(self.odd))
+
+    def capacity(self, noise: float) -> int:
+        """How many independent values of unit RMS can be told from noise of RMS `noise` (in E) in p_sig."""
+        return int(np.sum(self.singular_values() > noise))
+
+    def resolution(self, noise: float) -> float:
+        """Width in v of what a point of the waveform becomes when read back with the values above `noise`.
+
+        Full width at half maximum of the truncated inverse's point-spread function, mean over 0.2 < v < 0.8.
+        """
+        recalled, shapes = self._orthonormal()
+        left, values, _ = np.linalg.svd(recalled, full_matrices=False)
+        kept = values / np.sqrt(BINS) > noise
+        if not kept.any():
+            return 1.0
+        modes = left[:, kept].T @ shapes
+        widths = []
+        for at in range(FINE // 5, 4 * FINE // 5, FINE // 32):
+            spread = modes[:, at] @ modes
+            half = spread < 0.5 * spread[at]
+            right = np.argmax(half[at:]) if half[at:].any() else FINE - at
+            back = np.argmax(half[at::-1]) if half[at::-1].any() else at
+            widths.append((right + back) / FINE)
+        return float(np.mean(widths))
+
+    def coefficients(self, signals: Signals) -> np.ndarray:
+        """Amplitudes of the basis functions that come nearest to waveforms, [S, n]."""
+        return nearest(self.basis, signals)
+
+    def predict(self, signals: Signals, *, even: bool = True) -> np.ndarray:
+        """p_sig of waveforms by superposition, [S, 256], in E, at the kernel's gamma0.
+
+        Args:
+            signals: waveforms that were never simulated.
+            even: add the even parts, in proportion to the absolute amplitudes.
+        """
+        amplitudes = self.coefficients(signals)
+        linear: np.ndarray = amplitudes @ self.odd
+        return linear + np.abs(amplitudes) @ self.even if even else linear
+
+
+def bumps(amplitudes: np.ndarray | jax.Array, width: float) -> Bumps:
+    """Waveforms of amplitudes [S, n] on n evenly spaced bumps that fill [0, 1]."""
+    centres = np.linspace(0.5 * width, 1.0 - 0.5 * width, amplitudes.shape[1])
+    return Bumps(jnp.asarray(amplitudes), jnp.broadcast_to(jnp.asarray(centres), amplitudes.shape), width)
+
+
+def nearest(basis: Signals, signals: Signals) -> np.ndarray:
+    """Amplitudes of n basis functions that come nearest to waveforms (least squares), [S, n]."""
+    v = (jnp.arange(FINE) + 0.5) / FINE
+    shapes, wanted = np.asarray(basis.shear(v)), np.asarray(signals.shear(v))
+    result: np.ndarray = np.linalg.lstsq(shapes, wanted, rcond=None)[0].T
+    return result
+
+
+def memory_kernel(
+    pack: Pack,
+    n: int = 17,
+    width: float = 0.2,
+    *,
+    state: Any = None,
+    progress: Progress = silent,
+    experiment: Experiment | None = None,
+    **parameters: Any,
+) -> MemoryKernel:
+    """Measure the memory kernel of a pack.
+
+    Args:
+        pack: the pack.
+        n: basis waveforms; 2 n + 1 replicas are run.
+        width: of the bumps; narrow ones drive the walls faster.
+        state: what `sweep.prefix` gave for the same pack and friction, if there is one.
+        progress: told about every chunk.
+        experiment: pack and parameters in one; its signals do not matter.
+        parameters: fields of `Experiment` (friction, gamma0, delta0, timing).
+
+    Raises:
+        ValueError: if n < 2.
+        RunFailedError: if the simulation broke down.
+    """
+    if n < 2:
+        raise ValueError(f"a kernel needs at least 2 basis waveforms, got {n}")
+    both = bumps(np.concatenate([np.eye(n), -np.eye(n)]), width)
+    run = Experiment(pack, both, **parameters) if experiment is None else replace(experiment, signals=both)
+    p_sig = np.asarray(sweep.simulate(run, state, progress=progress)[0])
+    plus, minus = p_sig[:n], p_sig[n:]
+    return MemoryKernel(
+        u=(np.arange(BINS) + 0.5) / BINS,
+        centres=np.asarray(both.centres[0]),
+        width=width,
+        odd=0.5 * (plus - minus),
+        even=0.5 * (plus + minus),
+        gamma0=float(run.gamma0),
+        delta0=float(run.compression),
+    )
+
+
+def relative_error(predicted: np.ndarray, simulated: jax.Array | np.ndarray) -> np.ndarray:
+    """|predicted - simulated| / |simulated| of every signal, [S]."""
+    simulated = np.asarray(simulated)
+    result: np.ndarray = np.linalg.norm(predicted - simulated, axis=1) / np.linalg.norm(simulated, axis=1)
+    return result

@@ -1,0 +1,209 @@
+"""Shear waveforms I(u) and their integrals J(u), on the compression variable u in [0, 1].
+
+A set of S signals is a pytree with two methods, `shear(u)` and `integral(u)`, each [..., S] for u of shape [...].
+All waveforms vanish at u = 0 and u = 1, so that the box is unsheared outside the encoding ramp.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.physics.state import Scalar
+
+LONGEST_WORD = 12  # bits
+PAD = 2  # bits left free at either end of a word
+BINS = 256  # bins of u in the paper: the resolution of every recorded signal
+
+
+@runtime_checkable
+class Signals(Protocol):
+    """A set of S waveforms: a pytree whose arrays with a leading axis of length S belong to one signal each."""
+
+    @property
+    def count(self) -> int:
+        """Number of signals S."""
+        ...
+
+    def shear(self, u: jax.Array) -> jax.Array:
+        """I_s(u), [..., S]."""
+        ...
+
+    def integral(self, u: jax.Array) -> jax.Array:
+        """J_s(u), the integral of I_s from 0 to u, [..., S]."""
+        ...
+
+
+def part(signals: Signals, first: int, last: int) -> Signals:
+    """Signals number `first` to `last` - 1 of a set, as a set."""
+
+    def rows(leaf: jax.Array) -> jax.Array:
+        return leaf[first:last] if jnp.ndim(leaf) > 0 and jnp.shape(leaf)[0] == signals.count else leaf
+
+    chosen: Signals = jax.tree.map(rows, signals)
+    return chosen
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Bumps:
+    """Sums of half-cosine bumps, I_s(u) = sum_b a_b f((u - c_b) / du), f(x) = cos(pi x) for |x| < 1/2 (Sec. II).
+
+    Attributes:
+        amplitudes: a_b, [S, b]; zero entries pad signals with fewer bumps.
+        centres: c_b, [S, b].
+        width: du, scalar or [S, 1].
+    """
+
+    amplitudes: jax.Array
+    centres: jax.Array
+    width: Scalar
+
+    @property
+    def count(self) -> int:
+        """Number of signals S."""
+        return int(self.amplitudes.shape[-2])
+
+    def shear(self, u: jax.Array) -> jax.Array:
+        """I_s(u), [..., S]."""
+        x = (u[..., None, None] - self.centres) / self.width
+        bump = jnp.where(jnp.abs(x) < 0.5, jnp.cos(jnp.pi * x), 0.0)
+        return jnp.sum(self.amplitudes * bump, axis=-1)
+
+    def integral(self, u: jax.Array) -> jax.Array:
+        """J_s(u), [..., S]."""
+
+        def primitive(v: jax.Array) -> jax.Array:
+            x = jnp.clip((v[..., None, None] - self.centres) / self.width, -0.5, 0.5)
+            return self.width * (1.0 + jnp.sin(jnp.pi * x)) / jnp.pi
+
+        return jnp.sum(self.amplitudes * (primitive(u) - primitive(jnp.zeros_like(u))), axis=-1)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Samples:
+    """Waveforms given by samples, joined by a C1 cubic (Catmull-Rom) curve.
+
+    Attributes:
+        nodes: I_s at the n + 2 equally spaced nodes u = k / (n + 1), [S, n + 2]; first and last are zero.
+    """
+
+    nodes: jax.Array
+
+    @property
+    def count(self) -> int:
+        """Number of signals S."""
+        return int(self.nodes.shape[-2])
+
+    def _pieces(self) -> tuple[jax.Array, ...]:
+        """Cubic coefficients (ascending, in the local coordinate 0..1) of every interval, each [S, n + 1]."""
+        slope = jnp.asarray(jnp.gradient(self.nodes, axis=-1))  # per interval
+        left, right = self.nodes[..., :-1], self.nodes[..., 1:]
+        m0, m1 = slope[..., :-1], slope[..., 1:]
+        return left, m0, 3.0 * (right - left) - 2.0 * m0 - m1, 2.0 * (left - right) + m0 + m1
+
+    def _locate(self, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+        intervals = self.nodes.shape[-1] - 1
+        scaled = jnp.clip(u, 0.0, 1.0) * intervals
+        place = jnp.clip(jnp.floor(scaled).astype(jnp.int32), 0, intervals - 1)
+        return place, (scaled - place)[..., None]
+
+    def shear(self, u: jax.Array) -> jax.Array:
+        """I_s(u), [..., S]."""
+        place, x = self._locate(u)
+        a, b, c, d = (jnp.moveaxis(p, -1, 0)[place] for p in self._pieces())
+        return a + x * (b + x * (c + x * d))
+
+    def integral(self, u: jax.Array) -> jax.Array:
+        """J_s(u), [..., S]."""
+        place, x = self._locate(u)
+        width = 1.0 / (self.nodes.shape[-1] - 1)
+        pieces = self._pieces()
+        whole = pieces[0] + pieces[1] / 2.0 + pieces[2] / 3.0 + pieces[3] / 4.0
+        before = jnp.moveaxis(jnp.cumsum(whole, axis=-1) - whole, -1, 0)[place]
+        a, b, c, d = (jnp.moveaxis(p, -1, 0)[place] for p in pieces)
+        return width * (before + x * (a + x * (b / 2.0 + x * (c / 3.0 + x * d / 4.0))))
+
+
+def six_signals() -> Bumps:
+    """The paper's signals 1 to 6 (Sec. II, Fig. 5): one to three bumps of width 0.2."""
+    bumps: list[tuple[list[float], list[float]]] = [
+        ([0.3], [1.0]),
+        ([0.7], [1.0]),
+        ([0.3, 0.7], [1.0, 1.0]),
+        ([0.3, 0.7], [-1.0, 1.0]),
+        ([0.3, 0.7], [1.0, -1.0]),
+        ([0.2, 0.5, 0.8], [0.5, -1.0, 0.5]),
+    ]
+    centres, amplitudes = np.full((6, 3), 0.5), np.zeros((6, 3))
+    for row, (places, heights) in enumerate(bumps):
+        centres[row, : len(places)] = places
+        amplitudes[row, : len(heights)] = heights
+    return Bumps(amplitudes=jnp.asarray(amplitudes), centres=jnp.asarray(centres), width=0.2)
+
+
+def word_bits(bits: int) -> np.ndarray:
+    """The bits of every word, most significant first, [2^bits, bits] of 0 and 1; row k holds the number k.
+
+    Raises:
+        ValueError: if `bits` is not a whole number from 1 to 12.
+    """
+    if isinstance(bits, bool) or not isinstance(bits, int | np.integer) or not 1 <= bits <= LONGEST_WORD:
+        raise ValueError(f"a word has 1 to {LONGEST_WORD} bits, got {bits!r}")
+    places = np.arange(bits - 1, -1, -1)
+    return np.arange(2**bits)[:, None] >> places & 1
+
+
+def words(bits: int) -> Bumps:
+    """All binary words of a length (App. A): J is a plateau of height +u_b / pi for a 1 and -u_b / pi for a 0.
+
+    A bit is u_b = 1 / (bits + 4) wide, two of these are left free at either end, and plateaus that differ are joined
+    by bumps of width u_b. Signal s, from 1 to 2^bits, is the number s - 1, its most significant bit at small u. The
+    scale is the paper's: amplitudes of 1 between bits, 1/2 at the ends, whatever the word.
+
+    Raises:
+        ValueError: if `bits` is not a whole number from 1 to 12.
+    """
+    value = word_bits(bits)
+    width = bit_width(bits)
+    level = np.pad(value - 0.5, ((0, 0), (1, 1)))  # a word begins and ends half-way between its two plateaus
+    amplitudes = np.diff(level, axis=1)
+    centres = (PAD + np.arange(bits + 1)) * width
+    return Bumps(
+        amplitudes=jnp.asarray(amplitudes), centres=jnp.asarray(np.tile(centres, (len(value), 1))), width=width
+    )
+
+
+def bit_width(bits: int) -> float:
+    """u_b, the width of a bit in u."""
+    return 1.0 / (bits + 2 * PAD)
+
+
+def waveform(samples: jax.typing.ArrayLike) -> Samples:
+    """Any waveform from its samples.
+
+    Args:
+        samples: I at u = k / (n + 1), k = 1..n, for one signal [n] or several [S, n]; I is zero at u = 0 and 1.
+
+    Raises:
+        ValueError: if the shape is not [n] or [S, n] with n >= 2, or a concrete sample is not finite.
+    """
+    values = jnp.asarray(samples)
+    if values.ndim not in (1, 2) or values.shape[-1] < 2 or values.shape[0] < 1:
+        raise ValueError(f"a waveform needs at least 2 samples, as [n] or [signals, n]; got shape {values.shape}")
+    if not isinstance(values, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(values))):
+        raise ValueError("a waveform sample is not a finite number")
+    values = jnp.atleast_2d(values)
+    values = values.astype(jnp.result_type(values.dtype, float))
+    return Samples(nodes=jnp.pad(values, ((0, 0), (1, 1))))
+
+
+@functools.partial(jax.jit, static_argnames=("bins", "points"))  # fused: 4,096 words would fill the memory otherwise
+def bin_average(signals: Signals, bins: int = BINS, points: int = 16) -> jax.Array:
+    """J_s averaged over each bin of u, [S, bins] (midpoint rule on `points` per bin)."""
+    u = (jnp.arange(bins * points) + 0.5) / (bins * points)
+    return jnp.mean(signals.integral(u).reshape(bins, points, -1), axis=1).T

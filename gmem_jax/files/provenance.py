@@ -1,0 +1,47 @@
+"""Where a result came from: versions, backend and device, for every file and log."""
+
+import platform
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+
+
+def _commit() -> str | None:
+    """The git commit of a source checkout, read without running git; None for an installed package."""
+    git = Path(__file__).resolve().parents[2] / ".git"
+    head = git / "HEAD"
+    if not head.is_file():
+        return None
+    text = head.read_text().strip()
+    if not text.startswith("ref: "):
+        return text
+    name = text.removeprefix("ref: ")
+    if (git / name).is_file():
+        return (git / name).read_text().strip()
+    packed = git / "packed-refs"
+    lines = packed.read_text().splitlines() if packed.is_file() else []
+    return next((line.split()[0] for line in lines if line.endswith(" " + name)), None)
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, this package and the packages that decide its numbers."""
+    names = ("gmem-jax", "jax", "jaxlib", "jax-md", "flax", "numpy", "h5py")
+    found = {}
+    for name in names:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return {"python": platform.python_version(), **found}
+
+
+def provenance() -> dict[str, Any]:
+    """Versions, git commit and device."""
+    device = jax.devices()[0]
+    return {
+        "versions": versions(),
+        "commit": _commit(),
+        "device": f"{device.platform}: {device.device_kind}",
+    }

@@ -1,0 +1,61 @@
+"""Friction laws: tangential force from the sliding history of a contact, limited by Coulomb friction.
+
+A law is a frozen pytree of parameters with two methods, `init` and `__call__`, and nothing else; a user's law is
+one such class. `coulomb` and `kinematics.transport` are the shared pieces.
+
+The displacement of a step is the mean of its end-point velocities times dt (trapezoid): a history is stored with
+half of the next step's increment already in it, and `__call__` adds the other half. That makes the elastic law
+second order in dt at the cost of no extra memory.
+"""
+
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.physics.contact.kinematics import Kinematics
+from gmem_jax.physics.rotation import dot
+from gmem_jax.physics.state import Scalar
+
+
+@runtime_checkable
+class FrictionLaw(Protocol):
+    """What the simulator asks of a friction law."""
+
+    def init(self, contacts: int, replicas: int, dtype: Any) -> Any:
+        """The history of `contacts` untouched contacts: a pytree with leaves [contacts, ..., replicas]."""
+        ...
+
+    def __call__(self, kin: Kinematics, normal_force: jax.Array, history: Any) -> tuple[jax.Array, Any]:
+        """Tangential force on sphere i, [P, 3, B] (on j its opposite), and the new history.
+
+        Both must be exactly zero (the history as `init` gives it) where `kin.touching` is False.
+        """
+        ...
+
+
+@runtime_checkable
+class RangedLaw(Protocol):
+    """A law that is valid up to some overlap only, and says so."""
+
+    @property
+    def largest_overlap(self) -> Scalar:
+        """Largest overlap the law can represent; scalar or [B], in R."""
+        ...
+
+
+def largest_overlap(law: FrictionLaw) -> Scalar:
+    """Overlap beyond which a run with `law` is to be flagged (`Status.OVERLAP_RANGE`); infinite for most laws."""
+    return law.largest_overlap if isinstance(law, RangedLaw) else float("inf")
+
+
+def coulomb(trial: jax.Array, limit: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Scale tangential forces [P, 3, B] back to the friction limit [P, 1, B] where they exceed it.
+
+    Returns:
+        The limited force, and whether the contact slides, [P, 1, B].
+    """
+    square = dot(trial, trial)
+    slides = square > limit * limit
+    scale = jnp.where(slides, limit / jnp.sqrt(jnp.where(slides, square, 1.0)), 1.0)
+    return trial * scale, slides

@@ -1,0 +1,23 @@
+"""No tangential force at all: the law of the preparation, without any history to carry."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.physics.contact.kinematics import Kinematics
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Frictionless:
+    """mu = 0 (paper, Sec. II: the pack is prepared without friction)."""
+
+    def init(self, contacts: int, replicas: int, dtype: Any) -> tuple[()]:
+        """Nothing to remember."""
+        return ()
+
+    def __call__(self, kin: Kinematics, normal_force: jax.Array, history: tuple[()]) -> tuple[jax.Array, tuple[()]]:
+        """Zero force; see `FrictionLaw`."""
+        return jnp.zeros_like(kin.sliding), ()

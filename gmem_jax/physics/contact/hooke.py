@@ -1,0 +1,41 @@
+"""H: a linear tangential spring and dashpot under the Coulomb limit (the paper's default law)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.physics.contact.friction import coulomb
+from gmem_jax.physics.contact.kinematics import Kinematics, transport
+from gmem_jax.physics.state import Scalar
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Hooke:
+    """df_e = k dsigma, f_d = damping_time k dsigma/dt, |f_e + f_d| <= mu f_n (paper, Sec. II).
+
+    Attributes:
+        mu: friction coefficient; scalar or [B].
+        stiffness: k_H in E R; scalar or [B]. The paper gives "a typical inverse transverse compliance" of the
+            Mindlin law: k_M <sqrt(p)> is 0.10 to 0.145 over the compression.
+        damping_time: gamma_H / k_H in t_c; scalar or [B].
+    """
+
+    mu: Scalar = 1.0
+    stiffness: Scalar = 0.145
+    damping_time: Scalar = 0.069
+
+    def init(self, contacts: int, replicas: int, dtype: Any) -> jax.Array:
+        """No elastic force yet: zeros, [contacts, 3, replicas]."""
+        return jnp.zeros((contacts, 3, replicas), dtype)
+
+    def __call__(self, kin: Kinematics, normal_force: jax.Array, history: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Tangential force on sphere i and the new history; see `FrictionLaw`."""
+        half_step = (0.5 * self.stiffness * kin.dt) * kin.sliding
+        dashpot = (self.stiffness * self.damping_time) * kin.sliding
+        elastic = transport(history, kin) + half_step
+        force, _ = coulomb(elastic + dashpot, self.mu * normal_force)
+        force = jnp.where(kin.touching, force, 0.0)
+        return force, jnp.where(kin.touching, force - dashpot + half_step, 0.0)

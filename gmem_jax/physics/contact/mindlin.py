@@ -1,0 +1,166 @@
+"""M2: the Mindlin contact with its whole history, resolved by the overlap at which each part was attached."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.physics.contact.friction import coulomb
+from gmem_jax.physics.contact.kinematics import Kinematics
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.rotation import cross, dot
+from gmem_jax.physics.state import Scalar
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LayeredHistory:
+    """What M2 remembers of a contact; zero for an untouched one.
+
+    Attributes:
+        layers: f_j with half of the next step's increment, [P, Q, 3, B], in E R^1.5.
+        overlap: overlap of the last step, [P, 1, B], in R.
+    """
+
+    layers: jax.Array
+    overlap: jax.Array
+
+
+def transport_layers(layers: jax.Array, kin: Kinematics) -> jax.Array:
+    """`kinematics.transport` of every layer [P, Q, 3, B], to round-off.
+
+    Projection and turn are one matrix per contact here: three times faster than going through the layers one by one.
+    """
+    half = 0.5 * kin.twist * kin.dt
+    shrink = 1.0 / (1.0 + half * half)
+    cosine, sine = (1.0 - half * half) * shrink, 2.0 * half * shrink
+    moved, along, before = (jnp.zeros((), layers.dtype),) * 3
+    for axis in range(3):
+        unit = jnp.zeros_like(kin.normal).at[:, axis].set(1.0)
+        column = cosine * (unit - dot(unit, kin.normal) * kin.normal) + sine * cross(kin.normal, unit)
+        component = layers[:, :, axis : axis + 1]
+        moved += component * column[:, None]
+        along += component * kin.normal[:, None, axis : axis + 1]
+        before += component * component
+    after = before - along * along
+    alive = after > 0.0
+    return moved * jnp.where(alive, jnp.sqrt(jnp.where(alive, before, 1.0) / jnp.where(alive, after, 1.0)), 1.0)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Mindlin:
+    """f_e is the integral of f(q) over 0 < q < sqrt(p), where df = k dsigma; f beyond is forgotten (App. D.2).
+
+    f(q) is the elastic force per unit of q in the ring of contact area that was attached when sqrt(p) passed q. It is
+    kept on Q points a spacing dq = sqrt(p_max) / (Q - 1) apart: with x = sqrt(p) / dq and the outermost ring
+    jp = floor(x), f_e = dq sum_j w_j f_j over j <= jp. The dashpot is f_d = damping_time k p^0.5 dsigma/dt, and
+    |f_e + f_d| <= mu f_n; a sliding contact gives up the same f in all its rings.
+
+    The variants differ in the outermost ring, which the contact fills in part only:
+
+    - "averaged": w_j = 1 and w_jp = x - jp, so that the stiffness dq sum w_j is sqrt(p) to the last digit. While the
+      ring fills, its f_jp is diluted: the force in it stays. So no path whatever can extract energy, and f_e is in
+      error by what is in one ring, or by dq^2.
+    - "exact": the same weights without the dilution. Filling the ring adds force that nobody put in, so that f_e is
+      in error by dq, and a cycle of p within one ring can create energy.
+    - "paper": as "exact", but w_0 less by 1/2, the weights of App. D.2. The stiffness sqrt(p) - dq/2 would be
+      negative below x = 1/2; there this variant has no spring at all.
+
+    Attributes:
+        mu: friction coefficient; scalar or [B].
+        stiffness: k_M in E R^0.5; scalar or [B].
+        damping_time: gamma_M / k_M in t_c; scalar or [B].
+        p_max: largest overlap that the points cover, in R. Packs of the paper reach 0.16 at u = 1. Beyond it the
+            outermost ring is extrapolated and a run is flagged (`Status.OVERLAP_RANGE`).
+        points: Q, at least 2.
+        variant: "averaged", "exact" or "paper".
+
+    Raises:
+        ValueError: if `points` or `variant` is none of these.
+    """
+
+    mu: Scalar = 1.0
+    stiffness: Scalar = Material().mindlin_stiffness
+    damping_time: Scalar = Material().tangential_damping
+    p_max: Scalar = 0.2
+    points: int = field(default=100, metadata={"static": True})
+    variant: Literal["averaged", "exact", "paper"] = field(default="averaged", metadata={"static": True})
+
+    def __post_init__(self) -> None:
+        if self.points < 2:
+            raise ValueError(f"Mindlin.points must be at least 2, got {self.points}")
+        if self.variant not in ("averaged", "exact", "paper"):
+            raise ValueError(f"Mindlin.variant must be 'averaged', 'exact' or 'paper', got {self.variant!r}")
+
+    @property
+    def largest_overlap(self) -> Scalar:
+        """p_max: see `gmem_jax.physics.contact.friction.RangedLaw`."""
+        return self.p_max
+
+    @property
+    def spacing(self) -> jax.Array:
+        """dq, in R^0.5; scalar or [B]."""
+        return jnp.sqrt(jnp.asarray(self.p_max)) / (self.points - 1)
+
+    def init(self, contacts: int, replicas: int, dtype: Any) -> LayeredHistory:
+        """Nothing attached yet."""
+        return LayeredHistory(
+            jnp.zeros((contacts, self.points, 3, replicas), dtype), jnp.zeros((contacts, 1, replicas), dtype)
+        )
+
+    def outermost(self, x: jax.Array) -> jax.Array:
+        """The ring jp that a contact reaching to x = sqrt(p) / dq fills in part; a whole number, in the shape of x."""
+        return jnp.minimum(jnp.floor(x), self.points - 2)
+
+    def weights(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """How each point counts in the force of a contact that reaches to x = sqrt(p) / dq > 0.
+
+        Args:
+            x: [P, 1, B].
+
+        Returns:
+            Whether a point carries force, [P, Q, 1, B]; its weight; and the sum of the weights, [P, 1, B].
+        """
+        points = jnp.arange(self.points)[:, None, None]
+        outermost = self.outermost(x)[:, None]
+        inside = points <= outermost
+        weight = jnp.where(points == outermost, x[:, None] - outermost, 1.0)
+        if self.variant != "paper":
+            return inside, jnp.where(inside, weight, 0.0), x
+        inside &= x[:, None] > 0.5
+        return inside, jnp.where(inside, weight - 0.5 * (points == 0), 0.0), jnp.where(x > 0.5, x - 0.5, 1.0)
+
+    def _diluted(self, history: LayeredHistory, layers: jax.Array, x: jax.Array) -> jax.Array:
+        """The layers after the contact grew to x: the force w f of the ring that was partly filled stays."""
+        known = history.overlap > 0.0
+        reached = jnp.where(known, jnp.sqrt(jnp.where(known, history.overlap, 1.0)) / self.spacing, 0.0)
+        ring = self.outermost(reached)
+        filled, weight = reached - ring, jnp.where(self.outermost(x) > ring, 1.0, x - ring)
+        grows = filled < weight
+        dilution = jnp.where(grows, filled / jnp.where(grows, weight, 1.0), 1.0)
+        points = jnp.arange(self.points)[:, None, None]
+        return layers * jnp.where(points == ring[:, None], dilution[:, None], 1.0)
+
+    def __call__(
+        self, kin: Kinematics, normal_force: jax.Array, history: LayeredHistory
+    ) -> tuple[jax.Array, LayeredHistory]:
+        """Tangential force on sphere i and the new history; see `FrictionLaw`."""
+        root = jnp.sqrt(kin.safe_overlap)
+        x = root / self.spacing
+        inside, weight, total = self.weights(x)
+        inside &= kin.touching[:, None]
+        half_step = (0.5 * self.stiffness * kin.dt) * kin.sliding
+        dashpot = (self.stiffness * self.damping_time) * root * kin.sliding
+
+        layers = transport_layers(history.layers, kin)
+        if self.variant == "averaged":
+            layers = self._diluted(history, layers, x)
+        layers = jnp.where(inside, layers + half_step[:, None], 0.0)
+        trial = self.spacing * jnp.sum(weight * layers, axis=1) + dashpot
+        force, _ = coulomb(trial, self.mu * normal_force)
+        correction = (force - trial) / (self.spacing * total) + half_step
+        layers = jnp.where(inside, layers + correction[:, None], 0.0)
+        force = jnp.where(kin.touching, force, 0.0)
+        return force, LayeredHistory(layers, jnp.where(kin.touching, kin.overlap, 0.0))

@@ -1,0 +1,67 @@
+"""M1: the Mindlin contact whose elastic force is rescaled on unloading, so that it cannot create energy."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.physics.contact.friction import coulomb
+from gmem_jax.physics.contact.kinematics import Kinematics, transport
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.state import Scalar
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class RescaledHistory:
+    """What M1 remembers of a contact; zero for an untouched one.
+
+    Attributes:
+        force: elastic force with half of the next step's increment, [P, 3, B], in E R^2.
+        overlap: overlap of the last step, [P, 1, B], in R.
+    """
+
+    force: jax.Array
+    overlap: jax.Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class MindlinRescaled:
+    """f_e *= sqrt(p / p_old) on unloading, then df_e = k p^0.5 dsigma, f_d = damping_time k p^0.5 dsigma/dt (Sec. II).
+
+    The Coulomb limit |f_e + f_d| <= mu f_n applies as in the other laws.
+
+    The rescaling acts on the history with its half increment in it. While a contact unloads, f_e = sqrt(p) g and
+    dg = k dsigma, so this is the trapezoidal rule for g; while it loads, for f_e itself.
+
+    Attributes:
+        mu: friction coefficient; scalar or [B].
+        stiffness: k_M in E R^0.5; scalar or [B].
+        damping_time: gamma_M / k_M in t_c; scalar or [B].
+    """
+
+    mu: Scalar = 1.0
+    stiffness: Scalar = Material().mindlin_stiffness
+    damping_time: Scalar = Material().tangential_damping
+
+    def init(self, contacts: int, replicas: int, dtype: Any) -> RescaledHistory:
+        """No elastic force and no overlap yet."""
+        return RescaledHistory(jnp.zeros((contacts, 3, replicas), dtype), jnp.zeros((contacts, 1, replicas), dtype))
+
+    def __call__(
+        self, kin: Kinematics, normal_force: jax.Array, history: RescaledHistory
+    ) -> tuple[jax.Array, RescaledHistory]:
+        """Tangential force on sphere i and the new history; see `FrictionLaw`."""
+        unloads = kin.touching & (kin.overlap < history.overlap)
+        ratio = jnp.where(unloads, kin.safe_overlap, 1.0) / jnp.where(unloads, history.overlap, 1.0)
+        spring = self.stiffness * jnp.sqrt(kin.safe_overlap)
+        half_step = (0.5 * kin.dt) * spring * kin.sliding
+        dashpot = self.damping_time * spring * kin.sliding
+        elastic = jnp.sqrt(ratio) * transport(history.force, kin) + half_step
+        force, _ = coulomb(elastic + dashpot, self.mu * normal_force)
+        force = jnp.where(kin.touching, force, 0.0)
+        return force, RescaledHistory(
+            jnp.where(kin.touching, force - dashpot + half_step, 0.0), jnp.where(kin.touching, kin.overlap, 0.0)
+        )

@@ -1,0 +1,105 @@
+"""The +z wall under pressure: a speed-limited servo, and the free flight of the gas (a servo of zero speed)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from gmem_jax.physics.pairs import slack, sphere_centres
+from gmem_jax.physics.state import Box, Scalar, State
+from gmem_jax.physics.step import System, check
+
+March = Callable[..., tuple[State, jax.Array]]
+"""The signature of `gmem_jax.physics.step.march`."""
+
+BLOCK = 8  # steps between two looks at the neighbour list: grains may fly freely here
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Servo:
+    """The wall moves at gain * (p_z / target - 1), at most at `speed`.
+
+    Attributes:
+        target: p_z wanted, in E.
+        speed: largest wall speed, in R / t_c; 0 keeps the wall where it is.
+        gain: wall speed per relative pressure error, in R / t_c.
+        error: relative error of p_z that counts as settled.
+        quiet: largest grain speed that counts as settled, in R / t_c; 0 never settles.
+    """
+
+    target: Scalar
+    speed: Scalar
+    gain: Scalar
+    error: Scalar
+    quiet: Scalar
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Pressed:
+    """Where a servo run stands (one replica).
+
+    Attributes:
+        state: the grains.
+        box: the walls.
+        pressure: p_z averaged over the last block, [1].
+        blocks: blocks of `BLOCK` steps done by the last call.
+        settled: whether pressure and speed are within the servo's bounds.
+        crowded: whether the neighbour list must be rebuilt before going on.
+    """
+
+    state: State
+    box: Box
+    pressure: jax.Array
+    blocks: jax.Array
+    settled: jax.Array
+    crowded: jax.Array
+
+
+def largest_speed(state: State) -> jax.Array:
+    """Largest grain speed over grains and replicas, in R / t_c."""
+    return jnp.sqrt(jnp.max(jnp.sum(state.grains.velocity**2, axis=1)))
+
+
+def press(
+    system: System, pressed: Pressed, servo: Servo, dt: Scalar, drag: Scalar, blocks: int, march: March
+) -> Pressed:
+    """Run up to `blocks` blocks of steps; stop early when settled, when the list needs a rebuild, or on a status bit.
+
+    The wall moves steadily during a block, at a speed set by p_z averaged over the one before. The list is left early
+    enough that it is complete throughout: the next block is allowed for at the speed of the fastest sphere.
+    """
+    reach = jnp.sqrt(jnp.max(jnp.sum(system.clump.offsets**2, axis=1)))
+    times = dt * jnp.arange(1.0, BLOCK + 1.0)
+
+    def block(now: Pressed) -> Pressed:
+        velocity = jnp.clip(servo.gain * (now.pressure / servo.target - 1.0), -servo.speed, servo.speed)
+        climb = jnp.zeros_like(now.box.upper).at[2].set(velocity)
+        still, (lower, upper) = jnp.zeros_like(climb), (now.box.lower, now.box.upper)
+        boxes = jax.vmap(lambda time: Box(lower, upper + time * climb, still, climb))(times)
+        state, total = march(system, now.state, boxes, dt, drag)
+        box = jax.tree.map(lambda leaf: leaf[-1], boxes)
+        state = check(system, state, box)
+        fastest = largest_speed(state)
+        spin = jnp.sqrt(jnp.max(jnp.sum(state.grains.spin**2, axis=1)))
+        ahead = 2.0 * BLOCK * dt * (1.2 * (fastest + reach * spin) + servo.speed)
+        room = jnp.min(slack(system.pairs, sphere_centres(state.grains, system.clump), box))
+        pressure = total[2] / BLOCK
+        met = jnp.max(jnp.abs(pressure / servo.target - 1.0)) < servo.error
+        return Pressed(
+            state=state,
+            box=box,
+            pressure=pressure,
+            blocks=now.blocks + 1,
+            settled=met & (fastest < servo.quiet),
+            crowded=room < ahead,
+        )
+
+    def goes_on(now: Pressed) -> jax.Array:
+        return (now.blocks < blocks) & ~now.settled & ~now.crowded & (now.state.status[0] == 0)
+
+    no = jnp.asarray(False)
+    return lax.while_loop(goes_on, block, replace(pressed, blocks=jnp.asarray(0), settled=no, crowded=no))

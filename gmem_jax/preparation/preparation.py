@@ -1,0 +1,301 @@
+"""Preparation of a pack without friction: gas, pressure, compression cycles, rest (spec, section 4)."""
+
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax import native
+from gmem_jax.experiment.host import Progress, RunFailedError, Runner, compiled, refuse, require_x64, silent, worst
+from gmem_jax.experiment.pack import Pack, find_pairs, smallest_box
+from gmem_jax.experiment.protocol import Motion, Stage, clock, preparation_cycle
+from gmem_jax.files.provenance import provenance
+from gmem_jax.physics import rotation
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.frictionless import Frictionless
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.grain import Clump, tetra
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.pairs import PairFinder
+from gmem_jax.physics.state import Grains, still_box
+from gmem_jax.physics.step import Sample, System, accelerate, start
+from gmem_jax.preparation.piston import BLOCK, Pressed, Servo, largest_speed, press
+from gmem_jax.preparation.ringing import ringing_period
+
+FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
+SETTLING = 6.0e3  # t_c that coming to rest under the piston took at N = 325 to 3,267, for the progress bar
+CYCLE_SKIN = 0.5  # in R; frictionless grains turn freely, so a list lasts only some 50 t_c
+CYCLE_CHUNK = 8  # bins per compiled call during the cycles
+CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
+DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with it all six are the paper's
+
+_press = compiled(press, static_argnames=("blocks", "march"))
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The numbers of a preparation; every [I] and [C] of the spec is a field here.
+
+    Attributes:
+        grains: number of grains N.
+        seed: of orientations, velocities and spins.
+        delta0: areal compression of the cycles.
+        t0: duration of one compression, in t_c.
+        dt: largest time step, in t_c.
+        filling: of the lattice the gas starts from.
+        gas_speed: rms of each grain's initial velocity, and of its spin times R, in R / t_c.
+        gas_time: duration of the gas, in t_c.
+        pressure: p_z, in E.
+        piston_speed: largest speed of the +z wall, in R / t_c.
+        piston_gain: its speed per relative pressure error, in R / t_c.
+        cycles: number of compress/decompress cycles.
+        rest: rests at u = 0, in t0.
+        hold: hold at u = 1, in t0.
+        drag: viscous drag once the piston has met its pressure, and whenever the walls stand still, 1 / t_c. More of it
+            comes to rest later: soft frictionless modes are then overdamped.
+        settled_speed: largest grain speed at which the piston is fixed, in R / t_c.
+        quiet: largest grain speed of the finished pack, in R / t_c.
+        pressure_error: relative error of p_z at which the piston is fixed.
+        patience: longest time spent on coming to rest, in t_c.
+    """
+
+    grains: int = 325
+    seed: int = 1
+    delta0: float = 0.05
+    t0: float = 1.8e3
+    dt: float = 0.3
+    filling: float = 0.30
+    gas_speed: float = 0.02
+    gas_time: float = 6.0e3
+    pressure: float = 2.0e-3
+    piston_speed: float = 0.02
+    piston_gain: float = 0.005
+    cycles: int = 2
+    rest: float = 0.2
+    hold: float = 0.2
+    drag: float = 0.01
+    settled_speed: float = 1.0e-5
+    quiet: float = 1.0e-6
+    pressure_error: float = 0.01
+    patience: float = 6.0e4
+
+    def __post_init__(self) -> None:
+        if self.grains < 2:
+            raise ValueError(f"grains must be at least 2, got {self.grains}")
+        if not 0.0 < self.delta0 < 0.5:
+            raise ValueError(f"delta0 must be in (0, 0.5), got {self.delta0}")
+        if not 0.0 < self.filling < 0.6:
+            raise ValueError(f"filling of the gas must be in (0, 0.6), got {self.filling}")
+        if not 0.0 < self.dt <= 0.5:
+            raise ValueError(f"dt must be in (0, 0.5] t_c, got {self.dt}")
+        if self.cycles < 0 or self.drag < 0.0:
+            raise ValueError("cycles and drag must not be negative")
+        for name in (
+            "t0",
+            "pressure",
+            "gas_speed",
+            "gas_time",
+            "piston_speed",
+            "piston_gain",
+            "settled_speed",
+            "quiet",
+        ):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+def lattice(grains: int, filling: float = 0.30) -> tuple[int, int, int]:
+    """Sites (n, n, n_z) of a lattice of this filling that becomes about a cube when pressed (325 = 5 x 5 x 13)."""
+    side = max(2, round((grains * filling / DENSE) ** (1.0 / 3.0)))
+    return side, side, math.ceil(grains / side**2)
+
+
+def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array, jax.Array, np.ndarray]:
+    """Positions [N, 3], quaternions [N, 4], velocities and spins [N, 3], and box lengths [3] of the lattice."""
+    spacing = max((float(clump.mass) / recipe.filling) ** (1.0 / 3.0), 1.02 * float(clump.diameter))
+    sites = lattice(recipe.grains, recipe.filling)
+    cells = np.stack(np.meshgrid(*(np.arange(n) for n in sites), indexing="ij"), axis=-1).reshape(-1, 3)
+    cells = cells[np.argsort(cells[:, 2], kind="stable")][: recipe.grains]  # a last layer may be incomplete
+    turn_key, velocity_key, spin_key = jax.random.split(jax.random.key(recipe.seed), 3)
+    scale, shape = recipe.gas_speed / math.sqrt(3.0), (recipe.grains, 3)
+    return (
+        (cells + 0.5) * spacing,
+        rotation.uniform(turn_key, recipe.grains),
+        scale * jax.random.normal(velocity_key, shape),
+        scale * jax.random.normal(spin_key, shape),
+        np.asarray(sites) * spacing,
+    )
+
+
+class _Preparation:
+    """One preparation on its way: a `Runner` with one replica and no friction."""
+
+    def __init__(self, recipe: Recipe, clump: Clump, material: Material, backend: str, progress: Progress) -> None:
+        position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
+        self.recipe = recipe
+        box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
+        dt, self.steps = clock(recipe.t0, recipe.dt)
+        finder = PairFinder(clump, lengths, FREE_SKIN)
+        at = jnp.asarray(position)[..., None]
+        still = jnp.zeros_like(at)
+        grains = Grains(at, quaternion[..., None], velocity[..., None], spin[..., None], still, still)
+        system = System(clump, Frictionless(), finder(grains, clump, box), material)
+        state = start(system, at, grains.quaternion, box)
+        state = accelerate(system, replace(state, grains=grains), box)
+        per_t0 = recipe.t0 / float(dt)
+        cycle = 2.0 + recipe.rest + recipe.hold
+        fall = float(lengths[2]) * (1.0 - recipe.filling / DENSE) / min(recipe.piston_speed, recipe.piston_gain)
+        expected = (recipe.gas_time + fall + SETTLING) / float(dt) + (recipe.cycles * cycle + recipe.rest) * per_t0
+        native.pick(backend)  # refuses an unknown one before anything is computed
+        self.march = native.march if native.name(backend, system.friction) == "native" else dynamics.march
+        self.runner = Runner(
+            system, state, box, float(dt), finder, backend=backend, progress=progress, total_work=expected
+        )
+        self.log: dict[str, Sample] = {}
+
+    def press(self, name: str, servo: Servo, duration: float, drag: float) -> Pressed:
+        """Run the servo until it has settled or `duration` is over; the list is rebuilt as often as needed."""
+        runner = self.runner
+        block = BLOCK * runner.dt
+        no = jnp.asarray(False)
+        pressed = Pressed(runner.state, runner.box, jnp.zeros(1), jnp.asarray(0), no, no)
+        left = math.ceil(duration / block)
+        while left > 0:
+            pressed = _press(runner.system, pressed, servo, runner.dt, drag, blocks=min(CALL, left), march=self.march)
+            refuse(worst(pressed.state), name)
+            runner.state, runner.box = pressed.state, pressed.box
+            done = int(pressed.blocks)
+            left -= done
+            runner.report(name, done * BLOCK, float(done * block))
+            if bool(pressed.settled):
+                break
+            if bool(pressed.crowded):
+                runner.rebuild()
+                pressed = replace(pressed, state=runner.state)
+        return pressed
+
+    def compact(self) -> float:
+        """Gas, then pressure: returns p_z once the pack is at rest under it and the wall is fixed."""
+        recipe = self.recipe
+        closed = Servo(recipe.pressure, 0.0, 0.0, 0.0, 0.0)
+        self.press("gas", closed, recipe.gas_time, 0.0)
+        height = float(self.runner.box.lengths[2, 0])
+        approach = Servo(recipe.pressure, recipe.piston_speed, recipe.piston_gain, 0.1, math.inf)
+        self.press("press", approach, 4.0 * height / recipe.piston_speed, 0.0)
+        settle = replace(approach, error=recipe.pressure_error, quiet=recipe.settled_speed)
+        pressed = self.press("settle", settle, recipe.patience, recipe.drag)
+        if not bool(pressed.settled):
+            raise RunFailedError(
+                f"settle: p_z = {float(pressed.pressure[0]):.3e} E and largest speed "
+                f"{float(largest_speed(pressed.state)):.1e} R/t_c after {recipe.patience:g} t_c; allow more patience"
+            )
+        self.runner.box = still_box(self.runner.box.lower, self.runner.box.upper)
+        return float(pressed.pressure[0])
+
+    def cycle(self) -> None:
+        """Frictionless compress/decompress cycles of the x and y walls, then rest until quiet."""
+        recipe, runner = self.recipe, self.runner
+        lower, upper = runner.box.lower, runner.box.upper
+        smallest = smallest_box(np.asarray(lower)[:, 0], np.asarray(upper)[:, 0], recipe.delta0)
+        runner.finder, runner.skin, runner.chunk = None, CYCLE_SKIN, CYCLE_CHUNK
+        runner.smallest = smallest
+        runner.rebuild()
+        for number in range(1, recipe.cycles + 1):
+            for stage in preparation_cycle(recipe.rest, recipe.hold):
+                self._stage(f"cycle {number}: {stage.name}", stage, lower, upper)
+        rest = Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1))
+        waited = 0.0
+        while waited == 0.0 or float(largest_speed(runner.state)) > recipe.quiet:
+            if waited > recipe.patience:
+                raise RunFailedError(
+                    f"rest: largest speed {float(largest_speed(runner.state)):.1e} R/t_c after {waited:g} t_c"
+                )
+            self._stage("rest", rest, lower, upper)
+            waited += rest.length * recipe.t0
+
+    def _stage(self, name: str, stage: Stage, lower: jax.Array, upper: jax.Array) -> None:
+        duration = stage.bins * self.steps * self.runner.dt
+        motion = Motion(lower, upper, self.recipe.delta0, stage.start, stage.stop, duration)
+        drag = self.recipe.drag if stage.holds else 0.0
+        self.log[name] = self.runner.stage(name, motion, bins=stage.bins, steps=int(self.steps), drag=drag)
+
+
+def prepare(
+    recipe: Recipe | None = None,
+    grain: Clump | None = None,
+    *,
+    material: Material | None = None,
+    friction: FrictionLaw | None = None,
+    name: str = "",
+    backend: str = "auto",
+    progress: Progress = silent,
+    log: dict[str, Sample] | None = None,
+    **changes: Any,
+) -> Pack:
+    """Prepare a pack: gas, pressure, frictionless cycles, rest.
+
+    Args:
+        recipe: the numbers; default `Recipe()`.
+        grain: the grain; default `tetra(0.6)`.
+        material: the elastic solid.
+        friction: law under which the ringing period of the finished pack is measured; default `Hooke()`.
+        name: of the pack; default from grain, size and seed.
+        backend: "auto", "jax" or "native".
+        progress: told about every chunk.
+        log: filled with the samples of every cycle stage, if given.
+        **changes: fields of the recipe that differ, for example ``prepare(grains=64, seed=3)``.
+
+    Raises:
+        ValueError: for impossible numbers, or if 64-bit mode is off.
+        RunFailedError: if the simulation broke down or did not come to rest.
+    """
+    require_x64()
+    recipe = replace(recipe or Recipe(), **changes)
+    clump, material = grain or tetra(), material or Material()
+    preparation = _Preparation(recipe, clump, material, backend, progress)
+    preparation.compact()
+    preparation.cycle()
+    if log is not None:
+        log.update(preparation.log)
+    return _finish(preparation, material, friction or Hooke(), name)
+
+
+def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw, name: str) -> Pack:
+    """The pack at rest, with what was measured on it."""
+    recipe, runner = preparation.recipe, preparation.runner
+    grains, box, clump = runner.state.grains, runner.box, runner.system.clump
+    position, quaternion = np.asarray(grains.position)[..., 0], np.asarray(grains.quaternion)[..., 0]
+    centre = np.asarray(0.5 * (box.lower + box.upper))
+    box = still_box(box.lower - centre, box.upper - centre)
+    position = position - centre[:, 0]
+    pairs = find_pairs(clump, position, quaternion, box, recipe.delta0)
+    system = System(clump, friction, pairs, material)
+    period = ringing_period(system, jnp.asarray(position)[..., None], grains.quaternion, box, runner.dt)
+    last = jax.tree.map(lambda leaf: leaf[-1, ..., 0].tolist(), preparation.log["rest"])
+    record = {
+        "recipe": asdict(recipe),
+        "grain": clump.shape,
+        "material": asdict(material),
+        "rebuilds": runner.rebuilds,
+        "simulated_time": runner.time,
+        "at_rest": asdict(last),
+        **provenance(),
+        "backend": native.name(runner.backend, friction),
+    }
+    return Pack(
+        clump=clump,
+        position=jnp.asarray(position),
+        quaternion=jnp.asarray(quaternion),
+        lower=box.lower[:, 0],
+        upper=box.upper[:, 0],
+        delta0=jnp.asarray(recipe.delta0),
+        ringing_period=jnp.asarray(period),
+        pairs=pairs,
+        name=name or f"{clump.shape}-{recipe.grains}-seed{recipe.seed}",
+        record=json.dumps(record),
+    )

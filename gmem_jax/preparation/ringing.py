@@ -1,0 +1,54 @@
+"""The slowest mode of the box that wall motion excites: its period T_1, over which a recall is averaged."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment.host import Progress, Runner, silent
+from gmem_jax.experiment.protocol import Motion
+from gmem_jax.physics.state import Box, Scalar
+from gmem_jax.physics.step import System, accelerate, start
+
+KICK = 2.0e-5  # strain rate of the kick, 1 / t_c: strains of about 1e-4, below which the response is linear enough
+STEPS = 4  # steps per sample
+
+
+def spectrum_peak(series: np.ndarray, spacing: float) -> float:
+    """Period of the strongest oscillation in `series`, sampled every `spacing` (Hann window, parabolic peak)."""
+    steps = np.arange(series.size)
+    flat = series - np.polyval(np.polyfit(steps, series, 1), steps)
+    padded = 16 * series.size
+    power = np.abs(np.fft.rfft(flat * np.hanning(series.size), padded)) ** 2
+    power[: 3 * 16] = 0.0  # fewer than three periods in the record are drift, not ringing
+    peak = int(np.argmax(power))
+    below, at, above = power[peak - 1 : peak + 2] if 0 < peak < power.size - 1 else (0.0, 1.0, 0.0)
+    return padded * spacing / (peak + 0.5 * (below - above) / (below - 2.0 * at + above))
+
+
+def ringing_period(
+    system: System, position: jax.Array, quaternion: jax.Array, box: Box, dt: Scalar, progress: Progress = silent
+) -> float:
+    """T_1 in t_c: kick the resting pack with a uniform shear rate, and take the strongest period of p_xy.
+
+    Args:
+        system: with the friction law of the experiment.
+        position: grain centres at rest, [N, 3, 1].
+        quaternion: orientations, [N, 4, 1].
+        box: walls, one replica.
+        dt: time step, in t_c.
+        progress: told about the run.
+    """
+    lengths = box.lengths
+    duration = 40.0 * float(jnp.max(lengths))  # some 15 periods: the mode's speed is about 0.4 R / t_c
+    bins = int(duration / (STEPS * float(dt)))
+    state = start(system, position, quaternion, box)
+    rate = KICK * jnp.asarray([-1.0, 1.0, 0.0])[:, None]
+    velocity = rate * (position - 0.5 * (box.lower + box.upper))
+    state = accelerate(system, replace(state, grains=replace(state.grains, velocity=velocity)), box)
+    still = Motion(box.lower, box.upper, 0.0, 0.0, 0.0, duration)
+    runner = Runner(system, state, box, dt, progress=progress, total_work=float(bins * STEPS))
+    sample = runner.stage("ringing", still, bins=bins, steps=STEPS)
+    pressure = np.asarray(sample.pressure)[:, :, 0]
+    return spectrum_peak(pressure[:, 0] - pressure[:, 1], STEPS * float(dt))

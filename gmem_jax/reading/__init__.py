@@ -1,0 +1,1 @@
+"""Who reads binary words from a recall: the paper's net, and other readers."""

@@ -1,0 +1,230 @@
+"""Numbers as a person or a program wants to read them: tables beside the published points."""
+
+import csv
+import math
+from collections.abc import Sequence
+from importlib import resources
+from typing import Any
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from gmem_jax.experiment import analysis
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.state import Status, explain
+from gmem_jax.reading import net as classifier
+from gmem_jax.reading import readers
+
+
+def published(file: str = "six_signals.csv", **conditions: str | float) -> list[dict[str, Any]]:
+    """Rows of a published table (numbers converted) in which every named column has the given value."""
+    text = (resources.files("gmem_jax") / "reference" / file).read_text()
+    rows = [{key: _number(cell) for key, cell in row.items()} for row in csv.DictReader(text.splitlines())]
+    return [row for row in rows if all(row[key] == value for key, value in conditions.items())]
+
+
+def _number(cell: str) -> str | float:
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
+
+
+def spread(values: Sequence[float] | jax.Array) -> tuple[float, float, float]:
+    """Mean, sample standard deviation and standard error (NaN for fewer than two values)."""
+    array = np.asarray(values, dtype=float)
+    deviation = float(array.std(ddof=1)) if array.size > 1 else math.nan
+    return float(array.mean()), deviation, deviation / math.sqrt(array.size)
+
+
+def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
+    """The numbers of one recall and its resolved configuration, for JSON output and `recall_table`."""
+    readout = recall.stages["readout"]
+    pressure = np.asarray(readout.pressure)
+    unit = Material().modulus
+    status = int(np.bitwise_or.reduce(np.asarray(recall.status)))
+    return {
+        "pack": configuration["pack"],
+        "grains": configuration["grains"],
+        "gain": float(recall.gain),
+        "fidelity": float(recall.fidelity),
+        "windowed_gain": float(recall.windowed_gain),
+        "windowed_fidelity": float(recall.windowed_fidelity),
+        "ringing_period": float(recall.window),
+        "residual_speed": float(np.max(np.asarray(recall.residual_speed))),
+        "inertial_number": float(np.max(np.asarray(readout.inertial_number))),
+        "filling": [float(np.asarray(readout.filling)[k, 0]) for k in (-1, 0)],
+        "coordination": [float(np.asarray(readout.coordination)[k, 0]) for k in (-1, 0)],
+        "pressure_pa": [float(pressure[k, :2, 0].mean() * unit) for k in (-1, 0)],
+        "largest_signal_pa": float(np.max(np.abs(np.asarray(recall.p_sig))) * unit),
+        "dt": float(recall.dt),
+        "status": status,
+        "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
+        "status_text": explain(status),
+        **second_readout(recall, configuration),
+    }
+
+
+def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
+    """Every background's gain and fidelity, and what the second readout still holds; {} for a run without one.
+
+    "second_readout" has mean and standard error over the S signals of the correlation with J and of the gain. Words
+    are sums of few bits, so that their errors are not independent: the spread over packs is the better measure.
+    """
+    if "readout-2" not in recall.stages:
+        return {}
+    first, second = (analysis.recalled(recall.stages[name].pressure) for name in ("readout", "readout-2"))
+    scale = configuration["delta0"], configuration["gamma0"]
+    pairs = analysis.backgrounds(first, second, recall.J, *scale)
+    rows = {name: {"gain": float(gain), "fidelity": float(fidelity)} for name, (gain, fidelity) in pairs.items()}
+    correlation, left = (spread(values) for values in analysis.remembered_after(second, recall.J, *scale))
+    rest = {"correlation": correlation[0], "correlation_se": correlation[2], "gain": left[0], "gain_se": left[2]}
+    return {"backgrounds": rows, "second_readout": rest}
+
+
+def backgrounds_table(row: dict[str, Any]) -> Table:
+    """Gain and fidelity by each background, from the `summary` of a recall with a second readout."""
+    table = Table(title="By background")
+    for column in ("background", "G", "F"):
+        table.add_column(column, justify="left" if column == "background" else "right")
+    for name, values in row["backgrounds"].items():
+        table.add_row(name.upper(), f"{values['gain']:.3f}", f"{values['fidelity']:.3f}")
+    return table
+
+
+def second_readout_lines(row: dict[str, Any]) -> str:
+    """What the second readout still holds, in words, from such a `summary`."""
+    left = row["second_readout"]
+    return (
+        f"second readout: correlation with J {left['correlation']:.3f} ± {left['correlation_se']:.3f},\n"
+        f"gain {left['gain']:.4f} ± {left['gain_se']:.4f} (mean ± SE over signals)"
+    )
+
+
+def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> Table:
+    """Gain and fidelity of recalls, raw and averaged over the ringing period, beside the published point.
+
+    Args:
+        rows: a `summary` for each pack; several get a line of mean and standard deviation.
+        configuration: resolved, of any of them.
+    """
+    table = Table(title="Recall of the waveforms")
+    for column in ("pack", "G", "F", "G over T1", "F over T1", "T1", "status"):
+        words = column in ("pack", "status")  # may wrap in a narrow terminal; numbers are never cut
+        table.add_column(column, justify="left" if words else "right", no_wrap=not words, overflow="fold")
+    keys = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
+    for row in rows:
+        numbers = [f"{row[key]:.3f}" for key in keys]
+        table.add_row(row["pack"], *numbers, f"{row['ringing_period']:.0f}", row["status_names"])
+    if len(rows) > 1:
+        means = [spread([row[key] for row in rows]) for key in keys]
+        table.add_section()
+        table.add_row(f"mean ± SD ({len(rows)})", *(f"{mean:.3f}\n± {sd:.3f}" for mean, sd, _ in means))
+    same = {key: configuration[key] for key in ("mu", "delta0", "gamma0")}
+    points = [] if configuration["friction"] != "hooke" else published(n_grains=float(configuration["grains"]), **same)
+    shape = configuration["grain"]["shape"]
+    kind, overlap = ("sphere", 1.0) if shape == "sphere" else _tetra(shape)
+    for point in (p for p in points if p["shape"] == kind and p["overlap"] == overlap):
+        table.add_section()
+        gain = f"{point['gain_mean']:.3f}\n± {point['gain_sd']:.3f}"
+        fidelity = f"{point['fidelity_mean']:.3f}\n± {point['fidelity_sd']:.3f}"
+        table.add_row(f"published ({point['n_packs']:.0f})", gain, fidelity)
+    return table
+
+
+def reading(stored: readers.Stored, nets: Sequence[classifier.Training]) -> dict[str, Any]:
+    """How well the words of a recall are read: by the nets (mean and SD over training seeds) and by the baselines.
+
+    Accuracy, error rate of each bit and information (see `readers.information`) for every reader; for the nets over
+    all their readings together.
+    """
+    count = len(stored.signals)
+    answers = {
+        "net": np.stack([np.asarray(classifier.predict(training.net, stored.signals)) for training in nets]),
+        "nearest template": readers.nearest_template(stored.signals, stored.templates),
+        "linear decoder": readers.linear_decoder(stored.signals),
+    }
+    rows = {}
+    for name, read in answers.items():
+        table = readers.confusion(read, count)
+        right = np.atleast_1d(np.mean(read == np.arange(count), axis=-1))
+        mean, deviation, _ = spread(right.tolist())
+        rows[name] = {
+            "accuracy": mean,
+            "accuracy_sd": deviation if name == "net" and len(right) > 1 else None,
+            "bit_errors": readers.bit_errors(read).tolist(),
+            "information": readers.information(table),
+            "read": read.tolist(),
+        }
+    seeds = [
+        {
+            "seed": training.seed,
+            "accuracy": float(classifier.accuracy(training.net, stored.signals)),
+            "cross_entropy": float(classifier.cross_entropy(training.net, stored.signals)),
+            **{key: getattr(training, key) for key in ("validation", "examples", "finished", "step", "seconds")},
+        }
+        for training in nets
+    ]
+    return {"bits": stored.bits, "words": count, "background": stored.background, "readers": rows, "nets": seeds}
+
+
+def reading_tables(result: dict[str, Any]) -> list[Table]:
+    """The readers beside each other and the published accuracy, and the bits' error rates, from a `reading`."""
+    bits = result["bits"]
+    title = f"Reading {result['words']} words of {bits} bits ({result['background'].upper()})"
+    readers_table = Table(title=title, caption="information in bits, with one reading a word: see readers.information")
+    for column in ("reader", "accuracy", "plug-in", "bitwise", "Fano"):
+        readers_table.add_column(column, justify="left" if column == "reader" else "right")
+    errors_table = Table(title="Error rate by bit")
+    errors_table.add_column("reader")
+    for bit in range(bits):
+        errors_table.add_column(f"{bit}" if bit else "0 (first)", justify="right")
+    for name, row in result["readers"].items():
+        deviation = "" if row["accuracy_sd"] is None else f" ± {row['accuracy_sd']:.3f}"
+        known = (f"{row['information'][key]:.2f}" for key in ("plug_in", "bitwise", "fano"))
+        label = f"{name} ({len(result['nets'])} seeds)" if name == "net" else name
+        readers_table.add_row(label, f"{row['accuracy']:.3f}{deviation}", *known)
+        errors_table.add_row(name, *(f"{error:.3f}" for error in row["bit_errors"]))
+    for point in published("binary_words.csv", word_bits=float(bits)):
+        readers_table.add_section()
+        said = f"{point['classifier_accuracy']:.3f} ± {point['classifier_accuracy_sd']:.3f}"
+        readers_table.add_row("published net (N = 10,240)", said)
+    return [readers_table, errors_table]
+
+
+def _tetra(shape: str) -> tuple[str, float]:
+    """Kind and overlap of a shape like "tetra(0.6)"; an overlap that matches nothing for other shapes."""
+    kind, _, rest = shape.partition("(")
+    return kind, float(rest.rstrip(")")) if kind == "tetra" else math.nan
+
+
+def pack_table(pack: Pack) -> Table:
+    """What a pack file holds."""
+    unit = Material().modulus
+    rest = pack.info.get("at_rest", {})
+    recipe = pack.info.get("recipe", {})
+    table = Table(title=f"Pack {pack.name}", show_header=False)
+    rows: list[tuple[str, str]] = [
+        ("grains", f"{pack.grains} {pack.clump.shape}"),
+        ("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)) + " R"),
+        ("cycled with delta0", f"{float(pack.delta0):g}"),
+        ("ringing period T1", f"{float(pack.ringing_period):.1f} t_c"),
+        ("candidate contacts", f"{int(np.asarray(pack.pairs.valid).sum())}"),
+    ]
+    if rest:
+        pressures = ", ".join(f"{p * unit / 1e3:.2f}" for p in rest["pressure"])
+        rows += [
+            ("filling phi", f"{rest['filling']:.4f}"),
+            ("coordination Z", f"{rest['coordination']:.2f}"),
+            ("contacts per grain", f"{rest['contacts']:.2f}"),
+            ("p_x, p_y, p_z", f"{pressures} kPa"),
+            ("largest speed", f"{rest['largest_speed']:.1e} R/t_c"),
+        ]
+    if recipe:
+        rows.append(("seed", str(recipe["seed"])))
+    for key, value in rows:
+        table.add_row(key, value)
+    return table
