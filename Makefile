@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: demo test check install clean
 
 demo: install
-	$(BIN)/gmem demo
+	$(BIN)/gmem demo --force
 
 test: install-dev
 	$(BIN)/pytest -n 2 --dist loadgroup

@@ -9,15 +9,15 @@ import time
 from pathlib import Path
 
 import gmem_jax as gm
-from gmem_jax.command.config import RecallConfig
 from gmem_jax.experiment.signals import BINS
-from gmem_jax.show import tables as report
+from gmem_jax.show.tables import summary
 
 SCALES = {"laptop": range(3, 7), "paper": range(3, 11)}
 LENGTH = 9.0  # t0 of an experiment with a second readout ...
 COMMON = 2.6  # ... and of its beginning, which is run once for all signals
 PAPER_GRAINS = 10_240
 DT = 0.3  # t_c; the default time step
+BATCH = 63  # words that run together
 
 
 def parser(doc: str, folder: str) -> argparse.ArgumentParser:
@@ -50,6 +50,11 @@ def chosen(options: argparse.Namespace) -> tuple[list[gm.Pack], list[int], float
     return [gm.load_pack(name) for name in names], options.bits or list(SCALES[options.scale]), t0
 
 
+def experiment_of(pack: gm.Pack, bits: int, t0: float) -> gm.Experiment:
+    """All words of a length, with a second readout."""
+    return gm.Experiment(pack, gm.words(bits), t0=t0, dt=DT, background="sub2-bl")
+
+
 def announce(packs: list[gm.Pack], bits: list[int], t0: float) -> None:
     """Say what it will cost: from two fast recalls of three bits, with one and with three steps to a bin.
 
@@ -58,7 +63,7 @@ def announce(packs: list[gm.Pack], bits: list[int], t0: float) -> None:
 
     def seconds(steps: int) -> float:
         began = time.perf_counter()
-        gm.run_memory(packs[0], gm.words(3), t0=steps * BINS * DT, dt=DT, background="sub2-bl")
+        gm.run(experiment_of(packs[0], 3, steps * BINS * DT))
         return time.perf_counter() - began
 
     for steps in (1, 3):
@@ -78,12 +83,12 @@ def recall(pack: gm.Pack, bits: int, t0: float, folder: Path) -> dict:
     """The summary of one recall of all words of a length, with its file's path; run only if it is not there yet."""
     path = folder / f"recall-{pack.name}-words-{bits}-t0-{t0:g}.h5"
     if not path.exists():
-        config = RecallConfig(pack=pack.name, signals=f"words:{bits}", background="sub2-bl", t0=t0)
+        experiment = experiment_of(pack, bits, t0)
         began = time.perf_counter()
-        found = gm.run_memory(pack, gm.words(bits), batch=63, **config.arguments())
-        gm.save_recall(path, found, config.resolved(pack, time.perf_counter() - began))
+        found = gm.run(experiment, batch=BATCH)
+        gm.save_recall(path, found, gm.resolved(experiment, time.perf_counter() - began))
     kept, configuration = gm.load_recall(path)
-    row = report.summary(kept, configuration)
+    row = summary(kept, configuration)
     left = row["second_readout"]
     print(
         f"{pack.name}  L = {bits}  "

@@ -16,11 +16,9 @@ import numpy as np
 from console import say
 
 import gmem_jax as gm
-from gmem_jax.derivatives.gradient import with_parameters
-from gmem_jax.experiment import walk as sweep
-from gmem_jax.show import figures_of_designs as plot_gradient
+from gmem_jax.show.figures import history_figure
 
-BOUNDS = {"gamma0": (3e-4, 3e-3), "mu": (0.5, 2.0), "stiffness": (0.07, 0.29)}
+BOUNDS = {"gamma0": (3e-4, 3e-3), "friction.mu": (0.5, 2.0), "friction.stiffness": (0.07, 0.29)}
 
 
 def mean_and_error(values: list[float]) -> str:
@@ -43,7 +41,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
 
     def fidelity(experiment: gm.Experiment) -> float:
-        return float(experiment.fidelity(sweep.simulate(experiment)[0]))
+        return float(gm.run(experiment).fidelity)
 
     def of_packs(names: str) -> list[gm.Experiment]:
         return [gm.Experiment(gm.load_pack(name), gm.six_signals()) for name in names.split(",")]
@@ -54,7 +52,7 @@ def main() -> None:
     result: dict[str, Any] = {"values": found.values, "each": found.each.tolist(), "history": found.history}
     check = of_packs(arguments.check)
     result["check_before"] = [fidelity(each) for each in check]
-    result["check"] = [fidelity(with_parameters(each, **found.values)) for each in check]
+    result["check"] = [fidelity(gm.replace(each, found.values)) for each in check]
     print(f"designed on {arguments.packs}: F {found.before:.4f} -> {found.fidelity:.4f}; on {arguments.check}: "
           f"{mean_and_error(result['check_before'])} -> {mean_and_error(result['check'])}", flush=True)  # fmt: skip
 
@@ -63,15 +61,13 @@ def main() -> None:
         pair: dict[str, list[float]] = {"default": [], "designed": []}
         for seed in map(int, arguments.seeds.split(",")):
             pack = gm.prepare(delta0=float(text), seed=seed, name=f"tetra-325-{seed}-delta0-{text}")
+            experiment = gm.Experiment(pack, gm.six_signals())
             for key, values in (("default", {}), ("designed", found.values)):
-                drive = with_parameters(gm.Experiment(pack, gm.six_signals()), **values)
-                # Here, because it makes the neighbour list anew where a deep compression needs it.
-                recall = gm.run_memory(pack, drive.signals, friction=drive.friction, gamma0=drive.gamma0, t0=1.8e3)
-                pair[key].append(float(recall.fidelity))
+                pair[key].append(fidelity(gm.replace(experiment, values)))
         result["delta0"][text] = pair
         print(f"delta0 {text}: " + ", ".join(f"{key} {mean_and_error(row)}" for key, row in pair.items()), flush=True)
     (arguments.output / "drive.json").write_text(json.dumps(result, indent=1))
-    plot_gradient.history_figure(arguments.output / "history.png", {"drive": [mean for _, mean in found.history]})
+    history_figure(arguments.output / "history.png", {"drive": [mean for _, mean in found.history]})
 
 
 if __name__ == "__main__":

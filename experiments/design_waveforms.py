@@ -1,4 +1,4 @@
-"""Pre-distorted waveforms for the six integrals on shipped packs: before and after, verified by run_memory.
+"""Pre-distorted waveforms for the six integrals on shipped packs: before and after, verified in a run of their own.
 
 python experiments/design_waveforms.py [-o designed] [--packs tetra-325-a,tetra-325-b,...]
 
@@ -10,13 +10,11 @@ import time
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from console import say
 
 import gmem_jax as gm
-from gmem_jax.experiment import analysis
-from gmem_jax.show import figures_of_designs as plot_gradient
+from gmem_jax.show.figures import design_figure, history_figure
 
 
 def main() -> None:
@@ -32,26 +30,23 @@ def main() -> None:
     histories = {}
     for name in arguments.packs.split(","):
         began = time.perf_counter()
-        pack = gm.load_pack(name)
-        experiment = gm.Experiment(pack, gm.six_signals())
+        experiment = gm.Experiment(gm.load_pack(name), gm.six_signals())
         design = gm.design_waveforms(experiment, iterations=arguments.iterations, progress=say)
         seconds = time.perf_counter() - began
         gm.save_waveforms(arguments.output / f"{name}.csv", design.signals)
         again = gm.waveform(gm.load_waveforms(arguments.output / f"{name}.csv"))
-        recall = gm.run_memory(pack, again)  # another program than the design used
-        verified = analysis.fidelity(recall.p_sig, jnp.asarray(design.target), pack.delta0, 1e-3)
-        each = 1.0 - np.linalg.norm(
-            np.asarray(recall.p_sig) - design.gain * float(pack.delta0) * 1e-3 * design.target, axis=1
-        ) / np.linalg.norm(np.asarray(recall.p_sig), axis=1)
+        p_sig = np.asarray(gm.run(gm.replace(experiment, signals=again)).p_sig)
+        verified, unit = experiment.compare(p_sig).fidelity, float(experiment.scale)
+        miss = np.linalg.norm(p_sig - design.gain * unit * design.target, axis=1)
+        each = 1.0 - miss / np.linalg.norm(p_sig, axis=1)
         print(
             f"{name}: F {design.before:.4f} -> {float(verified):.4f}, G {design.gain:.3f}, {seconds:.0f} s; by signal "
             + " ".join(f"{value:.3f}" for value in each),
             flush=True,
         )
-        unit = float(pack.delta0) * 1e-3
-        plot_gradient.design_figure(arguments.output / f"{name}.png", design, unit, name)
+        design_figure(arguments.output / f"{name}.png", design, unit, name)
         histories[name] = design.history
-    plot_gradient.history_figure(arguments.output / "history.png", histories)
+    history_figure(arguments.output / "history.png", histories)
 
 
 if __name__ == "__main__":

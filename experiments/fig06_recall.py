@@ -23,8 +23,9 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
 
     pack = gm.load_pack(arguments.pack)
-    recall = gm.run_memory(pack, gm.six_signals(), t0=arguments.t0)
-    recall_figure(arguments.output / "fig06.png", recall, float(pack.delta0), 1e-3, pack.name)
+    experiment = gm.Experiment(pack, gm.six_signals(), t0=arguments.t0)
+    recall = gm.run(experiment)
+    recall_figure(arguments.output / "fig06.png", recall, experiment.scale, pack.name)
     print(
         f"{pack.name}: G = {recall.gain:.3f}, F = {recall.fidelity:.3f}, status: {gm.explain(int(recall.status.max()))}"
     )

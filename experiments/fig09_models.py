@@ -14,7 +14,7 @@ import jax
 import matplotlib
 
 import gmem_jax as gm
-from gmem_jax.show.tables import spread
+from gmem_jax.experiment.analysis import spread
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -60,7 +60,7 @@ def main() -> None:
         pack = gm.load_pack(name)
         recalls = {}
         for law in arguments.law:
-            recall = recalls[law] = gm.run_memory(pack, gm.six_signals(), friction=LAWS[law], t0=arguments.t0)
+            recall = recalls[law] = gm.run(gm.Experiment(pack, gm.six_signals(), LAWS[law], t0=arguments.t0))
             row = (pack.name, law, float(recall.gain), float(recall.fidelity), int(recall.status.max()))
             rows.append(row)
             print(f"{row[0]}  {law:22s} G = {row[2]:.3f}  F = {row[3]:.3f}  {gm.explain(row[4])}", flush=True)

@@ -11,14 +11,12 @@ import matplotlib
 import numpy as np
 
 import gmem_jax as gm
-from gmem_jax.physics.contact.mindlin import Mindlin
-from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.contact.path import contact_path, polyline
 
 CORNERS = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0)])  # (p, sigma), in R
 POINTS = 200  # to a segment
 FREE = {"mu": 1e6, "stiffness": 1.0, "damping_time": 0.0}  # never slides; force in units of the stiffness
-LAWS = {"H": gm.Hooke(**FREE), "M1": MindlinRescaled(**FREE), "M2": Mindlin(**FREE, p_max=1.5)}
+LAWS = {"H": gm.Hooke(**FREE), "M1": gm.MindlinRescaled(**FREE), "M2": gm.Mindlin(**FREE, p_max=1.5)}
 
 
 def unloading(name: str, overlap: np.ndarray) -> np.ndarray:

@@ -12,8 +12,10 @@ import numpy as np
 from capacity import announce, chosen, parser, recall
 
 import gmem_jax as gm
-from gmem_jax.reading import readers
-from gmem_jax.show import tables as report
+from gmem_jax.experiment.analysis import spread
+from gmem_jax.reading.readers import stored_words
+from gmem_jax.reading.report import reading
+from gmem_jax.show.tables import published
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -25,7 +27,7 @@ READERS = {"net": "C3", "nearest template": "C4", "linear decoder": "C5"}
 def measure(pack: gm.Pack, bits: int, t0: float, folder: Path, nets: list[gm.classify.Training]) -> dict:
     """Numbers of one pack and length, as a flat row."""
     row = recall(pack, bits, t0, folder)
-    read = report.reading(readers.stored_words(gm.load_recall(row["path"])[0]), nets)["readers"]
+    read = reading(stored_words(gm.load_recall(row["path"])[0]), nets)["readers"]
     print("    accuracy: " + ", ".join(f"{name} {values['accuracy']:.3f}" for name, values in read.items()), flush=True)
     flat = {"pack": pack.name, "grains": pack.grains, "bits": bits, "status": row["status"]}
     flat |= {f"fidelity {name}": row["backgrounds"][name]["fidelity"] for name in BACKGROUNDS}
@@ -42,9 +44,7 @@ def draw(path: Path, rows: list[dict]) -> None:
             lengths = sorted({row["bits"] for row in rows if row["grains"] == grains})
             for place, (name, colour) in enumerate(names.items()):
                 cells = [
-                    report.spread(
-                        [row[f"{kind} {name}"] for row in rows if (row["grains"], row["bits"]) == (grains, n)]
-                    )
+                    spread([row[f"{kind} {name}"] for row in rows if (row["grains"], row["bits"]) == (grains, n)])
                     for n in lengths
                 ]
                 mean, error = np.array([cell[0] for cell in cells]), np.nan_to_num([cell[2] for cell in cells])
@@ -59,7 +59,7 @@ def draw(path: Path, rows: list[dict]) -> None:
                     markersize=4,
                     label=label,
                 )
-    points = report.published("binary_words.csv")
+    points = published("binary_words.csv")
     length = [point["word_bits"] for point in points]
     for name, colour in BACKGROUNDS.items():
         values = [point[f"fidelity_{name.replace('-', '_')}"] for point in points]
@@ -91,8 +91,8 @@ def main() -> None:
         nets = []
         for seed in range(given.seeds):
             file = given.output / f"words-{length}-seed-{seed}.msgpack"
-            recipe = gm.classify.Recipe(length)
-            nets.append(gm.classify.train(recipe, seed, budget=given.budget, checkpoint=file))
+            lessons = gm.classify.Lessons(length)
+            nets.append(gm.classify.train(lessons, seed, budget=given.budget, checkpoint=file))
             print(f"L = {length}, net {seed}: {nets[-1].step} steps, held-out accuracy {nets[-1].validation:.4f}")
         rows += [measure(pack, length, t0, given.output, nets) for pack in packs]
         with (given.output / "fig14.csv").open("w", newline="") as file:
@@ -103,7 +103,7 @@ def main() -> None:
     for length in bits:
         cells = [row for row in rows if row["bits"] == length]
         for key in (key for key in rows[0] if key.startswith(("fidelity", "accuracy", "second"))):
-            mean, _, error = report.spread([row[key] for row in cells])
+            mean, _, error = spread([row[key] for row in cells])
             print(f"L = {length}  {key:28s} {mean:.4f} +- {error:.4f}  ({len(cells)} packs)")
 
 

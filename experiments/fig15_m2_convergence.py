@@ -14,6 +14,7 @@ import numpy as np
 
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.path import contact_path, polyline
+from gmem_jax.physics.pytree import pytree
 
 CORNERS = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0)])  # (p, sigma), in R
 POINTS = 1000  # to a segment
@@ -22,7 +23,7 @@ SHOWN = (20, 100, 400)
 COUNTS = (20, 35, 60, 100, 180, 400)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class WithoutH(Mindlin):
     """App. D.2 without its h term: the outermost ring counts in full as soon as it is reached."""

@@ -9,7 +9,6 @@ derivatives against the number of steps they have come through. At t0 = 1,800 t_
 
 import argparse
 import csv
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,11 @@ from console import say
 
 import gmem_jax as gm
 from gmem_jax.derivatives import gradient, jacobian
-from gmem_jax.experiment import walk as sweep
+from gmem_jax.experiment.experiment import value_at
 
 AMPLITUDES = 16
 STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
-SCALARS = ("gamma0", "mu", "stiffness")
+SCALARS = ("gamma0", "friction.mu", "friction.stiffness")
 
 
 def waveform() -> gm.Bumps:
@@ -49,25 +48,19 @@ def check_jacobian(experiment: gm.Experiment) -> tuple[dict[float, dict[str, flo
 
 def check_prefix(experiment: gm.Experiment) -> dict[float, np.ndarray]:
     """Misses of dp / d mu in every bin from the very beginning, by step size."""
-    law: Any = experiment.friction
-
-    def make(mu: Any) -> gm.Experiment:
-        return replace(experiment, friction=replace(law, mu=mu))
+    mu = value_at(experiment, "friction.mu")
 
     def joined(pressure: Any) -> np.ndarray:
         return np.concatenate([np.asarray(pressure[name])[..., -1] for name in pressure])
 
-    exact = joined(gradient.push(make, jnp.asarray(law.mu), jnp.asarray(1.0), progress=say).slope)
+    exact = joined(gradient.push(experiment, {"friction.mu": 1.0}, progress=say).slope)
     by_bin = {}
     for step in STEPS:
         sides = []
         for sign in (1.0, -1.0):
-            changed = make(law.mu * (1.0 + sign * step))
-            recall = gm.run_memory(
-                changed.pack, changed.signals, friction=changed.friction, t0=changed.timing.t0, gamma0=changed.gamma0
-            )
+            recall = gm.run(gm.replace(experiment, {"friction.mu": mu * (1.0 + sign * step)}))
             sides.append(joined({name: sample.pressure for name, sample in recall.stages.items()}))
-        slope = (sides[0] - sides[1]) / (2.0 * step * law.mu)
+        slope = (sides[0] - sides[1]) / (2.0 * step * mu)
         size = np.linalg.norm(slope, axis=1)  # zero before the first contact feels friction
         by_bin[step] = np.linalg.norm(exact - slope, axis=1) / np.where(size > 0.0, size, np.nan)
     return by_bin
@@ -75,39 +68,28 @@ def check_prefix(experiment: gm.Experiment) -> dict[float, np.ndarray]:
 
 def check_fidelity(experiment: gm.Experiment) -> tuple[list[list[Any]], float]:
     """Rows (parameter, exact, difference at each step) of dF; and how far forward and reverse mode are apart."""
-    signals, law = experiment.signals, experiment.friction
-    assert isinstance(signals, gm.Bumps)
-
-    def make(theta: Any) -> gm.Experiment:
-        friction = replace(law, mu=theta["mu"], stiffness=theta["stiffness"])  # type: ignore[type-var]
-        shapes = replace(signals, amplitudes=theta["amplitudes"])
-        return replace(experiment, signals=shapes, gamma0=theta["gamma0"], friction=friction)
-
-    chosen: Any = law
-    theta = {"amplitudes": signals.amplitudes, "gamma0": 1e-3, "mu": chosen.mu, "stiffness": chosen.stiffness}
-    theta = jax.tree.map(jnp.asarray, theta)
-    reverse = gm.value_and_grad(make, theta, progress=say)
-    toss = np.random.default_rng(0).normal(size=signals.amplitudes.shape)
-    direction = {"amplitudes": jnp.asarray(toss), **{name: theta[name] for name in SCALARS}}
-    pushed = gradient.push(make, theta, direction, progress=say)
+    names = ("signals.amplitudes", *SCALARS)
+    theta = {name: jnp.asarray(value_at(experiment, name)) for name in names}
+    reverse = gm.value_and_grad(experiment, names, progress=say)
+    toss = np.random.default_rng(0).normal(size=theta["signals.amplitudes"].shape)
+    direction = {"signals.amplitudes": jnp.asarray(toss), **{name: theta[name] for name in SCALARS}}
+    pushed = gradient.push(experiment, direction, progress=say)
 
     def score(theta: Any, p_sig: jax.Array) -> jax.Array:
-        return make(theta).fidelity(p_sig)
+        return gm.replace(experiment, theta).compare(p_sig).fidelity
 
     _, forward = jax.jvp(score, (theta, pushed.p_sig), (direction, pushed.p_sig_slope))
     back = sum(float(jnp.vdot(direction[name], reverse.slope[name])) for name in theta)
 
     def fidelity(theta: Any) -> float:
-        changed = make(theta)
-        return float(changed.fidelity(sweep.simulate(changed)[0]))
+        return float(gm.run(gm.replace(experiment, theta)).fidelity)
 
-    along = {"amplitudes": {"amplitudes": direction["amplitudes"]}, **{name: {name: theta[name]} for name in SCALARS}}
     rows: list[list[Any]] = []
-    for name, move in along.items():
-        exact = float(jnp.vdot(move[name], reverse.slope[name]))
+    for name, move in direction.items():
+        exact = float(jnp.vdot(move, reverse.slope[name]))
         differences = []
         for step in STEPS:
-            up, down = ({**theta, name: theta[name] + sign * step * move[name]} for sign in (1.0, -1.0))
+            up, down = ({**theta, name: theta[name] + sign * step * move} for sign in (1.0, -1.0))
             differences.append((fidelity(up) - fidelity(down)) / (2.0 * step))
         rows.append([name, exact, *differences])
     return rows, abs(back - float(forward)) / abs(float(forward))
@@ -154,8 +136,7 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
 
-    timing = gm.Timing(t0=arguments.t0)
-    experiment = gm.Experiment(gm.load_pack(arguments.pack), waveform(), timing=timing)
+    experiment = gm.Experiment(gm.load_pack(arguments.pack), waveform(), t0=arguments.t0)
     table, sheared = check_jacobian(experiment)
     with (arguments.output / "jacobian.csv").open("w", newline="") as file:
         writer = csv.writer(file)
@@ -164,16 +145,16 @@ def main() -> None:
             writer.writerow([step, *row.values()])
             print(f"{step:8.0e}  " + "  ".join(f"{group} {error:.1e}" for group, error in row.items()))
     whole = check_prefix(experiment)
-    draw(arguments.output / "gradient_check.png", table, sheared, whole, timing.steps)
+    draw(arguments.output / "gradient_check.png", table, sheared, whole, experiment.steps_per_bin)
 
-    rows, apart = check_fidelity(replace(experiment, signals=gm.six_signals()))
+    rows, apart = check_fidelity(gm.replace(experiment, signals=gm.six_signals()))
     with (arguments.output / "fidelity.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["along", "exact", *(f"step {step:g}" for step in STEPS)])
         writer.writerows(rows)
     print("dF along (in parts of each parameter), exact, and by differences with steps " + " ".join(map(str, STEPS)))
     for name, *numbers in rows:
-        print(f"{name:10}  " + "  ".join(f"{number:12.5e}" for number in numbers))
+        print(f"{name:18}  " + "  ".join(f"{number:12.5e}" for number in numbers))
     print(f"forward against reverse mode: {apart:.1e}")
 
 

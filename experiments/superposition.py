@@ -9,7 +9,6 @@ too. "Linear" uses the odd part of the kernel alone, "both" the even part beside
 import argparse
 import csv
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,8 @@ import numpy as np
 
 import gmem_jax as gm
 from gmem_jax import classify
-from gmem_jax.experiment import walk as sweep
+from gmem_jax.experiment.host import Walker
+from gmem_jax.experiment.recall import prefix_of, simulate
 from gmem_jax.experiment.signals import bit_width
 from gmem_jax.physics.material import Material
 
@@ -33,10 +33,10 @@ def error(predicted: np.ndarray, simulated: np.ndarray) -> float:
     return float(np.linalg.norm(predicted - simulated) / np.linalg.norm(simulated))
 
 
-def compare(experiment: gm.Experiment, state: Any, n: int, width: float) -> dict[str, Any]:
+def compare(experiment: gm.Experiment, begun: Walker, n: int, width: float) -> dict[str, Any]:
     """Predictions of the experiment's signals from a kernel on n bumps that can form them, and their simulation."""
-    kernel = gm.memory_kernel(experiment.pack, n, width, state=state, experiment=experiment)
-    simulated = np.asarray(sweep.simulate(experiment, state)[0])
+    kernel = gm.memory_kernel(experiment, n, width, begun=begun)
+    simulated = np.asarray(simulate(experiment, begun).p_sig)
     both, linear = kernel.predict(experiment.signals), kernel.predict(experiment.signals, even=False)
     return {
         "both": both,
@@ -105,22 +105,22 @@ def main() -> None:
 
     names = arguments.packs.split(",")
     for name in names:
-        experiment = gm.Experiment(gm.load_pack(name), gm.six_signals(), timing=gm.Timing(t0=arguments.t0))
-        state = sweep.prefix(experiment)
+        experiment = gm.Experiment(gm.load_pack(name), gm.six_signals(), t0=arguments.t0)
+        begun = prefix_of(experiment)
         for gamma0 in GAMMAS:
-            found = compare(replace(experiment, gamma0=gamma0), state, 17, 0.2)
+            found = compare(gm.replace(experiment, gamma0=gamma0), begun, 17, 0.2)
             note(name, "six", gamma0, found)
             if name == names[0] and gamma0 == 1e-3:
                 shown = found
         for bits in BITS:
-            found = compare(replace(experiment, signals=gm.words(bits)), state, *of_words(bits))
+            found = compare(gm.replace(experiment, signals=gm.words(bits)), begun, *of_words(bits))
             note(name, f"words {bits}", 1e-3, found)
         if name == names[0] and arguments.long:
             bits = arguments.long
-            found = compare(replace(experiment, signals=gm.words(bits)), state, *of_words(bits))
+            found = compare(gm.replace(experiment, signals=gm.words(bits)), begun, *of_words(bits))
             note(name, f"words {bits}", 1e-3, found)
             began = time.perf_counter()
-            net = classify.train(classify.Recipe(bits=bits)).net
+            net = classify.train(classify.Lessons(bits=bits)).net
             right = {key: float(classify.accuracy(net, found[key])) for key in ("simulated", "both", "linear")}
             print(f"net of {bits} bits, trained in {time.perf_counter() - began:.0f} s; words recognised: "
                   + ", ".join(f"{key} {value:.3f}" for key, value in right.items()), flush=True)  # fmt: skip

@@ -2,27 +2,29 @@
 
 Units are R = E = rho = 1 (time in t_c = R sqrt(rho/E)); `Material` converts. Ask for 64-bit numbers first:
 ``jax.config.update("jax_enable_x64", True)``.
+
+    pack = gm.load_pack("tetra-325-a")
+    experiment = gm.Experiment(pack, gm.six_signals(), friction=gm.Hooke(mu=1.0))
+    recall = gm.run(experiment)  # on the host; `gm.recall` and `gm.fidelity` are for jit, vmap and grad
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from gmem_jax.derivatives.gradient import value_and_grad
+from gmem_jax.derivatives.jacobian import exact as jacobian
 from gmem_jax.design.kernel import MemoryKernel, memory_kernel
-from gmem_jax.design.waveforms import Design, Drive, design_drive, design_waveforms
 from gmem_jax.experiment.analysis import running_mean
-from gmem_jax.experiment.experiment import Experiment, Timing
+from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.experiment.pack import Pack, pack_from, stack
-from gmem_jax.experiment.recall import Recall, fidelity, gain, run_memory
-from gmem_jax.experiment.signals import Bumps, Samples, Signals, six_signals, waveform, words
-from gmem_jax.files.storage import (
-    FileFormatError,
-    list_packs,
-    load_pack,
-    load_recall,
-    load_waveforms,
-    save_pack,
-    save_recall,
-    save_waveforms,
-)
+from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
+from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, waveform, words
+from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.configuration import experiment_from, resolved, written
+from gmem_jax.files.packs import list_packs, load_pack, save_pack
+from gmem_jax.files.recalls import load_recall, save_recall
+from gmem_jax.files.waveforms import load_waveforms, save_waveforms
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
@@ -31,13 +33,32 @@ from gmem_jax.physics.grain import Clump, clump, sphere, tetra
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain
 from gmem_jax.preparation.preparation import Recipe, prepare
-from gmem_jax.reading import net as classify
+
+if TYPE_CHECKING:
+    from gmem_jax.design.drive import TunedDrive, design_drive
+    from gmem_jax.design.waveforms import Design, design_waveforms
+    from gmem_jax.reading import classify
+
+_LATER = {  # what loads flax or optax, by where it is
+    "Design": "gmem_jax.design.waveforms",
+    "design_waveforms": "gmem_jax.design.waveforms",
+    "TunedDrive": "gmem_jax.design.drive",
+    "design_drive": "gmem_jax.design.drive",
+    "classify": "gmem_jax.reading.classify",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module 'gmem_jax' has no attribute {name!r}")
+    module = importlib.import_module(_LATER[name])
+    return module if name == "classify" else getattr(module, name)
+
 
 __all__ = [
     "Bumps",
     "Clump",
     "Design",
-    "Drive",
     "Experiment",
     "FileFormatError",
     "Frictionless",
@@ -50,17 +71,19 @@ __all__ = [
     "Recall",
     "Recipe",
     "RunFailedError",
-    "Samples",
     "Signals",
+    "Spline",
     "Status",
-    "Timing",
+    "TunedDrive",
     "classify",
     "clump",
     "design_drive",
     "design_waveforms",
+    "experiment_from",
     "explain",
     "fidelity",
     "gain",
+    "jacobian",
     "list_packs",
     "load_pack",
     "load_recall",
@@ -68,7 +91,10 @@ __all__ = [
     "memory_kernel",
     "pack_from",
     "prepare",
-    "run_memory",
+    "recall",
+    "replace",
+    "resolved",
+    "run",
     "running_mean",
     "save_pack",
     "save_recall",
@@ -80,4 +106,5 @@ __all__ = [
     "value_and_grad",
     "waveform",
     "words",
+    "written",
 ]

@@ -1,19 +1,24 @@
 """Small deterministic scenes, and compiled runs of them, shared by the tests of the core."""
 
 import functools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.protocol import Motion
+from gmem_jax.experiment.drive import Drive
+from gmem_jax.experiment.protocol import Bin
+from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, sphere, tetra
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import PairFinder, Pairs, slack, sphere_centres, tabulate
+from gmem_jax.physics.pairs import Pairs, slack, sphere_centres, tabulate
+from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import uniform
+from gmem_jax.physics.sample import Sample, end_bin
+from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, Grains, State, replicate, still_box
 
 ELASTIC = Material(normal_damping=0.0)
@@ -83,10 +88,60 @@ def scene(
     return system, state, box
 
 
-@functools.partial(jax.jit, static_argnames="bins")
-def advance(system, state, motion, dt, first_bin=0, *, bins, steps, drag=0.0):
-    """`dynamics.advance`, compiled."""
-    return dynamics.advance(system, state, motion, dt, first_bin=first_bin, bins=bins, steps=steps, drag=drag)
+@pytree
+@dataclass(frozen=True)
+class Motion:
+    """One stage of a drive: the walls as a function of time alone.
+
+    Attributes:
+        lower: lower planes at u = 0, [3, 1].
+        upper: upper planes, alike.
+        delta0: areal compression at u = 1, scalar or [B].
+        start: u at the beginning of the stage.
+        stop: u at its end.
+        duration: in t_c.
+        gamma0: shear amplitude, scalar or [B].
+        signals: the waveforms, or None for no shear.
+        sheared: whether they are applied.
+    """
+
+    lower: jax.Array
+    upper: jax.Array
+    delta0: Scalar
+    start: Scalar
+    stop: Scalar
+    duration: Scalar
+    gamma0: Scalar = 0.0
+    signals: Signals | None = None
+    sheared: Scalar | bool = True
+
+    def box_at(self, time: jax.Array) -> Box:
+        """The walls at `time` since the start of the stage."""
+        drive = Drive(self.lower, self.upper, self.delta0, self.gamma0, self.signals)
+        return drive.box_at(Bin(self.start, self.stop, 1, 0, self.sheared), jnp.asarray(time), self.duration)
+
+
+def advance_by(march):
+    """`advance` on a backend, whose `march` does the steps: not compiled."""
+
+    def advance(system, state, motion, dt, first_bin=0, *, bins, steps, drag=0.0) -> tuple[State, Sample]:
+        """`bins` bins of `steps` steps from bin number `first_bin` of a motion; the state, and samples [bins]."""
+        dt = jnp.asarray(dt)
+
+        def one_bin(state, number):
+            count = number * steps + 1 + jnp.arange(steps)
+            boxes = jax.vmap(motion.box_at)(count.reshape(-1, *(1 for _ in dt.shape)) * dt)
+            wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, 3, state.replicas)), boxes)
+            state, total = march(system, state, wide, dt, drag)
+            return end_bin(system, state, jax.tree.map(lambda leaf: leaf[-1], wide), total / steps)
+
+        return jax.lax.scan(one_bin, state, first_bin + jnp.arange(bins))
+
+    return advance
+
+
+advance_plain = advance_by(dynamics.march)
+advance = jax.jit(advance_plain, static_argnames=("bins", "steps"))
 
 
 @jax.jit

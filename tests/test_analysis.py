@@ -7,14 +7,14 @@ import pytest
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.signals import bin_average, six_signals
 
-DELTA0, GAMMA0 = 0.05, 1e-3
+SCALE = 0.05 * 1e-3  # delta0 gamma0
 J = bin_average(six_signals())
 
 
 def test_a_scaled_integral_is_a_perfect_memory() -> None:
-    signal = 0.3 * DELTA0 * GAMMA0 * J
-    np.testing.assert_allclose(analysis.gain(signal, J, DELTA0, GAMMA0), 0.3, rtol=1e-14)
-    np.testing.assert_allclose(analysis.fidelity(signal, J, DELTA0, GAMMA0), 1.0, atol=1e-7)  # sqrt of round-off
+    signal = 0.3 * SCALE * J
+    np.testing.assert_allclose(analysis.compare(signal, J, SCALE).gain, 0.3, rtol=1e-14)
+    np.testing.assert_allclose(analysis.compare(signal, J, SCALE).fidelity, 1.0, atol=1e-7)  # sqrt of round-off
 
 
 def test_fidelity_is_one_minus_the_sine_of_the_angle_to_the_template() -> None:
@@ -24,13 +24,21 @@ def test_fidelity_is_one_minus_the_sine_of_the_angle_to_the_template() -> None:
     other = other / jnp.sqrt(jnp.sum(other * other))
     for angle in (0.1, 0.7, 1.4):
         signal = np.cos(angle) * template + np.sin(angle) * other
-        np.testing.assert_allclose(analysis.fidelity(signal, J, DELTA0, GAMMA0), 1.0 - np.sin(angle), rtol=1e-12)
+        np.testing.assert_allclose(analysis.compare(signal, J, SCALE).fidelity, 1.0 - np.sin(angle), rtol=1e-12)
 
 
 def test_one_gain_serves_the_whole_set() -> None:
-    signal = DELTA0 * GAMMA0 * J * jnp.asarray([0.2, 0.2, 0.2, 0.2, 0.2, 0.8])[:, None]
-    assert 0.2 < float(analysis.gain(signal, J, DELTA0, GAMMA0)) < 0.8
-    assert float(analysis.fidelity(signal, J, DELTA0, GAMMA0)) < 0.9
+    signal = SCALE * J * jnp.asarray([0.2, 0.2, 0.2, 0.2, 0.2, 0.8])[:, None]
+    assert 0.2 < float(analysis.compare(signal, J, SCALE).gain) < 0.8
+    assert float(analysis.compare(signal, J, SCALE).fidelity) < 0.9
+
+
+def test_a_scale_of_its_own_for_each_signal_is_that_signals_part_of_the_template() -> None:
+    scale = SCALE * jnp.asarray([1.0, 2.0, 0.5, 3.0, 1.5, 0.1])[:, None]
+    found = analysis.compare(0.3 * scale * J, J, scale)
+    np.testing.assert_allclose(found.gain, 0.3, rtol=1e-14)
+    np.testing.assert_allclose(found.fidelity, 1.0, atol=1e-7)  # sqrt of round-off
+    assert float(analysis.compare(0.3 * scale * J, J, SCALE).fidelity) < 0.9
 
 
 def test_a_readout_is_turned_to_ascending_u() -> None:
@@ -69,18 +77,20 @@ def test_a_running_mean_of_one_bin_changes_nothing() -> None:
 
 
 def test_every_background_is_reported_with_its_own_gain_and_fidelity() -> None:
-    signal = 0.3 * DELTA0 * GAMMA0 * J
+    signal = 0.3 * SCALE * J
     ramp = jnp.linspace(0.0, 1.0, 256)
     drift = 1e-6 * (0.4 + ramp)  # between the two readouts: SUB2 suffers from it, a line is all that SUB2-BL removes
     first = jnp.concatenate([jnp.zeros((1, 256)), -signal]) + jnp.sin(ramp)
-    rows = analysis.backgrounds(first, jnp.broadcast_to(jnp.sin(ramp) + drift, first.shape), J, DELTA0, GAMMA0)
+    rows = analysis.backgrounds(first, jnp.broadcast_to(jnp.sin(ramp) + drift, first.shape), J, SCALE)
     assert list(rows) == ["sub0", "sub2", "sub2-bl"]
-    np.testing.assert_allclose(rows["sub0"][1], 1.0, atol=1e-6)  # round-off of the background, of order 1, over 1e-6
-    np.testing.assert_allclose(rows["sub0"][0], 0.3, rtol=1e-9)
-    assert float(rows["sub2"][1]) < 0.9
+    np.testing.assert_allclose(
+        rows["sub0"].fidelity, 1.0, atol=1e-6
+    )  # round-off of the background, of order 1, over 1e-6
+    np.testing.assert_allclose(rows["sub0"].gain, 0.3, rtol=1e-9)
+    assert float(rows["sub2"].fidelity) < 0.9
     # The line through the end bins also takes what J has left there, 2 du / pi of signals 1 to 3 and 6.
     alone = analysis.subtract("sub2-bl", -jnp.concatenate([jnp.zeros((1, 256)), signal]), jnp.zeros((7, 256)))
-    np.testing.assert_allclose(rows["sub2-bl"][1], analysis.fidelity(alone, J, DELTA0, GAMMA0), rtol=1e-6)
+    np.testing.assert_allclose(rows["sub2-bl"].fidelity, analysis.compare(alone, J, SCALE).fidelity, rtol=1e-6)
 
 
 def test_correlation_is_the_cosine_between_signal_and_integral() -> None:
@@ -95,13 +105,13 @@ def test_correlation_is_the_cosine_between_signal_and_integral() -> None:
 
 def test_what_is_left_after_the_first_readout_has_its_sign_and_its_size() -> None:
     zero = jnp.sin(jnp.linspace(0.0, 3.0, 256))[None]
-    second = jnp.concatenate([zero, zero - 0.02 * DELTA0 * GAMMA0 * J])
-    correlation, left = analysis.remembered_after(second, J, DELTA0, GAMMA0)
+    second = jnp.concatenate([zero, zero - 0.02 * SCALE * J])
+    correlation, left = analysis.remembered_after(second, J, SCALE)
     np.testing.assert_allclose(left, 0.02 * np.ones(6), rtol=1e-7)  # round-off of a background of order 1 over 1e-7
     np.testing.assert_allclose(correlation, np.ones(6), rtol=1e-12)
 
 
 def test_an_unrelated_second_readout_is_uncorrelated_with_the_integral() -> None:
     noise = jnp.asarray(np.random.default_rng(0).normal(size=(7, 256)))
-    correlation, _ = analysis.remembered_after(noise, J, DELTA0, GAMMA0)
+    correlation, _ = analysis.remembered_after(noise, J, SCALE)
     assert np.abs(correlation).max() < 4.0 / 16.0  # the correlation of white noise has an SD of 1 / sqrt(256)

@@ -36,7 +36,7 @@ def test_mirrored_copies_are_at_rest_without_the_walls_between_them(pack: gm.Pac
     large = bench.tile(pack, (2, 3, 1))
     assert large.grains == 6 * 27
     np.testing.assert_allclose(large.upper, (pack.upper - pack.lower) * jnp.asarray([2.0, 3.0, 1.0]))
-    one, many = (bench.encode(p, gm.Hooke(), 1)[1].grains.acceleration for p in (pack, large))
+    one, many = (bench.encode(p, gm.Hooke(), 1, "jax")[1].grains.acceleration for p in (pack, large))
     # Net forces are those of the pack, to the round-off of a rotation of contacts of some 1e-2 E R^2.
     np.testing.assert_allclose(np.abs(many).max(), np.abs(one).max(), rtol=1e-3, atol=1e-12)
     assert int(np.asarray(large.pairs.valid).sum()) > 6 * int(np.asarray(pack.pairs.valid).sum())

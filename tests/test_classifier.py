@@ -10,10 +10,11 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.experiment.signals import bin_average, words
-from gmem_jax.reading import net as classify
+from gmem_jax.reading import classify
+from gmem_jax.reading.training import QUICK_CHECK, STEPS
 
-SMALL = classify.Recipe(2, hidden=(32, 32))
-PAPER = classify.Recipe(3)
+SMALL = classify.Lessons(2, hidden=(32, 32))
+PAPER = classify.Lessons(3)
 MAKE = jax.jit(lambda data, word, combination: data.make(word, combination))
 
 
@@ -83,7 +84,7 @@ def test_held_out_combinations_are_never_trained_on(data: classify.Examples) -> 
         def make(self, word: jax.Array, combination: jax.Array) -> jax.Array:
             return combination
 
-    spy = Spy(data.table, data.order, data.noise, data.recipe)
+    spy = Spy(data.table, data.order, data.noise, data.lessons)
     for key in range(50):
         asked, word = spy.training(jax.random.key(key))
         assert set(np.asarray(asked).tolist()) <= trained
@@ -93,7 +94,7 @@ def test_held_out_combinations_are_never_trained_on(data: classify.Examples) -> 
     pairs = set(zip(np.asarray(word).tolist(), np.asarray(asked).tolist(), strict=True))
     assert len(pairs) == len(numbers)  # each once
     assert {combination for _, combination in pairs} == kept
-    few = np.asarray(spy.held_out(numbers[: classify.QUICK_CHECK])[0])
+    few = np.asarray(spy.held_out(numbers[:QUICK_CHECK])[0])
     assert len(set(few.tolist())) > 500  # a quick check covers many combinations
 
 
@@ -127,10 +128,10 @@ def test_training_is_reproducible_and_depends_on_the_seed(small: classify.Traini
 
 def test_broken_off_training_goes_on_to_the_same_net(tmp_path: Path) -> None:
     file = tmp_path / "net.msgpack"
-    limit = 3 * classify.STEPS
+    limit = 3 * STEPS
     through = classify.train(SMALL, 3, target=1.1, most_steps=limit)
     broken = classify.train(SMALL, 3, target=1.1, budget=0.0, checkpoint=file)  # one call, then out of time
-    assert (broken.step, broken.finished) == (classify.STEPS, False)
+    assert (broken.step, broken.finished) == (STEPS, False)
     resumed = classify.train(SMALL, 3, target=1.1, most_steps=limit, checkpoint=file)
     assert resumed.step == through.step == limit
     assert resumed.seconds > broken.seconds
@@ -143,17 +144,17 @@ def test_a_finished_net_is_loaded_not_trained(small: classify.Training, tmp_path
     file = tmp_path / "net.msgpack"
     classify.save(file, small)
     calls: list[classify.Training] = []
-    again = classify.train(SMALL, 0, checkpoint=file, progress=calls.append)
+    again = classify.train(SMALL, 0, checkpoint=file, listener=calls.append)
     assert calls == []
-    assert again.net.recipe == SMALL
+    assert again.net.lessons == SMALL
     assert (again.step, again.validation, again.seconds) == (small.step, small.validation, small.seconds)
     signals = np.random.default_rng(7).normal(size=(4, 256))
     np.testing.assert_array_equal(classify.logits(again.net, signals), classify.logits(small.net, signals))
 
 
-def test_progress_tells_loss_and_held_out_accuracy() -> None:
+def test_the_listener_is_told_loss_and_held_out_accuracy() -> None:
     seen: list[classify.Training] = []
-    classify.train(SMALL, 0, target=1.1, most_steps=500, progress=seen.append)
+    classify.train(SMALL, 0, target=1.1, most_steps=500, listener=seen.append)
     assert [training.step for training in seen] == [250, 500]
     assert 0.0 < seen[1].loss < seen[0].loss < np.log(4.0)
     assert all(0.0 < training.validation <= 1.0 for training in seen)
@@ -162,9 +163,9 @@ def test_progress_tells_loss_and_held_out_accuracy() -> None:
 def test_a_net_of_other_words_or_another_seed_is_not_mistaken(small: classify.Training, tmp_path: Path) -> None:
     file = tmp_path / "net.msgpack"
     classify.save(file, small)
-    for recipe, seed in ((SMALL, 1), (replace(SMALL, bits=3), 0), (replace(SMALL, noise=0.2), 0)):
+    for lessons, seed in ((SMALL, 1), (replace(SMALL, bits=3), 0), (replace(SMALL, noise=0.2), 0)):
         with pytest.raises(ValueError, match="holds the net of seed 0"):
-            classify.train(recipe, seed, checkpoint=file)
+            classify.train(lessons, seed, checkpoint=file)
 
 
 def test_broken_and_foreign_files_are_refused(small: classify.Training, tmp_path: Path) -> None:
@@ -212,7 +213,7 @@ def test_jit_changes_nothing(small: classify.Training) -> None:
 def test_training_can_be_mapped_over_seeds() -> None:
     def learn(seed: jax.Array) -> tuple[classify.Net, jax.Array, jax.Array]:
         data = classify.examples(SMALL, seed)
-        net, loss = classify.advance(classify.initial(SMALL, seed), data, seed, 0, 60)
+        net, loss = classify.learn(classify.initial(SMALL, seed), data, seed, 0, 60)
         return net, loss, classify.validate(net, data, 512)
 
     nets, losses, validation = jax.jit(jax.vmap(learn))(jnp.arange(3))

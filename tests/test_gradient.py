@@ -1,5 +1,6 @@
 """Derivatives through whole, shortened experiments on 27 grains, and at the corners of the contact laws."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -9,22 +10,24 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax import classify
 from gmem_jax.derivatives import gradient, jacobian
 from gmem_jax.experiment import checkpoint
-from gmem_jax.experiment import walk as sweep
+from gmem_jax.experiment.recall import run, simulate
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.normal import hertz
+from gmem_jax.physics.search import PairFinder
+from gmem_jax.physics.state import Grains
+from gmem_jax.reading import classify
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
-SHORT = gm.Timing(t0=75.0, dt=0.3, rest=0.1, hold=0.1, store=0.2)  # one step per bin: some 900 steps in all
+SHORT = {"t0": 75.0, "dt": 0.3, "rest": 0.1, "hold": 0.1, "store": 0.2}  # one step per bin: some 900 steps in all
 CENTRES = jnp.asarray([[0.3, 0.7]])
 
 
 @pytest.fixture(scope="module")
 def experiment() -> gm.Experiment:
     bumps = gm.Bumps(jnp.asarray([[1.0, -0.6]]), CENTRES, 0.2)
-    return gm.Experiment(gm.load_pack(PACK), bumps, gm.Hooke(mu=0.8), timing=SHORT)
+    return gm.Experiment(gm.load_pack(PACK), bumps, gm.Hooke(mu=0.8), **SHORT)
 
 
 @pytest.fixture(scope="module")
@@ -32,21 +35,7 @@ def exact(experiment: gm.Experiment) -> jacobian.Jacobian:
     return jacobian.exact(experiment)
 
 
-def by_everything(experiment: gm.Experiment) -> tuple[gradient.Make, dict[str, jax.Array]]:
-    def make(theta: Any) -> gm.Experiment:
-        law = gm.Hooke(mu=theta["mu"], stiffness=theta["stiffness"])
-        bumps = gm.Bumps(theta["amplitudes"], CENTRES, 0.2)
-        pack = gradient.replace(experiment.pack, position=theta["position"])
-        return gm.Experiment(pack, bumps, law, gamma0=theta["gamma0"], timing=SHORT)
-
-    theta = {
-        "amplitudes": jnp.asarray([[1.0, -0.6]]),
-        "gamma0": jnp.asarray(1e-3),
-        "mu": jnp.asarray(0.8),
-        "stiffness": jnp.asarray(0.145),
-        "position": experiment.pack.position,
-    }
-    return make, theta
+EVERYTHING = ("signals.amplitudes", "gamma0", "friction.mu", "friction.stiffness", "pack.position")
 
 
 def test_nested_checkpoints_change_neither_values_nor_derivatives() -> None:
@@ -65,24 +54,23 @@ def test_nested_checkpoints_change_neither_values_nor_derivatives() -> None:
 
 
 def test_the_reverse_sweep_agrees_with_the_forward_one(experiment: gm.Experiment, exact: jacobian.Jacobian) -> None:
-    make, theta = by_everything(experiment)
-    found = gm.value_and_grad(make, theta)
+    found = gm.value_and_grad(experiment, EVERYTHING)
 
     def score(p_sig: jax.Array, amplitudes: jax.Array, gamma0: jax.Array) -> jax.Array:
-        signals = gm.Bumps(amplitudes, CENTRES, 0.2)
-        return gradient.replace(experiment, signals=signals, gamma0=gamma0).fidelity(p_sig)
+        changed = gm.replace(experiment, {"signals.amplitudes": amplitudes}, gamma0=gamma0)
+        return changed.compare(p_sig).fidelity
 
-    at = (found.p_sig, theta["amplitudes"], theta["gamma0"])
+    at = (found.p_sig, experiment.signals.amplitudes, jnp.asarray(1e-3))
     through, direct, direct_gamma0 = jax.grad(score, argnums=(0, 1, 2))(*at)
     forward = exact.p_sig @ np.asarray(through)[0]
     forward[:2] += np.asarray(direct)[0]
     forward[2] += float(direct_gamma0)
-    reverse = [*found.slope["amplitudes"][0], *(found.slope[name] for name in ("gamma0", "mu", "stiffness"))]
+    reverse = [*found.slope["signals.amplitudes"][0], *(found.slope[name] for name in EVERYTHING[1:4])]
     # Both are exact derivatives of one program; 900 steps of round-off leave about 1e-12.
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)
-    assert found.slope["position"].shape == (27, 3)
-    assert np.all(np.isfinite(found.slope["position"]))
-    assert np.any(found.slope["position"] != 0.0)
+    assert found.slope["pack.position"].shape == (27, 3)
+    assert np.all(np.isfinite(found.slope["pack.position"]))
+    assert np.any(found.slope["pack.position"] != 0.0)
 
 
 def test_the_exact_jacobian_agrees_with_central_differences(
@@ -103,18 +91,20 @@ def test_the_jacobian_by_gamma0_follows_from_that_by_the_amplitudes(exact: jacob
     np.testing.assert_allclose(1e-3 * exact.p_sig[2], euler, atol=1e-9 * np.abs(euler).max())
 
 
-def test_what_acts_on_the_prefix_is_recognised(experiment: gm.Experiment) -> None:
-    make, theta = by_everything(experiment)
-    assert gradient.acts_on_prefix(make, theta)
+def test_what_acts_on_the_prefix_is_recognised() -> None:
+    assert gradient.acts_on_prefix(EVERYTHING)
+    assert not gradient.acts_on_prefix(["gamma0", "signals.centres"])
 
-    def by_gamma0(gamma0: jax.Array) -> gm.Experiment:
-        return gradient.replace(experiment, gamma0=gamma0)
 
-    assert not gradient.acts_on_prefix(by_gamma0, jnp.asarray(1e-3))
+def test_names_that_cannot_be_differentiated_by_are_refused(experiment: gm.Experiment) -> None:
+    with pytest.raises(ValueError, match="Hooke has no field 'p_max'"):
+        gm.value_and_grad(experiment, ["friction.p_max"])
+    with pytest.raises(ValueError, match="pack holds more than floats"):
+        gm.value_and_grad(experiment, ["pack"])
 
 
 def test_a_jacobian_of_several_signals_is_refused(experiment: gm.Experiment) -> None:
-    several = gradient.replace(experiment, signals=gm.six_signals())
+    several = gm.replace(experiment, signals=gm.six_signals())
     with pytest.raises(ValueError, match="one signal made of bumps"):
         jacobian.exact(several)
 
@@ -138,7 +128,7 @@ def test_derivatives_are_finite_at_the_corners_of_the_laws(law: Any, corner: str
     def contact(separation: jax.Array, velocity: jax.Array, mu: jax.Array, history: Any) -> Any:
         kin = kinematics(separation, velocity, jnp.zeros((1, 3, 1)), jnp.ones(1, bool), jnp.asarray(0.3))
         normal = hertz(kin.safe_overlap, kin.closing, kin.touching, 0.62, 0.23)
-        return gradient.replace(law, mu=mu)(kin, normal, history)
+        return dataclasses.replace(law, mu=mu)(kin, normal, history)
 
     arguments = (separation, velocity, jnp.asarray(0.5), history)
     for jacobian_of in (jax.jacfwd, jax.jacrev):
@@ -157,7 +147,7 @@ def test_at_the_coulomb_limit_the_derivative_is_that_of_one_side(law: Any) -> No
             jnp.asarray(0.3),
         )
         normal = jnp.full((1, 1, 1), 0.01)
-        return gradient.replace(law, mu=mu)(kin, normal, law.init(1, 1, jnp.float64))[0][0, 1, 0]
+        return dataclasses.replace(law, mu=mu)(kin, normal, law.init(1, 1, jnp.float64))[0][0, 1, 0]
 
     limit = force(jnp.asarray(1e6)) / 0.01  # mu at which this contact just sticks
     assert abs(float(jax.grad(force)(limit * (1.0 + 1e-9)))) == 0.0
@@ -166,49 +156,45 @@ def test_at_the_coulomb_limit_the_derivative_is_that_of_one_side(law: Any) -> No
 
 
 def test_the_classifier_is_differentiated_through_the_recall_to_the_waveform(experiment: gm.Experiment) -> None:
-    recipe = classify.Recipe(2, hidden=(16,))
-    net = classify.initial(recipe, 1)
+    lessons = classify.Lessons(2, hidden=(16,))
+    net = classify.initial(lessons, 1)
     words = gm.words(2)
 
-    def make(amplitudes: Any) -> gm.Experiment:
-        return gradient.replace(experiment, signals=gradient.replace(words, amplitudes=amplitudes))
+    at_words = gm.replace(experiment, signals=words)
 
     def loss(_: gm.Experiment, p_sig: jax.Array) -> jax.Array:
         return classify.cross_entropy(net, p_sig)
 
-    found = gm.value_and_grad(make, words.amplitudes, loss)
-    assert np.all(np.isfinite(found.slope))
+    slope = gm.value_and_grad(at_words, ["signals.amplitudes"], loss=loss).slope["signals.amplitudes"]
+    assert np.all(np.isfinite(slope))
     toss = jnp.asarray(np.random.default_rng(0).normal(size=words.amplitudes.shape))
 
     def at(step: float) -> float:
-        return float(loss(experiment, sweep.simulate(make(words.amplitudes + step * toss))[0]))
+        moved = gm.replace(at_words, {"signals.amplitudes": words.amplitudes + step * toss})
+        return float(loss(moved, simulate(moved).p_sig))
 
     # The net works in single precision: a loss of about 1 has 1e-7 of noise, 2e-4 of a difference over 2 x 3e-4.
     step = 3e-4
     difference = (at(step) - at(-step)) / (2.0 * step)
     assert abs(difference) > 0.01
-    np.testing.assert_allclose(jnp.vdot(toss, found.slope), difference, rtol=0.01, atol=5e-4)
+    np.testing.assert_allclose(jnp.vdot(toss, slope), difference, rtol=0.01, atol=5e-4)
 
 
 @pytest.mark.parametrize("law", [gm.Hooke(), gm.MindlinRescaled(), gm.Mindlin(points=6)], ids=["H", "M1", "M2"])
 def test_every_law_and_the_places_of_bumps_and_delta0_have_derivatives(experiment: gm.Experiment, law: Any) -> None:
-    def make(theta: Any) -> gm.Experiment:
-        bumps = gm.Bumps(jnp.asarray([[1.0, -0.6]]), theta["centres"], 0.2)
-        friction = gradient.replace(law, stiffness=theta["stiffness"])
-        changed = gradient.replace(experiment, signals=bumps, friction=friction, delta0=theta["delta0"])
-        return gradient.replace(changed, timing=gm.Timing(t0=75.0, rest=0.02, hold=0.02, store=0.02))
+    short = gm.replace(experiment, friction=law, delta0=0.05, rest=0.02, hold=0.02, store=0.02)
 
     def loss(experiment: gm.Experiment, p_sig: jax.Array) -> jax.Array:
-        return 1e6 * jnp.sum(p_sig * jnp.linspace(0.0, 1.0, p_sig.shape[-1])) + experiment.gain(p_sig)
+        return 1e6 * jnp.sum(p_sig * jnp.linspace(0.0, 1.0, p_sig.shape[-1])) + experiment.compare(p_sig).gain
 
-    theta = {"centres": CENTRES, "stiffness": jnp.asarray(law.stiffness), "delta0": jnp.asarray(0.05)}
-    found = gm.value_and_grad(make, theta, loss)
+    theta = {"signals.centres": CENTRES, "friction.stiffness": jnp.asarray(law.stiffness), "delta0": jnp.asarray(0.05)}
+    found = gm.value_and_grad(short, tuple(theta), loss=loss)
 
     def at(name: str, step: jax.Array) -> float:
-        changed = make({**theta, name: theta[name] + step})
-        return float(loss(changed, sweep.simulate(changed)[0]))
+        changed = gm.replace(short, {name: theta[name] + step})
+        return float(loss(changed, run(changed).p_sig))
 
-    for name, tolerance in {"centres": 1e-4, "stiffness": 1e-2, "delta0": 1e-2}.items():
+    for name, tolerance in {"signals.centres": 1e-4, "friction.stiffness": 1e-2, "delta0": 1e-2}.items():
         # The last two act from the first compression on: some contacts begin to slide or touch within the step.
         step = jnp.full(theta[name].shape, 1e-7) * theta[name]
         difference = (at(name, step) - at(name, -step)) / 2.0
@@ -216,18 +202,46 @@ def test_every_law_and_the_places_of_bumps_and_delta0_have_derivatives(experimen
         np.testing.assert_allclose(jnp.vdot(found.slope[name], step), difference, rtol=tolerance)
 
 
-def test_grad_of_run_memory_agrees_with_the_sweep_on_the_host(experiment: gm.Experiment) -> None:
-    timing = {"t0": 75.0, "rest": 0.02, "hold": 0.02, "store": 0.02}
-
-    def signals(amplitudes: jax.Array) -> gm.Bumps:
-        return gm.Bumps(amplitudes, CENTRES, 0.2)
+def test_grad_of_the_traced_recall_agrees_with_the_walk_on_the_host(experiment: gm.Experiment) -> None:
+    short = gm.replace(experiment, rest=0.02, hold=0.02, store=0.02)
 
     def score(amplitudes: jax.Array) -> jax.Array:
-        return gm.fidelity(experiment.pack, signals(amplitudes), friction=experiment.friction, **timing)
+        return gm.fidelity(gm.replace(short, {"signals.amplitudes": amplitudes}))
 
     amplitudes = jnp.asarray([[1.0, -0.6]])
     several = jax.vmap(jax.grad(score))(jnp.stack([amplitudes, 0.5 * amplitudes]))
-    short = gradient.replace(experiment, timing=gm.Timing(**timing))
-    found = gm.value_and_grad(lambda a: gradient.replace(short, signals=signals(a)), amplitudes)
-    np.testing.assert_allclose(several[0], found.slope, rtol=1e-8)
+    found = gm.value_and_grad(short, ["signals.amplitudes"])
+    np.testing.assert_allclose(several[0], found.slope["signals.amplitudes"], rtol=1e-8)
     assert np.all(np.isfinite(several[1]))
+
+
+def test_a_second_readout_as_background_is_differentiated_too(experiment: gm.Experiment) -> None:
+    short = gm.replace(experiment, rest=0.02, hold=0.02, store=0.02, background="sub2-bl")
+    found = gm.value_and_grad(short, ["gamma0"], loss=gradient.gain_of)
+    step = 1e-8
+    up, down = (float(run(gm.replace(short, gamma0=1e-3 + sign * step)).gain) for sign in (1.0, -1.0))
+    np.testing.assert_allclose(found.slope["gamma0"], (up - down) / (2.0 * step), rtol=1e-3)
+    along = gradient.push(short, {"gamma0": jnp.asarray(1.0)})
+    np.testing.assert_allclose(along.p_sig, found.p_sig, rtol=1e-10, atol=1e-18)
+
+
+@pytest.mark.parametrize("by", ["friction.mu", "gamma0"])
+def test_derivatives_do_not_mind_lists_that_are_made_anew(experiment: gm.Experiment, by: str) -> None:
+    short = gm.replace(experiment, rest=0.02, hold=0.02, store=0.02)
+    tight = gm.replace(short, pack=_with_skin(short.pack, 0.02))
+    wide, narrow = (gm.value_and_grad(one, [by]) for one in (short, tight))
+    # The same contacts in the same order, but sums over other tables: round-off of some 900 steps.
+    np.testing.assert_allclose(narrow.slope[by], wide.slope[by], rtol=1e-6)
+    direction = {by: jnp.asarray(1.0)}
+    one, other = (gradient.push(e, direction) for e in (short, tight))
+    scale = np.abs(one.p_sig_slope).max()
+    np.testing.assert_allclose(other.p_sig_slope, one.p_sig_slope, atol=1e-6 * scale)
+
+
+def _with_skin(pack: gm.Pack, skin: float) -> gm.Pack:
+    """The pack with a list of so small a skin that it goes stale on the way."""
+    lengths = np.asarray(pack.upper - pack.lower)
+    still = jnp.zeros((*pack.position.shape, 1))
+    grains = Grains(pack.position[..., None], pack.quaternion[..., None], still, still, still, still)
+    pairs = PairFinder(pack.clump, lengths, skin)(grains, pack.clump, pack.box)
+    return dataclasses.replace(pack, pairs=pairs)

@@ -9,12 +9,9 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.experiment import host
-from gmem_jax.experiment.protocol import Motion
-from gmem_jax.experiment.recall import COPIES, GRAIN_BYTES, default_batch, forget
+from gmem_jax.experiment.recall import COPIES, GRAIN_BYTES, default_batch, forget, shear, walker
 from gmem_jax.experiment.signals import BINS
-from gmem_jax.files.storage import Parts
-from gmem_jax.physics.state import replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.files.parts import Parts
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 SHORT = {"t0": 75.0, "dt": 0.3, "store": 0.2}  # one step per bin: some 1,200 steps in all
@@ -27,7 +24,7 @@ def pack() -> gm.Pack:
 
 @pytest.fixture(scope="module")
 def recall(pack: gm.Pack) -> gm.Recall:
-    return gm.run_memory(pack, gm.six_signals(), **SHORT)
+    return gm.run(gm.Experiment(pack, gm.six_signals(), **SHORT))
 
 
 def two_bumps(amplitudes: jax.Array) -> gm.Bumps:
@@ -61,7 +58,8 @@ def test_gain_and_fidelity_follow_their_definitions(recall: gm.Recall) -> None:
 
 
 def test_traced_and_host_runs_are_the_same_computation(pack: gm.Pack, recall: gm.Recall) -> None:
-    traced = jax.jit(lambda gamma0: gm.run_memory(pack, gm.six_signals(), gamma0=gamma0, **SHORT))(1e-3)
+    experiment = gm.Experiment(pack, gm.six_signals(), **SHORT)
+    traced = jax.jit(lambda gamma0: gm.recall(gm.replace(experiment, gamma0=gamma0)))(1e-3)
     # The two are compiled differently; round-off of 1e-16 grows over some 1,200 steps of frictional contacts.
     np.testing.assert_allclose(traced.p_sig, recall.p_sig, atol=1e-6 * np.abs(np.asarray(recall.p_sig)).max())
 
@@ -70,7 +68,8 @@ def test_vmap_over_parameters_equals_one_run_at_a_time(pack: gm.Pack) -> None:
     signals = two_bumps(jnp.asarray([[1.0, -1.0]]))
 
     def run(mu: jax.Array, stiffness: jax.Array, gamma0: jax.Array) -> jax.Array:
-        return gm.fidelity(pack, signals, friction=gm.Hooke(mu=mu, stiffness=stiffness), gamma0=gamma0, **SHORT)
+        friction = gm.Hooke(mu=mu, stiffness=stiffness)
+        return gm.fidelity(gm.Experiment(pack, signals, friction, gamma0=gamma0, **SHORT))
 
     mu, stiffness, gamma0 = jnp.asarray([1.0, 0.4]), jnp.asarray([0.145, 0.1]), jnp.asarray([1e-3, 2e-3])
     together = jax.jit(jax.vmap(run))(mu, stiffness, gamma0)
@@ -85,8 +84,8 @@ def test_vmap_over_stacked_packs_equals_one_run_at_a_time(pack: gm.Pack) -> None
     quaternion = pack.quaternion[:, jnp.asarray([3, 2, 1, 0])] * jnp.asarray([-1.0, -1.0, 1.0, 1.0])
     turned = gm.pack_from(pack, position=pack.position * mirrored, quaternion=quaternion)
     signals = two_bumps(jnp.asarray([[1.0, 1.0]]))
-    run = jax.jit(lambda one: gm.fidelity(one, signals, **SHORT))
-    together = jax.jit(jax.vmap(lambda one: gm.fidelity(one, signals, **SHORT)))(gm.stack([pack, turned]))
+    run = jax.jit(lambda one: gm.fidelity(gm.Experiment(one, signals, **SHORT)))
+    together = jax.jit(jax.vmap(run))(gm.stack([pack, turned]))
     np.testing.assert_allclose(together, jnp.stack([run(pack), run(turned)]), rtol=1e-6)
     np.testing.assert_allclose(together[0], together[1], rtol=1e-5)
 
@@ -97,23 +96,22 @@ def test_stacking_packs_of_different_sizes_is_refused(pack: gm.Pack) -> None:
         gm.stack([pack, other])
 
 
-def test_33_replicas_run_in_one_compiled_advance(pack: gm.Pack) -> None:
+def test_33_replicas_of_all_stages_run_in_one_compiled_program(pack: gm.Pack) -> None:
     signals = gm.Bumps(jnp.linspace(-1.0, 1.0, 32)[:, None], jnp.full((32, 1), 0.5), 0.2)
-    system = System(pack.clump, gm.Hooke(), pack.pairs)
-    state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
-    state = replicate(state, 33)
-    motion = Motion(pack.lower[:, None], pack.upper[:, None], pack.delta0, 0.0, 1.0, 100.0, 1e-3, signals)
-    runner = host.Runner(system, state, pack.box, 0.3)
-    move = host.compiled_advance("auto")
-    before = move._cache_size()
-    runner.stage("encode", motion, bins=4 * host.CHUNK, steps=1)
-    assert move._cache_size() == before + 1
-    assert runner.state.replicas == 33
+    experiment = gm.Experiment(pack, signals, t0=75.0, store=0.3, rest=0.01, hold=0.01)
+    common, own = experiment.phases
+    on = walker(experiment)
+    on.play(*common)
+    shear(on, experiment)
+    before = host.forward.program._cache_size()
+    on.play(*own)  # stages of 256 and 77 bins, in chunks of 32 and fewer
+    assert host.forward.program._cache_size() == before + 1
+    assert on.state.replicas == 33
 
 
 @pytest.mark.parametrize("background", ["sub2", "sub2-bl"])
 def test_a_second_readout_serves_as_background(pack: gm.Pack, background: str) -> None:
-    recall = gm.run_memory(pack, two_bumps(jnp.asarray([[1.0, 1.0]])), background=background, **SHORT)
+    recall = gm.run(gm.Experiment(pack, two_bumps(jnp.asarray([[1.0, 1.0]])), background=background, **SHORT))
     assert list(recall.stages)[-1] == "readout-2"
     if background == "sub2-bl":
         np.testing.assert_allclose(np.asarray(recall.p_sig)[:, [0, -1]], 0.0, atol=1e-18)
@@ -122,7 +120,7 @@ def test_a_second_readout_serves_as_background(pack: gm.Pack, background: str) -
 def test_fidelity_is_differentiable_by_amplitudes_and_friction(pack: gm.Pack) -> None:
     def run(parameters: jax.Array) -> jax.Array:
         friction = gm.Hooke(mu=parameters[2])
-        return gm.fidelity(pack, two_bumps(parameters[None, :2]), friction=friction, **SHORT)
+        return gm.fidelity(gm.Experiment(pack, two_bumps(parameters[None, :2]), friction, **SHORT))
 
     at = jnp.asarray([1.0, -0.6, 0.8])
     gradient = jax.jit(jax.grad(run))(at)
@@ -136,54 +134,35 @@ def test_fidelity_is_differentiable_by_amplitudes_and_friction(pack: gm.Pack) ->
 
 def test_forward_and_reverse_derivatives_agree(pack: gm.Pack) -> None:
     def run(amplitudes: jax.Array) -> jax.Array:
-        return gm.gain(pack, two_bumps(amplitudes[None]), **SHORT)
+        return gm.gain(gm.Experiment(pack, two_bumps(amplitudes[None]), **SHORT))
 
     at = jnp.asarray([1.0, -0.6])
     np.testing.assert_allclose(jax.jit(jax.jacfwd(run))(at), jax.jit(jax.grad(run))(at), rtol=1e-8)
 
 
 def test_a_step_too_large_for_a_traced_run_gives_nan_and_says_so(pack: gm.Pack) -> None:
-    recall = jax.jit(lambda dt: gm.run_memory(pack, gm.six_signals(), t0=150.0, dt=dt, store=0.1))(0.6)
+    experiment = gm.Experiment(pack, gm.six_signals(), t0=75.0, store=0.1)  # one step in a bin
+    recall = jax.jit(lambda t0: gm.recall(gm.replace(experiment, t0=t0)))(150.0)
     assert np.all(np.asarray(recall.status) & int(gm.Status.STEP_TOO_LARGE))
     assert np.isnan(float(recall.fidelity))
     assert "0.5 t_c" in gm.explain(int(recall.status[0]))
 
 
-@pytest.mark.parametrize(
-    ("bad", "words"),
-    [
-        ({"friction": gm.Hooke(mu=-0.1)}, "mu must not be negative"),
-        ({"dt": 0.6}, "dt must be at most 0.5"),
-        ({"t0": 0.0}, "t0 must be positive"),
-        ({"delta0": 1.0}, "delta0 must be in"),
-        ({"background": "sub9"}, "background must be one of"),
-        ({"store": -1.0}, "store must not be negative"),
-    ],
-)
-def test_impossible_numbers_are_refused_with_what_would_be_right(pack: gm.Pack, bad: dict, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        gm.run_memory(pack, gm.six_signals(), **bad)
-
-
-def test_a_waveform_that_does_not_vanish_at_the_ends_is_refused(pack: gm.Pack) -> None:
-    open_end = gm.Bumps(jnp.ones((1, 1)), jnp.full((1, 1), 0.95), 0.2)
-    with pytest.raises(ValueError, match="vanish at u = 0 and u = 1"):
-        gm.run_memory(pack, open_end)
-
-
 def test_another_delta0_than_the_packs_own_warns(pack: gm.Pack) -> None:
     with pytest.warns(UserWarning, match="was cycled with delta0"):
-        gm.run_memory(pack, two_bumps(jnp.ones((1, 2))), delta0=0.04, **SHORT)
+        gm.run(gm.Experiment(pack, two_bumps(jnp.ones((1, 2))), delta0=0.04, **SHORT))
 
 
 def test_single_precision_is_refused(pack: gm.Pack) -> None:
-    with jax.enable_x64(False), pytest.raises(ValueError, match="float64 is needed"):
-        gm.run_memory(pack, gm.six_signals())
+    experiment = gm.Experiment(pack, gm.six_signals())
+    for run in (gm.run, gm.recall):
+        with jax.enable_x64(False), pytest.raises(ValueError, match="float64 is needed"):
+            run(experiment)
 
 
 def test_batches_are_one_run_and_can_be_resumed(pack: gm.Pack, recall: gm.Recall, tmp_path: Path) -> None:
     def some(batch: int, parts: Parts | None = None) -> gm.Recall:
-        return gm.run_memory(pack, gm.six_signals(), batch=batch, keep=parts or forget, **SHORT)
+        return gm.run(gm.Experiment(pack, gm.six_signals(), **SHORT), batch=batch, keep=parts or forget)
 
     undisturbed = some(4)
     # A batch's replicas see the same forces in the same order; XLA's vector code differs with their number.
@@ -215,20 +194,19 @@ def test_batches_are_one_run_and_can_be_resumed(pack: gm.Pack, recall: gm.Recall
 def test_friction_may_differ_between_replicas(pack: gm.Pack) -> None:
     mus = jnp.asarray([1.0, 0.3, 1.0])
     signals = two_bumps(jnp.asarray([[1.0, -0.5], [1.0, -0.5]]))
-    mixed = gm.run_memory(pack, signals, friction=gm.Hooke(mu=mus), **SHORT)
-    alone = gm.run_memory(pack, two_bumps(jnp.asarray([[1.0, -0.5]])), friction=gm.Hooke(mu=1.0), **SHORT)
+    mixed = gm.run(gm.Experiment(pack, signals, gm.Hooke(mu=mus), **SHORT))
+    alone = gm.run(gm.Experiment(pack, two_bumps(jnp.asarray([[1.0, -0.5]])), gm.Hooke(mu=1.0), **SHORT))
     # The second signal has the zero signal's mu, and so a recall of its own as in a run without the others.
     np.testing.assert_allclose(mixed.p_sig[1], alone.p_sig[0], atol=1e-6 * float(jnp.abs(alone.p_sig).max()))
     assert float(jnp.abs(mixed.p_sig[0] - mixed.p_sig[1]).max()) > 0.1 * float(jnp.abs(alone.p_sig).max())
 
 
 def test_the_default_batch_fits_the_memory(pack: gm.Pack) -> None:
+    def batch(law: object, available: int) -> int:
+        return default_batch(gm.Experiment(pack, gm.six_signals(), law), available)
+
     replica = COPIES * (pack.pairs.capacity * 3 * 8 + GRAIN_BYTES * pack.grains)
-    assert default_batch(pack, gm.Hooke(), 0) == 1
-    assert (
-        default_batch(pack, gm.Hooke(), 22 * replica) == 10
-    )  # half of it holds 11 replicas, one of them the zero signal
-    assert default_batch(pack, gm.Hooke(), 10**12) == 63
-    assert (
-        default_batch(pack, gm.Mindlin(points=100), 220 * replica) < 10 < default_batch(pack, gm.Hooke(), 220 * replica)
-    )
+    assert batch(gm.Hooke(), 0) == 1
+    assert batch(gm.Hooke(), 22 * replica) == 10  # half of it holds 11 replicas, one of them the zero signal
+    assert batch(gm.Hooke(), 10**12) == 63
+    assert batch(gm.Mindlin(points=100), 220 * replica) < 10 < batch(gm.Hooke(), 220 * replica)

@@ -9,11 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import Motion, advance_by
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.experiment.protocol import Motion
+from gmem_jax.experiment.drive import Drive
+from gmem_jax.experiment.protocol import Stage
+from gmem_jax.experiment.signals import BINS
+from gmem_jax.experiment.walk import Course, walk, walk_some
 from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.sample import observe
 from gmem_jax.physics.state import State, replicate
 from gmem_jax.physics.step import System, start
 
@@ -38,7 +43,7 @@ def squeezed(law: Any) -> tuple[System, State]:
     """Three replicas in the middle of a sheared compression by 6 %: contacts stick, slide, form and break."""
     system = System(PACK.clump, law, PACK.pairs)
     state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
-    return system, native.advance(system, replicate(state, 3), motion(), 0.3, bins=1, steps=600)[0]
+    return system, advance_by(native.march)(system, replicate(state, 3), motion(), 0.3, bins=1, steps=600)[0]
 
 
 def motion(gamma0: Any = 3e-2, heights: jax.Array = HEIGHTS) -> Motion:
@@ -46,12 +51,12 @@ def motion(gamma0: Any = 3e-2, heights: jax.Array = HEIGHTS) -> Motion:
     return Motion(PACK.lower[:, None], PACK.upper[:, None], 0.06, 0.0, 1.0, 300.0, gamma0, shear)
 
 
-def end(advance: native.Advance, system: System, state: State, theta: dict[str, Any]) -> Any:
+def end(march: native.March, system: System, state: State, theta: dict[str, Any]) -> Any:
     """Everything that 20 more steps give, as a function of everything they depend on."""
     law = replace(system.friction, **theta["law"])
     clump = replace(system.clump, mass=theta["mass"], inertia=theta["inertia"])
     state = replace(state, grains=theta["grains"], history=theta["history"])
-    after, sample = advance(
+    after, sample = advance_by(march)(
         replace(system, friction=law, clump=clump),
         state,
         motion(theta["gamma0"], theta["heights"]),
@@ -96,18 +101,18 @@ def test_both_modes_agree_with_plain_jax(name: str, isotropic: bool) -> None:
     moments = system.clump.inertia * (1.0 if isotropic else jnp.asarray([0.8, 1.0, 1.3]))
     system = replace(system, clump=replace(system.clump, isotropic=isotropic, inertia=moments))
     theta = arguments(system, state)
-    touching = dynamics.observe(system, state, motion().box_at(180.0), jnp.ones((3, 3))).contacts
+    touching = observe(system, state, motion().box_at(180.0), jnp.ones((3, 3))).contacts
     assert np.all(np.asarray(touching) > 5.0)
 
-    def both(advance: native.Advance) -> Callable[..., Any]:
+    def both(march: native.March) -> Callable[..., Any]:
         def derivatives(theta: Any, direction: Any, weights: Any) -> Any:
-            _, forward = jax.jvp(lambda theta: end(advance, system, state, theta), (theta,), (direction,))
-            _, pull = jax.vjp(lambda theta: end(advance, system, state, theta), theta)
+            _, forward = jax.jvp(lambda theta: end(march, system, state, theta), (theta,), (direction,))
+            _, pull = jax.vjp(lambda theta: end(march, system, state, theta), theta)
             return forward, pull(weights)[0]
 
         return jax.jit(derivatives)
 
-    shapes = jax.eval_shape(lambda theta: end(dynamics.advance, system, state, theta), theta)
+    shapes = jax.eval_shape(lambda theta: end(dynamics.march, system, state, theta), theta)
     direction, weights = random_like(theta, 0), random_like(shapes, 1)
 
     def known(history: Any) -> Any:
@@ -116,8 +121,8 @@ def test_both_modes_agree_with_plain_jax(name: str, isotropic: bool) -> None:
 
     # Quaternions of unit length and forces in the tangent plane are not needed: the derivative is by each number.
     direction["history"] = known(direction["history"])
-    fast = both(native.advance)(theta, direction, weights)
-    plain = both(dynamics.advance)(theta, direction, weights)
+    fast = both(native.march)(theta, direction, weights)
+    plain = both(dynamics.march)(theta, direction, weights)
     for _, pulled in (fast, plain):
         pulled["history"] = known(pulled["history"])
     assert float(jnp.abs(plain[1]["gamma0"])) > 0.0
@@ -125,17 +130,17 @@ def test_both_modes_agree_with_plain_jax(name: str, isotropic: bool) -> None:
 
 
 def test_derivatives_through_200_steps_are_those_of_the_definition() -> None:
-    def last(advance: native.Advance, mu: jax.Array) -> jax.Array:
+    def last(march: native.March, mu: jax.Array) -> jax.Array:
         system = System(PACK.clump, gm.Hooke(mu=mu), PACK.pairs)
         state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
         walls = Motion(PACK.lower[:, None], PACK.upper[:, None], 0.05, 0.0, 1.0, 60.0)
-        _, sample = advance(system, state, walls, 0.3, bins=2, steps=100)
+        _, sample = advance_by(march)(system, state, walls, 0.3, bins=2, steps=100)
         return 1e3 * jnp.sum(sample.pressure[-1])
 
     mu = jnp.asarray(0.3)
     for derivative in (jax.grad, jax.jacfwd):
         fast, plain = (
-            jax.jit(derivative(lambda m, a=advance: last(a, m)))(mu) for advance in (native.advance, dynamics.advance)
+            jax.jit(derivative(lambda m, by=march: last(by, m)))(mu) for march in (native.march, dynamics.march)
         )
         assert abs(float(plain)) > 1e-3
         np.testing.assert_allclose(fast, plain, rtol=1e-8)
@@ -147,7 +152,7 @@ def test_vmap_and_grad_in_either_order() -> None:
 
     def loss(mu: jax.Array, gamma0: jax.Array) -> jax.Array:
         law = {**theta["law"], "mu": mu}
-        return jnp.sum(end(native.advance, system, state, {**theta, "law": law, "gamma0": gamma0})[2][-1] ** 2)
+        return jnp.sum(end(native.march, system, state, {**theta, "law": law, "gamma0": gamma0})[2][-1] ** 2)
 
     several = jnp.asarray([0.3, 0.5])
     one_by_one = jnp.stack([jax.grad(loss, argnums=1)(mu, theta["gamma0"]) for mu in several])
@@ -165,7 +170,8 @@ def test_any_number_of_threads_gives_the_same_derivatives(monkeypatch: pytest.Mo
 
     def last(grains: Any, mu: jax.Array) -> jax.Array:
         chosen = replace(system, friction=gm.Hooke(mu=mu))
-        return native.advance(chosen, replace(state, grains=grains), walls, 0.3, bins=1, steps=20)[1].pressure
+        advanced = advance_by(native.march)(chosen, replace(state, grains=grains), walls, 0.3, bins=1, steps=20)
+        return advanced[1].pressure
 
     run = jax.jit(jax.jacrev(lambda grains, mu: jnp.sum(last(grains, mu)), argnums=(0, 1)))
 
@@ -186,7 +192,7 @@ def test_every_instruction_set_has_the_same_derivatives(monkeypatch: pytest.Monk
     theta = arguments(system, state)
 
     def pull() -> Any:
-        result, back = jax.vjp(lambda theta: end(native.advance, system, state, theta), theta)
+        result, back = jax.vjp(lambda theta: end(native.march, system, state, theta), theta)
         return back(jax.tree.map(jnp.ones_like, result))[0]
 
     best = pull()
@@ -194,17 +200,27 @@ def test_every_instruction_set_has_the_same_derivatives(monkeypatch: pytest.Monk
     assert_close(pull(), best)
 
 
-def test_steps_known_only_at_run_time_are_differentiated_forwards() -> None:
+def test_bins_counted_only_at_run_time_are_differentiated_forwards() -> None:
     system, state = squeezed(LAWS["H"])
+    walls = motion()
+    drive = Drive(walls.lower, walls.upper, walls.delta0, walls.gamma0, walls.signals)
+    encode = Stage("encode", 0.0, 1.0, 100.0 / BINS, sheared=True)  # of 100 bins of 10 steps: as long as `motion`
 
-    def last(mu: jax.Array, steps: Any, advance: native.Advance) -> jax.Array:
-        chosen = replace(system, friction=gm.Hooke(mu=mu))
-        return advance(chosen, state, motion(), 0.3, first_bin=60, bins=1, steps=steps)[1].pressure
+    def course(mu: jax.Array, backend: str) -> Course:
+        return Course(replace(system, friction=gm.Hooke(mu=mu)), drive, 0.3, steps=10, backend=backend)
 
-    for advance in (native.advance, dynamics.advance):
-        slope = jax.jit(lambda mu, steps, a=advance: jax.jvp(lambda mu: last(mu, steps, a), (mu,), (1.0,))[1])
-        known = jax.jvp(lambda mu, a=advance: last(mu, 10, a), (0.3,), (1.0,))[1]
-        np.testing.assert_allclose(slope(0.3, 10), known, rtol=1e-9, atol=1e-18)
+    for backend in ("native", "jax"):
+
+        def counted(mu: jax.Array, count: Any, by: str = backend) -> jax.Array:
+            return walk_some(course(mu, by), state, encode.bin(60), count, 3)[1].pressure[:2]
+
+        def listed(mu: jax.Array, by: str = backend) -> jax.Array:
+            return walk(course(mu, by), state, encode.rows(60, 2))[1].pressure
+
+        slope = jax.jit(lambda mu, count, of=counted: jax.jvp(lambda mu: of(mu, count), (mu,), (1.0,)))(0.3, 2)
+        for found, known in zip(slope, jax.jvp(listed, (0.3,), (1.0,)), strict=True):
+            assert np.abs(known[-1]).max() > 0.0
+            np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-18)
 
 
 def test_second_derivatives_are_refused_in_one_line() -> None:
@@ -212,7 +228,7 @@ def test_second_derivatives_are_refused_in_one_line() -> None:
     theta = arguments(system, state)
 
     def loss(gamma0: jax.Array) -> jax.Array:
-        return jnp.sum(end(native.advance, system, state, {**theta, "gamma0": gamma0})[2])
+        return jnp.sum(end(native.march, system, state, {**theta, "gamma0": gamma0})[2])
 
     with pytest.raises(NotImplementedError, match="backend='jax'"):
         jax.grad(jax.grad(loss))(theta["gamma0"])

@@ -11,7 +11,9 @@ from scenes import SPHERE, blank_state, cached_tetra, cluster27, make_grains, or
 
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.hooke import Hooke
-from gmem_jax.physics.pairs import PairFinder, candidates, carry_history, slack, sphere_centres, tabulate
+from gmem_jax.physics.pairs import bucket, candidates, carry_history, slack, sphere_centres, tabulate
+from gmem_jax.physics.sample import observe
+from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import still_box
 
 TETRA = cached_tetra()
@@ -118,10 +120,19 @@ def test_capacities_grow_when_needed_never_shrink_and_lose_nothing():
     assert sizes[2] == sizes[1]
 
 
-def test_a_given_capacity_is_kept_when_it_suffices():
+@pytest.mark.parametrize(("given", "allocated"), [((52, 8), (52, 8)), ((50, 7), (52, 8)), ((0, 0), (8, 4))])
+def test_a_given_capacity_is_rounded_up_and_kept_when_it_suffices(given, allocated):
     found = np.array([[0, 0, 1], [1, 2, 2]])
-    pairs = tabulate(found, np.zeros((3, 3, 1)), np.ones(3), 2.4, 1, capacity=50, per_sphere=7)
-    assert (pairs.capacity, pairs.incidence.shape) == (50, (3, 7))
+    pairs = tabulate(found, np.zeros((3, 3, 1)), np.ones(3), 2.4, 1, capacity=given[0], per_sphere=given[1])
+    assert (pairs.capacity, pairs.incidence.shape) == (allocated[0], (3, allocated[1]))
+
+
+def test_capacities_are_eight_to_an_octave_and_at_most_an_eighth_too_large():
+    counts = np.arange(1, 5000)
+    sizes = np.array([bucket(int(count)) for count in counts])
+    assert np.all((counts <= sizes) & (8 * (sizes - counts) < np.maximum(counts, 8)))
+    np.testing.assert_array_equal([bucket(int(size)) for size in sizes], sizes)  # what was allocated fits again
+    assert len(set(sizes[(counts > 1024) & (counts <= 2048)])) == 8
 
 
 def test_the_list_of_replicas_is_the_union_of_their_own():
@@ -170,7 +181,7 @@ def test_a_gas_too_thin_for_any_candidate_can_still_be_observed():
     grains = make_grains([[5.0, 5.0, 5.0], [15.0, 15.0, 15.0]])
     pairs = tabulate(np.zeros((2, 0), int), np.zeros((2, 3, 1)), np.full(3, 20.0), 2.4, 1)
     system = dynamics.System(SPHERE, Hooke(), pairs)
-    sample = jax.jit(dynamics.observe)(system, blank_state(system, grains), box, jnp.zeros((3, 1)))
+    sample = jax.jit(observe)(system, blank_state(system, grains), box, jnp.zeros((3, 1)))
     assert candidates(pairs).shape == (2, 0)
     assert (float(sample.coordination[0]), float(sample.contacts[0])) == (0.0, 0.0)
     assert float(sample.largest_overlap[0]) <= 0.0

@@ -67,7 +67,7 @@ def test_the_same_seed_gives_the_same_pack_bit_for_bit_and_another_another(prepa
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
-        ({"grains": 0}, "grains must be at least 2"),
+        ({"grains": 0}, "grains must be at least 12"),
         ({"dt": 0.6}, "dt must be in"),
         ({"delta0": 0.0}, "delta0 must be in"),
         ({"filling": 0.9}, "filling of the gas must be in"),

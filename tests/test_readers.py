@@ -8,7 +8,7 @@ import pytest
 
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average, six_signals, word_bits, words
-from gmem_jax.physics.step import Sample
+from gmem_jax.physics.sample import Sample
 from gmem_jax.reading import readers
 
 J = {bits: np.asarray(bin_average(words(bits))) for bits in (1, 3, 5)}

@@ -8,24 +8,23 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.derivatives import gradient
+from gmem_jax.design import drive, waveforms
 from gmem_jax.design import kernel as response
-from gmem_jax.experiment import walk as sweep
-from gmem_jax.experiment.experiment import chunks
+from gmem_jax.experiment.recall import prefix_of, simulate
 from gmem_jax.experiment.signals import BINS, bin_average
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
-SHORT = gm.Timing(t0=75.0, dt=0.3, rest=0.1, hold=0.1, store=0.2)
+SHORT = {"t0": 75.0, "dt": 0.3, "rest": 0.1, "hold": 0.1, "store": 0.2}
 
 
 @pytest.fixture(scope="module")
 def experiment() -> gm.Experiment:
-    return gm.Experiment(gm.load_pack(PACK), gm.six_signals(), timing=SHORT)
+    return gm.Experiment(gm.load_pack(PACK), gm.six_signals(), **SHORT)
 
 
 @pytest.fixture(scope="module")
 def kernel(experiment: gm.Experiment) -> gm.MemoryKernel:
-    return gm.memory_kernel(experiment.pack, 5, 0.3, experiment=experiment)
+    return gm.memory_kernel(experiment, 5, 0.3)
 
 
 def ideal(gain: float, n: int = 17) -> gm.MemoryKernel:
@@ -66,19 +65,14 @@ def test_less_noise_means_finer_resolution() -> None:
     assert kernel.resolution(0.0) < kernel.resolution(0.5 * values[3]) < kernel.resolution(0.9 * values[0])
 
 
-def test_a_simulation_in_pieces_is_run_memory(experiment: gm.Experiment) -> None:
-    p_sig, _ = sweep.simulate(experiment)
-    timing = {"t0": 75.0, "dt": 0.3, "rest": 0.1, "hold": 0.1, "store": 0.2}
-    whole = gm.run_memory(experiment.pack, experiment.signals, **timing)
-    # Compiled in other pieces: round-off grows over some 900 steps of frictional contacts.
-    np.testing.assert_allclose(p_sig, whole.p_sig, atol=1e-6 * np.abs(np.asarray(whole.p_sig)).max())
-    np.testing.assert_allclose(float(experiment.fidelity(p_sig)), float(whole.fidelity), rtol=1e-4)
-
-
-def test_chunks_cover_a_stage_once(experiment: gm.Experiment) -> None:
-    for stage in (*experiment.timing.stages, *gm.Timing(store=0.23).stages):
-        covered = [bin for first, bins in chunks(stage) for bin in range(first, first + bins)]
-        assert covered == list(range(stage.bins))
+def test_a_prefix_serves_several_simulations(experiment: gm.Experiment) -> None:
+    whole = gm.run(experiment)
+    begun = prefix_of(experiment)
+    for _ in range(2):  # the same programs on the same state: the same bits
+        found = simulate(experiment, begun)
+        np.testing.assert_array_equal(found.p_sig, whole.p_sig)
+        assert float(found.fidelity) == float(whole.fidelity)
+        assert list(found.stages) == ["encode", "store", "readout"]
 
 
 def test_odd_and_even_parts_add_up_to_the_recall_of_each_bump(
@@ -86,7 +80,7 @@ def test_odd_and_even_parts_add_up_to_the_recall_of_each_bump(
 ) -> None:
     amplitudes = np.asarray([[0.0, 1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0, 0.0]])
     signals = response.bumps(amplitudes, 0.3)
-    p_sig, _ = sweep.simulate(gm.Experiment(experiment.pack, signals, timing=SHORT))
+    p_sig = simulate(gm.replace(experiment, signals=signals)).p_sig
     np.testing.assert_allclose(kernel.predict(signals), p_sig, atol=1e-6 * np.abs(np.asarray(p_sig)).max())
 
 
@@ -111,15 +105,17 @@ def test_design_inverts_a_linear_memory(monkeypatch: pytest.MonkeyPatch, experim
     odd = (np.eye(17) + 0.3 * mixing) @ kernel.odd  # linear, but no integral
     kernel = gm.MemoryKernel(kernel.u, kernel.centres, 0.2, odd, 0.0 * odd, 1e-3, 0.05)
 
-    def linear(run: gm.Experiment, *_: object) -> tuple[jnp.ndarray, dict]:
-        return jnp.asarray(kernel.coefficients(run.signals) @ odd), {}
+    def linear(run: gm.Experiment, *_: object) -> SimpleNamespace:
+        p_sig = jnp.asarray(kernel.coefficients(run.signals) @ odd)
+        return SimpleNamespace(p_sig=p_sig, **run.compare(p_sig)._asdict())
 
-    def push(make: object, rows: jnp.ndarray, directions: jnp.ndarray, **_: object) -> SimpleNamespace:
-        return SimpleNamespace(p_sig_slope=directions @ odd)
+    def push(run: gm.Experiment, direction: dict, **_: object) -> SimpleNamespace:
+        return SimpleNamespace(p_sig_slope=direction["signals.amplitudes"] @ odd)
 
-    monkeypatch.setattr(sweep, "simulate", linear)
-    monkeypatch.setattr(sweep, "prefix", lambda _: None)
-    monkeypatch.setattr(gradient, "push", push)
+    monkeypatch.setattr(waveforms, "simulate", linear)
+    monkeypatch.setattr(waveforms, "run", linear)
+    monkeypatch.setattr(waveforms, "prefix_of", lambda _: None)
+    monkeypatch.setattr(waveforms, "push", push)
     found = gm.design_waveforms(experiment, iterations=3, gain=0.1, damping=(1e-6,))
     assert found.before < 0.95
     assert found.fidelity > 0.999  # the sampled waveform is a cubic through 127 nodes
@@ -131,12 +127,13 @@ def test_a_drive_climbs_to_the_best_value_within_bounds(
     target = np.asarray(bin_average(experiment.signals))
     off = np.random.default_rng(0).standard_normal(target.shape)
 
-    def rugged(run: gm.Experiment, *_: object) -> tuple[jnp.ndarray, dict]:
+    def rugged(run: gm.Experiment) -> SimpleNamespace:
         mu = float(run.friction.mu)
         far = abs(np.log(mu / 0.6)) + 0.02 * np.sin(300.0 * mu)  # best at 0.6; its own derivative is of no use
-        return jnp.asarray(target + far * off * np.linalg.norm(target) / np.linalg.norm(off)), {}
+        p_sig = jnp.asarray(target + far * off * np.linalg.norm(target) / np.linalg.norm(off))
+        return SimpleNamespace(fidelity=experiment.compare(p_sig).fidelity)
 
-    monkeypatch.setattr(sweep, "simulate", rugged)
+    monkeypatch.setattr(drive, "run", rugged)
     wide = gm.design_drive([experiment, experiment], {"mu": (0.3, 2.0)}, iterations=8)
     assert abs(wide.values["mu"] - 0.6) < 0.1
     assert wide.fidelity > wide.before
@@ -149,4 +146,4 @@ def test_a_drive_climbs_to_the_best_value_within_bounds(
 
 def test_a_kernel_of_one_bump_is_refused(experiment: gm.Experiment) -> None:
     with pytest.raises(ValueError, match="at least 2"):
-        gm.memory_kernel(experiment.pack, 1)
+        gm.memory_kernel(experiment, 1)

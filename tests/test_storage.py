@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.files.storage import atomic
+from gmem_jax.files.atomic import atomic
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 

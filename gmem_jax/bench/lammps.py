@@ -21,8 +21,8 @@ from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.rotation import matrix
-from gmem_jax.physics.state import Scalar
 
 OUTPUT = "id x y z vx vy vz omegax omegay omegaz fx fy fz"
 

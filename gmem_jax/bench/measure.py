@@ -30,24 +30,27 @@ from gmem_jax import native
 from gmem_jax.bench import lammps
 from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.design.kernel import bumps
-from gmem_jax.experiment import walk as sweep
-from gmem_jax.experiment.experiment import Experiment, Timing
-from gmem_jax.experiment.host import compiled_advance, worst
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.host import forward, worst
 from gmem_jax.experiment.pack import SKIN, Pack, smallest_box
-from gmem_jax.experiment.protocol import Motion, clock
-from gmem_jax.experiment.signals import Bumps, six_signals
+from gmem_jax.experiment.protocol import Stage
+from gmem_jax.experiment.recall import run as gmem_run
+from gmem_jax.experiment.signals import Bumps
+from gmem_jax.experiment.walk import Course
 from gmem_jax.files.provenance import provenance
+from gmem_jax.physics.contact import laws
 from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
-from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.physics.pairs import PairFinder
 from gmem_jax.physics.rotation import matrix
-from gmem_jax.physics.state import Grains, Status, explain, replicate, still_box
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.search import PairFinder
+from gmem_jax.physics.state import Grains, State, Status, explain, replicate, still_box
+from gmem_jax.physics.step import System
 
-LAWS: dict[str, Hooke | MindlinRescaled | Mindlin] = {"H": Hooke(), "M1": MindlinRescaled(), "M2": Mindlin()}
+LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
 T0 = 1.8e3  # duration of the compression that is timed, t_c
+ENCODE = Stage("encode", 0.0, 1.0, 1.0, sheared=True)
 BINS = 4  # bins per timed call, so that checks and samples weigh as in a run
 AGREEMENT = 1e-8  # of the pressure, between backends: round-off grown over a few hundred steps
 LAMMPS_LISTS = ((0.1, 20), (0.2, 50), (0.2, 1000), (0.3, 1000))  # (skin in R, steps between checks) tried for LAMMPS
@@ -93,34 +96,33 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def encode(pack: Pack, law: FrictionLaw, replicas: int) -> tuple[System, Any, Motion, float, int]:
-    """The start of an encode stage: system, state, motion, dt and steps per bin."""
-    step, steps = clock(T0, 0.3)
+def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str) -> tuple[Course, State]:
+    """The start of an encode stage: what a walk needs."""
     heights = jnp.linspace(-1.0, 1.0, max(1, replicas - 1))[:, None]
-    signals = Bumps(heights, jnp.full_like(heights, 0.1), 0.2) if replicas > 1 else None
-    system = System(pack.clump, law, pack.pairs)
-    state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
-    motion = Motion(pack.box.lower, pack.box.upper, pack.delta0, 0.0, 1.0, T0, 1e-3, signals)
-    return system, replicate(state, replicas), motion, float(step), int(steps)
+    signals = Bumps(heights, jnp.full_like(heights, 0.1), 0.2)
+    experiment = Experiment(pack, signals, law, t0=T0, backend=backend)
+    course = experiment.course(sheared=replicas > 1)
+    return course, replicate(experiment.begin(), replicas)
 
 
 def measure(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 1.5) -> Row:
-    """Time `advance` of a backend; the best of as many calls as fit into about `seconds`, two at least."""
-    system, state, motion, dt, steps = encode(pack, LAWS[law], replicas)
+    """Time a walk of some bins on a backend; the best of as many calls as fit into about `seconds`, two at least."""
+    course, state = encode(pack, LAWS[law], replicas, backend)
+    call = (course, state, ENCODE.bin(0), BINS)
     began = time.perf_counter()
-    binary = compiled_advance(backend).lower(system, state, motion, dt, bins=BINS, steps=steps).compile()
+    binary = forward.program.lower(*call, most=BINS).compile()
     compile_s = time.perf_counter() - began
-    final, sample = jax.block_until_ready(binary(system, state, motion, dt))  # warm-up
+    final, sample = jax.block_until_ready(binary(*call))  # warm-up
     best, spent, calls = float("inf"), 0.0, 0
     while calls < 2 or spent < seconds:
         began = time.perf_counter()
-        final, sample = jax.block_until_ready(binary(system, state, motion, dt))
+        final, sample = jax.block_until_ready(binary(*call))
         taken = time.perf_counter() - began
         best, spent, calls = min(best, taken), spent + taken, calls + 1
     if Status(worst(final)).fatal:
         raise RuntimeError(f"{backend}, {law}, {pack.name}: {explain(worst(final))}")
     pressure = np.asarray(sample.pressure)
-    cost = 1e6 * best / (BINS * steps * pack.grains * replicas)
+    cost = 1e6 * best / (BINS * course.steps * pack.grains * replicas)
     return Row(
         backend, law, pack.grains, replicas, cost, compile_s, p_xy=float(pressure[-1, 0, -1] - pressure[-1, 1, -1])
     )
@@ -211,11 +213,10 @@ def tile(pack: Pack, times: tuple[int, int, int]) -> Pack:
 
 
 def _peak_memory(load: Callable[[str], Pack], name: str, backend: str, law: str, replicas: int) -> int:
-    """Peak resident bytes of a fresh process that runs one call of `advance`."""
+    """Peak resident bytes of a fresh process that runs one bin."""
     jax.config.update("jax_enable_x64", True)
-    system, state, motion, dt, steps = encode(load(name), LAWS[law], replicas)
-    move = compiled_advance(backend)
-    jax.block_until_ready(move(system, state, motion, dt, bins=1, steps=steps))
+    course, state = encode(load(name), LAWS[law], replicas, backend)
+    jax.block_until_ready(forward(course, state, ENCODE.bin(0), 1, most=BINS))
     return _peak_bytes()
 
 
@@ -239,11 +240,8 @@ def memory(load: Callable[[str], Pack], name: str, grains: int, backend: str, la
 
 def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int, t0: float) -> dict[str, float]:
     jax.config.update("jax_enable_x64", True)
-    experiment = Experiment(load(name), six_signals(), timing=Timing(t0=t0, backend=backend))
-    amplitudes = jnp.asarray(np.random.default_rng(0).normal(scale=0.2, size=(6, values)))
-
-    def make(amplitudes: Any) -> Experiment:
-        return replace(experiment, signals=bumps(amplitudes, 0.2))
+    amplitudes = np.random.default_rng(0).normal(scale=0.2, size=(6, values))
+    experiment = Experiment(load(name), bumps(amplitudes, 0.2), t0=t0, backend=backend)
 
     def seconds(run: Callable[[], Any]) -> float:
         taken = []
@@ -253,9 +251,9 @@ def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int,
             taken.append(time.perf_counter() - began)
         return min(taken)
 
-    forward = seconds(lambda: sweep.simulate(make(amplitudes)))
+    forward = seconds(lambda: gmem_run(experiment).p_sig)
     before = _peak_bytes()
-    reverse = seconds(lambda: value_and_grad(make, amplitudes).slope)
+    reverse = seconds(lambda: value_and_grad(experiment, ["signals.amplitudes"]).slope)
     return {"forward_s": forward, "gradient_s": reverse, "forward_bytes": before, "gradient_bytes": _peak_bytes()}
 
 

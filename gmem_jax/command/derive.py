@@ -1,133 +1,220 @@
-"""What `gmem gradient`, `gmem kernel`, `gmem design` and `gmem tune` do, apart from reading the command line."""
+"""`gmem gradient`, `gmem kernel`, `gmem design`, `gmem tune`."""
 
 import json
-from dataclasses import replace
+import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import jax.numpy as jnp
 import numpy as np
+import typer
 
-from gmem_jax.command.config import RecallConfig
-from gmem_jax.derivatives import gradient
-from gmem_jax.design import kernel as response
-from gmem_jax.design import waveforms as design
-from gmem_jax.experiment import walk as sweep
-from gmem_jax.experiment.experiment import Experiment, Timing
-from gmem_jax.experiment.host import Progress
-from gmem_jax.experiment.signals import Bumps, Samples
-from gmem_jax.files import storage
-from gmem_jax.files.provenance import provenance
+from gmem_jax.command.console import (
+    AsJson,
+    Force,
+    InputError,
+    Output,
+    PackName,
+    Picture,
+    claim,
+    emit,
+    finite,
+    pictured,
+    reporting,
+)
+from gmem_jax.command.options import Chosen, with_experiment
+from gmem_jax.derivatives.gradient import value_and_grad
+from gmem_jax.design.drive import PARAMETERS, design_drive
+from gmem_jax.design.kernel import memory_kernel, relative_error
+from gmem_jax.design.waveforms import design_waveforms
+from gmem_jax.experiment.experiment import Experiment, value_at
+from gmem_jax.experiment.recall import prefix_of, simulate
+from gmem_jax.experiment.signals import Bumps, Spline
+from gmem_jax.files.atomic import atomic
+from gmem_jax.files.configuration import resolved
+from gmem_jax.files.hdf5 import save_arrays
+from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
-from gmem_jax.show import figures_of_designs as plot_gradient
+from gmem_jax.show import figures
 
 KERNEL_SCHEMA = "gmem-kernel/1"
-DRIVE = ("gamma0", "mu", "stiffness")
 
 
-def experiment_of(config: RecallConfig) -> Experiment:
-    """The experiment that a configuration describes.
-
-    Raises:
-        ValueError: if the background is not "sub0".
-    """
-    if config.background != "sub0":
-        raise ValueError(f"--background: derivatives are taken with sub0, got {config.background}")
-    names = ("t0", "dt", "rest", "hold", "store", "hold_drag", "backend")
-    return Experiment(
-        pack=storage.load_pack(config.pack),
-        signals=config.waveforms(),
-        friction=config.law(),
-        gamma0=config.gamma0,
-        delta0=config.delta0,
-        timing=Timing(**{name: getattr(config, name) for name in names}),
-    )
+def _write(output: Path, result: dict[str, Any], experiment: Experiment) -> None:
+    """A result as JSON, with its configuration."""
+    configuration = resolved(experiment, result["seconds"])
+    with atomic(output) as temporary:
+        temporary.write_text(json.dumps(finite({**result, "configuration": configuration}), allow_nan=False))
 
 
-def run_gradient(config: RecallConfig, picture: Path | None, progress: Progress) -> dict[str, Any]:
-    """F of a recall and its derivatives by the waveforms, gamma0, mu and the stiffness."""
-    experiment = experiment_of(config)
-    signals, law = experiment.signals, experiment.friction
+def _waveform_of(experiment: Experiment) -> tuple[str, np.ndarray]:
+    """The field that holds the heights of the waveforms, and where in u each of them acts, [S, n]."""
+    signals = experiment.signals
     if isinstance(signals, Bumps):
-        waveforms, places = signals.amplitudes, np.asarray(signals.centres)
-    else:
-        assert isinstance(signals, Samples)
-        waveforms = signals.nodes[:, 1:-1]
-        places = np.broadcast_to(np.linspace(0.0, 1.0, signals.nodes.shape[1])[1:-1], waveforms.shape)
-
-    def make(theta: Any) -> Experiment:
-        shapes: Any = (
-            replace(signals, amplitudes=theta["waveform"])
-            if isinstance(signals, Bumps)
-            else Samples(jnp.pad(theta["waveform"], ((0, 0), (1, 1))))
-        )
-        friction = replace(law, mu=theta["mu"], stiffness=theta["stiffness"])  # type: ignore[type-var]
-        return replace(experiment, signals=shapes, gamma0=theta["gamma0"], friction=friction)
-
-    chosen: Any = law
-    theta = {"waveform": waveforms, "gamma0": config.gamma0, "mu": chosen.mu, "stiffness": chosen.stiffness}
-    result = gradient.value_and_grad(make, theta, progress=progress)
-    slope = {name: np.asarray(value).tolist() for name, value in result.slope.items()}
-    if picture is not None:
-        title = f"{config.pack}: F = {float(result.value):.4f}"
-        plot_gradient.gradient_figure(picture, places, np.asarray(result.slope["waveform"]), title)
-    return {"pack": config.pack, "fidelity": float(result.value), "places": places.tolist(), "gradient": slope}
+        return "signals.amplitudes", np.asarray(signals.centres)
+    assert isinstance(signals, Spline)
+    nodes = np.asarray(signals.nodes)
+    return "signals.nodes", np.broadcast_to(np.linspace(0.0, 1.0, nodes.shape[1]), nodes.shape)
 
 
-def run_kernel(
-    config: RecallConfig, output: Path, picture: Path | None, n: int, width: float, noise: float, progress: Progress
-) -> dict[str, Any]:
-    """Measure a memory kernel and write it; its numbers, and how well it predicts the configuration's signals."""
-    experiment = experiment_of(config)
-    state = sweep.prefix(experiment, progress=progress)
-    kernel = response.memory_kernel(experiment.pack, n, width, state=state, experiment=experiment, progress=progress)
-    p_sig, _ = sweep.simulate(experiment, state)
-    floor = noise / Material().modulus
-    numbers = {
+@with_experiment
+def gradient_command(
+    chosen: Chosen,
+    pack: PackName,
+    output: Output = Path("gradient.json"),
+    picture: Picture = True,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Exact derivatives of the fidelity by waveforms, gamma0, mu and stiffness (reverse mode; minutes)."""
+    experiment = chosen.experiment(pack)
+    inputs = (pack, *chosen.inputs)
+    claim(output, ".json", inputs=inputs, force=force)
+    drawn = pictured(output, picture, inputs=inputs, force=force)
+    began = time.perf_counter()
+    waves, places = _waveform_of(experiment)
+    law = experiment.friction
+    names = {"waveform": waves, **{name: path for name, path in PARAMETERS.items() if _has(law, path)}}
+    with reporting() as progress:
+        found = value_and_grad(experiment, tuple(names.values()), progress=progress)
+    slopes = {name: np.asarray(found.slope[path]) for name, path in names.items()}
+    # Amplitudes of zero at the same place as another are padding, and the ends of samples are fixed: no waveform has
+    # them.
+    rows = []
+    for place, height, slope in zip(places, np.asarray(value_at(experiment, waves)), slopes["waveform"], strict=True):
+        real = (height != 0.0) if waves == "signals.amplitudes" else (place > 0.0) & (place < 1.0)
+        order = np.argsort(place[real], kind="stable")
+        rows.append((place[real][order], slope[real][order]))
+    gradient = {
+        **{name: slope.tolist() for name, slope in slopes.items()},
+        "waveform": [row[1].tolist() for row in rows],
+    }
+    result = {
+        "pack": pack,
+        "fidelity": float(found.value),
+        "places": [row[0].tolist() for row in rows],
+        "gradient": gradient,
+        "seconds": time.perf_counter() - began,
+        "status": 0,
+    }
+    _write(output, result, experiment)
+    if drawn:
+        figures.gradient_figure(drawn, rows, f"{pack}: F = {result['fidelity']:.4f}")
+    lines = [f"F = {result['fidelity']:.4f}"]
+    lines += [f"dF/d{name} = {gradient[name]:.5g}" for name in gradient if name != "waveform"]
+    for number, row in enumerate(gradient["waveform"]):
+        lines.append(f"dF/da of signal {number + 1}: " + " ".join(f"{value:.4g}" for value in row))
+    emit(as_json, result, "\n".join(lines))
+
+
+def _has(law: Any, path: str) -> bool:
+    kind, _, name = path.partition(".")
+    return kind != "friction" or hasattr(law, name)
+
+
+@with_experiment
+def kernel_command(
+    chosen: Chosen,
+    pack: PackName,
+    output: Output = Path("kernel.h5"),
+    n: Annotated[int, typer.Option("-n", "--bumps", min=2, max=512, help="Basis waveforms.")] = 17,
+    width: Annotated[float, typer.Option(min=0.01, max=0.9, help="Width of the bumps, in u.")] = 0.2,
+    noise: Annotated[float, typer.Option(min=0.0, help="Noise in the recall, Pa RMS.")] = 1.0,
+    picture: Picture = True,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """The linear memory kernel of a pack: singular values, resolution, capacity, and what it predicts."""
+    experiment = chosen.experiment(pack)
+    inputs = (pack, *chosen.inputs)
+    claim(output, ".h5", inputs=inputs, force=force)
+    drawn = pictured(output, picture, inputs=inputs, force=force)
+    began = time.perf_counter()
+    with reporting() as progress:
+        begun = prefix_of(experiment, progress=progress)
+        kernel = memory_kernel(experiment, n, width, begun=begun, progress=progress)
+        p_sig = simulate(experiment, begun).p_sig
+    modulus = float(Material().modulus)
+    floor = noise / modulus
+    signals = experiment.signals
+    result = {
+        "pack": pack,
+        "noise_pa": noise,
+        "n": n,
+        "width": width,
         "gain": kernel.gain(),
         "distance": kernel.distance(),
         "asymmetry": kernel.asymmetry(),
         "capacity": kernel.capacity(floor),
         "resolution": kernel.resolution(floor),
-        "singular_values_pa": (kernel.singular_values() * Material().modulus).tolist(),
-        "prediction_error": response.relative_error(kernel.predict(experiment.signals), p_sig).tolist(),
-        "prediction_error_linear": response.relative_error(
-            kernel.predict(experiment.signals, even=False), p_sig
-        ).tolist(),
+        "singular_values_pa": (kernel.singular_values() * modulus).tolist(),
+        "prediction_error": relative_error(kernel.predict(signals), p_sig).tolist(),
+        "prediction_error_linear": relative_error(kernel.predict(signals, even=False), p_sig).tolist(),
+        "output": str(output),
+        "seconds": time.perf_counter() - began,
+        "status": 0,
     }
     arrays = {name: getattr(kernel, name) for name in ("u", "centres", "width", "odd", "even", "gamma0", "delta0")}
-    storage.save_arrays(output, KERNEL_SCHEMA, config.model_dump(), kernel=kernel.kernel(), **arrays)
-    if picture is not None:
-        plot_gradient.kernel_figure(picture, kernel, floor, config.pack)
-    return {"pack": config.pack, "noise_pa": noise, "n": n, "width": width, **numbers, "output": str(output)}
+    configuration = resolved(experiment, time.perf_counter() - began)
+    save_arrays(output, KERNEL_SCHEMA, configuration, kernel=kernel.kernel(), **arrays)
+    if drawn:
+        figures.kernel_figure(drawn, kernel, floor, pack)
+    lines = [f"{key}: {result[key]:.3f}" for key in ("gain", "distance", "asymmetry", "resolution")]
+    lines.append(f"values above {noise:g} Pa: {result['capacity']} of {n}")
+    lines.append("superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"]))
+    emit(as_json, result, "\n".join(lines))
 
 
-def run_design(
-    config: RecallConfig, output: Path, picture: Path | None, iterations: int, gain: float | None, progress: Progress
-) -> dict[str, Any]:
-    """Design waveforms for the integrals of the configuration's signals and write them as a CSV."""
-    experiment = experiment_of(config)
-    found = design.design_waveforms(experiment, iterations=iterations, gain=gain, progress=progress)
-    storage.save_waveforms(output, found.signals)
-    if picture is not None:
-        unit = float(experiment.compression) * config.gamma0
-        plot_gradient.design_figure(picture, found, unit, config.pack)
-        plot_gradient.history_figure(picture.with_name(f"{picture.stem}-history.png"), {config.pack: found.history})
-    return {
-        "pack": config.pack,
+def _needs_sub0(experiment: Experiment) -> None:
+    if experiment.background != "sub0":
+        raise InputError(f"--background {experiment.background}: designs are made with sub0")
+
+
+@with_experiment
+def design_command(
+    chosen: Chosen,
+    pack: PackName,
+    output: Output = Path("designed.csv"),
+    iterations: Annotated[int, typer.Option(min=1, help="Corrections; each takes a Jacobian.")] = 3,
+    gain: Annotated[float | None, typer.Option(help="Wanted gain; default half of the untouched waveforms'.")] = None,
+    picture: Picture = True,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Pre-distort waveforms so that the recall follows their integrals; writes a CSV for `gmem recall` (minutes)."""
+    experiment = chosen.experiment(pack)
+    _needs_sub0(experiment)
+    inputs = (pack, *chosen.inputs)
+    claim(output, ".csv", inputs=inputs, force=force)
+    drawn = pictured(output, picture, inputs=inputs, force=force)
+    history = output.with_name(f"{output.stem}-history.png")
+    if picture:
+        claim(history, ".png", inputs=inputs, force=force)
+    began = time.perf_counter()
+    with reporting() as progress:
+        found = design_waveforms(experiment, iterations=iterations, gain=gain, progress=progress)
+    save_waveforms(output, found.signals)
+    if drawn:
+        figures.design_figure(drawn, found, float(experiment.scale), pack)
+        figures.history_figure(history, {pack: found.history})
+    result = {
+        "pack": pack,
         "before": found.before,
         "fidelity": found.fidelity,
         "gain": found.gain,
         "history": list(found.history),
         "output": str(output),
+        "seconds": time.perf_counter() - began,
+        "status": 0,
     }
+    line = f"F of the recall with respect to the wanted J: {found.before:.4f} -> {found.fidelity:.4f}"
+    emit(as_json, result, f"{line} (gain {found.gain:.3f}); wrote {output}")
 
 
 def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
     """Bounds by name from "gamma0=3e-4:3e-3,mu=0.5:2".
 
     Raises:
-        ValueError: if it does not read like that.
+        InputError: if it does not read like that.
     """
     bounds = {}
     for item in text.split(","):
@@ -136,35 +223,56 @@ def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
         try:
             bounds[name.strip()] = float(low), float(high)
         except ValueError:
-            raise ValueError(f"--bounds: {item!r} should read like mu=0.5:2") from None
-    if unknown := set(bounds) - set(DRIVE):
-        raise ValueError(f"--bounds: {min(unknown)!r} is none of {', '.join(DRIVE)}")
+            raise InputError(f"--bounds: {item!r} should read like mu=0.5:2") from None
+    if unknown := set(bounds) - set(PARAMETERS):
+        raise InputError(f"--bounds: {min(unknown)!r} is none of {', '.join(PARAMETERS)}")
     return bounds
 
 
-def run_tune(
-    config: RecallConfig,
-    packs: list[str],
-    bounds: dict[str, tuple[float, float]],
-    output: Path,
-    picture: Path | None,
-    iterations: int,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Choose drive parameters within bounds for several packs; writes them as JSON."""
-    experiments = [experiment_of(config.model_copy(update={"pack": name})) for name in packs]
-    found = design.design_drive(experiments, bounds, iterations=iterations, progress=progress)
+@with_experiment
+def tune_command(
+    chosen: Chosen,
+    packs: Annotated[str, typer.Argument(help="Pack files or names of shipped packs, separated by commas.")],
+    output: Output = Path("tuned.json"),
+    bounds: Annotated[
+        str, typer.Option(help="Lowest and highest value of gamma0, mu or stiffness, as in mu=0.5:2,gamma0=3e-4:3e-3.")
+    ] = "gamma0=3e-4:3e-3,mu=0.5:2,stiffness=0.07:0.29",
+    iterations: Annotated[int, typer.Option(min=1, help="Steps; each 7 runs a pack.")] = 6,
+    picture: Picture = True,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Choose gamma0, mu and the friction stiffness within bounds so that the mean fidelity of packs grows."""
+    names, limits = packs.split(","), parse_bounds(bounds)
+    experiments = [chosen.experiment(name) for name in names]
+    _needs_sub0(experiments[0])
+    inputs = (*names, *chosen.inputs)
+    claim(output, ".json", inputs=inputs, force=force)
+    drawn = pictured(output, picture, inputs=inputs, force=force)
+    began = time.perf_counter()
+    with reporting() as progress:
+        found = design_drive(experiments, limits, iterations=iterations, progress=progress)
     result = {
-        "packs": packs,
+        "packs": names,
         "before": found.before,
         "fidelity": found.fidelity,
         "each": found.each.tolist(),
         "values": found.values,
         "history": [{**values, "fidelity": fidelity} for values, fidelity in found.history],
         "output": str(output),
+        "seconds": time.perf_counter() - began,
+        "status": 0,
     }
-    with storage.atomic(output) as temporary:
-        temporary.write_text(json.dumps({**result, "configuration": config.model_dump(), **provenance()}))
-    if picture is not None:
-        plot_gradient.history_figure(picture, {" ".join(packs): [value for _, value in found.history]})
-    return result
+    _write(output, result, experiments[0])
+    if drawn:
+        figures.history_figure(drawn, {" ".join(names): [value for _, value in found.history]})
+    values = ", ".join(f"{name} = {value:.4g}" for name, value in found.values.items())
+    emit(as_json, result, f"mean F {found.before:.4f} -> {found.fidelity:.4f} with {values}; wrote {output}")
+
+
+COMMANDS = {
+    "gradient": gradient_command,
+    "kernel": kernel_command,
+    "design": design_command,
+    "tune": tune_command,
+}

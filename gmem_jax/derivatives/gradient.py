@@ -1,121 +1,166 @@
-"""Derivatives through the whole memory experiment, chunk by chunk on the host, in both directions.
+"""Derivatives of a whole memory experiment on the host, chunk by chunk, in both directions.
 
-`jax.grad` and `jax.jvp` of `run_memory` work as they are. The sweeps here do the same in chunks of bins: they
-report progress, compile small programs, and need one state per chunk and the replay of one chunk. An experiment is
-given by a function `make` from the parameters (a pytree of float arrays) to an `Experiment`.
+`jax.grad` and `jax.jvp` of `gm.fidelity` work as they are. The walks here do the same in the chunks of
+`experiment.host`: they report progress, compile small programs, make stale lists anew, and need one state per chunk
+and the replay of one chunk. What is differentiated by is named: "gamma0", "friction.mu", "signals.amplitudes", ...
 """
 
-import functools
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.experiment import Experiment, Leg, chunks
-from gmem_jax.experiment.host import Progress, compiled, refuse, require_x64, silent, worst
-from gmem_jax.experiment.protocol import Stage, split
+from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, value_at
+from gmem_jax.experiment.experiment import replace as with_values
+from gmem_jax.experiment.host import Action, Compiled, Move, Progress, Walker, silent, within
+from gmem_jax.experiment.protocol import Bin, Stage
+from gmem_jax.experiment.recall import shear, walker
+from gmem_jax.experiment.walk import Course, walk, walk_some
 from gmem_jax.physics.state import State
-
-Make = Callable[[Any], Experiment]
-"""From parameters to an experiment. It is compiled in: use the same function object again to compile once."""
 
 Loss = Callable[[Experiment, jax.Array], jax.Array]
 """From an experiment and its p_sig [S, 256] to a number."""
 
-
-def fidelity(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
-    """F of the set."""
-    return experiment.fidelity(p_sig)
-
-
-def gain(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
-    """G of the set."""
-    return experiment.gain(p_sig)
-
-
 Moving = tuple[Any, Any]  # grains and history: what of a state can be differentiated
 
 
-def _piece(
-    make: Make, theta: Any, moving: Moving, status: jax.Array, leg: Leg, first: jax.Array, *, sheared: bool, bins: int
-) -> tuple[tuple[Moving, jax.Array], jax.Array]:
-    """A chunk as a function of parameters and state: ((state, pressures), status)."""
-    state, pressure = make(theta).part(State(moving[0], moving[1], status), leg, first, sheared=sheared, bins=bins)
-    return ((state.grains, state.history), pressure), state.status
+def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
+    """F of the set: a `Loss`."""
+    return experiment.compare(p_sig).fidelity
 
 
-@functools.cache
-def _program(kind: str) -> Any:
-    """The compiled chunk: "run", "push" (forward mode) or "pull" (reverse mode)."""
-
-    def run(make: Make, theta: Any, moving: Moving, *rest: Any, sheared: bool, bins: int) -> Any:
-        return _piece(make, theta, moving, *rest, sheared=sheared, bins=bins)
-
-    def push(
-        make: Make, theta: Any, moving: Moving, *rest: Any, slopes: tuple[Any, Moving], sheared: bool, bins: int
-    ) -> Any:
-        def piece(theta: Any, moving: Moving) -> Any:
-            return _piece(make, theta, moving, *rest, sheared=sheared, bins=bins)
-
-        return jax.jvp(piece, (theta, moving), slopes, has_aux=True)
-
-    def pull(
-        make: Make, theta: Any, moving: Moving, *rest: Any, slopes: tuple[Moving, jax.Array], sheared: bool, bins: int
-    ) -> Any:
-        def piece(theta: Any, moving: Moving) -> Any:
-            return _piece(make, theta, moving, *rest, sheared=sheared, bins=bins)
-
-        return jax.vjp(piece, theta, moving, has_aux=True)[1](slopes)
-
-    programs: dict[str, Callable[..., Any]] = {"run": run, "push": push, "pull": pull}
-    chosen = programs[kind]
-    return compiled(chosen, static_argnums=0, static_argnames=("sheared", "bins"))
+def gain_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
+    """G of the set: a `Loss`."""
+    return experiment.compare(p_sig).gain
 
 
-def _fan_out(make: Make, theta: Any, moving: Moving, status: jax.Array) -> Moving:
-    state = make(theta).fan_out(State(moving[0], moving[1], status))
+def _is_moving(path: Any, leaf: Any) -> bool:
+    """Whether a number of a course is differentiated by: not the list, nor the shape of the grain.
+
+    The native library has no derivatives by sphere offsets; `jax.grad` of plain JAX does.
+    """
+    fixed = {"pairs", "offsets"} & {getattr(key, "name", None) for key in path}
+    return not fixed and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+
+
+def _numbers(course: Course) -> list[jax.Array]:
+    """The numbers of a course that are differentiated by."""
+    leaves = jax.tree_util.tree_leaves_with_path(course)
+    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf)]
+
+
+def _with_numbers(course: Course, numbers: Sequence[jax.Array]) -> Course:
+    """The course with other numbers in the place of `_numbers`."""
+    left = iter(numbers)
+    leaves, structure = jax.tree_util.tree_flatten_with_path(course)
+    filled: Course = jax.tree.unflatten(
+        structure, [next(left) if _is_moving(path, leaf) else leaf for path, leaf in leaves]
+    )
+    return filled
+
+
+def _moving(state: State) -> Moving:
     return state.grains, state.history
 
 
-def _begin(make: Make, theta: Any) -> Moving:
-    state = make(theta).begin()
-    return state.grains, state.history
+def _push(course: Course, state: State, first: Bin, count: Any, slopes: Any, most: int) -> Any:
+    """A chunk and its tangent."""
+
+    def chunk(numbers: Any, moving: Moving) -> Any:
+        after, sample = walk_some(
+            _with_numbers(course, numbers), State(moving[0], moving[1], state.status), first, count, most
+        )
+        return (_moving(after), sample.pressure), (after.status, sample)
+
+    (moving, _), slope, (status, sample) = jax.jvp(chunk, (_numbers(course), _moving(state)), slopes, has_aux=True)
+    return State(moving[0], moving[1], status), sample, slope
 
 
-def acts_on_prefix(make: Make, theta: Any) -> bool:
-    """Whether the parameters change anything of the shear-free prefix (a random direction tells)."""
-    rng = np.random.default_rng(0)
-    direction = jax.tree.map(lambda leaf: jnp.asarray(rng.standard_normal(np.shape(leaf))), theta)
-    _, slopes = jax.jvp(lambda theta: make(theta).prefix_inputs(), (theta,), (direction,))
-    floats = [leaf for leaf in jax.tree.leaves(slopes) if leaf.dtype != jax.dtypes.float0]
-    return any(bool(np.any(np.asarray(leaf) != 0.0)) for leaf in floats)
+def _pull(course: Course, state: State, rows: Bin, slopes: tuple[Moving, jax.Array]) -> Any:
+    """Derivatives by numbers and state before a chunk, from those by state and pressures after it."""
+
+    def chunk(numbers: Any, moving: Moving) -> Any:
+        after, sample = walk(_with_numbers(course, numbers), State(moving[0], moving[1], state.status), rows)
+        return _moving(after), sample.pressure
+
+    return jax.vjp(chunk, _numbers(course), _moving(state))[1](slopes)
+
+
+_pushed = Compiled(_push, static_argnames="most")
+_pulled = Compiled(_pull)
 
 
 @dataclass
-class _Chunk:
-    """One chunk of the tape: where it begins, and how it is run."""
+class _Pushing(Action):
+    """Carries a tangent along.
 
-    stage: Stage
-    leg: Leg
-    first: int
-    bins: int
-    moving: Moving
-    status: jax.Array
+    Attributes:
+        numbers: tangent of the course's numbers.
+        moving: tangent of the state now; None as long as nothing has one.
+        slopes: derivatives of the pressures of every stage, by chunks.
+    """
 
-    def call(self, kind: str, make: Make, theta: Any, **extra: Any) -> Any:
-        options = {"sheared": self.stage.sheared, "bins": self.bins, **extra}
-        return _program(kind)(make, theta, self.moving, self.status, self.leg, jnp.asarray(self.first), **options)
+    numbers: Any
+    moving: Moving | None
+    slopes: dict[str, list[np.ndarray]] = field(default_factory=dict)
+
+    def chunk(self, course: Course, state: State, first: Bin, count: int, most: int) -> Any:
+        if self.moving is None:
+            after, sample, _ = super().chunk(course, state, first, count, most)
+            return after, sample, (None, jnp.zeros_like(sample.pressure))
+        return _pushed(course, state, first, count, (self.numbers, self.moving), most=most)
+
+    def accept(self, course: Course, state: State, stage: Stage, first: Bin, count: int, more: Any) -> None:
+        self.moving, change = more
+        self.slopes.setdefault(stage.name, []).append(np.asarray(change)[:count])
+
+    def renew(self, history: Any, move: Move, blank: Any) -> None:
+        if self.moving is not None:
+            self.moving = self.moving[0], move(self.moving[1], jax.tree.map(jnp.zeros_like, blank))
 
 
-def _plan(experiment: Experiment) -> tuple[list[tuple[Stage, int, int]], int]:
-    """The chunks (stage, first bin, bins) of the experiment, and how many of them belong to the prefix."""
-    common, sheared = (
-        [(stage, *piece) for stage in part for piece in chunks(stage)] for part in split(experiment.timing.stages)
-    )
-    return common + sheared, len(common)
+class _Piece(NamedTuple):
+    """A piece of the way: from derivatives by the state after it to those before it."""
+
+    back: Callable[[Moving], Moving]
+    name: str = ""
+    work: int = 0
+
+
+@dataclass
+class _Remembering(Action):
+    """Remembers the way, to go back on it."""
+
+    tape: list[_Piece] = field(default_factory=list)
+    numbers: Any = None  # derivatives by the course's numbers so far
+    readouts: Mapping[str, np.ndarray] = field(default_factory=dict)  # derivatives by the readouts' pressures
+
+    def accept(self, course: Course, state: State, stage: Stage, first: Bin, count: int, more: Any) -> None:
+        begun = int(first.number)
+        rows = stage.rows(begun, count)
+
+        def back(slope: Moving) -> Moving:
+            known = self.readouts.get(stage.name)
+            shape = (count, 3, state.replicas)
+            own = np.zeros(shape) if known is None else known[begun : begun + count]
+            by_numbers, before = _pulled(course, state, rows, (slope, jnp.asarray(own)))
+            self.numbers = by_numbers if self.numbers is None else jax.tree.map(jnp.add, self.numbers, by_numbers)
+            moving: Moving = before
+            return moving
+
+        self.tape.append(_Piece(back, stage.name, count * state.replicas))
+
+    def renew(self, history: Any, move: Move, blank: Any) -> None:
+        _, pull = jax.vjp(lambda old: move(old, blank), history)
+        self.tape.append(_Piece(lambda slope: (slope[0], pull(slope[1])[0])))
+
+
+def acts_on_prefix(names: Sequence[str]) -> bool:
+    """Whether any of the named parameters acts before the first shear."""
+    return any(name.split(".")[0] not in AFTER_PREFIX for name in names)
 
 
 @dataclass(frozen=True)
@@ -135,46 +180,75 @@ class Pushed:
     p_sig_slope: jax.Array
 
 
-def push(make: Make, theta: Any, direction: Any, *, progress: Progress = silent) -> Pushed:
-    """Forward mode: the derivative of a whole experiment along `direction` (a pytree like theta).
+def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Progress = silent) -> Pushed:
+    """Forward mode: the derivative of a whole experiment along a direction.
 
     Several derivatives at once are replicas: repeat a signal as often as there are parameters, and let the direction
     change another parameter in each (see `jacobian.exact`). A tangent costs some 2.5 runs on the native backend; the
     shear-free prefix is not differentiated if no parameter acts on it.
 
+    Args:
+        experiment: where.
+        direction: tangents by the name of what changes, each a pytree like what stands there.
+        progress: told about every chunk.
+
     Raises:
+        ValueError: for a name that is no field.
         RunFailedError: if the simulation broke down.
     """
-    require_x64()
-    experiment = make(theta)
-    plan, sheared_from = _plan(experiment)
-    moving, slope = jax.jvp(lambda theta: _begin(make, theta), (theta,), (direction,))
-    status = experiment.begin().status
-    differentiate = acts_on_prefix(make, theta)
-    pressures: dict[str, list[np.ndarray]] = {}
-    slopes: dict[str, list[np.ndarray]] = {}
-    for number, (stage, first, bins) in enumerate(plan):
-        if number == sheared_from:
-            differentiate = True
-            moving, slope = jax.jvp(
-                lambda moving, status=status: _fan_out(make, theta, moving, status), (moving,), (slope,)
-            )
-            status = jnp.broadcast_to(status, (experiment.replicas,))
-        chunk = _Chunk(stage, experiment.timing.leg(stage), first, bins, moving, status)
-        if differentiate:
-            (moving, pressure), (slope, change), status = chunk.call("push", make, theta, slopes=(direction, slope))
-        else:
-            (moving, pressure), status = chunk.call("run", make, theta)
-            change = jnp.zeros_like(pressure)
-        refuse(worst(State(moving[0], moving[1], status)), stage.name)
-        pressures.setdefault(stage.name, []).append(np.asarray(pressure))
-        slopes.setdefault(stage.name, []).append(np.asarray(change))
-        progress(stage.name, 0.0, (number + 1) / len(plan))
-    joined = {name: np.concatenate(parts) for name, parts in pressures.items()}
-    changed = {name: np.concatenate(parts) for name, parts in slopes.items()}
-    readout = jnp.asarray(joined["readout"]), jnp.asarray(changed["readout"])
-    p_sig, p_sig_slope = experiment.recalled(readout[0]), experiment.recalled(readout[1])
-    return Pushed(joined, changed, p_sig, p_sig_slope)
+    theta, tangent = _theta(experiment, direction), jax.tree.map(jnp.asarray, dict(direction))
+    along = _along(experiment)
+    common, own = experiment.phases
+    on = walker(experiment, progress=progress)
+    on.total_work = _work(experiment, on)
+    wide = on.state.replicas > 1
+    slope: Moving | None = None
+    if acts_on_prefix(list(theta)):
+        slope = jax.jvp(lambda theta: _moving(along(theta).begin()), (theta,), (tangent,))[1]
+    action = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope)
+    on.action = action
+    samples = on.play(*common)
+    if action.moving is None:
+        action.moving = jax.tree.map(jnp.zeros_like, _moving(on.state))
+    if not wide:
+        action.moving = jax.tree.map(lambda leaf: jnp.repeat(leaf, experiment.replicas, axis=-1), action.moving)
+    action.numbers = _number_slope(experiment, theta, tangent, sheared=True)
+    shear(on, experiment)
+    samples |= on.play(*own)
+    pressure = {name: np.asarray(sample.pressure) for name, sample in samples.items()}
+    slopes = {name: np.concatenate(parts) for name, parts in action.slopes.items()}
+    readouts, changes = ({name: jnp.asarray(of[name]) for name in of if "readout" in name} for of in (pressure, slopes))
+    return Pushed(pressure, slopes, experiment.recalled(readouts), experiment.recalled(changes))
+
+
+def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
+    """What stands at names, as arrays.
+
+    Raises:
+        ValueError: if there is no such name, or it holds what has no derivative.
+    """
+    theta = {name: jax.tree.map(jnp.asarray, value_at(experiment, name)) for name in names}
+    for name, tree in theta.items():
+        if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
+            raise ValueError(f"{name} holds more than floats; name what to differentiate by, like pack.position")
+    return theta
+
+
+def _along(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
+    return lambda theta: with_values(experiment, theta)
+
+
+def _number_slope(experiment: Experiment, theta: Any, tangent: Any, *, sheared: bool) -> Any:
+    def numbers(theta: Any) -> list[jax.Array]:
+        return _numbers(with_values(experiment, theta).course(sheared=sheared))
+
+    return jax.jvp(numbers, (theta,), (tangent,))[1]
+
+
+def _work(experiment: Experiment, on: Walker) -> float:
+    common, own = experiment.phases
+    before, after = (sum(stage.bins for stage in some) for some in (common, own))
+    return float(before * on.state.replicas + after * experiment.replicas)
 
 
 @dataclass(frozen=True)
@@ -183,79 +257,99 @@ class Gradient:
 
     Attributes:
         value: the loss.
-        slope: its derivative by every parameter, a pytree like theta.
+        slope: its derivatives by name, each a pytree like what stands there in the experiment.
         p_sig: recalled signals, [S, 256].
     """
 
     value: jax.Array
-    slope: Any
+    slope: dict[str, Any]
     p_sig: jax.Array
 
 
-def value_and_grad(make: Make, theta: Any, loss: Loss = fidelity, *, progress: Progress = silent) -> Gradient:
+def value_and_grad(
+    experiment: Experiment,
+    by: Sequence[str] = ("signals", "gamma0", "friction"),
+    *,
+    loss: Loss = fidelity_of,
+    progress: Progress = silent,
+) -> Gradient:
     """Reverse mode: a number and its derivatives by all parameters, through the whole experiment.
 
-    The forward sweep keeps the state at the start of each chunk; the backward sweep replays chunk after chunk and,
-    within it, bin after bin. On the native backend both happen in the library, for some ten forward runs in all.
+    The way forward keeps the state at the start of each chunk; the way back replays chunk after chunk and, within it,
+    bin after bin. On the native backend both happen in the library, for some ten forward runs in all.
 
     Args:
-        make: from parameters to the experiment.
-        theta: parameters, a pytree of floats.
+        experiment: where.
+        by: what to differentiate by: dotted names of floats or of parts that hold them, like "signals.amplitudes",
+            "friction.mu", "t0" or "pack.position". Shapes of grains are not among them (use `jax.grad`).
         loss: what is differentiated; default the fidelity.
-        progress: told about every chunk of both sweeps.
+        progress: told about every chunk of both ways.
 
     Raises:
+        ValueError: for a name that is no field.
         RunFailedError: if the simulation broke down.
     """
-    require_x64()
-    theta = jax.tree.map(jnp.asarray, theta)
-    experiment = make(theta)
-    plan, sheared_from = _plan(experiment)
-    moving, pull_begin = jax.vjp(lambda theta: _begin(make, theta), theta)
-    status = experiment.begin().status
-    tape: list[_Chunk] = []
-    readout = []
-    pull_fan: Any = None
-    for number, (stage, first, bins) in enumerate(plan):
-        if number == sheared_from:
-            moving, pull_fan = jax.vjp(lambda moving, status=status: _fan_out(make, theta, moving, status), moving)
-            status = jnp.broadcast_to(status, (experiment.replicas,))
-        tape.append(_Chunk(stage, experiment.timing.leg(stage), first, bins, moving, status))
-        (moving, pressure), status = tape[-1].call("run", make, theta)
-        refuse(worst(State(moving[0], moving[1], status)), stage.name)
-        if stage.name == "readout":
-            readout.append(pressure)
-        progress(stage.name, 0.0, 0.02 * (number + 1) / len(plan))
+    theta, along = _theta(experiment, by), _along(experiment)
+    common, own = experiment.phases
+    on = walker(experiment, progress=within(progress, 0.0, 0.02))
+    on.total_work = _work(experiment, on)
+    prefix, rest = _Remembering(), _Remembering()
+    on.action = prefix if acts_on_prefix(by) else Action()
+    _, pull_begin = jax.vjp(lambda theta: _moving(along(theta).begin()), theta)
+    on.play(*common)
+    fan_out = jax.linear_transpose(_fan_out(experiment), _moving(on.state))
+    on.action = rest
+    shear(on, experiment)
+    samples = on.play(*own)
 
-    def final(theta: Any, pressure: jax.Array) -> tuple[jax.Array, jax.Array]:
-        experiment = make(theta)
-        p_sig = experiment.recalled(pressure)
-        return loss(experiment, p_sig), p_sig
+    def final(theta: Any, readouts: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        changed = along(theta)
+        p_sig = changed.recalled(readouts)
+        return loss(changed, p_sig), p_sig
 
-    last = jax.value_and_grad(final, argnums=(0, 1), has_aux=True)
-    (value, p_sig), (slope, from_readout) = last(theta, jnp.concatenate(readout))
-    back = jax.tree.map(jnp.zeros_like, moving)
-    begins = 0 if acts_on_prefix(make, theta) else sheared_from
-    work = sum(chunk.bins * chunk.status.shape[0] for chunk in tape[begins:])
-    done = 0
-    for number in reversed(range(begins, len(tape))):
-        chunk = tape.pop()
-        on_pressure = jnp.zeros((chunk.bins, 3, chunk.status.shape[0]))
-        if chunk.stage.name == "readout":
-            on_pressure = from_readout[chunk.first : chunk.first + chunk.bins]
-        more, back = chunk.call("pull", make, theta, slopes=(back, on_pressure))
-        slope = jax.tree.map(jnp.add, slope, more)
-        if number == sheared_from:
-            (back,) = pull_fan(back)
-        done += chunk.bins * chunk.status.shape[0]
-        progress(f"back through {chunk.stage.name}", 0.0, 0.02 + 0.98 * done / work)
-    if begins == 0:
+    readouts = {name: jnp.asarray(samples[name].pressure) for name in samples if "readout" in name}
+    last = jax.jit(jax.value_and_grad(final, argnums=(0, 1), has_aux=True))
+    (value, p_sig), (slope, by_readouts) = last(theta, readouts)
+    rest.readouts = {name: np.asarray(by) for name, by in by_readouts.items()}
+
+    def pull_numbers(sheared: bool, found: Any) -> Any:
+        def numbers(theta: Any) -> list[jax.Array]:
+            return _numbers(along(theta).course(sheared=sheared))
+
+        return jax.vjp(numbers, theta)[1](found)[0]
+
+    back = jax.tree.map(jnp.zeros_like, _moving(on.state))
+    report = _Backwards(within(progress, 0.02, 1.0), rest.tape + prefix.tape)
+    back = report.through(rest.tape, back)
+    slope = jax.tree.map(jnp.add, slope, pull_numbers(True, rest.numbers))
+    if prefix.tape:
+        back = report.through(prefix.tape, fan_out(back)[0])
+        slope = jax.tree.map(jnp.add, slope, pull_numbers(False, prefix.numbers))
         slope = jax.tree.map(jnp.add, slope, pull_begin(back)[0])
     return Gradient(value, slope, p_sig)
 
 
-def with_parameters(experiment: Experiment, **changes: Any) -> Experiment:
-    """`experiment` with other parameters: fields of `Experiment`, or of its friction law (mu, stiffness, ...)."""
-    own = {name: changes.pop(name) for name in list(changes) if not hasattr(experiment, name)}
-    law: Any = experiment.friction
-    return replace(experiment, friction=replace(law, **own) if own else law, **changes)
+def _fan_out(experiment: Experiment) -> Callable[[Moving], Moving]:
+    def spread(moving: Moving) -> Moving:
+        status = jnp.zeros(moving[0].position.shape[-1], jnp.int32)
+        return _moving(experiment.fan_out(State(moving[0], moving[1], status)))
+
+    return spread
+
+
+class _Backwards:
+    """Goes back through tapes, forgetting them, and tells how far it is."""
+
+    def __init__(self, progress: Progress, tape: Sequence[_Piece]) -> None:
+        self.progress = progress
+        self.total = sum(piece.work for piece in tape)
+        self.done = 0
+
+    def through(self, tape: list[_Piece], slope: Moving) -> Moving:
+        while tape:
+            piece = tape.pop()
+            slope = piece.back(slope)
+            if piece.work:
+                self.done += piece.work
+                self.progress(f"back through {piece.name}", 0.0, self.done / self.total)
+        return slope

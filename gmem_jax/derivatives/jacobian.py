@@ -4,16 +4,16 @@ The parameters are the amplitudes a_k of the signal, gamma0, and the friction la
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.derivatives import gradient
-from gmem_jax.experiment import walk as sweep
-from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.experiment.experiment import Experiment, replace
+from gmem_jax.experiment.host import Progress, silent, within
+from gmem_jax.experiment.recall import Recall, simulate
 from gmem_jax.experiment.signals import Bumps
 
 LAW = ("mu", "stiffness")  # parameters that act on the prefix, and on the zero signal
@@ -55,6 +55,10 @@ def _sheared(pressure: dict[str, np.ndarray]) -> np.ndarray:
     return result
 
 
+def _pressures(recall: Recall) -> dict[str, np.ndarray]:
+    return {name: np.asarray(sample.pressure) for name, sample in recall.stages.items()}
+
+
 def exact(experiment: Experiment, *, law: bool = True, progress: Progress = silent) -> Jacobian:
     """Forward mode, parameters as replicas; two runs, because mu and the stiffness act on the prefix too.
 
@@ -70,30 +74,26 @@ def exact(experiment: Experiment, *, law: bool = True, progress: Progress = sile
     bumps, row = _one_signal(experiment)
     n = row.shape[1]
     rows = np.repeat(row, n + 1, axis=0)
-    theta = {"amplitudes": jnp.asarray(rows), "gamma0": jnp.full(n + 2, experiment.gamma0)}
+    drive = replace(experiment, signals=_copies(bumps, jnp.asarray(rows)), gamma0=jnp.full(n + 2, experiment.gamma0))
     direction = {
-        "amplitudes": jnp.asarray(np.eye(n + 1, n)),
+        "signals.amplitudes": jnp.asarray(np.eye(n + 1, n)),
         "gamma0": jnp.zeros(n + 2).at[-1].set(1.0),
     }
-
-    def by_drive(theta: Any) -> Experiment:
-        return replace(experiment, signals=_copies(bumps, theta["amplitudes"]), gamma0=theta["gamma0"])
-
     share = 0.7 if law else 1.0
-    pushed = gradient.push(by_drive, theta, direction, progress=lambda s, t, f: progress(s, t, share * f))
+    pushed = gradient.push(drive, direction, progress=within(progress, 0.0, share))
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
     p_sig, p_xy = [np.asarray(pushed.p_sig_slope)], [_sheared(pushed.slope)[1:]]
     if law:
         two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # replicas 0, 1: no signal; 2, 3: it
         chosen: Any = experiment.friction
-        theta = {name: jnp.full(4, getattr(chosen, name)) for name in LAW}
-        direction = {"mu": jnp.asarray([1.0, 0.0, 1.0, 0.0]), "stiffness": jnp.asarray([0.0, 1.0, 0.0, 1.0])}
-
-        def by_law(theta: Any) -> Experiment:
-            return replace(experiment, signals=_copies(bumps, two), friction=replace(chosen, **theta))
-
-        pushed = gradient.push(by_law, theta, direction, progress=lambda s, t, f: progress(s, t, share + 0.3 * f))
+        wide = {f"friction.{name}": jnp.full(4, getattr(chosen, name)) for name in LAW}
+        laws = replace(experiment, {**wide, "signals": _copies(bumps, two)})
+        direction = {
+            "friction.mu": jnp.asarray([1.0, 0.0, 1.0, 0.0]),
+            "friction.stiffness": jnp.asarray([0.0, 1.0, 0.0, 1.0]),
+        }
+        pushed = gradient.push(laws, direction, progress=within(progress, share, 1.0))
         readout = pushed.slope["readout"]
         change = np.flip(readout[:, 0] - readout[:, 1], axis=0).T
         p_sig.append(-(change[2:] - change[:2]))
@@ -116,8 +116,8 @@ def differences(experiment: Experiment, relative: float, *, law: bool = True, pr
     gamma0 = np.full(2 * n + 3, float(experiment.gamma0))
     gamma0[-2:] *= [1.0 + relative, 1.0 - relative]
     drive = replace(experiment, signals=_copies(bumps, jnp.asarray(row + steps)), gamma0=jnp.asarray(gamma0))
-    p_sig, pressure = sweep.simulate(drive, progress=progress)
-    recalled, p_xy = np.asarray(p_sig), _sheared(pressure)[1:]
+    found = simulate(drive, progress=progress)
+    recalled, p_xy = np.asarray(found.p_sig), _sheared(_pressures(found))[1:]
     widths = np.full((n + 1, 1), 2.0 * relative)
     widths[n] *= float(experiment.gamma0)
     up, down = [*range(n), 2 * n], [*range(n, 2 * n), 2 * n + 1]
@@ -128,12 +128,12 @@ def differences(experiment: Experiment, relative: float, *, law: bool = True, pr
         chosen: Any = experiment.friction
         factor = {"mu": [1.0, -1.0, 0.0, 0.0], "stiffness": [0.0, 0.0, 1.0, -1.0]}
         shifted = {
-            name: jnp.asarray(float(getattr(chosen, name)) * (1.0 + relative * np.tile(factor[name], 2)))
+            f"friction.{name}": jnp.asarray(float(getattr(chosen, name)) * (1.0 + relative * np.tile(factor[name], 2)))
             for name in LAW
         }
         rows = jnp.asarray(np.concatenate([np.zeros((3, n)), np.repeat(row, 4, axis=0)]))
-        other = replace(experiment, signals=_copies(bumps, rows), friction=replace(chosen, **shifted))
-        _, pressure = sweep.simulate(other, progress=progress)
+        other = replace(experiment, {**shifted, "signals": _copies(bumps, rows)})
+        pressure = _pressures(simulate(other, progress=progress))
         readout = pressure["readout"]
         change = np.flip(readout[:, 0] - readout[:, 1], axis=0).T
         signal = -(change[4:] - change[:4])

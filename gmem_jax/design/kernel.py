@@ -6,18 +6,16 @@ the odd part, M; half the sum is the even part, which a linear memory would not 
 to a weak waveform: a pack answers a shear and its opposite differently, however small they are.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import analysis
-from gmem_jax.experiment import walk as sweep
-from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.host import Progress, silent
-from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.experiment import Experiment, replace
+from gmem_jax.experiment.host import Progress, Walker, silent
+from gmem_jax.experiment.recall import simulate
 from gmem_jax.experiment.signals import BINS, Bumps, Signals, bin_average
 
 FINE = 2048  # points of v for inner products of basis functions
@@ -70,15 +68,16 @@ class MemoryKernel:
         values: np.ndarray = np.linalg.svd(recalled, compute_uv=False) / np.sqrt(BINS)
         return values
 
+    def _match(self) -> analysis.Match:
+        return analysis.compare(jnp.asarray(self.odd), bin_average(self.basis), self.delta0 * self.gamma0)
+
     def gain(self) -> float:
         """G of the ideal kernel G E delta0 (v < u) that is nearest to this one on the basis."""
-        ideal = bin_average(self.basis)
-        return float(analysis.gain(jnp.asarray(self.odd), ideal, self.delta0, self.gamma0))
+        return float(self._match().gain)
 
     def distance(self) -> float:
         """|odd - ideal| / |odd| over the basis: 0 for a perfect integral, 1 for none; 1 - distance is like F."""
-        ideal = bin_average(self.basis)
-        return 1.0 - float(analysis.fidelity(jnp.asarray(self.odd), ideal, self.delta0, self.gamma0))
+        return 1.0 - float(self._match().fidelity)
 
     def asymmetry(self) -> float:
         """|even| / |odd| over the basis: 0 for a linear memory."""
@@ -139,35 +138,33 @@ def nearest(basis: Signals, signals: Signals) -> np.ndarray:
 
 
 def memory_kernel(
-    pack: Pack,
+    experiment: Experiment,
     n: int = 17,
     width: float = 0.2,
     *,
-    state: Any = None,
+    begun: Walker | None = None,
     progress: Progress = silent,
-    experiment: Experiment | None = None,
-    **parameters: Any,
 ) -> MemoryKernel:
     """Measure the memory kernel of a pack.
 
     Args:
-        pack: the pack.
+        experiment: pack and parameters; its signals do not matter.
         n: basis waveforms; 2 n + 1 replicas are run.
         width: of the bumps; narrow ones drive the walls faster.
-        state: what `sweep.prefix` gave for the same pack and friction, if there is one.
+        begun: what `recall.prefix_of` gave for the same pack and law, if there is one.
         progress: told about every chunk.
-        experiment: pack and parameters in one; its signals do not matter.
-        parameters: fields of `Experiment` (friction, gamma0, delta0, timing).
 
     Raises:
-        ValueError: if n < 2.
+        ValueError: if n < 2, or gamma0 or delta0 differ between replicas.
         RunFailedError: if the simulation broke down.
     """
     if n < 2:
         raise ValueError(f"a kernel needs at least 2 basis waveforms, got {n}")
     both = bumps(np.concatenate([np.eye(n), -np.eye(n)]), width)
-    run = Experiment(pack, both, **parameters) if experiment is None else replace(experiment, signals=both)
-    p_sig = np.asarray(sweep.simulate(run, state, progress=progress)[0])
+    wanted = replace(experiment, signals=both)
+    if jnp.ndim(wanted.scale):
+        raise ValueError("a kernel is measured at one gamma0 and one delta0, not one for each replica")
+    p_sig = np.asarray(simulate(wanted, begun, progress=progress).p_sig)
     plus, minus = p_sig[:n], p_sig[n:]
     return MemoryKernel(
         u=(np.arange(BINS) + 0.5) / BINS,
@@ -175,8 +172,8 @@ def memory_kernel(
         width=width,
         odd=0.5 * (plus - minus),
         even=0.5 * (plus + minus),
-        gamma0=float(run.gamma0),
-        delta0=float(run.compression),
+        gamma0=float(wanted.gamma0),
+        delta0=float(wanted.compression),
     )
 
 

@@ -1,4 +1,4 @@
-"""Inverse design: waveforms whose nonlinear recall follows wanted curves, and drives that recall best.
+"""Inverse design: waveforms whose nonlinear recall follows wanted curves.
 
 Waveforms are corrected by the exact Jacobian of the recall around the present ones: one tangent per amplitude, as
 replicas of one run (`gradient.push`). A damped Gauss-Newton step is handed to an optax optimiser as a preconditioned
@@ -6,20 +6,19 @@ gradient, and simulated before it is accepted.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 
-from gmem_jax.derivatives import gradient
-from gmem_jax.derivatives.gradient import with_parameters
+from gmem_jax.derivatives.gradient import push
 from gmem_jax.design.kernel import FINE, bumps, nearest
-from gmem_jax.experiment import walk as sweep
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Progress, silent
-from gmem_jax.experiment.signals import Samples, Signals, waveform
+from gmem_jax.experiment.recall import prefix_of, run, simulate
+from gmem_jax.experiment.signals import Signals, Spline, waveform
 
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)
@@ -41,7 +40,7 @@ class Design:
         history: F after every iteration, the untouched waveforms first.
     """
 
-    signals: Samples
+    signals: Spline
     target: np.ndarray
     p_sig: np.ndarray
     fidelity: float
@@ -67,7 +66,7 @@ def _step(jacobian: np.ndarray, miss: np.ndarray, damping: float) -> np.ndarray:
     return result
 
 
-def sampled(signals: Signals, nodes: int = NODES) -> Samples:
+def sampled(signals: Signals, nodes: int = NODES) -> Spline:
     """The same waveforms as samples at u = k / (nodes + 1), as `gmem recall --signals` reads them."""
     values = signals.shear(jnp.arange(1, nodes + 1) / (nodes + 1)).T
     return waveform(values)
@@ -101,12 +100,14 @@ def design_waveforms(
     Raises:
         RunFailedError: if a simulation broke down.
     """
-    state = sweep.prefix(experiment)
+    if jnp.ndim(experiment.scale):
+        raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
+    begun = prefix_of(experiment)
     target = np.asarray(experiment.integral())
-    original, _ = sweep.simulate(experiment, state)
-    before, own_gain = float(experiment.fidelity(original)), float(experiment.gain(original))
+    original = simulate(experiment, begun)
+    before, own_gain = float(original.fidelity), float(original.gain)
     gain = 0.5 * own_gain if gain is None else gain
-    wanted = gain * float(experiment.compression) * float(experiment.gamma0) * target
+    wanted = gain * float(experiment.scale) * target
     basis = bumps(np.eye(n), width)
     amplitudes = bounded(nearest(basis, experiment.signals) * gain / own_gain, width)
     optimiser = optax.sgd(1.0) if optimiser is None else optimiser
@@ -117,7 +118,7 @@ def design_waveforms(
         return replace(experiment, signals=bumps(rows, width))
 
     def recall(rows: np.ndarray) -> np.ndarray:
-        return np.asarray(sweep.simulate(make(rows), state)[0])
+        return np.asarray(simulate(make(rows), begun).p_sig)
 
     def jacobians(at: np.ndarray, begun: float, ended: float) -> np.ndarray:
         """dp_sig / da of every signal, [S, n, 256]."""
@@ -126,7 +127,7 @@ def design_waveforms(
             progress(f"F = {history[-1]:.4f}", moment, begun + (ended - begun) * fraction)
 
         rows, directions = np.repeat(at, n, axis=0), np.tile(np.eye(n), (count, 1))
-        pushed = gradient.push(make, jnp.asarray(rows), jnp.asarray(directions), progress=report)
+        pushed = push(make(rows), {"signals.amplitudes": jnp.asarray(directions)}, progress=report)
         return np.asarray(pushed.p_sig_slope).reshape(count, n, -1)
 
     p_sig = recall(amplitudes)
@@ -141,121 +142,18 @@ def design_waveforms(
         recalls = np.stack([p_sig, *recall(np.concatenate(tried)).reshape(len(tried), count, -1)])
         chosen = np.linalg.norm(recalls - wanted, axis=2).argmin(axis=0), np.arange(count)
         amplitudes, p_sig = candidates[chosen], recalls[chosen]
-        history.append(float(experiment.fidelity(jnp.asarray(p_sig))))
+        history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
     signals = sampled(bumps(amplitudes, width))
-    fresh, _ = sweep.simulate(replace(experiment, signals=signals))
+    fresh = np.asarray(run(replace(experiment, signals=signals)).p_sig)
+    match = experiment.compare(jnp.asarray(fresh))
     progress("verified", 0.0, 1.0)
     return Design(
         signals=signals,
         target=target,
-        p_sig=np.asarray(fresh),
-        fidelity=float(experiment.fidelity(fresh)),
-        gain=float(experiment.gain(fresh)),
-        untouched=np.asarray(original),
+        p_sig=fresh,
+        fidelity=float(match.fidelity),
+        gain=float(match.gain),
+        untouched=np.asarray(original.p_sig),
         before=before,
         history=tuple(history),
     )
-
-
-@dataclass(frozen=True)
-class Drive:
-    """Drive parameters found, and the way there.
-
-    Attributes:
-        values: of the best drive, by name.
-        fidelity: mean F over the packs, there.
-        each: F of every pack, there, [packs].
-        before: mean F of the drive that was begun with.
-        history: (values, mean F) after every iteration, the first drive first.
-    """
-
-    values: dict[str, float]
-    fidelity: float
-    each: np.ndarray
-    before: float
-    history: tuple[tuple[dict[str, float], float], ...]
-
-
-def design_drive(
-    experiments: Sequence[Experiment],
-    bounds: dict[str, tuple[float, float]],
-    *,
-    iterations: int = 6,
-    spread: float = 0.2,
-    optimiser: optax.GradientTransformation | None = None,
-    progress: Progress = silent,
-) -> Drive:
-    """Choose gamma0 and parameters of the friction law within bounds so that the mean fidelity of some packs grows.
-
-    F of one pack is rugged in mu and the stiffness: the exact derivative holds for changes of 1e-5 (see
-    experiments/gradient_check.py), because grains rearrange. What can be climbed is the slope on a coarser scale, from
-    central differences over +- `spread` of each logarithm, averaged over packs. The best drive that was simulated is
-    kept; where none is better than the present one, the spread is halved. The maximum of a rugged function is biased:
-    check the drive on other packs.
-
-    Args:
-        experiments: one for each pack, alike in all else; where they stand is the start.
-        bounds: lowest and highest value by name: "gamma0", "mu", "stiffness" (any of them).
-        iterations: steps; each costs 2 n + 1 runs a pack for n parameters.
-        spread: of the differences at first, in parts of each parameter.
-        optimiser: what makes a step of the logarithms of a gradient of length `spread`; default the gradient itself.
-        progress: told about every run.
-
-    Raises:
-        ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
-        RunFailedError: if a simulation broke down.
-    """
-    if not experiments:
-        raise ValueError("a drive is designed for at least one pack")
-    names = list(bounds)
-    start = [_value(experiments[0], name) for name in names]
-    for name, value in zip(names, start, strict=True):
-        low, high = bounds[name]
-        if not 0.0 < low <= value <= high:
-            raise ValueError(
-                f"{name}: bounds must be positive and hold the first value {value:g}, got {low:g} to {high:g}"
-            )
-    lowest, highest = np.log([bounds[name] for name in names]).T
-    total, done = (iterations * (2 * len(names) + 1) + 1) * len(experiments), 0
-
-    def each(logs: np.ndarray) -> np.ndarray:
-        nonlocal done
-        found = []
-        for experiment in experiments:
-            changed = with_parameters(experiment, **dict(zip(names, np.exp(logs), strict=True)))
-            found.append(float(changed.fidelity(sweep.simulate(changed)[0])))
-            done += 1
-            progress(f"F = {np.mean(found):.4f}", 0.0, done / total)
-        return np.asarray(found)
-
-    optimiser = optax.sgd(1.0) if optimiser is None else optimiser
-    logs = np.log(start)
-    memory = optimiser.init(jnp.asarray(logs))
-    found = each(logs)
-    history = [(logs, float(found.mean()))]
-    for _ in range(iterations):
-        seen: list[tuple[np.ndarray, np.ndarray]] = [(logs, found)]
-        slope = np.zeros(len(names))
-        for place, step in enumerate(spread * np.eye(len(names))):
-            sides = [np.clip(logs + sign * step, lowest, highest) for sign in (1.0, -1.0)]
-            up, down = (each(side) for side in sides)
-            slope[place] = np.mean(up - down) / max(sides[0][place] - sides[1][place], 1e-12)
-            seen += zip(sides, (up, down), strict=True)
-        # As long as the differences reach: the slope says nothing of what is further away.
-        along = -slope * spread / max(float(np.linalg.norm(slope)), 1e-12)
-        updates, memory = optimiser.update(jnp.asarray(along), memory, jnp.asarray(logs))
-        stepped = np.clip(np.asarray(optax.apply_updates(jnp.asarray(logs), updates)), lowest, highest)
-        seen.append((stepped, each(stepped)))
-        before, (logs, found) = logs, max(seen, key=lambda pair: float(pair[1].mean()))
-        spread = 0.5 * spread if logs is before else spread
-        history.append((logs, float(found.mean())))
-
-    def named(logs: np.ndarray) -> dict[str, float]:
-        return {name: float(value) for name, value in zip(names, np.exp(logs), strict=True)}
-
-    way = tuple((named(logs), value) for logs, value in history)
-    return Drive(named(logs), float(found.mean()), found, history[0][1], way)
-
-
-def _value(experiment: Experiment, name: str) -> float:
-    return float(getattr(experiment if hasattr(experiment, name) else experiment.friction, name))

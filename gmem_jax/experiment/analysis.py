@@ -1,9 +1,14 @@
 """From wall pressures to the recalled signal, its gain and its fidelity (paper, Sec. II; spec, section 7)."""
 
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from gmem_jax.physics.state import Scalar
+from gmem_jax.physics.pytree import Scalar
 
 BACKGROUNDS = ("sub0", "sub2", "sub2-bl")
 """Ways to remove the background: the zero signal's run; the same run's second readout; that without its line."""
@@ -38,42 +43,42 @@ def subtract(background: str, first: jax.Array, second: jax.Array | None = None)
     return signal - (signal[:, :1] * (1.0 - ramp) + signal[:, -1:] * ramp)
 
 
-def gain(signal: jax.Array, integral: jax.Array, delta0: Scalar, gamma0: Scalar) -> jax.Array:
-    """G = J.p_sig / (E delta0 gamma0 J.J), one for the set.
+class Match(NamedTuple):
+    """How well recalled signals follow their integrals, one number each for the set.
+
+    Attributes:
+        gain: G = J.p_sig / (E delta0 gamma0 J.J).
+        fidelity: F = 1 - sqrt(|p_sig - G E delta0 gamma0 J|^2 / p_sig.p_sig).
+    """
+
+    gain: jax.Array
+    fidelity: jax.Array
+
+
+def compare(signal: jax.Array, integral: jax.Array, scale: Scalar) -> Match:
+    """Gain and fidelity of a set of signals (paper, Sec. II).
 
     Args:
         signal: p_sig, [S, bins], in E.
         integral: J, bin-averaged like p_sig, [S, bins].
-        delta0: areal compression.
-        gamma0: shear amplitude; scalar or [S, 1].
+        scale: delta0 gamma0; scalar or [S, 1].
     """
-    template = delta0 * gamma0 * integral
-    return jnp.sum(template * signal) / jnp.sum(template * template)
+    template = scale * integral
+    gain = jnp.sum(template * signal) / jnp.sum(template * template)
+    miss = jnp.sum((signal - gain * template) ** 2)
+    return Match(gain, 1.0 - jnp.sqrt(miss / jnp.sum(signal * signal)))
 
 
-def fidelity(signal: jax.Array, integral: jax.Array, delta0: Scalar, gamma0: Scalar) -> jax.Array:
-    """F = 1 - sqrt(|p_sig - G E delta0 gamma0 J|^2 / p_sig.p_sig); arguments as in `gain`."""
-    template = gain(signal, integral, delta0, gamma0) * delta0 * gamma0 * integral
-    return 1.0 - jnp.sqrt(jnp.sum((signal - template) ** 2) / jnp.sum(signal * signal))
-
-
-def backgrounds(
-    first: jax.Array, second: jax.Array, integral: jax.Array, delta0: Scalar, gamma0: Scalar
-) -> dict[str, tuple[jax.Array, jax.Array]]:
+def backgrounds(first: jax.Array, second: jax.Array, integral: jax.Array, scale: Scalar) -> dict[str, Match]:
     """Gain and fidelity of the set by each of `BACKGROUNDS`, from a run with a second readout.
 
     Args:
         first: p_xy of the readout, replica 0 the zero signal, [S + 1, bins], in E.
         second: p_xy of the second readout, alike.
         integral: J, [S, bins].
-        delta0: areal compression.
-        gamma0: shear amplitude; scalar or [S, 1].
+        scale: delta0 gamma0; scalar or [S, 1].
     """
-    signals = {name: subtract(name, first, second) for name in BACKGROUNDS}
-    return {
-        name: (gain(signal, integral, delta0, gamma0), fidelity(signal, integral, delta0, gamma0))
-        for name, signal in signals.items()
-    }
+    return {name: compare(subtract(name, first, second), integral, scale) for name in BACKGROUNDS}
 
 
 def correlation(signal: jax.Array, integral: jax.Array) -> jax.Array:
@@ -87,9 +92,7 @@ def correlation(signal: jax.Array, integral: jax.Array) -> jax.Array:
     return jnp.sum(signal * integral, axis=-1) / jnp.sqrt(power)
 
 
-def remembered_after(
-    second: jax.Array, integral: jax.Array, delta0: Scalar, gamma0: Scalar
-) -> tuple[jax.Array, jax.Array]:
+def remembered_after(second: jax.Array, integral: jax.Array, scale: Scalar) -> tuple[jax.Array, jax.Array]:
     """What the second readout still holds of each signal: its correlation with J, and its gain, both [S].
 
     The zero signal's second readout is subtracted, as in SUB0. Both are near zero where the first readout erased the
@@ -98,11 +101,10 @@ def remembered_after(
     Args:
         second: p_xy of the second readout, replica 0 the zero signal, [S + 1, bins], in E.
         integral: J, [S, bins].
-        delta0: areal compression.
-        gamma0: shear amplitude; scalar or [S, 1].
+        scale: delta0 gamma0; scalar or [S, 1].
     """
     residue = subtract("sub0", second)
-    template = delta0 * gamma0 * integral
+    template = scale * integral
     return correlation(residue, integral), jnp.sum(template * residue, axis=-1) / jnp.sum(template * template, axis=-1)
 
 
@@ -122,3 +124,10 @@ def running_mean(series: jax.Array, width: Scalar) -> jax.Array:
     low = jnp.clip(centre - 0.5 * width, 0.0, bins)
     high = jnp.clip(centre + 0.5 * width, 0.0, bins)
     return (cumulative(high) - cumulative(low)) / (high - low)
+
+
+def spread(values: Sequence[float] | jax.Array) -> tuple[float, float, float]:
+    """Mean, sample standard deviation and standard error (NaN for fewer than two values)."""
+    array = np.asarray(values, dtype=float)
+    deviation = float(array.std(ddof=1)) if array.size > 1 else math.nan
+    return float(array.mean()), deviation, deviation / math.sqrt(array.size)

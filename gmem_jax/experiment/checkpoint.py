@@ -15,8 +15,8 @@ def inner_length(length: int) -> int:
     return next(part for part in range(math.isqrt(max(1, length)), 0, -1) if length % part == 0)
 
 
-def scan(body: Callable[[Any, jax.Array], tuple[Any, Any]], carry: Any, xs: jax.Array) -> tuple[Any, Any]:
-    """`jax.lax.scan` over xs [n] in blocks of blocks: reverse mode keeps about 2 sqrt(n) carries instead of n.
+def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any) -> tuple[Any, Any]:
+    """`jax.lax.scan` over xs, leaves [n, ...], in blocks of blocks: reverse mode keeps about 2 sqrt(n) carries, not n.
 
     The price is one more evaluation of the body, which short scans are spared. Forward evaluation and forward mode are
     those of one scan.
@@ -24,15 +24,18 @@ def scan(body: Callable[[Any, jax.Array], tuple[Any, Any]], carry: Any, xs: jax.
     Args:
         body: as for `jax.lax.scan`.
         carry: as for `jax.lax.scan`.
-        xs: as for `jax.lax.scan`, one array.
+        xs: as for `jax.lax.scan`.
     """
     one = jax.checkpoint(body)
-    inner = inner_length(xs.shape[0]) if xs.shape[0] > SHORT else 1
+    length = jax.tree.leaves(xs)[0].shape[0]
+    inner = inner_length(length) if length > SHORT else 1
     if inner == 1:
         return lax.scan(one, carry, xs)
 
-    def block(carry: Any, some: jax.Array) -> tuple[Any, Any]:
+    def block(carry: Any, some: Any) -> tuple[Any, Any]:
         return lax.scan(one, carry, some)
 
-    carry, ys = lax.scan(jax.checkpoint(block), carry, xs.reshape(-1, inner, *xs.shape[1:]))
+    carry, ys = lax.scan(
+        jax.checkpoint(block), carry, jax.tree.map(lambda leaf: leaf.reshape(-1, inner, *leaf.shape[1:]), xs)
+    )
     return carry, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ys)

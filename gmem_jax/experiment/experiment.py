@@ -1,107 +1,147 @@
-"""The memory experiment as one pytree that can be run in pieces: what derivatives and designs are taken of.
+"""The one description of a memory experiment: every field, default and check (paper, Secs. II and III)."""
 
-`run_memory` is the whole experiment in one call. Here the same stages are cut into chunks of bins, so that a host
-loop can keep the states between them, report progress, and go through them in either direction.
-"""
-
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from gmem_jax import native
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.drive import Drive
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.protocol import Motion, Stage, clock, memory_protocol
-from gmem_jax.experiment.recall import HOLD_DRAG, PAPER_T0
-from gmem_jax.experiment.signals import Signals, bin_average
+from gmem_jax.experiment.protocol import Stage, memory_protocol, split
+from gmem_jax.experiment.signals import BINS, Signals, bin_average
+from gmem_jax.experiment.walk import Course
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
-from gmem_jax.physics.state import Scalar, State, replicate
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.pytree import Scalar, impossible, parameter, pytree, settle, static, traced
+from gmem_jax.physics.state import State, Status, replicate
 from gmem_jax.physics.step import System, start
 
-CHUNK = 32  # bins of one chunk, where a stage's bins can be divided so
+PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
+HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
+LARGEST_STEP = 0.5  # t_c; the stiffest mode has a period near 10 t_c
+BACKENDS = ("auto", "jax", "native")
+AFTER_PREFIX = ("signals", "gamma0")  # fields that the shear-free prefix does not depend on
 
 
-class Leg(NamedTuple):
-    """A stage as numbers: u at its begin and end, its bins, the drag during it."""
+class Timing(NamedTuple):
+    """The time step, in t_c, and the whole number of them in a bin."""
 
-    start: jax.Array
-    stop: jax.Array
-    bins: jax.Array
-    drag: jax.Array
+    dt: Scalar
+    steps: int
 
 
-@dataclass(frozen=True)
-class Timing:
-    """What is fixed when an experiment is compiled; arguments as of `run_memory`."""
-
-    t0: float = 1.8e3
-    dt: float = 0.3
-    rest: float = 0.2
-    hold: float = 0.2
-    store: float = 2.0
-    hold_drag: float | None = None
-    backend: str = "auto"
-
-    @property
-    def step(self) -> float:
-        """The time step, in t_c."""
-        return float(clock(self.t0, self.dt)[0])
-
-    @property
-    def steps(self) -> int:
-        """Steps in a bin."""
-        return int(clock(self.t0, self.dt)[1])
-
-    @property
-    def stages(self) -> tuple[Stage, ...]:
-        """The stages of Sec. II."""
-        return memory_protocol(self.rest, self.hold, self.store)
-
-    def leg(self, stage: Stage) -> Leg:
-        """The numbers of a stage."""
-        drag = HOLD_DRAG if self.t0 < 0.999 * PAPER_T0 else 0.0
-        drag = drag if self.hold_drag is None else self.hold_drag
-        numbers = (stage.start, stage.stop, float(stage.bins), drag if stage.holds else 0.0)
-        return Leg(*(jnp.asarray(number) for number in numbers))
-
-
-def chunks(stage: Stage) -> Iterator[tuple[int, int]]:
-    """The first bin and the number of bins of every chunk of a stage: equal pieces of at most `CHUNK` bins."""
-    size = next(size for size in range(min(CHUNK, stage.bins), 0, -1) if stage.bins % size == 0)
-    size = size if size > 4 else min(CHUNK, stage.bins)
-    for first in range(0, stage.bins, size):
-        yield first, min(size, stage.bins - first)
-
-
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Experiment:
-    """Everything a recall depends on.
+    """Everything a recall depends on. S signals make S + 1 replicas; replica 0 is the zero signal.
+
+    A pytree: its floats can be differentiated and vmapped. The friction law's parameters, gamma0, delta0, t0 and
+    hold_drag are one number or one for each replica, [S + 1].
 
     Attributes:
         pack: the pack at rest.
-        signals: the waveforms, one replica each; replica 0 is the zero signal.
-        friction: the friction law; parameters scalar or [S + 1].
-        gamma0: shear amplitude; scalar or [S + 1].
-        delta0: areal compression; default the pack's own.
-        timing: the rest.
+        signals: the waveforms.
+        friction: the friction law.
+        material: the elastic solid.
+        gamma0: shear amplitude.
+        delta0: areal compression; default the pack's own. Another value makes `run` warn.
+        t0: duration of one compression, in t_c. The paper's is 1.8e4.
+        hold_drag: viscous drag while the walls stand still, 1 / t_c; default 0.05 for t0 below the paper's, else 0.
+        dt: largest time step, in t_c.
+        steps: steps in a bin of t0 / 256; default the fewest that `dt` allows. Needed where t0 is a tracer.
+        steps_per_bin: what follows from that.
+        rest: rests at u = 0, in t0.
+        hold: holds at u = 1, in t0.
+        store: storage, in t0.
+        background: "sub0", "sub2" or "sub2-bl" (in any case); the last two add a second readout.
+        backend: "jax", the definition; "native", C++ on CPUs; "auto", native where it is built and knows the law.
+
+    Raises:
+        ValueError: for impossible numbers or waveforms, and shapes that do not fit. What is traced cannot be refused:
+            it sets `Status.IMPOSSIBLE`.
     """
 
     pack: Pack
     signals: Signals
-    friction: FrictionLaw = field(default_factory=Hooke)
-    gamma0: Scalar = 1e-3
-    delta0: Scalar | None = None
-    timing: Timing = field(default=Timing(), metadata={"static": True})
+    friction: FrictionLaw = Hooke()
+    material: Material = Material()
+    gamma0: Scalar = parameter(1e-3, "(0, 0.5)")
+    delta0: Scalar | None = parameter(None, "(0, 0.5)")
+    t0: Scalar = parameter(1.8e3, "(0, inf)")
+    hold_drag: Scalar | None = parameter(None, "[0, inf)")
+    dt: float = static(0.3)
+    steps: int | None = static(None)
+    rest: float = static(0.2)
+    hold: float = static(0.2)
+    store: float = static(2.0)
+    background: str = static("sub0")
+    backend: str = static("auto")
+    steps_per_bin: int = dataclasses.field(init=False, default=1, metadata={"static": True})
 
-    @property
-    def compression(self) -> Scalar:
-        """delta0."""
-        return self.pack.delta0 if self.delta0 is None else self.delta0
+    def __post_init__(self) -> None:
+        for name in ("dt", "rest", "hold", "store"):
+            object.__setattr__(self, name, _static_number(name, getattr(self, name)))
+        object.__setattr__(self, "background", self.background.lower())
+        settle(self)
+        if self.background not in analysis.BACKGROUNDS:
+            raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {self.background!r}")
+        if self.backend not in BACKENDS:
+            raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
+        if not 0.0 < self.dt <= LARGEST_STEP:
+            raise ValueError(f"dt must be in (0, {LARGEST_STEP}], got {self.dt:g}")
+        if self.steps is not None and not (isinstance(self.steps, int) and self.steps >= 1):
+            raise ValueError(f"steps must be a whole number from 1, got {self.steps!r}")
+        object.__setattr__(self, "steps_per_bin", self._whole_steps())
+        self._check_shapes()
+        self._check_waveforms()
+        step = self.timing.dt
+        if not traced(step) and not np.all(np.asarray(step) <= LARGEST_STEP):
+            raise ValueError(
+                f"{self.steps_per_bin} steps in a bin make a time step of {np.max(step):g} t_c, which must be at most "
+                f"{LARGEST_STEP}; give more steps, or none to have them chosen"
+            )
+
+    def _whole_steps(self) -> int:
+        if self.steps is not None:
+            return self.steps
+        if traced(self.t0):
+            raise ValueError(
+                "t0 is traced, and the number of steps must not depend on it: give steps, or use gm.replace, which "
+                "keeps those of the experiment"
+            )
+        return max(1, math.ceil(float(np.max(self.t0)) / (BINS * self.dt) * (1.0 - 1e-12)))
+
+    def _check_shapes(self) -> None:
+        if jnp.ndim(self.pack.position) != 2:
+            raise ValueError(
+                f"an experiment has one pack: positions [N, 3], got {jnp.shape(self.pack.position)}; put a stack of "
+                "packs into jax.vmap"
+            )
+        for name, value in _replica_parameters(self).items():
+            if jnp.shape(value) not in ((), (self.replicas,)):
+                raise ValueError(
+                    f"{name} must be one number or one for each replica, [S + 1] = [{self.replicas}] with the zero "
+                    f"signal first; got shape {jnp.shape(value)}"
+                )
+
+    def _check_waveforms(self) -> None:
+        """The walls are unsheared at u = 0 and u = 1; a waveform that is not would make them jump."""
+        if traced(self.signals):
+            return
+        with jax.ensure_compile_time_eval():
+            ends, within = (np.asarray(values) for values in _probe(self.signals))
+            silent = not np.any(within) and not np.any(np.asarray(bin_average(self.signals)))
+        if not np.all(np.isfinite(ends)) or np.max(np.abs(ends)) > _OPEN:
+            raise ValueError(f"waveforms must vanish at u = 0 and u = 1; found {np.abs(ends).max():g} there")
+        if silent:
+            raise ValueError("every waveform is zero: there is nothing to recall, and no gain or fidelity")
 
     @property
     def replicas(self) -> int:
@@ -109,69 +149,193 @@ class Experiment:
         return self.signals.count + 1
 
     @property
-    def system(self) -> System:
-        """The pack's grains and contacts with the friction law."""
-        return System(self.pack.clump, self.friction, self.pack.pairs)
+    def compression(self) -> Scalar:
+        """delta0."""
+        return self.pack.delta0 if self.delta0 is None else self.delta0
 
-    def prefix_inputs(self) -> Any:
-        """What the shear-free prefix depends on."""
-        return self.pack, self.friction, self.compression
+    @property
+    def drag(self) -> Scalar:
+        """hold_drag."""
+        if self.hold_drag is not None:
+            return self.hold_drag
+        if isinstance(self.t0, float):
+            return HOLD_DRAG if self.t0 < 0.999 * PAPER_T0 else 0.0
+        return jnp.where(self.t0 < 0.999 * PAPER_T0, HOLD_DRAG, 0.0)
+
+    @property
+    def timing(self) -> Timing:
+        """dt, a little smaller than asked for so that bins are whole, and the steps in a bin."""
+        return Timing(self.t0 / (BINS * self.steps_per_bin), self.steps_per_bin)
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """The protocol."""
+        return memory_protocol(self.rest, self.hold, self.store, second_readout=self.background != "sub0")
+
+    @property
+    def phases(self) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
+        """The shear-free prefix, run once for all signals; and the stages from the first sheared one on."""
+        return split(self.stages)
+
+    def course(self, *, sheared: bool) -> Course:
+        """What a walk is told, in the prefix or after it."""
+        lower, upper = self.pack.box.lower, self.pack.box.upper
+        gamma0, signals = (self.gamma0, self.signals) if sheared else (0.0, None)
+        dt, steps = self.timing
+        return Course(
+            System(self.pack.clump, self.friction, self.pack.pairs, self.material),
+            Drive(lower, upper, self.compression, gamma0, signals),
+            dt,
+            self.drag,
+            steps=steps,
+            backend=self.backend,
+        )
 
     def begin(self) -> State:
-        """The pack at rest with friction switched on; one replica, or [S + 1] if parameters of the prefix are."""
-        wide = any(jnp.ndim(leaf) for leaf in jax.tree.leaves((self.friction, self.compression)))
-        position, quaternion = replicate(
-            (self.pack.position[..., None], self.pack.quaternion[..., None]), self.replicas if wide else 1
-        )
-        return start(self.system, position, quaternion, self.pack.box)
+        """The pack at rest with friction switched on: one replica, or all where parameters differ in the prefix."""
+        before = {name: value for name, value in _replica_parameters(self).items() if name not in AFTER_PREFIX}
+        wide = self.replicas if any(jnp.ndim(value) for value in before.values()) else 1
+        position, quaternion = replicate((self.pack.position[..., None], self.pack.quaternion[..., None]), wide)
+        state = start(self.course(sheared=False).system, position, quaternion, self.pack.box)
+        bits = jnp.where(self._impossible(), int(Status.IMPOSSIBLE), 0)
+        bits |= jnp.where(jnp.all(jnp.asarray(self.timing.dt) <= LARGEST_STEP), 0, int(Status.STEP_TOO_LARGE))
+        return dataclasses.replace(state, status=state.status | bits.astype(jnp.int32))
+
+    def _impossible(self) -> jax.Array:
+        ends = _ends(self.signals)
+        return impossible(self) | ~jnp.all(jnp.isfinite(ends) & (jnp.abs(ends) <= _OPEN))
 
     def fan_out(self, state: State) -> State:
-        """One replica for every signal and one for the zero signal, if there is only one so far."""
+        """A replica for the zero signal and one for each of the others, if there is only one so far."""
         copies: State = replicate(state, self.replicas) if state.replicas == 1 < self.replicas else state
         return copies
 
-    def part(self, state: State, leg: Leg, first_bin: Scalar, *, sheared: bool, bins: int) -> tuple[State, jax.Array]:
-        """Some bins of a stage.
-
-        Returns:
-            The state after them, and (p_x, p_y, p_z) averaged over each bin, [bins, 3, B], in E.
-        """
-        timing = self.timing
-        motion = Motion(
-            lower=self.pack.box.lower,
-            upper=self.pack.box.upper,
-            delta0=self.compression,
-            start=leg.start,
-            stop=leg.stop,
-            duration=leg.bins * (timing.steps * timing.step),
-            gamma0=self.gamma0 if sheared else 0.0,
-            signals=self.signals if sheared else None,
-        )
-        state, sample = native.pick(timing.backend)(
-            self.system,
-            state,
-            motion,
-            jnp.asarray(timing.step),
-            first_bin=first_bin,
-            bins=bins,
-            steps=timing.steps,
-            drag=leg.drag,
-        )
-        return state, sample.pressure
-
-    def recalled(self, readout: jax.Array) -> jax.Array:
-        """p_sig of every signal in ascending u, [S, 256], from the pressures of the readout [256, 3, S + 1]."""
-        return analysis.subtract("sub0", analysis.recalled(readout))
+    @property
+    def scale(self) -> Scalar:
+        """E delta0 gamma0, what gains are measured in; scalar, or [S, 1] where it differs between signals."""
+        scale = self.compression * self.gamma0
+        return scale if jnp.ndim(scale) == 0 else jnp.asarray(scale)[1:, None]
 
     def integral(self) -> jax.Array:
         """J of every signal averaged over each bin, [S, 256]."""
         averaged: jax.Array = bin_average(self.signals)
         return averaged
 
-    def fidelity(self, p_sig: jax.Array) -> jax.Array:
-        """F of the set (needs one gamma0 and one delta0)."""
-        return analysis.fidelity(p_sig, self.integral(), self.compression, self.gamma0)
+    def recalled(self, readouts: Mapping[str, jax.Array]) -> jax.Array:
+        """p_sig of every signal in ascending u, [S, 256], in E, from the pressures [256, 3, S + 1] by stage."""
+        first = analysis.recalled(readouts["readout"])
+        second = analysis.recalled(readouts["readout-2"]) if "readout-2" in readouts else None
+        return analysis.subtract(self.background, first, second)
 
-    def gain(self, p_sig: jax.Array) -> jax.Array:
-        """G of the set (needs one gamma0 and one delta0)."""
-        return analysis.gain(p_sig, self.integral(), self.compression, self.gamma0)
+    def compare(self, p_sig: jax.Array) -> analysis.Match:
+        """Gain and fidelity of recalled signals [S, 256]."""
+        return analysis.compare(p_sig, self.integral(), self.scale)
+
+
+_OPEN = 1e-9  # of a waveform where it should vanish
+
+
+def _ends(signals: Signals) -> jax.Array:
+    return signals.shear(jnp.asarray([0.0, 1.0]))
+
+
+@jax.jit
+def _probe(signals: Signals) -> tuple[jax.Array, jax.Array]:
+    """The waveforms at both ends, and in between."""
+    return _ends(signals), signals.shear((jnp.arange(BINS) + 0.5) / BINS)
+
+
+def _static_number(name: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except TypeError:
+        raise ValueError(f"{name} is fixed when a program is compiled: it must be a number, got {value!r}") from None
+    if not 0.0 <= number < math.inf:
+        raise ValueError(f"{name} must be in [0, inf), got {value}")
+    return number
+
+
+def _replica_parameters(experiment: Experiment) -> dict[str, Any]:
+    """The parameters that may differ between replicas, by name."""
+    own = {name: getattr(experiment, name) for name in ("gamma0", "delta0", "t0", "hold_drag")}
+    law: Any = experiment.friction
+    of_law = {f"friction.{field.name}": getattr(law, field.name) for field in fields(law)} if is_dataclass(law) else {}
+    numbers = {**own, **of_law}
+    return {name: value for name, value in numbers.items() if isinstance(value, float | jax.Array)}
+
+
+class Changes(TypedDict, total=False):
+    """The fields of an `Experiment`, as keywords."""
+
+    pack: Pack
+    signals: Signals
+    friction: FrictionLaw
+    material: Material
+    gamma0: Scalar
+    delta0: Scalar | None
+    t0: Scalar
+    hold_drag: Scalar | None
+    dt: float
+    steps: int | None
+    rest: float
+    hold: float
+    store: float
+    background: str
+    backend: str
+
+
+def replace(
+    experiment: Experiment, values: Mapping[str, Any] | None = None, /, **changes: Unpack[Changes]
+) -> Experiment:
+    """The same experiment with other fields.
+
+    A traced t0 keeps the number of steps that the experiment has; a concrete one has it chosen anew unless it was
+    given.
+
+    Args:
+        experiment: the experiment; it stays as it is.
+        values: what changes by dotted name, like {"friction.mu": 0.5}.
+        changes: what changes by field.
+
+    Raises:
+        ValueError: if there is no such field, or the new experiment is impossible.
+    """
+    found: dict[str, Any] = dict(changes)
+    for path, value in (values or {}).items():
+        name, *deeper = path.split(".")
+        _require_field(experiment, name)
+        found[name] = _with(found.get(name, getattr(experiment, name)), deeper, value)
+    for name in found:
+        _require_field(experiment, name)
+    if traced(found.get("t0")):
+        found.setdefault("steps", experiment.steps_per_bin)
+    return dataclasses.replace(experiment, **found)
+
+
+def _with(tree: Any, path: list[str], value: Any) -> Any:
+    if not path:
+        return value
+    _require_field(tree, path[0])
+    return dataclasses.replace(tree, **{path[0]: _with(getattr(tree, path[0]), path[1:], value)})
+
+
+def value_at(experiment: Experiment, path: str) -> Any:
+    """What stands at a dotted name, like "friction.mu"; defaults resolved.
+
+    Raises:
+        ValueError: if there is no such field.
+    """
+    resolved: dict[str, Any] = {"delta0": experiment.compression, "hold_drag": experiment.drag}
+    if path in resolved:
+        return resolved[path]
+    found: Any = experiment
+    for name in path.split("."):
+        _require_field(found, name)
+        found = getattr(found, name)
+    return found
+
+
+def _require_field(tree: Any, name: str) -> None:
+    names = [field.name for field in fields(tree)] if is_dataclass(tree) else []
+    if name not in names:
+        raise ValueError(f"{type(tree).__name__} has no field {name!r}; it has {', '.join(names) or 'none'}")

@@ -1,28 +1,32 @@
-"""The host loop: chunks of bins outside jit, with checks, rebuilt neighbour lists and progress.
+"""Walks on the host: chunks of bins, with what only a host can do: renew a stale list, report progress, stop.
 
-Nothing here is physics; `dynamics.advance` is. A chunk that ends with a stale list is thrown away, the list is
-rebuilt from the chunk's start, and the chunk is done again.
+A chunk that ends with a stale list is thrown away, the list is made anew from the chunk's start, and the chunk is done
+again. What a chunk is may be changed (`Action`): derivatives in forward and reverse mode go through the same chunks.
 """
 
 import functools
+from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import native
-from gmem_jax.experiment.protocol import Motion
-from gmem_jax.physics.pairs import PairFinder, carry_history
-from gmem_jax.physics.state import Box, Scalar, State, Status, explain
-from gmem_jax.physics.step import Sample, System
+from gmem_jax.experiment.pack import SKIN
+from gmem_jax.experiment.protocol import Bin, Stage
+from gmem_jax.experiment.walk import Course, walk_some
+from gmem_jax.physics.pairs import carry_history
+from gmem_jax.physics.sample import Sample
+from gmem_jax.physics.search import PairFinder
+from gmem_jax.physics.state import Box, State, Status, explain
 
 Progress = Callable[[str, float, float], None]
 """Called with the stage's name, the simulated time so far (t_c) and the fraction of the whole work done (0 to 1)."""
 
-CHUNK = 32  # bins per compiled call: some seconds of work at most, a few milliseconds of overhead
+CHUNK = 32  # bins per call: some seconds of work at most, a few milliseconds of overhead
+WIDEST = 2.0  # skin beyond which a list that goes stale within a bin is a broken run
 
 
 class RunFailedError(RuntimeError):
@@ -33,14 +37,42 @@ def silent(stage: str, time: float, fraction: float) -> None:
     """Report nothing."""
 
 
-def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """`jax.jit` with the compiler settings that suit this code on the default device.
+def within(progress: Progress, begun: float, ended: float) -> Progress:
+    """`progress` for a part of the work, from one fraction to another."""
+    return lambda stage, time, fraction: progress(stage, time, begun + (ended - begun) * fraction)
+
+
+@functools.cache
+def _settings() -> dict[str, Any] | None:
+    """Compiler settings that suit this code on the default device.
 
     On CPUs XLA's newer fusion emitters do not vectorise the contact law over the replicas; the older ones do, and
-    make a step 1.3 times faster (8 replicas, jax 0.9.2).
+    make a step of plain JAX 1.3 times faster (8 replicas, jax 0.9.2). Later releases have no others to choose.
     """
-    settings = {"xla_cpu_use_fusion_emitters": False} if jax.default_backend() == "cpu" else None
-    return jax.jit(function, compiler_options=settings, **options)
+    settings = {"xla_cpu_use_fusion_emitters": False}
+    if jax.default_backend() != "cpu":
+        return None
+    try:
+        jax.jit(lambda: 0, compiler_options=settings)()
+    except jax.errors.JaxRuntimeError:  # no such option
+        return None
+    return settings
+
+
+class Compiled:
+    """`jax.jit` with settings chosen when it is first called: importing must not start a backend."""
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        self._function, self._options = function, options
+
+    @functools.cached_property
+    def program(self) -> Any:
+        """What `jax.jit` made."""
+        return jax.jit(self._function, compiler_options=_settings(), **self._options)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call it."""
+        return self.program(*args, **kwargs)
 
 
 def require_x64() -> None:
@@ -49,10 +81,15 @@ def require_x64() -> None:
     Raises:
         ValueError: if JAX's 64-bit mode is off.
     """
-    if jnp.zeros(()).dtype != jnp.float64:
+    if jax.dtypes.canonicalize_dtype(np.float64) != np.float64:
         raise ValueError(
             'float64 is needed but JAX runs in 32 bits: call jax.config.update("jax_enable_x64", True) first'
         )
+
+
+def worst(state: State) -> int:
+    """All status bits of all replicas."""
+    return int(np.bitwise_or.reduce(np.asarray(state.status)))
 
 
 def refuse(status: int, where: str) -> None:
@@ -65,112 +102,129 @@ def refuse(status: int, where: str) -> None:
         raise RunFailedError(f"{where}: {explain(status)}")
 
 
-@functools.cache
-def compiled_advance(backend: str) -> Any:
-    """`advance` of a backend ("auto", "jax" or "native"), compiled once for the process."""
-    return compiled(native.pick(backend), static_argnames=("bins", "steps"))
+forward = Compiled(walk_some, static_argnames="most")
+"""`walk_some`, compiled once for all chunks and stages of one structure."""
 
 
-def worst(state: State) -> int:
-    """All status bits of all replicas."""
-    return int(np.bitwise_or.reduce(np.asarray(state.status)))
+Move = Callable[[Any, Any], Any]
+"""From a history of an old list and a blank one of the new, to the history of the new: linear in both."""
+
+
+class Action:
+    """What is done with a chunk: here, going forwards. Others remember it, or carry a tangent along."""
+
+    def chunk(self, course: Course, state: State, first: Bin, count: int, most: int) -> tuple[State, Sample, Any]:
+        """Do `count` bins; the third result is handed to `accept` if the chunk stands."""
+        return *forward(course, state, first, count, most), None
+
+    def accept(self, course: Course, state: State, stage: Stage, first: Bin, count: int, more: Any) -> None:
+        """The chunk that began with `state` stands."""
+
+    def renew(self, history: Any, move: Move, blank: Any) -> None:
+        """The list was made anew: `history` becomes `move(history, blank)`."""
 
 
 @dataclass
-class Runner:
-    """A system on its way through the stages of an experiment.
+class Walker:
+    """A pack on its way through the stages of a protocol.
 
     Attributes:
-        system: changes only in its pairs.
+        course: changes only in its list.
         state: now.
-        box: the walls now.
-        dt: time step, in t_c.
-        finder: rebuilds the pairs; made when first needed if not given.
-        skin: of that neighbour list, in R.
-        smallest: smallest box of the motion to come, [3], for the neighbour list.
-        chunk: bins per compiled call; halved where the list does not last as long.
-        backend: of `advance`; see `native.pick`.
+        smallest: smallest box of the motion to come, [3], for the neighbour list; default the present one.
+        skin: of lists that are made anew, in R.
+        chunk: bins per call at most; fewer where a list does not last as long.
+        action: what is done with a chunk.
         progress: see `Progress`.
+        finder: makes lists; made when first needed if not given.
         time: simulated time so far, in t_c.
-        work: work done so far, in replica-steps; `total_work` is all there is to do.
+        work: work done so far, in replica-bins; `total_work` is all there is to do.
+        rebuilds: lists made anew so far.
     """
 
-    system: System
+    course: Course
     state: State
-    box: Box
-    dt: Scalar
-    finder: PairFinder | None = None
-    skin: float = 0.3
     smallest: np.ndarray | None = None
+    skin: float = SKIN
     chunk: int = CHUNK
-    backend: str = "auto"
+    action: Action = field(default_factory=Action)
     progress: Progress = silent
+    finder: PairFinder | None = None
     time: float = 0.0
     work: float = 0.0
     total_work: float = 1.0
     rebuilds: int = 0
-    _rebuilt_at: tuple[str, float] | None = None
+    _renewed_at: tuple[str, float] | None = None
 
-    def rebuild(self) -> None:
-        """Build the neighbour list anew where the grains are now, and carry the histories over."""
-        if self.finder is None:
-            self.finder = PairFinder(self.system.clump, np.asarray(self.box.lengths)[:, 0], self.skin)
-        old = self.system.pairs
-        pairs = self.finder(self.state.grains, self.system.clump, self.box, self.smallest)
-        blank = self.system.friction.init(pairs.capacity, self.state.replicas, self.state.grains.position.dtype)
-        history = carry_history(self.state.history, blank, old, pairs)
-        self.system = replace(self.system, pairs=pairs)
-        self.state = replace(self.state, history=history)
-        self.rebuilds += 1
+    def afresh(self, **changes: Any) -> "Walker":
+        """A walk that begins where this one is, whatever lists were made on the way here."""
+        return replace(self, **{"finder": None, "skin": SKIN, "chunk": CHUNK, **changes})
 
-    def report(self, name: str, replica_steps: float, time: float) -> None:
-        """Count finished work and tell the progress callback."""
-        self.work += replica_steps
-        self.time += time
-        self.progress(name, self.time, min(1.0, self.work / self.total_work))
-
-    def stage(self, name: str, motion: Motion, *, bins: int, steps: Any, drag: Scalar = 0.0) -> Sample:
-        """Run one stage under prescribed walls.
+    def play(self, *stages: Stage) -> OrderedDict[str, Sample]:
+        """Run stages one after the other.
 
         Returns:
-            The samples of its bins, numpy arrays with a leading axis [bins].
+            Their samples by name, numpy arrays with a leading axis of bins.
 
         Raises:
             RunFailedError: if the numbers became meaningless.
         """
-        move = compiled_advance(self.backend)
-        samples, done = [], 0
-        while done < bins:
-            while True:
-                count = min(self.chunk, bins - done)
-                state, sample = move(
-                    self.system, self.state, motion, self.dt, first_bin=done, bins=count, steps=steps, drag=drag
-                )
-                status = worst(state)
-                if not status & Status.STALE_PAIRS:
-                    break
-                self._renew(name)
-            refuse(status, name)
+        return OrderedDict((stage.name, self._play(stage)) for stage in stages)
+
+    def _play(self, stage: Stage) -> Sample:
+        samples, done, most = [], 0, CHUNK
+        while done < stage.bins:
+            first = stage.bin(done)
+            count = min(self.chunk, stage.bins - done)
+            state, sample, more = self.action.chunk(self.course, self.state, first, count, most)
+            status = worst(state)
+            if status & Status.STALE_PAIRS:
+                self._renew_again(stage, first)
+                continue
+            refuse(status, stage.name)
+            self.action.accept(self.course, self.state, stage, first, count, more)
             self.state = state
             done += count
-            self.box = motion.box_at(jnp.asarray(done * steps * self.dt))
-            samples.append(jax.tree.map(np.asarray, sample))
-            self.report(name, state.replicas * count * steps, count * steps * float(np.max(self.dt)))
+            samples.append(jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], sample))
+            self.report(stage.name, state.replicas * count, self._moment(count))
         joined: Sample = jax.tree.map(lambda *parts: np.concatenate(parts), *samples)
         return joined
 
-    def _renew(self, name: str) -> None:
-        """Rebuild a stale list before its chunk is redone; if that was just done, shorten the chunk or widen the skin.
+    def _moment(self, bins: int) -> float:
+        return bins * self.course.steps * float(np.max(self.course.dt))
+
+    def report(self, name: str, work: float, time: float) -> None:
+        """Count finished work and tell the progress callback."""
+        self.work += work
+        self.time += time
+        self.progress(name, self.time, min(1.0, self.work / self.total_work))
+
+    def renew(self, box: Box) -> None:
+        """Make the neighbour list anew where the grains are now, between the walls as they are now."""
+        system, replicas = self.course.system, self.state.replicas
+        if self.finder is None:
+            self.finder = PairFinder(system.clump, np.asarray(box.lengths).max(axis=1), self.skin)
+        pairs = self.finder(self.state.grains, system.clump, box, self.smallest)
+        blank = system.friction.init(pairs.capacity, replicas, self.state.grains.position.dtype)
+        move = functools.partial(carry_history, old=system.pairs, new=pairs)
+        self.action.renew(self.state.history, move, blank)
+        self.state = replace(self.state, history=move(self.state.history, blank))
+        self.course = self.course.with_pairs(pairs)
+        self.rebuilds += 1
+
+    def _renew_again(self, stage: Stage, first: Bin) -> None:
+        """Renew a stale list before its chunk is redone; if that was just done, shorten the chunk or widen the skin.
 
         Frictionless grains turn and fly freely in their cages: what a list must allow for grows with the time it lasts.
         """
-        if self._rebuilt_at == (name, self.time):
+        if self._renewed_at == (stage.name, self.time):
             if self.chunk > 1:
                 self.chunk = max(1, self.chunk // 4)
                 return
             self.skin *= 1.5
             self.finder = None
-            if self.skin > 2.0:
-                raise RunFailedError(f"{name}: {explain(int(Status.STALE_PAIRS))}")
-        self._rebuilt_at = (name, self.time)
-        self.rebuild()
+            if self.skin > WIDEST:
+                raise RunFailedError(f"{stage.name}: {explain(int(Status.STALE_PAIRS))}")
+        self._renewed_at = (stage.name, self.time)
+        # Lengths alone count here: time and duration in bins.
+        self.renew(self.course.drive.box_at(first, jnp.asarray(float(first.number)), float(first.bins)))

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.grain import Clump
-from gmem_jax.physics.pairs import PairFinder, Pairs, candidates, tabulate
+from gmem_jax.physics.pairs import Pairs, candidates, tabulate
+from gmem_jax.physics.pytree import label, pytree
+from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, Grains, still_box
 
 SKIN = 0.3
@@ -18,7 +20,7 @@ SKIN = 0.3
 below 0.11 R at N = 325 to 3267, so one list serves a whole experiment; the margin covers the shear and a repeat."""
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Pack:
     """Grains at rest in their box at u = 0 (R = E = rho = 1).
@@ -34,6 +36,9 @@ class Pack:
         pairs: candidate contacts for a compression by delta0.
         name: for logs and files.
         record: JSON of the resolved configuration and of what was measured at the end of the preparation.
+        source: the file it was read from, or the name of a shipped pack.
+
+    The last three are labels: they are no part of what a program is compiled for.
     """
 
     clump: Clump
@@ -44,8 +49,9 @@ class Pack:
     delta0: jax.Array
     ringing_period: jax.Array
     pairs: Pairs
-    name: str = field(default="pack", metadata={"static": True})
-    record: str = field(default="{}", metadata={"static": True})
+    name: str = label("pack")
+    record: str = label("{}")
+    source: str = label("")
 
     @property
     def grains(self) -> int:

@@ -1,79 +1,35 @@
-"""The walls of the experiment: compression u(t), shear gamma(u), and the stages they make up."""
+"""The stages of an experiment, and the table of bins they make up."""
 
 import itertools
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
-from gmem_jax.experiment.signals import BINS, Signals
-from gmem_jax.physics.state import Box, Scalar
+from gmem_jax.experiment.signals import BINS
+
+Numbers = float | np.ndarray | jax.Array
+"""A number, or a column of a table."""
 
 
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Motion:
-    """Prescribed walls during one stage: u runs linearly, the shear follows a waveform of u (paper, Sec. II).
-
-    L_x = X (1 - gamma/2), L_y = Y (1 + gamma/2) with X, Y = L0 (1 - (1 - sqrt(1 - delta0)) u); z does not move. The
-    box stays centred. Half of gamma on each axis is this project's reading of the paper.
+class Bin(NamedTuple):
+    """One bin of t0 / 256 as numbers, or a table of them with a leading axis on each.
 
     Attributes:
-        lower: lower planes at u = 0, [3, 1].
-        upper: upper planes at u = 0, [3, 1].
-        delta0: areal compression at u = 1, scalar or [B].
-        start: u at the beginning of the stage.
-        stop: u at its end.
-        duration: in t_c.
-        gamma0: shear amplitude, scalar or [B].
-        signals: the waveforms of the replicas, or None for no shear; replica 0 is always the zero signal.
+        start: u at the beginning of its stage.
+        stop: u at the end of its stage.
+        bins: length of its stage.
+        number: its place in the stage, from 0.
+        sheared: whether the waveform is applied.
     """
 
-    lower: jax.Array
-    upper: jax.Array
-    delta0: Scalar
-    start: Scalar
-    stop: Scalar
-    duration: Scalar
-    gamma0: Scalar = 0.0
-    signals: Signals | None = None
-
-    def compression(self, time: Scalar) -> Scalar:
-        """u at `time` since the start of the stage."""
-        return self.start + (self.stop - self.start) * (time / self.duration)
-
-    def _shear(self, u: Scalar) -> jax.Array:
-        if self.signals is None:
-            return jnp.zeros(1)
-        return self.gamma0 * jnp.concatenate([jnp.zeros(1), self.signals.shear(jnp.asarray(u))])
-
-    def box_at(self, time: jax.Array) -> Box:
-        """Planes and their velocities at `time` since the start of the stage, [3, B] (or [3, 1] without shear)."""
-
-        def lengths(moment: jax.Array) -> jax.Array:
-            u = self.compression(moment)
-            squeeze = 1.0 - (1.0 - jnp.sqrt(1.0 - self.delta0)) * u
-            half = 0.5 * self._shear(u)
-            scale = jnp.stack(jnp.broadcast_arrays(squeeze * (1.0 - half), squeeze * (1.0 + half), jnp.ones(1)))
-            return (self.upper - self.lower) * scale
-
-        now, rate = jax.jvp(lengths, (time,), (jnp.ones_like(time),))
-        centre = 0.5 * (self.lower + self.upper)
-        return Box(centre - 0.5 * now, centre + 0.5 * now, -0.5 * rate, 0.5 * rate)
-
-
-def clock(t0: Scalar, dt: Scalar, bins: int = BINS) -> tuple[Scalar, int | jax.Array]:
-    """The time step and the steps per bin of a ramp of duration t0: dt a little smaller, so that bins are whole.
-
-    Concrete arguments give a Python int of steps, and reverse-mode derivatives; traced ones (t0 or dt under
-    `jax.vmap`, say) a traced number, which runs but has forward-mode derivatives only.
-    """
-    if isinstance(t0, jax.core.Tracer) or isinstance(dt, jax.core.Tracer):
-        steps = jnp.ceil(t0 / (bins * dt) * (1.0 - 1e-12)).astype(jnp.int32)
-        return t0 / (bins * steps), steps
-    whole = max(1, math.ceil(float(t0) / (bins * float(dt)) * (1.0 - 1e-12)))
-    return float(t0) / (bins * whole), whole
+    start: Numbers
+    stop: Numbers
+    bins: Numbers
+    number: Numbers
+    sheared: Numbers
 
 
 @dataclass(frozen=True)
@@ -95,14 +51,23 @@ class Stage:
     sheared: bool = False
 
     @property
-    def holds(self) -> bool:
-        """Whether the walls stand still."""
-        return self.start == self.stop
-
-    @property
     def bins(self) -> int:
         """Length in bins of t0 / 256; a hold is rounded up to whole bins."""
         return max(1, math.ceil(self.length * BINS - 1e-9))
+
+    def bin(self, number: Numbers) -> Bin:
+        """The bin of a number, or the bins of several."""
+        return Bin(self.start, self.stop, self.bins, number, self.sheared)
+
+    def rows(self, first: int, count: int) -> Bin:
+        """`count` bins from number `first` on, as columns [count]."""
+        return Bin(*(np.broadcast_to(column, count) for column in self.bin(first + np.arange(count))))
+
+
+def table(stages: tuple[Stage, ...]) -> Bin:
+    """All bins of some stages, one after the other; [rows] each."""
+    columns = zip(*(stage.rows(0, stage.bins) for stage in stages), strict=True)
+    return Bin(*(np.concatenate(column) for column in columns))
 
 
 def preparation_cycle(rest: float, hold: float) -> tuple[Stage, ...]:
@@ -115,9 +80,7 @@ def preparation_cycle(rest: float, hold: float) -> tuple[Stage, ...]:
     )
 
 
-def memory_protocol(
-    rest: float = 0.2, hold: float = 0.2, store: float = 2.0, second_readout: bool = False
-) -> tuple[Stage, ...]:
+def memory_protocol(rest: float, hold: float, store: float, *, second_readout: bool) -> tuple[Stage, ...]:
     """The experiment of Sec. II, lengths in t0: a shear-free cycle, rest, encode, store, readout (6.6 t0 in all).
 
     With `second_readout`, Sec. III's: another rest, compression, hold and readout (9 t0 in all).

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.physics.state import Scalar
+from gmem_jax.physics.pytree import Scalar, pytree, traced
 
 LONGEST_WORD = 12  # bits
 PAD = 2  # bits left free at either end of a word
@@ -47,7 +47,7 @@ def part(signals: Signals, first: int, last: int) -> Signals:
     return chosen
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Bumps:
     """Sums of half-cosine bumps, I_s(u) = sum_b a_b f((u - c_b) / du), f(x) = cos(pi x) for |x| < 1/2 (Sec. II).
@@ -83,10 +83,10 @@ class Bumps:
         return jnp.sum(self.amplitudes * (primitive(u) - primitive(jnp.zeros_like(u))), axis=-1)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
-class Samples:
-    """Waveforms given by samples, joined by a C1 cubic (Catmull-Rom) curve.
+class Spline:
+    """Waveforms through samples, joined by a C1 cubic (Catmull-Rom) curve.
 
     Attributes:
         nodes: I_s at the n + 2 equally spaced nodes u = k / (n + 1), [S, n + 2]; first and last are zero.
@@ -183,23 +183,26 @@ def bit_width(bits: int) -> float:
     return 1.0 / (bits + 2 * PAD)
 
 
-def waveform(samples: jax.typing.ArrayLike) -> Samples:
+def waveform(samples: jax.typing.ArrayLike) -> Spline:
     """Any waveform from its samples.
 
     Args:
         samples: I at u = k / (n + 1), k = 1..n, for one signal [n] or several [S, n]; I is zero at u = 0 and 1.
 
     Raises:
-        ValueError: if the shape is not [n] or [S, n] with n >= 2, or a concrete sample is not finite.
+        ValueError: if the shape is not [n] or [S, n] with n >= 2, or a concrete sample is not a finite real number.
     """
-    values = jnp.asarray(samples)
-    if values.ndim not in (1, 2) or values.shape[-1] < 2 or values.shape[0] < 1:
-        raise ValueError(f"a waveform needs at least 2 samples, as [n] or [signals, n]; got shape {values.shape}")
-    if not isinstance(values, jax.core.Tracer) and not bool(jnp.all(jnp.isfinite(values))):
+    known = samples if traced(samples) else np.asarray(samples)
+    if jnp.iscomplexobj(known):
+        raise ValueError("a waveform is made of real samples, got complex ones")
+    if jnp.ndim(known) not in (1, 2) or jnp.shape(known)[-1] < 2 or jnp.shape(known)[0] < 1:
+        raise ValueError(f"a waveform needs at least 2 samples, as [n] or [signals, n]; got shape {jnp.shape(known)}")
+    if isinstance(known, np.ndarray) and not np.all(np.isfinite(known)):
         raise ValueError("a waveform sample is not a finite number")
+    values = jnp.asarray(known)
     values = jnp.atleast_2d(values)
     values = values.astype(jnp.result_type(values.dtype, float))
-    return Samples(nodes=jnp.pad(values, ((0, 0), (1, 1))))
+    return Spline(nodes=jnp.pad(values, ((0, 0), (1, 1))))
 
 
 @functools.partial(jax.jit, static_argnames=("bins", "points"))  # fused: 4,096 words would fill the memory otherwise

@@ -1,71 +1,96 @@
-"""An `Experiment` run forward on the host, the shear-free prefix apart: for many waveforms on one pack."""
+"""The one loop: a bin is some steps under prescribed walls; a walk is one bin after the other.
 
-import functools
-from collections.abc import Sequence
+Everything that moves an experiment goes through `bin_step`: a walk of a whole protocol in one traced computation, and
+the host's walks in chunks (`experiment.host`), forwards and for derivatives.
+"""
+
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax import lax
 
-from gmem_jax.experiment.experiment import Experiment, chunks
-from gmem_jax.experiment.host import Progress, compiled, refuse, require_x64, silent, worst
-from gmem_jax.experiment.protocol import Stage, split
-from gmem_jax.physics.state import State
-
-
-@functools.cache
-def _part() -> Any:
-    return compiled(Experiment.part, static_argnames=("sheared", "bins"))
-
-
-def _advance(
-    experiment: Experiment, state: State, stages: Sequence[Stage], progress: Progress, whole: tuple[float, float]
-) -> tuple[State, dict[str, np.ndarray]]:
-    """Run stages; `whole` is the part of all work that they are, as (from, to)."""
-    pressures: dict[str, np.ndarray] = {}
-    total, done = sum(stage.bins for stage in stages), 0
-    for stage in stages:
-        leg, parts = experiment.timing.leg(stage), []
-        for first, bins in chunks(stage):
-            state, pressure = _part()(experiment, state, leg, jnp.asarray(first), sheared=stage.sheared, bins=bins)
-            refuse(worst(state), stage.name)
-            parts.append(np.asarray(pressure))
-            done += bins
-            moment = done * experiment.timing.steps * experiment.timing.step
-            progress(stage.name, moment, whole[0] + (whole[1] - whole[0]) * done / total)
-        pressures[stage.name] = np.concatenate(parts)
-    return state, pressures
+from gmem_jax import native
+from gmem_jax.experiment import checkpoint
+from gmem_jax.experiment.drive import Drive
+from gmem_jax.experiment.protocol import Bin
+from gmem_jax.physics.pairs import Pairs
+from gmem_jax.physics.pytree import Scalar, pytree, static
+from gmem_jax.physics.sample import Sample, end_bin
+from gmem_jax.physics.state import Box, State
+from gmem_jax.physics.step import System
 
 
-def prefix(experiment: Experiment, *, progress: Progress = silent) -> State:
-    """The state when encoding begins: the same for all waveforms.
+@pytree
+@dataclass(frozen=True)
+class Course:
+    """What a walk is told, and does not change.
 
-    Raises:
-        RunFailedError: if the simulation broke down.
+    Attributes:
+        system: grains, law, candidates, material.
+        drive: the walls.
+        dt: time step, in t_c; scalar or [B].
+        drag: viscous drag while the walls stand still, 1 / t_c; scalar or [B].
+        steps: steps in a bin.
+        backend: who does them; see `native.marcher`.
     """
-    require_x64()
-    return _advance(experiment, experiment.begin(), split(experiment.timing.stages)[0], progress, (0.0, 0.1))[0]
+
+    system: System
+    drive: Drive
+    dt: Scalar
+    drag: Scalar = 0.0
+    steps: int = static(1)
+    backend: str = static("auto")
+
+    def with_pairs(self, pairs: Pairs) -> "Course":
+        """The same with another list of candidates."""
+        return replace(self, system=replace(self.system, pairs=pairs))
 
 
-def simulate(
-    experiment: Experiment, state: State | None = None, *, progress: Progress = silent
-) -> tuple[jax.Array, dict[str, np.ndarray]]:
-    """Recall all signals of an experiment.
+def walls(course: Course, row: Bin, replicas: int) -> Box:
+    """The walls at the end of each step of a bin, leaves [steps, 3, B]."""
+    dt, steps = jnp.asarray(course.dt), course.steps
+    count = row.number * steps + 1 + jnp.arange(steps)
+    times = count.reshape(-1, *(1 for _ in dt.shape)) * dt
+    boxes = jax.vmap(lambda time: course.drive.box_at(row, time, (row.bins * steps) * dt))(times)
+    wide: Box = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, 3, replicas)), boxes)
+    return wide
 
-    Args:
-        experiment: the experiment.
-        state: what `prefix` gave for the same pack and friction; computed if not given.
-        progress: told about every chunk.
+
+def bin_step(course: Course, state: State, row: Bin) -> tuple[State, Sample]:
+    """One bin: its steps, the checks at its end, its sample."""
+    with jax.named_scope("drive"):
+        boxes = walls(course, row, state.replicas)
+        drag = jnp.where(row.start == row.stop, course.drag, 0.0)
+    with jax.named_scope("steps"):
+        state, total = native.marcher(course.backend)(course.system, state, boxes, course.dt, drag)
+    with jax.named_scope("sample"):
+        last = jax.tree.map(lambda leaf: leaf[-1], boxes)
+        return end_bin(course.system, state, last, total / course.steps)
+
+
+def walk(course: Course, state: State, rows: Bin) -> tuple[State, Sample]:
+    """The bins of a table one after the other; the state after them, and their samples with a leading axis.
+
+    Reverse mode keeps states at two levels and computes the rest again (see `checkpoint.scan`).
+    """
+    return checkpoint.scan(lambda state, row: bin_step(course, state, row), state, rows)
+
+
+def walk_some(course: Course, state: State, first: Bin, count: jax.Array, most: int) -> tuple[State, Sample]:
+    """`count` bins of one stage from the bin `first`, in a program for any count up to `most`; not for reverse mode.
 
     Returns:
-        p_sig, [S, 256], and the pressures of the stages from the encoding on, [bins, 3, S + 1], in E.
-
-    Raises:
-        RunFailedError: if the simulation broke down.
+        The state, and samples with a leading axis [most], zero beyond `count`.
     """
-    state = prefix(experiment, progress=progress) if state is None else state
-    _, pressures = _advance(
-        experiment, experiment.fan_out(state), split(experiment.timing.stages)[1], progress, (0.1, 1.0)
-    )
-    return experiment.recalled(jnp.asarray(pressures["readout"])), pressures
+
+    def one(place: jax.Array, carry: tuple[State, Any]) -> tuple[State, Any]:
+        state, kept = carry
+        state, sample = bin_step(course, state, first._replace(number=first.number + place))
+        return state, jax.tree.map(lambda all_, new: all_.at[place].set(new), kept, sample)
+
+    shape = jax.eval_shape(lambda: bin_step(course, state, first)[1])
+    blank = jax.tree.map(lambda leaf: jnp.zeros((most, *leaf.shape), leaf.dtype), shape)
+    done: tuple[State, Sample] = lax.fori_loop(0, count, one, (state, blank))
+    return done

@@ -1,7 +1,7 @@
 """`advance` in C++ for CPUs, behind jax.ffi: the numbers of `gmem_jax.physics.step.advance`, several times faster.
 
 One call into the library runs all steps of one bin for all replicas; walls, checks and samples are computed in JAX,
-as in `dynamics.advance`. It works under `jax.jit`, `jax.vmap` and both modes of differentiation, whose derivatives
+as in `step.advance`. It works under `jax.jit`, `jax.vmap` and both modes of differentiation, whose derivatives
 are computed in the library too; see `gmem_jax.native.derivatives`.
 """
 
@@ -15,25 +15,25 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gmem_jax.experiment import checkpoint
-from gmem_jax.experiment.protocol import Motion
 from gmem_jax.native import derivatives
 from gmem_jax.native.derivatives import Call
-from gmem_jax.physics import step as dynamics
+from gmem_jax.physics import step
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.laws import entry_of
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.physics.state import Box, Grains, Scalar, State
-from gmem_jax.physics.step import Sample, System
+from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.state import Box, Grains, State
+from gmem_jax.physics.step import System
 
-Advance = Callable[..., tuple[State, Sample]]
-"""The signature of `gmem_jax.physics.step.advance`."""
+March = Callable[..., tuple[State, jax.Array]]
+"""The signature of `gmem_jax.physics.step.march`."""
 
 BACKENDS = ("auto", "jax", "native")
 
-_LAWS: tuple[type, ...] = (Frictionless, Hooke, MindlinRescaled, Mindlin)  # numbered as in problem.h
+_LAW_NUMBERS = 4  # rows of the parameter array for a law's own, as in problem.h
 _VARIANTS = ("exact", "averaged", "paper")
 _PART = 32  # steps per call where their number is not known when the program is compiled
 
@@ -72,7 +72,7 @@ def available() -> tuple[bool, str]:
 
 def supports(law: FrictionLaw) -> bool:
     """Whether the native backend knows this friction law (a user's own runs in plain JAX)."""
-    return type(law) in _LAWS
+    return entry_of(law) is not None
 
 
 def name(backend: str, law: FrictionLaw) -> str:
@@ -82,8 +82,8 @@ def name(backend: str, law: FrictionLaw) -> str:
     return "native" if available()[0] and supports(law) else "jax"
 
 
-def pick(backend: str = "auto") -> Advance:
-    """The `advance` of a backend.
+def marcher(backend: str = "auto") -> March:
+    """Who does the steps of a bin; the signature of `gmem_jax.physics.step.march`.
 
     Args:
         backend: "jax"; "native"; or "auto", native where it is available and knows the friction law.
@@ -97,13 +97,12 @@ def pick(backend: str = "auto") -> Advance:
     if backend == "native" and not possible:
         raise ValueError(f"the native backend is not available: {reason}")
     if backend == "native":
-        return advance
-    return _where_supported if possible else dynamics.advance
+        return march
+    return _where_supported if possible else step.march
 
 
-def _where_supported(system: System, state: State, *args: Any, **options: Any) -> tuple[State, Sample]:
-    chosen = advance if supports(system.friction) else dynamics.advance
-    return chosen(system, state, *args, **options)
+def _where_supported(system: System, state: State, *args: Any) -> tuple[State, jax.Array]:
+    return (march if supports(system.friction) else step.march)(system, state, *args)
 
 
 def _require(system: System, state: State) -> None:
@@ -127,54 +126,6 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
     numbers = (jnp.asarray(dt), jnp.asarray(drag))
     grains, history, total = _bin(system, state.grains, state.history, boxes, numbers, None, jnp.asarray(0))
     return State(grains, history, state.status), total
-
-
-def advance(
-    system: System,
-    state: State,
-    motion: Motion,
-    dt: jax.Array,
-    *,
-    first_bin: Scalar = 0,
-    bins: int,
-    steps: Scalar,
-    drag: Scalar = 0.0,
-) -> tuple[State, Sample]:
-    """`gmem_jax.physics.step.advance` on the native backend; arguments and results as there.
-
-    Raises:
-        ValueError: if the backend is not available, does not know the friction law, or the state is not float64.
-    """
-    _require(system, state)
-    dt = jnp.asarray(dt)
-    replicas = state.replicas
-
-    def part(state: State, begun: jax.Array, count: int, limit: Scalar | None) -> tuple[State, jax.Array]:
-        """The next `count` steps, or only `limit` of them, and the sum of their wall pressures."""
-        times = (jnp.reshape(begun + 1 + jnp.arange(count), (-1, *(1 for _ in dt.shape))) * dt).astype(dt.dtype)
-        boxes = jax.vmap(motion.box_at)(times)
-        boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, 3, replicas)), boxes)
-        numbers = (dt, jnp.asarray(drag))
-        limits = None if limit is None else jnp.broadcast_to(jnp.asarray(limit, jnp.int32), (replicas,))
-        grains, history, total = _bin(system, state.grains, state.history, boxes, numbers, limits, begun)
-        return State(grains, history, state.status), total
-
-    def one_bin(state: State, bin_index: jax.Array) -> tuple[State, Sample]:
-        begun = bin_index * steps
-        if isinstance(steps, jax.core.Tracer):
-
-            def next_part(index: jax.Array, carry: tuple[State, jax.Array]) -> tuple[State, jax.Array]:
-                state, total = carry
-                state, more = part(state, begun + index * _PART, _PART, jnp.minimum(steps - index * _PART, _PART))
-                return state, total + more
-
-            nothing = jnp.zeros((3, replicas), state.grains.position.dtype)
-            state, total = lax.fori_loop(0, (steps + _PART - 1) // _PART, next_part, (state, nothing))
-        else:
-            state, total = part(state, begun, int(steps), None)
-        return dynamics.end_bin(system, state, motion.box_at((begun + steps) * dt), total / steps)
-
-    return checkpoint.scan(one_bin, state, first_bin + jnp.arange(bins))
 
 
 _Result = tuple[Grains, Any, jax.Array]
@@ -204,9 +155,10 @@ def _bin(
 
 def _call(system: System, history: Any) -> Call:
     """What the library is told beside arrays."""
-    law = system.friction
+    law, entry = system.friction, entry_of(system.friction)
+    assert entry is not None  # `_require` has seen to it
     return Call(
-        law=_LAWS.index(type(law)),
+        law=entry.native,
         variant=_VARIANTS.index(law.variant) if isinstance(law, Mindlin) else 0,
         points=law.points if isinstance(law, Mindlin) else 0,
         isotropic=int(system.clump.isotropic),
@@ -237,10 +189,10 @@ def _result(grains: Grains, history: Any, results: derivatives.Results) -> _Resu
 
 def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: int) -> jax.Array:
     """What problem.h calls the rows of the parameter array, [rows, B]."""
-    law, clump, material = system.friction, system.clump, system.material
-    own: tuple[Any, ...] = (0.0, 0.0, 0.0, 1.0)
-    if isinstance(law, Hooke | MindlinRescaled | Mindlin):
-        own = (law.mu, law.stiffness, law.damping_time, law.spacing if isinstance(law, Mindlin) else 1.0)
+    clump, material, entry = system.clump, system.material, entry_of(system.friction)
+    assert entry is not None  # `_require` has seen to it
+    own = [getattr(system.friction, number) for number in entry.numbers]
+    own += [1.0] * (_LAW_NUMBERS - len(own))
     solid = (material.normal_stiffness, material.normal_damping, material.wall_stiffness)
     rows = (*numbers, clump.mass, *clump.inertia, *solid, *own)
     return jnp.stack([jnp.broadcast_to(jnp.asarray(row, jnp.float64), (replicas,)) for row in rows])
@@ -263,8 +215,8 @@ def _plain_bin(
     def one_step(carry: tuple[State, jax.Array], xs: tuple[jax.Array, Box]) -> tuple[tuple[State, jax.Array], None]:
         state, total = carry
         index, box = xs
-        moved, walls = dynamics.step(system, state, box, dt, drag, alive & (index >= 0))
-        after = moved, total + dynamics.wall_pressure(walls, box)
+        moved, walls = step.step(system, state, box, dt, drag, alive & (index >= 0))
+        after = moved, total + step.wall_pressure(walls, box)
         going = True if limits is None else index < limits
         return jax.tree.map(lambda new, old: jnp.where(going, new, old), after, carry), None
 

@@ -5,16 +5,18 @@ they are computed by summing exact one-dimensional sections of the union along a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.pytree import label, pytree, static
+
 _LINES = 700  # lines per side of the integration grid: volume and inertia to about 1e-5
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Clump:
     """One kind of grain, in its principal frame with the centre of mass at the origin (R = rho = 1).
@@ -32,8 +34,8 @@ class Clump:
     mass: jax.Array
     inertia: jax.Array
     diameter: jax.Array
-    isotropic: bool = field(default=True, metadata={"static": True})
-    shape: str = field(default="clump", metadata={"static": True})
+    isotropic: bool = static(True)
+    shape: str = label("clump")
 
     @property
     def spheres(self) -> int:

@@ -4,10 +4,12 @@ Everything downstream works in units where the sphere radius R, Young's modulus 
 that time is measured in t_c = R sqrt(rho / E), pressure in E, force in E R^2 and stiffness in E R.
 """
 
-import math
 from dataclasses import dataclass
 
+from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle
 
+
+@pytree
 @dataclass(frozen=True)
 class Material:
     """An elastic solid: what the spheres of all grains and their contacts are made of.
@@ -26,46 +28,44 @@ class Material:
         ValueError: if a value is outside its physical range.
     """
 
-    radius: float = 5.0e-4
-    modulus: float = 1.0e7
-    density: float = 1200.0
-    poisson: float = 0.49
-    normal_damping: float = 0.23
-    tangential_damping: float = 0.069
+    radius: Scalar = parameter(5.0e-4, "(0, inf)")
+    modulus: Scalar = parameter(1.0e7, "(0, inf)")
+    density: Scalar = parameter(1200.0, "(0, inf)")
+    poisson: Scalar = parameter(0.49, "(-1, 0.5]")
+    normal_damping: Scalar = parameter(0.23, "[0, inf)")
+    tangential_damping: Scalar = parameter(0.069, "[0, inf)")
 
     def __post_init__(self) -> None:
-        for name in ("radius", "modulus", "density"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"Material.{name} must be positive, got {getattr(self, name)}")
-        if not -1.0 < self.poisson <= 0.5:
-            raise ValueError(f"Material.poisson must be in (-1, 0.5], got {self.poisson}")
-        if not (self.normal_damping >= 0.0 and self.tangential_damping >= 0.0):
-            raise ValueError("Material damping times must not be negative")
+        settle(self)
 
     @property
-    def time_unit(self) -> float:
+    def time_unit(self) -> Scalar:
         """t_c = R sqrt(rho / E), in seconds."""
-        return self.radius * math.sqrt(self.density / self.modulus)
+        unit: Scalar = self.radius * (self.density / self.modulus) ** 0.5
+        return unit
 
     @property
-    def wall_stiffness(self) -> float:
+    def wall_stiffness(self) -> Scalar:
         """k_w of a sphere on a rigid plane, f = k_w p^1.5 (Hertz; effective radius R), in E R^0.5."""
-        return (4.0 / 3.0) / (1.0 - self.poisson**2)
+        stiffness: Scalar = (4.0 / 3.0) / ((1.0 - self.poisson) * (1.0 + self.poisson))
+        return stiffness
 
     @property
-    def normal_stiffness(self) -> float:
+    def normal_stiffness(self) -> Scalar:
         """k_n of two equal spheres, f = k_n p^1.5 (Hertz; effective radius R/2, two compliant bodies)."""
-        return self.wall_stiffness / math.sqrt(8.0)
+        stiffness: Scalar = self.wall_stiffness * 2.0**-1.5
+        return stiffness
 
     @property
-    def mindlin_stiffness(self) -> float:
+    def mindlin_stiffness(self) -> Scalar:
         """k_M of the Mindlin laws, df = k_M p^0.5 dsigma."""
-        return 3.0 * self.normal_stiffness * (1.0 - self.poisson) / (2.0 - self.poisson)
+        stiffness: Scalar = 3.0 * self.normal_stiffness * (1.0 - self.poisson) / (2.0 - self.poisson)
+        return stiffness
 
-    def pascal(self, pressure: float) -> float:
+    def pascal(self, pressure: Scalar) -> Scalar:
         """A simulation pressure (in E) in Pa."""
         return pressure * self.modulus
 
-    def seconds(self, time: float) -> float:
+    def seconds(self, time: Scalar) -> Scalar:
         """A simulation time (in t_c) in s."""
         return time * self.time_unit

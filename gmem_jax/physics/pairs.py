@@ -1,11 +1,9 @@
-"""Candidate contacts: which sphere pairs may touch, found by jax-md and shared by all replicas.
+"""Candidate contacts: which sphere pairs may touch, one list shared by all replicas (`search` makes it).
 
-The list is a half list in canonical (i, j) order. It is built on positions mapped affinely into the smallest box of
-the coming motion, so that only non-affine displacements use up its skin (a whole experiment needs about 0.2 R).
+A half list in canonical (i, j) order, with an incidence table by which forces are gathered. Its capacities are rounded
+up to a few sizes, so that lists of packs of one size fit one compiled program.
 """
 
-import functools
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,13 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.pytree import pytree
 from gmem_jax.physics.rotation import matrix
 from gmem_jax.physics.state import Box, Grains
 
-_SPARE = 1.15  # capacity allocated over what is needed now
+
+def bucket(count: int) -> int:
+    """The capacity allocated for `count` rows: the next of eight sizes to an octave, so at most an eighth more."""
+    grain = max(1, 1 << max(0, count.bit_length() - 4))
+    return -(-count // grain) * grain
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Pairs:
     """Candidate contacts of S = N K spheres; sphere s belongs to grain s // K.
@@ -86,24 +89,27 @@ def tabulate(
     *,
     capacity: int = 0,
     per_sphere: int = 0,
-    spare: float = _SPARE,
 ) -> Pairs:
-    """`Pairs` from sorted sphere pairs [2, n]: padded to capacity, with the incidence table.
+    """`Pairs` from sorted sphere pairs [2, n]: padded, with the incidence table.
 
-    Capacities too small for what was found are raised, and then allocated `spare` times over (1 for a list that is
-    not expected to be rebuilt: padding costs as much as candidates do); the other arguments are fields of `Pairs`.
+    Args:
+        found: i < j, sorted, [2, n].
+        reference: see `Pairs`.
+        smallest: see `Pairs`.
+        reach: see `Pairs`.
+        spheres_per_grain: K.
+        capacity: rows to allocate at least; rounded up (see `bucket`), and raised to what was found.
+        per_sphere: columns of the incidence table to allocate at least; likewise, to multiples of four.
     """
     pairs, count = found.shape[1], reference.shape[0]
-    if pairs > capacity or capacity == 0:
-        capacity = max(8, int(pairs * spare))  # a gas may have no candidates, but arrays need rows
+    capacity = bucket(max(8, capacity, pairs))  # a gas may have no candidates, but arrays need rows
     owners = found.ravel()
     rows = np.concatenate([np.arange(pairs), capacity + np.arange(pairs)])
     order = np.argsort(owners, kind="stable")
     owners, rows = owners[order], rows[order]
     place = np.arange(2 * pairs) - np.searchsorted(owners, owners)
-    if pairs and place.max() >= per_sphere:
-        per_sphere = int(place.max() * spare) + 1
-    incidence = np.full((count, max(1, per_sphere)), 2 * capacity, dtype=np.int32)
+    per_sphere = -(-max(1, per_sphere, place.max(initial=-1) + 1) // 4) * 4
+    incidence = np.full((count, per_sphere), 2 * capacity, dtype=np.int32)
     incidence[owners, place] = rows
     padded = np.zeros((2, capacity), dtype=np.int32)
     padded[:, :pairs] = found
@@ -117,7 +123,7 @@ def tabulate(
         grain_pair=jnp.asarray(grain_pair.astype(np.int32)),
         reference=jnp.asarray(reference),
         smallest=jnp.asarray(smallest),
-        reach=jnp.asarray(reach),
+        reach=jnp.asarray(float(reach)),
     )
 
 
@@ -126,106 +132,6 @@ def candidates(pairs: Pairs) -> np.ndarray:
     real = np.asarray(pairs.valid)
     listed: np.ndarray = np.stack([np.asarray(pairs.first)[real], np.asarray(pairs.second)[real]])
     return listed
-
-
-class PairFinder:
-    """Builds `Pairs` from a jax-md neighbour list whose capacities grow when they must, and never shrink.
-
-    jax-md lists pairs of grain centres within reach of each other's spheres; each is expanded into its K x K sphere
-    pairs, of which those in reach are kept. That keeps spheres of one grain apart by construction, and is several
-    times cheaper than a list of spheres (whose prune step scatters N K x 27 cells of candidates).
-
-    Args:
-        clump: the grain.
-        extent: edge lengths of a box that contains all (mapped) positions of the coming builds, [3].
-        skin: distance beyond contact that is still listed, in R.
-        capacity: rows to allocate at least.
-        per_sphere: contacts per sphere to allocate at least.
-
-    Raises:
-        ValueError: if the skin is not positive.
-    """
-
-    def __init__(
-        self, clump: Clump, extent: np.ndarray, skin: float, *, capacity: int = 0, per_sphere: int = 0
-    ) -> None:
-        # Imported here because jax-md takes seconds to load, and most commands never look for neighbours.
-        from jax_md import partition, space
-
-        if not skin > 0.0:
-            raise ValueError(f"the skin of a neighbour list must be positive, got {skin}")
-        self.skin = skin
-        self._spheres_per_grain = clump.spheres
-        self._capacity = capacity
-        self._per_sphere = per_sphere
-        self._neighbors: Any = None
-        free_displacement, _ = space.free()
-        body = np.asarray(clump.offsets)
-        cutoff = 2.0 * (1.0 + float(np.linalg.norm(body - body.mean(axis=0), axis=1).max())) + skin
-        self._fns = partition.neighbor_list(
-            free_displacement,
-            # jax-md keeps box and cutoff in float32 and wraps its cells around: a margin keeps every centre inside,
-            # and the float32 rounding of the cutoff harmless.
-            np.asarray(extent, dtype=float) + 1.0,
-            r_cutoff=cutoff + 1e-4,
-            dr_threshold=0.0,
-            capacity_multiplier=_SPARE,
-            format=partition.OrderedSparse,
-        )
-        self._update = jax.jit(lambda positions, neighbors: neighbors.update(positions))
-
-    def _grain_pairs(self, centres: np.ndarray) -> np.ndarray:
-        """Pairs (i < j) of grains whose centres [N, 3] are within the cutoff, [2, n]."""
-        positions = jnp.asarray(centres)
-        with warnings.catch_warnings():
-            # jax-md 0.2.29 scatters 64-bit indices into its 32-bit tables, and jax warns of it.
-            warnings.filterwarnings("ignore", message="scatter inputs have incompatible types")
-            if self._neighbors is not None:
-                self._neighbors = self._update(positions, self._neighbors)
-            if self._neighbors is None or bool(self._neighbors.did_buffer_overflow):
-                self._neighbors = self._fns.allocate(positions)
-        found = np.sort(np.asarray(self._neighbors.idx), axis=0)
-        return found[:, found[1] < len(centres)]
-
-    def _keys(self, mapped: np.ndarray) -> np.ndarray:
-        """Pairs i < j of spheres of different grains within reach, of centres [S, 3], as sorted numbers i S + j."""
-        spheres = np.int64(len(mapped))
-        mapped = mapped.reshape(-1, self._spheres_per_grain, 3)
-        one, other = self._grain_pairs(mapped.mean(axis=1))
-        distance = np.linalg.norm(mapped[one][:, :, None] - mapped[other][:, None, :], axis=-1)
-        pair, sphere_i, sphere_j = np.nonzero(distance < 2.0 + self.skin)
-        first, second = (side[pair] * self._spheres_per_grain for side in (one, other))
-        keys: np.ndarray = np.sort((first + sphere_i) * spheres + second + sphere_j)
-        return keys
-
-    def __call__(self, grains: Grains, clump: Clump, box: Box, smallest: np.ndarray | None = None) -> Pairs:
-        """The candidate list of `grains` in `box`, which holds what any of the replicas needs.
-
-        Args:
-            grains: the grains.
-            clump: their shape.
-            box: the walls now.
-            smallest: edge lengths of the smallest box of the coming motion, [3]; default the present box.
-        """
-        lengths = np.asarray(box.lengths)
-        smallest = lengths[:, 0] if smallest is None else np.minimum(smallest, lengths[:, 0])
-        reference = (np.asarray(sphere_centres(grains, clump)) - np.asarray(box.lower)) / lengths
-        if np.all(reference == reference[..., :1]):
-            reference = reference[..., :1]
-        spheres = reference.shape[0]
-        keys = [self._keys(reference[..., b] * smallest) for b in range(reference.shape[-1])]
-        found = np.stack(np.divmod(functools.reduce(np.union1d, keys), spheres))
-        pairs = tabulate(
-            found,
-            reference,
-            smallest,
-            2.0 + self.skin,
-            self._spheres_per_grain,
-            capacity=self._capacity,
-            per_sphere=self._per_sphere,
-        )
-        self._capacity, self._per_sphere = pairs.capacity, int(pairs.incidence.shape[-1])
-        return pairs
 
 
 def carry_history(history: Any, blank: Any, old: Pairs, new: Pairs) -> Any:

@@ -10,8 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-Scalar = float | jax.Array
-"""A parameter: one number, or an array that broadcasts against the replica axis [B]."""
+from gmem_jax.physics.pytree import pytree
 
 
 class Status(enum.IntFlag):
@@ -24,6 +23,7 @@ class Status(enum.IntFlag):
     OVERLAP_RANGE = 16
     STEP_TOO_LARGE = 32
     CAPACITY = 64
+    IMPOSSIBLE = 128
 
     @property
     def fatal(self) -> bool:
@@ -39,6 +39,7 @@ SENTENCES = {
     Status.OVERLAP_RANGE: "an overlap exceeded the p_max of the friction law; use a larger p_max",
     Status.STEP_TOO_LARGE: "the time step exceeds 0.5 t_c; use a smaller dt",
     Status.CAPACITY: "the neighbour list overflowed its capacity; allocate it anew",
+    Status.IMPOSSIBLE: "a parameter or a waveform is impossible; use numbers that `Experiment` accepts outside a trace",
 }
 
 
@@ -47,7 +48,7 @@ def explain(status: int) -> str:
     return "; ".join(text for bit, text in SENTENCES.items() if status & bit) or "ok"
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Grains:
     """Centres, orientations and their derivatives, one entry per grain (R = E = rho = 1).
@@ -69,7 +70,7 @@ class Grains:
     spin_rate: jax.Array
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Box:
     """Six rigid planes and their velocities; [3, B] each (x, y, z), in R and R / t_c."""
@@ -85,7 +86,7 @@ class Box:
         return self.upper - self.lower
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class State:
     """Everything that evolves: a run resumes bit for bit from this and the walls' motion.

@@ -1,27 +1,26 @@
-"""One time step and `advance`, the primitive that moves time: the definition of the physics, in plain JAX."""
+"""One time step, and `march`, a step for each of some boxes: the definition of the physics, in plain JAX."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gmem_jax.experiment import checkpoint
-from gmem_jax.experiment.protocol import Motion
-from gmem_jax.physics.contact.friction import FrictionLaw, largest_overlap
+from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.contact.wall import wall_forces
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import Pairs, slack, sphere_centres, sphere_offsets
-from gmem_jax.physics.rotation import cross, dot, matrix, turn
-from gmem_jax.physics.state import Box, Grains, Scalar, State, Status
+from gmem_jax.physics.pairs import Pairs, sphere_offsets
+from gmem_jax.physics.pytree import Scalar, pytree
+from gmem_jax.physics.rotation import cross, matrix, turn
+from gmem_jax.physics.state import Box, Grains, State
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class System:
     """What does not change during a run.
@@ -36,36 +35,7 @@ class System:
     clump: Clump
     friction: FrictionLaw
     pairs: Pairs
-    material: Material = field(default=Material(), metadata={"static": True})
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Sample:
-    """What is recorded of one bin of steps; a leading time axis is added by `advance`.
-
-    Attributes:
-        pressure: (p_x, p_y, p_z), mean of the two opposite walls at their instantaneous area, averaged over the
-            steps of the bin, [3, B], in E.
-        lengths: box edges at the end of the bin, [3, B], in R.
-        kinetic_energy: at the end of the bin, translation and rotation, [B], in E R^3.
-        largest_speed: at the end of the bin, [B], in R / t_c.
-        coordination: Z, touching grain pairs per grain times two, rattlers included, walls not, [B].
-        contacts: touching sphere pairs per grain times two, [B].
-        filling: phi, volume of the grains over that of the box, [B].
-        largest_overlap: deepest sphere-sphere contact at the end of the bin, [B], in R.
-        inertial_number: I = (strain rate of the x axis) sqrt(m / (D p)), p the mean of p_x and p_y, [B]; 0 without p.
-    """
-
-    pressure: jax.Array
-    lengths: jax.Array
-    kinetic_energy: jax.Array
-    largest_speed: jax.Array
-    coordination: jax.Array
-    contacts: jax.Array
-    filling: jax.Array
-    largest_overlap: jax.Array
-    inertial_number: jax.Array
+    material: Material = Material()
 
 
 def _apart(alive: jax.Array, function: Callable[..., Any], *args: Any) -> Any:
@@ -130,14 +100,26 @@ def contact_forces(
     return _apart(alive, lambda rows: jnp.sum(rows[pairs.incidence], axis=1), stack), history
 
 
+@jax.jit
+def _loads(
+    system: System, grains: Grains, history: Any, box: Box, dt: jax.Array, alive: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Any]:
+    """Of every sphere: its arm [N, K, 3, B], contact forces and torques [S, 6, B], wall forces; and the new history."""
+    material = system.material
+    with jax.named_scope("spheres"):
+        table, arms = _apart(alive, lambda grains: _sphere_table(system.clump, grains), grains)
+    with jax.named_scope("contacts"):
+        contact, history = contact_forces(system, table, history, dt, alive)
+    with jax.named_scope("walls"):
+        lower, upper = wall_forces(table[:, :3], table[:, 3:6], box, material.wall_stiffness, material.normal_damping)
+    return arms, contact, lower, upper, history
+
+
 def _forces(
     system: System, grains: Grains, history: Any, box: Box, dt: jax.Array, alive: jax.Array
 ) -> tuple[jax.Array, jax.Array, Any, jax.Array]:
     """Total force and torque on every grain [N, 3, B], the new history, and the wall forces [2, 3, B]."""
-    material = system.material
-    table, arms = _apart(alive, lambda grains: _sphere_table(system.clump, grains), grains)
-    contact, history = contact_forces(system, table, history, dt, alive)
-    lower, upper = wall_forces(table[:, :3], table[:, 3:6], box, material.wall_stiffness, material.normal_damping)
+    arms, contact, lower, upper, history = _loads(system, grains, history, box, dt, alive)
     per_sphere = (*arms.shape[:2], -1, contact.shape[-1])
     force = (contact[:, :3] + lower - upper).reshape(per_sphere)
     torque = contact[:, 3:].reshape(per_sphere) + cross(arms, force)
@@ -205,7 +187,7 @@ def wall_pressure(walls: jax.Array, box: Box) -> jax.Array:
 
 
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
-    """One step for each of the boxes.
+    """One step for each of the boxes: what a backend does with a bin.
 
     Args:
         system: the system.
@@ -226,7 +208,7 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
 
     total = jnp.zeros((3, state.replicas), state.grains.position.dtype)
     count = jnp.arange(boxes.lower.shape[0])
-    (state, total), _ = lax.scan(one_step, (state, total), (count, boxes))
+    (state, total), _ = lax.scan(jax.checkpoint(one_step), (state, total), (count, boxes))
     return state, total
 
 
@@ -242,7 +224,7 @@ def start(system: System, position: jax.Array, quaternion: jax.Array, box: Box) 
 
 def accelerate(system: System, state: State, box: Box) -> State:
     """Recompute the accelerations of `state`, its histories untouched (after velocities or the law were changed)."""
-    zero, alive = jnp.zeros(()), jnp.asarray(True)
+    zero, alive = jnp.zeros(()), system.pairs.reach > 0.0
     force, torque, _, _ = _forces(system, state.grains, state.history, box, zero, alive)
     grains = replace(
         state.grains,
@@ -250,99 +232,3 @@ def accelerate(system: System, state: State, box: Box) -> State:
         spin_rate=_angular_acceleration(system.clump, state.grains, torque),
     )
     return replace(state, grains=grains)
-
-
-def check(system: System, state: State, box: Box) -> State:
-    """Set the status bits for what can be seen in one configuration: stale list, escaped grain, non-finite number."""
-    grains = state.grains
-    spheres = sphere_centres(grains, system.clump)
-    outside = jnp.any((spheres < box.lower) | (spheres > box.upper), axis=(0, 1))
-    numbers = grains.position.sum((0, 1)) + grains.acceleration.sum((0, 1)) + grains.spin_rate.sum((0, 1))
-    bits = (
-        jnp.where(slack(system.pairs, spheres, box) <= 0.0, int(Status.STALE_PAIRS), 0)
-        | jnp.where(outside, int(Status.OUTSIDE_BOX), 0)
-        | jnp.where(jnp.isfinite(numbers), 0, int(Status.NOT_FINITE))
-    ).astype(jnp.int32)
-    return replace(state, status=state.status | bits)
-
-
-def observe(system: System, state: State, box: Box, pressure: jax.Array) -> Sample:
-    """The instantaneous quantities of a `Sample`, beside the given bin-averaged pressure."""
-    grains, clump, pairs = state.grains, system.clump, system.pairs
-    spheres = sphere_centres(grains, clump)
-    square = dot(spheres[pairs.second] - spheres[pairs.first], spheres[pairs.second] - spheres[pairs.first])[:, 0]
-    overlap = jnp.where(pairs.valid[:, None], 2.0 - jnp.sqrt(jnp.where(pairs.valid[:, None], square, 1.0)), -1.0)
-    touching = (overlap > 0.0).astype(jnp.int32)
-    count = grains.position.shape[0]
-    touching_pairs = jax.ops.segment_max(touching, pairs.grain_pair, num_segments=pairs.capacity)
-    body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)
-    energy = clump.mass * jnp.sum(grains.velocity**2, axis=1) + jnp.sum(clump.inertia[:, None] * body_spin**2, axis=1)
-    lengths = jnp.broadcast_to(box.lengths, pressure.shape)
-    rate = jnp.abs(box.upper_velocity[0] - box.lower_velocity[0]) / lengths[0]
-    squeezing = 0.5 * (pressure[0] + pressure[1])
-    loaded = squeezing > 0.0
-    inertial = rate * jnp.sqrt(clump.mass / (clump.diameter * jnp.where(loaded, squeezing, 1.0)))
-    return Sample(
-        pressure=pressure,
-        lengths=lengths,
-        kinetic_energy=0.5 * jnp.sum(energy, axis=0),
-        largest_speed=jnp.sqrt(jnp.max(jnp.sum(lax.stop_gradient(grains.velocity) ** 2, axis=1), axis=0)),
-        coordination=2.0 * jnp.sum(jnp.maximum(touching_pairs, 0), axis=0) / count,
-        contacts=2.0 * jnp.sum(touching, axis=0) / count,
-        filling=count * clump.mass / jnp.prod(lengths, axis=0),
-        largest_overlap=jnp.max(lax.stop_gradient(overlap), axis=0),
-        inertial_number=jnp.where(loaded, inertial, 0.0),
-    )
-
-
-def end_bin(system: System, state: State, box: Box, pressure: jax.Array) -> tuple[State, Sample]:
-    """Check the state at the end of a bin and take its sample; `pressure` is the bin's average, [3, B]."""
-    state = check(system, state, box)
-    sample = observe(system, state, box, pressure)
-    beyond = sample.largest_overlap > largest_overlap(system.friction)
-    bits = jnp.where(beyond, int(Status.OVERLAP_RANGE), 0).astype(jnp.int32)
-    return replace(state, status=state.status | bits), sample
-
-
-def advance(
-    system: System,
-    state: State,
-    motion: Motion,
-    dt: jax.Array,
-    *,
-    first_bin: Scalar = 0,
-    bins: int,
-    steps: Scalar,
-    drag: Scalar = 0.0,
-) -> tuple[State, Sample]:
-    """Advance by `bins` bins of `steps` steps under prescribed walls.
-
-    Args:
-        system: the system.
-        state: at the start of bin `first_bin` of the stage.
-        motion: the walls as a function of the time since the start of the stage.
-        dt: time step, in t_c.
-        first_bin: number of bins of this stage already done.
-        bins: number of bins to advance (static).
-        steps: steps per bin; a Python int where reverse-mode differentiation is wanted.
-        drag: see `step`.
-
-    Returns:
-        The state, and samples with a leading axis [bins].
-    """
-    dt = jnp.asarray(dt)
-    alive = jnp.asarray(first_bin) >= 0
-
-    def one_step(index: jax.Array, carry: tuple[State, jax.Array, jax.Array]) -> tuple[State, jax.Array, jax.Array]:
-        state, total, done = carry
-        box = motion.box_at((done + index + 1) * dt)
-        state, walls = step(system, state, box, dt, drag, alive & (index >= 0))
-        return state, total + wall_pressure(walls, box), done
-
-    def one_bin(state: State, bin_index: jax.Array) -> tuple[State, Sample]:
-        done = bin_index * steps
-        empty = jnp.zeros((3, state.replicas), state.grains.position.dtype)
-        state, total, _ = lax.fori_loop(0, steps, jax.checkpoint(one_step), (state, empty, done))
-        return end_bin(system, state, motion.box_at((done + steps) * dt), total / steps)
-
-    return checkpoint.scan(one_bin, state, first_bin + jnp.arange(bins))

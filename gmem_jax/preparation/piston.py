@@ -8,8 +8,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from gmem_jax.physics.pairs import slack, sphere_centres
-from gmem_jax.physics.state import Box, Scalar, State
-from gmem_jax.physics.step import System, check
+from gmem_jax.physics.pytree import Scalar, pytree
+from gmem_jax.physics.sample import check
+from gmem_jax.physics.state import Box, State
+from gmem_jax.physics.step import System
 
 March = Callable[..., tuple[State, jax.Array]]
 """The signature of `gmem_jax.physics.step.march`."""
@@ -17,7 +19,7 @@ March = Callable[..., tuple[State, jax.Array]]
 BLOCK = 8  # steps between two looks at the neighbour list: grains may fly freely here
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Servo:
     """The wall moves at gain * (p_z / target - 1), at most at `speed`.
@@ -37,7 +39,7 @@ class Servo:
     quiet: Scalar
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Pressed:
     """Where a servo run stands (one replica).

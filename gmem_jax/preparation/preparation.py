@@ -10,20 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax import native
-from gmem_jax.experiment.host import Progress, RunFailedError, Runner, compiled, refuse, require_x64, silent, worst
+from gmem_jax.experiment.drive import Drive
+from gmem_jax.experiment.host import Compiled, Progress, RunFailedError, Walker, refuse, require_x64, silent, worst
 from gmem_jax.experiment.pack import Pack, find_pairs, smallest_box
-from gmem_jax.experiment.protocol import Motion, Stage, clock, preparation_cycle
+from gmem_jax.experiment.protocol import Stage, preparation_cycle
+from gmem_jax.experiment.signals import BINS
+from gmem_jax.experiment.walk import Course
 from gmem_jax.files.provenance import provenance
 from gmem_jax.physics import rotation
-from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, tetra
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import PairFinder
+from gmem_jax.physics.sample import Sample
+from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Grains, still_box
-from gmem_jax.physics.step import Sample, System, accelerate, start
+from gmem_jax.physics.step import System, accelerate, start
 from gmem_jax.preparation.piston import BLOCK, Pressed, Servo, largest_speed, press
 from gmem_jax.preparation.ringing import ringing_period
 
@@ -31,10 +34,11 @@ FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds fo
 SETTLING = 6.0e3  # t_c that coming to rest under the piston took at N = 325 to 3,267, for the progress bar
 CYCLE_SKIN = 0.5  # in R; frictionless grains turn freely, so a list lasts only some 50 t_c
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles
+FEWEST = 12  # grains of the smallest pack that was prepared
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
 DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with it all six are the paper's
 
-_press = compiled(press, static_argnames=("blocks", "march"))
+_press = Compiled(press, static_argnames=("blocks", "march"))
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,8 @@ class Recipe:
     patience: float = 6.0e4
 
     def __post_init__(self) -> None:
-        if self.grains < 2:
-            raise ValueError(f"grains must be at least 2, got {self.grains}")
+        if self.grains < FEWEST:
+            raise ValueError(f"grains must be at least {FEWEST} to jam between six walls, got {self.grains}")
         if not 0.0 < self.delta0 < 0.5:
             raise ValueError(f"delta0 must be in (0, 0.5), got {self.delta0}")
         if not 0.0 < self.filling < 0.6:
@@ -117,7 +121,7 @@ def lattice(grains: int, filling: float = 0.30) -> tuple[int, int, int]:
 
 def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array, jax.Array, np.ndarray]:
     """Positions [N, 3], quaternions [N, 4], velocities and spins [N, 3], and box lengths [3] of the lattice."""
-    spacing = max((float(clump.mass) / recipe.filling) ** (1.0 / 3.0), 1.02 * float(clump.diameter))
+    spacing = _spacing(recipe, clump)
     sites = lattice(recipe.grains, recipe.filling)
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in sites), indexing="ij"), axis=-1).reshape(-1, 3)
     cells = cells[np.argsort(cells[:, 2], kind="stable")][: recipe.grains]  # a last layer may be incomplete
@@ -132,51 +136,70 @@ def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array
     )
 
 
+def expected_time(recipe: Recipe, height: float) -> float:
+    """How long a preparation will take about, in t_c; `height` is that of the gas, in R."""
+    fall = height * (1.0 - recipe.filling / DENSE) / min(recipe.piston_speed, recipe.piston_gain)
+    cycles = recipe.cycles * (2.0 + recipe.rest + recipe.hold) + recipe.rest
+    return recipe.gas_time + fall + SETTLING + cycles * recipe.t0
+
+
+def grain_steps(recipe: Recipe, clump: Clump) -> float:
+    """What a preparation will cost about: grains times steps."""
+    height = lattice(recipe.grains, recipe.filling)[2] * _spacing(recipe, clump)
+    return recipe.grains * expected_time(recipe, height) / recipe.dt
+
+
+def _spacing(recipe: Recipe, clump: Clump) -> float:
+    """Of the lattice's sites, in R."""
+    side: float = (float(clump.mass) / recipe.filling) ** (1.0 / 3.0)
+    return max(side, 1.02 * float(clump.diameter))
+
+
 class _Preparation:
-    """One preparation on its way: a `Runner` with one replica and no friction."""
+    """One preparation on its way: a `Walker` with one replica and no friction, and the walls as they are now."""
 
     def __init__(self, recipe: Recipe, clump: Clump, material: Material, backend: str, progress: Progress) -> None:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
         self.recipe = recipe
-        box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
-        dt, self.steps = clock(recipe.t0, recipe.dt)
+        self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
+        steps = max(1, math.ceil(recipe.t0 / (BINS * recipe.dt) * (1.0 - 1e-12)))
+        self.dt = recipe.t0 / (BINS * steps)
         finder = PairFinder(clump, lengths, FREE_SKIN)
         at = jnp.asarray(position)[..., None]
         still = jnp.zeros_like(at)
         grains = Grains(at, quaternion[..., None], velocity[..., None], spin[..., None], still, still)
-        system = System(clump, Frictionless(), finder(grains, clump, box), material)
-        state = start(system, at, grains.quaternion, box)
-        state = accelerate(system, replace(state, grains=grains), box)
-        per_t0 = recipe.t0 / float(dt)
-        cycle = 2.0 + recipe.rest + recipe.hold
-        fall = float(lengths[2]) * (1.0 - recipe.filling / DENSE) / min(recipe.piston_speed, recipe.piston_gain)
-        expected = (recipe.gas_time + fall + SETTLING) / float(dt) + (recipe.cycles * cycle + recipe.rest) * per_t0
-        native.pick(backend)  # refuses an unknown one before anything is computed
-        self.march = native.march if native.name(backend, system.friction) == "native" else dynamics.march
-        self.runner = Runner(
-            system, state, box, float(dt), finder, backend=backend, progress=progress, total_work=expected
-        )
+        system = System(clump, Frictionless(), finder(grains, clump, self.box), material)
+        state = start(system, at, grains.quaternion, self.box)
+        state = accelerate(system, replace(state, grains=grains), self.box)
+        expected = expected_time(recipe, float(lengths[2])) / (self.dt * steps)
+        self.march = native.marcher(native.name(backend, system.friction))
+        course = Course(system, self._drive(), self.dt, recipe.drag, steps=steps, backend=backend)
+        self.walker = Walker(course, state, finder=finder, progress=progress, total_work=expected)
         self.log: dict[str, Sample] = {}
 
+    def _drive(self) -> Drive:
+        return Drive(self.box.lower, self.box.upper, self.recipe.delta0)
+
     def press(self, name: str, servo: Servo, duration: float, drag: float) -> Pressed:
-        """Run the servo until it has settled or `duration` is over; the list is rebuilt as often as needed."""
-        runner = self.runner
-        block = BLOCK * runner.dt
+        """Run the servo until it has settled or `duration` is over; the list is made anew as often as needed."""
+        walker = self.walker
+        block, per_bin = BLOCK * self.dt, BLOCK / walker.course.steps
         no = jnp.asarray(False)
-        pressed = Pressed(runner.state, runner.box, jnp.zeros(1), jnp.asarray(0), no, no)
+        pressed = Pressed(walker.state, self.box, jnp.zeros(1), jnp.asarray(0), no, no)
         left = math.ceil(duration / block)
         while left > 0:
-            pressed = _press(runner.system, pressed, servo, runner.dt, drag, blocks=min(CALL, left), march=self.march)
+            system = walker.course.system
+            pressed = _press(system, pressed, servo, self.dt, drag, blocks=min(CALL, left), march=self.march)
             refuse(worst(pressed.state), name)
-            runner.state, runner.box = pressed.state, pressed.box
+            walker.state, self.box = pressed.state, pressed.box
             done = int(pressed.blocks)
             left -= done
-            runner.report(name, done * BLOCK, float(done * block))
+            walker.report(name, done * per_bin, float(done * block))
             if bool(pressed.settled):
                 break
             if bool(pressed.crowded):
-                runner.rebuild()
-                pressed = replace(pressed, state=runner.state)
+                walker.renew(self.box)
+                pressed = replace(pressed, state=walker.state)
         return pressed
 
     def compact(self) -> float:
@@ -184,7 +207,7 @@ class _Preparation:
         recipe = self.recipe
         closed = Servo(recipe.pressure, 0.0, 0.0, 0.0, 0.0)
         self.press("gas", closed, recipe.gas_time, 0.0)
-        height = float(self.runner.box.lengths[2, 0])
+        height = float(self.box.lengths[2, 0])
         approach = Servo(recipe.pressure, recipe.piston_speed, recipe.piston_gain, 0.1, math.inf)
         self.press("press", approach, 4.0 * height / recipe.piston_speed, 0.0)
         settle = replace(approach, error=recipe.pressure_error, quiet=recipe.settled_speed)
@@ -194,35 +217,30 @@ class _Preparation:
                 f"settle: p_z = {float(pressed.pressure[0]):.3e} E and largest speed "
                 f"{float(largest_speed(pressed.state)):.1e} R/t_c after {recipe.patience:g} t_c; allow more patience"
             )
-        self.runner.box = still_box(self.runner.box.lower, self.runner.box.upper)
+        self.box = still_box(self.box.lower, self.box.upper)
         return float(pressed.pressure[0])
 
     def cycle(self) -> None:
         """Frictionless compress/decompress cycles of the x and y walls, then rest until quiet."""
-        recipe, runner = self.recipe, self.runner
-        lower, upper = runner.box.lower, runner.box.upper
-        smallest = smallest_box(np.asarray(lower)[:, 0], np.asarray(upper)[:, 0], recipe.delta0)
-        runner.finder, runner.skin, runner.chunk = None, CYCLE_SKIN, CYCLE_CHUNK
-        runner.smallest = smallest
-        runner.rebuild()
+        recipe, walker = self.recipe, self.walker
+        walker.course = replace(walker.course, drive=self._drive())
+        walker.finder, walker.skin, walker.chunk = None, CYCLE_SKIN, CYCLE_CHUNK
+        walker.smallest = smallest_box(
+            np.asarray(self.box.lower)[:, 0], np.asarray(self.box.upper)[:, 0], recipe.delta0
+        )
+        walker.renew(self.box)
         for number in range(1, recipe.cycles + 1):
             for stage in preparation_cycle(recipe.rest, recipe.hold):
-                self._stage(f"cycle {number}: {stage.name}", stage, lower, upper)
+                self.log |= walker.play(replace(stage, name=f"cycle {number}: {stage.name}"))
         rest = Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1))
         waited = 0.0
-        while waited == 0.0 or float(largest_speed(runner.state)) > recipe.quiet:
+        while waited == 0.0 or float(largest_speed(walker.state)) > recipe.quiet:
             if waited > recipe.patience:
                 raise RunFailedError(
-                    f"rest: largest speed {float(largest_speed(runner.state)):.1e} R/t_c after {waited:g} t_c"
+                    f"rest: largest speed {float(largest_speed(walker.state)):.1e} R/t_c after {waited:g} t_c"
                 )
-            self._stage("rest", rest, lower, upper)
+            self.log |= walker.play(rest)
             waited += rest.length * recipe.t0
-
-    def _stage(self, name: str, stage: Stage, lower: jax.Array, upper: jax.Array) -> None:
-        duration = stage.bins * self.steps * self.runner.dt
-        motion = Motion(lower, upper, self.recipe.delta0, stage.start, stage.stop, duration)
-        drag = self.recipe.drag if stage.holds else 0.0
-        self.log[name] = self.runner.stage(name, motion, bins=stage.bins, steps=int(self.steps), drag=drag)
 
 
 def prepare(
@@ -267,25 +285,25 @@ def prepare(
 
 def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw, name: str) -> Pack:
     """The pack at rest, with what was measured on it."""
-    recipe, runner = preparation.recipe, preparation.runner
-    grains, box, clump = runner.state.grains, runner.box, runner.system.clump
+    recipe, walker, box = preparation.recipe, preparation.walker, preparation.box
+    grains, clump = walker.state.grains, walker.course.system.clump
     position, quaternion = np.asarray(grains.position)[..., 0], np.asarray(grains.quaternion)[..., 0]
     centre = np.asarray(0.5 * (box.lower + box.upper))
     box = still_box(box.lower - centre, box.upper - centre)
     position = position - centre[:, 0]
     pairs = find_pairs(clump, position, quaternion, box, recipe.delta0)
     system = System(clump, friction, pairs, material)
-    period = ringing_period(system, jnp.asarray(position)[..., None], grains.quaternion, box, runner.dt)
+    period = ringing_period(system, jnp.asarray(position)[..., None], grains.quaternion, box, preparation.dt)
     last = jax.tree.map(lambda leaf: leaf[-1, ..., 0].tolist(), preparation.log["rest"])
     record = {
         "recipe": asdict(recipe),
         "grain": clump.shape,
         "material": asdict(material),
-        "rebuilds": runner.rebuilds,
-        "simulated_time": runner.time,
+        "rebuilds": walker.rebuilds,
+        "simulated_time": walker.time,
         "at_rest": asdict(last),
         **provenance(),
-        "backend": native.name(runner.backend, friction),
+        "backend": native.name(walker.course.backend, friction),
     }
     return Pack(
         clump=clump,

@@ -6,9 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.host import Progress, Runner, silent
-from gmem_jax.experiment.protocol import Motion
-from gmem_jax.physics.state import Box, Scalar
+from gmem_jax.experiment.drive import Drive
+from gmem_jax.experiment.host import Progress, Walker, silent
+from gmem_jax.experiment.protocol import Stage
+from gmem_jax.experiment.signals import BINS
+from gmem_jax.experiment.walk import Course
+from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.state import Box
 from gmem_jax.physics.step import System, accelerate, start
 
 KICK = 2.0e-5  # strain rate of the kick, 1 / t_c: strains of about 1e-4, below which the response is linear enough
@@ -47,8 +51,8 @@ def ringing_period(
     rate = KICK * jnp.asarray([-1.0, 1.0, 0.0])[:, None]
     velocity = rate * (position - 0.5 * (box.lower + box.upper))
     state = accelerate(system, replace(state, grains=replace(state.grains, velocity=velocity)), box)
-    still = Motion(box.lower, box.upper, 0.0, 0.0, 0.0, duration)
-    runner = Runner(system, state, box, dt, progress=progress, total_work=float(bins * STEPS))
-    sample = runner.stage("ringing", still, bins=bins, steps=STEPS)
+    still = Course(system, Drive(box.lower, box.upper, 0.0), dt, steps=STEPS)
+    walker = Walker(still, state, progress=progress, total_work=float(bins))
+    sample = walker.play(Stage("ringing", 0.0, 0.0, bins / BINS))["ringing"]
     pressure = np.asarray(sample.pressure)[:, :, 0]
     return spectrum_peak(pressure[:, 0] - pressure[:, 1], STEPS * float(dt))

@@ -1,27 +1,51 @@
 """Pictures. Matplotlib is imported on first use, and without a display."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from gmem_jax.design.kernel import MemoryKernel
+from gmem_jax.design.waveforms import Design
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.storage import atomic
+from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.pytree import Scalar
 
 
-def recall_figure(path: Path, recall: Recall, delta0: float, gamma0: float, title: str) -> None:
-    """p_sig of every signal and its scaled integral G E delta0 gamma0 J, like the paper's Fig. 6; at most 12 panels.
-
-    Raises:
-        OSError: if the path cannot be written.
-    """
+def _pyplot() -> Any:
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    return plt
+
+
+def _save(path: Path, figure: Any) -> None:
+    figure.tight_layout()
+    with atomic(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=130)
+    _pyplot().close(figure)
+
+
+def recall_figure(path: Path, recall: Recall, scale: Scalar, title: str) -> None:
+    """p_sig of every signal and its scaled integral G E delta0 gamma0 J, like the paper's Fig. 6; at most 12 panels.
+
+    Args:
+        path: file to write.
+        recall: what to draw.
+        scale: delta0 gamma0, scalar or [S, 1].
+        title: over the picture.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    plt = _pyplot()
     unit = Material().modulus
     u, signals, integrals = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J))
+    scaled_integrals = float(recall.gain) * np.asarray(scale) * integrals
     shown = min(len(signals), 12)
     columns = min(shown, 3)
     lines = -(-shown // columns)
@@ -34,7 +58,7 @@ def recall_figure(path: Path, recall: Recall, delta0: float, gamma0: float, titl
             continue
         axis.axhline(0.0, color="0.8", linewidth=0.8)
         axis.plot(u, unit * signals[number], color="C0", linewidth=1.2, label="recalled $p_{sig}$")
-        scaled = float(recall.gain) * delta0 * gamma0 * integrals[number]
+        scaled = scaled_integrals[number]
         axis.plot(u, unit * scaled, color="C3", linewidth=1.2, linestyle="--", label=r"$G E \delta_0 \gamma_0 J$")
         axis.set_title(f"signal {number + 1}", fontsize=9)
     for axis in axes[-1]:
@@ -43,10 +67,7 @@ def recall_figure(path: Path, recall: Recall, delta0: float, gamma0: float, titl
         axis.set_ylabel("stress (Pa)")
     axes[0, 0].legend(fontsize=7, frameon=False)
     figure.suptitle(f"{title}: G = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}", fontsize=10)
-    figure.tight_layout()
-    with atomic(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=130)
-    plt.close(figure)
+    _save(path, figure)
 
 
 def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:
@@ -55,11 +76,7 @@ def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:
     Raises:
         OSError: if the path cannot be written.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    plt = _pyplot()
     count = len(table)
     bits = count.bit_length() - 1
     figure, axes = plt.subplots(figsize=(5.6, 5.0))
@@ -78,7 +95,86 @@ def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:
     axes.set_ylabel("word stored")
     axes.set_title(title, fontsize=10)
     figure.colorbar(image, label="part of the readings", shrink=0.8)
-    figure.tight_layout()
-    with atomic(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=130)
-    plt.close(figure)
+    _save(path, figure)
+
+
+def gradient_figure(path: Path, rows: Sequence[tuple[np.ndarray, np.ndarray]], title: str) -> None:
+    """dF / da of every signal's heights against where in u they act; a pair (places, slopes) for each signal.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    figure, axis = _pyplot().subplots(figsize=(6.4, 3.6))
+    for number, (place, slope) in enumerate(rows):
+        axis.plot(place, slope, "o-", markersize=4, linewidth=0.8, label=f"signal {number + 1}")
+    axis.axhline(0.0, color="0.8", linewidth=0.8)
+    axis.set(xlabel="compression variable u", ylabel="dF / d amplitude", title=title)
+    axis.legend(fontsize=7, frameon=False)
+    _save(path, figure)
+
+
+def kernel_figure(path: Path, kernel: MemoryKernel, noise: float, title: str) -> None:
+    """M(u, v), and its singular values beside the noise.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    figure, (left, right) = _pyplot().subplots(1, 2, figsize=(9.6, 3.9))
+    values = kernel.kernel() / kernel.delta0
+    limit = float(np.abs(values).max())
+    image = left.pcolormesh(kernel.centres, kernel.u, values, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="nearest")
+    figure.colorbar(image, ax=left, label=r"$M(u, v) / E \delta_0$")
+    left.plot([0, 1], [0, 1], color="0.3", linewidth=0.8)
+    left.set(xlabel="v (where the shear acts)", ylabel="u (where it is read)", title=title)
+    singular = kernel.singular_values() * Material().modulus
+    right.semilogy(np.arange(1, singular.size + 1), singular, "o-", markersize=4)
+    right.axhline(noise * Material().modulus, color="C3", linestyle="--", linewidth=0.8, label="noise")
+    right.set(xlabel="number", ylabel="singular value (Pa)", title="recall of the n-th best waveform")
+    right.legend(frameon=False, fontsize=8)
+    _save(path, figure)
+
+
+def history_figure(path: Path, histories: dict[str, Sequence[float]]) -> None:
+    """1 - F against iterations.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    figure, axis = _pyplot().subplots(figsize=(5.2, 3.6))
+    for name, history in histories.items():
+        axis.semilogy(range(len(history)), 1.0 - np.asarray(history), "o-", markersize=4, label=name)
+    axis.set(xlabel="iteration", ylabel="1 - F")
+    axis.legend(frameon=False, fontsize=8)
+    _save(path, figure)
+
+
+def design_figure(path: Path, design: Design, unit: float, title: str) -> None:
+    """Designed waveforms, and their recall beside the targets and what the untouched waveforms gave.
+
+    Args:
+        path: file to write.
+        design: the design, of S signals.
+        unit: delta0 gamma0.
+        title: over the picture.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    shown = min(len(design.target), 6)
+    u = (np.arange(design.target.shape[1]) + 0.5) / design.target.shape[1]
+    pascal = Material().modulus
+    figure, axes = _pyplot().subplots(2, shown, figsize=(2.6 * shown, 4.8), sharex=True, sharey="row", squeeze=False)
+    nodes = np.linspace(0.0, 1.0, design.signals.nodes.shape[1])
+    for number in range(shown):
+        axes[0, number].plot(nodes, np.asarray(design.signals.nodes[number]), color="C2")
+        axes[0, number].set_title(f"signal {number + 1}", fontsize=9)
+        low = axes[1, number]
+        low.plot(u, pascal * design.untouched[number], color="0.7", label="recall, untouched")
+        low.plot(u, pascal * design.p_sig[number], color="C0", label="recall, designed")
+        low.plot(u, pascal * design.gain * unit * design.target[number], "--", color="C3", label="target")
+        low.set_xlabel("u")
+    axes[0, 0].set_ylabel("designed I(u)")
+    axes[1, 0].set_ylabel("stress (Pa)")
+    axes[1, 0].legend(fontsize=6, frameon=False)
+    figure.suptitle(f"{title}: F {design.before:.3f} -> {design.fidelity:.3f}", fontsize=10)
+    _save(path, figure)

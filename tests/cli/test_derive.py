@@ -10,7 +10,6 @@ from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
 from gmem_jax.command import derive
-from gmem_jax.command.config import RecallConfig
 
 
 def test_kernel_and_design_write_what_they_say(
@@ -40,7 +39,7 @@ def test_gradient_prints_finite_slopes_of_everything(
     target = tmp_path / "gradient.json"
     assert gmem(monkeypatch, "gradient", PACK, "-o", target, "--signals", waves, "--json", *SHORT) == 0
     said = json.loads(capsys.readouterr().out)
-    assert np.shape(said["gradient"]["waveform"]) == (1, 8)
+    assert np.shape(said["gradient"]["waveform"]) == np.shape(said["places"]) == (1, 8)
     assert all(np.all(np.isfinite(slope)) for slope in said["gradient"].values())
     assert json.loads(target.read_text())["fidelity"] == said["fidelity"]
     assert (tmp_path / "gradient.png").exists()
@@ -68,6 +67,20 @@ def test_bounds_that_make_no_sense_are_refused_in_one_line(
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_another_background_is_refused() -> None:
-    with pytest.raises(ValueError, match="sub0"):
-        derive.experiment_of(RecallConfig(pack=str(PACK), background="sub2"))
+@pytest.mark.parametrize("command", ["design", "tune"])
+def test_designs_are_made_with_sub0(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, command: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert gmem(monkeypatch, command, PACK, "--background", "SUB2", *SHORT) == 2
+    assert "designs are made with sub0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["recall", "gradient", "kernel", "design", "tune"])
+def test_every_command_takes_the_whole_experiment(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, command: str
+) -> None:
+    assert gmem(monkeypatch, command, "--help") == 0
+    said = capsys.readouterr().out
+    for option in ("--stiffness", "--delta0", "--dt", "--backend", "--hold-drag", "--points", "--variant", "--force"):
+        assert option in said

@@ -32,7 +32,7 @@ def test_a_recall_killed_in_the_middle_goes_on_to_the_same_bits(tmp_path: Path) 
     target, parts = tmp_path / "killed.h5", tmp_path / "killed.h5.parts"
     run = recall(target)
     deadline = time.monotonic() + 300.0
-    while not (parts / "batch-0000.pickle").exists():
+    while not (parts / "batch-0000.npz").exists():
         assert run.poll() is None, target.with_suffix(".log").read_text()
         assert time.monotonic() < deadline, "no batch was finished in five minutes"
         time.sleep(0.01)

@@ -19,7 +19,7 @@ import scenes
 
 import gmem_jax as gm
 from gmem_jax.bench import lammps
-from gmem_jax.experiment.host import compiled
+from gmem_jax.experiment.host import Compiled
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
@@ -46,6 +46,9 @@ def surface_kinematics(separation, velocity, spin_sum, valid, dt):
 @pytest.fixture
 def lammps_kinematics(monkeypatch):
     monkeypatch.setattr(dynamics, "kinematics", surface_kinematics)
+    jax.clear_caches()  # of what was traced with our own kinematics
+    yield
+    jax.clear_caches()
 
 
 # ---------------------------------------------------------------- one contact, prescribed motion
@@ -192,7 +195,7 @@ class Comparison:
 
             return jax.lax.fori_loop(0, steps, one, (state, jnp.zeros((2, 3, 1))))
 
-        self._block = compiled(block)
+        self._block = Compiled(block)
 
     def ours(self, dt, steps, frames):
         """Positions, velocities, spins [frames, N, 3] and wall forces [frames, F] (-x, +x, -y, ...)."""
@@ -299,7 +302,7 @@ def strained_pack(law, strain=1e-3, duration=300.0):
     lower, upper = np.asarray(pack.lower), np.asarray(pack.upper)
     inward = 0.5 * strain / duration * (upper - lower) * np.array([1.0, 1.0, 0.0])
     system = dynamics.System(pack.clump, law, pack.pairs)
-    start = compiled(dynamics.start)
+    start = Compiled(dynamics.start)
     state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
     return Comparison(system, state, Planes(lower, upper, inward, -inward))
 

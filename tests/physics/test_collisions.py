@@ -7,9 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import ELASTIC, FREE, SPHERE, column, record, scene, still
+from scenes import ELASTIC, FREE, SPHERE, Motion, column, record, scene, still
 
-from gmem_jax.experiment.protocol import Motion
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import still_box

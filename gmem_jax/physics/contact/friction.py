@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from gmem_jax.physics.contact.kinematics import Kinematics
+from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.rotation import dot
-from gmem_jax.physics.state import Scalar
 
 
 @runtime_checkable

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from gmem_jax.physics.contact.kinematics import Kinematics
+from gmem_jax.physics.pytree import pytree
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Frictionless:
     """mu = 0 (paper, Sec. II: the pack is prepared without friction)."""

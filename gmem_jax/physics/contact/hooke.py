@@ -8,10 +8,10 @@ import jax.numpy as jnp
 
 from gmem_jax.physics.contact.friction import coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
-from gmem_jax.physics.state import Scalar
+from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Hooke:
     """df_e = k dsigma, f_d = damping_time k dsigma/dt, |f_e + f_d| <= mu f_n (paper, Sec. II).
@@ -23,9 +23,12 @@ class Hooke:
         damping_time: gamma_H / k_H in t_c; scalar or [B].
     """
 
-    mu: Scalar = 1.0
-    stiffness: Scalar = 0.145
-    damping_time: Scalar = 0.069
+    mu: Scalar = parameter(1.0, "[0, inf)")
+    stiffness: Scalar = parameter(0.145, "(0, inf)")
+    damping_time: Scalar = parameter(0.069, "[0, inf)")
+
+    def __post_init__(self) -> None:
+        settle(self)
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> jax.Array:
         """No elastic force yet: zeros, [contacts, 3, replicas]."""

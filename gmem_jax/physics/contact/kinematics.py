@@ -5,10 +5,11 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from gmem_jax.physics.pytree import pytree
 from gmem_jax.physics.rotation import cross, dot
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Kinematics:
     """Relative position and motion at P candidate contacts; [P, 3, B] vectors, [P, 1, B] scalars.

@@ -1,6 +1,6 @@
 """M2: the Mindlin contact with its whole history, resolved by the overlap at which each part was attached."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from gmem_jax.physics.contact.friction import coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle, static
 from gmem_jax.physics.rotation import cross, dot
-from gmem_jax.physics.state import Scalar
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class LayeredHistory:
     """What M2 remembers of a contact; zero for an untouched one.
@@ -48,7 +48,7 @@ def transport_layers(layers: jax.Array, kin: Kinematics) -> jax.Array:
     return moved * jnp.where(alive, jnp.sqrt(jnp.where(alive, before, 1.0) / jnp.where(alive, after, 1.0)), 1.0)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class Mindlin:
     """f_e is the integral of f(q) over 0 < q < sqrt(p), where df = k dsigma; f beyond is forgotten (App. D.2).
@@ -81,14 +81,15 @@ class Mindlin:
         ValueError: if `points` or `variant` is none of these.
     """
 
-    mu: Scalar = 1.0
-    stiffness: Scalar = Material().mindlin_stiffness
-    damping_time: Scalar = Material().tangential_damping
-    p_max: Scalar = 0.2
-    points: int = field(default=100, metadata={"static": True})
-    variant: Literal["averaged", "exact", "paper"] = field(default="averaged", metadata={"static": True})
+    mu: Scalar = parameter(1.0, "[0, inf)")
+    stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)")
+    damping_time: Scalar = parameter(Material().tangential_damping, "[0, inf)")
+    p_max: Scalar = parameter(0.2, "(0, inf)")
+    points: int = static(100)
+    variant: Literal["averaged", "exact", "paper"] = static("averaged")
 
     def __post_init__(self) -> None:
+        settle(self)
         if self.points < 2:
             raise ValueError(f"Mindlin.points must be at least 2, got {self.points}")
         if self.variant not in ("averaged", "exact", "paper"):

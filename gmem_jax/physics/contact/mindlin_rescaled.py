@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from gmem_jax.physics.contact.friction import coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.state import Scalar
+from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class RescaledHistory:
     """What M1 remembers of a contact; zero for an untouched one.
@@ -26,7 +26,7 @@ class RescaledHistory:
     overlap: jax.Array
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclass(frozen=True)
 class MindlinRescaled:
     """f_e *= sqrt(p / p_old) on unloading, then df_e = k p^0.5 dsigma, f_d = damping_time k p^0.5 dsigma/dt (Sec. II).
@@ -42,9 +42,12 @@ class MindlinRescaled:
         damping_time: gamma_M / k_M in t_c; scalar or [B].
     """
 
-    mu: Scalar = 1.0
-    stiffness: Scalar = Material().mindlin_stiffness
-    damping_time: Scalar = Material().tangential_damping
+    mu: Scalar = parameter(1.0, "[0, inf)")
+    stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)")
+    damping_time: Scalar = parameter(Material().tangential_damping, "[0, inf)")
+
+    def __post_init__(self) -> None:
+        settle(self)
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> RescaledHistory:
         """No elastic force and no overlap yet."""

@@ -3,9 +3,11 @@
 import jax
 import jax.numpy as jnp
 
+from gmem_jax.physics.pytree import Scalar
+
 
 def hertz(
-    overlap: jax.Array, closing: jax.Array, touching: jax.Array, stiffness: float, damping_time: float
+    overlap: jax.Array, closing: jax.Array, touching: jax.Array, stiffness: Scalar, damping_time: Scalar
 ) -> jax.Array:
     """f_n = max(0, k p^1.5 + gamma p^0.5 dp/dt) with gamma = damping_time k (paper, Sec. II).
 

@@ -10,7 +10,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.kinematics import Kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.state import Scalar
+from gmem_jax.physics.pytree import Scalar
 
 
 def led_contact(overlap: jax.Array, sliding: jax.Array, dt: Scalar) -> Kinematics:

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 
 from gmem_jax.physics.contact.normal import hertz
+from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.state import Box
 
 
 def wall_forces(
-    position: jax.Array, velocity: jax.Array, box: Box, stiffness: float, damping_time: float
+    position: jax.Array, velocity: jax.Array, box: Box, stiffness: Scalar, damping_time: Scalar
 ) -> tuple[jax.Array, jax.Array]:
     """Damped Hertz contact of unit spheres with the planes; damping acts on the velocity relative to the plane.
 

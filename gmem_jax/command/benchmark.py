@@ -1,0 +1,51 @@
+"""`gmem bench`."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gmem_jax.bench import measure
+from gmem_jax.command.console import AsJson, InputError, claim, emit, reporting
+from gmem_jax.files.packs import list_packs, load_pack
+
+
+def bench_command(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for bench.json and bench.md.")] = Path("bench"),
+    packs: Annotated[str, typer.Option(help="Packs, separated by commas; default one of each shipped size.")] = "",
+    laws: Annotated[str, typer.Option(help="Friction laws among H, M1, M2, separated by commas.")] = "H,M1,M2",
+    replicas: Annotated[str, typer.Option(help="Numbers of replicas, separated by commas.")] = "1,8,16,32",
+    with_lammps: Annotated[bool, typer.Option("--lammps/--no-lammps", help="Measure LAMMPS beside us.")] = True,
+    baseline: Annotated[Path | None, typer.Option(help="A bench.json to compare with.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what a grain-step costs: native backend, plain JAX and LAMMPS, side by side.
+
+    The folder's bench.json and bench.md are replaced.
+    """
+    shipped = [f"tetra-{size}-a" for size in (325, 1024, 3267)]
+    names = packs.split(",") if packs else [name for name in shipped if name in list_packs()]
+    chosen = laws.split(",")
+    if unknown := [law for law in chosen if law not in measure.LAWS]:
+        raise InputError(f"--laws {unknown[0]}: no such law; there are {', '.join(measure.LAWS)}")
+    counts = replicas.split(",")
+    if not all(count.isdigit() and int(count) > 0 for count in counts):
+        raise InputError(f"--replicas {replicas}: must be positive whole numbers, separated by commas")
+    before = json.loads(baseline.read_text()) if baseline else None
+    claim(output.parent / "bench.json" if not output.is_dir() else output / "bench.json", ".json", force=True)
+    with reporting() as progress:
+        result = measure.run(
+            load_pack,
+            names,
+            laws=chosen,
+            replicas=[int(count) for count in counts],
+            with_lammps=with_lammps,
+            say=lambda what, fraction: progress(what, 0.0, fraction),
+        )
+    text = measure.markdown(result, before)
+    measure.save(output, result, text)
+    emit(as_json, {**result, "status": 0}, text)
+
+
+COMMANDS = {"bench": bench_command}

@@ -1,0 +1,107 @@
+"""`gmem classify`."""
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich import progress
+
+from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, emit, log, pictured, say
+from gmem_jax.files.atomic import atomic
+from gmem_jax.files.recalls import load_recall
+from gmem_jax.show import figures, tables
+
+if TYPE_CHECKING:
+    from gmem_jax.reading import training
+
+
+@contextlib.contextmanager
+def _training(budget: float) -> Iterator["training.Listener"]:
+    """Loss and validation accuracy of a training: in a bar of its time on a terminal, a line now and then elsewhere."""
+
+    def words(one: "training.Training") -> str:
+        passed = f"seed {one.seed}: step {one.step}, loss {one.loss:.3f}"
+        return f"{passed}, held-out accuracy {one.validation:.4f}"
+
+    began = time.perf_counter()
+    if not log.is_terminal:
+        last = began
+
+        def line(one: "training.Training") -> None:
+            nonlocal last
+            if one.finished or time.perf_counter() - last > EVERY:
+                last = time.perf_counter()
+                say(words(one))
+
+        yield line
+        return
+    columns = (progress.TextColumn("{task.description}"), progress.BarColumn())
+    more = (progress.TextColumn("of the time budget"), progress.TimeElapsedColumn())
+    with progress.Progress(*columns, *more, console=log) as bar:
+        task = bar.add_task("compiling", total=budget)
+        yield lambda one: bar.update(task, completed=min(time.perf_counter() - began, budget), description=words(one))
+
+
+def classify_command(
+    recall: Annotated[Path, typer.Argument(help="A recall of binary words (gmem recall --signals words:L).")],
+    output: Output = Path("classify.json"),
+    seeds: Annotated[int, typer.Option(min=1, help="Nets to train, with seeds 0, 1, ...")] = 3,
+    budget: Annotated[float, typer.Option(min=0.0, help="Longest training of one net, seconds.")] = 300.0,
+    nets: Annotated[
+        Path | None,
+        typer.Option(help="Folder of trained nets, used and added to; default gmem-nets beside the recall."),
+    ] = None,
+    picture: Picture = True,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Read recalled binary words: the paper's neural net, trained on inputs only, and two baselines.
+
+    A net depends on the length of the words and its seed, not on the recall: nets in the folder are used again, and
+    those that ran out of time are trained on.
+    """
+    kept, configuration = load_recall(recall)
+    # Here, not above: flax takes a second to load, and no other command needs it.
+    from gmem_jax.reading import report, training
+    from gmem_jax.reading.lessons import Lessons
+    from gmem_jax.reading.readers import confusion, stored_words
+
+    try:
+        stored = stored_words(kept)
+    except ValueError as error:
+        raise InputError(f"{recall}: {error}; make one with gmem recall --signals words:L") from error
+    claim(output, ".json", inputs=(recall,), force=force)
+    drawn = pictured(output, picture, inputs=(recall,), force=force)
+    folder = recall.parent / "gmem-nets" if nets is None else nets
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--nets {folder}: cannot make this folder ({error.strerror})") from error
+    say(f"{stored.bits}-bit words of pack {configuration['pack']}, background {stored.background.upper()}")
+    began = time.perf_counter()
+    trained = []
+    for seed in range(seeds):
+        file = claim(folder / f"words-{stored.bits}-seed-{seed}.msgpack", "", force=True, option="--nets")
+        with _training(budget) as listener:
+            one = training.train(Lessons(stored.bits), seed, budget=budget, checkpoint=file, listener=listener)
+        trained.append(one)
+        state = "trained" if one.finished else "out of time"
+        say(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}")
+    result = report.reading(stored, trained)
+    seconds = time.perf_counter() - began
+    result = {"recall": str(recall), "pack": configuration["pack"], "status": 0, "seconds": seconds, **result}
+    with atomic(output) as temporary:
+        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    if drawn:
+        net = result["readers"]["net"]
+        title = f"{configuration['pack']}, {stored.bits} bits: accuracy {net['accuracy']:.3f} ({seeds} nets)"
+        figures.confusion_figure(drawn, confusion(net["read"], len(stored.signals)), title)
+    say(f"wrote {output}" + (f" and {drawn}" if drawn else ""))
+    emit(as_json, result, *tables.reading_tables(result))
+
+
+COMMANDS = {"classify": classify_command}

@@ -1,0 +1,168 @@
+"""What every command says and how: logs and progress on stderr, results on stdout, outputs that destroy nothing."""
+
+import contextlib
+import json
+import math
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import psutil
+import typer
+from rich import progress
+from rich.console import Console
+
+from gmem_jax.experiment.host import Progress
+from gmem_jax.files.atomic import probe
+
+log = Console(stderr=True, highlight=False)
+out = Console(highlight=False)
+
+COST = {
+    "native": (0.2, 0.08),
+    "jax": (2.0, 1.3),
+}  # us a grain-step on two cores, one replica and several; see benchmarks
+EVERY = 30.0  # seconds between lines of progress where there is no terminal
+
+Output = Annotated[Path, typer.Option("-o", "--output", help="File to write.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; logs go to stderr.")]
+Picture = Annotated[bool, typer.Option(help="Also draw it, beside the output.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")]
+PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a shipped pack.")]
+
+
+class InputError(ValueError):
+    """Bad input, in words for the command line."""
+
+
+def say(line: str, **style: Any) -> None:
+    """A line of the log."""
+    log.print(line, soft_wrap=True, markup=False, **style)
+
+
+def emit(as_json: bool, result: Any, *tables: Any) -> None:
+    """The result: one JSON object, or tables and lines for a person."""
+    if as_json:
+        sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
+    else:
+        for table in tables:
+            out.print(table)
+
+
+def finite(value: Any) -> Any:
+    """The same with null for numbers that are none, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool, option: str = "--output") -> Path:
+    """`path`, once it is sure that writing it can succeed and destroys nothing: a long run must not end in a refusal.
+
+    Args:
+        path: the file to write.
+        suffix: that its name must have; "" for any.
+        inputs: files that the command reads, which are never written onto.
+        force: whether a file that is there may be replaced.
+        option: what to name in the refusal.
+
+    Raises:
+        InputError: saying what is wrong, and what would be right.
+    """
+    folder = path.parent
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder; name a file")
+    if not folder.is_dir():
+        raise InputError(f"{option} {path}: folder {folder} does not exist")
+    if suffix and path.suffix.lower() != suffix:
+        raise InputError(f"{option} {path}: this is a {suffix} file; name it {path.with_suffix(suffix).name}")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{option} {path}: is neither a file nor free; name a file")
+    for read in inputs:
+        if path.exists() and Path(read).exists() and path.samefile(read):
+            raise InputError(f"{option} {path}: is an input of this command; name another file")
+    if path.exists() and not force:
+        raise InputError(f"{option} {path}: exists; name another file, or allow its replacement with --force")
+    try:
+        probe(folder)
+    except OSError as error:
+        raise InputError(f"{option} {path}: cannot write there ({error.strerror})") from error
+    return path
+
+
+def pictured(data: Path, picture: bool, *, inputs: tuple[Any, ...] = (), force: bool) -> Path | None:
+    """The picture's path beside an output, claimed too; None if none is wanted."""
+    return claim(data.with_suffix(".png"), ".png", inputs=inputs, force=force) if picture else None
+
+
+def announce(what: str, grain_steps: float, memory: float, backend: str, replicas: int = 1) -> None:
+    """Say what a run will need before it begins, and refuse what cannot fit the free memory.
+
+    Args:
+        what: the run.
+        grain_steps: grains times steps times replicas.
+        memory: in bytes.
+        backend: who does the steps.
+        replicas: side by side: several are cheaper than one.
+
+    Raises:
+        InputError: saying what is needed and what there is.
+    """
+    free = psutil.virtual_memory().available
+    seconds = 1e-6 * COST[backend][replicas > 1] * grain_steps
+    units = (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0), ("seconds", 1.0))
+    name, unit = next(pair for pair in units if seconds >= 2.0 * pair[1] or pair[1] == 1.0)
+    needs = f"some {max(1, round(seconds / unit))} {name} on a free machine and {memory / 1e9:.1f} GB of memory"
+    if memory > free:
+        raise InputError(f"{what} needs {needs}, and {free / 1e9:.1f} GB are free")
+    say(f"{what}: {needs}")
+
+
+class RunInterruptedError(KeyboardInterrupt):
+    """Ctrl-C in a run whose finished parts are kept."""
+
+
+@contextlib.contextmanager
+def reporting(*, goes_on: bool = False) -> Iterator[Progress]:
+    """Progress of a run: a bar on a terminal; elsewhere a line for every stage, and one at least every 30 s.
+
+    Args:
+        goes_on: whether the same command goes on where it was interrupted.
+    """
+    try:
+        with _reporting() as progress:
+            yield progress
+    except KeyboardInterrupt:
+        raise (RunInterruptedError if goes_on else KeyboardInterrupt) from None
+
+
+@contextlib.contextmanager
+def _reporting() -> Iterator[Progress]:
+    if not log.is_terminal:
+        told, at = "", -math.inf
+        first: tuple[float, float] | None = None  # when the first chunk was done: what came before is compiling
+
+        def line(stage: str, moment: float, fraction: float) -> None:
+            nonlocal told, at, first
+            now = time.perf_counter()
+            first = first or (now, fraction)
+            if stage == told and now - at < EVERY:
+                return
+            told, at = stage, now
+            since, done = now - first[0], fraction - first[1]
+            left = f", {since * (1.0 - fraction) / done:.0f} s left" if done > 0.01 and fraction < 1.0 else ""
+            say(f"{fraction:5.0%}  {stage}" + (f" (t = {moment:.0f} t_c{left})" if moment else left))
+
+        yield line
+        return
+    columns = (progress.TextColumn("{task.description}"), progress.BarColumn(), progress.TaskProgressColumn())
+    times = (progress.TimeElapsedColumn(), progress.TextColumn("ETA"), progress.TimeRemainingColumn())
+    with progress.Progress(*columns, *times, console=log) as bar:
+        task = bar.add_task("compiling", total=1.0)
+        yield lambda stage, moment, fraction: bar.update(
+            task, completed=fraction, description=f"{stage}, t = {moment:.0f} t_c" if moment else stage
+        )

@@ -1,0 +1,129 @@
+"""Options that describe an experiment: the same for every command, their defaults those of `Experiment` and its law."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import typer
+
+from gmem_jax.command.console import InputError
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.signals import LONGEST_WORD, Signals, six_signals, waveform, words
+from gmem_jax.files.packs import load_pack
+from gmem_jax.files.waveforms import load_waveforms
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.laws import LAWS, law_named
+
+_NAMES = ", ".join(entry.name for entry in LAWS)
+
+
+class _Option(NamedTuple):
+    kind: Any
+    words: str
+
+
+_FIELDS = {  # of an experiment
+    "gamma0": _Option(float, "Shear amplitude."),
+    "delta0": _Option(float | None, "Areal compression; default the pack's own."),
+    "t0": _Option(float, "Duration of one compression, t_c (the paper's is 18000)."),
+    "dt": _Option(float, "Largest time step, t_c."),
+    "rest": _Option(float, "Rests at u = 0, in t0."),
+    "hold": _Option(float, "Holds at u = 1, in t0."),
+    "store": _Option(float, "Storage, in t0."),
+    "hold_drag": _Option(float | None, "Drag in holds, 1/t_c; default 0.05 if t0 < 18000."),
+    "background": _Option(str, "sub0, sub2 or sub2-bl."),
+    "backend": _Option(str, "auto, jax or native."),
+}
+_OF_LAW = {  # of its friction law
+    "mu": _Option(float, "Friction coefficient."),
+    "stiffness": _Option(float | None, "k_H in E R, or k_M in E R^0.5; default the law's."),
+    "damping_time": _Option(float | None, "Tangential damping over stiffness, t_c; default the law's."),
+    "p_max": _Option(float | None, "m2: largest overlap of its history, R."),
+    "points": _Option(int | None, "m2: points of its history."),
+    "variant": _Option(str | None, "m2: averaged, exact or paper."),
+}
+_OTHERS = {
+    "signals": _Option(str, "six; words:L, all words of L bits; or a .csv (a column per signal) or .npy file."),
+    "friction": _Option(str, f"Friction law: {_NAMES}, or the paper's H, M1, M2."),
+}
+
+
+def named_signals(name: str) -> Signals:
+    """Waveforms by what the command line calls them.
+
+    Raises:
+        InputError: if the name is none.
+        FileFormatError: if a file cannot be read.
+    """
+    kind, _, length = name.lower().partition(":")
+    if kind == "six":
+        return six_signals()
+    if kind == "words":
+        if not length.isdecimal() or not 1 <= int(length) <= LONGEST_WORD:
+            raise InputError(f"--signals {name}: words need a length from 1 to {LONGEST_WORD}, as in words:3")
+        return words(int(length))
+    if Path(name).suffix.lower() not in (".csv", ".npy"):
+        raise InputError(f'--signals {name}: must be "six", "words:L" or a .csv or .npy file')
+    return waveform(load_waveforms(Path(name)))
+
+
+class Chosen:
+    """What the options of a command chose; a pack makes an experiment of it.
+
+    Attributes:
+        inputs: files that are read.
+    """
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        self._values = values
+        self.inputs: tuple[str, ...] = (values["signals"],)
+
+    def experiment(self, pack: str) -> Experiment:
+        """The experiment on a pack file, or a shipped pack.
+
+        Raises:
+            ValueError: for impossible values.
+            FileNotFoundError: if there is no such pack.
+        """
+        values = self._values
+        of_law = {name: values[name] for name in _OF_LAW if values[name] is not None}
+        if values["friction"].lower() == "frictionless" or values["friction"] == "mu = 0":
+            of_law.pop("mu")
+        law = law_named(values["friction"], **of_law)
+        signals = named_signals(values["signals"])
+        return Experiment(load_pack(pack), signals, law, **{name: values[name] for name in _FIELDS})
+
+
+def _default(name: str) -> Any:
+    if name in _FIELDS:
+        return next(entry.default for entry in fields(Experiment) if entry.name == name)
+    return {"signals": "six", "friction": "hooke", "mu": Hooke().mu}.get(name)
+
+
+def with_experiment(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command all options of an experiment; it gets what they chose as `chosen`."""
+    options = {**_OTHERS, **_OF_LAW, **_FIELDS}
+    signature = inspect.signature(command)
+    own = [entry for entry in signature.parameters.values() if entry.name != "chosen"]
+    added = [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=_default(name),
+            annotation=Annotated[option.kind, typer.Option(help=option.words)],
+        )
+        for name, option in options.items()
+    ]
+
+    @functools.wraps(command)
+    def wrapper(**given: Any) -> None:
+        chosen = Chosen({name: given.pop(name) for name in options})
+        command(chosen=chosen, **given)
+
+    wrapper.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=[entry.replace(kind=inspect.Parameter.KEYWORD_ONLY) for entry in own] + added
+    )
+    return wrapper

@@ -1,0 +1,76 @@
+"""`gmem info`, `gmem prepare`."""
+
+import time
+from typing import Annotated, Any
+
+import jax
+import typer
+
+from gmem_jax import native
+from gmem_jax.command.console import AsJson, Force, InputError, Output, announce, claim, emit, reporting, say
+from gmem_jax.files.packs import list_packs, save_pack
+from gmem_jax.files.provenance import provenance
+from gmem_jax.physics import grain
+from gmem_jax.physics.contact.frictionless import Frictionless
+from gmem_jax.physics.sample import Sample
+from gmem_jax.preparation.preparation import Recipe, grain_steps, prepare
+from gmem_jax.show import tables
+
+
+def info(as_json: AsJson = False) -> None:
+    """Versions, devices, backend and shipped packs."""
+    built, why = native.available()
+    facts: dict[str, Any] = {
+        **provenance(),
+        "devices": [f"{d.platform}: {d.device_kind}" for d in jax.devices()],
+        "backend": f"native ({why})" if built else f"jax (no native backend: {why})",
+        "packs": list_packs(),
+    }
+    lines = [f"{key}: {value}" for key, value in facts["versions"].items()]
+    lines += [f"commit: {facts['commit']}", f"backend: {facts['backend']}"]
+    lines += [f"device: {device}" for device in facts["devices"]]
+    lines += ["shipped packs: " + ", ".join(facts["packs"])]
+    emit(as_json, facts, "\n".join(lines))
+
+
+PREPARATION_BYTES = 2e4  # of memory a grain: lists while grains fly, at N = 10,240
+_DEFAULT = Recipe()
+
+
+def prepare_command(
+    output: Output,
+    grains: Annotated[int, typer.Option(help="Number of grains N.")] = _DEFAULT.grains,
+    shape: Annotated[str, typer.Option(help="tetra or sphere.")] = "tetra",
+    overlap: Annotated[float, typer.Option(help="Overlap O of a tetra grain, in [0, 1).")] = 0.6,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = _DEFAULT.seed,
+    delta0: Annotated[
+        float, typer.Option(help="Areal compression of the cycles and of the experiment.")
+    ] = _DEFAULT.delta0,
+    t0: Annotated[float, typer.Option(help="Duration of one compression, t_c.")] = _DEFAULT.t0,
+    dt: Annotated[float, typer.Option(help="Largest time step, t_c.")] = _DEFAULT.dt,
+    name: Annotated[str, typer.Option(help="Name of the pack; default from grain, size and seed.")] = "",
+    backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Prepare a pack: gas, pressure, frictionless cycles, rest."""
+    if shape not in ("tetra", "sphere"):
+        raise InputError(f"--shape must be tetra or sphere, got {shape!r}")
+    clump = grain.tetra(overlap) if shape == "tetra" else grain.sphere()
+    recipe = Recipe(grains=grains, seed=seed, delta0=delta0, t0=t0, dt=dt)
+    claim(output, ".h5", force=force)
+    backend = native.name(backend, Frictionless())
+    announce(f"{grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * grains, backend)
+    began = time.perf_counter()
+    stages: dict[str, Sample] = {}
+    with reporting() as progress:
+        pack = prepare(recipe, clump, name=name, backend=backend, progress=progress, log=stages)
+    save_pack(output, pack, stages)
+    seconds = time.perf_counter() - began
+    rest = pack.info["at_rest"]
+    say(f"at rest: largest grain speed {rest['largest_speed']:.1e} R/t_c; wrote {output} in {seconds:.0f} s")
+    result = {"pack": pack.name, "output": str(output), "seconds": seconds, "status": 0, **rest}
+    emit(as_json, result, tables.pack_table(pack))
+
+
+COMMANDS = {"info": info, "prepare": prepare_command}

@@ -1,0 +1,155 @@
+"""`gmem recall`, `gmem demo`, `gmem show`."""
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import psutil
+import typer
+
+from gmem_jax import native
+from gmem_jax.command.console import (
+    AsJson,
+    Force,
+    InputError,
+    Output,
+    PackName,
+    Picture,
+    announce,
+    claim,
+    emit,
+    pictured,
+    reporting,
+    say,
+)
+from gmem_jax.command.options import Chosen, with_experiment
+from gmem_jax.experiment.analysis import spread
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.recall import default_batch, replica_bins, run, run_bytes
+from gmem_jax.experiment.signals import six_signals
+from gmem_jax.files.atomic import sweep
+from gmem_jax.files.configuration import key_of_run, resolved
+from gmem_jax.files.hdf5 import schema_of
+from gmem_jax.files.packs import PACK_SCHEMA, list_packs, load_pack
+from gmem_jax.files.parts import Parts, locked
+from gmem_jax.files.recalls import load_recall, save_recall
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.show import figures, tables
+
+
+def _run(
+    experiment: Experiment, data: Path, picture: Path | None, batch: int | None = None, *, restart: bool = False
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
+    with locked(data):
+        sweep(data.parent, data.name)
+        return _run_alone(experiment, data, picture, batch, restart)
+
+
+def _run_alone(
+    experiment: Experiment, data: Path, picture: Path | None, batch: int | None, restart: bool
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    began = time.perf_counter()
+    folder = data.with_name(f"{data.name}.parts")
+    batch = batch or (None if restart else Parts.key_of(folder).get("batch"))
+    batch = batch or default_batch(experiment, psutil.virtual_memory().available)
+    work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
+    backend = native.name(experiment.backend, experiment.friction)
+    side_by_side = min(batch, experiment.signals.count)
+    what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
+    announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
+    parts = Parts(folder, key_of_run(experiment, batch), restart=restart)
+    if parts.finished():
+        say(f"going on from {parts.folder}: {parts.finished()} finished parts")
+    with reporting(goes_on=True) as progress:
+        recall = jax.block_until_ready(run(experiment, batch=batch, keep=parts, progress=progress))
+    configuration = resolved(experiment, time.perf_counter() - began)
+    save_recall(data, recall, configuration)
+    parts.discard()
+    if picture is not None:
+        figures.recall_figure(picture, recall, experiment.scale, configuration["pack"])
+    say(f"wrote {data}" + (f" and {picture}" if picture else ""))
+    row = {**tables.summary(recall, configuration), "seconds": configuration["seconds"], "output": str(data)}
+    if row["status"]:
+        say(f"warning: {row['status_text']}", style="yellow")
+    return row, configuration
+
+
+def _tables(row: dict[str, Any], configuration: dict[str, Any]) -> list[Any]:
+    """What to print of one recall."""
+    more = [tables.backgrounds_table(row), tables.second_readout_lines(row)] if "backgrounds" in row else []
+    return [tables.recall_table([row], configuration), *more]
+
+
+@with_experiment
+def recall_command(
+    chosen: Chosen,
+    pack: PackName,
+    output: Output = Path("recall.h5"),
+    batch: Annotated[
+        int | None, typer.Option(min=1, help="Signals run together; default what fits the free memory.")
+    ] = None,
+    restart: Annotated[bool, typer.Option("--restart", help="Discard finished parts of an interrupted run.")] = False,
+    picture: Picture = True,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Store waveforms in a pack and recall them."""
+    experiment = chosen.experiment(pack)
+    inputs = (pack, *chosen.inputs)
+    claim(output, ".h5", inputs=inputs, force=force)
+    drawn = pictured(output, picture, inputs=inputs, force=force)
+    row, configuration = _run(experiment, output, drawn, batch, restart=restart)
+    emit(as_json, row, *_tables(row, configuration))
+
+
+def demo(
+    packs: Annotated[str, typer.Option(help="all, or names of shipped packs, separated by commas.")] = "",
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write to.")] = Path("gmem-demo"),
+    mu: Annotated[float, typer.Option(help="Friction coefficient.")] = 1.0,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """The main job: six waveforms stored in a shipped pack and recalled; table, recall.h5 and recall.png."""
+    shipped = list_packs()
+    default = [name for name in shipped if name.startswith("tetra-325")]
+    names = default if packs == "all" else packs.split(",") if packs else default[:1]
+    unknown = [name for name in names if name not in shipped]
+    if unknown:
+        raise InputError(f"--packs {unknown[0]}: no such shipped pack; there are {', '.join(shipped)}")
+    law = Hooke(mu=mu)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--output {output}: cannot make this folder ({error.strerror})") from error
+    stems = [output / ("recall.h5" if len(names) == 1 else f"recall-{name}.h5") for name in names]
+    for data in stems:
+        claim(data, ".h5", force=force)
+    rows = []
+    for name, data in zip(names, stems, strict=True):
+        say(f"pack {name}")
+        experiment = Experiment(load_pack(name), six_signals(), law)
+        row, configuration = _run(experiment, data, pictured(data, True, force=force))
+        rows.append(row)
+    means = {key: spread([row[key] for row in rows])[0] for key in ("gain", "fidelity")}
+    total = {"status": max(row["status"] for row in rows), "seconds": sum(row["seconds"] for row in rows)}
+    emit(as_json, {**means, **total, "packs": rows}, tables.recall_table(rows, configuration))
+
+
+def show(
+    file: Annotated[Path, typer.Argument(help="A pack or a recall file, or the name of a shipped pack.")],
+    as_json: AsJson = False,
+) -> None:
+    """What a file holds."""
+    if str(file) in list_packs() or schema_of(file) == PACK_SCHEMA:
+        pack = load_pack(file)
+        facts = {"pack": pack.name, "grains": pack.grains, "ringing_period": float(pack.ringing_period), **pack.info}
+        emit(as_json, facts, tables.pack_table(pack))
+        return
+    recall, configuration = load_recall(file)
+    row = tables.summary(recall, configuration)
+    emit(as_json, {**row, "configuration": configuration}, *_tables(row, configuration))
+
+
+COMMANDS = {"recall": recall_command, "demo": demo, "show": show}

@@ -1,0 +1,115 @@
+"""Drives that recall best: gamma0 and the friction law's parameters, tuned over several packs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from gmem_jax.experiment.experiment import Experiment, replace, value_at
+from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.experiment.recall import run
+
+PARAMETERS = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.stiffness"}
+
+
+@dataclass(frozen=True)
+class TunedDrive:
+    """Drive parameters found, and the way there.
+
+    Attributes:
+        values: of the best drive, by name.
+        fidelity: mean F over the packs, there.
+        each: F of every pack, there, [packs].
+        before: mean F of the drive that was begun with.
+        history: (values, mean F) after every iteration, the first drive first.
+    """
+
+    values: dict[str, float]
+    fidelity: float
+    each: np.ndarray
+    before: float
+    history: tuple[tuple[dict[str, float], float], ...]
+
+
+def design_drive(
+    experiments: Sequence[Experiment],
+    bounds: dict[str, tuple[float, float]],
+    *,
+    iterations: int = 6,
+    spread: float = 0.2,
+    optimiser: optax.GradientTransformation | None = None,
+    progress: Progress = silent,
+) -> TunedDrive:
+    """Choose gamma0 and parameters of the friction law within bounds so that the mean fidelity of some packs grows.
+
+    F of one pack is rugged in mu and the stiffness: the exact derivative holds for changes of 1e-5 (see
+    experiments/gradient_check.py), because grains rearrange. What can be climbed is the slope on a coarser scale, from
+    central differences over +- `spread` of each logarithm, averaged over packs. The best drive that was simulated is
+    kept; where none is better than the present one, the spread is halved. The maximum of a rugged function is biased:
+    check the drive on other packs.
+
+    Args:
+        experiments: one for each pack, alike in all else; where they stand is the start.
+        bounds: lowest and highest value by name: "gamma0", "mu", "stiffness" (any of them), or another dotted name.
+        iterations: steps; each costs 2 n + 1 runs a pack for n parameters.
+        spread: of the differences at first, in parts of each parameter.
+        optimiser: what makes a step of the logarithms of a gradient of length `spread`; default the gradient itself.
+        progress: told about every run.
+
+    Raises:
+        ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
+        RunFailedError: if a simulation broke down.
+    """
+    if not experiments:
+        raise ValueError("a drive is designed for at least one pack")
+    names = list(bounds)
+    paths = [PARAMETERS.get(name, name) for name in names]
+    start = [float(value_at(experiments[0], path)) for path in paths]
+    for name, value in zip(names, start, strict=True):
+        low, high = bounds[name]
+        if not 0.0 < low <= value <= high:
+            raise ValueError(
+                f"{name}: bounds must be positive and hold the first value {value:g}, got {low:g} to {high:g}"
+            )
+    lowest, highest = np.log([bounds[name] for name in names]).T
+    total, done = (iterations * (2 * len(names) + 1) + 1) * len(experiments), 0
+
+    def each(logs: np.ndarray) -> np.ndarray:
+        nonlocal done
+        found = []
+        for experiment in experiments:
+            changed = replace(experiment, dict(zip(paths, np.exp(logs), strict=True)))
+            found.append(float(run(changed).fidelity))
+            done += 1
+            progress(f"F = {np.mean(found):.4f}", 0.0, done / total)
+        return np.asarray(found)
+
+    optimiser = optax.sgd(1.0) if optimiser is None else optimiser
+    logs = np.log(start)
+    memory = optimiser.init(jnp.asarray(logs))
+    found = each(logs)
+    history = [(logs, float(found.mean()))]
+    for _ in range(iterations):
+        seen: list[tuple[np.ndarray, np.ndarray]] = [(logs, found)]
+        slope = np.zeros(len(names))
+        for place, step in enumerate(spread * np.eye(len(names))):
+            sides = [np.clip(logs + sign * step, lowest, highest) for sign in (1.0, -1.0)]
+            up, down = (each(side) for side in sides)
+            slope[place] = np.mean(up - down) / max(sides[0][place] - sides[1][place], 1e-12)
+            seen += zip(sides, (up, down), strict=True)
+        # As long as the differences reach: the slope says nothing of what is further away.
+        along = -slope * spread / max(float(np.linalg.norm(slope)), 1e-12)
+        updates, memory = optimiser.update(jnp.asarray(along), memory, jnp.asarray(logs))
+        stepped = np.clip(np.asarray(optax.apply_updates(jnp.asarray(logs), updates)), lowest, highest)
+        seen.append((stepped, each(stepped)))
+        before, (logs, found) = logs, max(seen, key=lambda pair: float(pair[1].mean()))
+        spread = 0.5 * spread if logs is before else spread
+        history.append((logs, float(found.mean())))
+
+    def named(logs: np.ndarray) -> dict[str, float]:
+        return {name: float(value) for name, value in zip(names, np.exp(logs), strict=True)}
+
+    way = tuple((named(logs), value) for logs, value in history)
+    return TunedDrive(named(logs), float(found.mean()), found, history[0][1], way)

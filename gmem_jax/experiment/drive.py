@@ -1,0 +1,60 @@
+"""How the walls move: compression u(t), shear gamma(u) (paper, Sec. II)."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.experiment.protocol import Bin, Numbers
+from gmem_jax.experiment.signals import Signals
+from gmem_jax.physics.pytree import Scalar, pytree
+from gmem_jax.physics.state import Box
+
+
+@pytree
+@dataclass(frozen=True)
+class Drive:
+    """Prescribed walls: u runs linearly during a stage, the shear follows a waveform of u.
+
+    L_x = X (1 - gamma/2), L_y = Y (1 + gamma/2) with X, Y = L0 (1 - (1 - sqrt(1 - delta0)) u); z does not move. The
+    box stays centred. Half of gamma on each axis is this project's reading of the paper.
+
+    Attributes:
+        lower: lower planes at u = 0, [3, 1].
+        upper: upper planes at u = 0, [3, 1].
+        delta0: areal compression at u = 1, scalar or [B].
+        gamma0: shear amplitude, scalar or [B].
+        signals: the waveforms of the replicas, or None for no shear; replica 0 is always the zero signal.
+    """
+
+    lower: jax.Array
+    upper: jax.Array
+    delta0: Scalar
+    gamma0: Scalar = 0.0
+    signals: Signals | None = None
+
+    def _shear(self, u: Numbers, sheared: Numbers) -> jax.Array:
+        if self.signals is None:
+            return jnp.zeros(1)
+        gamma = self.gamma0 * jnp.concatenate([jnp.zeros(1), self.signals.shear(jnp.asarray(u))])
+        return jnp.where(sheared, gamma, 0.0)
+
+    def box_at(self, row: Bin, time: jax.Array, duration: Numbers) -> Box:
+        """Planes and their velocities, [3, B] (or [3, 1] without shear).
+
+        Args:
+            row: a bin of the stage; only what is common to the stage counts.
+            time: since the start of the stage, in t_c.
+            duration: of the stage, in t_c.
+        """
+
+        def lengths(moment: jax.Array) -> jax.Array:
+            u = row.start + (row.stop - row.start) * (moment / duration)
+            squeeze = 1.0 - (1.0 - jnp.sqrt(1.0 - self.delta0)) * u
+            half = 0.5 * self._shear(u, row.sheared)
+            scale = jnp.stack(jnp.broadcast_arrays(squeeze * (1.0 - half), squeeze * (1.0 + half), jnp.ones(1)))
+            return (self.upper - self.lower) * scale
+
+        now, rate = jax.jvp(lengths, (time,), (jnp.ones_like(time),))
+        centre = 0.5 * (self.lower + self.upper)
+        return Box(centre - 0.5 * now, centre + 0.5 * now, -0.5 * rate, 0.5 * rate)

@@ -1,0 +1,52 @@
+"""Files that are whole or not there: written under a temporary name, flushed to disk, and renamed."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+class FileFormatError(ValueError):
+    """A file that is not what it should be; the message names the file, what is wrong and what would be right."""
+
+
+@contextmanager
+def atomic(path: Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place, fsynced, if the block succeeds, and vanishes if it fails.
+
+    Raises:
+        OSError: if the folder cannot be written.
+    """
+    path = Path(path)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o644)
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def probe(folder: Path) -> None:
+    """Make sure that a folder can be written.
+
+    Raises:
+        OSError: if it cannot.
+    """
+    handle, name = tempfile.mkstemp(dir=folder, prefix=".gmem-", suffix=".tmp")
+    os.close(handle)
+    Path(name).unlink()
+
+
+def sweep(folder: Path, name: str = "") -> None:
+    """Remove what killed writers left behind: temporary files of the files in a folder (or of one of them)."""
+    for left in Path(folder).glob(f".{name}.*.tmp" if name else ".*.tmp"):
+        with contextlib.suppress(OSError):
+            left.unlink()

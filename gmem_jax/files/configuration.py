@@ -1,0 +1,172 @@
+"""The written form of an experiment: the configuration in every result, which reads back to the same experiment."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax import native
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, words
+from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.packs import load_pack
+from gmem_jax.files.provenance import provenance
+from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.laws import entry_of, law_named
+from gmem_jax.physics.material import Material
+
+_SIGNALS = {"bumps": Bumps, "spline": Spline}
+_PARTS = ("pack", "signals", "friction", "material")
+
+
+def fingerprint(tree: Any) -> str:
+    """SHA-256 of the arrays of a pytree, shapes and types included."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        array = np.asarray(leaf)
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def pack_fingerprint(pack: Pack) -> str:
+    """SHA-256 of what makes a pack: grain, centres, orientations, box; not of its list of candidates."""
+    return fingerprint((pack.clump, pack.position, pack.quaternion, pack.lower, pack.upper, pack.delta0))
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and lists of a parameter, which JSON can hold exactly."""
+    return value if isinstance(value, float | int | str | None) else np.asarray(value).tolist()
+
+
+def _equal(one: Signals, other: Signals) -> bool:
+    return fingerprint(one) == fingerprint(other) if type(one) is type(other) else False
+
+
+def written_signals(signals: Signals) -> dict[str, Any]:
+    """Waveforms as JSON: by name where they have one, else by their numbers."""
+    if _equal(signals, six_signals()):
+        return {"kind": "six"}
+    bits = signals.count.bit_length() - 1
+    if signals.count == 1 << bits and 1 <= bits <= 12 and _equal(signals, words(bits)):
+        return {"kind": "words", "bits": bits}
+    for kind, known in _SIGNALS.items():
+        if isinstance(signals, known):
+            return {"kind": kind, **{entry.name: _plain(getattr(signals, entry.name)) for entry in fields(known)}}
+    return {"kind": type(signals).__name__, "sha256": fingerprint(signals)}
+
+
+def _signals_from(written: Mapping[str, Any]) -> Signals:
+    kind = written["kind"]
+    if kind == "six":
+        return six_signals()
+    if kind == "words":
+        return words(written["bits"])
+    if kind not in _SIGNALS:
+        raise ValueError(f"signals of kind {kind!r} cannot be read back")
+    numbers = {name: value for name, value in written.items() if name != "kind"}
+    made: Signals = _SIGNALS[kind](**{name: _number(value) for name, value in numbers.items()})
+    return made
+
+
+def _number(value: Any) -> Any:
+    return jnp.asarray(value, float) if isinstance(value, list) else value
+
+
+def written_law(law: FrictionLaw) -> dict[str, Any]:
+    """A friction law as JSON: its name and parameters."""
+    entry = entry_of(law)
+    if entry is None:
+        return {"law": repr(law)}
+    return {"law": entry.name, **{item.name: _plain(getattr(law, item.name)) for item in fields(entry.kind)}}
+
+
+def _law_from(written: Mapping[str, Any]) -> FrictionLaw:
+    parameters = {name: _number(value) for name, value in written.items() if name != "law"}
+    return law_named(written["law"], **parameters)
+
+
+def written(experiment: Experiment) -> dict[str, Any]:
+    """An experiment as JSON: every field, the pack by its source and content.
+
+    `experiment_from` makes the same experiment of it.
+    """
+    pack = experiment.pack
+    numbers = [entry.name for entry in fields(Experiment) if entry.init and entry.name not in _PARTS]
+    material = experiment.material
+    return {
+        "pack": {"source": pack.source or pack.name, "name": pack.name, "sha256": pack_fingerprint(pack)},
+        "signals": written_signals(experiment.signals),
+        "friction": written_law(experiment.friction),
+        "material": {entry.name: _plain(getattr(material, entry.name)) for entry in fields(Material)},
+        **{name: _plain(getattr(experiment, name)) for name in numbers},
+    }
+
+
+def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) -> Experiment:
+    """The experiment of a written form.
+
+    Args:
+        configuration: what `written` gave.
+        pack: its pack; default the one that it names, read from its file or from those that ship.
+
+    Raises:
+        FileNotFoundError: if the pack is not there.
+        FileFormatError: if the pack is another one than was written, or the form is not one of an experiment.
+        ValueError: for impossible numbers, or own laws and signals, which have no written form.
+    """
+    known = {entry.name for entry in fields(Experiment) if entry.init}
+    if odd := sorted(known ^ set(configuration)):
+        problem = "its {} is missing" if odd[0] in known else "it has no field {}"
+        raise FileFormatError(f"not the written form of an experiment: {problem.format(repr(odd[0]))}")
+    of_pack = configuration["pack"]
+    pack = load_pack(of_pack["source"]) if pack is None else pack
+    if pack_fingerprint(pack) != of_pack["sha256"]:
+        raise FileFormatError(f"{of_pack['source']}: not the pack that this was made with (its content has changed)")
+    own = {name: _number(value) for name, value in configuration.items() if name not in _PARTS}
+    material = {name: _number(value) for name, value in configuration["material"].items()}
+    return Experiment(
+        pack, _signals_from(configuration["signals"]), _law_from(configuration["friction"]), Material(**material), **own
+    )
+
+
+def key_of_run(experiment: Experiment, batch: int) -> dict[str, Any]:
+    """What the numbers of a run depend on, and no more: for parts of it that may be used again."""
+    facts = provenance()
+    own = {**written(experiment), "pack": pack_fingerprint(experiment.pack)}
+    same = {"versions": facts["versions"], "commit": facts["commit"]}
+    return {**own, "batch": batch, "backend": native.name(experiment.backend, experiment.friction), **same}
+
+
+def resolved(experiment: Experiment, seconds: float) -> dict[str, Any]:
+    """All that is to be known of a result: the experiment as written, what its defaults came to, and where it ran."""
+    pack, entry = experiment.pack, entry_of(experiment.friction)
+    dt, steps = experiment.timing
+    return {
+        "experiment": written(experiment),
+        "pack": pack.source or pack.name,
+        "grains": pack.grains,
+        "grain": {
+            "shape": pack.clump.shape,
+            "mass": float(pack.clump.mass),
+            "diameter": float(pack.clump.diameter),
+        },
+        "pack_record": pack.info,
+        "friction": entry.name if entry else type(experiment.friction).__name__,
+        "mu": _plain(getattr(experiment.friction, "mu", 0.0)),
+        "delta0": _plain(experiment.compression),
+        "gamma0": _plain(experiment.gamma0),
+        "t0": _plain(experiment.t0),
+        "hold_drag": _plain(experiment.drag),
+        "dt": _plain(dt),
+        "steps": steps,
+        "background": experiment.background,
+        "seconds": seconds,
+        **provenance(),
+        "backend": native.name(experiment.backend, experiment.friction),
+    }

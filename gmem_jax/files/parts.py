@@ -1,0 +1,187 @@
+"""Finished parts of a long run, kept beside its output until it is whole.
+
+A part is an .npz file: its arrays, how they make up a pytree (JSON), and a checksum of both. Nothing in it is code.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import zipfile
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from gmem_jax.files.atomic import FileFormatError, atomic, sweep
+from gmem_jax.physics.pytree import KINDS
+
+PART_SCHEMA = "gmem-part/1"
+
+
+def _taken_apart(tree: Any, arrays: list[np.ndarray]) -> Any:
+    """How a tree of arrays is made up, as JSON; its arrays are added to the list.
+
+    Raises:
+        TypeError: for what is neither an array, a tuple, a dictionary nor a pytree of this package.
+    """
+    if isinstance(tree, np.ndarray | np.generic | jax.Array):
+        arrays.append(np.asarray(tree))
+        return {"array": len(arrays) - 1}
+    if isinstance(tree, tuple):
+        return {"tuple": [_taken_apart(item, arrays) for item in tree]}
+    if isinstance(tree, dict):
+        return {"ordered": [[name, _taken_apart(item, arrays)] for name, item in tree.items()]}
+    if is_dataclass(tree) and KINDS.get(type(tree).__name__) is type(tree):
+        own = {entry.name: _taken_apart(getattr(tree, entry.name), arrays) for entry in fields(tree)}
+        return {"kind": type(tree).__name__, "fields": own}
+    raise TypeError(f"a {type(tree).__name__} cannot be kept in a file")
+
+
+def _put_together(form: Any, arrays: list[np.ndarray]) -> Any:
+    """The tree that `_taken_apart` took apart."""
+    if "array" in form:
+        return arrays[form["array"]]
+    if "tuple" in form:
+        return tuple(_put_together(item, arrays) for item in form["tuple"])
+    if "ordered" in form:
+        return OrderedDict((name, _put_together(item, arrays)) for name, item in form["ordered"])
+    return KINDS[form["kind"]](**{name: _put_together(item, arrays) for name, item in form["fields"].items()})
+
+
+def _checksum(form: str, arrays: list[np.ndarray]) -> str:
+    digest = hashlib.sha256(form.encode())
+    for array in arrays:
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def save_part(path: Path, tree: Any) -> None:
+    """Write a tree of arrays.
+
+    Raises:
+        TypeError: if it holds something else.
+        OSError: if the path cannot be written.
+    """
+    arrays: list[np.ndarray] = []
+    form = json.dumps(_taken_apart(tree, arrays))
+    head = json.dumps({"schema": PART_SCHEMA, "form": form, "sha256": _checksum(form, arrays)})
+    named = {f"array_{number:03d}": array for number, array in enumerate(arrays)}
+    with atomic(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, head=np.asarray(head), **named)  # type: ignore[arg-type]
+
+
+def load_part(path: Path) -> Any:
+    """Read what `save_part` wrote, arrays as numpy arrays.
+
+    Raises:
+        FileFormatError: if the file is damaged, or none of this schema.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            head = json.loads(str(file["head"]))
+            if head["schema"] != PART_SCHEMA:
+                raise FileFormatError(f"{path}: schema is {head['schema']!r}, expected {PART_SCHEMA!r}")
+            arrays = [file[f"array_{number:03d}"] for number in range(len(file.files) - 1)]
+    except FileFormatError:
+        raise
+    except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile) as error:
+        raise FileFormatError(f"{path}: not a readable part of a run (truncated?)") from error
+    if _checksum(head["form"], arrays) != head["sha256"]:
+        raise FileFormatError(f"{path}: damaged, its checksum does not fit; remove it")
+    return _put_together(json.loads(head["form"]), arrays)
+
+
+class Parts:
+    """Finished parts of a long run, in a folder beside its output: what `gm.run` takes as `keep`.
+
+    The folder is locked as long as the object lives in `locked`.
+
+    Args:
+        folder: made when the first part is stored.
+        key: what the parts depend on; stored with them.
+        restart: discard what is there.
+
+    Raises:
+        FileFormatError: if the folder holds finished parts of another run.
+        OSError: if it cannot be written.
+    """
+
+    def __init__(self, folder: Path, key: dict[str, Any], *, restart: bool = False) -> None:
+        self.folder = Path(folder)
+        if restart or (self.folder.exists() and not self.finished()):
+            shutil.rmtree(self.folder, ignore_errors=True)  # parts of which none is finished are worth nothing
+        found, wanted = self.key_of(self.folder), json.loads(json.dumps(key))
+        other = [name for name in wanted if found and found.get(name) != wanted[name]]
+        if other:
+            raise FileFormatError(
+                f"{self.folder}: holds parts of an interrupted run with another {other[0]} "
+                f"({_short(found.get(other[0]))}, now {_short(wanted[other[0]])}); begin anew with "
+                "--restart, or choose another output"
+            )
+        self.folder.mkdir(exist_ok=True)
+        sweep(self.folder)
+        with atomic(self.folder / "run.json") as temporary:
+            temporary.write_text(json.dumps(wanted, indent=1))
+
+    @staticmethod
+    def key_of(folder: Path) -> dict[str, Any]:
+        """The key stored in a folder of parts; empty if there is none that can be read."""
+        card = Path(folder) / "run.json"
+        try:
+            key = json.loads(card.read_text()) if card.is_file() else {}
+        except (ValueError, OSError):
+            key = {}
+        return key if isinstance(key, dict) else {}
+
+    def __call__(self, name: str, run: Callable[[], Any]) -> Any:
+        """The part of that name, its arrays as numpy arrays: read if it is there and sound, else run and stored."""
+        path = self.folder / f"{name}.npz"
+        if path.is_file():
+            return load_part(path)
+        result = jax.tree.map(np.asarray, run())
+        # A law of the user's may remember in classes of its own: then there is nothing to go on from, and no harm.
+        with contextlib.suppress(TypeError):
+            save_part(path, result)
+        return result
+
+    def finished(self) -> int:
+        """Number of parts there are."""
+        return len(list(self.folder.glob("*.npz")))
+
+    def discard(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.folder)
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+@contextlib.contextmanager
+def locked(output: Path) -> Iterator[None]:
+    """Keep an output to oneself: a second run into it is refused as long as the first one lives.
+
+    Raises:
+        FileFormatError: if another process holds it.
+    """
+    import fcntl  # where there is none, as on Windows, there is no lock either
+
+    lock = output.with_name(f".{output.name}.lock")
+    with lock.open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise FileFormatError(f"{output}: another run is writing it; name another output") from None
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                os.unlink(lock)

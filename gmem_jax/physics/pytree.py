@@ -1,0 +1,142 @@
+"""Frozen dataclasses that JAX can take apart, whose numbers are checked when a user makes one and not when JAX does.
+
+A field is data (an array, a number, another pytree) unless it says otherwise: `static` fields are part of the
+structure that a program is compiled for; a `label` is carried along but compiles nothing anew.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import field, fields, is_dataclass
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Scalar = float | jax.Array
+"""A parameter: one number, or an array that broadcasts against the replica axis [B]."""
+
+T = TypeVar("T")
+
+
+class Interval(NamedTuple):
+    """Where a parameter may lie; read from words like "[0, inf)"."""
+
+    words: str
+    low: float
+    high: float
+
+    def holds(self, value: Any) -> Any:
+        """Whether it does, elementwise; False for what is not a number."""
+        above = value >= self.low if self.words.startswith("[") else value > self.low
+        return above & (value <= self.high if self.words.endswith("]") else value < self.high)
+
+
+def _interval(words: str) -> Interval:
+    low, high = words[1:-1].split(",")
+    return Interval(words, float(low), float(high))
+
+
+def parameter(default: Any, within: str = "(-inf, inf)") -> Any:
+    """A data field that is a float: one number, or one for each replica [B]; `within` is an interval."""
+    return field(default=default, metadata={"interval": _interval(within)})
+
+
+def static(default: Any) -> Any:
+    """A field that programs are compiled for: hashable, and no array."""
+    return field(default=default, metadata={"static": True})
+
+
+def label(default: str) -> Any:
+    """A text that programs are not compiled for: what comes out of a transformation may carry another's."""
+    return field(default=default, metadata={"label": True})
+
+
+class _Labels(tuple[str, ...]):
+    """Texts that look alike to JAX."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Labels)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+KINDS: dict[str, type] = {}
+"""Every class that `pytree` registered, by name: what files may hold."""
+
+
+def pytree(cls: type[T]) -> type[T]:
+    """Register a frozen dataclass with JAX. Rebuilding one runs no checks: its leaves may be tracers, or anything."""
+    KINDS[cls.__name__] = cls
+    kinds: dict[str, list[str]] = {"data": [], "static": [], "label": []}
+    for entry in fields(cls):  # type: ignore[arg-type]
+        kinds[next((kind for kind in ("static", "label") if kind in entry.metadata), "data")].append(entry.name)
+    data, fixed, labels = kinds.values()
+
+    def flatten(made: T) -> tuple[list[tuple[Any, Any]], Any]:
+        children = [(jax.tree_util.GetAttrKey(name), getattr(made, name)) for name in data]
+        structure = tuple(getattr(made, name) for name in fixed), _Labels(getattr(made, name) for name in labels)
+        return children, structure
+
+    def unflatten(structure: Any, children: Any) -> T:
+        made = object.__new__(cls)
+        values = (*zip(data, children, strict=True), *zip(fixed, structure[0], strict=True))
+        for name, value in (*values, *zip(labels, structure[1], strict=True)):
+            object.__setattr__(made, name, value)
+        return made
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+    return cls
+
+
+def traced(*trees: Any) -> bool:
+    """Whether anything in them is a tracer of JAX."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def _number(value: Any) -> Any:
+    """One kind of number for every way to write it, so that 1, 1.0 and np.float32(1) share a program."""
+    if not traced(value) and np.ndim(value) == 0:
+        return float(value)
+    return jnp.asarray(value, float)
+
+
+def _parameters(made: Any) -> Iterator[tuple[str, Interval]]:
+    for entry in fields(made):
+        if "interval" in entry.metadata and getattr(made, entry.name) is not None:
+            yield entry.name, entry.metadata["interval"]
+
+
+def settle(made: Any) -> None:
+    """Bring the parameters of a new object to one kind of number, and refuse those outside their interval.
+
+    Raises:
+        ValueError: naming the parameter, where it may lie, and what was given. Traced ones cannot be refused; see
+            `impossible`.
+    """
+    for name, interval in _parameters(made):
+        given = getattr(made, name)
+        try:
+            value = _number(given)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name} must be a number or an array of numbers, got {given!r}") from None
+        if not traced(value) and not np.all(interval.holds(np.asarray(value))):
+            raise ValueError(f"{name} must be in {interval.words}, got {_shown(given)}")
+        object.__setattr__(made, name, value)
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float | int) and math.isfinite(value) else str(value)
+
+
+def impossible(made: Any) -> jax.Array:
+    """Whether any parameter in `made`, or in a pytree of this kind within it, is outside its interval; a scalar."""
+    bad = jnp.asarray(False)
+    for name, interval in _parameters(made):
+        bad |= ~jnp.all(interval.holds(jnp.asarray(getattr(made, name))))
+    for entry in fields(made):
+        within = getattr(made, entry.name)
+        if is_dataclass(within):
+            bad |= impossible(within)
+    return bad

@@ -1,0 +1,95 @@
+"""What is recorded of a run, and what is watched in it."""
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from gmem_jax.physics.contact.friction import largest_overlap
+from gmem_jax.physics.pairs import slack, sphere_centres
+from gmem_jax.physics.pytree import pytree
+from gmem_jax.physics.rotation import dot, matrix
+from gmem_jax.physics.state import Box, State, Status
+from gmem_jax.physics.step import System
+
+
+@pytree
+@dataclass(frozen=True)
+class Sample:
+    """What is recorded of one bin of steps; a walk adds a leading axis of bins.
+
+    Attributes:
+        pressure: (p_x, p_y, p_z), mean of the two opposite walls at their instantaneous area, averaged over the
+            steps of the bin, [3, B], in E.
+        lengths: box edges at the end of the bin, [3, B], in R.
+        kinetic_energy: at the end of the bin, translation and rotation, [B], in E R^3.
+        largest_speed: at the end of the bin, [B], in R / t_c.
+        coordination: Z, touching grain pairs per grain times two, rattlers included, walls not, [B].
+        contacts: touching sphere pairs per grain times two, [B].
+        filling: phi, volume of the grains over that of the box, [B].
+        largest_overlap: deepest sphere-sphere contact at the end of the bin, [B], in R.
+        inertial_number: I = (strain rate of the x axis) sqrt(m / (D p)), p the mean of p_x and p_y, [B]; 0 without p.
+    """
+
+    pressure: jax.Array
+    lengths: jax.Array
+    kinetic_energy: jax.Array
+    largest_speed: jax.Array
+    coordination: jax.Array
+    contacts: jax.Array
+    filling: jax.Array
+    largest_overlap: jax.Array
+    inertial_number: jax.Array
+
+
+def check(system: System, state: State, box: Box) -> State:
+    """Set the status bits for what can be seen in one configuration: stale list, escaped grain, non-finite number."""
+    grains = state.grains
+    spheres = sphere_centres(grains, system.clump)
+    outside = jnp.any((spheres < box.lower) | (spheres > box.upper), axis=(0, 1))
+    numbers = grains.position.sum((0, 1)) + grains.acceleration.sum((0, 1)) + grains.spin_rate.sum((0, 1))
+    bits = (
+        jnp.where(slack(system.pairs, spheres, box) <= 0.0, int(Status.STALE_PAIRS), 0)
+        | jnp.where(outside, int(Status.OUTSIDE_BOX), 0)
+        | jnp.where(jnp.isfinite(numbers), 0, int(Status.NOT_FINITE))
+    ).astype(jnp.int32)
+    return replace(state, status=state.status | bits)
+
+
+def observe(system: System, state: State, box: Box, pressure: jax.Array) -> Sample:
+    """The instantaneous quantities of a `Sample`, beside the given bin-averaged pressure."""
+    grains, clump, pairs = state.grains, system.clump, system.pairs
+    spheres = sphere_centres(grains, clump)
+    square = dot(spheres[pairs.second] - spheres[pairs.first], spheres[pairs.second] - spheres[pairs.first])[:, 0]
+    overlap = jnp.where(pairs.valid[:, None], 2.0 - jnp.sqrt(jnp.where(pairs.valid[:, None], square, 1.0)), -1.0)
+    touching = (overlap > 0.0).astype(jnp.int32)
+    count = grains.position.shape[0]
+    touching_pairs = jax.ops.segment_max(touching, pairs.grain_pair, num_segments=pairs.capacity)
+    body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)
+    energy = clump.mass * jnp.sum(grains.velocity**2, axis=1) + jnp.sum(clump.inertia[:, None] * body_spin**2, axis=1)
+    lengths = jnp.broadcast_to(box.lengths, pressure.shape)
+    rate = jnp.abs(box.upper_velocity[0] - box.lower_velocity[0]) / lengths[0]
+    squeezing = 0.5 * (pressure[0] + pressure[1])
+    loaded = squeezing > 0.0
+    inertial = rate * jnp.sqrt(clump.mass / (clump.diameter * jnp.where(loaded, squeezing, 1.0)))
+    return Sample(
+        pressure=pressure,
+        lengths=lengths,
+        kinetic_energy=0.5 * jnp.sum(energy, axis=0),
+        largest_speed=jnp.sqrt(jnp.max(jnp.sum(lax.stop_gradient(grains.velocity) ** 2, axis=1), axis=0)),
+        coordination=2.0 * jnp.sum(jnp.maximum(touching_pairs, 0), axis=0) / count,
+        contacts=2.0 * jnp.sum(touching, axis=0) / count,
+        filling=count * clump.mass / jnp.prod(lengths, axis=0),
+        largest_overlap=jnp.max(lax.stop_gradient(overlap), axis=0),
+        inertial_number=jnp.where(loaded, inertial, 0.0),
+    )
+
+
+def end_bin(system: System, state: State, box: Box, pressure: jax.Array) -> tuple[State, Sample]:
+    """Check the state at the end of a bin and take its sample; `pressure` is the bin's average, [3, B]."""
+    state = check(system, state, box)
+    sample = observe(system, state, box, pressure)
+    beyond = sample.largest_overlap > largest_overlap(system.friction)
+    bits = jnp.where(beyond, int(Status.OVERLAP_RANGE), 0).astype(jnp.int32)
+    return replace(state, status=state.status | bits), sample

@@ -1,0 +1,121 @@
+"""The search for candidate contacts, by jax-md.
+
+The list is built on positions mapped affinely into the smallest box of the coming motion, so that only non-affine
+displacements use up its skin (a whole experiment needs about 0.2 R).
+"""
+
+import functools
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.pairs import Pairs, sphere_centres, tabulate
+from gmem_jax.physics.state import Box, Grains
+
+_SPARE = 1.15  # capacity allocated over what is needed now: a list that is built again should fit the same program
+
+
+class PairFinder:
+    """Builds `Pairs` from a jax-md neighbour list whose capacities grow when they must, and never shrink.
+
+    jax-md lists pairs of grain centres within reach of each other's spheres; each is expanded into its K x K sphere
+    pairs, of which those in reach are kept. That keeps spheres of one grain apart by construction, and is several
+    times cheaper than a list of spheres (whose prune step scatters N K x 27 cells of candidates).
+
+    Args:
+        clump: the grain.
+        extent: edge lengths of a box that contains all (mapped) positions of the coming builds, [3].
+        skin: distance beyond contact that is still listed, in R.
+        capacity: rows to allocate at least.
+        per_sphere: contacts per sphere to allocate at least.
+
+    Raises:
+        ValueError: if the skin is not positive.
+    """
+
+    def __init__(
+        self, clump: Clump, extent: np.ndarray, skin: float, *, capacity: int = 0, per_sphere: int = 0
+    ) -> None:
+        # Imported here because jax-md takes seconds to load, and most commands never look for neighbours.
+        from jax_md import partition, space
+
+        if not skin > 0.0:
+            raise ValueError(f"the skin of a neighbour list must be positive, got {skin}")
+        self.skin = skin
+        self._spheres_per_grain = clump.spheres
+        self._capacity = capacity
+        self._per_sphere = per_sphere
+        self._neighbors: Any = None
+        free_displacement, _ = space.free()
+        body = np.asarray(clump.offsets)
+        cutoff = 2.0 * (1.0 + float(np.linalg.norm(body - body.mean(axis=0), axis=1).max())) + skin
+        self._fns = partition.neighbor_list(
+            free_displacement,
+            # jax-md keeps box and cutoff in float32 and wraps its cells around: a margin keeps every centre inside,
+            # and the float32 rounding of the cutoff harmless.
+            np.asarray(extent, dtype=float) + 1.0,
+            r_cutoff=cutoff + 1e-4,
+            dr_threshold=0.0,
+            capacity_multiplier=_SPARE,
+            format=partition.OrderedSparse,
+        )
+        self._update = jax.jit(lambda positions, neighbors: neighbors.update(positions))
+
+    def _grain_pairs(self, centres: np.ndarray) -> np.ndarray:
+        """Pairs (i < j) of grains whose centres [N, 3] are within the cutoff, [2, n]."""
+        positions = jnp.asarray(centres)
+        with warnings.catch_warnings():
+            # jax-md 0.2.29 scatters 64-bit indices into its 32-bit tables, and jax warns of it.
+            warnings.filterwarnings("ignore", message="scatter inputs have incompatible types")
+            if self._neighbors is not None:
+                self._neighbors = self._update(positions, self._neighbors)
+            if self._neighbors is None or bool(self._neighbors.did_buffer_overflow):
+                self._neighbors = self._fns.allocate(positions)
+        found = np.sort(np.asarray(self._neighbors.idx), axis=0)
+        return found[:, found[1] < len(centres)]
+
+    def _keys(self, mapped: np.ndarray) -> np.ndarray:
+        """Pairs i < j of spheres of different grains within reach, of centres [S, 3], as sorted numbers i S + j."""
+        spheres = np.int64(len(mapped))
+        mapped = mapped.reshape(-1, self._spheres_per_grain, 3)
+        one, other = self._grain_pairs(mapped.mean(axis=1))
+        distance = np.linalg.norm(mapped[one][:, :, None] - mapped[other][:, None, :], axis=-1)
+        pair, sphere_i, sphere_j = np.nonzero(distance < 2.0 + self.skin)
+        first, second = (side[pair] * self._spheres_per_grain for side in (one, other))
+        keys: np.ndarray = np.sort((first + sphere_i) * spheres + second + sphere_j)
+        return keys
+
+    def __call__(self, grains: Grains, clump: Clump, box: Box, smallest: np.ndarray | None = None) -> Pairs:
+        """The candidate list of `grains` in `box`, which holds what any of the replicas needs.
+
+        Args:
+            grains: the grains.
+            clump: their shape.
+            box: the walls now.
+            smallest: edge lengths of the smallest box of the coming motion, [3]; default the present box.
+        """
+        lengths = np.asarray(box.lengths)
+        smallest = lengths[:, 0] if smallest is None else np.minimum(smallest, lengths[:, 0])
+        reference = (np.asarray(sphere_centres(grains, clump)) - np.asarray(box.lower)) / lengths
+        if np.all(reference == reference[..., :1]):
+            reference = reference[..., :1]
+        spheres = reference.shape[0]
+        keys = [self._keys(reference[..., b] * smallest) for b in range(reference.shape[-1])]
+        found = np.stack(np.divmod(functools.reduce(np.union1d, keys), spheres))
+        if found.shape[1] > self._capacity > 0:
+            self._capacity = int(_SPARE * found.shape[1])
+        pairs = tabulate(
+            found,
+            reference,
+            smallest,
+            2.0 + self.skin,
+            self._spheres_per_grain,
+            capacity=self._capacity,
+            per_sphere=self._per_sphere,
+        )
+        self._capacity, self._per_sphere = pairs.capacity, int(pairs.incidence.shape[-1])
+        return pairs

@@ -1,0 +1,134 @@
+"""What the paper's reader learns from: the inputs J_s alone, shifted, scaled, with noise (Sec. III; spec, section 7).
+
+Nothing of the training set is stored but the shifted J_s, [S, shifts, 256]: an example follows from the numbers of its
+word, shift, amplitude and draw, and from the seed. All functions are pure.
+"""
+
+import functools
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.experiment.signals import BINS, bin_average, bit_width, words
+
+
+@dataclass(frozen=True)
+class Lessons:
+    """What the net is and what it is trained on; by default the paper's net and 17,325 examples a word.
+
+    Attributes:
+        bits: L, the length of the words.
+        hidden: widths of the hidden layers.
+        shifts: number of shifts in u, equally spaced in +-`shift`.
+        shift: largest shift, in bits (u_b).
+        amplitudes: number of factors, equally spaced in 1 +- `amplitude`.
+        amplitude: largest change of the amplitude.
+        draws: noise draws; their SDs are equally spaced from 0 to `noise`.
+        noise: largest SD of the noise, in <|J|>.
+        held_out: part of the (shift, amplitude, draw) combinations that is kept for validation.
+        batch: examples to a step.
+        rate: learning rate of plain SGD.
+    """
+
+    bits: int
+    hidden: tuple[int, ...] = (1024, 1024)
+    shifts: int = 21
+    shift: float = 0.3
+    amplitudes: int = 33
+    amplitude: float = 0.3
+    draws: int = 25
+    noise: float = 0.3
+    held_out: float = 0.1
+    batch: int = 32
+    rate: float = 0.1
+
+    @property
+    def classes(self) -> int:
+        """Number of words S."""
+        return 1 << self.bits
+
+    @property
+    def combinations(self) -> int:
+        """Transformations of one word."""
+        return self.shifts * self.amplitudes * self.draws
+
+    @property
+    def kept(self) -> int:
+        """How many of them are held out."""
+        return max(1, round(self.held_out * self.combinations))
+
+
+@functools.partial(jax.tree_util.register_dataclass, data_fields=["table", "order", "noise"], meta_fields=["lessons"])
+@dataclass(frozen=True)
+class Examples:
+    """Everything an example is made from.
+
+    Attributes:
+        table: J_s(u - shift) / <|J|>, [S, shifts, 256], float32.
+        order: numbers of the (shift, amplitude, draw) combinations, shuffled by the seed; the first `lessons.kept` are
+            held out.
+        noise: random key.
+        lessons: the transformations.
+    """
+
+    table: jax.Array
+    order: jax.Array
+    noise: jax.Array
+    lessons: Lessons
+
+    def make(self, word: jax.Array, combination: jax.Array) -> jax.Array:
+        """Input [..., 256] of word number `word` (from 0) under a combination; the same numbers, the same input."""
+        lessons = self.lessons
+        shift, rest = jnp.divmod(combination, lessons.amplitudes * lessons.draws)
+        factor, draw = jnp.divmod(rest, lessons.draws)
+        scale = 1.0 + lessons.amplitude * _ladder(factor, lessons.amplitudes)
+        deviation = lessons.noise * (draw / max(lessons.draws - 1, 1))
+        number = word * lessons.combinations + combination
+
+        def normal(one: jax.Array) -> jax.Array:
+            return jax.random.normal(jax.random.fold_in(self.noise, one), (BINS,), jnp.float32)
+
+        noise = jax.vmap(normal)(number.ravel()).reshape(*number.shape, BINS)
+        clean = self.table[word, shift]
+        return scale.astype(jnp.float32)[..., None] * clean + deviation.astype(jnp.float32)[..., None] * noise
+
+    def training(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """A batch of training inputs [batch, 256] and their words [batch], drawn with replacement."""
+        lessons = self.lessons
+        for_word, for_combination = jax.random.split(key)
+        word = jax.random.randint(for_word, (lessons.batch,), 0, lessons.classes)
+        place = jax.random.randint(for_combination, (lessons.batch,), lessons.kept, lessons.combinations)
+        return self.make(word, self.order[place]), word
+
+    def held_out(self, number: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Held-out inputs [..., 256] and their words; `number` counts through all S * kept of them, words first."""
+        word = number % self.lessons.classes
+        # Neighbouring words take different combinations, so that a few thousand examples cover many.
+        place = (number // self.lessons.classes + 7 * word) % self.lessons.kept
+        return self.make(word, self.order[place]), word
+
+
+def _ladder(place: jax.Array, rungs: int) -> jax.Array:
+    """-1 to 1 in `rungs` equal steps; 0 if there is but one."""
+    return 2.0 * place / (rungs - 1) - 1.0 if rungs > 1 else 0.0 * place
+
+
+def examples(lessons: Lessons, seed: jax.typing.ArrayLike) -> Examples:
+    """The training and validation set of a seed."""
+    shuffle, noise = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+    order = jax.random.permutation(shuffle, lessons.combinations)
+    return Examples(table=_table(lessons), order=order, noise=noise, lessons=lessons)
+
+
+def _table(lessons: Lessons) -> jax.Array:
+    """J_s shifted, over the mean of |J| of the words as they are, [S, shifts, 256]."""
+    signals = words(lessons.bits)
+    mean = jnp.mean(jnp.abs(bin_average(signals)))
+    steps = _ladder(jnp.arange(lessons.shifts), lessons.shifts) * lessons.shift * bit_width(lessons.bits)
+
+    def moved(step: jax.Array) -> jax.Array:
+        return jnp.asarray(bin_average(replace(signals, centres=signals.centres + step)) / mean, jnp.float32)
+
+    # One shift after another: side by side they would need `shifts` times the memory of `bin_average`.
+    return jnp.moveaxis(jax.lax.map(moved, steps), 0, 1)

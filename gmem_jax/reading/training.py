@@ -1,0 +1,201 @@
+"""How the paper's reader learns, and its files."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import serialization
+
+from gmem_jax.files.atomic import FileFormatError, atomic
+from gmem_jax.reading.lessons import Examples, Lessons, examples
+from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
+
+SCHEMA = "gmem-classifier/1"
+STEPS = 250  # to a call from the host: a second or so, and one check of the validation accuracy
+QUICK_CHECK = 4_096  # held-out examples tried after every call
+LAST_CHECK = 65_536  # held-out examples, at most, that must agree before training stops early
+SLICE = 1_024  # examples evaluated side by side
+SAVE_EVERY = 30.0  # seconds between checkpoints
+
+
+def learn(
+    net: Net, data: Examples, seed: jax.typing.ArrayLike, first: jax.typing.ArrayLike, count: int
+) -> tuple[Net, jax.Array]:
+    """`count` steps of plain SGD from step number `first`; the net after them and the mean loss during them.
+
+    A step depends on its number and the seed alone, so that training can be broken off and taken up anywhere.
+    """
+    optimiser = optax.sgd(net.lessons.rate)  # plain: its state is empty
+    key = jax.random.fold_in(jax.random.key(seed), 2)
+
+    def step(net: Net, number: Any) -> tuple[Net, jax.Array]:
+        inputs, word = data.training(jax.random.fold_in(key, number))
+        loss, slope = jax.value_and_grad(loss_of)(net, inputs, word)
+        change, _ = optimiser.update(slope, optimiser.init(net))
+        return optax.apply_updates(net, change), loss
+
+    net, losses = jax.lax.scan(step, net, first + jnp.arange(count))
+    return net, jnp.mean(losses)
+
+
+def validate(net: Net, data: Examples, count: int) -> jax.Array:
+    """Accuracy on the first `count` held-out examples (or on all S * kept, if fewer)."""
+    total = min(count, net.lessons.classes * net.lessons.kept)
+    slices = -(-total // SLICE)
+
+    def right(number: jax.Array) -> jax.Array:
+        inputs, word = data.held_out(number)
+        return jnp.sum((jnp.argmax(raw_logits(net, inputs), axis=-1) == word) & (number < total))
+
+    return jnp.sum(jax.lax.map(right, jnp.arange(slices * SLICE).reshape(slices, SLICE))) / total
+
+
+@dataclass(frozen=True)
+class Training:
+    """A training, finished or broken off.
+
+    Attributes:
+        net: as it is now.
+        seed: random seed of weights, order and noise.
+        step: steps done.
+        loss: mean cross-entropy of the last call's steps.
+        validation: accuracy on held-out examples at the last check.
+        examples: how many these were.
+        finished: whether the accuracy asked for was reached, confirmed on `LAST_CHECK` examples or all there are.
+        seconds: spent so far, compilation included.
+    """
+
+    net: Net
+    seed: int
+    step: int = 0
+    loss: float = float("nan")
+    validation: float = 0.0
+    examples: int = 0
+    finished: bool = False
+    seconds: float = 0.0
+
+
+Listener = Callable[[Training], None]
+"""Told about every call of `STEPS` steps."""
+
+
+def silent(training: Training) -> None:
+    """Report nothing."""
+
+
+_learn = jax.jit(learn, static_argnames="count")
+_validate = jax.jit(validate, static_argnames="count")
+_examples = jax.jit(examples, static_argnames="lessons")
+
+
+def train(
+    lessons: Lessons,
+    seed: int = 0,
+    *,
+    budget: float = 600.0,
+    target: float = 0.999,
+    most_steps: int | None = None,
+    checkpoint: Path | None = None,
+    listener: Listener = silent,
+) -> Training:
+    """Train a net until it reads held-out transformed inputs, or until time is up.
+
+    The same lessons and seed go through the same nets, bit for bit on one machine, however often they are broken off.
+
+    Args:
+        lessons: the net and its training data.
+        seed: of weights, order and noise.
+        budget: seconds that this call may take; it ends within one call of `STEPS` steps and a last check of it.
+        target: validation accuracy to stop at.
+        most_steps: steps to stop at; default no limit.
+        checkpoint: file that holds the training, written every 30 s and at the end; if it exists, training goes on
+            from there, and one that has reached `target` is only loaded.
+        listener: told about every `STEPS` steps.
+
+    Raises:
+        FileFormatError: if the checkpoint is broken.
+        ValueError: if it is of another lessons or seed.
+        OSError: if it cannot be written.
+    """
+    began = saved = time.perf_counter()
+    training = _take_up(lessons, seed, checkpoint)
+    before = training.seconds
+    if training.finished and training.validation >= target:
+        return training
+    data = _examples(lessons, seed)
+    total = lessons.classes * lessons.kept
+    over = False
+    while not over:
+        count = STEPS if most_steps is None else min(STEPS, most_steps - training.step)
+        if count > 0:
+            net, loss = _learn(training.net, data, seed, training.step, count)
+            training = replace(training, net=net, step=training.step + count, loss=float(loss))
+        quick = float(_validate(training.net, data, QUICK_CHECK))
+        over = time.perf_counter() - began > budget or (most_steps is not None and training.step >= most_steps)
+        training = replace(training, validation=quick, examples=min(QUICK_CHECK, total), finished=False)
+        if over or quick >= target:
+            whole = float(_validate(training.net, data, LAST_CHECK))
+            training = replace(training, validation=whole, examples=min(LAST_CHECK, total), finished=whole >= target)
+            over = over or training.finished
+        now = time.perf_counter()
+        training = replace(training, seconds=before + now - began)
+        if checkpoint is not None and (over or now - saved > SAVE_EVERY):
+            save(checkpoint, training)
+            saved = now
+        listener(training)
+    return training
+
+
+def _take_up(lessons: Lessons, seed: int, checkpoint: Path | None) -> Training:
+    if checkpoint is None or not Path(checkpoint).exists():
+        return Training(initial(lessons, seed), seed)
+    found = load(checkpoint)
+    if (found.net.lessons, found.seed) != (lessons, seed):
+        raise ValueError(f"{checkpoint}: holds the net of seed {found.seed} and {found.net.lessons}; name another file")
+    return found
+
+
+def save(path: Path, training: Training) -> None:
+    """Write a training, finished or not.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    content = {
+        "schema": SCHEMA,
+        "recipe": json.dumps(asdict(training.net.lessons)),
+        "training": {entry.name: getattr(training, entry.name) for entry in fields(training) if entry.name != "net"},
+        "parameters": jax.tree.map(np.asarray, training.net.parameters),
+    }
+    with atomic(path) as temporary:
+        temporary.write_bytes(serialization.msgpack_serialize(content))
+
+
+def load(path: Path) -> Training:
+    """Read a training; its net can be used whether it is finished or not.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if it is not a complete file of this schema.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        content = serialization.msgpack_restore(path.read_bytes())
+    except ValueError as error:
+        raise FileFormatError(f"{path}: not a readable classifier file (truncated?)") from error
+    found = content.get("schema", "none") if isinstance(content, dict) else "none"
+    if found != SCHEMA:
+        raise FileFormatError(f"{path}: schema is {found!r}, expected {SCHEMA!r}")
+    given = json.loads(content["recipe"])
+    lessons = Lessons(**{**given, "hidden": tuple(given["hidden"])})
+    parameters = jax.tree.map(jnp.asarray, content["parameters"])
+    return Training(Net(parameters, lessons), **content["training"])

@@ -1,0 +1,93 @@
+"""How the house is built: imports point downwards only, and importing it starts and loads nothing heavy."""
+
+import ast
+import subprocess
+import sys
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import gmem_jax
+
+ROOT = Path(gmem_jax.__file__).parent
+FLOORS = (
+    "physics",
+    "native",
+    "experiment",
+    "files",
+    "preparation",
+    "derivatives",
+    "design",
+    "reading",
+    "show",
+    "bench",
+    "command",
+)
+
+
+def modules() -> dict[str, Path]:
+    """Every module by its dotted name; a package by its own."""
+    found = {}
+    for path in sorted(ROOT.rglob("*.py")):
+        parts = path.relative_to(ROOT.parent).with_suffix("").parts
+        found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = modules()
+
+
+def imports(name: str) -> set[str]:
+    """The modules of this package that a module imports anywhere in it, late ones and those for types included."""
+    found = set()
+    for node in ast.walk(ast.parse(MODULES[name].read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name}: relative import in line {node.lineno}"
+            below = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {one if one in MODULES else str(node.module) for one in below}
+    return {one for one in found if one.split(".")[0] == ROOT.name}
+
+
+def floor(name: str) -> int:
+    """The number of a module's floor, from below."""
+    return FLOORS.index(name.split(".")[1])
+
+
+def test_the_floors_are_the_folders_there_are() -> None:
+    assert {name.split(".")[1] for name in MODULES if "." in name} == set(FLOORS)
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name != ROOT.name])
+def test_imports_point_downwards(name: str) -> None:
+    above = [one for one in imports(name) if one == ROOT.name or floor(one) > floor(name)]
+    assert not above, f"{name} imports {', '.join(sorted(above))}"
+    assert all(one in MODULES for one in imports(name))
+
+
+def test_no_import_goes_in_a_circle() -> None:
+    graph = {name: imports(name) - {name} for name in MODULES if name != ROOT.name}
+    assert len(list(TopologicalSorter(graph).static_order())) == len(MODULES) - 1  # raises CycleError, which names it
+
+
+LOADING = """
+import sys
+import gmem_jax
+from jax._src import xla_bridge
+heavy = [name for name in ("flax", "optax", "matplotlib", "rich", "jax_md") if name in sys.modules]
+print(xla_bridge.backends_are_initialized(), *heavy)
+"""
+
+
+def test_importing_the_package_starts_no_backend_and_loads_nothing_heavy() -> None:
+    done = subprocess.run([sys.executable, "-c", LOADING], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False"]
+
+
+def test_every_public_name_is_there() -> None:
+    for name in gmem_jax.__all__:
+        assert getattr(gmem_jax, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'run_memory'"):
+        gmem_jax.run_memory  # noqa: B018
