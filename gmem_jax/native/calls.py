@@ -176,10 +176,13 @@ def _library(
         limits = jnp.full((*(1 for _ in leading), arrays.walls.shape[-1]), arrays.walls.shape[-3], jnp.int32)
     pack = (fixed.first, fixed.second, fixed.valid, fixed.reference, fixed.smallest, fixed.offsets)
     before = [*arrays.fields, *pack, arrays.parameters, arrays.walls, limits]
-    # Histories, much the largest arrays, are updated where they are.
-    first_result = len(arrays.fields) + 1
-    aliases = {len(before) + leaf: first_result + leaf for leaf in range(call.leaves)} if in_place else {}
-    run = jax.ffi.ffi_call(target, outputs(parts), input_output_aliases=aliases)
+    shapes, aliases = outputs(parts), {}
+    if in_place:  # histories, much the largest arrays, are updated where they are
+        for number, leaf in enumerate(arrays.history):
+            argument, result = len(before) + number, len(arrays.fields) + 1 + number
+            if leaf.shape == shapes[result].shape:
+                aliases[argument] = result
+    run = jax.ffi.ffi_call(target, shapes, input_output_aliases=aliases)
     found: Sequence[jax.Array] = run(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict())
     return found
 
@@ -232,20 +235,19 @@ def _primitive(
 
     def abstract(*leaves: Any, tree: Any, **_: Any) -> list[Any]:
         parts = jax.tree.unflatten(tree, leaves)
-        like, leading = leaves[-1], _leading(parts)
-        # Where the mesh is part of types an axis is split as in the first argument in which it is.
-        split: dict[str | None, Any] = {}
+        # Where the mesh is part of types, an axis is split as in the first argument in which it is.
+        mesh, split = leaves[0].sharding.mesh, {}
         for leaf, names in zip(leaves, _names_of_arguments(parts), strict=True):
             for name, axes in zip(names, leaf.sharding.spec, strict=True):
-                split[name] = split.get(name) or (axes if name else None)
+                if name and axes and name not in split:
+                    mesh, split[name] = leaf.sharding.mesh, axes
 
-        def placed(shape: tuple[int, ...]) -> NamedSharding:
-            return NamedSharding(like.sharding.mesh, PartitionSpec(*map(split.get, _names(leading, shape))))
+        def aval(output: Any) -> Any:
+            places = PartitionSpec(*map(split.get, _names(_leading(parts), output.shape)))
+            sharding = NamedSharding(mesh, places)
+            return leaves[0].update(shape=output.shape, dtype=output.dtype, weak_type=False, sharding=sharding)
 
-        return [
-            like.update(shape=output.shape, dtype=output.dtype, weak_type=False, sharding=placed(output.shape))
-            for output in outputs(parts)
-        ]
+        return [aval(output) for output in outputs(parts)]
 
     def batch(arguments: Sequence[Any], axes: Sequence[int | None], **static: Any) -> tuple[Any, list[int]]:
         moved = [

@@ -250,12 +250,13 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
         ValueError: if an argument does not fit the number of replicas.
     """
     require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass)
-    system, state, boxes, (dt_, drag_) = together((system, state, boxes, (jnp.asarray(dt), jnp.asarray(drag))))
+    numbers: tuple[jax.Array, jax.Array] = (jnp.asarray(dt), jnp.asarray(drag))
+    system, state, boxes, numbers = together((system, state, boxes, numbers))
 
     def one_step(carry: tuple[State, jax.Array], xs: tuple[jax.Array, Box]) -> tuple[tuple[State, jax.Array], None]:
         state, total = carry
         index, box = xs
-        state, walls = step(system, state, box, dt_, drag_, index >= 0)
+        state, walls = step(system, state, box, numbers[0], numbers[1], index >= 0)
         return (state, total + wall_pressure(walls, box)), None
 
     total = jnp.zeros_like(state.grains.position, shape=(3, state.replicas))
