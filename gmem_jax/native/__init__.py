@@ -1,41 +1,38 @@
-"""`advance` in C++ for CPUs, behind jax.ffi: the numbers of `gmem_jax.physics.step.advance`, several times faster.
+"""The steps of one bin in C++, behind jax.ffi: the numbers of `gmem_jax.physics.step.march`, several times faster.
 
-One call into the library runs all steps of one bin for all replicas; walls, checks and samples are computed in JAX,
-as in `step.advance`. It works under `jax.jit`, `jax.vmap` and both modes of differentiation, whose derivatives
-are computed in the library too; see `gmem_jax.native.derivatives`.
+One call into the library runs all steps of one bin for all replicas; walls, checks and samples are computed in JAX.
+It works under `jax.jit`, `jax.vmap`, `jax.shard_map`, on sharded arrays, and in both modes of differentiation, whose
+derivatives are computed in the library too; see `gmem_jax.native.calls`.
 """
 
 import ctypes
 import functools
+import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
-from gmem_jax.native import derivatives
-from gmem_jax.native.derivatives import Call
-from gmem_jax.physics import step
+from gmem_jax.native import calls
+from gmem_jax.native.calls import Arrays, Call, Fixed, Results
+from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
-from gmem_jax.physics.contact.frictionless import Frictionless
-from gmem_jax.physics.contact.hooke import Hooke
-from gmem_jax.physics.contact.laws import entry_of
+from gmem_jax.physics.contact.laws import Entry, entry_of
 from gmem_jax.physics.contact.mindlin import Mindlin
-from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.state import Box, Grains, State
 from gmem_jax.physics.step import System
 
-March = Callable[..., tuple[State, jax.Array]]
+March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 """The signature of `gmem_jax.physics.step.march`."""
 
 BACKENDS = ("auto", "jax", "native")
 
 _LAW_NUMBERS = 4  # rows of the parameter array for a law's own, as in problem.h
 _VARIANTS = ("exact", "averaged", "paper")
-_PART = 32  # steps per call where their number is not known when the program is compiled
 
 
 def _path() -> Path:
@@ -45,29 +42,25 @@ def _path() -> Path:
 
 
 @functools.cache
-def _load() -> str:
-    """Load and register the library, once; returns why that failed ("" if it did not)."""
+def _load() -> tuple[str, str]:
+    """Load and register the library, once; returns its instruction set, and why that failed ("" if it did not)."""
     path = _path()
     if not path.exists():
-        return "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
+        return "", "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
     try:
         library = ctypes.CDLL(str(path))
-        for target in derivatives.TARGETS:
+        for target in calls.TARGETS:
             jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
+        library.gmem_instruction_set.restype = ctypes.c_char_p
+        return library.gmem_instruction_set().decode(), ""
     except (OSError, AttributeError) as error:
-        return f"its library could not be loaded: {error}"
-    return ""
+        return "", f"its library could not be loaded: {error}"
 
 
 def available() -> tuple[bool, str]:
-    """Whether the native backend can run here, and why not (or the instruction set it uses)."""
-    if reason := _load():
-        return False, reason
-    if jax.default_backend() != "cpu":
-        return False, f"it runs on CPUs, and JAX's default device is a {jax.default_backend()}"
-    library = ctypes.CDLL(str(_path()))
-    library.gmem_instruction_set.restype = ctypes.c_char_p
-    return True, library.gmem_instruction_set().decode()
+    """Whether the native backend can run on this machine's CPU, and the instruction set it uses (or why not)."""
+    instructions, reason = _load()
+    return not reason, reason or instructions
 
 
 def supports(law: FrictionLaw) -> bool:
@@ -76,33 +69,69 @@ def supports(law: FrictionLaw) -> bool:
 
 
 def name(backend: str, law: FrictionLaw) -> str:
-    """What "auto" means here for this friction law: "jax" or "native"; the other names are themselves."""
+    """What "auto" means for this friction law on JAX's default device, "jax" or "native"; others are themselves."""
     if backend != "auto":
         return backend
-    return "native" if available()[0] and supports(law) else "jax"
+    return "native" if available()[0] and supports(law) and jax.default_backend() == "cpu" else "jax"
 
 
 def marcher(backend: str = "auto") -> March:
-    """Who does the steps of a bin; the signature of `gmem_jax.physics.step.march`.
+    """The `march` of a backend.
 
     Args:
-        backend: "jax"; "native"; or "auto", native where it is available and knows the friction law.
+        backend: "jax", the definition; "native", this library, which is refused where there is none; or "auto": native
+            in what is compiled for CPUs, where the library is at hand and knows the friction law, else plain JAX.
 
     Raises:
         ValueError: if the backend is unknown or not available.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
-    possible, reason = (False, "") if backend == "jax" else available()
-    if backend == "native" and not possible:
-        raise ValueError(f"the native backend is not available: {reason}")
     if backend == "native":
-        return march
-    return _where_supported if possible else step.march
+        _require_library()
+    return {"jax": dynamics.march, "native": march, "auto": _march_anywhere}[backend]
 
 
-def _where_supported(system: System, state: State, *args: Any) -> tuple[State, jax.Array]:
-    return (march if supports(system.friction) else step.march)(system, state, *args)
+def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
+    """`gmem_jax.physics.step.march` on the native backend.
+
+    Args:
+        system: the system; parameters of its friction law are scalars or [B].
+        state: at time t.
+        boxes: the walls at t + dt, t + 2 dt, ...; leaves [steps, 3, B], in R and R / t_c.
+        dt: scalar or [B], in t_c.
+        drag: scalar or [B], in 1 / t_c.
+
+    Returns:
+        The state after them, and the sum over the steps of the wall pressures, [3, B], in E.
+
+    Raises:
+        ValueError: if the backend is not available, does not know the friction law, or the state is not float64; or if
+            an argument does not fit the number of replicas.
+        NotImplementedError: if it is compiled for anything but a CPU.
+    """
+    return _march(system, state, boxes, dt, drag, anywhere=False)
+
+
+def _march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
+    """`march` on CPUs, its definition elsewhere."""
+    if not supports(system.friction):
+        return dynamics.march(system, state, boxes, dt, drag)
+    if not available()[0]:
+        _warn_once(available()[1])
+        return dynamics.march(system, state, boxes, dt, drag)
+    return _march(system, state, boxes, dt, drag, anywhere=True)
+
+
+@functools.cache
+def _warn_once(reason: str) -> None:
+    warnings.warn(f"plain JAX runs, and slowly: the native backend is not available: {reason}", stacklevel=4)
+
+
+def _require_library() -> None:
+    possible, reason = available()
+    if not possible:
+        raise ValueError(f"the native backend is not available: {reason}")
 
 
 def _require(system: System, state: State) -> None:
@@ -111,124 +140,44 @@ def _require(system: System, state: State) -> None:
     Raises:
         ValueError: if the backend is not available, does not know the friction law, or the state is not float64.
     """
-    possible, reason = available()
-    if not possible:
-        raise ValueError(f"the native backend is not available: {reason}")
+    _require_library()
     if not supports(system.friction):
         raise ValueError(f"the native backend does not know the friction law {type(system.friction).__name__}")
     if state.grains.position.dtype != jnp.float64:
         raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
 
 
-def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
-    """`gmem_jax.physics.step.march` on the native backend; arguments, results and errors as of `advance`."""
+def _march(
+    system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, *, anywhere: bool
+) -> tuple[State, jax.Array]:
     _require(system, state)
-    numbers = (jnp.asarray(dt), jnp.asarray(drag))
-    grains, history, total = _bin(system, state.grains, state.history, boxes, numbers, None, jnp.asarray(0))
+    law = {field.name: getattr(system.friction, field.name) for field in fields(system.friction)}  # type: ignore[arg-type]
+    dynamics.require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass, **law)
+    boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
+    system, state, boxes, dt, drag = dynamics.together((system, state, boxes, jnp.asarray(dt), jnp.asarray(drag)))
+    grains, history, total = _bin(anywhere, system, state.grains, state.history, boxes, (dt, drag))
     return State(grains, history, state.status), total
 
 
 _Result = tuple[Grains, Any, jax.Array]
 
 
-@functools.partial(jax.custom_jvp)
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _bin(
-    system: System,
-    grains: Grains,
-    history: Any,
-    boxes: Box,
-    numbers: tuple[jax.Array, jax.Array],
-    limits: jax.Array | None,
-    begun: jax.Array,
+    anywhere: bool, system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]
 ) -> _Result:
-    """The steps whose walls are `boxes` ([steps, 3, B]), or the first `limits` [B] of them; `numbers` are (dt, drag).
+    """The steps whose walls are `boxes` ([steps, 3, B]); `numbers` are (dt, drag).
 
     Returns:
         The grains, the history, and the sum over the steps of the wall pressures, [3, B].
     """
-    steps, replicas = boxes.lower.shape[0], grains.position.shape[-1]
-    counts = jnp.full(replicas, steps, jnp.int32) if limits is None else limits
-    call = _call(system, history)
-    fixed = _fixed(system, counts)
-    return _result(grains, history, derivatives.forward(call, fixed, _moving(system, grains, history, boxes, numbers)))
-
-
-def _call(system: System, history: Any) -> Call:
-    """What the library is told beside arrays."""
-    law, entry = system.friction, entry_of(system.friction)
-    assert entry is not None  # `_require` has seen to it
-    return Call(
-        law=entry.native,
-        variant=_VARIANTS.index(law.variant) if isinstance(law, Mindlin) else 0,
-        points=law.points if isinstance(law, Mindlin) else 0,
-        isotropic=int(system.clump.isotropic),
-        leaves=len(jax.tree.leaves(history)),
-    )
-
-
-def _fixed(system: System, steps: jax.Array) -> tuple[jax.Array, ...]:
-    """Arguments without derivatives."""
-    pairs = system.pairs
-    candidates = (pairs.first, pairs.second, pairs.valid, pairs.reference[..., 0], pairs.smallest)
-    return (*candidates, system.clump.offsets, steps)
-
-
-def _moving(
-    system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]
-) -> derivatives.Arrays:
-    """Arguments with derivatives."""
-    walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
-    parameters = _parameters(system, numbers, grains.position.shape[-1])
-    return derivatives.Arrays(jax.tree.leaves(grains), parameters, walls, jax.tree.leaves(history))
-
-
-def _result(grains: Grains, history: Any, results: derivatives.Results) -> _Result:
-    moved = jax.tree.unflatten(jax.tree.structure(grains), results.fields)
-    return moved, jax.tree.unflatten(jax.tree.structure(history), results.history), results.pressure
-
-
-def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: int) -> jax.Array:
-    """What problem.h calls the rows of the parameter array, [rows, B]."""
-    clump, material, entry = system.clump, system.material, entry_of(system.friction)
-    assert entry is not None  # `_require` has seen to it
-    own = [getattr(system.friction, number) for number in entry.numbers]
-    own += [1.0] * (_LAW_NUMBERS - len(own))
-    solid = (material.normal_stiffness, material.normal_damping, material.wall_stiffness)
-    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own)
-    return jnp.stack([jnp.broadcast_to(jnp.asarray(row, jnp.float64), (replicas,)) for row in rows])
-
-
-def _plain_bin(
-    system: System,
-    grains: Grains,
-    history: Any,
-    boxes: Box,
-    numbers: tuple[jax.Array, jax.Array],
-    limits: jax.Array | None,
-    begun: jax.Array,
-) -> _Result:
-    """The definition of `_bin`, for derivatives that the library does not have."""
-    dt, drag = numbers
-    alive = jnp.asarray(begun) >= 0
-    replicas = grains.position.shape[-1]
-
-    def one_step(carry: tuple[State, jax.Array], xs: tuple[jax.Array, Box]) -> tuple[tuple[State, jax.Array], None]:
-        state, total = carry
-        index, box = xs
-        moved, walls = step.step(system, state, box, dt, drag, alive & (index >= 0))
-        after = moved, total + step.wall_pressure(walls, box)
-        going = True if limits is None else index < limits
-        return jax.tree.map(lambda new, old: jnp.where(going, new, old), after, carry), None
-
-    state = State(grains, history, jnp.zeros(replicas, jnp.int32))
-    total = jnp.zeros((3, replicas), grains.position.dtype)
-    steps = jnp.arange(boxes.lower.shape[0])
-    (state, total), _ = lax.scan(jax.checkpoint(one_step), (state, total), (steps, boxes))
-    return state.grains, state.history, total
+    arrays = _arrays(system, grains, history, boxes, numbers)
+    definition = _Definition.of(system, history) if anywhere else None
+    return _result(grains, history, calls.forward(_call(system, history), definition, _fixed(system), arrays))
 
 
 @functools.partial(_bin.defjvp, symbolic_zeros=True)
-def _bin_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
+def _bin_jvp(anywhere: bool, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
     """The tangent with respect to what is being differentiated and no more."""
     leaves, structure = jax.tree.flatten(primals)
     slopes = jax.tree.leaves(tangents)
@@ -242,17 +191,113 @@ def _bin_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Resu
         rebuilt: tuple[Any, ...] = jax.tree.unflatten(structure, whole)
         return rebuilt
 
-    system, limits = primals[0], primals[5]
-    of_system = tangents[0]
-    known = limits is None and all(map(_is_zero, jax.tree.leaves((of_system.pairs, of_system.clump.offsets))))
-    if not known:
-        _, slope = jax.jvp(lambda *varied: _plain_bin(*filled(varied)), varied, directions)
-        return _bin(*primals), slope
-    moving, along = jax.jvp(lambda *varied: _moving(*filled(varied)[:5]), varied, directions)
-    counts = jnp.full(moving.parameters.shape[-1], moving.walls.shape[0], jnp.int32)
-    change = derivatives.tangent(_call(system, primals[2]), _fixed(system, counts), moving, along)
-    return _bin(*primals), _result(primals[1], primals[2], change)
+    system, _, history, *_ = primals
+    if not all(map(_is_zero, jax.tree.leaves((tangents[0].pairs, tangents[0].clump.offsets)))):
+        # The library has no derivatives by these.
+        _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
+        return _bin(anywhere, *primals), slope
+    arrays, along = jax.jvp(lambda *varied: _arrays(*filled(varied)), varied, directions)
+    definition = _Definition.of(system, history) if anywhere else None
+    change = calls.tangent(_call(system, history), definition, _fixed(system), arrays, along)
+    return _bin(anywhere, *primals), _result(primals[1], history, change)
 
 
 def _is_zero(slope: Any) -> bool:
     return isinstance(slope, jax.custom_derivatives.SymbolicZero)
+
+
+def _plain(system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]) -> _Result:
+    """The definition of `_bin`."""
+    state = State(grains, history, jnp.zeros(grains.position.shape[-1], jnp.int32))
+    state, total = dynamics.march(system, state, boxes, *numbers)
+    return state.grains, state.history, total
+
+
+class _Solid(NamedTuple):
+    """What a step asks of a `Material`."""
+
+    normal_stiffness: jax.Array
+    normal_damping: jax.Array
+    wall_stiffness: jax.Array
+
+
+def _entry(law: FrictionLaw) -> Entry:
+    entry = entry_of(law)
+    assert entry is not None  # `_require` has seen to it
+    return entry
+
+
+@dataclass(frozen=True)
+class _Definition:
+    """`_plain` on the arguments of a call, `gmem_jax.native.calls.Definition`.
+
+    Attributes:
+        system: structure of the `System`.
+        history: structure of the history.
+    """
+
+    system: Any
+    history: Any
+
+    @classmethod
+    def of(cls, system: System, history: Any) -> "_Definition":
+        return cls(jax.tree.structure(system), jax.tree.structure(history))
+
+    def __call__(self, fixed: Fixed, arrays: Arrays) -> Results:
+        empty: System = jax.tree.unflatten(self.system, [None] * self.system.num_leaves)
+        dt, drag, mass, *inertia = arrays.parameters[:6]
+        clump = replace(empty.clump, offsets=fixed.offsets, mass=mass, inertia=jnp.stack(inertia))
+        law: Any = empty.friction
+        own = dict(zip(_entry(law).numbers, arrays.parameters[9:], strict=False))
+        if (spacing := own.pop("spacing", None)) is not None:
+            own["p_max"] = (spacing * (law.points - 1)) ** 2
+        law = replace(law, **own)
+        material: Any = _Solid(*arrays.parameters[6:9])
+        lists = ("first", "second", "valid", "incidence")
+        pairs = replace(empty.pairs, **{field: getattr(fixed, field) for field in lists})
+        boxes = Box(*jnp.split(arrays.walls, 4, axis=1))
+        history = jax.tree.unflatten(self.history, arrays.history)
+        system = replace(empty, clump=clump, friction=law, pairs=pairs, material=material)
+        grains, history, total = _plain(system, Grains(*arrays.fields), history, boxes, (dt, drag))
+        return Results(jax.tree.leaves(grains), total, jax.tree.leaves(history))
+
+
+def _call(system: System, history: Any) -> Call:
+    """What the library is told beside arrays."""
+    law = system.friction
+    return Call(
+        law=_entry(law).native,
+        variant=_VARIANTS.index(law.variant) if isinstance(law, Mindlin) else 0,
+        points=law.points if isinstance(law, Mindlin) else 0,
+        isotropic=int(system.clump.isotropic),
+        leaves=len(jax.tree.leaves(history)),
+    )
+
+
+def _fixed(system: System) -> Fixed:
+    """Arguments without derivatives."""
+    pairs = system.pairs
+    candidates = (pairs.first, pairs.second, pairs.valid, pairs.incidence, pairs.reference[..., 0], pairs.smallest)
+    return Fixed(*candidates, system.clump.offsets)
+
+
+def _arrays(system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]) -> Arrays:
+    """Arguments with derivatives."""
+    walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
+    parameters = _parameters(system, numbers, grains.position.shape[-1])
+    return Arrays(jax.tree.leaves(grains), parameters, walls, jax.tree.leaves(history))
+
+
+def _result(grains: Grains, history: Any, results: Results) -> _Result:
+    moved = jax.tree.unflatten(jax.tree.structure(grains), results.fields)
+    return moved, jax.tree.unflatten(jax.tree.structure(history), results.history), results.pressure
+
+
+def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: int) -> jax.Array:
+    """What problem.h calls the rows of the parameter array, [rows, B]."""
+    law, clump, material = system.friction, system.clump, system.material
+    own = [getattr(law, number) for number in _entry(law).numbers]
+    own += [1.0] * (_LAW_NUMBERS - len(own))
+    solid = (material.normal_stiffness, material.normal_damping, material.wall_stiffness)
+    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own)
+    return jnp.stack([jnp.broadcast_to(jnp.asarray(row, jnp.float64), (replicas,)) for row in rows])

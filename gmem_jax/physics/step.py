@@ -46,9 +46,23 @@ def _apart(alive: jax.Array, function: Callable[..., Any], *args: Any) -> Any:
     (`alive` is true, which the compiler cannot know) makes it store them once, and halves the time of a step.
     """
     shapes = jax.eval_shape(function, *args)
-    return lax.cond(
-        alive, function, lambda *_: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes), *args
-    )
+    return lax.cond(alive, function, lambda *_: jax.tree.map(jnp.zeros_like, shapes), *args)
+
+
+def together(tree: Any) -> Any:
+    """`tree`, each leaf marked as varying over the axes of a `jax.shard_map` that any of them varies over.
+
+    What the devices have in common becomes part of what they have not, in a loop at the latest; said at the start, the
+    types of the loop agree. Outside a shard_map there is nothing to mark.
+    """
+
+    def axes(leaf: Any) -> frozenset[str]:
+        kind: Any = jax.typeof(leaf)
+        varying: frozenset[str] = kind.vma if hasattr(kind, "vma") else kind.manual_axis_type.varying  # jax < 0.11
+        return varying
+
+    union = frozenset[str]().union(*map(axes, jax.tree.leaves(tree)))
+    return jax.tree.map(lambda leaf: lax.pcast(leaf, tuple(sorted(union - axes(leaf))), to="varying"), tree)
 
 
 def _sphere_table(clump: Clump, grains: Grains) -> tuple[jax.Array, jax.Array]:
@@ -132,7 +146,7 @@ def _angular_acceleration(clump: Clump, grains: Grains, torque: jax.Array) -> ja
     if clump.isotropic:
         return torque / clump.inertia[0]
     rotation = matrix(grains.quaternion)
-    inertia = clump.inertia[:, None]
+    inertia = clump.inertia.reshape(3, -1)
     body_spin = jnp.sum(rotation * grains.spin[:, :, None], axis=1)
     body_torque = jnp.sum(rotation * torque[:, :, None], axis=1)
     body_rate = (body_torque - cross(body_spin, inertia * body_spin)) / inertia
@@ -186,6 +200,21 @@ def wall_pressure(walls: jax.Array, box: Box) -> jax.Array:
     return (walls[0] + walls[1]) / (2.0 * area)
 
 
+def require_shapes(state: State, boxes: Box, **numbers: Any) -> None:
+    """Raise if the walls of a `march`, or numbers that are scalars or [B], do not fit the replicas of `state`.
+
+    Raises:
+        ValueError: naming the first that does not.
+    """
+    replicas = state.replicas
+    for name, number in numbers.items():
+        if jnp.shape(number) not in ((), (1,), (replicas,)):
+            raise ValueError(f"{name} must be a number or one for each of {replicas} replicas, got {jnp.shape(number)}")
+    for name, walls in vars(boxes).items():
+        if jnp.shape(walls)[1:] not in ((3, 1), (3, replicas)) or len(walls) != len(boxes.lower):
+            raise ValueError(f"boxes.{name} must be [steps, 3, {replicas}], got {jnp.shape(walls)}")
+
+
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
     """One step for each of the boxes: what a backend does with a bin.
 
@@ -198,15 +227,21 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
 
     Returns:
         The state after them, and the sum over the steps of the wall pressures, [3, B].
+
+    Raises:
+        ValueError: if an argument does not fit the number of replicas.
     """
+    require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass)
+    numbers: tuple[jax.Array, jax.Array] = (jnp.asarray(dt), jnp.asarray(drag))
+    system, state, boxes, numbers = together((system, state, boxes, numbers))
 
     def one_step(carry: tuple[State, jax.Array], xs: tuple[jax.Array, Box]) -> tuple[tuple[State, jax.Array], None]:
         state, total = carry
         index, box = xs
-        state, walls = step(system, state, box, jnp.asarray(dt), drag, index >= 0)
+        state, walls = step(system, state, box, numbers[0], numbers[1], index >= 0)
         return (state, total + wall_pressure(walls, box)), None
 
-    total = jnp.zeros((3, state.replicas), state.grains.position.dtype)
+    total = jnp.zeros_like(state.grains.position, shape=(3, state.replicas))
     count = jnp.arange(boxes.lower.shape[0])
     (state, total), _ = lax.scan(jax.checkpoint(one_step), (state, total), (count, boxes))
     return state, total

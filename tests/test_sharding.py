@@ -1,0 +1,41 @@
+"""Replicas and sweeps on several devices: the numbers of one device, and no array is gathered."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from sharded import CHECKS
+
+from gmem_jax import native
+
+HERE = Path(__file__).parent
+BUILT, REASON = native.available()
+
+
+@pytest.fixture(scope="module")
+def found(request: pytest.FixtureRequest) -> dict[str, str]:
+    """What each check found wrong, from a process whose CPU counts as eight devices."""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
+    command = [sys.executable, str(HERE / "sharded.py"), request.param]
+    run = subprocess.run(command, env={**os.environ, "XLA_FLAGS": flags}, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    wrong: dict[str, str] = json.loads(run.stdout)
+    return wrong
+
+
+def cases() -> list[object]:
+    built = pytest.mark.skipif(not BUILT, reason=REASON)
+    marks = {"native": [built], "jax": []}
+    return [
+        pytest.param(backend, check.__name__, marks=marks[backend], id=f"{backend}-{check.__name__}")
+        for backend, checks in CHECKS.items()
+        for check in checks
+    ]
+
+
+@pytest.mark.parametrize(("found", "check"), cases(), indirect=["found"])
+def test_devices_share_out_replicas_and_sweeps(found: dict[str, str], check: str) -> None:
+    assert not found[check], found[check]
