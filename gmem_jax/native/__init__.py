@@ -7,6 +7,7 @@ are computed in the library too; see `gmem_jax.native.derivatives`.
 
 import ctypes
 import functools
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ Advance = Callable[..., tuple[State, Sample]]
 
 BACKENDS = ("auto", "jax", "native")
 
-_LAWS: tuple[type, ...] = (Frictionless, Hooke, MindlinRescaled, Mindlin)  # numbered as in problem.h
+_LAWS: tuple[type, ...] = (Frictionless, Hooke, MindlinRescaled, Mindlin)  # numbered as in parameters.h
 _VARIANTS = ("exact", "averaged", "paper")
 _PART = 32  # steps per call where their number is not known when the program is compiled
 
@@ -47,11 +48,17 @@ def _path() -> Path:
 @functools.cache
 def _load() -> str:
     """Load and register the library, once; returns why that failed ("" if it did not)."""
+    from gmem_jax.native.build import is_stale  # here, as in `_path`
+
     path = _path()
     if not path.exists():
         return "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
     try:
         library = ctypes.CDLL(str(path))
+        if is_stale(library):
+            reason = "its library is older than its sources; rebuild it: python -m gmem_jax.native.build"
+            warnings.warn(f"the native backend is not used: {reason}", RuntimeWarning, stacklevel=2)
+            return reason
         for target in derivatives.TARGETS:
             jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
     except (OSError, AttributeError) as error:
@@ -236,7 +243,7 @@ def _result(grains: Grains, history: Any, results: derivatives.Results) -> _Resu
 
 
 def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: int) -> jax.Array:
-    """What problem.h calls the rows of the parameter array, [rows, B]."""
+    """What parameters.h calls the rows of the parameter array, [rows, B]."""
     law, clump, material = system.friction, system.clump, system.material
     own: tuple[Any, ...] = (0.0, 0.0, 0.0, 1.0)
     if isinstance(law, Hooke | MindlinRescaled | Mindlin):

@@ -2,7 +2,7 @@
 
 The tangent is a primitive of JAX with a rule for its transpose, so that `jax.jvp`, `jax.linearize`, `jax.grad` and
 their compositions with `jax.vmap` and `jax.checkpoint` all come out of the two calls. Forward mode runs the steps in
-numbers that carry a derivative; reverse mode redoes them, remembers each step, and goes back (native/adjoint.h).
+numbers that carry a derivative; reverse mode redoes them, remembers each step, and goes back (src/cpu/adjoint.h).
 """
 
 import functools
@@ -20,7 +20,7 @@ _FIELDS = 6  # leaves of a State's grains
 
 
 class Call(NamedTuple):
-    """Attributes of a call; see problem.h.
+    """Attributes of a call; see src/cpu/problem.h.
 
     Attributes:
         law: number of the friction law.
@@ -42,7 +42,7 @@ class Arrays(NamedTuple):
 
     Attributes:
         fields: leaves of `Grains`, [N, 3 or 4, B].
-        parameters: rows of problem.h's parameter array, [rows, B].
+        parameters: rows of src/physics/parameters.h's parameter array, [rows, B].
         walls: lower, upper and their velocities of every step, [steps, 12, B].
         history: leaves of the history.
     """

@@ -8,7 +8,7 @@
 
 #pragma once
 
-#include "problem.h"
+#include "cpu/problem.h"
 
 #include <memory>
 #include <vector>

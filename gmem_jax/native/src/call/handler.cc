@@ -4,9 +4,9 @@
 // size one or of the full size. Each index into them times each index of the innermost axis is a replica; replicas
 // with the same candidate list may share a block.
 
-#include "plan.h"
-#include "problem.h"
-#include "team.h"
+#include "cpu/plan.h"
+#include "cpu/problem.h"
+#include "cpu/team.h"
 
 #include <algorithm>
 #include <array>
@@ -340,6 +340,9 @@ auto binding() {
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_advance, gmem::handle<gmem::Task::forward>, gmem::binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_tangent, gmem::handle<gmem::Task::tangent>, gmem::binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_adjoint, gmem::handle<gmem::Task::adjoint>, gmem::binding());
+
+// Of the sources and flags that this library was compiled from; see native/build.py.
+extern "C" const char* gmem_source_hash() { return GMEM_SOURCE_HASH; }
 
 // Name of the instruction set in use.
 extern "C" const char* gmem_instruction_set() { return gmem::best_kernel(gmem::Task::forward).name; }
