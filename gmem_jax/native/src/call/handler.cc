@@ -4,23 +4,22 @@
 // size one or of the full size. Each index into them times each index of the innermost axis is a replica; replicas
 // with the same candidate list may share a block.
 
-#include "cpu/plan.h"
-#include "cpu/problem.h"
-#include "cpu/team.h"
-
 #include <algorithm>
 #include <array>
-#include <atomic>
 #include <cstdlib>
-#include <cstring>
+#include <exception>
 #include <map>
 #include <memory>
-#include <mutex>
 #include <new>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
-#include "xla/ffi/api/ffi.h"
+#include "call/arguments.h"
+#include "cpu/blocks.h"
+#include "cpu/plan.h"
+#include "cpu/problem.h"
+#include "cpu/team.h"
 
 namespace gmem {
 
@@ -53,186 +52,91 @@ const Kernel& best_kernel(Task task) {
   return of_task(baseline::kernel, baseline_derivatives::kernel);
 }
 
-// Memory that outlives a call, so that the next one does not fault its pages in again.
-class ScratchPool {
- public:
-  struct Piece {
-    std::unique_ptr<char[]> memory;
-    std::size_t bytes = 0;
-    void* aligned() const {
-      return reinterpret_cast<void*>((reinterpret_cast<std::uintptr_t>(memory.get()) + 63) / 64 * 64);
-    }
-  };
-
-  Piece take(std::size_t bytes) {
-    {
-      std::lock_guard<std::mutex> lock(mutex_);
-      for (auto piece = free_.begin(); piece != free_.end(); ++piece) {
-        if (piece->bytes < bytes || piece->bytes > 2 * bytes) continue;
-        Piece found = std::move(*piece);
-        free_.erase(piece);
-        return found;
-      }
-    }
-    return {std::unique_ptr<char[]>(new char[bytes + 64]), bytes};
-  }
-
-  void give(Piece piece) {
-    std::lock_guard<std::mutex> lock(mutex_);
-    free_.push_back(std::move(piece));
-    std::size_t total = 0;
-    for (const Piece& kept : free_) total += kept.bytes;
-    while (total > kKept && !free_.empty()) {
-      total -= free_.front().bytes;
-      free_.erase(free_.begin());
-    }
-  }
-
- private:
-  static constexpr std::size_t kKept = std::size_t{512} << 20;
-  std::mutex mutex_;
-  std::vector<Piece> free_;
-};
-
-ScratchPool& scratch_pool() {
-  static ScratchPool* pool = new ScratchPool;
-  return *pool;
-}
-
-// One argument or result: its data, and how far apart the entries of each leading axis are.
-struct Array {
-  char* data = nullptr;
-  std::vector<int64_t> shape;  // without the leading axes
-  std::vector<int64_t> step;   // of the leading axes, in elements; 0 where the array has size one
-
-  int64_t at(const std::vector<int64_t>& index) const {
-    int64_t offset = 0;
-    for (std::size_t axis = 0; axis < index.size(); ++axis) offset += index[axis] * step[axis];
-    return offset;
-  }
-};
-
 enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kOffsets, kParameterRows, kWallRows, kSteps,
                 kHistoryIn };
-constexpr int kRanks[kHistoryIn] = {3, 3, 3, 3, 3, 3, 1, 1, 1, 2, 1, 2, 2, 3, 1};
 constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
 
-Array view(const ffi::AnyBuffer& buffer, int leading) {
-  Array array;
-  array.data = static_cast<char*>(buffer.untyped_data());
-  const auto dims = buffer.dimensions();
-  array.shape.assign(dims.begin() + leading, dims.end());
-  array.step.resize(leading);
-  int64_t size = 1;
-  for (const int64_t n : array.shape) size *= n;
-  for (int axis = leading - 1; axis >= 0; --axis) {
-    array.step[axis] = dims[axis] == 1 ? 0 : size;
-    size *= dims[axis];
-  }
-  return array;
+// Axes are grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
+// Mindlin's points Q, replicas B.
+using Wants = std::vector<Wanted>;
+
+Wants operator+(Wants one, const Wants& other) {
+  one.insert(one.end(), other.begin(), other.end());
+  return one;
 }
 
-// Blocks one by one to single threads as long as that keeps all busy, then the rest to teams.
-void run_blocks(const Problem& problem, const Kernel& kernel, const std::vector<Block>& blocks, int threads) {
-  const int count = static_cast<int>(blocks.size());
-  if (count == 0) return;
-  const int alone = count / threads * threads, rest = count - alone;
-  std::size_t bytes = 0;
-  int domains = 0;
-  for (const Block& block : blocks) {
-    bytes = std::max(bytes, kernel.scratch_bytes(problem, block));
-    domains = std::max(domains, block.pack->plan->domains);
-  }
-  if (alone > 0) {
-    std::atomic<int> next{0};
-    const int ranks = std::min(threads, alone);
-    std::vector<ScratchPool::Piece> scratch;
-    for (int rank = 0; rank < ranks; ++rank) scratch.push_back(scratch_pool().take(bytes));
-    run_ranks(ranks, [&](int rank) {
-      for (int i; (i = next.fetch_add(1)) < alone;) {
-        Team team(1);
-        kernel.run(problem, blocks[i], team, 0, scratch[rank].aligned());
-      }
-    });
-    for (auto& piece : scratch) scratch_pool().give(std::move(piece));
-  }
-  if (rest > 0) {
-    const int size = std::min({threads / rest, domains, Team::kMaxSize});
-    std::vector<std::unique_ptr<Team>> teams;
-    std::vector<ScratchPool::Piece> scratch;
-    for (int i = 0; i < rest; ++i) {
-      teams.emplace_back(new Team(size));
-      scratch.push_back(scratch_pool().take(bytes));
-    }
-    run_ranks(rest * size, [&](int rank) {
-      const int i = rank / size;
-      kernel.run(problem, blocks[alone + i], *teams[i], rank % size, scratch[i].aligned());
-    });
-    for (auto& piece : scratch) scratch_pool().give(std::move(piece));
+Wants histories(Law law) {
+  switch (law) {
+    case Law::hooke: return {{"forces", "P3B"}};
+    case Law::mindlin_rescaled: return {{"forces", "P3B"}, {"overlaps", "P1B"}};
+    case Law::mindlin: return {{"layers", "PQ3B"}, {"overlaps", "P1B"}};
+    default: return {};
   }
 }
 
-ffi::Error invalid(const std::string& what) { return ffi::Error::InvalidArgument("gmem_jax native: " + what); }
+struct Signature {
+  Wants arguments, results;
+};
 
 // Arguments of the three tasks are those of the steps themselves, then, for derivatives, a number for each of the
 // results' or arguments' own; see `Task`.
+// gmem_jax/native/derivatives.py: _arguments, _shapes
+Signature signature(Task task, Law law) {
+  const Wants fields = {{"positions", "N3B"}, {"quaternions", "N4B"},   {"velocities", "N3B"},
+                        {"spins", "N3B"},     {"accelerations", "N3B"}, {"spin rates", "N3B"}};
+  const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
+                      {"validities", "P", ffi::PRED},   {"reference centres", "S3"},
+                      {"smallest lengths", "3"},        {"offsets", "K3"}};
+  const Wants numbers = {{"parameters", "RB"}, {"walls", "TWB"}}, steps = {{"steps", "B", ffi::S32}};
+  const Wants history = histories(law), arguments = fields + pack + numbers + steps + history;
+  const Wants arrays = fields + numbers + history, moved = fields + Wants{{"pressures", "3B"}} + history;
+  switch (task) {
+    case Task::tangent: return {arguments + arrays, moved};
+    case Task::adjoint: return {arguments + moved, arrays};
+    default: return {arguments, moved};
+  }
+}
+
 ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
                 ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  const std::vector<int> fields(kFields, 3);
-  std::vector<int> histories(leaves, 3);
-  if (law == static_cast<int64_t>(Law::mindlin) && leaves > 0) histories[0] = 4;
-  const auto join = [&](std::vector<int> ranks, std::initializer_list<int> more) {
-    ranks.insert(ranks.end(), more);
-    ranks.insert(ranks.end(), histories.begin(), histories.end());
-    return ranks;
-  };
-  const std::vector<int> inner = join(fields, {2}), outer = join(fields, {2, 3});
-  std::vector<int> argument_ranks = join({std::begin(kRanks), std::end(kRanks)}, {});
-  if (task != Task::forward) {
-    const std::vector<int>& more = task == Task::tangent ? outer : inner;
-    argument_ranks.insert(argument_ranks.end(), more.begin(), more.end());
-  }
-  const std::vector<int>& result_ranks = task == Task::adjoint ? outer : inner;
-  if (args.size() != argument_ranks.size() || rets.size() != result_ranks.size() || leaves > kMaxHistory)
-    return invalid("wrong number of arguments or results");
-  std::vector<Array> in, out;
-  std::vector<int64_t> batch;
-  for (std::size_t i = 0; i < rets.size(); ++i) {
-    auto buffer = rets.get<ffi::AnyBuffer>(i);
-    if (!buffer.has_value()) return buffer.error();
-    if (i == 0) {
-      const auto dims = (*buffer)->dimensions();
-      if (dims.size() < 3) return invalid("positions need three axes");
-      batch.assign(dims.begin(), dims.end() - 3);
-    }
-    if ((*buffer)->element_type() != ffi::F64) return invalid("results must be float64");
-    out.push_back(view(**buffer, static_cast<int>(batch.size())));
-  }
-  for (std::size_t i = 0; i < args.size(); ++i) {
-    auto buffer = args.get<ffi::AnyBuffer>(i);
-    if (!buffer.has_value()) return buffer.error();
-    const bool integer = i == kFirst || i == kSecond || i == kSteps;
-    const auto wanted = i == kValid ? ffi::PRED : integer ? ffi::S32 : ffi::F64;
-    if (buffer->element_type() != wanted) return invalid("argument " + std::to_string(i) + " has the wrong type");
-    if (buffer->dimensions().size() != argument_ranks[i] + batch.size())
-      return invalid("argument " + std::to_string(i) + " has the wrong number of axes");
-    in.push_back(view(*buffer, static_cast<int>(batch.size())));
-  }
-
-  const int64_t replicas = in[0].shape[2];
+  require(0 <= law && law <= static_cast<int64_t>(Law::mindlin), "no friction law has number " + std::to_string(law));
+  require(0 <= variant && variant <= static_cast<int64_t>(Variant::paper),
+          "no variant of the Mindlin law has number " + std::to_string(variant));
   Problem problem{};
   problem.task = task;
   problem.law = static_cast<Law>(law);
   problem.variant = static_cast<Variant>(variant);
   problem.isotropic = isotropic != 0;
+  require(problem.law != Law::mindlin || points >= 2, "the Mindlin law needs two points or more");
+  const Signature wanted = signature(task, problem.law);
+  require(static_cast<std::size_t>(leaves) == histories(problem.law).size() && args.size() == wanted.arguments.size() &&
+              rets.size() == wanted.results.size(),
+          "the number of arguments or results is not that of the friction law");
+
+  std::vector<ffi::AnyBuffer> results;
+  for (std::size_t i = 0; i < rets.size(); ++i) results.push_back(*rets.get<ffi::AnyBuffer>(i).value());
+  const auto dims = results[0].dimensions();
+  require(dims.size() >= 3, "positions need three axes");
+  const std::vector<int64_t> batch(dims.begin(), dims.end() - 3);
+  Reader reader(batch);
+  reader.size('R') = kParameters;
+  reader.size('W') = kWalls;
+  reader.size('Q') = points;
+  std::vector<Array> in, out;
+  for (std::size_t i = 0; i < args.size(); ++i)
+    in.push_back(reader.read(args.get<ffi::AnyBuffer>(i).value(), wanted.arguments[i]));
+  for (std::size_t i = 0; i < results.size(); ++i) {
+    out.push_back(reader.read(results[i], wanted.results[i]));
+    for (std::size_t axis = 0; axis < batch.size(); ++axis)
+      require(batch[axis] == results[i].dimensions()[axis], "results differ in their leading axes");
+  }
+  const int64_t replicas = reader.size('B'), rows = reader.size('T');
   problem.points = static_cast<int>(points);
-  problem.grains = static_cast<int>(in[0].shape[0]);
-  problem.spheres_per_grain = static_cast<int>(in[kOffsets].shape[0]);
+  problem.grains = static_cast<int>(reader.size('N'));
+  problem.spheres_per_grain = static_cast<int>(reader.size('K'));
   problem.stride = replicas;
-  const int64_t rows = in[kWallRows].shape[0];
-  if (in[kParameterRows].shape[0] != kParameters || in[kWallRows].shape[1] != kWalls ||
-      in[kReference].shape[0] != problem.spheres() || in[kSteps].shape[0] != replicas)
-    return invalid("arguments do not fit each other");
+  require(problem.grains > 0 && problem.spheres_per_grain > 0, "there is no grain");
+  require(reader.size('S') == reader.size('N') * reader.size('K'), "there are not as many spheres as the grains have");
   problem.history_aliased = task == Task::forward && leaves > 0;
   for (int64_t leaf = 0; leaf < leaves; ++leaf)
     problem.history_aliased &= in[kHistoryIn + leaf].data == out[kHistoryOut + leaf].data;
@@ -254,7 +158,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       const auto doubles = [&](Argument i) { return reinterpret_cast<const double*>(in[i].data) + key[i - kFirst]; };
       const auto integers = [&](Argument i) { return reinterpret_cast<const int32_t*>(in[i].data) + key[i - kFirst]; };
       const bool* valid = reinterpret_cast<const bool*>(in[kValid].data) + key[kValid - kFirst];
-      plans.push_back(plan_for({problem.grains, problem.spheres_per_grain, static_cast<int>(in[kFirst].shape[0]),
+      plans.push_back(plan_for({problem.grains, problem.spheres_per_grain, static_cast<int>(reader.size('P')),
                                 integers(kFirst), integers(kSecond), valid, doubles(kReference), doubles(kSmallest)}));
       packs.emplace_back(new Pack{&plans.back()->plan, doubles(kOffsets)});
       lanes.emplace_back();
@@ -304,23 +208,27 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       whole.push_back({packs[i].get(), &lanes[i][done], &slopes[i][done], std::min(kernel.width, count - done), false});
     for (; done < count; ++done) packed.push_back({packs[i].get(), &lanes[i][done], nullptr, 1, true});
   }
-  const int threads = acquire_threads(thread_count());
-  bool enough = true;
-  try {
-    run_blocks(problem, kernel, whole, threads);
-    run_blocks(problem, kernel, packed, threads);
-  } catch (const std::bad_alloc&) {
-    enough = false;
-  }
-  if (threads > 1) release_threads();
-  if (!enough) return ffi::Error(ffi::ErrorCode::kResourceExhausted, "gmem_jax native: out of memory; use fewer replicas");
+  const Threads threads(thread_count());
+  run_blocks(problem, kernel, whole, threads.count);
+  run_blocks(problem, kernel, packed, threads.count);
   return ffi::Error::Success();
 }
 
 template <Task task>
 ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
                   ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  return call(task, law, variant, points, isotropic, leaves, args, rets);
+  const auto error = [](ffi::ErrorCode code, const char* what) {
+    return ffi::Error(code, std::string("gmem_jax native: ") + what);
+  };
+  try {
+    return call(task, law, variant, points, isotropic, leaves, args, rets);
+  } catch (const std::invalid_argument& wrong) {
+    return error(ffi::ErrorCode::kInvalidArgument, wrong.what());
+  } catch (const std::bad_alloc&) {
+    return error(ffi::ErrorCode::kResourceExhausted, "out of memory; use fewer replicas");
+  } catch (const std::exception& other) {
+    return error(ffi::ErrorCode::kInternal, other.what());
+  }
 }
 
 auto binding() {
