@@ -1,19 +1,13 @@
 """The native library is what its sources say, and refuses what would lead it astray."""
 
-import ctypes
-import dataclasses
-import os
-import re
+import functools
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import gmem_jax as gm
@@ -29,6 +23,7 @@ PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
 Arguments = dict[str, Any]
 
 
+@functools.cache
 def arguments(law: Any) -> Arguments:
     """What `derivatives.forward` takes for two steps of two replicas, by name."""
     system = System(PACK.clump, law, PACK.pairs)
@@ -90,13 +85,55 @@ HOSTILE = {
 def test_arrays_that_do_not_fit_are_refused_in_a_sentence(law: Any, name: str) -> None:
     spoil, sentence = HOSTILE[name]
     given = arguments(law)
-    run(given)
-    with pytest.raises(Exception, match=f"gmem_jax native: .*({sentence})"):
+    with pytest.raises(jax.errors.JaxRuntimeError, match=f"gmem_jax native: .*({sentence})"):
         run(spoil(given))
+
+
+@needs_library
+@pytest.mark.parametrize("law", [gm.Hooke(), gm.Mindlin(points=4)], ids=lambda law: type(law).__name__)
+def test_arrays_that_fit_are_not_refused(law: Any) -> None:
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(run(arguments(law))))
 
 
 @needs_library
 @pytest.mark.parametrize("points", [1, 5])
 def test_points_that_are_not_those_of_the_layers_are_refused(points: int) -> None:
-    with pytest.raises(Exception, match="two points or more|with Q = 5"):
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"two points or more|with Q = 5"):
         run(called(points=points)(arguments(gm.Mindlin(points=4))))
+
+
+@needs_library
+def test_want_of_memory_is_an_error_and_leaves_the_library_working() -> None:
+    steps, points = 600_000, 1_500_000  # whose derivatives would take more than any address space has
+    given = arguments(gm.Mindlin(points=4))
+    alone = {
+        "first": given["first"][:1],
+        "second": given["second"][:1],
+        "valid": given["valid"][:1],
+        "fields": [leaf[..., :1] for leaf in given["fields"]],
+        "parameters": given["parameters"][:, :1],
+        "walls": jnp.zeros((steps, 12, 1)),
+        "steps": given["steps"][:1],
+        "history": [jnp.zeros((1, points, 3, 1)), jnp.zeros((1, 1, 1))],
+    }
+    values = {**called(points=points)(given), **alone}
+    call = values.pop("call")
+    moving = derivatives.Arrays(*(values.pop(name) for name in derivatives.Arrays._fields))
+    bars = [*moving.fields, jnp.zeros((3, 1)), *moving.history]
+    everything = derivatives._arguments(tuple(values.values()), moving)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="gmem_jax native: out of memory"):
+        jax.block_until_ready(derivatives._adjoint_p.bind(*everything, *bars, call=call))
+    run(given)
+
+
+@needs_library
+def test_a_library_older_than_its_sources_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    shutil.copytree(build.SOURCES, tmp_path / "src")
+    monkeypatch.setattr(build, "SOURCES", tmp_path / "src")
+    assert native._load.__wrapped__() == ""
+    with (tmp_path / "src" / "physics" / "laws.h").open("a") as file:
+        file.write("// new\n")
+    with pytest.warns(RuntimeWarning, match="older than its sources; rebuild it: python -m gmem_jax.native.build"):
+        assert "older than its sources" in native._load.__wrapped__()
+    shutil.rmtree(tmp_path / "src")  # a library alone is what it is
+    assert native._load.__wrapped__() == ""

@@ -103,7 +103,7 @@ def build(target: Path) -> None:
     jobs: list[tuple[str, str, tuple[str, ...]]] = [(f"cpu/{name}.cc", f"{name}.o", ()) for name in names]
     stamp = f'-DGMEM_SOURCE_HASH="{source_hash()}"'
     jobs.append(("call/handler.cc", "handler.o", (stamp, "-isystem", str(include))))
-    # From the lowest instruction set up: of an inline function of the standard library, the linker keeps the first copy.
+    # From the lowest instruction set up: the linker keeps the first copy of what they share, of the standard library.
     for name, flags in sets.items():
         jobs.append(("cpu/kernel.cc", f"{name}.o", (f"-DGMEM_ISA={name}", *flags)))
         derivatives = (f"-DGMEM_ISA={name}_derivatives", "-DGMEM_DERIVATIVES", "-O2", *flags)

@@ -298,7 +298,7 @@ struct Adjoint {
 
     int points() const { return count; }
     Vec<Taped> get(int j) const {
-      if (j > reached) return Vec<Taped>{Taped{}, Taped{}, Taped{}};
+      if (j > reached) return Vec<Taped>{};
       leaves->push_back(tape->mark().slots);
       return leaf(load_vec(before + 3 * j));
     }
@@ -485,7 +485,7 @@ struct Adjoint {
   }
 
   void run() {
-    tape = &recorded;
+    const Recording recording(&recorded);
     go_forward();
     load_bars();
     V pressure_bar[3];
@@ -493,7 +493,6 @@ struct Adjoint {
       pressure_bar[axis] = forward.mode.gather(block.slopes, [](const Lane& lane) { return lane.pressure; }, axis);
     for (int step = steps - 1; step >= 0; --step) step_back(step, load_vec(pressure_bar));
     unload_bars();
-    tape = nullptr;
   }
 };
 

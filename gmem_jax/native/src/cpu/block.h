@@ -206,7 +206,7 @@ struct Engine {
     int steps = 0;
     for (int l = 0; l < block.count; ++l) steps = block.lanes[l].steps > steps ? block.lanes[l].steps : steps;
     load();
-    Vec<V> total{V{}, V{}, V{}};
+    Vec<V> total{};
     if (any_ends(0)) deliver(0, total);
     if (steps > 0) grains(false, true, 0);
     for (int step = 0; step < steps; ++step) {

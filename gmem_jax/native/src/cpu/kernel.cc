@@ -1,5 +1,5 @@
-// The time step for one instruction set; compiled once for each, with GMEM_ISA the name of its namespace and the compiler's
-// flags, and once more with GMEM_DERIVATIVES for its derivatives.
+// The time step for one instruction set; compiled once for each, with GMEM_ISA the name of its namespace and the
+// compiler's flags, and once more with GMEM_DERIVATIVES for its derivatives.
 
 #include <cstdint>
 #include <cstdlib>
@@ -37,7 +37,7 @@ struct As {
 };
 
 template <class Function>
-auto with_worker(const Problem& problem, const Block& block, const Function& function) {
+auto with_worker(const Problem& problem, [[maybe_unused]] const Block& block, const Function& function) {
   return with_law(problem, [&](auto law) {
     using L = decltype(law);
 #ifdef GMEM_DERIVATIVES

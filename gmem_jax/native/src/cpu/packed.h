@@ -196,7 +196,7 @@ struct Packed {
 
     int points() const { return count; }
     Vec<V> get(int j) const {
-      Vec<V> f{V{}, V{}, V{}};
+      Vec<V> f{};
       for (int l = 0; l < W; ++l)
         if (j <= *last[l]) f.x[l] = at[l][3 * j], f.y[l] = at[l][3 * j + 1], f.z[l] = at[l][3 * j + 2];
       return f;

@@ -224,7 +224,7 @@ struct Replicas {
 
   Vec<V> sum_walls(const double* walls, int chunks) const {
     const V* s = reinterpret_cast<const V*>(walls);
-    Vec<V> lower{V{}, V{}, V{}}, upper = lower;
+    Vec<V> lower{}, upper = lower;
     for (int chunk = 0; chunk < chunks; ++chunk) {
       lower = lower + load_vec(s + 6 * chunk);
       upper = upper + load_vec(s + 6 * chunk + 3);
@@ -240,7 +240,7 @@ struct Replicas {
     int count;
 
     int points() const { return count; }
-    Vec<V> get(int j) const { return j <= *last ? stored(j) : Vec<V>{V{}, V{}, V{}}; }
+    Vec<V> get(int j) const { return j <= *last ? stored(j) : Vec<V>{}; }
     Vec<V> stored(int j) const { return load_vec(at + 3 * j); }
     void set(int j, Vec<V> f) { store_vec(at + 3 * j, f); }
     void keep(int kept) { *last = kept - 1; }

@@ -10,6 +10,18 @@
 namespace gmem {
 namespace GMEM_ISA {
 
+// The given lanes of `a`, and of `b` counted on from there.
+template <int... lanes, class T>
+inline auto shuffle(T a, T b) {
+#if defined(__clang__) || __GNUC__ >= 12
+  return __builtin_shufflevector(a, b, lanes...);
+#else
+  constexpr int width = sizeof(T) / sizeof(double);
+  typedef double Result __attribute__((vector_size(sizeof...(lanes) * sizeof(double))));
+  return Result{(lanes < width ? a[lanes % width] : b[lanes % width])...};
+#endif
+}
+
 typedef double Row __attribute__((vector_size(32), aligned(32)));
 
 // W rows, packed into vectors.
@@ -23,32 +35,32 @@ template <class Pointer>
 inline Rows load_rows(const Pointer& row) {
   Rows r;
   for (int i = 0; i < 4; ++i)
-    r.part[i] = __builtin_shufflevector(*row(2 * i), *row(2 * i + 1), 0, 1, 2, 3, 4, 5, 6, 7);
+    r.part[i] = shuffle<0, 1, 2, 3, 4, 5, 6, 7>(*row(2 * i), *row(2 * i + 1));
   return r;
 }
 
 inline Vec<Real> columns(const Rows& r) {
-  const Real p = __builtin_shufflevector(r.part[0], r.part[1], 0, 4, 8, 12, 1, 5, 9, 13);
-  const Real q = __builtin_shufflevector(r.part[2], r.part[3], 0, 4, 8, 12, 1, 5, 9, 13);
-  const Real s = __builtin_shufflevector(r.part[0], r.part[1], 2, 6, 10, 14, 3, 7, 11, 15);
-  const Real t = __builtin_shufflevector(r.part[2], r.part[3], 2, 6, 10, 14, 3, 7, 11, 15);
-  return {__builtin_shufflevector(p, q, 0, 1, 2, 3, 8, 9, 10, 11), __builtin_shufflevector(p, q, 4, 5, 6, 7, 12, 13, 14, 15),
-          __builtin_shufflevector(s, t, 0, 1, 2, 3, 8, 9, 10, 11)};
+  const Real p = shuffle<0, 4, 8, 12, 1, 5, 9, 13>(r.part[0], r.part[1]);
+  const Real q = shuffle<0, 4, 8, 12, 1, 5, 9, 13>(r.part[2], r.part[3]);
+  const Real s = shuffle<2, 6, 10, 14, 3, 7, 11, 15>(r.part[0], r.part[1]);
+  const Real t = shuffle<2, 6, 10, 14, 3, 7, 11, 15>(r.part[2], r.part[3]);
+  return {shuffle<0, 1, 2, 3, 8, 9, 10, 11>(p, q), shuffle<4, 5, 6, 7, 12, 13, 14, 15>(p, q),
+          shuffle<0, 1, 2, 3, 8, 9, 10, 11>(s, t)};
 }
 
 inline Rows rows_of(Vec<Real> a) {
   const Real zero{};
-  const Real p = __builtin_shufflevector(a.x, a.y, 0, 8, 1, 9, 2, 10, 3, 11);
-  const Real q = __builtin_shufflevector(a.x, a.y, 4, 12, 5, 13, 6, 14, 7, 15);
-  const Real s = __builtin_shufflevector(a.z, zero, 0, 8, 1, 9, 2, 10, 3, 11);
-  const Real t = __builtin_shufflevector(a.z, zero, 4, 12, 5, 13, 6, 14, 7, 15);
-  return {{__builtin_shufflevector(p, s, 0, 1, 8, 9, 2, 3, 10, 11), __builtin_shufflevector(p, s, 4, 5, 12, 13, 6, 7, 14, 15),
-           __builtin_shufflevector(q, t, 0, 1, 8, 9, 2, 3, 10, 11), __builtin_shufflevector(q, t, 4, 5, 12, 13, 6, 7, 14, 15)}};
+  const Real p = shuffle<0, 8, 1, 9, 2, 10, 3, 11>(a.x, a.y);
+  const Real q = shuffle<4, 12, 5, 13, 6, 14, 7, 15>(a.x, a.y);
+  const Real s = shuffle<0, 8, 1, 9, 2, 10, 3, 11>(a.z, zero);
+  const Real t = shuffle<4, 12, 5, 13, 6, 14, 7, 15>(a.z, zero);
+  return {{shuffle<0, 1, 8, 9, 2, 3, 10, 11>(p, s), shuffle<4, 5, 12, 13, 6, 7, 14, 15>(p, s),
+           shuffle<0, 1, 8, 9, 2, 3, 10, 11>(q, t), shuffle<4, 5, 12, 13, 6, 7, 14, 15>(q, t)}};
 }
 
 inline Row row_of(const Rows& r, int l) {
-  return l % 2 ? __builtin_shufflevector(r.part[l / 2], r.part[l / 2], 4, 5, 6, 7)
-               : __builtin_shufflevector(r.part[l / 2], r.part[l / 2], 0, 1, 2, 3);
+  return l % 2 ? shuffle<4, 5, 6, 7>(r.part[l / 2], r.part[l / 2])
+               : shuffle<0, 1, 2, 3>(r.part[l / 2], r.part[l / 2]);
 }
 
 #elif defined(__AVX__)
@@ -59,22 +71,22 @@ inline Rows load_rows(const Pointer& row) {
 }
 
 inline Vec<Real> columns(const Rows& r) {
-  const Real p = __builtin_shufflevector(r.part[0], r.part[1], 0, 4, 2, 6);  // x0 x1 z0 z1
-  const Real q = __builtin_shufflevector(r.part[2], r.part[3], 0, 4, 2, 6);
-  const Real s = __builtin_shufflevector(r.part[0], r.part[1], 1, 5, 3, 7);
-  const Real t = __builtin_shufflevector(r.part[2], r.part[3], 1, 5, 3, 7);
-  return {__builtin_shufflevector(p, q, 0, 1, 4, 5), __builtin_shufflevector(s, t, 0, 1, 4, 5),
-          __builtin_shufflevector(p, q, 2, 3, 6, 7)};
+  const Real p = shuffle<0, 4, 2, 6>(r.part[0], r.part[1]);  // x0 x1 z0 z1
+  const Real q = shuffle<0, 4, 2, 6>(r.part[2], r.part[3]);
+  const Real s = shuffle<1, 5, 3, 7>(r.part[0], r.part[1]);
+  const Real t = shuffle<1, 5, 3, 7>(r.part[2], r.part[3]);
+  return {shuffle<0, 1, 4, 5>(p, q), shuffle<0, 1, 4, 5>(s, t),
+          shuffle<2, 3, 6, 7>(p, q)};
 }
 
 inline Rows rows_of(Vec<Real> a) {
   const Real zero{};
-  const Real p = __builtin_shufflevector(a.x, a.y, 0, 4, 2, 6);  // x0 y0 x2 y2
-  const Real q = __builtin_shufflevector(a.x, a.y, 1, 5, 3, 7);
-  const Real s = __builtin_shufflevector(a.z, zero, 0, 4, 2, 6);
-  const Real t = __builtin_shufflevector(a.z, zero, 1, 5, 3, 7);
-  return {{__builtin_shufflevector(p, s, 0, 1, 4, 5), __builtin_shufflevector(q, t, 0, 1, 4, 5),
-           __builtin_shufflevector(p, s, 2, 3, 6, 7), __builtin_shufflevector(q, t, 2, 3, 6, 7)}};
+  const Real p = shuffle<0, 4, 2, 6>(a.x, a.y);  // x0 y0 x2 y2
+  const Real q = shuffle<1, 5, 3, 7>(a.x, a.y);
+  const Real s = shuffle<0, 4, 2, 6>(a.z, zero);
+  const Real t = shuffle<1, 5, 3, 7>(a.z, zero);
+  return {{shuffle<0, 1, 4, 5>(p, s), shuffle<0, 1, 4, 5>(q, t),
+           shuffle<2, 3, 6, 7>(p, s), shuffle<2, 3, 6, 7>(q, t)}};
 }
 
 inline Row row_of(const Rows& r, int l) { return r.part[l]; }
@@ -88,18 +100,18 @@ inline Rows load_rows(const Pointer& row) {
 }
 
 inline Vec<Real> columns(const Rows& r) {
-  return {__builtin_shufflevector(r.part[0], r.part[2], 0, 2), __builtin_shufflevector(r.part[0], r.part[2], 1, 3),
-          __builtin_shufflevector(r.part[1], r.part[3], 0, 2)};
+  return {shuffle<0, 2>(r.part[0], r.part[2]), shuffle<1, 3>(r.part[0], r.part[2]),
+          shuffle<0, 2>(r.part[1], r.part[3])};
 }
 
 inline Rows rows_of(Vec<Real> a) {
   const Real zero{};
-  return {{__builtin_shufflevector(a.x, a.y, 0, 2), __builtin_shufflevector(a.z, zero, 0, 2),
-           __builtin_shufflevector(a.x, a.y, 1, 3), __builtin_shufflevector(a.z, zero, 1, 3)}};
+  return {{shuffle<0, 2>(a.x, a.y), shuffle<0, 2>(a.z, zero),
+           shuffle<1, 3>(a.x, a.y), shuffle<1, 3>(a.z, zero)}};
 }
 
 inline Row row_of(const Rows& r, int l) {
-  return __builtin_shufflevector(r.part[2 * l], r.part[2 * l + 1], 0, 1, 2, 3);
+  return shuffle<0, 1, 2, 3>(r.part[2 * l], r.part[2 * l + 1]);
 }
 
 #endif

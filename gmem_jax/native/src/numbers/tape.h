@@ -182,6 +182,14 @@ class Tape {
 // The tape on which this thread records.
 static thread_local Tape* tape __attribute__((tls_model("initial-exec"))) = nullptr;
 
+// Makes it that tape for as long as this lives.
+struct Recording {
+  explicit Recording(Tape* on) { tape = on; }
+  ~Recording() { tape = nullptr; }
+  Recording(const Recording&) = delete;
+  Recording& operator=(const Recording&) = delete;
+};
+
 // --- numbers
 
 // A number in a slot, or a constant (slot 0).

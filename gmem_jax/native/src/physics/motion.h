@@ -48,7 +48,7 @@ struct GrainParameters {
 };
 
 // First half of a step: positions and orientations at its end, and velocities predicted for it.
-// gmem_jax/physics/step.py: step, up to the forces
+// gmem_jax/physics/step.py: step (up to the forces)
 template <class V>
 GMEM_INLINE Midway<V> begin_step(const GrainParameters<V>& p, const Grain<V>& g) {
   const Vec<V> half_velocity = fma(p.half_dt, g.acceleration, g.velocity), half_spin = fma(p.half_dt, g.spin_rate, g.spin);
@@ -73,7 +73,7 @@ inline Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropic, 
 }
 
 // Second half: accelerations and velocities; position and orientation stay.
-// gmem_jax/physics/step.py: step, from the forces on
+// gmem_jax/physics/step.py: step (from the forces on)
 template <class V>
 GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const Midway<V>& m, Vec<V> force, Vec<V> torque) {
   const Vec<V> acceleration = fnma(p.drag, m.velocity, p.inverse_mass * force);
