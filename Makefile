@@ -2,13 +2,17 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
+REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
 .PHONY: demo test check install clean
 
 demo: install
+	$(REBUILD)
 	$(BIN)/gmem demo --force
 
 test: install-dev
+	$(REBUILD)
 	$(BIN)/pytest -n 2 --dist loadgroup
 
 check: install-dev

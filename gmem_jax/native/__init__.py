@@ -31,7 +31,7 @@ March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 
 BACKENDS = ("auto", "jax", "native")
 
-_LAW_NUMBERS = 4  # rows of the parameter array for a law's own, as in problem.h
+_LAW_NUMBERS = 4  # rows of the parameter array for a law's own, as in parameters.h
 _VARIANTS = ("exact", "averaged", "paper")
 
 
@@ -44,11 +44,15 @@ def _path() -> Path:
 @functools.cache
 def _load() -> tuple[str, str]:
     """Load and register the library, once; returns its instruction set, and why that failed ("" if it did not)."""
+    from gmem_jax.native.build import is_stale  # here, as in `_path`
+
     path = _path()
     if not path.exists():
         return "", "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
     try:
         library = ctypes.CDLL(str(path))
+        if is_stale(library):
+            return "", "its library is older than its sources; rebuild it: python -m gmem_jax.native.build"
         for target in calls.TARGETS:
             jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
         library.gmem_instruction_set.restype = ctypes.c_char_p
@@ -294,7 +298,7 @@ def _result(grains: Grains, history: Any, results: Results) -> _Result:
 
 
 def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: int) -> jax.Array:
-    """What problem.h calls the rows of the parameter array, [rows, B]."""
+    """What parameters.h calls the rows of the parameter array, [rows, B]."""
     law, clump, material = system.friction, system.clump, system.material
     own = [getattr(law, number) for number in _entry(law).numbers]
     own += [1.0] * (_LAW_NUMBERS - len(own))

@@ -1,10 +1,14 @@
 """Compile the native backend: at install time (setup.py), or in place with ``python -m gmem_jax.native.build``.
 
+With ``--if-stale`` it is compiled only if it is not there, or not made of the sources beside it.
+
 The library has no Python in it: one shared object whose symbols `gmem_jax.native` registers with XLA. The time step and
 its derivatives are compiled once per instruction set, and the best one that the CPU has is chosen when it runs. Only
 the standard library is imported here, because setup.py loads this file before the package exists.
 """
 
+import ctypes
+import hashlib
 import os
 import platform
 import shlex
@@ -17,6 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
+SOURCES = HERE / "src"
 LIBRARY = "libgmem.so"
 # No option here may reorder or contract arithmetic: a replica's numbers must not depend on how it is vectorised.
 FLAGS = ("-std=c++17", "-O3", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-pthread")
@@ -57,6 +62,34 @@ def headers() -> Path:
     return Path(spec.origin).parent / "include"
 
 
+def source_hash() -> str:
+    """What the library would be compiled from: a hash of its sources and flags; "" where the sources are not there."""
+    files = sorted(path for path in SOURCES.rglob("*") if path.suffix in (".cc", ".h"))
+    if not files:
+        return ""
+    found = hashlib.sha256(repr((FLAGS, INSTRUCTION_SETS)).encode())
+    for path in files:
+        found.update(path.relative_to(SOURCES).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return found.hexdigest()[:16]
+
+
+def is_stale(library: ctypes.CDLL) -> bool:
+    """Whether a library was compiled from other sources than those that lie here, if any do."""
+    try:
+        library.gmem_source_hash.restype = ctypes.c_char_p
+        compiled: str = library.gmem_source_hash().decode()
+    except AttributeError:  # from before there were hashes
+        compiled = ""
+    return source_hash() not in ("", compiled)
+
+
+def _is_current(target: Path) -> bool:
+    try:
+        return not is_stale(ctypes.CDLL(str(target)))
+    except OSError:
+        return False
+
+
 def build(target: Path) -> None:
     """Compile the library to the file `target`.
 
@@ -66,12 +99,15 @@ def build(target: Path) -> None:
     cxx, include = compiler(), headers()
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     sets = INSTRUCTION_SETS if x86 else {"baseline": ()}
-    jobs: list[tuple[str, str, tuple[str, ...]]] = [("team.cc", "team.o", ()), ("plan.cc", "plan.o", ())]
-    jobs.append(("handler.cc", "handler.o", ("-isystem", str(include))))
+    names = ("team", "plan", "blocks")
+    jobs: list[tuple[str, str, tuple[str, ...]]] = [(f"cpu/{name}.cc", f"{name}.o", ()) for name in names]
+    stamp = f'-DGMEM_SOURCE_HASH="{source_hash()}"'
+    jobs.append(("call/handler.cc", "handler.o", (stamp, "-isystem", str(include))))
+    # From the lowest instruction set up: the linker keeps the first copy of what they share, of the standard library.
     for name, flags in sets.items():
-        jobs.append(("kernel.cc", f"{name}.o", (f"-DGMEM_ISA={name}", *flags)))
+        jobs.append(("cpu/kernel.cc", f"{name}.o", (f"-DGMEM_ISA={name}", *flags)))
         derivatives = (f"-DGMEM_ISA={name}_derivatives", "-DGMEM_DERIVATIVES", "-O2", *flags)
-        jobs.append(("kernel.cc", f"{name}_derivatives.o", derivatives))
+        jobs.append(("cpu/kernel.cc", f"{name}_derivatives.o", derivatives))
 
     def run(command: list[str]) -> None:
         try:
@@ -87,7 +123,7 @@ def build(target: Path) -> None:
         def compile_one(job: tuple[str, str, tuple[str, ...]]) -> str:
             source, name, flags = job
             result = str(Path(folder) / name)
-            run([*cxx, *FLAGS, *flags, "-c", str(HERE / source), "-o", result])
+            run([*cxx, *FLAGS, *flags, "-I", str(SOURCES), "-c", str(SOURCES / source), "-o", result])
             return result
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -101,6 +137,7 @@ def build(target: Path) -> None:
 
 if __name__ == "__main__":
     try:
-        build(HERE / LIBRARY)
+        if "--if-stale" not in sys.argv or not _is_current(HERE / LIBRARY):
+            build(HERE / LIBRARY)
     except BuildError as reason:
         sys.exit(str(reason))

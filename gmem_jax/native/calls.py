@@ -2,7 +2,7 @@
 
 The tangent is a primitive of JAX with a rule for its transpose, so that `jax.jvp`, `jax.linearize`, `jax.grad` and
 their compositions with `jax.vmap` and `jax.checkpoint` all come out of the two calls. Forward mode runs the steps in
-numbers that carry a derivative; reverse mode redoes them, remembers each step, and goes back (native/adjoint.h).
+numbers that carry a derivative; reverse mode redoes them, remembers each step, and goes back (src/cpu/adjoint.h).
 
 Which code runs is settled when a program is lowered: the library on CPUs, the definition in plain JAX elsewhere.
 Replicas know nothing of each other, so a call on arrays that are sharded by replicas runs on each device by itself.
@@ -29,7 +29,7 @@ TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint")
 
 
 class Call(NamedTuple):
-    """Attributes of a call; see problem.h.
+    """Attributes of a call; see src/physics/parameters.h.
 
     Attributes:
         law: number of the friction law.
@@ -73,7 +73,7 @@ class Arrays(NamedTuple):
 
     Attributes:
         fields: leaves of `Grains`, [N, 3 or 4, B].
-        parameters: rows of problem.h's parameter array, [rows, B].
+        parameters: rows of src/physics/parameters.h's parameter array, [rows, B].
         walls: lower, upper and their velocities of every step, [steps, 12, B].
         history: leaves of the history, [P, ..., B].
     """

@@ -17,7 +17,7 @@ class Entry(NamedTuple):
         name: in files and on the command line.
         paper: what the paper calls it.
         kind: its class.
-        native: its number in the native library (native/src, enum Law).
+        native: its number in the native library (native/src/physics/parameters.h, enum Law).
         numbers: attributes that the native library is given, in the order of its parameter array.
     """
 

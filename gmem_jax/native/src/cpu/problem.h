@@ -8,46 +8,14 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "physics/parameters.h"
+
 namespace gmem {
 
-enum class Law { frictionless = 0, hooke = 1, mindlin_rescaled = 2, mindlin = 3 };
-enum class Variant { exact = 0, averaged = 1, paper = 2 };
-
-// Rows of the parameter array; a law's own follow.
-enum Parameter { kDt, kDrag, kMass, kInertia, kNormalStiffness = kInertia + 3, kNormalDamping, kWallStiffness, kLaw };
-constexpr int kLawParameters = 4;  // mu, stiffness, damping time, spacing of Mindlin's points
-constexpr int kParameters = kLaw + kLawParameters;
 constexpr int kFields = 6;  // position, quaternion, velocity, spin, acceleration, spin rate
 constexpr int kWalls = 12;  // lower, upper, lower velocity, upper velocity
 constexpr int kMaxHistory = 2;
 constexpr int kMaxWidth = 8;
-
-// The laws as types.
-struct Frictionless {
-  static constexpr int kHistory = 0;  // numbers remembered of a contact, beside Mindlin's layers
-  static constexpr int kVectors = 0;  // those of them that are components of forces
-  static constexpr bool kLayered = false;
-};
-
-struct Hooke {
-  static constexpr int kHistory = 3;
-  static constexpr int kVectors = 3;
-  static constexpr bool kLayered = false;
-};
-
-struct Rescaled {
-  static constexpr int kHistory = 4;  // force, overlap
-  static constexpr int kVectors = 3;
-  static constexpr bool kLayered = false;
-};
-
-template <Variant variant_>
-struct Layered {
-  static constexpr int kHistory = 1;  // overlap; the layers are kept apart
-  static constexpr int kVectors = 0;
-  static constexpr bool kLayered = true;
-  static constexpr Variant variant = variant_;
-};
 
 // What is wanted: all steps; their derivative along a direction; or, back from derivatives by all results, those by all
 // arguments.

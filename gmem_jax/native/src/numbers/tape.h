@@ -1,8 +1,18 @@
 // Numbers and vectors that remember how they came about: a calculation with them can be gone through backwards, from
-// derivatives by its results to derivatives by its arguments ("bars"). Included inside a namespace of its own, ahead of
-// what calculates, in place of vectors.h.
+// derivatives by its results to derivatives by its arguments ("bars").
 
-using GVec = GMEM_ISA::Vec;
+#pragma once
+
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <new>
+
+#include "numbers/simd.h"
+#include "numbers/vectors.h"
+
+namespace gmem {
+namespace GMEM_ISA {
 
 enum class Operation : std::int32_t {
   // of numbers
@@ -35,7 +45,7 @@ class Tape {
     return slots_++;
   }
 
-  GMEM_INLINE int slot(const GVec& value) {
+  GMEM_INLINE int slot(const Vec<Real>& value) {
     if (__builtin_expect(slots_ + 3 > slot_capacity_, 0)) grow_slots();
     Real* v = value_ + slots_;
     Real* b = bar_ + slots_;
@@ -79,21 +89,21 @@ class Tape {
         case Operation::divide: {
           const Real by_a = g / value_[node.b];
           *a += by_a;
-          *b = GMEM_ISA::fnma(by_a, *result, *b);
+          *b = fnma(by_a, *result, *b);
           break;
         }
         case Operation::root:  // at zero, where it has no derivative, zero
-          *a += GMEM_ISA::zero_unless(*result > Real{}, GMEM_ISA::splat(0.5) * g / *result);
+          *a += zero_unless(*result > Real{}, splat<Real>(0.5) * g / *result);
           break;
         case Operation::inverse_root: {  // what is not wanted stays zero, even where its slope is infinite
           const Real y = *result;
-          *a += GMEM_ISA::zero_unless(g != Real{}, GMEM_ISA::splat(-0.5) * (((g * y) * y) * y));
+          *a += zero_unless(g != Real{}, splat<Real>(-0.5) * (((g * y) * y) * y));
           break;
         }
         case Operation::select: {
-          const Mask m = (Mask)value_[node.c];
-          *a += GMEM_ISA::zero_unless(m, g);
-          *b += GMEM_ISA::zero_unless(~m, g);
+          const Bits m = (Bits)value_[node.c];
+          *a += zero_unless(m, g);
+          *b += zero_unless(~m, g);
           break;
         }
         case Operation::vec_add: add(a, vec_bar(node)), add(b, vec_bar(node)); break;
@@ -103,15 +113,15 @@ class Tape {
         case Operation::vec_fma: scaled(node, vec_bar(node)), add(c, vec_bar(node)); break;
         case Operation::vec_fnma: scaled(node, -vec_bar(node)), add(c, vec_bar(node)); break;
         case Operation::dot: {
-          const GVec one = at(value_ + node.a), other = at(value_ + node.b);
-          put(a, GMEM_ISA::fma(g, other, at(a)));
-          put(b, GMEM_ISA::fma(g, one, at(b)));
+          const Vec<Real> one = at(value_ + node.a), other = at(value_ + node.b);
+          put(a, fma(g, other, at(a)));
+          put(b, fma(g, one, at(b)));
           break;
         }
         case Operation::cross: crossed(node, vec_bar(node)); break;
         case Operation::add_cross: crossed(node, vec_bar(node)), add(c, vec_bar(node)); break;
         case Operation::copy: *a += g, *b += bar_[node.result + 1], *c += bar_[node.result + 2]; break;
-        case Operation::vec_select: add(a, GMEM_ISA::zero_unless((Mask)value_[node.c], vec_bar(node))); break;
+        case Operation::vec_select: add(a, zero_unless((Bits)value_[node.c], vec_bar(node))); break;
       }
     }
   }
@@ -122,25 +132,25 @@ class Tape {
     int result, a, b, c;
   };
 
-  static GVec at(const Real* p) { return GMEM_ISA::load_vec(p); }
-  static void put(Real* p, GVec a) { GMEM_ISA::store_vec(p, a); }
-  static void add(Real* to, GVec a) { put(to, at(to) + a); }
-  GVec vec_bar(const Node& node) const { return at(bar_ + node.result); }
+  static Vec<Real> at(const Real* p) { return load_vec(p); }
+  static void put(Real* p, Vec<Real> a) { store_vec(p, a); }
+  static void add(Real* to, Vec<Real> a) { put(to, at(to) + a); }
+  Vec<Real> vec_bar(const Node& node) const { return at(bar_ + node.result); }
 
   void product(const Node& node, Real g) {
-    bar_[node.a] = GMEM_ISA::fma(g, value_[node.b], bar_[node.a]);
-    bar_[node.b] = GMEM_ISA::fma(g, value_[node.a], bar_[node.b]);
+    bar_[node.a] = fma(g, value_[node.b], bar_[node.a]);
+    bar_[node.b] = fma(g, value_[node.a], bar_[node.b]);
   }
 
-  void scaled(const Node& node, GVec g) {
-    bar_[node.a] += GMEM_ISA::dot(g, at(value_ + node.b));
-    put(bar_ + node.b, GMEM_ISA::fma(value_[node.a], g, at(bar_ + node.b)));
+  void scaled(const Node& node, Vec<Real> g) {
+    bar_[node.a] += dot(g, at(value_ + node.b));
+    put(bar_ + node.b, fma(value_[node.a], g, at(bar_ + node.b)));
   }
 
-  void crossed(const Node& node, GVec g) {
-    const GVec one = at(value_ + node.a), other = at(value_ + node.b);
-    put(bar_ + node.a, GMEM_ISA::add_cross(at(bar_ + node.a), other, g));
-    put(bar_ + node.b, GMEM_ISA::add_cross(at(bar_ + node.b), g, one));
+  void crossed(const Node& node, Vec<Real> g) {
+    const Vec<Real> one = at(value_ + node.a), other = at(value_ + node.b);
+    put(bar_ + node.a, add_cross(at(bar_ + node.a), other, g));
+    put(bar_ + node.b, add_cross(at(bar_ + node.b), g, one));
   }
 
   __attribute__((noinline)) void grow_nodes() {
@@ -172,115 +182,135 @@ class Tape {
 // The tape on which this thread records.
 static thread_local Tape* tape __attribute__((tls_model("initial-exec"))) = nullptr;
 
+// Makes it that tape for as long as this lives.
+struct Recording {
+  explicit Recording(Tape* on) { tape = on; }
+  ~Recording() { tape = nullptr; }
+  Recording(const Recording&) = delete;
+  Recording& operator=(const Recording&) = delete;
+};
+
 // --- numbers
 
 // A number in a slot, or a constant (slot 0).
-struct V {
+struct Taped {
   Real value;
   int slot;
+
+  static Taped of(double a) { return {splat<Real>(a), 0}; }
   double operator[](int l) const { return value[l]; }
 };
 
-inline V leaf(Real value) { return {value, tape->slot(value)}; }
+inline Taped leaf(Real value) { return {value, tape->slot(value)}; }
 // The slot of an operand whose value will be wanted.
-GMEM_INLINE int kept(V a) { return a.slot ? a.slot : tape->slot(a.value); }
+GMEM_INLINE int kept(Taped a) { return a.slot ? a.slot : tape->slot(a.value); }
 
-inline V splat(double a) { return {GMEM_ISA::splat(a), 0}; }
-inline V constant(Real a) { return {a, 0}; }
+inline Taped constant(Real a) { return {a, 0}; }
 
-GMEM_INLINE V select(Mask m, V a, V b) {
+GMEM_INLINE Taped select(Bits m, Taped a, Taped b) {
   const Real value = m ? a.value : b.value;
   if (!a.slot && !b.slot) return constant(value);
   return {value, tape->push(Operation::select, value, a.slot, b.slot, tape->slot((Real)m))};
 }
-GMEM_INLINE V zero_unless(Mask m, V a) { return select(m, a, V{}); }
+GMEM_INLINE Taped zero_unless(Bits m, Taped a) { return select(m, a, Taped{}); }
 
-GMEM_INLINE V of_sum(Operation operation, Real value, V a, V b) {
-  return a.slot || b.slot ? V{value, tape->push(operation, value, a.slot, b.slot)} : constant(value);
+GMEM_INLINE Taped of_sum(Operation operation, Real value, Taped a, Taped b) {
+  return a.slot || b.slot ? Taped{value, tape->push(operation, value, a.slot, b.slot)} : constant(value);
 }
-GMEM_INLINE V operator+(V a, V b) { return of_sum(Operation::add, a.value + b.value, a, b); }
-GMEM_INLINE V operator-(V a, V b) { return of_sum(Operation::subtract, a.value - b.value, a, b); }
-GMEM_INLINE V operator-(V a) { return of_sum(Operation::negate, -a.value, a, V{}); }
+GMEM_INLINE Taped operator+(Taped a, Taped b) { return of_sum(Operation::add, a.value + b.value, a, b); }
+GMEM_INLINE Taped operator-(Taped a, Taped b) { return of_sum(Operation::subtract, a.value - b.value, a, b); }
+GMEM_INLINE Taped operator-(Taped a) { return of_sum(Operation::negate, -a.value, a, Taped{}); }
 
-GMEM_INLINE V of_product(Operation operation, Real value, V a, V b, V c) {
+GMEM_INLINE Taped of_product(Operation operation, Real value, Taped a, Taped b, Taped c) {
   if (!a.slot && !b.slot && !c.slot) return constant(value);
   const int one = kept(a), other = kept(b);
   return {value, tape->push(operation, value, one, other, c.slot)};
 }
-GMEM_INLINE V operator*(V a, V b) { return of_product(Operation::multiply, a.value * b.value, a, b, V{}); }
-GMEM_INLINE V operator/(V a, V b) { return of_product(Operation::divide, a.value / b.value, a, b, V{}); }
-GMEM_INLINE V fma(V a, V b, V c) { return of_product(Operation::fma, GMEM_ISA::fma(a.value, b.value, c.value), a, b, c); }
-GMEM_INLINE V fms(V a, V b, V c) { return of_product(Operation::fms, GMEM_ISA::fms(a.value, b.value, c.value), a, b, c); }
-GMEM_INLINE V fnma(V a, V b, V c) { return of_product(Operation::fnma, GMEM_ISA::fnma(a.value, b.value, c.value), a, b, c); }
-
-GMEM_INLINE V of_root(Operation operation, Real value, V a) {
-  return a.slot ? V{value, tape->push(operation, value, a.slot)} : constant(value);
+GMEM_INLINE Taped operator*(Taped a, Taped b) {
+  return of_product(Operation::multiply, a.value * b.value, a, b, Taped{});
 }
-GMEM_INLINE V root(V a) { return of_root(Operation::root, GMEM_ISA::root(a.value), a); }
-GMEM_INLINE V inverse_root(V a) { return of_root(Operation::inverse_root, GMEM_ISA::inverse_root(a.value), a); }
+GMEM_INLINE Taped operator/(Taped a, Taped b) { return of_product(Operation::divide, a.value / b.value, a, b, Taped{}); }
+GMEM_INLINE Taped fma(Taped a, Taped b, Taped c) {
+  return of_product(Operation::fma, fma(a.value, b.value, c.value), a, b, c);
+}
+GMEM_INLINE Taped fms(Taped a, Taped b, Taped c) {
+  return of_product(Operation::fms, fms(a.value, b.value, c.value), a, b, c);
+}
+GMEM_INLINE Taped fnma(Taped a, Taped b, Taped c) {
+  return of_product(Operation::fnma, fnma(a.value, b.value, c.value), a, b, c);
+}
 
-inline Mask operator<(V a, V b) { return a.value < b.value; }
-inline Mask operator>(V a, V b) { return a.value > b.value; }
-inline Mask operator<=(V a, V b) { return a.value <= b.value; }
-inline unsigned bits_less(V a, V b) { return GMEM_ISA::bits_less(a.value, b.value); }
-inline V max(V a, V b) { return constant(GMEM_ISA::max(a.value, b.value)); }  // only ever asked who is near
-inline double largest(V a) { return GMEM_ISA::largest(a.value); }
-inline double smallest(V a) { return GMEM_ISA::smallest(a.value); }
-inline V floor_of(V a) { return constant(GMEM_ISA::floor_of(a.value)); }
+GMEM_INLINE Taped of_root(Operation operation, Real value, Taped a) {
+  return a.slot ? Taped{value, tape->push(operation, value, a.slot)} : constant(value);
+}
+GMEM_INLINE Taped root(Taped a) { return of_root(Operation::root, root(a.value), a); }
+GMEM_INLINE Taped inverse_root(Taped a) { return of_root(Operation::inverse_root, inverse_root(a.value), a); }
+
+inline Bits operator<(Taped a, Taped b) { return a.value < b.value; }
+inline Bits operator>(Taped a, Taped b) { return a.value > b.value; }
+inline Bits operator<=(Taped a, Taped b) { return a.value <= b.value; }
+inline unsigned bits_less(Taped a, Taped b) { return bits_less(a.value, b.value); }
+inline Taped max(Taped a, Taped b) { return constant(max(a.value, b.value)); }  // only ever asked who is near
+inline double largest(Taped a) { return largest(a.value); }
+inline double smallest(Taped a) { return smallest(a.value); }
+inline Taped floor_of(Taped a) { return constant(floor_of(a.value)); }
 
 // --- vectors
 
-struct Vec {
-  V x, y, z;
+template <>
+struct Vec<Taped> {
+  Taped x, y, z;
 
-  GVec value() const { return {x.value, y.value, z.value}; }
+  Vec<Real> value() const { return {x.value, y.value, z.value}; }
   bool constant() const { return !x.slot && !y.slot && !z.slot; }
 };
 
-GMEM_INLINE Vec in_slots(const GVec& a, int slot) { return {{a.x, slot}, {a.y, slot + 1}, {a.z, slot + 2}}; }
-inline Vec leaf(GVec a) { return in_slots(a, tape->slot(a)); }
-inline Vec constant(GVec a) { return {constant(a.x), constant(a.y), constant(a.z)}; }
+GMEM_INLINE Vec<Taped> in_slots(const Vec<Real>& a, int slot) { return {{a.x, slot}, {a.y, slot + 1}, {a.z, slot + 2}}; }
+inline Vec<Taped> leaf(Vec<Real> a) { return in_slots(a, tape->slot(a)); }
+inline Vec<Taped> constant(Vec<Real> a) { return {constant(a.x), constant(a.y), constant(a.z)}; }
 
 // The first slot of a vector; one that was put together from numbers is copied.
-GMEM_INLINE int first_slot(const Vec& a) {
+GMEM_INLINE int first_slot(const Vec<Taped>& a) {
   if (a.x.slot && a.y.slot == a.x.slot + 1 && a.z.slot == a.x.slot + 2) return a.x.slot;
   const int slot = tape->slot(a.value());
   if (!a.constant()) tape->copy(slot, a.x.slot, a.y.slot, a.z.slot);
   return slot;
 }
 
-GMEM_INLINE Vec vec_of(Operation operation, GVec value, int a, int b = 0, int c = 0) {
+GMEM_INLINE Vec<Taped> vec_of(Operation operation, Vec<Real> value, int a, int b = 0, int c = 0) {
   return in_slots(value, tape->push(operation, value, a, b, c));
 }
 
-GMEM_INLINE Vec operator+(const Vec& a, const Vec& b) {
+GMEM_INLINE Vec<Taped> operator+(const Vec<Taped>& a, const Vec<Taped>& b) {
   return vec_of(Operation::vec_add, a.value() + b.value(), first_slot(a), first_slot(b));
 }
-GMEM_INLINE Vec operator-(const Vec& a, const Vec& b) {
+GMEM_INLINE Vec<Taped> operator-(const Vec<Taped>& a, const Vec<Taped>& b) {
   return vec_of(Operation::vec_subtract, a.value() - b.value(), first_slot(a), first_slot(b));
 }
-GMEM_INLINE Vec operator-(const Vec& a) { return vec_of(Operation::vec_negate, -a.value(), first_slot(a)); }
-GMEM_INLINE Vec operator*(V s, const Vec& a) { return vec_of(Operation::scale, s.value * a.value(), kept(s), first_slot(a)); }
-GMEM_INLINE Vec zero_unless(Mask m, const Vec& a) {
-  return vec_of(Operation::vec_select, GMEM_ISA::zero_unless(m, a.value()), first_slot(a), 0, tape->slot((Real)m));
+GMEM_INLINE Vec<Taped> operator-(const Vec<Taped>& a) { return vec_of(Operation::vec_negate, -a.value(), first_slot(a)); }
+GMEM_INLINE Vec<Taped> operator*(Taped s, const Vec<Taped>& a) {
+  return vec_of(Operation::scale, s.value * a.value(), kept(s), first_slot(a));
 }
-GMEM_INLINE Vec fma(V s, const Vec& a, const Vec& b) {
-  return vec_of(Operation::vec_fma, GMEM_ISA::fma(s.value, a.value(), b.value()), kept(s), first_slot(a), first_slot(b));
+GMEM_INLINE Vec<Taped> zero_unless(Bits m, const Vec<Taped>& a) {
+  return vec_of(Operation::vec_select, zero_unless(m, a.value()), first_slot(a), 0, tape->slot((Real)m));
 }
-GMEM_INLINE Vec fnma(V s, const Vec& a, const Vec& b) {
-  return vec_of(Operation::vec_fnma, GMEM_ISA::fnma(s.value, a.value(), b.value()), kept(s), first_slot(a), first_slot(b));
+GMEM_INLINE Vec<Taped> fma(Taped s, const Vec<Taped>& a, const Vec<Taped>& b) {
+  return vec_of(Operation::vec_fma, fma(s.value, a.value(), b.value()), kept(s), first_slot(a), first_slot(b));
 }
-GMEM_INLINE V dot(const Vec& a, const Vec& b) {
-  const Real value = GMEM_ISA::dot(a.value(), b.value());
+GMEM_INLINE Vec<Taped> fnma(Taped s, const Vec<Taped>& a, const Vec<Taped>& b) {
+  return vec_of(Operation::vec_fnma, fnma(s.value, a.value(), b.value()), kept(s), first_slot(a), first_slot(b));
+}
+GMEM_INLINE Taped dot(const Vec<Taped>& a, const Vec<Taped>& b) {
+  const Real value = dot(a.value(), b.value());
   return {value, tape->push(Operation::dot, value, first_slot(a), first_slot(b))};
 }
-GMEM_INLINE Vec cross(const Vec& a, const Vec& b) {
-  return vec_of(Operation::cross, GMEM_ISA::cross(a.value(), b.value()), first_slot(a), first_slot(b));
+GMEM_INLINE Vec<Taped> cross(const Vec<Taped>& a, const Vec<Taped>& b) {
+  return vec_of(Operation::cross, cross(a.value(), b.value()), first_slot(a), first_slot(b));
 }
-GMEM_INLINE Vec add_cross(const Vec& c, const Vec& a, const Vec& b) {
-  return vec_of(Operation::add_cross, GMEM_ISA::add_cross(c.value(), a.value(), b.value()), first_slot(a), first_slot(b),
+GMEM_INLINE Vec<Taped> add_cross(const Vec<Taped>& c, const Vec<Taped>& a, const Vec<Taped>& b) {
+  return vec_of(Operation::add_cross, add_cross(c.value(), a.value(), b.value()), first_slot(a), first_slot(b),
                 first_slot(c));
 }
 
-inline Vec load_vec(const V* p) { return {p[0], p[1], p[2]}; }
-inline void store_vec(V* p, const Vec& a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
+}  // namespace GMEM_ISA
+}  // namespace gmem

@@ -3,10 +3,21 @@
 //
 // Forces are summed in the order that the plan fixes, wall forces in chunks of grains of fixed size. So neither the
 // number of threads, nor which of them did what, nor the way replicas share blocks can change a number.
-//
-// Included inside the instruction set's namespace.
 
-constexpr std::ptrdiff_t kNumber = sizeof(V) / sizeof(double);
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+
+#include "cpu/problem.h"
+#include "cpu/team.h"
+#include "physics/contact.h"
+#include "physics/motion.h"
+
+namespace gmem {
+namespace GMEM_ISA {
+
 constexpr int kChunk = 16;  // grains per piece of work, and per partial sum of the wall forces
 static_assert(kChunk % kMaxWidth == 0, "a chunk holds whole vectors of grains");
 
@@ -24,6 +35,9 @@ constexpr FieldPlace kField[kFields] = {{true, kPosition, 3}, {false, kQuaternio
 
 template <class Mode>
 struct Engine {
+  using V = typename Mode::Number;
+  static constexpr std::ptrdiff_t kNumber = sizeof(V) / sizeof(double);
+
   const Problem& problem;
   const Block& block;
   const Plan& plan;
@@ -35,7 +49,7 @@ struct Engine {
   double* walls;  // partial sums, [chunks, 2, 3] in the mode's own layout
   V* fastest;     // squares of the largest half-step velocity and spin, [chunks, 2]
   V parameter[kParameters];
-  GrainParameters constants;
+  GrainParameters<V> constants;
   double arm;           // of the outermost sphere of a grain
   double travel = 0.0;  // how much closer any two spheres can have come since the call began
 
@@ -57,7 +71,7 @@ struct Engine {
     carve(problem, block, carver, this);
     mode.hot = hot;
     for (int row = 0; row < kParameters; ++row) parameter[row] = mode.per_lane(&Lane::parameters, row);
-    constants = GrainParameters(parameter);
+    constants = GrainParameters<V>(parameter);
     arm = 0.0;
     for (int k = 0; k < problem.spheres_per_grain; ++k) {
       const double* body = block.pack->offsets + 3 * k;
@@ -66,17 +80,17 @@ struct Engine {
     }
   }
 
-  WallState walls_at(int step) const {
+  WallState<V> walls_at(int step) const {
     V w[kWalls];
     for (int row = 0; row < kWalls; ++row) w[row] = mode.per_lane(&Lane::walls, step * kWalls + row);
     return {load_vec(w), load_vec(w + 3), load_vec(w + 6), load_vec(w + 9)};
   }
 
   // First half of a step of unit u, and wall forces.
-  void begin(int u, const WallState& box, double* wall_sums, V* speeds) {
+  void begin(int u, const WallState<V>& box, double* wall_sums, V* speeds) {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
-    const Midway m = begin_step(constants, {load_vec(h + kPosition), {c[kQuaternion], load_vec(c + kQuaternion + 1)},
+    const Midway<V> m = begin_step(constants, {load_vec(h + kPosition), {c[kQuaternion], load_vec(c + kQuaternion + 1)},
                                             load_vec(h + kVelocity), load_vec(h + kSpin), load_vec(c + kAcceleration),
                                             load_vec(c + kSpinRate)});
     speeds[0] = max(speeds[0], dot(m.half_velocity, m.half_velocity));
@@ -88,15 +102,15 @@ struct Engine {
     store_vec(h + kPosition, m.position);
     store_vec(h + kVelocity, m.velocity);
     store_vec(h + kSpin, m.spin);
-    WallForces on{};
+    WallForces<V> on{};
     const bool near = spheres_of(constants, m, block.pack->offsets, problem.spheres_per_grain, arm, box, on,
-                                 [&](int k, Vec centre) { mode.put_sphere(u, k, centre); });
+                                 [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     mode.put_grain(u, m.position, m.velocity, m.spin, on.force, on.torque);
     if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
   }
 
   // What `begin` left of unit u.
-  Midway midway(int u) const {
+  Midway<V> midway(int u) const {
     const V* h = hot + static_cast<std::size_t>(u) * kHot;
     const V* c = cold + static_cast<std::size_t>(u) * kCold;
     return {load_vec(h + kPosition), {c[kQuaternion], load_vec(c + kQuaternion + 1)}, load_vec(h + kVelocity),
@@ -107,9 +121,9 @@ struct Engine {
   void finish(int u) {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
-    Vec force, torque;
+    Vec<V> force, torque;
     mode.total_force(u, force, torque);
-    const Grain g = end_step(constants, problem.isotropic, midway(u), force, torque);
+    const Grain<V> g = end_step(constants, problem.isotropic, midway(u), force, torque);
     store_vec(h + kVelocity, g.velocity);
     store_vec(h + kSpin, g.spin);
     store_vec(c + kAcceleration, g.acceleration);
@@ -118,7 +132,7 @@ struct Engine {
 
   // One pass over the grains: `ends` the step in progress and/or `begins` step number `step`.
   void grains(bool ends, bool begins, int step) {
-    const WallState box = walls_at(begins ? step : 0);
+    const WallState<V> box = walls_at(begins ? step : 0);
     team.share(Team::kGrains, rank, chunks(problem));
     for (int chunk; team.take(Team::kGrains, rank, &chunk);) {
       double* sums = walls + static_cast<std::size_t>(chunk) * 6 * kNumber;
@@ -144,12 +158,12 @@ struct Engine {
       speed = max(speed, fastest[2 * chunk]);
       spin = max(spin, fastest[2 * chunk + 1]);
     }
-    const V step = parameter[kDt] * fma(splat(arm), root(spin), root(speed));
+    const V step = parameter[kDt] * fma(splat<V>(arm), root(spin), root(speed));
     travel += 2.0 * (1.0 + 1e-9) * largest(step);
   }
 
   void contacts() {
-    const LawParameters law(parameter + kLaw, parameter[kDt]);
+    const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
     team.share(Team::kContacts, rank, plan.domains);
     for (int domain; team.take(Team::kContacts, rank, &domain);)
       mode.contacts(plan.domain_candidate[domain], plan.domain_candidate[domain + 1], parameter, law, travel);
@@ -157,7 +171,7 @@ struct Engine {
   }
 
   // p of each axis in `step`.
-  Vec pressure_at(int step) const { return pressure(walls_at(step), mode.sum_walls(walls, chunks(problem))); }
+  Vec<V> pressure_at(int step) const { return pressure(walls_at(step), mode.sum_walls(walls, chunks(problem))); }
 
   int share_begin(int count, int next = 0) const {
     return static_cast<int>(static_cast<int64_t>(count) * (rank + next) / team.size());
@@ -178,7 +192,7 @@ struct Engine {
   }
 
   // Write the results of the lanes that have done all their steps.
-  void deliver(int steps_done, Vec pressure) {
+  void deliver(int steps_done, Vec<V> pressure) {
     if (rank == 0) mode.unload_pressure(pressure, steps_done);
     const int units = Mode::units(problem);
     for (int u = share_begin(units); u < share_begin(units, 1); ++u) mode.unload_unit(u, hot, cold, steps_done);
@@ -192,7 +206,7 @@ struct Engine {
     int steps = 0;
     for (int l = 0; l < block.count; ++l) steps = block.lanes[l].steps > steps ? block.lanes[l].steps : steps;
     load();
-    Vec total{V{}, V{}, V{}};
+    Vec<V> total{};
     if (any_ends(0)) deliver(0, total);
     if (steps > 0) grains(false, true, 0);
     for (int step = 0; step < steps; ++step) {
@@ -209,3 +223,6 @@ struct Engine {
     }
   }
 };
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

@@ -1,7 +1,20 @@
-// W replicas of a pack side by side: each vector is one number of one grain or contact. Included inside the
-// instruction set's namespace; see `Engine` in block.h for how it is used.
+// W replicas of a pack side by side: each vector is one number of one grain or contact. See `Engine` in
+// block.h for how it is used.
+
+#pragma once
+
+#include <cstddef>
+#include <type_traits>
+
+#include "cpu/block.h"
+#include "cpu/marks.h"
+#include "numbers/dual.h"
+
+namespace gmem {
+namespace GMEM_ISA {
 
 // What the histories of the contacts were when a step looked at them; kept where the step is to be gone through backwards.
+template <class V>
 struct Trace {
   bool* touched = nullptr;  // [candidates]
   V* history;               // [candidates, kHistory] of the law
@@ -9,8 +22,22 @@ struct Trace {
   int* reached;             // [candidates]
 };
 
-template <class Law>
+// How numbers are put together from the arrays of a block, and which of them are results.
+template <class V, class Gather>
+inline V of_lanes(const Block& block, const Gather& gather) {
+  if constexpr (std::is_same<V, Real>::value) {
+    return gather(block.lanes);
+  } else {
+    return {gather(block.lanes), gather(block.slopes)};
+  }
+}
+inline Real result(Real a) { return a; }
+inline Real result(Dual<Real> a) { return a.slope; }
+
+template <class Law, class V>
 struct Replicas {
+  using Number = V;
+
   const Problem& problem;
   const Block& block;
   const Plan& plan;
@@ -22,7 +49,7 @@ struct Replicas {
   V* history;     // [candidates, Law::kHistory]
   V* layer;       // [candidates, Q, 3] of the Mindlin law
   Marks marks;
-  Trace trace;
+  Trace<V> trace;
 
   Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
     adjacent = block.count == W;
@@ -63,16 +90,18 @@ struct Replicas {
   }
 
   V per_lane(const double* Lane::*array, std::ptrdiff_t row) const {
-    return of_lanes(block, [&](const Lane* lanes) {
+    return of_lanes<V>(block, [&](const Lane* lanes) {
       return gather(lanes, [array](const Lane& lane) { return lane.*array; }, row);
     });
   }
 
   // --- copying in and out
 
+  const Lane* results() const { return std::is_same<V, Real>::value ? block.lanes : block.slopes; }
+
   template <class Pointer>
   V read(const Pointer& pointer, std::ptrdiff_t row) const {
-    return of_lanes(block, [&](const Lane* lanes) {
+    return of_lanes<V>(block, [&](const Lane* lanes) {
       return adjacent ? load(pointer(lanes[0]) + row * problem.stride) : gather(lanes, pointer, row);
     });
   }
@@ -81,17 +110,17 @@ struct Replicas {
   template <class Pointer>
   void write(const Pointer& pointer, std::ptrdiff_t row, V number, int steps_done) const {
     const Real a = result(number);
-    const Lane* lanes = results(block);
+    const Lane* lanes = results();
     if (adjacent && together) return store(pointer(lanes[0]) + row * problem.stride, a);
     for (int l = 0; l < block.count; ++l)
       if (block.lanes[l].steps == steps_done) pointer(lanes[l])[row * problem.stride] = a[l];
   }
 
-  void unload_pressure(Vec pressure, int steps_done) const {
+  void unload_pressure(Vec<V> pressure, int steps_done) const {
     const V p[3] = {pressure.x, pressure.y, pressure.z};
     for (int l = 0; l < block.count; ++l)
       for (int axis = 0; axis < 3; ++axis)
-        if (block.lanes[l].steps == steps_done) results(block)[l].pressure[axis * problem.stride] = result(p[axis])[l];
+        if (block.lanes[l].steps == steps_done) results()[l].pressure[axis * problem.stride] = result(p[axis])[l];
   }
 
   void load_unit(int u, V* hot, V* cold) const {
@@ -169,16 +198,16 @@ struct Replicas {
 
   // --- what the grains tell the contacts, and the contacts the grains
 
-  void put_sphere(int u, int k, Vec centre) {
+  void put_sphere(int u, int k, Vec<V> centre) {
     store_vec(sphere + 3 * (static_cast<std::size_t>(u) * problem.spheres_per_grain + k), centre);
   }
 
-  void put_grain(int u, Vec, Vec, Vec, Vec force, Vec torque) {
+  void put_grain(int u, Vec<V>, Vec<V>, Vec<V>, Vec<V> force, Vec<V> torque) {
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kForce, force);
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque, torque);
   }
 
-  void total_force(int u, Vec& force, Vec& torque) const {
+  void total_force(int u, Vec<V>& force, Vec<V>& torque) const {
     force = load_vec(hot + static_cast<std::size_t>(u) * kHot + kForce);
     torque = load_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque);
     for (int n = plan.guest_start[u]; n < plan.guest_start[u + 1]; ++n) {
@@ -187,15 +216,15 @@ struct Replicas {
     }
   }
 
-  void add_walls(int, double* sums, Vec lower, Vec upper) const {
+  void add_walls(int, double* sums, Vec<V> lower, Vec<V> upper) const {
     V* s = reinterpret_cast<V*>(sums);
     store_vec(s, load_vec(s) + lower);
     store_vec(s + 3, load_vec(s + 3) + upper);
   }
 
-  Vec sum_walls(const double* walls, int chunks) const {
+  Vec<V> sum_walls(const double* walls, int chunks) const {
     const V* s = reinterpret_cast<const V*>(walls);
-    Vec lower{V{}, V{}, V{}}, upper = lower;
+    Vec<V> lower{}, upper = lower;
     for (int chunk = 0; chunk < chunks; ++chunk) {
       lower = lower + load_vec(s + 6 * chunk);
       upper = upper + load_vec(s + 6 * chunk + 3);
@@ -211,9 +240,9 @@ struct Replicas {
     int count;
 
     int points() const { return count; }
-    Vec get(int j) const { return j <= *last ? stored(j) : Vec{V{}, V{}, V{}}; }
-    Vec stored(int j) const { return load_vec(at + 3 * j); }
-    void set(int j, Vec f) { store_vec(at + 3 * j, f); }
+    Vec<V> get(int j) const { return j <= *last ? stored(j) : Vec<V>{}; }
+    Vec<V> stored(int j) const { return load_vec(at + 3 * j); }
+    void set(int j, Vec<V> f) { store_vec(at + 3 * j, f); }
     void keep(int kept) { *last = kept - 1; }
   };
 
@@ -227,11 +256,11 @@ struct Replicas {
     }
   }
 
-  void contacts(int first, int end, const V* parameter, const LawParameters& law, double travel) {
+  void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel) {
     constexpr int kLook = 256, kBatch = 8;
-    const V contact_square = splat(4.0);
+    const V contact_square = splat<V>(4.0);
     int awake[kLook + 1], touching[kBatch];
-    Contact contact[kBatch];
+    Contact<V> contact[kBatch];
     int count = 0;
     for (int look = first; look < end; look += kLook) {
       const int look_end = look + kLook < end ? look + kLook : end;
@@ -243,8 +272,8 @@ struct Replicas {
       for (int n = 0; n < found; ++n) {
         const int c = awake[n];
         const Candidate& pair = plan.candidate[c];
-        const Vec one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
-        const Vec other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
+        const Vec<V> one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
+        const Vec<V> other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
         const V square = dot(other - one, other - one);
         if (!bits_less(square, contact_square)) {
           if (marks.touched[c]) forget(c, pair);
@@ -264,7 +293,7 @@ struct Replicas {
     compute(touching, count, contact, parameter, law);
   }
 
-  void compute(const int* touching, int count, Contact* contact, const V* parameter, const LawParameters& law) {
+  void compute(const int* touching, int count, Contact<V>* contact, const V* parameter, const LawParameters<V>& law) {
     close(contact, count, parameter);
     if constexpr (Law::kLayered) {
       for (int n = 0; n < count; ++n) {
@@ -285,10 +314,10 @@ struct Replicas {
       for (int q = 0; q < 6; ++q) guest[6 * static_cast<std::size_t>(pair.guest) + q] = V{};
   }
 
-  GMEM_INLINE Meeting meeting(const Candidate& pair, Vec centre_one, Vec centre_other) const {
+  GMEM_INLINE Meeting<V> meeting(const Candidate& pair, Vec<V> centre_one, Vec<V> centre_other) const {
     const V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
     const V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
-    const Vec point = splat(0.5) * (centre_one + centre_other);
+    const Vec<V> point = splat<V>(0.5) * (centre_one + centre_other);
     return {centre_other - centre_one,
             point - load_vec(one + kPosition),
             point - load_vec(other + kPosition),
@@ -298,7 +327,7 @@ struct Replicas {
   }
 
   // The lower-numbered grain is at home in this domain, the other may be elsewhere.
-  GMEM_INLINE void add(const Candidate& pair, const Push& push) {
+  GMEM_INLINE void add(const Candidate& pair, const Push<V>& push) {
     V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
     V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
     const bool away_is_one = pair.grain_one > pair.grain_other;
@@ -317,3 +346,6 @@ struct Replicas {
     }
   }
 };
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

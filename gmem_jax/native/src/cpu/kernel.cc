@@ -1,63 +1,18 @@
-// The time step for one instruction set; compiled once for each, with GMEM_ISA the name of its namespace and the compiler's
-// flags, and once more with GMEM_DERIVATIVES for its derivatives.
+// The time step for one instruction set; compiled once for each, with GMEM_ISA the name of its namespace and the
+// compiler's flags, and once more with GMEM_DERIVATIVES for its derivatives.
 
-#include "problem.h"
-#include "team.h"
-
+#include <cstdint>
 #include <cstdlib>
-#include <cstring>
-#include <new>
-#include <vector>
 
-#if defined(__SSE2__)
-#include <immintrin.h>
-#elif defined(__aarch64__)
-#include <arm_neon.h>
+#ifdef GMEM_DERIVATIVES
+#include "cpu/adjoint.h"
+#else
+#include "cpu/packed.h"
 #endif
+#include "cpu/replicas.h"
 
 namespace gmem {
 namespace GMEM_ISA {
-
-#include "simd.h"
-#include "vectors.h"
-#include "rotation.h"
-#include "laws.h"
-#include "contact.h"
-#include "motion.h"
-#include "rows.h"
-#include "block.h"
-#include "marks.h"
-#include "replicas.h"
-
-#ifdef GMEM_DERIVATIVES
-
-namespace dual {
-#include "dual.h"
-#include "vectors.h"
-#include "rotation.h"
-#include "laws.h"
-#include "contact.h"
-#include "motion.h"
-#include "block.h"
-#include "marks.h"
-#include "replicas.h"
-}  // namespace dual
-
-namespace taped {
-#include "tape.h"
-#include "rotation.h"
-#include "laws.h"
-#include "contact.h"
-#include "motion.h"
-}  // namespace taped
-
-#include "adjoint.h"
-
-#else
-
-#include "packed.h"
-
-#endif
 
 // Calls `function` with the law of `problem` as a type.
 template <class Function>
@@ -82,13 +37,13 @@ struct As {
 };
 
 template <class Function>
-auto with_worker(const Problem& problem, const Block& block, const Function& function) {
+auto with_worker(const Problem& problem, [[maybe_unused]] const Block& block, const Function& function) {
   return with_law(problem, [&](auto law) {
     using L = decltype(law);
 #ifdef GMEM_DERIVATIVES
-    return problem.task == Task::tangent ? function(As<dual::Engine<dual::Replicas<L>>>{}) : function(As<Adjoint<L>>{});
+    return problem.task == Task::tangent ? function(As<Engine<Replicas<L, Dual<Real>>>>{}) : function(As<Adjoint<L>>{});
 #else
-    return block.packed ? function(As<Engine<Packed<L>>>{}) : function(As<Engine<Replicas<L>>>{});
+    return block.packed ? function(As<Engine<Packed<L>>>{}) : function(As<Engine<Replicas<L, Real>>>{});
 #endif
   });
 }

@@ -1,5 +1,15 @@
 // What both modes keep of each candidate beside forces and histories, and where a law's history lies in the arrays of
-// a call. Included inside the instruction set's namespace.
+// a call.
+
+#pragma once
+
+#include <cstddef>
+
+#include "cpu/problem.h"
+#include "numbers/scalar.h"
+
+namespace gmem {
+namespace GMEM_ISA {
 
 struct Marks {
   bool* touched;       // in any lane, at the last step: only then is there a history to forget
@@ -36,3 +46,6 @@ template <class Law>
 Place place_of(std::ptrdiff_t row, int q) {
   return q < Law::kVectors ? Place{0, row * Law::kVectors + q} : Place{1, row};
 }
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

@@ -1,5 +1,16 @@
 // One replica: each vector is one number of W grains or of W contacts. What contacts look up is kept in rows of four
-// doubles besides. Included inside the instruction set's namespace; see `Engine` in block.h for how it is used.
+// doubles besides. See `Engine` in block.h for how it is used.
+
+#pragma once
+
+#include <cstddef>
+
+#include "cpu/block.h"
+#include "cpu/marks.h"
+#include "numbers/rows.h"
+
+namespace gmem {
+namespace GMEM_ISA {
 
 struct GrainRows {
   Row position, velocity, spin, force, torque;
@@ -7,6 +18,9 @@ struct GrainRows {
 
 template <class Law>
 struct Packed {
+  using Number = Real;
+  using V = Real;
+
   const Problem& problem;
   const Block& block;
   const Plan& plan;
@@ -39,7 +53,7 @@ struct Packed {
     return carver.used;
   }
 
-  V per_lane(const double* Lane::*array, std::ptrdiff_t row) const { return splat((lane.*array)[row * problem.stride]); }
+  V per_lane(const double* Lane::*array, std::ptrdiff_t row) const { return splat<V>((lane.*array)[row * problem.stride]); }
 
   // --- copying in and out
 
@@ -100,7 +114,7 @@ struct Packed {
     }
   }
 
-  void unload_pressure(Vec pressure, int) const {
+  void unload_pressure(Vec<V> pressure, int) const {
     const V p[3] = {pressure.x, pressure.y, pressure.z};
     for (int axis = 0; axis < 3; ++axis) lane.pressure[axis * problem.stride] = p[axis][0];
   }
@@ -129,12 +143,12 @@ struct Packed {
 
   // --- what the grains tell the contacts, and the contacts the grains
 
-  void put_sphere(int u, int k, Vec centre) {
+  void put_sphere(int u, int k, Vec<V> centre) {
     const int spheres = problem.spheres_per_grain;
     store_rows(sphere + static_cast<std::size_t>(u) * W * spheres + k, spheres, centre);
   }
 
-  void put_grain(int u, Vec position, Vec velocity, Vec spin, Vec force, Vec torque) {
+  void put_grain(int u, Vec<V> position, Vec<V> velocity, Vec<V> spin, Vec<V> force, Vec<V> torque) {
     constexpr std::ptrdiff_t stride = sizeof(GrainRows) / sizeof(Row);
     GrainRows* first = grain + static_cast<std::size_t>(u) * W;
     store_rows(&first->position, stride, position);
@@ -144,7 +158,7 @@ struct Packed {
     store_rows(&first->torque, stride, torque);
   }
 
-  void total_force(int u, Vec& force, Vec& torque) const {
+  void total_force(int u, Vec<V>& force, Vec<V>& torque) const {
     Row f[W], t[W];
     for (int l = 0; l < W; ++l) {
       const int g = u * W + l;
@@ -160,17 +174,17 @@ struct Packed {
     torque = columns(load_rows([&](int l) { return t + l; }));
   }
 
-  void add_walls(int u, double* sums, Vec lower, Vec upper) const {
+  void add_walls(int u, double* sums, Vec<V> lower, Vec<V> upper) const {
     const V parts[6] = {lower.x, lower.y, lower.z, upper.x, upper.y, upper.z};
     for (int l = 0; l < W && u * W + l < problem.grains; ++l)
       for (int q = 0; q < 6; ++q) sums[q] += parts[q][l];
   }
 
-  Vec sum_walls(const double* walls, int chunks) const {
+  Vec<V> sum_walls(const double* walls, int chunks) const {
     double sums[6] = {};
     for (int chunk = 0; chunk < chunks; ++chunk)
       for (int q = 0; q < 6; ++q) sums[q] += walls[static_cast<std::size_t>(chunk) * 6 * W + q];
-    return {splat(sums[0] + sums[3]), splat(sums[1] + sums[4]), splat(sums[2] + sums[5])};
+    return {splat<V>(sums[0] + sums[3]), splat<V>(sums[1] + sums[4]), splat<V>(sums[2] + sums[5])};
   }
 
   // --- contacts
@@ -181,18 +195,18 @@ struct Packed {
     int count;
 
     int points() const { return count; }
-    Vec get(int j) const {
-      Vec f{V{}, V{}, V{}};
+    Vec<V> get(int j) const {
+      Vec<V> f{};
       for (int l = 0; l < W; ++l)
         if (j <= *last[l]) f.x[l] = at[l][3 * j], f.y[l] = at[l][3 * j + 1], f.z[l] = at[l][3 * j + 2];
       return f;
     }
-    Vec stored(int j) const {
-      Vec f;
+    Vec<V> stored(int j) const {
+      Vec<V> f;
       for (int l = 0; l < W; ++l) f.x[l] = at[l][3 * j], f.y[l] = at[l][3 * j + 1], f.z[l] = at[l][3 * j + 2];
       return f;
     }
-    void set(int j, Vec f) {
+    void set(int j, Vec<V> f) {
       for (int l = 0; l < W; ++l) at[l][3 * j] = f.x[l], at[l][3 * j + 1] = f.y[l], at[l][3 * j + 2] = f.z[l];
     }
     void keep(int kept) {
@@ -207,7 +221,7 @@ struct Packed {
     Candidate pair[W];
   };
 
-  void contacts(int first, int end, const V* parameter, const LawParameters& law, double travel) {
+  void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel) {
     constexpr int kLook = 256, kBatch = 8 * W;
     int awake[kLook + 1], touching[kBatch];
     int count = 0;
@@ -233,7 +247,7 @@ struct Packed {
   // Whether a candidate that did not touch at the last step does now, by the same arithmetic as in vectors.
   bool touches(std::size_t c, double travel) {
     const Row d = sphere[plan.candidate[c].other] - sphere[plan.candidate[c].one];
-    const double square = fma_one(d[2], d[2], fma_one(d[1], d[1], d[0] * d[0]));
+    const double square = fma(d[2], d[2], fma(d[1], d[1], d[0] * d[0]));
     if (square < 4.0) return marks.touched[c] = true;
     if (marks.wake[c] < 0.0) blank(c);
     marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(square) - 2.0);
@@ -247,17 +261,17 @@ struct Packed {
     if (n >= 0) guest[2 * static_cast<std::size_t>(n)] = guest[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
 
-  void compute(const int* touching, int count, const V* parameter, const LawParameters& law) {
+  void compute(const int* touching, int count, const V* parameter, const LawParameters<V>& law) {
     constexpr int kGroups = 8;
     Group group[kGroups];
-    Contact contact[kGroups];
+    Contact<V> contact[kGroups];
     V memory[kGroups][4];
     const int groups = (count + W - 1) / W;
     for (int n = 0; n < groups; ++n) {
       group[n] = group_of(touching + n * W, count - n * W);
       contact[n].history = memory[n];
       read_history(group[n], memory[n]);
-      const Meeting m = meeting(group[n]);
+      const Meeting<V> m = meeting(group[n]);
       meet(m, dot(m.separation, m.separation), contact[n]);
     }
     close(contact, groups, parameter);
@@ -275,7 +289,7 @@ struct Packed {
 
   // Contacts that have come apart in this step: the laws give them no force and a blank history.
   void forget_apart(const Group& g, V overlap) {
-    if (!bits_less(overlap, splat(1e-300))) return;
+    if (!bits_less(overlap, splat<V>(1e-300))) return;
     for (int l = 0; l < g.count; ++l)
       if (!(overlap[l] > 0.0)) marks.touched[g.c[l]] = false;
   }
@@ -291,12 +305,12 @@ struct Packed {
     return g;
   }
 
-  GMEM_INLINE Meeting meeting(const Group& g) const {
+  GMEM_INLINE Meeting<V> meeting(const Group& g) const {
     const auto one = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); }); };
     const auto other = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_other].*row); }); };
     const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l].one; });
     const Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l].other; });
-    const Rows point = splat(0.5) * (centre_one + centre_other);
+    const Rows point = splat<V>(0.5) * (centre_one + centre_other);
     return {columns(centre_other - centre_one),
             columns(point - one(&GrainRows::position)),
             columns(point - other(&GrainRows::position)),
@@ -332,7 +346,7 @@ struct Packed {
     return layers;
   }
 
-  GMEM_INLINE void add(const Group& g, const Push& push) {
+  GMEM_INLINE void add(const Group& g, const Push<V>& push) {
     const Rows force = rows_of(push.force);
     const Rows torque_one = rows_of(push.torque_one), torque_other = rows_of(push.torque_other);
     Row f[W], t_one[W], t_other[W];
@@ -354,3 +368,6 @@ struct Packed {
     }
   }
 };
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

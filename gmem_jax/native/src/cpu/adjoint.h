@@ -1,9 +1,21 @@
 // Reverse mode: all steps of one block gone through forwards, then backwards. The physics is that of the other headers,
-// read with numbers that are recorded on a tape (namespace `taped`); here stands only who gets which derivative.
+// read with numbers that are recorded on a tape (`Taped`); here stands only who gets which derivative.
 // "Bar" x is the derivative of the final result by x.
 //
 // Grains and contacts are shared among the threads of a team as in the forward steps, and sums are taken in the same
-// fixed order. Included inside the instruction set's namespace.
+// fixed order.
+
+#pragma once
+
+#include <cstddef>
+#include <cstring>
+#include <vector>
+
+#include "cpu/replicas.h"
+#include "numbers/tape.h"
+
+namespace gmem {
+namespace GMEM_ISA {
 
 // Rows of what is kept, and of the bars, of one grain: at the beginning of a step, the fields in order ...
 enum StateRow { kStatePosition = 0, kStateQuaternion = 3, kStateVelocity = 7, kStateSpin = 10, kStateAcceleration = 13,
@@ -14,55 +26,56 @@ enum MidRow { kMidPosition = 0, kMidQuaternion = 3, kMidVelocity = 7, kMidSpin =
 // What a contact adds to the bars of a grain of another domain.
 enum GuestRow { kGuestCentre = 0, kGuestPosition = 3, kGuestVelocity = 6, kGuestSpin = 9, kGuest = 12 };
 
-using taped::leaf;
+inline void add_vec(Real* to, Vec<Real> a) { store_vec(to, load_vec(to) + a); }
 
-inline void add_vec(V* to, Vec a) { store_vec(to, load_vec(to) + a); }
-
-inline taped::Quaternion leaf(Quaternion q) { return {taped::leaf(q.w), taped::leaf(q.v)}; }
-inline Vec bars(int slot) { return load_vec(&taped::tape->bar(slot)); }
-inline void seed(taped::V a, V bar) {
-  if (a.slot) taped::tape->bar(a.slot) += bar;
+inline Quaternion<Taped> leaf(Quaternion<Real> q) { return {leaf(q.w), leaf(q.v)}; }
+inline Vec<Real> bars(int slot) { return load_vec(&tape->bar(slot)); }
+inline void seed(Taped a, Real bar) {
+  if (a.slot) tape->bar(a.slot) += bar;
 }
-inline void seed(taped::Vec a, Vec bar) { seed(a.x, bar.x), seed(a.y, bar.y), seed(a.z, bar.z); }
+inline void seed(Vec<Taped> a, Vec<Real> bar) { seed(a.x, bar.x), seed(a.y, bar.y), seed(a.z, bar.z); }
 
 struct TapedWalls {
   int first;
-  taped::WallState box;
+  WallState<Taped> box;
 
-  explicit TapedWalls(const WallState& w)
-      : first(taped::tape->mark().slots), box{leaf(w.lower), leaf(w.upper), leaf(w.lower_velocity), leaf(w.upper_velocity)} {}
+  explicit TapedWalls(const WallState<Real>& w)
+      : first(tape->mark().slots), box{leaf(w.lower), leaf(w.upper), leaf(w.lower_velocity), leaf(w.upper_velocity)} {}
 
-  void add_bars(V* to) const {
-    for (int row = 0; row < kWalls; ++row) to[row] += taped::tape->bar(first + row);
+  void add_bars(Real* to) const {
+    for (int row = 0; row < kWalls; ++row) to[row] += tape->bar(first + row);
   }
 };
 
 struct TapedParameters {
   int first;
-  taped::V row[kParameters];
+  Taped row[kParameters];
 
-  explicit TapedParameters(const V* parameter) : first(taped::tape->mark().slots) {
-    for (int r = 0; r < kParameters; ++r) row[r] = taped::leaf(parameter[r]);
+  explicit TapedParameters(const Real* parameter) : first(tape->mark().slots) {
+    for (int r = 0; r < kParameters; ++r) row[r] = leaf(parameter[r]);
   }
 
-  void add_bars(V* to) const {
-    for (int r = 0; r < kParameters; ++r) to[r] += taped::tape->bar(first + r);
+  void add_bars(Real* to) const {
+    for (int r = 0; r < kParameters; ++r) to[r] += tape->bar(first + r);
   }
 };
 
 template <class Law>
 struct Adjoint {
-  Engine<Replicas<Law>> forward;
+  using V = Real;
+  using Forward = Engine<Replicas<Law, Real>>;
+
+  Forward forward;
   const Problem& problem;
   const Block& block;
   const Plan& plan;
   Team& team;
   const int rank, steps;
-  taped::Tape recorded;
+  Tape recorded;
 
   V* state;        // [steps, N, kState]: at the beginning of each step
   V* total;        // [steps, N, 6]: force and torque in it
-  Trace* trace;    // [steps]
+  Trace<V>* trace;    // [steps]
   V* state_bar;    // [N, kState]
   V* mid_bar;      // [N, kMid]
   V* sphere_bar;   // [S, 3]
@@ -74,16 +87,15 @@ struct Adjoint {
 
   // What is kept of every step is given room for all candidates; memory that contacts apart leave untouched is not used.
   static std::size_t carve(const Problem& p, const Block& block, Carver& carver, Adjoint* to) {
-    using Forward = Engine<Replicas<Law>>;
     Forward::carve(p, block, carver, to ? &to->forward : nullptr);
     const Plan& plan = *block.pack->plan;
     const std::size_t steps = block.lanes[0].steps, grains = p.grains, candidates = plan.candidates;
     const std::size_t layers = Law::kLayered ? candidates * p.points * 3 : 0;
     V* state = carver.take<V>(steps * grains * kState);
     V* total = carver.take<V>(steps * grains * 6);
-    Trace* trace = carver.take<Trace>(steps);
+    Trace<V>* trace = carver.take<Trace<V>>(steps);
     for (std::size_t step = 0; step < steps; ++step) {
-      Trace t;
+      Trace<V> t;
       t.touched = carver.take<bool>(candidates + 1);
       t.history = carver.take<V>(candidates * Law::kHistory);
       t.layer = carver.take<V>(layers);
@@ -135,7 +147,7 @@ struct Adjoint {
     team.barrier();
   }
 
-  static Grain grain_of(const V* s) {
+  static Grain<V> grain_of(const V* s) {
     return {load_vec(s + kStatePosition), {s[kStateQuaternion], load_vec(s + kStateQuaternion + 1)},
             load_vec(s + kStateVelocity), load_vec(s + kStateSpin),
             load_vec(s + kStateAcceleration), load_vec(s + kStateSpinRate)};
@@ -166,7 +178,7 @@ struct Adjoint {
       forward.mode.trace = trace[step];
       forward.contacts();
       for_grains([&](int u) {
-        Vec force, torque;
+        Vec<V> force, torque;
         forward.mode.total_force(u, force, torque);
         store_vec(total_of(step, u), force);
         store_vec(total_of(step, u) + 3, torque);
@@ -249,17 +261,17 @@ struct Adjoint {
   void end_back(int chunk, int step) {
     recorded.clear();
     const TapedParameters parameter(forward.parameter);
-    const taped::GrainParameters constants(parameter.row);
+    const GrainParameters<Taped> constants(parameter.row);
     const auto mark = recorded.mark();
     for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
-      const Midway m = forward.midway(u);
+      const Midway<V> m = forward.midway(u);
       const V* before = total_of(step, u);
       const int first = recorded.mark().slots;
-      const taped::Midway midway{leaf(m.position), leaf(m.orientation), leaf(m.velocity),
+      const Midway<Taped> midway{leaf(m.position), leaf(m.orientation), leaf(m.velocity),
                                  leaf(m.spin), leaf(m.half_velocity), leaf(m.half_spin)};
-      const taped::Vec force = leaf(load_vec(before)), torque = leaf(load_vec(before + 3));
-      const taped::Grain g = end_step(constants, problem.isotropic, midway, force, torque);
-      const Grain bar = grain_of(of_grain(state_bar, u, kState));
+      const Vec<Taped> force = leaf(load_vec(before)), torque = leaf(load_vec(before + 3));
+      const Grain<Taped> g = end_step(constants, problem.isotropic, midway, force, torque);
+      const Grain<V> bar = grain_of(of_grain(state_bar, u, kState));
       seed(g.position, bar.position);
       seed(g.orientation.w, bar.orientation.w);
       seed(g.orientation.v, bar.orientation.v);
@@ -282,16 +294,16 @@ struct Adjoint {
     const V* before;
     int reached, count;
     std::vector<int>* leaves;      // first of each layer that was stored
-    std::vector<taped::Vec>* now;  // what the law left
+    std::vector<Vec<Taped>>* now;  // what the law left
 
     int points() const { return count; }
-    taped::Vec get(int j) const {
-      if (j > reached) return taped::Vec{taped::V{}, taped::V{}, taped::V{}};
-      leaves->push_back(taped::tape->mark().slots);
+    Vec<Taped> get(int j) const {
+      if (j > reached) return Vec<Taped>{};
+      leaves->push_back(tape->mark().slots);
       return leaf(load_vec(before + 3 * j));
     }
-    taped::Vec stored(int j) const { return (*now)[j]; }
-    void set(int j, taped::Vec f) {
+    Vec<Taped> stored(int j) const { return (*now)[j]; }
+    void set(int j, Vec<Taped> f) {
       if (static_cast<int>(now->size()) <= j) now->resize(j + 1);
       (*now)[j] = f;
     }
@@ -302,7 +314,7 @@ struct Adjoint {
   void contacts_back(int domain, int step) {
     recorded.clear();
     const TapedParameters parameter(forward.parameter);
-    const taped::LawParameters law(parameter.row + kLaw, parameter.row[kDt]);
+    const LawParameters<Taped> law(parameter.row + kLaw, parameter.row[kDt]);
     const auto mark = recorded.mark();
     for (int c = plan.domain_candidate[domain]; c < plan.domain_candidate[domain + 1]; ++c) {
       if (!trace[step].touched[c]) {
@@ -324,22 +336,22 @@ struct Adjoint {
       for (int q = 0; q < kGuest; ++q) of_grain(guest_bar, guest, kGuest)[q] = V{};
   }
 
-  void contact_back(std::size_t c, const taped::V* parameter, const taped::LawParameters& law, const Trace& seen) {
+  void contact_back(std::size_t c, const Taped* parameter, const LawParameters<Taped>& law, const Trace<V>& seen) {
     constexpr int kMeeting = 18;
     const auto mark = recorded.mark();
     const Candidate& pair = plan.candidate[c];
-    const Meeting m = forward.mode.meeting(pair, load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.one)),
+    const Meeting<V> m = forward.mode.meeting(pair, load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.one)),
                                            load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.other)));
-    const taped::Meeting meeting{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
+    const Meeting<Taped> meeting{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
                                  leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
-    taped::V memory[4];
+    Taped memory[4];
     for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(seen.history[c * Law::kHistory + q]);
-    taped::Contact contact;
+    Contact<Taped> contact;
     contact.history = memory;
     meet(meeting, dot(meeting.separation, meeting.separation), contact);
     close(&contact, 1, parameter);
     std::vector<int> leaves;
-    std::vector<taped::Vec> now;
+    std::vector<Vec<Taped>> now;
     if constexpr (Law::kLayered) {
       friction(Law{}, contact, law,
                Layers{seen.layer + c * problem.points * 3, seen.reached[c], problem.points, &leaves, &now});
@@ -347,7 +359,7 @@ struct Adjoint {
       friction(Law{}, &contact, 1, law);
     }
 
-    const taped::Push found = push(contact);
+    const Push<Taped> found = push(contact);
     const V* one = of_grain(mid_bar, pair.grain_one, kMid);
     const V* other = of_grain(mid_bar, pair.grain_other, kMid);
     V* bar = history_of(c);
@@ -366,16 +378,16 @@ struct Adjoint {
 
   // The bars of a meeting go to the two grains and spheres it was made from.
   void share_out(const Candidate& pair, int first) {
-    const Vec separation = bars(first), lever_one = bars(first + 3), lever_other = bars(first + 6);
-    const Vec velocity = bars(first + 9), spin_one = bars(first + 12), spin_other = bars(first + 15);
-    const Vec point = splat(0.5) * (lever_one + lever_other);
+    const Vec<V> separation = bars(first), lever_one = bars(first + 3), lever_other = bars(first + 6);
+    const Vec<V> velocity = bars(first + 9), spin_one = bars(first + 12), spin_other = bars(first + 15);
+    const Vec<V> point = splat<V>(0.5) * (lever_one + lever_other);
     const bool away_is_one = pair.grain_one > pair.grain_other;
     give(pair, !away_is_one, pair.one, pair.grain_one, {point - separation, -lever_one, -velocity, spin_one});
     give(pair, away_is_one, pair.other, pair.grain_other, {point + separation, -lever_other, velocity, spin_other});
   }
 
   struct Given {
-    Vec centre, position, velocity, spin;
+    Vec<V> centre, position, velocity, spin;
   };
 
   void give(const Candidate& pair, bool at_home, int sphere, int grain, const Given& bar) {
@@ -395,26 +407,26 @@ struct Adjoint {
   }
 
   // The first half of a step, of one chunk of grains; `on_wall` is the bar of the force on either wall of an axis.
-  void begin_back(int chunk, int step, Vec on_wall) {
+  void begin_back(int chunk, int step, Vec<V> on_wall) {
     recorded.clear();
     const TapedParameters parameter(forward.parameter);
-    const taped::GrainParameters constants(parameter.row);
+    const GrainParameters<Taped> constants(parameter.row);
     const TapedWalls walls(forward.walls_at(step));
     const auto mark = recorded.mark();
     const int spheres = problem.spheres_per_grain;
     for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
       const V* s = state_of(step, u);
-      const Grain g = grain_of(s);
+      const Grain<V> g = grain_of(s);
       const int first = recorded.mark().slots;
-      const taped::Grain grain{leaf(g.position), leaf(g.orientation), leaf(g.velocity),
+      const Grain<Taped> grain{leaf(g.position), leaf(g.orientation), leaf(g.velocity),
                                leaf(g.spin), leaf(g.acceleration), leaf(g.spin_rate)};
-      const taped::Midway m = begin_step(constants, grain);
-      taped::WallForces on{};
+      const Midway<Taped> m = begin_step(constants, grain);
+      WallForces<Taped> on{};
       V* of_spheres = of_grain(sphere_bar, u, 3 * spheres);
       V* bar = of_grain(mid_bar, u, kMid);
       take_guests(u, bar);
       spheres_of(constants, m, block.pack->offsets, spheres, forward.arm, walls.box, on,
-                 [&](int k, taped::Vec centre) { seed(centre, load_vec(of_spheres + 3 * k)); });
+                 [&](int k, Vec<Taped> centre) { seed(centre, load_vec(of_spheres + 3 * k)); });
       seed(on.force, load_vec(bar + kMidForce));
       seed(on.torque, load_vec(bar + kMidTorque));
       seed(on.lower, on_wall);
@@ -447,7 +459,7 @@ struct Adjoint {
     }
   }
 
-  void step_back(int step, Vec pressure_bar) {
+  void step_back(int step, Vec<V> pressure_bar) {
     for_grains([&](int u) { move_state(u, state_of(step, u), [](V kept, V& now) { now = kept; }); });
     team.barrier();
     forward.grains(false, true, step);
@@ -459,10 +471,10 @@ struct Adjoint {
     recorded.clear();
     const TapedWalls walls(forward.walls_at(step));
     const int first = recorded.mark().slots;
-    const taped::Vec force = leaf(forward.mode.sum_walls(forward.walls, chunks()));
+    const Vec<Taped> force = leaf(forward.mode.sum_walls(forward.walls, chunks()));
     seed(pressure(walls.box, force), pressure_bar);
     recorded.reverse({});
-    const Vec on_wall = bars(first);
+    const Vec<V> on_wall = bars(first);
     V by_walls[kWalls] = {};
     walls.add_bars(by_walls);
     for_chunks([&](int chunk) { begin_back(chunk, step, on_wall); });
@@ -473,7 +485,7 @@ struct Adjoint {
   }
 
   void run() {
-    taped::tape = &recorded;
+    const Recording recording(&recorded);
     go_forward();
     load_bars();
     V pressure_bar[3];
@@ -481,6 +493,8 @@ struct Adjoint {
       pressure_bar[axis] = forward.mode.gather(block.slopes, [](const Lane& lane) { return lane.pressure; }, axis);
     for (int step = steps - 1; step >= 0; --step) step_back(step, load_vec(pressure_bar));
     unload_bars();
-    taped::tape = nullptr;
   }
 };
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

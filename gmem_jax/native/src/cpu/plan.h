@@ -8,14 +8,14 @@
 
 #pragma once
 
-#include "problem.h"
+#include "cpu/problem.h"
 
 #include <memory>
 #include <vector>
 
 namespace gmem {
 
-// The arrays of gmem_jax.neighbors.Pairs that a plan is made from.
+// The arrays of gmem_jax.physics.pairs.Pairs that a plan is made from.
 struct List {
   int grains, spheres_per_grain, rows;
   const int32_t* first;
@@ -32,7 +32,8 @@ struct PlanStore {
   std::vector<Candidate> candidate;
 };
 
-// The plan of a list; that of a list seen lately is remembered.
+// The plan of a list; that of a list seen lately is remembered. Throws std::invalid_argument if a candidate is not a
+// pair of spheres of different grains.
 std::shared_ptr<const PlanStore> plan_for(const List& list);
 
 }  // namespace gmem

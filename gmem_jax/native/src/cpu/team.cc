@@ -1,7 +1,8 @@
-#include "team.h"
+#include "cpu/team.h"
 
 #include <condition_variable>
 #include <cstdlib>
+#include <exception>
 #include <mutex>
 #include <thread>
 #include <vector>
@@ -91,6 +92,7 @@ void Team::barrier() {
   }
   // Spin for some microseconds; then the others may need this CPU.
   for (int spins = 0; phase_.load(std::memory_order_acquire) == phase; ++spins) {
+    if (failed_.load(std::memory_order_relaxed)) throw Left{};
     if (spins < 200) {
       pause();
     } else {
@@ -118,11 +120,23 @@ bool Team::take(Queue queue, int rank, int* chunk) {
 
 void run_ranks(int threads, const std::function<void(int)>& work) {
   if (threads <= 1) return work(0);
-  pool().run(threads, work);
+  std::mutex mutex;
+  std::exception_ptr first;
+  pool().run(threads, [&](int rank) {
+    try {
+      work(rank);
+    } catch (...) {
+      std::lock_guard<std::mutex> lock(mutex);
+      if (!first) first = std::current_exception();
+    }
+  });
+  if (first) std::rethrow_exception(first);
 }
 
-int acquire_threads(int wanted) { return wanted > 1 && pool().busy.try_lock() ? wanted : 1; }
-void release_threads() { pool().busy.unlock(); }
+Threads::Threads(int wanted) : count(wanted > 1 && pool().busy.try_lock() ? wanted : 1) {}
+Threads::~Threads() {
+  if (count > 1) pool().busy.unlock();
+}
 
 int thread_count() {
   if (const char* text = std::getenv("GMEM_THREADS")) {

@@ -17,6 +17,18 @@ class Team {
   explicit Team(int size) : size_(size) {}
   int size() const { return size_; }
 
+  // Do the work of one thread. If it throws, the others do not wait for it: they leave at their next barrier.
+  template <class Work>
+  void run(const Work& work) {
+    try {
+      work();
+    } catch (const Left&) {
+    } catch (...) {
+      failed_.store(true, std::memory_order_release);
+      throw;
+    }
+  }
+
   // Wait for the whole team.
   void barrier();
   // Open the share of `rank` in a phase of `chunks` chunks. The queue must have been emptied before.
@@ -29,16 +41,27 @@ class Team {
     std::atomic<int> next{0};
     std::atomic<int> last{0};
   };
+  struct Left {};  // thrown at a barrier that not all will reach
   const int size_;
+  std::atomic<bool> failed_{false};
   alignas(64) std::atomic<int> arrived_{0};
   alignas(64) std::atomic<int> phase_{0};
   Share shares_[kQueues][kMaxSize];
 };
 
-// Run `work(rank)` for rank 0 (here) to threads - 1 (in the pool) and wait for all. While another call holds the
-// pool, its ranks are run one after the other, so work must not wait for other ranks unless `concurrent` says so.
-int acquire_threads(int wanted);
-void release_threads();
+// The pool's threads for the length of one call; while another call has them, `count` is 1.
+class Threads {
+ public:
+  explicit Threads(int wanted);
+  ~Threads();
+  Threads(const Threads&) = delete;
+  Threads& operator=(const Threads&) = delete;
+
+  const int count;
+};
+
+// Run `work(rank)` for rank 0 (here) to threads - 1 (in the pool, whose `Threads` the caller has) and wait for all;
+// then throw what the first of them to fail threw.
 void run_ranks(int threads, const std::function<void(int)>& work);
 
 // Threads to use: the environment's GMEM_THREADS, or the CPUs this process may run on.

@@ -1,4 +1,4 @@
-#include "plan.h"
+#include "cpu/plan.h"
 
 #include <algorithm>
 #include <cmath>
@@ -6,6 +6,8 @@
 #include <deque>
 #include <mutex>
 #include <numeric>
+#include <stdexcept>
+#include <string>
 #include <tuple>
 
 namespace gmem {
@@ -66,7 +68,21 @@ int domains_for(int candidates) {
   return 1 << static_cast<int>(std::lround(logarithm));
 }
 
+// A list that would lead outside of its arrays must not become a plan.
+void check(const List& list) {
+  const int spheres = list.grains * list.spheres_per_grain;
+  for (int row = 0; row < list.rows; ++row) {
+    const int i = list.first[row], j = list.second[row];
+    if (!list.valid[row] || (0 <= i && i < j && j < spheres && i / list.spheres_per_grain != j / list.spheres_per_grain))
+      continue;
+    throw std::invalid_argument("candidate " + std::to_string(row) + " joins spheres " + std::to_string(i) + " and " +
+                                std::to_string(j) + "; wanted are two of different grains, in order, from 0 to " +
+                                std::to_string(spheres - 1));
+  }
+}
+
 std::shared_ptr<const PlanStore> make_plan(const List& list) {
+  check(list);
   auto store = std::make_shared<PlanStore>();
   const int spheres = list.spheres_per_grain;
   store->grain = spatial_order(list);

@@ -1,0 +1,256 @@
+// The XLA custom call: finds the replicas in the arguments, shares them out to blocks and threads.
+//
+// Every argument and result may have further leading axes, from jax.vmap: all have the same number of them, each of
+// size one or of the full size. Each index into them times each index of the innermost axis is a replica; replicas
+// with the same candidate list may share a block.
+
+#include <algorithm>
+#include <array>
+#include <cstdlib>
+#include <exception>
+#include <map>
+#include <memory>
+#include <new>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "call/arguments.h"
+#include "cpu/blocks.h"
+#include "cpu/plan.h"
+#include "cpu/problem.h"
+#include "cpu/team.h"
+
+namespace gmem {
+
+#define GMEM_DECLARE(name)                        \
+  namespace name { extern const Kernel kernel; } \
+  namespace name##_derivatives { extern const Kernel kernel; }
+#if defined(__x86_64__)
+GMEM_DECLARE(avx512)
+GMEM_DECLARE(avx2)
+#endif
+GMEM_DECLARE(baseline)
+
+namespace {
+
+namespace ffi = xla::ffi;
+
+const Kernel& best_kernel(Task task) {
+  const auto of_task = [task](const Kernel& steps, const Kernel& derivatives) -> const Kernel& {
+    return task == Task::forward ? steps : derivatives;
+  };
+  const char* wanted = std::getenv("GMEM_ISA");  // for tests: a lower instruction set than the best
+  const std::string limit = wanted ? wanted : "";
+#if defined(__x86_64__)
+  const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+  const bool avx512 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+                      __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
+  if (avx512 && limit != "avx2" && limit != "baseline") return of_task(avx512::kernel, avx512_derivatives::kernel);
+  if (avx2 && limit != "baseline") return of_task(avx2::kernel, avx2_derivatives::kernel);
+#endif
+  return of_task(baseline::kernel, baseline_derivatives::kernel);
+}
+
+enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kOffsets, kParameterRows, kWallRows, kSteps,
+                kHistoryIn };
+constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
+
+// Axes are grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
+// Mindlin's points Q, replicas B.
+using Wants = std::vector<Wanted>;
+
+Wants operator+(Wants one, const Wants& other) {
+  one.insert(one.end(), other.begin(), other.end());
+  return one;
+}
+
+Wants histories(Law law) {
+  switch (law) {
+    case Law::hooke: return {{"forces", "P3B"}};
+    case Law::mindlin_rescaled: return {{"forces", "P3B"}, {"overlaps", "P1B"}};
+    case Law::mindlin: return {{"layers", "PQ3B"}, {"overlaps", "P1B"}};
+    default: return {};
+  }
+}
+
+struct Signature {
+  Wants arguments, results;
+};
+
+// Arguments of the three tasks are those of the steps themselves, then, for derivatives, a number for each of the
+// results' or arguments' own; see `Task`.
+// gmem_jax/native/derivatives.py: _arguments, _shapes
+Signature signature(Task task, Law law) {
+  const Wants fields = {{"positions", "N3B"}, {"quaternions", "N4B"},   {"velocities", "N3B"},
+                        {"spins", "N3B"},     {"accelerations", "N3B"}, {"spin rates", "N3B"}};
+  const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
+                      {"validities", "P", ffi::PRED},   {"reference centres", "S3"},
+                      {"smallest lengths", "3"},        {"offsets", "K3"}};
+  const Wants numbers = {{"parameters", "RB"}, {"walls", "TWB"}}, steps = {{"steps", "B", ffi::S32}};
+  const Wants history = histories(law), arguments = fields + pack + numbers + steps + history;
+  const Wants arrays = fields + numbers + history, moved = fields + Wants{{"pressures", "3B"}} + history;
+  switch (task) {
+    case Task::tangent: return {arguments + arrays, moved};
+    case Task::adjoint: return {arguments + moved, arrays};
+    default: return {arguments, moved};
+  }
+}
+
+ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
+                ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  require(0 <= law && law <= static_cast<int64_t>(Law::mindlin), "no friction law has number " + std::to_string(law));
+  require(0 <= variant && variant <= static_cast<int64_t>(Variant::paper),
+          "no variant of the Mindlin law has number " + std::to_string(variant));
+  Problem problem{};
+  problem.task = task;
+  problem.law = static_cast<Law>(law);
+  problem.variant = static_cast<Variant>(variant);
+  problem.isotropic = isotropic != 0;
+  require(problem.law != Law::mindlin || points >= 2, "the Mindlin law needs two points or more");
+  const Signature wanted = signature(task, problem.law);
+  require(static_cast<std::size_t>(leaves) == histories(problem.law).size() && args.size() == wanted.arguments.size() &&
+              rets.size() == wanted.results.size(),
+          "the number of arguments or results is not that of the friction law");
+
+  std::vector<ffi::AnyBuffer> results;
+  for (std::size_t i = 0; i < rets.size(); ++i) results.push_back(*rets.get<ffi::AnyBuffer>(i).value());
+  const auto dims = results[0].dimensions();
+  require(dims.size() >= 3, "positions need three axes");
+  const std::vector<int64_t> batch(dims.begin(), dims.end() - 3);
+  Reader reader(batch);
+  reader.size('R') = kParameters;
+  reader.size('W') = kWalls;
+  reader.size('Q') = points;
+  std::vector<Array> in, out;
+  for (std::size_t i = 0; i < args.size(); ++i)
+    in.push_back(reader.read(args.get<ffi::AnyBuffer>(i).value(), wanted.arguments[i]));
+  for (std::size_t i = 0; i < results.size(); ++i) {
+    out.push_back(reader.read(results[i], wanted.results[i]));
+    for (std::size_t axis = 0; axis < batch.size(); ++axis)
+      require(batch[axis] == results[i].dimensions()[axis], "results differ in their leading axes");
+  }
+  const int64_t replicas = reader.size('B'), rows = reader.size('T');
+  problem.points = static_cast<int>(points);
+  problem.grains = static_cast<int>(reader.size('N'));
+  problem.spheres_per_grain = static_cast<int>(reader.size('K'));
+  problem.stride = replicas;
+  require(problem.grains > 0 && problem.spheres_per_grain > 0, "there is no grain");
+  require(reader.size('S') == reader.size('N') * reader.size('K'), "there are not as many spheres as the grains have");
+  problem.history_aliased = task == Task::forward && leaves > 0;
+  for (int64_t leaf = 0; leaf < leaves; ++leaf)
+    problem.history_aliased &= in[kHistoryIn + leaf].data == out[kHistoryOut + leaf].data;
+
+  // Collect the replicas by candidate list.
+  constexpr int kOfPack = 6;  // arguments that belong to a pack
+  std::map<std::array<int64_t, kOfPack>, std::size_t> known;
+  std::vector<std::shared_ptr<const PlanStore>> plans;
+  std::vector<std::unique_ptr<Pack>> packs;
+  std::vector<std::vector<Lane>> lanes, slopes;
+  std::vector<int64_t> index(batch.size(), 0);
+  int64_t entries = 1;
+  for (const int64_t n : batch) entries *= n;
+  for (int64_t entry = 0; entry < entries; ++entry) {
+    std::array<int64_t, kOfPack> key;
+    for (int i = 0; i < kOfPack; ++i) key[i] = in[kFirst + i].at(index);
+    const auto place = known.emplace(key, packs.size());
+    if (place.second) {
+      const auto doubles = [&](Argument i) { return reinterpret_cast<const double*>(in[i].data) + key[i - kFirst]; };
+      const auto integers = [&](Argument i) { return reinterpret_cast<const int32_t*>(in[i].data) + key[i - kFirst]; };
+      const bool* valid = reinterpret_cast<const bool*>(in[kValid].data) + key[kValid - kFirst];
+      plans.push_back(plan_for({problem.grains, problem.spheres_per_grain, static_cast<int>(reader.size('P')),
+                                integers(kFirst), integers(kSecond), valid, doubles(kReference), doubles(kSmallest)}));
+      packs.emplace_back(new Pack{&plans.back()->plan, doubles(kOffsets)});
+      lanes.emplace_back();
+      slopes.emplace_back();
+    }
+    for (int64_t b = 0; b < replicas; ++b) {
+      // Pointers to this replica in the next array of arguments, and of results.
+      std::size_t argument = 0, result = 0;
+      const auto source = [&](const Array& a) { return reinterpret_cast<double*>(a.data) + a.at(index) + b; };
+      const auto next_argument = [&] { return source(in[argument++]); };
+      const auto next_result = [&] { return source(out[result++]); };
+      Lane lane{};
+      for (int f = 0; f < kFields; ++f) lane.grains_in[f] = next_argument(), lane.grains_out[f] = next_result();
+      lane.parameters = source(in[kParameterRows]);
+      lane.walls = source(in[kWallRows]);
+      const int32_t steps = (reinterpret_cast<const int32_t*>(in[kSteps].data) + in[kSteps].at(index))[b];
+      lane.steps = static_cast<int>(task == Task::forward ? std::min<int64_t>(std::max(steps, 0), rows) : rows);
+      argument = kHistoryIn;
+      for (int64_t leaf = 0; leaf < leaves; ++leaf) lane.history_in[leaf] = next_argument();
+      Lane slope = lane;
+      if (task != Task::forward)
+        for (int f = 0; f < kFields; ++f) slope.grains_in[f] = next_argument();
+      if (task == Task::tangent) slope.parameters = next_argument(), slope.walls = next_argument();
+      if (task == Task::adjoint) {
+        slope.pressure = next_argument();
+        slope.parameters_out = next_result(), slope.walls_out = next_result();
+      } else {
+        lane.pressure = slope.pressure = next_result();
+      }
+      for (int64_t leaf = 0; leaf < leaves; ++leaf) {
+        lane.history_out[leaf] = slope.history_out[leaf] = next_result();
+        if (task != Task::forward) slope.history_in[leaf] = next_argument();
+      }
+      lanes[place.first->second].push_back(lane);
+      slopes[place.first->second].push_back(slope);
+    }
+    for (int axis = static_cast<int>(batch.size()) - 1; axis >= 0 && ++index[axis] == batch[axis]; --axis) index[axis] = 0;
+  }
+
+  const Kernel& kernel = best_kernel(task);
+  std::vector<Block> whole, packed;
+  for (std::size_t i = 0; i < packs.size(); ++i) {
+    const int count = static_cast<int>(lanes[i].size());
+    int done = 0;
+    // Replicas side by side share much work: a vector that is half full is cheaper than they are one by one.
+    for (; 2 * (count - done) >= kernel.width || (task != Task::forward && done < count); done += kernel.width)
+      whole.push_back({packs[i].get(), &lanes[i][done], &slopes[i][done], std::min(kernel.width, count - done), false});
+    for (; done < count; ++done) packed.push_back({packs[i].get(), &lanes[i][done], nullptr, 1, true});
+  }
+  const Threads threads(thread_count());
+  run_blocks(problem, kernel, whole, threads.count);
+  run_blocks(problem, kernel, packed, threads.count);
+  return ffi::Error::Success();
+}
+
+template <Task task>
+ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
+                  ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  const auto error = [](ffi::ErrorCode code, const char* what) {
+    return ffi::Error(code, std::string("gmem_jax native: ") + what);
+  };
+  try {
+    return call(task, law, variant, points, isotropic, leaves, args, rets);
+  } catch (const std::invalid_argument& wrong) {
+    return error(ffi::ErrorCode::kInvalidArgument, wrong.what());
+  } catch (const std::bad_alloc&) {
+    return error(ffi::ErrorCode::kResourceExhausted, "out of memory; use fewer replicas");
+  } catch (const std::exception& other) {
+    return error(ffi::ErrorCode::kInternal, other.what());
+  }
+}
+
+auto binding() {
+  return ffi::Ffi::Bind()
+      .Attr<int64_t>("law")
+      .Attr<int64_t>("variant")
+      .Attr<int64_t>("points")
+      .Attr<int64_t>("isotropic")
+      .Attr<int64_t>("leaves")
+      .RemainingArgs()
+      .RemainingRets();
+}
+
+}  // namespace
+}  // namespace gmem
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_advance, gmem::handle<gmem::Task::forward>, gmem::binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_tangent, gmem::handle<gmem::Task::tangent>, gmem::binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_adjoint, gmem::handle<gmem::Task::adjoint>, gmem::binding());
+
+// Of the sources and flags that this library was compiled from; see native/build.py.
+extern "C" const char* gmem_source_hash() { return GMEM_SOURCE_HASH; }
+
+// Name of the instruction set in use.
+extern "C" const char* gmem_instruction_set() { return gmem::best_kernel(gmem::Task::forward).name; }

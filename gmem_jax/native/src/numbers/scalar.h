@@ -1,0 +1,64 @@
+// What the physics asks of a number, for one double: a lane of a GPU, or of a test.
+//
+// All that kernel.cc compiles stands in a namespace named after the instruction set: the linker must not take one set's
+// code for another's.
+
+#pragma once
+
+#if defined(__GNUC__) && !defined(__clang__) && __GNUC__ < 11
+#error "gmem_jax needs g++ 11 or newer, or clang++ 14 or newer"
+#elif defined(__clang__) && __clang_major__ < 14 && !defined(__apple_build_version__)
+#error "gmem_jax needs clang++ 14 or newer, or g++ 11 or newer"
+#endif
+
+#ifndef GMEM_ISA
+#define GMEM_ISA baseline
+#endif
+
+#define GMEM_INLINE inline __attribute__((always_inline))
+
+namespace gmem {
+namespace GMEM_ISA {
+
+// What comparing two numbers gives.
+template <class V>
+using Mask = decltype(V{} < V{});
+
+template <class V>
+inline V splat(double a) {
+  if constexpr (__is_class(V)) {
+    return V::of(a);
+  } else {
+    return V{} + a;
+  }
+}
+
+inline double select(bool m, double a, double b) { return m ? a : b; }
+inline double zero_unless(bool m, double a) { return m ? a : 0.0; }
+
+#if defined(__CUDA_ARCH__)
+inline double fma(double a, double b, double c) { return __fma_rn(a, b, c); }
+inline double root(double a) { return __dsqrt_rn(a); }
+inline double inverse_root(double a) { return ::rsqrt(a); }
+inline double floor_of(double a) { return ::floor(a); }
+#else
+inline double fma(double a, double b, double c) {
+#if defined(__FMA__) || defined(__aarch64__)
+  return __builtin_fma(a, b, c);
+#else
+  return a * b + c;
+#endif
+}
+inline double root(double a) { return __builtin_sqrt(a); }
+inline double inverse_root(double a) { return 1.0 / __builtin_sqrt(a); }
+inline double floor_of(double a) { return __builtin_floor(a); }
+#endif
+inline double fms(double a, double b, double c) { return fma(a, b, -c); }
+inline double fnma(double a, double b, double c) { return fma(-a, b, c); }
+inline double max(double a, double b) { return a > b ? a : b; }
+inline unsigned bits_less(double a, double b) { return a < b; }
+inline double largest(double a) { return a; }
+inline double smallest(double a) { return a; }
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

@@ -1,0 +1,45 @@
+// The contact laws by name and by type, and the rows in which their parameters come.
+
+#pragma once
+
+namespace gmem {
+
+// In the order of
+// gmem_jax/native/__init__.py: _LAWS, _VARIANTS
+enum class Law { frictionless = 0, hooke = 1, mindlin_rescaled = 2, mindlin = 3 };
+enum class Variant { exact = 0, averaged = 1, paper = 2 };
+
+// Rows of the parameter array; a law's own follow.
+// gmem_jax/native/__init__.py: _parameters
+enum Parameter { kDt, kDrag, kMass, kInertia, kNormalStiffness = kInertia + 3, kNormalDamping, kWallStiffness, kLaw };
+constexpr int kLawParameters = 4;  // mu, stiffness, damping time, spacing of Mindlin's points
+constexpr int kParameters = kLaw + kLawParameters;
+
+// The laws as types.
+struct Frictionless {
+  static constexpr int kHistory = 0;  // numbers remembered of a contact, beside Mindlin's layers
+  static constexpr int kVectors = 0;  // those of them that are components of forces
+  static constexpr bool kLayered = false;
+};
+
+struct Hooke {
+  static constexpr int kHistory = 3;
+  static constexpr int kVectors = 3;
+  static constexpr bool kLayered = false;
+};
+
+struct Rescaled {
+  static constexpr int kHistory = 4;  // force, overlap
+  static constexpr int kVectors = 3;
+  static constexpr bool kLayered = false;
+};
+
+template <Variant variant_>
+struct Layered {
+  static constexpr int kHistory = 1;  // overlap; the layers are kept apart
+  static constexpr int kVectors = 0;
+  static constexpr bool kLayered = true;
+  static constexpr Variant variant = variant_;
+};
+
+}  // namespace gmem

@@ -1,0 +1,121 @@
+// Threads that fail, and the order and checks of plans.
+
+#include <atomic>
+#include <new>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "check.h"
+#include "cpu/blocks.h"
+#include "cpu/plan.h"
+#include "cpu/team.h"
+
+using namespace gmem;
+
+template <class Error, class Work>
+std::string thrown(const Work& work) {
+  try {
+    work();
+  } catch (const Error& error) {
+    return error.what();
+  }
+  return "";
+}
+
+void a_failed_rank_is_thrown_when_all_have_ended() {
+  for (int failing = 0; failing < 4; ++failing) {
+    std::atomic<int> ended{0};
+    const std::string what = thrown<std::runtime_error>([&] {
+      run_ranks(4, [&](int rank) {
+        if (rank == failing) throw std::runtime_error("rank " + std::to_string(rank));
+        ++ended;
+      });
+    });
+    CHECK(what == "rank " + std::to_string(failing));
+    CHECK(ended == 3);
+  }
+}
+
+void a_team_does_not_wait_for_one_that_failed() {
+  Team team(3);
+  std::atomic<int> through{0};
+  const std::string what = thrown<std::runtime_error>([&] {
+    run_ranks(3, [&](int rank) {
+      team.run([&] {
+        team.barrier();
+        if (rank == 1) throw std::runtime_error("lost");
+        team.barrier();
+        ++through;
+      });
+    });
+  });
+  CHECK(what == "lost");
+  CHECK(through == 0);
+}
+
+// Four grains of one sphere in a row, far ones first in the list.
+struct Row {
+  std::vector<int32_t> first{2, 0, 0, 1}, second{3, 0, 1, 2};
+  bool valid[4] = {true, false, true, true};
+  std::vector<double> reference{0.1, 0.5, 0.5, 0.3, 0.5, 0.5, 0.5, 0.5, 0.5, 0.7, 0.5, 0.5}, smallest{10.0, 3.0, 3.0};
+  List list() const { return {4, 1, 4, first.data(), second.data(), valid, reference.data(), smallest.data()}; }
+};
+
+void plans_keep_neighbours_together_and_padding_apart() {
+  const Row row;
+  const auto store = plan_for(row.list());
+  const Plan& plan = store->plan;
+  CHECK(plan.candidates == 3 && plan.padding == 1 && plan.padding_row[0] == 1 && plan.domains == 1);
+  for (int g = 0; g < 4; ++g) CHECK(plan.grain[g] == g);
+  for (int c = 0; c < 3; ++c) {
+    CHECK(plan.candidate[c].one == c && plan.candidate[c].other == c + 1 && plan.candidate[c].guest == -1);
+    CHECK(plan.candidate[c].row == (c + 2) % 4);
+  }
+  CHECK(plan_for(row.list()) == store);  // remembered
+}
+
+void lists_that_lead_astray_are_refused() {
+  const auto refused = [](int32_t one, int32_t other) {
+    Row row;
+    row.first[3] = one, row.second[3] = other;
+    return thrown<std::invalid_argument>([&] { plan_for(row.list()); }).find("candidate 3 joins") == 0;
+  };
+  CHECK(refused(-1, 2) && refused(1, 4) && refused(2, 1) && refused(1, 1));
+  CHECK(!refused(1, 3));
+}
+
+// A kernel whose third block, or every team's last thread, runs out of memory.
+std::size_t no_scratch(const Problem&, const Block&) { return 64; }
+void fail(const Problem&, const Block& block, Team& team, int rank, void*) {
+  team.barrier();
+  if (block.count == 3 && rank == team.size() - 1) throw std::bad_alloc();
+  team.barrier();
+}
+
+void a_failed_block_fails_the_call_and_not_the_next() {
+  const Kernel kernel{"test", 1, no_scratch, fail};
+  Plan plan{};
+  plan.domains = 64;
+  const Pack pack{&plan, nullptr};
+  for (const int threads : {1, 2, 4})
+    for (int repeat = 0; repeat < 20; ++repeat) {
+      std::vector<Block> blocks;
+      for (int n = 1; n <= 5; ++n) blocks.push_back({&pack, nullptr, nullptr, n, false});
+      const Threads held(threads);
+      CHECK(held.count == threads);
+      CHECK(!thrown<std::bad_alloc>([&] { run_blocks(Problem{}, kernel, blocks, held.count); }).empty());
+      blocks.erase(blocks.begin() + 2);
+      run_blocks(Problem{}, kernel, blocks, held.count);
+      run_blocks(Problem{}, kernel, {blocks[0]}, held.count);
+    }
+}
+
+int main() {
+  a_failed_rank_is_thrown_when_all_have_ended();
+  a_team_does_not_wait_for_one_that_failed();
+  plans_keep_neighbours_together_and_padding_apart();
+  lists_that_lead_astray_are_refused();
+  a_failed_block_fails_the_call_and_not_the_next();
+  return failures != 0;
+}

@@ -1,0 +1,139 @@
+"""The native library is what its sources say, and refuses what would lead it astray."""
+
+import functools
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import gmem_jax as gm
+from gmem_jax import native
+from gmem_jax.native import build, derivatives
+from gmem_jax.physics.state import replicate
+from gmem_jax.physics.step import System, start
+
+BUILT, REASON = native.available()
+needs_library = pytest.mark.skipif(not BUILT, reason=REASON)
+PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
+
+Arguments = dict[str, Any]
+
+
+@functools.cache
+def arguments(law: Any) -> Arguments:
+    """What `derivatives.forward` takes for two steps of two replicas, by name."""
+    system = System(PACK.clump, law, PACK.pairs)
+    state = replicate(start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box), 2)
+    boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, 3, 2)), PACK.box)
+    numbers = (jnp.asarray(0.3), jnp.asarray(0.0))
+    fixed = native._fixed(system, jnp.full(2, 2, jnp.int32))
+    moving = native._moving(system, state.grains, state.history, boxes, numbers)
+    names = ("first", "second", "valid", "reference", "smallest", "offsets", "steps")
+    return {
+        "call": native._call(system, state.history),
+        **dict(zip(names, fixed, strict=True)),
+        **moving._asdict(),
+    }
+
+
+def run(given: Arguments) -> Any:
+    given = dict(given)
+    call = given.pop("call")
+    moving = derivatives.Arrays(*(given.pop(name) for name in derivatives.Arrays._fields))
+    return jax.block_until_ready(derivatives.forward(call, tuple(given.values()), moving))
+
+
+def changed(name: str, change: Callable[[Any], Any]) -> Callable[[Arguments], Arguments]:
+    return lambda given: {**given, name: change(given[name])}
+
+
+def called(**numbers: int) -> Callable[[Arguments], Arguments]:
+    return changed("call", lambda call: call._replace(**numbers))
+
+
+HOSTILE = {
+    "a negative sphere": (changed("first", lambda a: a.at[3].set(-1)), "candidate 3 joins spheres -1 and"),
+    "a sphere too many": (changed("second", lambda a: a.at[3].set(10**6)), "1000000; wanted are two"),
+    "a grain with itself": (changed("second", lambda a: a.at[0].set(1)), "candidate 0 joins"),
+    "the wrong order": (lambda g: {**g, "first": g["second"], "second": g["first"]}, "in order"),
+    "fewer second spheres": (changed("second", lambda a: a[:-1]), "second spheres .* should be .P. with P"),
+    "other numbers": (changed("first", lambda a: a.astype(float)), "first spheres .* wrong type"),
+    "a missing grain": (changed("fields", lambda a: [a[0][:-1], *a[1:]]), "quaternions .* with N = 26"),
+    "a flat quaternion": (changed("fields", lambda a: [a[0], a[1][:, :3], *a[2:]]), "quaternions .* with 4 = 4"),
+    "an axis less": (changed("walls", lambda a: a[:, 0]), "walls .* should be .TWB."),
+    "fewer walls": (changed("walls", lambda a: a[:, :6]), "walls .* with W = 12"),
+    "fewer parameters": (changed("parameters", lambda a: a[:-1]), "parameters .* with R = "),
+    "steps of one replica": (changed("steps", lambda a: a[:1]), "steps .* with B = 2"),
+    "half a centre": (changed("reference", lambda a: a[:, :2]), "reference centres .* with 3 = 3"),
+    "a sphere less": (changed("reference", lambda a: a[:-1]), "as many spheres"),
+    "no sphere in a grain": (changed("offsets", lambda a: a[:0]), "no grain"),
+    "a short history": (changed("history", lambda a: [a[0][:-1], *a[1:]]), "should be .P.*3B. with P"),
+    "no history": (lambda g: {**called(leaves=0)(g), "history": []}, "not that of the friction law"),
+    "an unknown law": (called(law=4), "no friction law has number 4"),
+    "an unknown variant": (called(variant=-1), "no variant of the Mindlin law has number -1"),
+    "the history of another law": (called(law=2), "not that of the friction law|forces .* should be"),
+}
+
+
+@needs_library
+@pytest.mark.parametrize("law", [gm.Hooke(), gm.Mindlin(points=4)], ids=lambda law: type(law).__name__)
+@pytest.mark.parametrize("name", HOSTILE)
+def test_arrays_that_do_not_fit_are_refused_in_a_sentence(law: Any, name: str) -> None:
+    spoil, sentence = HOSTILE[name]
+    given = arguments(law)
+    with pytest.raises(jax.errors.JaxRuntimeError, match=f"gmem_jax native: .*({sentence})"):
+        run(spoil(given))
+
+
+@needs_library
+@pytest.mark.parametrize("law", [gm.Hooke(), gm.Mindlin(points=4)], ids=lambda law: type(law).__name__)
+def test_arrays_that_fit_are_not_refused(law: Any) -> None:
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(run(arguments(law))))
+
+
+@needs_library
+@pytest.mark.parametrize("points", [1, 5])
+def test_points_that_are_not_those_of_the_layers_are_refused(points: int) -> None:
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"two points or more|with Q = 5"):
+        run(called(points=points)(arguments(gm.Mindlin(points=4))))
+
+
+@needs_library
+def test_want_of_memory_is_an_error_and_leaves_the_library_working() -> None:
+    steps, points = 600_000, 1_500_000  # whose derivatives would take more than any address space has
+    given = arguments(gm.Mindlin(points=4))
+    alone = {
+        "first": given["first"][:1],
+        "second": given["second"][:1],
+        "valid": given["valid"][:1],
+        "fields": [leaf[..., :1] for leaf in given["fields"]],
+        "parameters": given["parameters"][:, :1],
+        "walls": jnp.zeros((steps, 12, 1)),
+        "steps": given["steps"][:1],
+        "history": [jnp.zeros((1, points, 3, 1)), jnp.zeros((1, 1, 1))],
+    }
+    values = {**called(points=points)(given), **alone}
+    call = values.pop("call")
+    moving = derivatives.Arrays(*(values.pop(name) for name in derivatives.Arrays._fields))
+    bars = [*moving.fields, jnp.zeros((3, 1)), *moving.history]
+    everything = derivatives._arguments(tuple(values.values()), moving)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="gmem_jax native: out of memory"):
+        jax.block_until_ready(derivatives._adjoint_p.bind(*everything, *bars, call=call))
+    run(given)
+
+
+@needs_library
+def test_a_library_older_than_its_sources_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    shutil.copytree(build.SOURCES, tmp_path / "src")
+    monkeypatch.setattr(build, "SOURCES", tmp_path / "src")
+    assert native._load.__wrapped__() == ""
+    with (tmp_path / "src" / "physics" / "laws.h").open("a") as file:
+        file.write("// new\n")
+    with pytest.warns(RuntimeWarning, match="older than its sources; rebuild it: python -m gmem_jax.native.build"):
+        assert "older than its sources" in native._load.__wrapped__()
+    shutil.rmtree(tmp_path / "src")  # a library alone is what it is
+    assert native._load.__wrapped__() == ""
