@@ -11,6 +11,7 @@ from scenes import SPHERE, blank_state, cached_tetra, cluster27, make_grains, or
 
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.grain import clump
 from gmem_jax.physics.pairs import PairFinder, candidates, carry_history, slack, sphere_centres, tabulate
 from gmem_jax.physics.state import still_box
 
@@ -35,6 +36,10 @@ def box_of(lengths):
     return still_box(0.3 + jnp.zeros((3, 1)), 0.3 + lengths)  # not at the origin
 
 
+def unshifted_box(lengths):
+    return still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
+
+
 def shifted(grains):
     return replace(grains, position=grains.position + 0.3)
 
@@ -57,6 +62,38 @@ def test_the_list_is_the_one_found_by_brute_force_in_canonical_order(case):
         expected = brute_force(mapped, clump.spheres, 2.4)
         assert expected.shape[1] > 100
         np.testing.assert_array_equal(candidates(pairs), expected)
+
+
+@pytest.mark.parametrize("face", ["lower", "upper"])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_grains_at_the_very_faces_of_the_box_find_their_neighbours(axis, face):
+    """jax-md sorts centres into cells, whose edges it knows in single precision and wraps around."""
+    lengths = np.array([9.3, 12.7, 10.1])  # cells on every axis
+    position = np.random.default_rng(0).uniform(0.5, lengths - 0.5, (100, 3))
+    position[:40, axis] = 0.0 if face == "lower" else lengths[axis]
+    pairs = PairFinder(SPHERE, lengths, 0.4)(make_grains(position), SPHERE, unshifted_box(lengths))
+    expected = brute_force(position, 1, 2.4)
+    assert np.sum((expected[0] < 40) & (expected[1] < 40)) > 20
+    np.testing.assert_array_equal(candidates(pairs), expected)
+
+
+@pytest.mark.parametrize("skin", [0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0])
+def test_pairs_are_listed_up_to_the_last_digit_of_the_skin(skin):
+    """jax-md keeps its cutoff in single precision, which is less than some of these."""
+    lengths, distance = np.array([12.0, 9.0, 9.0]), 2.0 + skin
+    for part, listed in ((1.0 - 1e-12, 1), (1.0 + 1e-12, 0)):
+        grains = make_grains([[3.0, 4.0, 5.0], [3.0 + part * distance, 4.0, 5.0]])
+        pairs = PairFinder(SPHERE, lengths, skin)(grains, SPHERE, unshifted_box(lengths))
+        assert candidates(pairs).shape[1] == listed
+
+
+def test_clumps_that_reach_for_each_other_with_their_outermost_spheres_are_listed():
+    grain = clump([[1.2, 0.0, 0.0], [-1.2, 0.0, 0.0]])
+    lengths = np.array([20.0, 9.0, 9.0])
+    reach = 2.0 + 0.3 + 2.0 * 1.2  # of the centres of two of them in a row
+    grains = make_grains([[5.0, 4.0, 5.0], [5.0 + reach * (1.0 - 1e-6), 4.0, 5.0]])
+    pairs = PairFinder(grain, lengths, 0.3)(grains, grain, unshifted_box(lengths))
+    assert candidates(pairs).shape[1] == 1
 
 
 @pytest.fixture(scope="module")
