@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.files.storage import atomic
+from gmem_jax.files.storage import Parts, atomic, save_waveforms
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 
@@ -92,6 +92,35 @@ def test_waveforms_are_read_from_csv_with_or_without_header_and_from_npy(tmp_pat
     np.save(tmp_path / "both.npy", samples)
     for name in ("plain.csv", "header.csv", "both.npy"):
         np.testing.assert_array_equal(gm.load_waveforms(tmp_path / name), samples)
+
+
+def test_waveforms_survive_their_file_bit_for_bit(tmp_path: Path) -> None:
+    signals = gm.waveform(np.random.default_rng(0).normal(size=(3, 7)))
+    save_waveforms(tmp_path / "own.csv", signals)
+    np.testing.assert_array_equal(gm.load_waveforms(tmp_path / "own.csv"), np.asarray(signals.nodes)[:, 1:-1])
+
+
+def test_a_part_that_is_kept_is_not_run_again(tmp_path: Path) -> None:
+    ran: list[int] = []
+
+    def work() -> dict[str, np.ndarray]:
+        ran.append(len(ran))
+        return {"answer": np.arange(3) + len(ran)}
+
+    first = Parts(tmp_path / "parts", {"seed": 1})("one", work)
+    again = Parts(tmp_path / "parts", {"seed": 1})
+    np.testing.assert_array_equal(again("one", work)["answer"], first["answer"])
+    assert (ran, again.finished()) == ([0], 1)
+    again("two", work)
+    assert (ran, again.finished()) == ([0, 1], 2)
+    again.discard()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_parts_of_another_run_are_refused(tmp_path: Path) -> None:
+    Parts(tmp_path / "parts", {"seed": 1, "pack": "a"})
+    with pytest.raises(gm.FileFormatError, match=r"another pack \('a', now 'b'\)"):
+        Parts(tmp_path / "parts", {"seed": 1, "pack": "b"})
 
 
 @pytest.mark.parametrize(
