@@ -2,16 +2,18 @@
 
 The repository is copied to a temporary folder; there each mutation is made in turn, the native library rebuilt if it is
 in C++, and the tests that are named beside it are run until one fails. A mutation that they all pass has survived: the
-exit code is then 1. Before, all these tests must pass on the code as it is. A mutation whose text or tests are not found
-any more is an error (exit code 2): the table is to be kept in step with the code.
+exit code is then 1. Before, all these tests must pass on the code as it is. A mutation whose text or tests cannot be
+found is an error (exit code 2): the table is to be kept in step with the code.
 
-The library is built here without much optimisation, and objects that a mutation does not concern are not built again.
+The library is built for one instruction set and without much optimisation here, and objects that a mutation does not
+concern are not built again.
 """
 
 import argparse
 import fnmatch
 import hashlib
 import os
+import platform
 import re
 import shlex
 import shutil
@@ -27,6 +29,8 @@ ROOT = HERE.parents[1]
 LEFT_OUT = (".*", "__pycache__", "*.egg-info", "build", "dist", "out", "*.so", "gmem-*")
 PATIENCE = 600.0  # seconds for the tests of one mutation; one that makes them hang has been noticed
 COMPILED = (".cc", ".h")
+# The instruction set that is built here and stands for all; the narrowest would not fill its vectors with contacts.
+ONE_SET = "avx2" if platform.machine().lower() in ("x86_64", "amd64") else "baseline"
 
 
 @dataclass(frozen=True)
@@ -744,9 +748,17 @@ def nodes_of(root: Path, entry: Mutation) -> list[str]:
 
 
 def pytest(root: Path, nodes: list[str]) -> tuple[int, str]:
-    """Run tests there until one fails; pytest's exit code (1 as well if they hang) and what it said."""
+    """Run tests there until one fails; pytest's exit code (1 as well if they hang) and what it said.
+
+    XLA's programs are kept beside the repository: most mutations concern few of those that their tests need.
+    """
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "-x", "--tb=line", *nodes]
-    settings = {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
+    settings = {
+        "PYTHONPATH": str(root),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "JAX_COMPILATION_CACHE_DIR": str(root.parent / "programs"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
+    }
     try:
         done = subprocess.run(
             command, cwd=root, env=os.environ | settings, capture_output=True, text=True, timeout=PATIENCE, check=False
@@ -773,13 +785,18 @@ def build(root: Path, objects: Path) -> None:
 
 
 def compile_once(arguments: list[str]) -> int:
-    """A C++ compiler that optimises little, and copies an object whose preprocessed source it has seen."""
+    """A C++ compiler that optimises little, knows one instruction set, and copies an object that it has made before."""
     compiler = shlex.split(os.environ["GMEM_MUTATIONS_CXX"])
-    arguments = ["-O1" if re.fullmatch("-O[23]", argument) else argument for argument in arguments]
+    arguments = ["-Og" if argument.startswith("-O") else argument for argument in arguments]
     if "-c" not in arguments:
-        return subprocess.run([*compiler, *arguments], check=False).returncode
+        others = [Path(argument).stem for argument in arguments if re.fullmatch(r".*/(baseline|avx)\w*\.o", argument)]
+        names = {name: re.sub("^[a-z0-9]+", ONE_SET, name) for name in others}
+        same = [f"-Wl,--defsym={_kernel(name)}={_kernel(one)}" for name, one in names.items() if name != one]
+        return subprocess.run([*compiler, *arguments, *same], check=False).returncode
     place = arguments.index("-o")
     target, rest = arguments[place + 1], arguments[:place] + arguments[place + 2 :]
+    if re.search(rf"-DGMEM_ISA=(?!{ONE_SET})", " ".join(arguments)):
+        return subprocess.run([*compiler, "-x", "c++", "-c", os.devnull, "-o", target], check=False).returncode
     preprocess = [argument for argument in rest if argument != "-c"]
     text = subprocess.run([*compiler, *preprocess, "-E", "-P"], capture_output=True, check=True).stdout
     flags = " ".join(argument for argument in rest if argument.startswith("-"))
@@ -791,6 +808,11 @@ def compile_once(arguments: list[str]) -> int:
         shutil.copyfile(target, known)
     shutil.copyfile(known, target)
     return 0
+
+
+def _kernel(name: str) -> str:
+    """The symbol of gmem::name::kernel."""
+    return f"_ZN4gmem{len(name)}{name}6kernelE"
 
 
 def attempt(root: Path, objects: Path, entry: Mutation, nodes: list[str]) -> str:

@@ -166,7 +166,7 @@ MEETINGS = {  # of two upright rods: distance, velocity of the first along x (th
 }
 
 
-@pytest.mark.parametrize("replicas", [1, 3])
+@pytest.mark.parametrize("replicas", [1, 5])
 @pytest.mark.parametrize("meeting", MEETINGS)
 def test_grains_that_come_from_afar_meet_when_they_should(meeting: str, replicas: int) -> None:
     apart, speed, spin = MEETINGS[meeting]
