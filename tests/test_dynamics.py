@@ -12,6 +12,7 @@ from scenes import (
     FREE,
     SPHERE,
     advance,
+    blank_state,
     cached_tetra,
     cluster27,
     coast,
@@ -204,11 +205,14 @@ def test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall(axis):
 
 
 def test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin():
-    system, state, box = cluster27(skin=0.5)
+    lengths = np.array([9.0, 12.0, 10.0])
+    box = still_box(jnp.zeros((3, 1)), column(lengths))
+    grains = make_grains(np.random.default_rng(0).uniform(1.0, lengths - 1.0, (30, 3)))
+    system = dynamics.System(SPHERE, Hooke(), PairFinder(SPHERE, lengths, 0.5)(grains, SPHERE, box))
+    state = blank_state(system, grains)
     for step, expected in ((0.25 - 1e-9, 0), (0.25 + 1e-9, int(Status.STALE_PAIRS))):
-        position = state.grains.position.at[3, 0, 0].add(step)
-        status = CHECK(system, replace(state, grains=replace(state.grains, position=position)), box).status
-        assert int(status[0]) == expected
+        moved = replace(grains, position=grains.position.at[3, 0, 0].add(step))
+        assert int(CHECK(system, replace(state, grains=moved), box).status[0]) == expected
 
 
 def test_a_nan_position_is_not_finite_rather_than_stale():
