@@ -1,5 +1,6 @@
 """Gain, fidelity and background subtraction on made-up signals."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from gmem_jax.experiment.signals import bin_average, six_signals
 
 SCALE = 0.05 * 1e-3  # delta0 gamma0
 J = bin_average(six_signals())
+RUNNING_MEAN = jax.jit(analysis.running_mean)
 
 
 def test_a_scaled_integral_is_a_perfect_memory() -> None:
@@ -74,6 +76,20 @@ def test_a_running_mean_over_one_period_removes_it_and_keeps_a_line() -> None:
 def test_a_running_mean_of_one_bin_changes_nothing() -> None:
     series = jnp.asarray([[1.0, 5.0, 2.0, 8.0]])
     np.testing.assert_allclose(analysis.running_mean(series, 1.0), series, rtol=1e-15)
+
+
+@pytest.mark.parametrize("width", [0.5, 1.0, 2.5, 4.3, 6.9, 40.0])
+def test_a_running_mean_is_the_mean_over_the_part_of_its_window_that_is_inside(width: float) -> None:
+    bins, fine = 7, 20  # windows of these widths begin and end between the fine steps
+    series = np.random.default_rng(0).normal(size=(2, bins))
+    steps = np.repeat(series, fine, axis=1)
+    place = (np.arange(bins * fine) + 0.5) / fine
+    expected = [steps[:, np.abs(place - centre) < 0.5 * width].mean(axis=1) for centre in np.arange(bins) + 0.5]
+    np.testing.assert_allclose(RUNNING_MEAN(jnp.asarray(series), width), np.transpose(expected), rtol=1e-12)
+
+
+def test_a_running_mean_keeps_a_constant_to_the_ends() -> None:
+    np.testing.assert_allclose(analysis.running_mean(jnp.full((1, 9), 0.7), 3.7), np.full((1, 9), 0.7), rtol=1e-14)
 
 
 def test_every_background_is_reported_with_its_own_gain_and_fidelity() -> None:

@@ -98,6 +98,30 @@ def test_held_out_combinations_are_never_trained_on(data: classify.Examples) -> 
     assert len(set(few.tolist())) > 500  # a quick check covers many combinations
 
 
+def test_no_two_examples_have_the_same_noise() -> None:
+    recipe = classify.Lessons(2, shifts=2, amplitudes=3, draws=3)
+    data = classify.examples(recipe, 0)
+    word, combination = (part.ravel() for part in jnp.meshgrid(jnp.arange(4), jnp.arange(18), indexing="ij"))
+    shift, factor, draw = combination // 9, combination // 3 % 3, combination % 3
+    clean = np.asarray(data.table[word, shift]) * (0.7 + 0.3 * np.asarray(factor))[:, None]
+    noise = (np.asarray(MAKE(data, word, combination)) - clean)[np.asarray(draw) > 0]  # the first draw has none
+    correlation = np.corrcoef(noise)[np.triu_indices(len(noise), 1)]
+    assert len(noise) == 48
+    assert np.abs(correlation).max() < 0.4  # 1,128 pairs with an SD of 1 / 16; the same noise has 1
+
+
+def test_a_quick_check_takes_other_combinations_for_every_word(data: classify.Examples) -> None:
+    class Spy(classify.Examples):
+        def make(self, word: jax.Array, combination: jax.Array) -> jax.Array:
+            return combination
+
+    asked, word = Spy(data.table, data.order, data.noise, data.lessons).held_out(jnp.arange(QUICK_CHECK))
+    assert np.bincount(np.asarray(word)).tolist() == [QUICK_CHECK // 8] * 8
+    assert len(set(np.asarray(asked[:8]).tolist())) == 8
+    # 512 for every word; each word begins 7 further than the one before.
+    assert len(set(np.asarray(asked).tolist())) == 512 + 7 * 7
+
+
 def test_which_combinations_are_held_out_depends_on_the_seed(data: classify.Examples) -> None:
     other = classify.examples(PAPER, 1)
     same = np.intersect1d(data.order[: PAPER.kept], other.order[: PAPER.kept])

@@ -13,6 +13,7 @@ from scenes import (
     advance,
     advance_by,
     advance_plain,
+    blank_state,
     cached_tetra,
     cluster27,
     coast,
@@ -189,6 +190,32 @@ def test_status_bits_name_what_is_wrong_with_which_replica():
     ]
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall(axis):
+    grain = cached_tetra()
+    box = still_box(column([-4.0, -5.0, -6.0]), column([4.0, 5.0, 6.0]))
+    offsets = np.asarray(grain.offsets)
+    flagged = []
+    for wall, outermost in ((box.lower, offsets[:, axis].min()), (box.upper, offsets[:, axis].max())):
+        for beyond in (-1e-9, 1e-9):
+            position = np.zeros((1, 3))
+            position[0, axis] = float(wall[axis, 0]) - outermost + beyond * np.sign(outermost)
+            system, state, _ = scene(grain, position, box=box)
+            flagged.append(bool(CHECK(system, state, box).status[0] & Status.OUTSIDE_BOX))
+    assert flagged == [False, True, False, True]
+
+
+def test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin():
+    lengths = np.array([9.0, 12.0, 10.0])
+    box = still_box(jnp.zeros((3, 1)), column(lengths))
+    grains = make_grains(np.random.default_rng(0).uniform(1.0, lengths - 1.0, (30, 3)))
+    system = dynamics.System(SPHERE, Hooke(), PairFinder(SPHERE, lengths, 0.5)(grains, SPHERE, box))
+    state = blank_state(system, grains)
+    for step, expected in ((0.25 - 1e-9, 0), (0.25 + 1e-9, int(Status.STALE_PAIRS))):
+        moved = replace(grains, position=grains.position.at[3, 0, 0].add(step))
+        assert int(CHECK(system, replace(state, grains=moved), box).status[0]) == expected
+
+
 def test_a_nan_position_is_not_finite_rather_than_stale():
     # A stale list is rebuilt and the chunk repeated; that would not help here.
     system, state, box = cluster27()
@@ -279,6 +306,20 @@ def test_observables_are_those_counted_by_hand():
     assert float(sample.kinetic_energy[0]) == pytest.approx(energy, rel=1e-12)
     assert float(sample.largest_speed[0]) == pytest.approx(0.3, rel=1e-14)
     assert float(sample.filling[0]) == pytest.approx(3.0 * mass / 30.0**3, rel=1e-12)
+
+
+def test_the_kinetic_energy_of_a_turned_anisotropic_grain_is_that_of_its_own_tensor():
+    grain = clump([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.2, 0.6, 0.0]])
+    moments = np.asarray(grain.inertia)
+    assert np.ptp(moments) > 0.3 * moments.mean()
+    assert not grain.isotropic
+    velocity, spin = np.random.default_rng(0).normal(size=(2, 5, 3))
+    system, state, box = scene(grain, 8.0 * np.eye(5, 3) - 4.0, orientations(5), velocity, spin)
+    rotation = np.asarray(matrix(state.grains.quaternion))[..., 0]
+    tensor = np.einsum("nij,j,nkj->nik", rotation, moments, rotation)
+    energy = 0.5 * float(grain.mass) * (velocity**2).sum() + 0.5 * np.einsum("ni,nij,nj->", spin, tensor, spin)
+    sample = OBSERVE(system, state, box, jnp.zeros((3, 1)))
+    assert float(sample.kinetic_energy[0]) == pytest.approx(energy, rel=1e-12)
 
 
 def test_wall_pressure_is_the_mean_force_of_two_walls_over_their_area():

@@ -11,6 +11,7 @@ from scenes import SPHERE, blank_state, cached_tetra, cluster27, make_grains, or
 
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.grain import clump
 from gmem_jax.physics.pairs import bucket, candidates, carry_history, slack, sphere_centres, tabulate
 from gmem_jax.physics.sample import observe
 from gmem_jax.physics.search import PairFinder
@@ -37,6 +38,10 @@ def box_of(lengths):
     return still_box(0.3 + jnp.zeros((3, 1)), 0.3 + lengths)  # not at the origin
 
 
+def unshifted_box(lengths):
+    return still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
+
+
 def shifted(grains):
     return replace(grains, position=grains.position + 0.3)
 
@@ -59,6 +64,25 @@ def test_the_list_is_the_one_found_by_brute_force_in_canonical_order(case):
         expected = brute_force(mapped, clump.spheres, 2.4)
         assert expected.shape[1] > 100
         np.testing.assert_array_equal(candidates(pairs), expected)
+
+
+@pytest.mark.parametrize("skin", [0.1, 0.3, 0.4, 1.0])
+def test_pairs_are_listed_up_to_the_last_digit_of_the_skin(skin):
+    """jax-md keeps its cutoff in single precision, which is less than some of these."""
+    lengths, distance = np.array([12.0, 9.0, 9.0]), 2.0 + skin
+    for part, listed in ((1.0 - 1e-12, 1), (1.0 + 1e-12, 0)):
+        grains = make_grains([[3.0, 4.0, 5.0], [3.0 + part * distance, 4.0, 5.0]])
+        pairs = PairFinder(SPHERE, lengths, skin)(grains, SPHERE, unshifted_box(lengths))
+        assert candidates(pairs).shape[1] == listed
+
+
+def test_clumps_that_reach_for_each_other_with_their_outermost_spheres_are_listed():
+    grain = clump([[1.2, 0.0, 0.0], [-1.2, 0.0, 0.0]])
+    lengths = np.array([20.0, 9.0, 9.0])
+    reach = 2.0 + 0.3 + 2.0 * 1.2  # of the centres of two of them in a row
+    grains = make_grains([[5.0, 4.0, 5.0], [5.0 + reach * (1.0 - 1e-6), 4.0, 5.0]])
+    pairs = PairFinder(grain, lengths, 0.3)(grains, grain, unshifted_box(lengths))
+    assert candidates(pairs).shape[1] == 1
 
 
 @pytest.fixture(scope="module")

@@ -1,12 +1,18 @@
 """Preparation of a tiny pack: at rest, under its pressure, reproducible."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import ELASTIC, SPHERE, column, scene
 
 import gmem_jax as gm
-from gmem_jax.preparation.preparation import lattice
+from gmem_jax.physics.state import still_box
+from gmem_jax.physics.step import march
+from gmem_jax.preparation.piston import Pressed, Servo, press
+from gmem_jax.preparation.preparation import _gas, lattice
 
+PRESS = jax.jit(press, static_argnames=("blocks", "march"))
 TINY = gm.Recipe(grains=12, gas_time=500.0, t0=300.0, cycles=1)
 
 
@@ -31,6 +37,78 @@ def test_lattices_are_those_of_the_paper(grains: int, sites: tuple[int, int, int
     assert lattice(grains) == sites
 
 
+def test_the_gas_has_the_speeds_and_spins_of_the_recipe_each_at_random() -> None:
+    recipe = gm.Recipe(grains=4000, gas_speed=0.03)
+    position, quaternion, velocity, spin, lengths = _gas(recipe, gm.sphere())
+    for motion in (np.asarray(velocity), np.asarray(spin)):
+        # Of 12,000 normal numbers the mean is known to 1 / 110 and the mean square to 1 / 77 of itself: four of these.
+        assert np.sqrt(np.mean(np.sum(motion**2, axis=1))) == pytest.approx(0.03, rel=4.0 / 77.0 / 2.0)
+        assert np.abs(motion.mean(axis=0)).max() < 4.0 * 0.03 / np.sqrt(3.0 * 4000.0)
+        assert np.std(motion, axis=0) == pytest.approx(0.03 / np.sqrt(3.0), rel=4.0 / np.sqrt(2.0 * 4000.0))
+    together = np.concatenate([velocity, spin, quaternion], axis=1)
+    assert np.abs(np.corrcoef(together.T)[np.triu_indices(10, 1)]).max() < 4.5 / np.sqrt(4000.0)
+    np.testing.assert_allclose(np.linalg.norm(quaternion, axis=1), 1.0, rtol=1e-12)
+    # A lattice of whole layers, as thin as asked for: nobody touches anybody, or a wall.
+    other = _gas(gm.Recipe(grains=4000, gas_speed=0.03, seed=2), gm.sphere())
+    assert np.abs(np.asarray(other[2]) - np.asarray(velocity)).max() > 0.01
+    assert np.all(position > 1.0)
+    assert np.all(position < lengths - 1.0)
+
+
+def test_the_gas_starts_as_thin_as_the_recipe_says_and_never_thicker_than_grains_that_turn_freely() -> None:
+    for grain, filling in ((gm.sphere(), 0.3), (gm.tetra(), 0.2)):
+        position, _, _, _, lengths = _gas(gm.Recipe(grains=325, filling=filling), grain)
+        sites = np.prod(lattice(325, filling))  # the last layer may have holes
+        assert sites * float(grain.mass) / np.prod(lengths) == pytest.approx(filling, rel=1e-12)
+        apart = np.linalg.norm(position[:, None] - position, axis=-1)[np.triu_indices(325, 1)]
+        assert apart.min() > float(grain.diameter)
+    position, _, _, _, _ = _gas(gm.Recipe(grains=325, filling=0.5), gm.tetra())  # too thick for them
+    apart = np.linalg.norm(position[:, None] - position, axis=-1)[np.triu_indices(325, 1)]
+    assert apart.min() == pytest.approx(1.02 * float(gm.tetra().diameter), rel=1e-12)
+
+
+def pressed(error: float = 0.0, flight: float = 0.0, **servo: float) -> Pressed:
+    """One block of a servo on a sphere that is held between floor and piston, and flies along x at `flight`.
+
+    The pressure is the target times 1 + `error`.
+    """
+    overlap, area = 0.01, 100.0
+    force = ELASTIC.wall_stiffness * overlap**1.5
+    box = still_box(column([-5.0, -5.0, -1.0 + overlap]), column([5.0, 5.0, 1.0 - overlap]))
+    system, state, _ = scene(SPHERE, [[0.0, 0.0, 0.0]], velocity=[[flight, 0.0, 0.0]], material=ELASTIC, box=box)
+    no = jnp.asarray(False)
+    now = Pressed(state, box, jnp.asarray([force / area]), jnp.asarray(0), no, no)
+    numbers = {"target": force / area / (1.0 + error), "speed": 0.0, "gain": 0.005, "error": 0.01, "quiet": 1e-5}
+    return PRESS(system, now, Servo(**numbers | servo), 0.3, 0.0, blocks=1, march=march)
+
+
+@pytest.mark.parametrize(
+    ("error", "speed", "settled"),
+    [
+        (0.0, 0.0, True),
+        (0.0099, 0.0, True),
+        (0.0101, 0.0, False),
+        (-0.0099, 0.0, True),
+        (-0.0101, 0.0, False),
+        (0.0, 0.99e-5, True),
+        (0.0, 1.01e-5, False),
+    ],
+)
+def test_the_piston_has_settled_when_pressure_and_speed_are_both_within_their_bounds(
+    error: float, speed: float, settled: bool
+) -> None:
+    assert bool(pressed(error, speed).settled) is settled
+    assert not bool(pressed(error, speed, quiet=0.0).settled)
+
+
+def test_the_piston_moves_with_the_error_of_the_pressure_at_most_at_its_speed() -> None:
+    for error in (-0.5, -0.1, 0.2, 3.0):
+        after = pressed(error, speed=0.002)
+        moved = float(after.box.upper[2, 0] - 0.99)
+        assert moved == pytest.approx(8 * 0.3 * np.clip(0.005 * error, -0.002, 0.002), rel=1e-9)
+        np.testing.assert_array_equal(after.box.lower[:, 0], [-5.0, -5.0, -0.99])
+
+
 def test_a_pack_ends_at_rest_under_its_pressure(prepared: tuple[gm.Pack, dict]) -> None:
     pack, log = prepared
     rest = pack.info["at_rest"]
@@ -39,7 +117,10 @@ def test_a_pack_ends_at_rest_under_its_pressure(prepared: tuple[gm.Pack, dict]) 
     assert 0.2e-3 < rest["pressure"][2] < 2e-2
     assert list(log) == ["cycle 1: rest", "cycle 1: compress", "cycle 1: hold", "cycle 1: decompress", "rest"]
     first = log["cycle 1: rest"]
-    np.testing.assert_allclose(first.pressure[0, 2, 0], TINY.pressure, rtol=0.05)
+    # The piston was fixed at 1 % and hardly a grain moving; at the end of the first bin, four steps later, its own last
+    # speed, 1 % of its gain, may have gone into a grain.
+    np.testing.assert_allclose(first.pressure[0, 2, 0], TINY.pressure, rtol=1.2 * TINY.pressure_error)
+    assert first.largest_speed[0, 0] < TINY.settled_speed + TINY.piston_gain * TINY.pressure_error
 
 
 def test_a_pack_is_centred_with_all_spheres_inside(prepared: tuple[gm.Pack, dict]) -> None:

@@ -32,6 +32,13 @@ def test_the_nearest_template_is_the_likeliest_word_and_not_the_row_number() -> 
     assert np.array_equal(readers.nearest_template(noisy(5, 0.5)[order], J[5]), order)
 
 
+def test_the_nearest_template_is_found_whatever_its_size() -> None:
+    sizes = np.geomspace(0.01, 100.0, 8)[:, None]
+    truth = np.arange(8)
+    assert np.array_equal(readers.nearest_template(noisy(3, 0.5), sizes * J[3]), truth)
+    assert np.array_equal(readers.nearest_template(sizes * noisy(3, 0.5), J[3]), truth)
+
+
 def test_the_linear_decoder_learns_what_the_pack_does_to_the_words() -> None:
     """A pack that mirrors u: templates are lost, a decoder fitted on other words is not."""
     mirrored = noisy(5, 0.2)[:, ::-1]

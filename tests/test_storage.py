@@ -1,13 +1,20 @@
 """Files are complete or absent, and say what is wrong with them."""
 
+import subprocess
+import sys
+from collections import OrderedDict
 from pathlib import Path
 
 import h5py
+import jax
 import numpy as np
 import pytest
 
 import gmem_jax as gm
 from gmem_jax.files.atomic import atomic
+from gmem_jax.files.parts import Parts, load_part, locked, save_part
+from gmem_jax.files.waveforms import save_waveforms
+from gmem_jax.physics.state import Grains, State
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 
@@ -92,6 +99,74 @@ def test_waveforms_are_read_from_csv_with_or_without_header_and_from_npy(tmp_pat
     np.save(tmp_path / "both.npy", samples)
     for name in ("plain.csv", "header.csv", "both.npy"):
         np.testing.assert_array_equal(gm.load_waveforms(tmp_path / name), samples)
+
+
+def test_waveforms_survive_their_file_bit_for_bit(tmp_path: Path) -> None:
+    signals = gm.waveform(np.random.default_rng(0).normal(size=(3, 7)))
+    save_waveforms(tmp_path / "own.csv", signals)
+    np.testing.assert_array_equal(gm.load_waveforms(tmp_path / "own.csv"), np.asarray(signals.nodes)[:, 1:-1])
+
+
+def test_a_part_that_is_kept_is_not_run_again(tmp_path: Path) -> None:
+    ran: list[int] = []
+
+    def work() -> dict[str, np.ndarray]:
+        ran.append(len(ran))
+        return {"answer": np.arange(3) + len(ran)}
+
+    first = Parts(tmp_path / "parts", {"seed": 1})("one", work)
+    again = Parts(tmp_path / "parts", {"seed": 1})
+    np.testing.assert_array_equal(again("one", work)["answer"], first["answer"])
+    assert (ran, again.finished()) == ([0], 1)
+    again("two", work)
+    assert (ran, again.finished()) == ([0, 1], 2)
+    again.discard()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_parts_of_another_run_are_refused(tmp_path: Path) -> None:
+    Parts(tmp_path / "parts", {"seed": 1, "pack": "a"})
+    Parts(tmp_path / "parts", {"seed": 1, "pack": "b"})("one", lambda: np.zeros(1))  # nothing was finished: no matter
+    with pytest.raises(gm.FileFormatError, match=r"another pack \('b', now 'a'\)"):
+        Parts(tmp_path / "parts", {"seed": 1, "pack": "a"})
+    assert Parts(tmp_path / "parts", {"seed": 1, "pack": "a"}, restart=True).finished() == 0
+
+
+def test_a_part_is_a_table_of_arrays_with_a_checksum(tmp_path: Path) -> None:
+    """What cannot be told from its bytes alone is refused: no code, no damage."""
+    state = State(Grains(*(np.full((2, 3, 1), float(k)) for k in range(6))), (np.ones(4), ()), np.zeros(1, np.int32))
+    tree = (OrderedDict(rest=state, compress=state), np.arange(3))
+    save_part(tmp_path / "part.npz", tree)
+    found = load_part(tmp_path / "part.npz")
+    assert jax.tree.structure(found) == jax.tree.structure(tree)
+    assert list(found[0]) == ["rest", "compress"]
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
+        np.testing.assert_array_equal(one, other)
+    whole = (tmp_path / "part.npz").read_bytes()
+    for place in range(0, len(whole), 97):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0x10
+        (tmp_path / "bad.npz").write_bytes(bytes(damaged))
+        try:
+            again = load_part(tmp_path / "bad.npz")
+        except gm.FileFormatError:
+            continue
+        # What the archive says of times and permissions may change; the numbers may not.
+        for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(tree), strict=True):
+            np.testing.assert_array_equal(one, other)
+    with pytest.raises(TypeError, match="cannot be kept"):
+        save_part(tmp_path / "part.npz", {"function": print})
+
+
+def test_an_output_belongs_to_one_run_at_a_time(tmp_path: Path) -> None:
+    output = tmp_path / "out.h5"
+    other = "from pathlib import Path; import sys; from gmem_jax.files.parts import locked\n"
+    other += "with locked(Path(sys.argv[1])): pass"
+    with locked(output):
+        refused = subprocess.run([sys.executable, "-c", other, str(output)], capture_output=True, text=True)
+        assert "another run is writing it" in refused.stderr
+    assert subprocess.run([sys.executable, "-c", other, str(output)]).returncode == 0
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

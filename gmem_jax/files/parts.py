@@ -84,7 +84,7 @@ def load_part(path: Path) -> Any:
         FileFormatError: if the file is damaged, or none of this schema.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             head = json.loads(str(file["head"]))
             if head["schema"] != PART_SCHEMA:
                 raise FileFormatError(f"{path}: schema is {head['schema']!r}, expected {PART_SCHEMA!r}")

@@ -168,10 +168,8 @@ def _library(
     target: str, outputs: Callable[[Any], list[Any]], call: Call, in_place: bool, parts: Any
 ) -> Sequence[jax.Array]:
     fixed, arrays, *slopes = parts
-    *leading, steps, _, replicas = arrays.walls.shape
-    limits = jnp.full((*(1 for _ in leading), replicas), steps, jnp.int32)
     pack = (fixed.first, fixed.second, fixed.valid, fixed.reference, fixed.smallest, fixed.offsets)
-    before = [*arrays.fields, *pack, arrays.parameters, arrays.walls, limits]
+    before = [*arrays.fields, *pack, arrays.parameters, arrays.walls]
     shapes, aliases = outputs(parts), {}
     if in_place:  # histories, much the largest arrays, are updated where they are
         for number, leaf in enumerate(arrays.history):

@@ -52,8 +52,7 @@ const Kernel& best_kernel(Task task) {
   return of_task(baseline::kernel, baseline_derivatives::kernel);
 }
 
-enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kOffsets, kParameterRows, kWallRows, kSteps,
-                kHistoryIn };
+enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kOffsets, kParameterRows, kWallRows, kHistoryIn };
 constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
 
 // Axes are grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
@@ -80,15 +79,15 @@ struct Signature {
 
 // Arguments of the three tasks are those of the steps themselves, then, for derivatives, a number for each of the
 // results' or arguments' own; see `Task`.
-// gmem_jax/native/derivatives.py: _arguments, _shapes
+// gmem_jax/native/calls.py: _library, _of_results, _of_arrays
 Signature signature(Task task, Law law) {
   const Wants fields = {{"positions", "N3B"}, {"quaternions", "N4B"},   {"velocities", "N3B"},
                         {"spins", "N3B"},     {"accelerations", "N3B"}, {"spin rates", "N3B"}};
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
                       {"validities", "P", ffi::PRED},   {"reference centres", "S3"},
                       {"smallest lengths", "3"},        {"offsets", "K3"}};
-  const Wants numbers = {{"parameters", "RB"}, {"walls", "TWB"}}, steps = {{"steps", "B", ffi::S32}};
-  const Wants history = histories(law), arguments = fields + pack + numbers + steps + history;
+  const Wants numbers = {{"parameters", "RB"}, {"walls", "TWB"}};
+  const Wants history = histories(law), arguments = fields + pack + numbers + history;
   const Wants arrays = fields + numbers + history, moved = fields + Wants{{"pressures", "3B"}} + history;
   switch (task) {
     case Task::tangent: return {arguments + arrays, moved};
@@ -174,8 +173,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       for (int f = 0; f < kFields; ++f) lane.grains_in[f] = next_argument(), lane.grains_out[f] = next_result();
       lane.parameters = source(in[kParameterRows]);
       lane.walls = source(in[kWallRows]);
-      const int32_t steps = (reinterpret_cast<const int32_t*>(in[kSteps].data) + in[kSteps].at(index))[b];
-      lane.steps = static_cast<int>(task == Task::forward ? std::min<int64_t>(std::max(steps, 0), rows) : rows);
+      lane.steps = static_cast<int>(rows);
       argument = kHistoryIn;
       for (int64_t leaf = 0; leaf < leaves; ++leaf) lane.history_in[leaf] = next_argument();
       Lane slope = lane;

@@ -5,7 +5,7 @@
 namespace gmem {
 
 // In the order of
-// gmem_jax/native/__init__.py: _LAWS, _VARIANTS
+// gmem_jax/physics/contact/laws.py: LAWS
 enum class Law { frictionless = 0, hooke = 1, mindlin_rescaled = 2, mindlin = 3 };
 enum class Variant { exact = 0, averaged = 1, paper = 2 };
 

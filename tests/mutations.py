@@ -1,0 +1,885 @@
+"""Wrong code that the tests must notice, tried on demand: ``python tests/mutations.py [names]`` or ``make mutations``.
+
+The repository is copied to a temporary folder; there each mutation is made in turn, the native library rebuilt if it is
+in C++, and the tests that are named beside it are run until one fails. A mutation that they all pass has survived: the
+exit code is then 1. Before, all these tests must pass on the code as it is. A mutation whose text or tests cannot be
+found is an error (exit code 2): the table is to be kept in step with the code.
+
+The library is built for one instruction set and without much optimisation here, and objects that a mutation does not
+concern are not built again.
+"""
+
+import argparse
+import fnmatch
+import hashlib
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+HERE = Path(__file__).resolve()
+ROOT = HERE.parents[1]
+LEFT_OUT = (".*", "__pycache__", "*.egg-info", "build", "dist", "out", "*.so", "gmem-*")
+PATIENCE = 600.0  # seconds for the tests of one mutation; one that makes them hang has been noticed
+COMPILED = (".cc", ".h")
+# The instruction set that is built here and stands for all; the narrowest would not fill its vectors with contacts.
+ONE_SET = "avx2" if platform.machine().lower() in ("x86_64", "amd64") else "baseline"
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """A change for the worse.
+
+    Attributes:
+        name: for the command line.
+        file: the end of its path, below the package.
+        text: as it is; there must be one of it.
+        wrong: in its place.
+        tests: names of test functions, one of which must fail; a parameter may follow in brackets.
+    """
+
+    name: str
+    file: str
+    text: str
+    wrong: str
+    tests: tuple[str, ...]
+
+
+def mutation(name: str, file: str, text: str, wrong: str, *tests: str) -> Mutation:
+    return Mutation(name, file, text, wrong, tests)
+
+
+DOMAINS = "test_spinning_sliding_grains_of_several_domains_move_as_defined"
+ACROSS = "test_both_modes_of_derivatives_cross_the_domains_as_defined"
+AFAR = "test_grains_that_come_from_afar_meet_when_they_should"
+GAS = "test_the_gas_has_the_speeds_and_spins_of_the_recipe_each_at_random"
+MEAN = "test_a_running_mean_is_the_mean_over_the_part_of_its_window_that_is_inside"
+PISTON = "test_the_piston_has_settled_when_pressure_and_speed_are_both_within_their_bounds"
+
+MUTATIONS = (
+    # ---------------------------------------------------------------- physics: the step and what is observed
+    mutation(
+        "step-position",
+        "physics/step.py",
+        "position=old.position + dt * half_velocity",
+        "position=old.position + dt * old.velocity",
+        "test_a_collision_without_friction_or_damping_is_second_order",
+    ),
+    mutation(
+        "step-prediction",
+        "physics/step.py",
+        "velocity=old.velocity + dt * old.acceleration",
+        "velocity=half_velocity",
+        "test_sticking_contacts_with_damping_are_second_order_until_they_open",
+    ),
+    mutation(
+        "step-spin-drag",
+        "physics/step.py",
+        "torque) - drag * predicted.spin",
+        "torque)",
+        "test_drag_slows_a_free_grain_at_its_rate",
+    ),
+    mutation(
+        "step-gyroscopic-term",
+        "physics/step.py",
+        "(body_torque - cross(body_spin, inertia * body_spin))",
+        "body_torque",
+        "test_a_symmetric_top_precesses_at_the_rate_of_its_angular_momentum",
+    ),
+    mutation(
+        "step-torque-sign",
+        "physics/step.py",
+        "torque = kin.arm * cross(kin.normal, tangential)",
+        "torque = kin.arm * cross(tangential, kin.normal)",
+        "test_an_oblique_collision_conserves_momentum_and_angular_momentum",
+    ),
+    mutation(
+        "pressure-of-one-wall",
+        "physics/step.py",
+        "(walls[0] + walls[1]) / (2.0 * area)",
+        "walls[0] / area",
+        "test_wall_pressure_is_the_mean_force_of_two_walls_over_their_area",
+    ),
+    mutation(
+        "energy-of-isotropic-grains",
+        "physics/step.py",
+        "jnp.sum(clump.inertia[:, None] * body_spin**2, axis=1)",
+        "clump.inertia[0] * jnp.sum(body_spin**2, axis=1)",
+        "test_the_kinetic_energy_of_a_turned_anisotropic_grain_is_that_of_its_own_tensor",
+    ),
+    mutation(
+        "energy-in-the-wrong-frame",
+        "physics/step.py",
+        "body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)\n    energy",
+        "body_spin = grains.spin\n    energy",
+        "test_the_kinetic_energy_of_a_turned_anisotropic_grain_is_that_of_its_own_tensor",
+    ),
+    mutation(
+        "coordination-of-spheres",
+        "physics/step.py",
+        "jax.ops.segment_max(touching",
+        "jax.ops.segment_sum(touching",
+        "test_observables_are_those_counted_by_hand",
+    ),
+    mutation(
+        "status-forgotten",
+        "physics/step.py",
+        ").astype(jnp.int32)\n    return replace(state, status=state.status | bits)\n\n\ndef observe",
+        ").astype(jnp.int32)\n    return replace(state, status=bits)\n\n\ndef observe",
+        "test_status_bits_are_sticky",
+    ),
+    mutation(
+        "stale-too-late",
+        "physics/step.py",
+        "slack(system.pairs, spheres, box) <= 0.0",
+        "slack(system.pairs, spheres, box) <= -0.01",
+        "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
+    ),
+    mutation(
+        "stale-too-early",
+        "physics/step.py",
+        "slack(system.pairs, spheres, box) <= 0.0",
+        "slack(system.pairs, spheres, box) <= 0.01",
+        "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
+    ),
+    mutation(
+        "box-margin-below",
+        "physics/step.py",
+        "(spheres < box.lower)",
+        "(spheres < box.lower - 0.1)",
+        "test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall",
+    ),
+    mutation(
+        "box-margin-above",
+        "physics/step.py",
+        "(spheres > box.upper)",
+        "(spheres > box.upper - 0.01)",
+        "test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall",
+    ),
+    # ---------------------------------------------------------------- physics: candidates
+    mutation(
+        "slack-of-one-sphere",
+        "physics/pairs.py",
+        "2.0 - 2.0 * deviation",
+        "2.0 - 1.0 * deviation",
+        "test_slack_is_negative_before_any_unlisted_pair_can_touch",
+    ),
+    mutation(
+        "slack-without-the-box",
+        "physics/pairs.py",
+        "return ratio * pairs.reach",
+        "return pairs.reach",
+        "test_slack_shrinks_when_the_box_gets_smaller_than_the_smallest",
+    ),
+    mutation(
+        "cells-without-margin",
+        "physics/pairs.py",
+        "np.asarray(extent, dtype=float) + 1.0",
+        "np.asarray(extent, dtype=float)",
+        "test_grains_at_the_very_faces_of_the_box_find_their_neighbours",
+    ),
+    mutation(
+        "cutoff-without-margin",
+        "physics/pairs.py",
+        "r_cutoff=cutoff + 1e-4",
+        "r_cutoff=cutoff",
+        "test_pairs_are_listed_up_to_the_last_digit_of_the_skin",
+    ),
+    mutation(
+        "cutoff-of-one-clump",
+        "physics/pairs.py",
+        "cutoff = 2.0 * (1.0 + float(",
+        "cutoff = 2.0 + 1.0 * (float(",
+        "test_clumps_that_reach_for_each_other_with_their_outermost_spheres_are_listed",
+    ),
+    mutation(
+        "histories-not-carried",
+        "physics/pairs.py",
+        "empty.at[target].set(leaf[source])",
+        "empty",
+        "test_histories_move_by_pair_and_newcomers_start_blank",
+    ),
+    # ---------------------------------------------------------------- physics: contacts, grains, material
+    mutation(
+        "turn-in-the-body-frame",
+        "physics/rotation.py",
+        "w * half + cross(half, v)",
+        "w * half + cross(v, half)",
+        "test_one_turn_is_the_rotation_by_twice_the_arctangent_in_the_lab_frame",
+    ),
+    mutation(
+        "friction-limit-doubled",
+        "contact/friction.py",
+        "slides = square > limit * limit",
+        "slides = square > 4.0 * limit * limit",
+        "test_a_sliding_contact_carries_the_friction_limit_and_resumes_from_it",
+    ),
+    mutation(
+        "whole-step-for-half-a-step",
+        "contact/hooke.py",
+        "half_step = (0.5 * self.stiffness",
+        "half_step = (1.0 * self.stiffness",
+        "test_hooke_follows_figure_10_to_the_last_digit",
+    ),
+    mutation(
+        "twist-of-both-spins",
+        "contact/kinematics.py",
+        "twist=0.5 * dot(",
+        "twist=1.0 * dot(",
+        "test_spinning_turns_the_force_about_the_normal_by_half_the_sum_of_the_spins",
+    ),
+    mutation(
+        "magnitude-not-restored",
+        "contact/kinematics.py",
+        "flat = stretch * flat",
+        "flat = 1.0 * flat",
+        "test_a_rigidly_rotating_pair_does_not_slide_and_keeps_the_magnitude_of_its_force",
+    ),
+    mutation(
+        "arm-without-overlap",
+        "contact/kinematics.py",
+        "arm = 1.0 - 0.5 * overlap",
+        "arm = jnp.ones_like(overlap)",
+        "test_a_rigidly_rotating_pair_does_not_slide_and_keeps_the_magnitude_of_its_force",
+    ),
+    mutation(
+        "m1-rescaled-by-p",
+        "contact/mindlin_rescaled.py",
+        "jnp.sqrt(ratio) * transport",
+        "ratio * transport",
+        "test_m1_follows_figure_10_to_the_last_digit",
+    ),
+    mutation(
+        "m2-without-dilution",
+        "contact/mindlin.py",
+        'if self.variant == "averaged":',
+        'if self.variant == "none":',
+        "test_within_one_ring_only_the_averaged_variant_of_m2_is_passive",
+    ),
+    mutation(
+        "attractive-damping",
+        "contact/normal.py",
+        "touching & (force > 0.0)",
+        "touching",
+        "test_damped_spheres_never_attract",
+    ),
+    mutation(
+        "wall-velocity-ignored",
+        "contact/wall.py",
+        "velocity - box.upper_velocity",
+        "velocity",
+        "test_a_moving_wall_throws_a_resting_sphere_as_if_the_sphere_had_come_to_it",
+    ),
+    mutation(
+        "inertia-about-the-first-sphere",
+        "physics/grain.py",
+        "second = second - volume * np.outer(centre, centre)",
+        "second = second - 0.0 * np.outer(centre, centre)",
+        "test_moments_do_not_depend_on_order_place_or_orientation_of_the_offsets",
+    ),
+    mutation(
+        "spheres-as-stiff-as-walls",
+        "physics/material.py",
+        "math.sqrt(8.0)",
+        "math.sqrt(2.0)",
+        "test_stiffnesses_are_those_of_the_specification",
+    ),
+    # ---------------------------------------------------------------- the native library
+    mutation(
+        "packed-guest-torques-swapped",
+        "packed.h",
+        "to[1] = away_is_one ? torque_one : torque_other;",
+        "to[1] = away_is_one ? torque_other : torque_one;",
+        f"{DOMAINS}[1-H]",
+    ),
+    mutation(
+        "packed-guest-force-reversed",
+        "packed.h",
+        "to[0] = away_is_one ? force : -force;",
+        "to[0] = away_is_one ? -force : force;",
+        f"{DOMAINS}[1-H]",
+    ),
+    mutation(
+        "packed-guest-torque-times-five",
+        "packed.h",
+        "t[l] += guest[2 * static_cast<std::size_t>(n) + 1];",
+        "t[l] += 5.0 * guest[2 * static_cast<std::size_t>(n) + 1];",
+        f"{DOMAINS}[1-M1]",
+    ),
+    mutation(
+        "packed-spins-swapped",
+        "packed.h",
+        "columns(one(&GrainRows::spin)),\n            columns(other(&GrainRows::spin))};",
+        "columns(other(&GrainRows::spin)),\n            columns(one(&GrainRows::spin))};",
+        f"{DOMAINS}[1-H]",
+    ),
+    mutation(
+        "replicas-guest-torques-swapped",
+        "replicas.h",
+        "store_vec(to + 3, away_is_one ? push.torque_one : push.torque_other);",
+        "store_vec(to + 3, away_is_one ? push.torque_other : push.torque_one);",
+        f"{DOMAINS}[9-H]",
+    ),
+    mutation(
+        "replicas-guest-force-reversed",
+        "replicas.h",
+        "store_vec(to, away_is_one ? push.force : -push.force);",
+        "store_vec(to, away_is_one ? -push.force : push.force);",
+        f"{DOMAINS}[9-H]",
+    ),
+    mutation(
+        "replicas-spin-times-five",
+        "replicas.h",
+        "load_vec(one + kSpin),\n            load_vec(other + kSpin)};",
+        "load_vec(one + kSpin),\n            splat(5.0) * load_vec(other + kSpin)};",
+        f"{DOMAINS}[9-M2]",
+    ),
+    mutation(
+        "replicas-guest-torque-lost",
+        "replicas.h",
+        "torque = torque + load_vec(guest + 6 * static_cast<std::size_t>(n) + 3);",
+        "",
+        f"{DOMAINS}[9-H]",
+    ),
+    mutation(
+        "replicas-guests-not-forgotten",
+        "replicas.h",
+        "for (int q = 0; q < 6; ++q) guest[6",
+        "for (int q = 0; q < 3; ++q) guest[6",
+        f"{DOMAINS}[9-H]",
+    ),
+    mutation(
+        "travel-of-one-grain",
+        "block.h",
+        "travel += 2.0 *",
+        "travel += 1.0 *",
+        AFAR,
+    ),
+    mutation(
+        "travel-without-spin",
+        "block.h",
+        "fma(splat(arm), root(spin), root(speed))",
+        "root(speed)",
+        AFAR,
+    ),
+    mutation(
+        "native-turn-about-the-normal",
+        "contact.h",
+        "quarter_dt = splat(0.25)",
+        "quarter_dt = splat(0.5)",
+        f"{DOMAINS}[1-H]",
+    ),
+    mutation(
+        "native-dashpot-in-the-history",
+        "laws.h",
+        "rest = law.half_step - law.dashpot;",
+        "rest = law.half_step;",
+        f"{DOMAINS}[1-H]",
+    ),
+    mutation(
+        "native-m1-not-rescaled",
+        "laws.h",
+        "return ratio * carried;",
+        "return carried;",
+        f"{DOMAINS}[9-M1]",
+    ),
+    mutation(
+        "native-m2-weights",
+        "laws.h",
+        "select(j < r.outer, splat(1.0), r.x - j)",
+        "splat(1.0)",
+        f"{DOMAINS}[9-M2]",
+    ),
+    mutation(
+        "tangent-of-a-product",
+        "dual.h",
+        "GMEM_ISA::fma(a.slope, b.value, a.value * b.slope)}",
+        "GMEM_ISA::fma(a.slope, b.value, b.slope)}",
+        f"{ACROSS}[H]",
+    ),
+    mutation(
+        "adjoint-guest-spin",
+        "adjoint.h",
+        "store_vec(to + kGuestSpin, bar.spin);",
+        "store_vec(to + kGuestSpin, bar.velocity);",
+        f"{ACROSS}[H]",
+    ),
+    mutation(
+        "adjoint-guest-centre-lost",
+        "adjoint.h",
+        "store_vec(to + kGuestCentre, bar.centre);",
+        "store_vec(to + kGuestCentre, Vec{V{}, V{}, V{}});",
+        f"{ACROSS}[M1]",
+    ),
+    mutation(
+        "adjoint-guest-of-the-other-sphere",
+        "plan.cc",
+        "away(c) == c.grain_one ? c.one : c.other",
+        "away(c) == c.grain_one ? c.other : c.one",
+        f"{ACROSS}[H]",
+    ),
+    mutation(
+        "adjoint-home-and-away",
+        "adjoint.h",
+        "give(pair, away_is_one, pair.other,",
+        "give(pair, !away_is_one, pair.other,",
+        f"{ACROSS}[M2]",
+    ),
+    mutation(
+        "native-walls-and-spheres",
+        "native/__init__.py",
+        "(material.normal_stiffness, material.normal_damping, material.wall_stiffness)",
+        "(material.wall_stiffness, material.normal_damping, material.normal_stiffness)",
+        f"{DOMAINS}[1-H]",
+    ),
+    # ---------------------------------------------------------------- analysis and signals
+    mutation(
+        "gain-without-gamma0",
+        "experiment/analysis.py",
+        "template = delta0 * gamma0 * integral\n    return jnp.sum(template * signal)",
+        "template = delta0 * integral\n    return jnp.sum(template * signal)",
+        "test_a_scaled_integral_is_a_perfect_memory",
+    ),
+    mutation(
+        "fidelity-squared",
+        "experiment/analysis.py",
+        "1.0 - jnp.sqrt(jnp.sum((signal - template) ** 2) / jnp.sum(signal * signal))",
+        "1.0 - jnp.sum((signal - template) ** 2) / jnp.sum(signal * signal)",
+        "test_fidelity_is_one_minus_the_sine_of_the_angle_to_the_template",
+    ),
+    mutation(
+        "readout-not-turned",
+        "experiment/analysis.py",
+        "jnp.flip(pressure[:, 0] - pressure[:, 1], axis=0).T",
+        "(pressure[:, 0] - pressure[:, 1]).T",
+        "test_a_readout_is_turned_to_ascending_u",
+    ),
+    mutation(
+        "background-line-of-one-end",
+        "experiment/analysis.py",
+        "signal - (signal[:, :1] * (1.0 - ramp) + signal[:, -1:] * ramp)",
+        "signal - signal[:, -1:] * ramp",
+        "test_backgrounds_subtract_what_they_say",
+    ),
+    mutation(
+        "running-mean-window",
+        "experiment/analysis.py",
+        "low = jnp.clip(centre - 0.5 * width",
+        "low = jnp.clip(centre - 0.4 * width",
+        MEAN,
+    ),
+    mutation(
+        "running-mean-edges",
+        "experiment/analysis.py",
+        "/ (high - low)",
+        "/ width",
+        MEAN,
+    ),
+    mutation(
+        "running-mean-last-bin",
+        "experiment/analysis.py",
+        ".astype(jnp.int32), 0, bins - 1)",
+        ".astype(jnp.int32), 0, bins - 2)",
+        MEAN,
+    ),
+    mutation(
+        "bump-too-narrow",
+        "experiment/signals.py",
+        "jnp.abs(x) < 0.5",
+        "jnp.abs(x) < 0.45",
+        "test_the_integral_is_the_integral_of_the_shear",
+    ),
+    mutation(
+        "integral-not-from-zero",
+        "experiment/signals.py",
+        "primitive(u) - primitive(jnp.zeros_like(u))",
+        "primitive(u)",
+        "test_a_bump_cut_by_the_end_of_the_range_integrates_from_zero",
+    ),
+    mutation(
+        "bins-sampled",
+        "experiment/signals.py",
+        "jnp.mean(signals.integral(u).reshape(bins, points, -1), axis=1).T",
+        "signals.integral(u).reshape(bins, points, -1)[:, points // 2].T",
+        "test_bins_hold_the_average_of_the_integral_not_its_samples",
+    ),
+    mutation(
+        "words-from-the-last-bit",
+        "experiment/signals.py",
+        "places = np.arange(bits - 1, -1, -1)",
+        "places = np.arange(bits)",
+        "test_there_are_two_to_the_bits_words_most_significant_bit_first",
+    ),
+    # ---------------------------------------------------------------- preparation
+    mutation(
+        "ringing-peak",
+        "preparation/ringing.py",
+        "return padded * spacing /",
+        "return 0.7 * padded * spacing /",
+        "test_the_peak_of_one_oscillation_is_its_period",
+    ),
+    mutation(
+        "ringing-between-points",
+        "preparation/ringing.py",
+        "(peak + 0.5 * (below - above)",
+        "(peak + 0.0 * (below - above)",
+        "test_the_peak_of_one_oscillation_is_its_period",
+    ),
+    mutation(
+        "ringing-drift",
+        "preparation/ringing.py",
+        "power[: 3 * 16] = 0.0",
+        "power[:1] = 0.0",
+        "test_drift_is_not_taken_for_ringing",
+    ),
+    mutation(
+        "ringing-unit",
+        "preparation/ringing.py",
+        "pressure[:, 1], STEPS * float(dt))",
+        "pressure[:, 1], 0.7 * STEPS * float(dt))",
+        "test_two_spheres_between_two_walls_ring_at_the_rate_of_their_springs",
+    ),
+    mutation(
+        "gas-speed",
+        "preparation/preparation.py",
+        "recipe.gas_speed / math.sqrt(3.0)",
+        "recipe.gas_speed",
+        GAS,
+    ),
+    mutation(
+        "gas-spins-like-velocities",
+        "preparation/preparation.py",
+        "scale * jax.random.normal(spin_key, shape)",
+        "scale * jax.random.normal(velocity_key, shape)",
+        GAS,
+    ),
+    mutation(
+        "gas-without-spins",
+        "preparation/preparation.py",
+        "scale * jax.random.normal(spin_key, shape)",
+        "0.0 * jax.random.normal(spin_key, shape)",
+        GAS,
+    ),
+    mutation(
+        "gas-too-thick",
+        "preparation/preparation.py",
+        "1.02 * float(clump.diameter)",
+        "0.9 * float(clump.diameter)",
+        "test_the_gas_starts_as_thin_as_the_recipe_says_and_never_thicker_than_grains_that_turn_freely",
+    ),
+    mutation(
+        "lattice",
+        "preparation/preparation.py",
+        "DENSE = 0.72",
+        "DENSE = 0.64",
+        "test_lattices_are_those_of_the_paper",
+    ),
+    mutation(
+        "piston-settles-in-motion",
+        "preparation/piston.py",
+        "met & (fastest < servo.quiet)",
+        "met",
+        PISTON,
+    ),
+    mutation(
+        "piston-settles-off-its-pressure",
+        "preparation/piston.py",
+        "- 1.0)) < servo.error",
+        "- 1.0)) < 2.0 * servo.error",
+        PISTON,
+    ),
+    mutation(
+        "piston-without-a-speed-limit",
+        "preparation/piston.py",
+        "- 1.0), -servo.speed, servo.speed)",
+        "- 1.0), -servo.speed, 9.0)",
+        "test_the_piston_moves_with_the_error_of_the_pressure_at_most_at_its_speed",
+    ),
+    mutation(
+        "settling-in-motion",
+        "preparation/preparation.py",
+        "quiet=recipe.settled_speed",
+        "quiet=1e3 * recipe.settled_speed",
+        "test_a_pack_ends_at_rest_under_its_pressure",
+    ),
+    mutation(
+        "rest-in-motion",
+        "preparation/preparation.py",
+        "float(largest_speed(runner.state)) > recipe.quiet:",
+        "float(largest_speed(runner.state)) > 1e2 * recipe.quiet:",
+        "test_a_pack_ends_at_rest_under_its_pressure",
+    ),
+    # ---------------------------------------------------------------- reading
+    mutation(
+        "noise-of-a-neighbour",
+        "reading/net.py",
+        "number = word * recipe.combinations + combination",
+        "number = word + combination",
+        "test_no_two_examples_have_the_same_noise",
+    ),
+    mutation(
+        "quick-check-of-few",
+        "reading/net.py",
+        "self.recipe.classes + 7 * word)",
+        "self.recipe.classes + 0 * word)",
+        "test_a_quick_check_takes_other_combinations_for_every_word",
+    ),
+    mutation(
+        "held-out-stride",
+        "reading/net.py",
+        "self.recipe.classes + 7 * word)",
+        "self.recipe.classes + 1 * word)",
+        "test_a_quick_check_takes_other_combinations_for_every_word",
+    ),
+    mutation(
+        "amplitude-stride",
+        "reading/net.py",
+        "jnp.divmod(combination, recipe.amplitudes * recipe.draws)",
+        "jnp.divmod(combination, recipe.shifts * recipe.draws)",
+        "test_an_example_is_a_shifted_scaled_word_plus_noise_of_its_rung",
+    ),
+    mutation(
+        "trained-on-what-is-held-out",
+        "reading/net.py",
+        "(recipe.batch,), recipe.kept, recipe.combinations)",
+        "(recipe.batch,), 0, recipe.combinations)",
+        "test_held_out_combinations_are_never_trained_on",
+    ),
+    mutation(
+        "template-by-product",
+        "reading/readers.py",
+        "return np.asarray(array / np.linalg.norm(array, axis=1, keepdims=True))",
+        "return array",
+        "test_the_nearest_template_is_found_whatever_its_size",
+    ),
+    mutation(
+        "ridge-sees-all",
+        "reading/readers.py",
+        "others = np.setdiff1d(order, part)",
+        "others = order",
+        "test_a_left_out_word_has_no_influence_on_the_decoder_that_reads_it",
+    ),
+    mutation(
+        "confusion-turned",
+        "reading/readers.py",
+        "(np.tile(np.arange(count), len(answers)), answers.ravel())",
+        "(answers.ravel(), np.tile(np.arange(count), len(answers)))",
+        "test_confusion_counts_rows_of_stored_and_columns_of_read_words",
+    ),
+    # ---------------------------------------------------------------- files
+    mutation(
+        "half-a-file-stays",
+        "files/storage.py",
+        "temporary.unlink(missing_ok=True)",
+        "pass",
+        "test_a_failed_write_leaves_nothing_behind",
+    ),
+    mutation(
+        "any-schema",
+        "files/storage.py",
+        "if found != schema:",
+        "if False:",
+        "test_another_schema_is_refused_and_named",
+    ),
+    mutation(
+        "waveforms-by-rows",
+        "files/storage.py",
+        'np.loadtxt(lines, delimiter=",", ndmin=2).T',
+        'np.loadtxt(lines, delimiter=",", ndmin=2)',
+        "test_waveforms_are_read_from_csv_with_or_without_header_and_from_npy",
+    ),
+    mutation(
+        "waveforms-rounded",
+        "files/storage.py",
+        'fmt="%.17g"',
+        'fmt="%.12g"',
+        "test_waveforms_survive_their_file_bit_for_bit",
+    ),
+    mutation(
+        "parts-run-again",
+        "files/storage.py",
+        "if path.is_file():\n            return pickle",
+        "if False:\n            return pickle",
+        "test_a_part_that_is_kept_is_not_run_again",
+    ),
+    mutation(
+        "parts-of-another-run",
+        "files/storage.py",
+        "if found and found.get(name) != wanted[name]]",
+        "if False]",
+        "test_parts_of_another_run_are_refused",
+    ),
+)
+
+
+class TableError(Exception):
+    """An entry of the table that does not fit the code or the tests."""
+
+
+def source_of(root: Path, entry: Mutation) -> Path:
+    """The file of a mutation, wherever it lies in the package."""
+    ending = Path(entry.file).parts
+    found = [path for path in (root / "gmem_jax").rglob(ending[-1]) if path.parts[-len(ending) :] == ending]
+    if len(found) != 1:
+        raise TableError(f"{entry.name}: {len(found)} files are called {entry.file}")
+    count = found[0].read_text().count(entry.text)
+    if count != 1:
+        raise TableError(f"{entry.name}: its text stands {count} times in {found[0].relative_to(root)}")
+    return found[0]
+
+
+def nodes_of(root: Path, entry: Mutation) -> list[str]:
+    """What pytest calls the tests of a mutation."""
+    nodes = []
+    for test in entry.tests:
+        function = re.compile(rf"^def {test.partition('[')[0]}\(", re.MULTILINE)
+        files = [path for path in sorted((root / "tests").rglob("test_*.py")) if function.search(path.read_text())]
+        if len(files) != 1:
+            raise TableError(f"{entry.name}: {len(files)} files have the test {test}")
+        nodes.append(f"{files[0].relative_to(root)}::{test}")
+    return nodes
+
+
+def pytest(root: Path, nodes: list[str]) -> tuple[int, str]:
+    """Run tests there until one fails; pytest's exit code (1 as well if they hang) and what it said.
+
+    XLA's programs are kept beside the repository: most mutations concern few of those that their tests need.
+    """
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", "-x", "--tb=line", *nodes]
+    settings = {
+        "PYTHONPATH": str(root),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "JAX_COMPILATION_CACHE_DIR": str(root.parent / "programs"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
+    }
+    try:
+        done = subprocess.run(
+            command, cwd=root, env=os.environ | settings, capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return 1, f"no end after {PATIENCE:g} s"
+    return done.returncode, done.stdout + done.stderr
+
+
+def build(root: Path, objects: Path) -> None:
+    """Build the library there, by way of `compile_once`."""
+    compiler = os.environ.get("CXX") or next(name for name in ("c++", "g++", "clang++") if shutil.which(name))
+    settings = {
+        "CXX": shlex.join([sys.executable, str(HERE), "--compile"]),
+        "GMEM_MUTATIONS_CXX": compiler,
+        "GMEM_MUTATIONS_OBJECTS": str(objects),
+        "PYTHONPATH": str(root),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    command = [sys.executable, "-m", "gmem_jax.native.build"]
+    done = subprocess.run(command, cwd=root, env=os.environ | settings, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise TableError(f"the library cannot be built: {done.stderr.strip()}")
+
+
+def compile_once(arguments: list[str]) -> int:
+    """A C++ compiler that optimises little, knows one instruction set, and copies an object that it has made before."""
+    compiler = shlex.split(os.environ["GMEM_MUTATIONS_CXX"])
+    arguments = ["-Og" if argument.startswith("-O") else argument for argument in arguments]
+    if "-c" not in arguments:
+        others = [Path(argument).stem for argument in arguments if re.fullmatch(r".*/(baseline|avx)\w*\.o", argument)]
+        names = {name: re.sub("^[a-z0-9]+", ONE_SET, name) for name in others}
+        same = [f"-Wl,--defsym={_kernel(name)}={_kernel(one)}" for name, one in names.items() if name != one]
+        return subprocess.run([*compiler, *arguments, *same], check=False).returncode
+    place = arguments.index("-o")
+    target, rest = arguments[place + 1], arguments[:place] + arguments[place + 2 :]
+    if re.search(rf"-DGMEM_ISA=(?!{ONE_SET})", " ".join(arguments)):
+        return subprocess.run([*compiler, "-x", "c++", "-c", os.devnull, "-o", target], check=False).returncode
+    preprocess = [argument for argument in rest if argument != "-c"]
+    text = subprocess.run([*compiler, *preprocess, "-E", "-P"], capture_output=True, check=True).stdout
+    flags = " ".join(argument for argument in rest if argument.startswith("-"))
+    known = Path(os.environ["GMEM_MUTATIONS_OBJECTS"]) / hashlib.sha256(flags.encode() + text).hexdigest()
+    if not known.is_file():
+        code = subprocess.run([*compiler, *rest, "-o", target], check=False).returncode
+        if code:
+            return code
+        shutil.copyfile(target, known)
+    shutil.copyfile(known, target)
+    return 0
+
+
+def _kernel(name: str) -> str:
+    """The symbol of gmem::name::kernel."""
+    return f"_ZN4gmem{len(name)}{name}6kernelE"
+
+
+def attempt(root: Path, objects: Path, entry: Mutation, nodes: list[str]) -> str:
+    """What became of a mutation: "killed" or "SURVIVED"; the code is put right again."""
+    source = source_of(root, entry)
+    original = source.read_text()
+    library = next((root / "gmem_jax" / "native").rglob("*.so"))
+    sound = library.read_bytes()
+    source.write_text(original.replace(entry.text, entry.wrong))
+    try:
+        if source.suffix in COMPILED:
+            build(root, objects)
+        code, said = pytest(root, nodes)
+    finally:
+        source.write_text(original)
+        library.write_bytes(sound)
+    if code not in (0, 1):
+        raise TableError(f"{entry.name}: pytest ended with {code}\n{said}")
+    return "killed" if code else "SURVIVED"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="mutations to try, with * and ?; default all")
+    parser.add_argument("--list", action="store_true", help="only check the table against code and tests, and show it")
+    parser.add_argument("--trust", action="store_true", help="do not run the tests on the code as it is first")
+    options = parser.parse_args()
+    chosen = [
+        entry
+        for entry in MUTATIONS
+        if not options.names or any(fnmatch.fnmatch(entry.name, name) for name in options.names)
+    ]
+    if not chosen:
+        parser.error(f"no mutation is called {' or '.join(options.names)}")
+    try:
+        for entry in chosen:
+            source, nodes = source_of(ROOT, entry), nodes_of(ROOT, entry)
+            if options.list:
+                print(f"{entry.name:36} {source.relative_to(ROOT)}: {', '.join(nodes)}")
+        return 0 if options.list else run(chosen, options.trust)
+    except TableError as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def run(chosen: list[Mutation], trust: bool) -> int:
+    """Try the mutations in a copy of the repository; 1 if any survived, or if the tests fail without them."""
+    survived = []
+    with tempfile.TemporaryDirectory(prefix="mutations-") as folder:
+        root, objects = Path(folder) / "repository", Path(folder) / "objects"
+        objects.mkdir()
+        shutil.copytree(ROOT, root, ignore=shutil.ignore_patterns(*LEFT_OUT))
+        build(root, objects)
+        nodes = {entry.name: nodes_of(root, entry) for entry in chosen}
+        if not trust:
+            code, said = pytest(root, list(dict.fromkeys(node for some in nodes.values() for node in some)))
+            if code:
+                print(f"the tests fail without any mutation\n{said}", file=sys.stderr)
+                return 1
+        for entry in chosen:
+            began = time.perf_counter()
+            outcome = attempt(root, objects, entry, nodes[entry.name])
+            print(f"{outcome:9} {entry.name:36} {time.perf_counter() - began:5.0f} s", flush=True)
+            survived += [entry.name] if outcome == "SURVIVED" else []
+    print(f"{len(chosen)} mutations, {len(survived)} survived{': ' if survived else ''}{', '.join(survived)}")
+    return 1 if survived else 0
+
+
+if __name__ == "__main__":
+    sys.exit(compile_once(sys.argv[2:]) if sys.argv[1:2] == ["--compile"] else main())
