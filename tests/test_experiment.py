@@ -75,6 +75,14 @@ def test_waveforms_that_cannot_be_are_refused() -> None:
         gm.waveform(np.asarray([0.1j, 0.2, 0.3]))
 
 
+def test_a_law_that_jax_does_not_know_is_refused_at_once() -> None:
+    class Glue:
+        """No pytree."""
+
+    with pytest.raises(ValueError, match="friction must be a pytree: register Glue with"):
+        make(friction=Glue())
+
+
 def test_a_stack_of_packs_is_refused_at_once() -> None:
     with pytest.raises(ValueError, match=r"one pack: positions \[N, 3\], got \(2, 27, 3\)"):
         gm.Experiment(gm.stack([PACK, PACK]), BUMP)

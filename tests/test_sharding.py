@@ -1,5 +1,6 @@
 """Replicas and sweeps on several devices: the numbers of one device, and no array is gathered."""
 
+import functools
 import json
 import os
 import subprocess
@@ -15,11 +16,11 @@ HERE = Path(__file__).parent
 BUILT, REASON = native.available()
 
 
-@pytest.fixture(scope="module")
-def found(request: pytest.FixtureRequest) -> dict[str, str]:
+@functools.cache
+def found(backend: str) -> dict[str, str]:
     """What each check found wrong, from a process whose CPU counts as eight devices."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
-    command = [sys.executable, str(HERE / "sharded.py"), request.param]
+    command = [sys.executable, str(HERE / "sharded.py"), backend]
     run = subprocess.run(command, env={**os.environ, "XLA_FLAGS": flags}, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     wrong: dict[str, str] = json.loads(run.stdout)
@@ -36,6 +37,7 @@ def cases() -> list[object]:
     ]
 
 
-@pytest.mark.parametrize(("found", "check"), cases(), indirect=["found"])
-def test_devices_share_out_replicas_and_sweeps(found: dict[str, str], check: str) -> None:
-    assert not found[check], found[check]
+@pytest.mark.parametrize(("backend", "check"), cases())
+def test_devices_share_out_replicas_and_sweeps(backend: str, check: str) -> None:
+    wrong = found(backend)[check]
+    assert not wrong, wrong

@@ -119,6 +119,12 @@ class Experiment:
         return max(1, math.ceil(float(np.max(self.t0)) / (BINS * self.dt) * (1.0 - 1e-12)))
 
     def _check_shapes(self) -> None:
+        for name in ("signals", "friction"):
+            if jax.tree_util.all_leaves([getattr(self, name)]):
+                raise ValueError(
+                    f"{name} must be a pytree: register {type(getattr(self, name)).__name__} with "
+                    "jax.tree_util.register_dataclass"
+                )
         if jnp.ndim(self.pack.position) != 2:
             raise ValueError(
                 f"an experiment has one pack: positions [N, 3], got {jnp.shape(self.pack.position)}; put a stack of "

@@ -19,7 +19,7 @@ from gmem_jax.physics.pairs import Pairs
 from gmem_jax.physics.pytree import Scalar, pytree, static
 from gmem_jax.physics.sample import Sample, end_bin
 from gmem_jax.physics.state import Box, State
-from gmem_jax.physics.step import System
+from gmem_jax.physics.step import System, together
 
 
 @pytree
@@ -75,6 +75,7 @@ def walk(course: Course, state: State, rows: Bin) -> tuple[State, Sample]:
 
     Reverse mode keeps states at two levels and computes the rest again (see `checkpoint.scan`).
     """
+    state, _ = together((state, course))
     return checkpoint.scan(lambda state, row: bin_step(course, state, row), state, rows)
 
 

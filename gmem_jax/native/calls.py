@@ -251,11 +251,16 @@ def _primitive(
         results = primitive.bind(*moved, **static)
         return results, [0] * len(results)
 
-    def library(*leaves: jax.Array, tree: Any, call: Call, **_: Any) -> Any:
+    def library(context: mlir.LoweringRuleContext, *values: Any, tree: Any, call: Call, **_: Any) -> Any:
         def here(*leaves: jax.Array) -> Sequence[jax.Array]:
             return _library(target, outputs, call, in_place, jax.tree.unflatten(tree, leaves))
 
-        return _sharded(here, jax.tree.unflatten(tree, leaves), outputs)(*leaves)
+        def shared_out(*leaves: jax.Array) -> Any:
+            return _sharded(here, jax.tree.unflatten(tree, leaves), outputs)(*leaves)
+
+        # A program for one device stays free of `custom_partitioning`, which JAX's persistent cache cannot hold.
+        alone = getattr(context.module_context.axis_context, "num_devices", None) == 1
+        return mlir.lower_fun(here if alone else shared_out, multiple_results=True)(context, *values)
 
     def elsewhere(*leaves: jax.Array, tree: Any, call: Call, definition: Definition | None) -> Any:
         if definition is None:
@@ -266,7 +271,7 @@ def _primitive(
     primitive.def_impl(jax.jit(primitive.bind, static_argnames=("tree", "call", "definition")))
     primitive.def_abstract_eval(abstract)
     batching.primitive_batchers[primitive] = batch
-    mlir.register_lowering(primitive, mlir.lower_fun(library, multiple_results=True), platform="cpu")
+    mlir.register_lowering(primitive, library, platform="cpu")
     mlir.register_lowering(primitive, mlir.lower_fun(elsewhere, multiple_results=True))
     # `custom_partitioning` wants to know the devices, and JAX has no public name for saying so.
     dispatch.prim_requires_devices_during_lowering.add(primitive)
