@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich import progress
 
-from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, emit, log, pictured, say
+from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, emit, log, say
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.show import figures, tables
@@ -75,7 +75,7 @@ def classify_command(
     except ValueError as error:
         raise InputError(f"{recall}: {error}; make one with gmem recall --signals words:L") from error
     claim(output, ".json", inputs=(recall,), force=force)
-    drawn = pictured(output, picture, inputs=(recall,), force=force)
+    drawn = claim(output.with_suffix(".png"), ".png", force=force) if picture else None
     folder = recall.parent / "gmem-nets" if nets is None else nets
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -94,11 +94,6 @@ def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool,
     return path
 
 
-def pictured(data: Path, picture: bool, *, inputs: tuple[Any, ...] = (), force: bool) -> Path | None:
-    """The picture's path beside an output, claimed too; None if none is wanted."""
-    return claim(data.with_suffix(".png"), ".png", inputs=inputs, force=force) if picture else None
-
-
 def announce(what: str, grain_steps: float, memory: float, backend: str, replicas: int = 1) -> None:
     """Say what a run will need before it begins, and refuse what cannot fit the free memory.
 

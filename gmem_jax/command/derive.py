@@ -18,7 +18,6 @@ from gmem_jax.command.console import (
     claim,
     emit,
     finite,
-    pictured,
     reporting,
 )
 from gmem_jax.command.options import Chosen, with_experiment
@@ -66,10 +65,7 @@ def gradient_command(
     as_json: AsJson = False,
 ) -> None:
     """Exact derivatives of the fidelity by waveforms, gamma0, mu and stiffness (reverse mode; minutes)."""
-    experiment = chosen.experiment(pack)
-    inputs = (pack, *chosen.inputs)
-    claim(output, ".json", inputs=inputs, force=force)
-    drawn = pictured(output, picture, inputs=inputs, force=force)
+    (experiment,), drawn = chosen.claim([pack], output, ".json", picture=picture, force=force)
     began = time.perf_counter()
     waves, places = _waveform_of(experiment)
     law = experiment.friction
@@ -124,10 +120,7 @@ def kernel_command(
     as_json: AsJson = False,
 ) -> None:
     """The linear memory kernel of a pack: singular values, resolution, capacity, and what it predicts."""
-    experiment = chosen.experiment(pack)
-    inputs = (pack, *chosen.inputs)
-    claim(output, ".h5", inputs=inputs, force=force)
-    drawn = pictured(output, picture, inputs=inputs, force=force)
+    (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
     began = time.perf_counter()
     with reporting() as progress:
         begun = prefix_of(experiment, progress=progress)
@@ -181,14 +174,11 @@ def design_command(
     as_json: AsJson = False,
 ) -> None:
     """Pre-distort waveforms so that the recall follows their integrals; writes a CSV for `gmem recall` (minutes)."""
-    experiment = chosen.experiment(pack)
+    (experiment,), drawn = chosen.claim([pack], output, ".csv", picture=picture, force=force)
     _needs_sub0(experiment)
-    inputs = (pack, *chosen.inputs)
-    claim(output, ".csv", inputs=inputs, force=force)
-    drawn = pictured(output, picture, inputs=inputs, force=force)
     history = output.with_name(f"{output.stem}-history.png")
     if picture:
-        claim(history, ".png", inputs=inputs, force=force)
+        claim(history, ".png", force=force)
     began = time.perf_counter()
     with reporting() as progress:
         found = design_waveforms(experiment, iterations=iterations, gain=gain, progress=progress)
@@ -244,11 +234,8 @@ def tune_command(
 ) -> None:
     """Choose gamma0, mu and the friction stiffness within bounds so that the mean fidelity of packs grows."""
     names, limits = packs.split(","), parse_bounds(bounds)
-    experiments = [chosen.experiment(name) for name in names]
+    experiments, drawn = chosen.claim(names, output, ".json", picture=picture, force=force)
     _needs_sub0(experiments[0])
-    inputs = (*names, *chosen.inputs)
-    claim(output, ".json", inputs=inputs, force=force)
-    drawn = pictured(output, picture, inputs=inputs, force=force)
     began = time.perf_counter()
     with reporting() as progress:
         found = design_drive(experiments, limits, iterations=iterations, progress=progress)

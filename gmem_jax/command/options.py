@@ -2,14 +2,14 @@
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from gmem_jax.command.console import InputError
+from gmem_jax.command.console import InputError, claim
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.signals import LONGEST_WORD, Signals, six_signals, waveform, words
 from gmem_jax.files.packs import load_pack
@@ -71,15 +71,25 @@ def named_signals(name: str) -> Signals:
 
 
 class Chosen:
-    """What the options of a command chose; a pack makes an experiment of it.
-
-    Attributes:
-        inputs: files that are read.
-    """
+    """What the options of a command chose; a pack makes an experiment of it."""
 
     def __init__(self, values: dict[str, Any]) -> None:
         self._values = values
-        self.inputs: tuple[str, ...] = (values["signals"],)
+
+    def claim(
+        self, packs: Sequence[str], output: Path, suffix: str, *, picture: bool, force: bool
+    ) -> tuple[list[Experiment], Path | None]:
+        """The experiments on some packs, once it is sure that the output and the picture beside it can be written.
+
+        Raises:
+            ValueError: for impossible values, or an output that would destroy something.
+            FileNotFoundError: if there is no such pack.
+        """
+        experiments = [self.experiment(pack) for pack in packs]
+        inputs = (*packs, self._values["signals"])
+        claim(output, suffix, inputs=inputs, force=force)
+        drawn = claim(output.with_suffix(".png"), ".png", inputs=inputs, force=force) if picture else None
+        return experiments, drawn
 
     def experiment(self, pack: str) -> Experiment:
         """The experiment on a pack file, or a shipped pack.

@@ -19,7 +19,6 @@ from gmem_jax.command.console import (
     announce,
     claim,
     emit,
-    pictured,
     reporting,
     say,
 )
@@ -96,10 +95,7 @@ def recall_command(
     as_json: AsJson = False,
 ) -> None:
     """Store waveforms in a pack and recall them."""
-    experiment = chosen.experiment(pack)
-    inputs = (pack, *chosen.inputs)
-    claim(output, ".h5", inputs=inputs, force=force)
-    drawn = pictured(output, picture, inputs=inputs, force=force)
+    (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
     row, configuration = _run(experiment, output, drawn, batch, restart=restart)
     emit(as_json, row, *_tables(row, configuration))
 
@@ -126,11 +122,12 @@ def demo(
     stems = [output / ("recall.h5" if len(names) == 1 else f"recall-{name}.h5") for name in names]
     for data in stems:
         claim(data, ".h5", force=force)
+        claim(data.with_suffix(".png"), ".png", force=force)
     rows = []
     for name, data in zip(names, stems, strict=True):
         say(f"pack {name}")
         experiment = Experiment(load_pack(name), six_signals(), law)
-        row, configuration = _run(experiment, data, pictured(data, True, force=force))
+        row, configuration = _run(experiment, data, data.with_suffix(".png"))
         rows.append(row)
     means = {key: spread([row[key] for row in rows])[0] for key in ("gain", "fidelity")}
     total = {"status": max(row["status"] for row in rows), "seconds": sum(row["seconds"] for row in rows)}

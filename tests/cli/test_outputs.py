@@ -1,0 +1,146 @@
+"""What a command may write to, and what it never destroys."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import PACK, SHORT, gmem
+
+import gmem_jax as gm
+from gmem_jax.command.console import finite
+from gmem_jax.show import tables
+
+
+@pytest.fixture
+def own_pack(tmp_path: Path) -> Path:
+    copy = tmp_path / "own.h5"
+    copy.write_bytes(PACK.read_bytes())
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [
+        ("own.h5", "is an input of this command"),
+        ("there.h5", "exists; name another file, or allow its replacement with --force"),
+        ("recall.png", "this is a .h5 file; name it recall.h5"),
+        ("/dev/null", "this is a .h5 file"),
+        ("device.h5", "is neither a file nor free"),
+    ],
+)
+def test_nothing_is_overwritten_unasked(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    tmp_path: Path,
+    own_pack: Path,
+    output: str,
+    words: str,
+) -> None:
+    (tmp_path / "there.h5").write_text("precious")
+    (tmp_path / "device.h5").symlink_to("/dev/null")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
+    assert gmem(monkeypatch, "recall", own_pack, "-o", tmp_path / output, *SHORT) == 2
+    assert words in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
+    assert Path("/dev/null").is_char_device()
+
+
+def test_not_even_by_force_is_an_input_overwritten(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, own_pack: Path
+) -> None:
+    assert gmem(monkeypatch, "recall", own_pack, "-o", own_pack, "--force", *SHORT) == 2
+    assert "is an input" in capsys.readouterr().err
+    assert own_pack.read_bytes() == PACK.read_bytes()
+
+
+def test_a_picture_that_is_there_counts_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    (tmp_path / "out.png").write_text("precious")
+    assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "out.h5", *SHORT) == 2
+    assert "out.png: exists" in capsys.readouterr().err
+    assert (tmp_path / "out.png").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0.1,x\n0.2,0.3\n0.1,0.2\n", "its first line mixes numbers and words"),
+        ("u,I\n0.25,1\n0.5,2\n0.75,1\n", "has a column of u"),
+        ("0.25,1\n0.5,2\n0.75,1\n", "has a column of u"),
+        ("0\n0\n0\n", "every waveform is zero"),
+    ],
+)
+def test_waveforms_that_are_not_what_they_seem_are_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, text: str, words: str
+) -> None:
+    (tmp_path / "wave.csv").write_text(text)
+    arguments = ["--signals", tmp_path / "wave.csv", "-o", tmp_path / "out.h5"]
+    assert gmem(monkeypatch, "recall", PACK, *arguments, *SHORT) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_complex_samples_are_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "wave.npy", np.asarray([0.0, 1.0j, 0.5]))
+    arguments = ["--signals", tmp_path / "wave.npy", "-o", tmp_path / "out.h5"]
+    assert gmem(monkeypatch, "recall", PACK, *arguments, *SHORT) == 2
+    assert "samples must be real numbers, found complex128" in capsys.readouterr().err
+
+
+def test_names_of_the_paper_are_accepted_in_any_case(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    options = ["--friction", "M1", "--background", "SUB2", "--no-picture", "--json", "-o", tmp_path / "out.h5"]
+    assert gmem(monkeypatch, "recall", PACK, *options, *SHORT) == 0
+    capsys.readouterr()
+    _, configuration = gm.load_recall(tmp_path / "out.h5")
+    assert (configuration["friction"], configuration["background"]) == ("m1", "sub2")
+    again = gm.experiment_from(configuration["experiment"])
+    assert isinstance(again.friction, gm.MindlinRescaled)
+
+
+def test_published_points_stand_only_beside_what_they_were_measured_on() -> None:
+    pack = gm.load_pack("tetra-325-a")
+
+    def points(**changes: object) -> int:
+        experiment = gm.replace(gm.Experiment(pack, gm.six_signals()), changes)
+        return len(tables._comparable(gm.resolved(experiment, 1.0)))
+
+    assert points() == 1
+    assert points(signals=gm.words(3)) == 0
+    assert points(signals=gm.waveform(np.ones(9))) == 0
+    assert points(t0=100.0) == 0
+    assert points(background="sub2") == 0
+    assert points(friction=gm.Mindlin()) == 0
+    assert points(**{"friction.mu": 0.5}) == 0
+
+
+def test_json_has_null_where_there_is_no_number() -> None:
+    odd = {"a": float("nan"), "b": [float("inf"), 1.0], "c": {"d": (-float("inf"), "x")}}
+    assert json.dumps(finite(odd), allow_nan=False) == '{"a": null, "b": [null, 1.0], "c": {"d": [null, "x"]}}'
+
+
+def test_what_cannot_fit_is_refused_before_it_begins(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    assert gmem(monkeypatch, "prepare", "--grains", 10**9, "-o", tmp_path / "out.h5") == 2
+    said = capsys.readouterr().err
+    assert "GB of memory, and" in said
+    assert "are free" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_gradient_is_that_of_the_bumps_there_are(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    target = tmp_path / "gradient.json"
+    assert gmem(monkeypatch, "gradient", PACK, "-o", target, "--no-picture", "--json", *SHORT) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert [len(row) for row in said["places"]] == [1, 1, 2, 2, 2, 3]
+    assert [len(row) for row in said["gradient"]["waveform"]] == [1, 1, 2, 2, 2, 3]
+    assert all(row == sorted(row) for row in said["places"])
