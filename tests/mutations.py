@@ -179,17 +179,10 @@ MUTATIONS = (
         "test_slack_shrinks_when_the_box_gets_smaller_than_the_smallest",
     ),
     mutation(
-        "cells-without-margin",
-        "physics/pairs.py",
-        "np.asarray(extent, dtype=float) + 1.0",
-        "np.asarray(extent, dtype=float)",
-        "test_grains_at_the_very_faces_of_the_box_find_their_neighbours",
-    ),
-    mutation(
-        "cutoff-without-margin",
+        "cutoff-a-little-short",
         "physics/pairs.py",
         "r_cutoff=cutoff + 1e-4",
-        "r_cutoff=cutoff",
+        "r_cutoff=cutoff - 1e-4",
         "test_pairs_are_listed_up_to_the_last_digit_of_the_skin",
     ),
     mutation(
@@ -416,7 +409,7 @@ MUTATIONS = (
         "adjoint.h",
         "store_vec(to + kGuestCentre, bar.centre);",
         "store_vec(to + kGuestCentre, Vec{V{}, V{}, V{}});",
-        f"{ACROSS}[M1]",
+        f"{ACROSS}[H]",
     ),
     mutation(
         "adjoint-guest-of-the-other-sphere",
@@ -664,7 +657,7 @@ MUTATIONS = (
         "reading/readers.py",
         "others = np.setdiff1d(order, part)",
         "others = order",
-        "test_a_left_out_word_has_no_influence_on_the_decoder_that_reads_it",
+        "test_the_linear_decoder_never_sees_the_word_it_reads",
     ),
     mutation(
         "confusion-turned",
