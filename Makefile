@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo test check install clean
+.PHONY: demo test check mutations install clean
 
 demo: install
 	$(REBUILD)
@@ -14,6 +14,10 @@ demo: install
 test: install-dev
 	$(REBUILD)
 	$(BIN)/pytest -n 2 --dist loadgroup
+
+# Wrong code that the tests must notice; an hour or two. Names of mutations: make mutations NAMES="step-* native-*"
+mutations: install-dev
+	$(BIN)/python tests/mutations.py $(NAMES)
 
 check: install-dev
 	$(BIN)/ruff check .
