@@ -68,10 +68,22 @@ def assert_equal_trees(one, other):
     jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
+def assert_same_replicas(one, other):
+    """Bit for bit in jax 0.9; later releases vectorise by the number of replicas, which is left in the round-off.
+
+    1e-15 of a position and 1e-12 of the largest history are measured after 300 steps with jax 0.12.
+    """
+    if jax.__version_info__ < (0, 10):
+        assert_equal_trees(one, other)
+        return
+    for leaf, expected in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(leaf, expected, rtol=1e-12, atol=1e-11 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize("chosen", [(1,), (3,)])
-def test_a_replica_does_not_depend_on_its_neighbours_in_the_batch_bit_for_bit(five, chosen):
+def test_a_replica_does_not_depend_on_its_neighbours_in_the_batch(five, chosen):
     few = sheared_cluster([AMPLITUDES[k] for k in chosen])
-    assert_equal_trees(few, replica(five, np.array([0, *(k + 1 for k in chosen)])))
+    assert_same_replicas(few, replica(five, np.array([0, *(k + 1 for k in chosen)])))
     assert np.ptp(five[1].pressure[-1, 0]) > 1e-4  # the replicas do differ
 
 
