@@ -71,13 +71,14 @@ def assert_equal_trees(one, other):
 def assert_same_replicas(one, other):
     """Bit for bit in jax 0.9; later releases vectorise by the number of replicas, which is left in the round-off.
 
-    1e-15 of a position and 1e-12 of the largest history are measured after 300 steps with jax 0.12.
+    Measured after 300 steps with jax 0.12: 1e-15 of a position, and 3e-11 of the largest acceleration, which is what is
+    left of forces that balance.
     """
     if jax.__version_info__ < (0, 10):
         assert_equal_trees(one, other)
         return
     for leaf, expected in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(leaf, expected, rtol=1e-12, atol=1e-11 * np.abs(expected).max())
+        np.testing.assert_allclose(leaf, expected, rtol=1e-12, atol=3e-10 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("chosen", [(1,), (3,)])
