@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.derivatives import gradient
-from gmem_jax.experiment.experiment import Experiment, replace
+from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.host import Progress, silent, within
 from gmem_jax.experiment.recall import Recall, simulate
 from gmem_jax.experiment.signals import Bumps
 
-LAW = ("mu", "stiffness")  # parameters that act on the prefix, and on the zero signal
+LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,10 @@ def _one_signal(experiment: Experiment) -> tuple[Bumps, np.ndarray]:
     if not isinstance(bumps, Bumps) or bumps.count != 1:
         raise ValueError("a Jacobian is taken of one signal made of bumps")
     return bumps, np.asarray(bumps.amplitudes)
+
+
+def _law_values(experiment: Experiment) -> list[float]:
+    return [float(value_at(experiment, path)) for path in LAW.values()]
 
 
 def _sheared(pressure: dict[str, np.ndarray]) -> np.ndarray:
@@ -86,8 +90,7 @@ def exact(experiment: Experiment, *, law: bool = True, progress: Progress = sile
     p_sig, p_xy = [np.asarray(pushed.p_sig_slope)], [_sheared(pushed.slope)[1:]]
     if law:
         two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # replicas 0, 1: no signal; 2, 3: it
-        chosen: Any = experiment.friction
-        wide = {f"friction.{name}": jnp.full(4, getattr(chosen, name)) for name in LAW}
+        wide = {path: jnp.full(4, value_at(experiment, path)) for path in LAW.values()}
         laws = replace(experiment, {**wide, "signals": _copies(bumps, two)})
         direction = {
             "friction.mu": jnp.asarray([1.0, 0.0, 1.0, 0.0]),
@@ -99,7 +102,7 @@ def exact(experiment: Experiment, *, law: bool = True, progress: Progress = sile
         p_sig.append(-(change[2:] - change[:2]))
         p_xy.append(_sheared(pushed.slope)[2:])
         names += LAW
-        values += [float(getattr(chosen, name)) for name in LAW]
+        values += _law_values(experiment)
     return Jacobian(tuple(names), np.asarray(values), np.concatenate(p_sig), np.concatenate(p_xy))
 
 
@@ -125,11 +128,11 @@ def differences(experiment: Experiment, relative: float, *, law: bool = True, pr
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
     if law:
-        chosen: Any = experiment.friction
+        law_values = _law_values(experiment)
         factor = {"mu": [1.0, -1.0, 0.0, 0.0], "stiffness": [0.0, 0.0, 1.0, -1.0]}
         shifted = {
-            f"friction.{name}": jnp.asarray(float(getattr(chosen, name)) * (1.0 + relative * np.tile(factor[name], 2)))
-            for name in LAW
+            path: jnp.asarray(value * (1.0 + relative * np.tile(factor[name], 2)))
+            for (name, path), value in zip(LAW.items(), law_values, strict=True)
         }
         rows = jnp.asarray(np.concatenate([np.zeros((3, n)), np.repeat(row, 4, axis=0)]))
         other = replace(experiment, {**shifted, "signals": _copies(bumps, rows)})
@@ -138,11 +141,11 @@ def differences(experiment: Experiment, relative: float, *, law: bool = True, pr
         change = np.flip(readout[:, 0] - readout[:, 1], axis=0).T
         signal = -(change[4:] - change[:4])
         p_xy = _sheared(pressure)[4:]
-        widths = 2.0 * relative * np.asarray([[float(getattr(chosen, name))] for name in LAW])
+        widths = 2.0 * relative * np.asarray(law_values)[:, None]
         slopes[0].append((signal[[0, 2]] - signal[[1, 3]]) / widths)
         slopes[1].append((p_xy[[0, 2]] - p_xy[[1, 3]]) / widths)
         names += LAW
-        values += [float(getattr(chosen, name)) for name in LAW]
+        values += law_values
     return Jacobian(tuple(names), np.asarray(values), np.concatenate(slopes[0]), np.concatenate(slopes[1]))
 
 

@@ -16,7 +16,7 @@ from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, wor
 from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import provenance
-from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.physics.material import Material
 
@@ -145,7 +145,7 @@ def key_of_run(experiment: Experiment, batch: int) -> dict[str, Any]:
 
 def resolved(experiment: Experiment, seconds: float) -> dict[str, Any]:
     """All that is to be known of a result: the experiment as written, what its defaults came to, and where it ran."""
-    pack, entry = experiment.pack, entry_of(experiment.friction)
+    pack, law, entry = experiment.pack, experiment.friction, entry_of(experiment.friction)
     dt, steps = experiment.timing
     return {
         "experiment": written(experiment),
@@ -157,8 +157,8 @@ def resolved(experiment: Experiment, seconds: float) -> dict[str, Any]:
             "diameter": float(pack.clump.diameter),
         },
         "pack_record": pack.info,
-        "friction": entry.name if entry else type(experiment.friction).__name__,
-        "mu": _plain(getattr(experiment.friction, "mu", 0.0)),
+        "friction": entry.name if entry else type(law).__name__,
+        "mu": _plain(law.mu) if isinstance(law, CoulombLaw) else 0.0,
         "delta0": _plain(experiment.compression),
         "gamma0": _plain(experiment.gamma0),
         "t0": _plain(experiment.t0),

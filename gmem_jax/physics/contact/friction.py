@@ -35,6 +35,16 @@ class FrictionLaw(Protocol):
 
 
 @runtime_checkable
+class CoulombLaw(Protocol):
+    """A law with a friction coefficient."""
+
+    @property
+    def mu(self) -> Scalar:
+        """Friction coefficient; scalar or [B]."""
+        ...
+
+
+@runtime_checkable
 class RangedLaw(Protocol):
     """A law that is valid up to some overlap only, and says so."""
 
