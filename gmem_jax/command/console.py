@@ -111,10 +111,14 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
     seconds = 1e-6 * COST[backend][replicas > 1] * grain_steps
     units = (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0), ("seconds", 1.0))
     name, unit = next(pair for pair in units if seconds >= 2.0 * pair[1] or pair[1] == 1.0)
-    needs = f"some {max(1, round(seconds / unit))} {name} on a free machine and {memory / 1e9:.1f} GB of memory"
+    needs = f"some {max(1, round(seconds / unit))} {name} on a free machine and {_bytes(memory)} of memory"
     if memory > free:
-        raise InputError(f"{what} needs {needs}, and {free / 1e9:.1f} GB are free")
+        raise InputError(f"{what} needs {needs}, and {_bytes(free)} are free")
     say(f"{what}: {needs}")
+
+
+def _bytes(count: float) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
 class RunInterruptedError(KeyboardInterrupt):
