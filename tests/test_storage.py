@@ -154,6 +154,11 @@ def test_a_part_is_a_table_of_arrays_with_a_checksum(tmp_path: Path) -> None:
         # What the archive says of times and permissions may change; the numbers may not.
         for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(tree), strict=True):
             np.testing.assert_array_equal(one, other)
+    with np.load(tmp_path / "part.npz") as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "bad.npz", **{**arrays, "array_000": arrays["array_000"] + 1.0})  # an archive without a flaw
+    with pytest.raises(gm.FileFormatError, match="its checksum does not fit"):
+        load_part(tmp_path / "bad.npz")
     with pytest.raises(TypeError, match="cannot be kept"):
         save_part(tmp_path / "part.npz", {"function": print})
 
