@@ -11,7 +11,7 @@ import gmem_jax as gm
 from gmem_jax.experiment.drive import Drive
 from gmem_jax.experiment.host import Walker
 from gmem_jax.experiment.protocol import Stage
-from gmem_jax.experiment.recall import REST_SPEED, finish
+from gmem_jax.experiment.recall import finish
 from gmem_jax.experiment.walk import Course
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.sample import end_bin
@@ -111,7 +111,6 @@ def test_a_pack_is_at_rest_below_one_percent_of_the_speed_of_its_walls() -> None
         stages = found.stages | {"store": replace(store, largest_speed=speeds)}
         return finish(experiment, stages, jnp.zeros(7, jnp.int32))
 
-    assert REST_SPEED == 0.01
     below, above = at(0.01 * (1.0 - 1e-9)), at(0.01 * (1.0 + 1e-9))
     assert np.all(np.asarray(below.status) == 0)
     np.testing.assert_array_equal(above.status, [0] + [int(Status.NOT_AT_REST)] * 6)
