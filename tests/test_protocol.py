@@ -1,0 +1,107 @@
+"""The stages of an experiment: each hold has its own length, bins are whole, and the walls never jump."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax.experiment.protocol import Stage, memory_protocol, preparation_cycle, split, table
+from gmem_jax.experiment.walk import bin_step, walls
+from gmem_jax.physics.state import replicate, still_box
+from gmem_jax.physics.step import start
+
+PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
+REST, HOLD, STORE = 0.1, 0.3, 0.7
+CYCLE = [("rest", 0, 0, REST), ("compress", 0, 1, 1.0), ("hold", 1, 1, HOLD), ("decompress", 1, 0, 1.0)]
+FIRST = [*CYCLE, ("rest-2", 0, 0, REST), ("encode", 0, 1, 1.0), ("store", 1, 1, STORE), ("readout", 1, 0, 1.0)]
+AGAIN = [("rest-3", 0, 0, REST), ("compress-3", 0, 1, 1.0), ("hold-3", 1, 1, HOLD), ("readout-2", 1, 0, 1.0)]
+
+
+def written(stages: tuple[Stage, ...]) -> list[tuple[str, float, float, float]]:
+    return [(stage.name, stage.start, stage.stop, stage.length) for stage in stages]
+
+
+def test_rests_holds_and_storage_have_lengths_of_their_own() -> None:
+    assert written(preparation_cycle(REST, HOLD)) == CYCLE
+    assert written(memory_protocol(REST, HOLD, STORE, second_readout=False)) == FIRST
+    assert written(memory_protocol(REST, HOLD, STORE, second_readout=True)) == FIRST + AGAIN
+
+
+def test_only_the_encoding_is_sheared_and_all_before_it_is_common() -> None:
+    stages = memory_protocol(REST, HOLD, STORE, second_readout=True)
+    assert [stage.name for stage in stages if stage.sheared] == ["encode"]
+    common, own = split(stages)
+    assert written(common + own) == FIRST + AGAIN
+    assert own[0].name == "encode"
+
+
+@pytest.mark.parametrize(
+    ("length", "bins"),
+    [(0.0, 1), (0.001, 1), (1 / 256, 1), (0.1, 26), (0.2, 52), (0.25, 64), (0.3, 77), (1.0, 256), (2.0, 512)],
+)
+def test_a_hold_that_is_not_whole_bins_is_rounded_up_to_them(length: float, bins: int) -> None:
+    assert Stage("hold", 1.0, 1.0, length).bins == bins
+
+
+def experiment() -> gm.Experiment:
+    """Two steps to a bin; holds of 25.6, 76.8 and 179.2 bins."""
+    bumps = gm.Bumps(jnp.asarray([[1.0]]), jnp.asarray([[0.5]]), 0.9)
+    return gm.Experiment(
+        PACK, bumps, t0=153.6, dt=0.3, rest=REST, hold=HOLD, store=STORE, gamma0=0.02, background="sub2"
+    )
+
+
+def test_the_table_counts_the_bins_of_every_stage_from_zero() -> None:
+    stages = experiment().stages
+    rows = table(stages)
+    place = 0
+    for stage in stages:
+        here = slice(place, place + stage.bins)
+        np.testing.assert_array_equal(rows.number[here], np.arange(stage.bins))
+        assert {*np.asarray(rows.bins)[here]} == {stage.bins}
+        assert {*np.asarray(rows.start)[here], *np.asarray(rows.stop)[here]} == {stage.start, stage.stop}
+        assert {*np.asarray(rows.sheared)[here]} == {stage.sheared}
+        place += stage.bins
+    assert place == len(rows.number) == 26 + 256 + 77 + 256 + 26 + 256 + 180 + 256 + 26 + 256 + 77 + 256
+
+
+def test_the_walls_never_jump_whatever_the_lengths_of_the_holds() -> None:
+    one = experiment()
+    course, rows = one.course(sheared=True), table(one.stages)
+    boxes = jax.jit(jax.vmap(lambda row: walls(course, row, one.replicas)))(jax.tree.map(jnp.asarray, rows))
+    upper, speed = (np.asarray(leaf).reshape(-1, 3, 2) for leaf in (boxes.upper, boxes.upper_velocity))
+    dt = 153.6 / 512
+    full = 0.5 * np.asarray(PACK.upper - PACK.lower)
+    shrink = 1.0 - np.sqrt(1.0 - float(PACK.delta0))
+    # The zero signal: u in every step by hand, from the lengths of the stages alone.
+    u = np.concatenate([np.linspace(s.start, s.stop, 2 * s.bins + 1)[1:] for s in one.stages])
+    np.testing.assert_allclose(upper[:, 0, 0], full[0] * (1.0 - shrink * u), rtol=1e-13)
+    np.testing.assert_allclose(upper[:, 1, 0], full[1] * (1.0 - shrink * u), rtol=1e-13)
+    np.testing.assert_array_equal(upper[:, 2, 0], np.full(len(u), full[2]))
+    np.testing.assert_array_equal(speed[np.repeat(rows.start == rows.stop, 2)], 0.0)
+    # The sheared one: no step is larger than the fastest wall's, and shear is gone outside the encoding.
+    assert np.abs(np.diff(upper[:, :, 1], axis=0)).max() <= 1.01 * dt * np.abs(speed[:, :, 1]).max()
+    sheared = np.repeat(np.asarray(rows.sheared), 2)
+    np.testing.assert_allclose(upper[~sheared, :, 1], upper[~sheared, :, 0], rtol=1e-13)
+    assert np.abs(upper[sheared, 0, 1] / upper[sheared, 0, 0] - 1.0).max() == pytest.approx(0.01, rel=1e-3)
+
+
+def test_drag_acts_in_holds_only() -> None:
+    """Grains that touch nothing keep their spins while the walls move, and lose them while the walls stand still."""
+    one = replace(experiment(), hold_drag=0.05)
+    course = one.course(sheared=True)
+    drive = replace(course.drive, lower=100.0 * course.drive.lower, upper=100.0 * course.drive.upper)
+    course = replace(course, drive=drive)
+    state = jax.jit(start)(
+        course.system, 10.0 * PACK.position[..., None], PACK.quaternion[..., None], still_box(drive.lower, drive.upper)
+    )
+    state = replicate(replace(state, grains=replace(state.grains, spin=jnp.full_like(state.grains.spin, 0.01))), 2)
+    step = jax.jit(bin_step)
+    spins = {stage.name: float(step(course, state, stage.bin(0))[0].grains.spin.max()) for stage in one.stages}
+    slowed = {name for name, spin in spins.items() if spin < 0.01 * (1.0 - 1e-3)}
+    assert slowed == {stage.name for stage in one.stages if stage.start == stage.stop}
+    assert {spins[name] for name in spins if name not in slowed} == {0.01}
