@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -81,6 +81,21 @@ def test_a_law_that_jax_does_not_know_is_refused_at_once() -> None:
 
     with pytest.raises(ValueError, match="friction must be a pytree: register Glue with"):
         make(friction=Glue())
+
+
+def test_a_law_made_of_another_may_be_registered_by_jax_itself() -> None:
+    @jax.tree_util.register_dataclass
+    @dataclass(frozen=True)
+    class Slippery(gm.Hooke):
+        """Half of H's friction."""
+
+        def __call__(self, kin: Any, normal_force: jax.Array, history: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return super().__call__(kin, 0.5 * normal_force, history)
+
+    experiment = make(friction=Slippery(mu=1.0), backend="jax")
+    half = make(friction=gm.Hooke(mu=0.5), backend="jax")
+    found, expected = (jax.jit(gm.gain)(one) for one in (experiment, half))
+    np.testing.assert_allclose(found, expected, rtol=1e-6)  # another program: round-off of some 800 steps
 
 
 def test_a_stack_of_packs_is_refused_at_once() -> None:

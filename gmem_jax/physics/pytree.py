@@ -117,6 +117,8 @@ def settle(made: Any) -> None:
     """
     for name, interval in _parameters(made):
         given = getattr(made, name)
+        if type(given) is object:  # JAX's own placeholder, in a subclass that `pytree` did not register
+            continue
         try:
             value = _number(given)
         except (TypeError, ValueError):
