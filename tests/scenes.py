@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.drive import Drive
+from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocol import Bin
 from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics import step as dynamics
@@ -215,3 +216,12 @@ def cluster27(friction=None, replicas: int = 1, skin: float = 0.5, material: Mat
 def squeeze(box: Box, duration: float, delta0: float = 0.05, gamma0=0.0, signals=None) -> Motion:
     """Compression of `box` from u = 0 to 1."""
     return Motion(box.lower, box.upper, delta0, 0.0, 1.0, duration, gamma0, signals)
+
+
+def with_skin(pack: Pack, skin: float) -> Pack:
+    """The pack with a list of so small a skin that it goes stale on the way."""
+    lengths = np.asarray(pack.upper - pack.lower)
+    still = jnp.zeros((*pack.position.shape, 1))
+    grains = Grains(pack.position[..., None], pack.quaternion[..., None], still, still, still, still)
+    pairs = PairFinder(pack.clump, lengths, skin)(grains, pack.clump, pack.box)
+    return replace(pack, pairs=pairs)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import with_skin
 
 import gmem_jax as gm
 from gmem_jax.derivatives import gradient, jacobian
@@ -15,8 +16,6 @@ from gmem_jax.experiment import checkpoint
 from gmem_jax.experiment.recall import run, simulate
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.normal import hertz
-from gmem_jax.physics.search import PairFinder
-from gmem_jax.physics.state import Grains
 from gmem_jax.reading import classify
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
@@ -228,7 +227,7 @@ def test_a_second_readout_as_background_is_differentiated_too(experiment: gm.Exp
 @pytest.mark.parametrize("by", ["friction.mu", "gamma0"])
 def test_derivatives_do_not_mind_lists_that_are_made_anew(experiment: gm.Experiment, by: str) -> None:
     short = gm.replace(experiment, rest=0.02, hold=0.02, store=0.02)
-    tight = gm.replace(short, pack=_with_skin(short.pack, 0.02))
+    tight = gm.replace(short, pack=with_skin(short.pack, 0.02))
     wide, narrow = (gm.value_and_grad(one, [by]) for one in (short, tight))
     # The same contacts in the same order, but sums over other tables: round-off of some 900 steps.
     np.testing.assert_allclose(narrow.slope[by], wide.slope[by], rtol=1e-6)
@@ -236,12 +235,3 @@ def test_derivatives_do_not_mind_lists_that_are_made_anew(experiment: gm.Experim
     one, other = (gradient.push(e, direction) for e in (short, tight))
     scale = np.abs(one.p_sig_slope).max()
     np.testing.assert_allclose(other.p_sig_slope, one.p_sig_slope, atol=1e-6 * scale)
-
-
-def _with_skin(pack: gm.Pack, skin: float) -> gm.Pack:
-    """The pack with a list of so small a skin that it goes stale on the way."""
-    lengths = np.asarray(pack.upper - pack.lower)
-    still = jnp.zeros((*pack.position.shape, 1))
-    grains = Grains(pack.position[..., None], pack.quaternion[..., None], still, still, still, still)
-    pairs = PairFinder(pack.clump, lengths, skin)(grains, pack.clump, pack.box)
-    return dataclasses.replace(pack, pairs=pairs)

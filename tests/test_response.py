@@ -105,7 +105,7 @@ def test_design_inverts_a_linear_memory(monkeypatch: pytest.MonkeyPatch, experim
     odd = (np.eye(17) + 0.3 * mixing) @ kernel.odd  # linear, but no integral
     kernel = gm.MemoryKernel(kernel.u, kernel.centres, 0.2, odd, 0.0 * odd, 1e-3, 0.05)
 
-    def linear(run: gm.Experiment, *_: object) -> SimpleNamespace:
+    def linear(run: gm.Experiment, *_: object, **__: object) -> SimpleNamespace:
         p_sig = jnp.asarray(kernel.coefficients(run.signals) @ odd)
         return SimpleNamespace(p_sig=p_sig, **run.compare(p_sig)._asdict())
 
@@ -114,7 +114,7 @@ def test_design_inverts_a_linear_memory(monkeypatch: pytest.MonkeyPatch, experim
 
     monkeypatch.setattr(waveforms, "simulate", linear)
     monkeypatch.setattr(waveforms, "run", linear)
-    monkeypatch.setattr(waveforms, "prefix_of", lambda _: None)
+    monkeypatch.setattr(waveforms, "prefix_of", lambda *_, **__: None)
     monkeypatch.setattr(waveforms, "push", push)
     found = gm.design_waveforms(experiment, iterations=3, gain=0.1, damping=(1e-6,))
     assert found.before < 0.95

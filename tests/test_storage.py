@@ -110,7 +110,7 @@ def test_waveforms_survive_their_file_bit_for_bit(tmp_path: Path) -> None:
 def test_a_part_that_is_kept_is_not_run_again(tmp_path: Path) -> None:
     ran: list[int] = []
 
-    def work() -> dict[str, np.ndarray]:
+    def work(_: object) -> dict[str, np.ndarray]:
         ran.append(len(ran))
         return {"answer": np.arange(3) + len(ran)}
 
@@ -126,7 +126,7 @@ def test_a_part_that_is_kept_is_not_run_again(tmp_path: Path) -> None:
 
 def test_parts_of_another_run_are_refused(tmp_path: Path) -> None:
     Parts(tmp_path / "parts", {"seed": 1, "pack": "a"})
-    Parts(tmp_path / "parts", {"seed": 1, "pack": "b"})("one", lambda: np.zeros(1))  # nothing was finished: no matter
+    Parts(tmp_path / "parts", {"seed": 1, "pack": "b"})("one", lambda _: np.zeros(1))  # nothing was finished: no matter
     with pytest.raises(gm.FileFormatError, match=r"another pack \('b', now 'a'\)"):
         Parts(tmp_path / "parts", {"seed": 1, "pack": "a"})
     assert Parts(tmp_path / "parts", {"seed": 1, "pack": "a"}, restart=True).finished() == 0

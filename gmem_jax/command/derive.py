@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from gmem_jax import native
 from gmem_jax.command.console import (
     AsJson,
     Force,
@@ -15,27 +16,31 @@ from gmem_jax.command.console import (
     Output,
     PackName,
     Picture,
+    announce,
     claim,
     emit,
     finite,
     reporting,
 )
 from gmem_jax.command.options import Chosen, with_experiment
-from gmem_jax.derivatives.gradient import value_and_grad
-from gmem_jax.design.drive import PARAMETERS, design_drive
+from gmem_jax.command.resuming import Restart, resumable
+from gmem_jax.derivatives.gradient import Gradient, value_and_grad
+from gmem_jax.design.drive import PARAMETERS, design_drive, start_within
 from gmem_jax.design.kernel import memory_kernel, relative_error
-from gmem_jax.design.waveforms import design_waveforms
+from gmem_jax.design.waveforms import BUMPS, cost, design_waveforms
 from gmem_jax.experiment.experiment import Experiment, value_at
-from gmem_jax.experiment.recall import prefix_of, simulate
+from gmem_jax.experiment.host import CHUNK, Checkpoint, Keep, within
+from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run_bytes, simulate
 from gmem_jax.experiment.signals import Bumps, Spline
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.configuration import resolved
+from gmem_jax.files.configuration import key_of_run, pack_fingerprint, resolved
 from gmem_jax.files.hdf5 import save_arrays
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
 from gmem_jax.show import figures
 
 KERNEL_SCHEMA = "gmem-kernel/1"
+GRADIENT = 11.0  # cost of a gradient in runs; see benchmarks
 
 
 def _write(output: Path, result: dict[str, Any], experiment: Experiment) -> None:
@@ -43,6 +48,22 @@ def _write(output: Path, result: dict[str, Any], experiment: Experiment) -> None
     configuration = resolved(experiment, result["seconds"])
     with atomic(output) as temporary:
         temporary.write_text(json.dumps(finite({**result, "configuration": configuration}), allow_nan=False))
+
+
+def _announce(experiment: Experiment, what: str, runs: float, side_by_side: int, memory: float = 1.0) -> None:
+    """Say what is needed.
+
+    Args:
+        experiment: of one run.
+        what: is done.
+        runs: of the experiment's signals that it takes.
+        side_by_side: signals at once.
+        memory: in parts of what they take in a run.
+    """
+    steps = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, experiment.signals.count)
+    backend = native.name(experiment.backend, experiment.friction)
+    needs = memory * run_bytes(experiment, side_by_side)
+    announce(f"{what}, {experiment.pack.grains} grains", runs * steps, needs, backend, side_by_side + 1)
 
 
 def _waveform_of(experiment: Experiment) -> tuple[str, np.ndarray]:
@@ -60,6 +81,7 @@ def gradient_command(
     chosen: Chosen,
     pack: PackName,
     output: Output = Path("gradient.json"),
+    restart: Restart = False,
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,
@@ -70,29 +92,26 @@ def gradient_command(
     waves, places = _waveform_of(experiment)
     law = experiment.friction
     names = {"waveform": waves, **{name: path for name, path in PARAMETERS.items() if _has(law, path)}}
-    with reporting() as progress:
-        found = value_and_grad(experiment, tuple(names.values()), progress=progress)
-    slopes = {name: np.asarray(found.slope[path]) for name, path in names.items()}
-    # Amplitudes of zero at the same place as another are padding, and the ends of samples are fixed: no waveform has
-    # them.
-    rows = []
-    for place, height, slope in zip(places, np.asarray(value_at(experiment, waves)), slopes["waveform"], strict=True):
-        real = (height != 0.0) if waves == "signals.amplitudes" else (place > 0.0) & (place < 1.0)
-        order = np.argsort(place[real], kind="stable")
-        rows.append((place[real][order], slope[real][order]))
-    gradient = {
-        **{name: slope.tolist() for name, slope in slopes.items()},
-        "waveform": [row[1].tolist() for row in rows],
-    }
-    result = {
-        "pack": pack,
-        "fidelity": float(found.value),
-        "places": [row[0].tolist() for row in rows],
-        "gradient": gradient,
-        "seconds": time.perf_counter() - began,
-        "status": 0,
-    }
-    _write(output, result, experiment)
+    # The way back needs the state at the beginning of every chunk.
+    chunks = sum(stage.bins for stage in experiment.stages) / CHUNK
+    _announce(experiment, "gradient", GRADIENT, experiment.signals.count, 1.0 + chunks / COPIES)
+    with resumable(output, key_of_run(experiment, by=list(names)), restart=restart) as parts:
+        found = _gradient(experiment, tuple(names.values()), parts)
+        slopes = {name: np.asarray(found.slope[path]) for name, path in names.items()}
+        rows = _of_waveforms(experiment, waves, places, slopes["waveform"])
+        gradient = {
+            **{name: slope.tolist() for name, slope in slopes.items()},
+            "waveform": [row[1].tolist() for row in rows],
+        }
+        result = {
+            "pack": pack,
+            "fidelity": float(found.value),
+            "places": [row[0].tolist() for row in rows],
+            "gradient": gradient,
+            "seconds": time.perf_counter() - began,
+            "status": 0,
+        }
+        _write(output, result, experiment)
     if drawn:
         figures.gradient_figure(drawn, rows, f"{pack}: F = {result['fidelity']:.4f}")
     lines = [f"F = {result['fidelity']:.4f}"]
@@ -100,6 +119,33 @@ def gradient_command(
     for number, row in enumerate(gradient["waveform"]):
         lines.append(f"dF/da of signal {number + 1}: " + " ".join(f"{value:.4g}" for value in row))
     emit(as_json, result, "\n".join(lines))
+
+
+def _of_waveforms(
+    experiment: Experiment, name: str, places: np.ndarray, slopes: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Where in u each waveform can be changed, in order, and the derivatives there.
+
+    Amplitudes of zero at the same place as another are padding, and the ends of samples are fixed: no waveform has
+    them.
+    """
+    rows = []
+    for place, height, slope in zip(places, np.asarray(value_at(experiment, name)), slopes, strict=True):
+        real = (height != 0.0) if name == "signals.amplitudes" else (place > 0.0) & (place < 1.0)
+        order = np.argsort(place[real], kind="stable")
+        rows.append((place[real][order], slope[real][order]))
+    return rows
+
+
+def _gradient(experiment: Experiment, by: tuple[str, ...], keep: Keep) -> Gradient:
+    with reporting(goes_on=True) as progress:
+
+        def run(checkpoint: Checkpoint) -> tuple[Any, ...]:
+            found = value_and_grad(experiment, by, checkpoint=checkpoint, progress=progress)
+            return found.value, tuple(found.slope[name] for name in by), found.p_sig
+
+        value, slopes, p_sig = keep("gradient", run)
+    return Gradient(value, dict(zip(by, slopes, strict=True)), p_sig)
 
 
 def _has(law: Any, path: str) -> bool:
@@ -115,6 +161,7 @@ def kernel_command(
     n: Annotated[int, typer.Option("-n", "--bumps", min=2, max=512, help="Basis waveforms.")] = 17,
     width: Annotated[float, typer.Option(min=0.01, max=0.9, help="Width of the bumps, in u.")] = 0.2,
     noise: Annotated[float, typer.Option(min=0.0, help="Noise in the recall, Pa RMS.")] = 1.0,
+    restart: Restart = False,
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,
@@ -122,33 +169,38 @@ def kernel_command(
     """The linear memory kernel of a pack: singular values, resolution, capacity, and what it predicts."""
     (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
     began = time.perf_counter()
-    with reporting() as progress:
-        begun = prefix_of(experiment, progress=progress)
-        kernel = memory_kernel(experiment, n, width, begun=begun, progress=progress)
-        p_sig = simulate(experiment, begun).p_sig
-    modulus = float(Material().modulus)
-    floor = noise / modulus
-    signals = experiment.signals
-    result = {
-        "pack": pack,
-        "noise_pa": noise,
-        "n": n,
-        "width": width,
-        "gain": kernel.gain(),
-        "distance": kernel.distance(),
-        "asymmetry": kernel.asymmetry(),
-        "capacity": kernel.capacity(floor),
-        "resolution": kernel.resolution(floor),
-        "singular_values_pa": (kernel.singular_values() * modulus).tolist(),
-        "prediction_error": relative_error(kernel.predict(signals), p_sig).tolist(),
-        "prediction_error_linear": relative_error(kernel.predict(signals, even=False), p_sig).tolist(),
-        "output": str(output),
-        "seconds": time.perf_counter() - began,
-        "status": 0,
-    }
-    arrays = {name: getattr(kernel, name) for name in ("u", "centres", "width", "odd", "even", "gamma0", "delta0")}
-    configuration = resolved(experiment, time.perf_counter() - began)
-    save_arrays(output, KERNEL_SCHEMA, configuration, kernel=kernel.kernel(), **arrays)
+    runs = 2.0 * n / experiment.signals.count
+    _announce(experiment, "kernel", 1.0 + runs, 2 * n)
+    with resumable(output, key_of_run(experiment, n=n, width=width), restart=restart) as parts:
+        with reporting(goes_on=True) as progress:
+            begun = prefix_of(experiment, keep=parts, progress=within(progress, 0.0, 0.05))
+            most = within(progress, 0.05, 0.05 + 0.95 * runs / (1.0 + runs))
+            kernel = memory_kernel(experiment, n, width, begun=begun, keep=parts, progress=most)
+            rest = within(progress, 0.05 + 0.95 * runs / (1.0 + runs), 1.0)
+            p_sig = parts("check", lambda at: simulate(experiment, begun, checkpoint=at, progress=rest).p_sig)
+        modulus = float(Material().modulus)
+        floor = noise / modulus
+        signals = experiment.signals
+        result = {
+            "pack": pack,
+            "noise_pa": noise,
+            "n": n,
+            "width": width,
+            "gain": kernel.gain(),
+            "distance": kernel.distance(),
+            "asymmetry": kernel.asymmetry(),
+            "capacity": kernel.capacity(floor),
+            "resolution": kernel.resolution(floor),
+            "singular_values_pa": (kernel.singular_values() * modulus).tolist(),
+            "prediction_error": relative_error(kernel.predict(signals), p_sig).tolist(),
+            "prediction_error_linear": relative_error(kernel.predict(signals, even=False), p_sig).tolist(),
+            "output": str(output),
+            "seconds": time.perf_counter() - began,
+            "status": 0,
+        }
+        arrays = {name: getattr(kernel, name) for name in ("u", "centres", "width", "odd", "even", "gamma0", "delta0")}
+        configuration = resolved(experiment, time.perf_counter() - began)
+        save_arrays(output, KERNEL_SCHEMA, configuration, kernel=kernel.kernel(), **arrays)
     if drawn:
         figures.kernel_figure(drawn, kernel, floor, pack)
     lines = [f"{key}: {result[key]:.3f}" for key in ("gain", "distance", "asymmetry", "resolution")]
@@ -169,6 +221,7 @@ def design_command(
     output: Output = Path("designed.csv"),
     iterations: Annotated[int, typer.Option(min=1, help="Corrections; each takes a Jacobian.")] = 3,
     gain: Annotated[float | None, typer.Option(help="Wanted gain; default half of the untouched waveforms'.")] = None,
+    restart: Restart = False,
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,
@@ -180,9 +233,11 @@ def design_command(
     if picture:
         claim(history, ".png", force=force)
     began = time.perf_counter()
-    with reporting() as progress:
-        found = design_waveforms(experiment, iterations=iterations, gain=gain, progress=progress)
-    save_waveforms(output, found.signals)
+    _announce(experiment, "design", cost(experiment, iterations), 2 * BUMPS * experiment.signals.count)
+    with resumable(output, key_of_run(experiment, iterations=iterations, gain=gain), restart=restart) as parts:
+        with reporting(goes_on=True) as progress:
+            found = design_waveforms(experiment, iterations=iterations, gain=gain, keep=parts, progress=progress)
+        save_waveforms(output, found.signals)
     if drawn:
         figures.design_figure(drawn, found, float(experiment.scale), pack)
         figures.history_figure(history, {pack: found.history})
@@ -228,6 +283,7 @@ def tune_command(
         str, typer.Option(help="Lowest and highest value of gamma0, mu or stiffness, as in mu=0.5:2,gamma0=3e-4:3e-3.")
     ] = "gamma0=3e-4:3e-3,mu=0.5:2,stiffness=0.07:0.29",
     iterations: Annotated[int, typer.Option(min=1, help="Steps; each 7 runs a pack.")] = 6,
+    restart: Restart = False,
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,
@@ -236,21 +292,26 @@ def tune_command(
     names, limits = packs.split(","), parse_bounds(bounds)
     experiments, drawn = chosen.claim(names, output, ".json", picture=picture, force=force)
     _needs_sub0(experiments[0])
+    start_within(experiments, limits)
     began = time.perf_counter()
-    with reporting() as progress:
-        found = design_drive(experiments, limits, iterations=iterations, progress=progress)
-    result = {
-        "packs": names,
-        "before": found.before,
-        "fidelity": found.fidelity,
-        "each": found.each.tolist(),
-        "values": found.values,
-        "history": [{**values, "fidelity": fidelity} for values, fidelity in found.history],
-        "output": str(output),
-        "seconds": time.perf_counter() - began,
-        "status": 0,
-    }
-    _write(output, result, experiments[0])
+    first = experiments[0]
+    _announce(first, "tune", len(names) * ((2 * len(limits) + 1) * iterations + 1), first.signals.count)
+    key = key_of_run(first, packs=[pack_fingerprint(each.pack) for each in experiments], bounds=limits)
+    with resumable(output, key, restart=restart) as parts:
+        with reporting(goes_on=True) as progress:
+            found = design_drive(experiments, limits, iterations=iterations, keep=parts, progress=progress)
+        result = {
+            "packs": names,
+            "before": found.before,
+            "fidelity": found.fidelity,
+            "each": found.each.tolist(),
+            "values": found.values,
+            "history": [{**values, "fidelity": fidelity} for values, fidelity in found.history],
+            "output": str(output),
+            "seconds": time.perf_counter() - began,
+            "status": 0,
+        }
+        _write(output, result, first)
     if drawn:
         figures.history_figure(drawn, {" ".join(names): [value for _, value in found.history]})
     values = ", ".join(f"{name} = {value:.4g}" for name, value in found.values.items())

@@ -1,6 +1,7 @@
 """`gmem info`, `gmem prepare`."""
 
 import time
+from dataclasses import asdict
 from typing import Annotated, Any
 
 import jax
@@ -8,8 +9,10 @@ import typer
 
 from gmem_jax import native
 from gmem_jax.command.console import AsJson, Force, InputError, Output, announce, claim, emit, reporting, say
+from gmem_jax.command.resuming import Restart, resumable
+from gmem_jax.files.configuration import fingerprint
 from gmem_jax.files.packs import list_packs, save_pack
-from gmem_jax.files.provenance import provenance
+from gmem_jax.files.provenance import code, provenance
 from gmem_jax.physics import grain
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.sample import Sample
@@ -50,6 +53,7 @@ def prepare_command(
     dt: Annotated[float, typer.Option(help="Largest time step, t_c.")] = _DEFAULT.dt,
     name: Annotated[str, typer.Option(help="Name of the pack; default from grain, size and seed.")] = "",
     backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",
+    restart: Restart = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -63,9 +67,11 @@ def prepare_command(
     announce(f"{grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * grains, backend)
     began = time.perf_counter()
     stages: dict[str, Sample] = {}
-    with reporting() as progress:
-        pack = prepare(recipe, clump, name=name, backend=backend, progress=progress, log=stages)
-    save_pack(output, pack, stages)
+    key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, **code()}
+    with resumable(output, key, restart=restart) as parts:
+        with reporting(goes_on=True) as progress:
+            pack = prepare(recipe, clump, name=name, backend=backend, keep=parts, progress=progress, log=stages)
+        save_pack(output, pack, stages)
     seconds = time.perf_counter() - began
     rest = pack.info["at_rest"]
     say(f"at rest: largest grain speed {rest['largest_speed']:.1e} R/t_c; wrote {output} in {seconds:.0f} s")

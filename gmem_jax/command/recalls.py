@@ -23,15 +23,15 @@ from gmem_jax.command.console import (
     say,
 )
 from gmem_jax.command.options import Chosen, with_experiment
+from gmem_jax.command.resuming import Restart, folder_of, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import default_batch, replica_bins, run, run_bytes
 from gmem_jax.experiment.signals import six_signals
-from gmem_jax.files.atomic import sweep
 from gmem_jax.files.configuration import key_of_run, resolved
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.packs import PACK_SCHEMA, list_packs, load_pack
-from gmem_jax.files.parts import Parts, locked
+from gmem_jax.files.parts import Parts
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.show import figures, tables
@@ -41,31 +41,19 @@ def _run(
     experiment: Experiment, data: Path, picture: Path | None, batch: int | None = None, *, restart: bool = False
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
-    with locked(data):
-        sweep(data.parent, data.name)
-        return _run_alone(experiment, data, picture, batch, restart)
-
-
-def _run_alone(
-    experiment: Experiment, data: Path, picture: Path | None, batch: int | None, restart: bool
-) -> tuple[dict[str, Any], dict[str, Any]]:
     began = time.perf_counter()
-    folder = data.with_name(f"{data.name}.parts")
-    batch = batch or (None if restart else Parts.key_of(folder).get("batch"))
+    batch = batch or (None if restart else Parts.key_of(folder_of(data)).get("batch"))
     batch = batch or default_batch(experiment, psutil.virtual_memory().available)
     work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
     backend = native.name(experiment.backend, experiment.friction)
     side_by_side = min(batch, experiment.signals.count)
     what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
     announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
-    parts = Parts(folder, key_of_run(experiment, batch), restart=restart)
-    if parts.finished():
-        say(f"going on from {parts.folder}: {parts.finished()} finished parts")
-    with reporting(goes_on=True) as progress:
-        recall = jax.block_until_ready(run(experiment, batch=batch, keep=parts, progress=progress))
-    configuration = resolved(experiment, time.perf_counter() - began)
-    save_recall(data, recall, configuration)
-    parts.discard()
+    with resumable(data, key_of_run(experiment, batch=batch), restart=restart) as parts:
+        with reporting(goes_on=True) as progress:
+            recall = jax.block_until_ready(run(experiment, batch=batch, keep=parts, progress=progress))
+        configuration = resolved(experiment, time.perf_counter() - began)
+        save_recall(data, recall, configuration)
     if picture is not None:
         figures.recall_figure(picture, recall, experiment.scale, configuration["pack"])
     say(f"wrote {data}" + (f" and {picture}" if picture else ""))
@@ -89,7 +77,7 @@ def recall_command(
     batch: Annotated[
         int | None, typer.Option(min=1, help="Signals run together; default what fits the free memory.")
     ] = None,
-    restart: Annotated[bool, typer.Option("--restart", help="Discard finished parts of an interrupted run.")] = False,
+    restart: Restart = False,
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,

@@ -15,7 +15,7 @@ import numpy as np
 
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, value_at
 from gmem_jax.experiment.experiment import replace as with_values
-from gmem_jax.experiment.host import Action, Compiled, Move, Progress, Walker, silent, within
+from gmem_jax.experiment.host import NOWHERE, Action, Checkpoint, Compiled, Move, Progress, Walker, silent, within
 from gmem_jax.experiment.protocol import Bin, Stage
 from gmem_jax.experiment.recall import shear, walker
 from gmem_jax.experiment.walk import Course, walk, walk_some
@@ -23,6 +23,8 @@ from gmem_jax.physics.state import State
 
 Loss = Callable[[Experiment, jax.Array], jax.Array]
 """From an experiment and its p_sig [S, 256] to a number."""
+
+FORWARDS = 0.1  # of a gradient's time is the way forward
 
 Moving = tuple[Any, Any]  # grains and history: what of a state can be differentiated
 
@@ -271,6 +273,7 @@ def value_and_grad(
     by: Sequence[str] = ("signals", "gamma0", "friction"),
     *,
     loss: Loss = fidelity_of,
+    checkpoint: Checkpoint = NOWHERE,
     progress: Progress = silent,
 ) -> Gradient:
     """Reverse mode: a number and its derivatives by all parameters, through the whole experiment.
@@ -283,6 +286,7 @@ def value_and_grad(
         by: what to differentiate by: dotted names of floats or of parts that hold them, like "signals.amplitudes",
             "friction.mu", "t0" or "pack.position". Shapes of grains are not among them (use `jax.grad`).
         loss: what is differentiated; default the fidelity.
+        checkpoint: where to go on and to keep how far it is on the way back; the way forward, a tenth, is done again.
         progress: told about every chunk of both ways.
 
     Raises:
@@ -291,7 +295,7 @@ def value_and_grad(
     """
     theta, along = _theta(experiment, by), _along(experiment)
     common, own = experiment.phases
-    on = walker(experiment, progress=within(progress, 0.0, 0.02))
+    on = walker(experiment, progress=within(progress, 0.0, FORWARDS))
     on.total_work = _work(experiment, on)
     prefix, rest = _Remembering(), _Remembering()
     on.action = prefix if acts_on_prefix(by) else Action()
@@ -319,11 +323,11 @@ def value_and_grad(
         return jax.vjp(numbers, theta)[1](found)[0]
 
     back = jax.tree.map(jnp.zeros_like, _moving(on.state))
-    report = _Backwards(within(progress, 0.02, 1.0), rest.tape + prefix.tape)
-    back = report.through(rest.tape, back)
+    way = _Backwards(within(progress, FORWARDS, 1.0), (rest, prefix), checkpoint)
+    back = way.through(rest, back)
     slope = jax.tree.map(jnp.add, slope, pull_numbers(True, rest.numbers))
-    if prefix.tape:
-        back = report.through(prefix.tape, fan_out(back)[0])
+    if acts_on_prefix(by):
+        back = way.through(prefix, fan_out(back)[0])
         slope = jax.tree.map(jnp.add, slope, pull_numbers(False, prefix.numbers))
         slope = jax.tree.map(jnp.add, slope, pull_begin(back)[0])
     return Gradient(value, slope, p_sig)
@@ -338,18 +342,34 @@ def _fan_out(experiment: Experiment) -> Callable[[Moving], Moving]:
 
 
 class _Backwards:
-    """Goes back through tapes, forgetting them, and tells how far it is."""
+    """Goes back through some ways, the last first, forgetting their tapes; tells and keeps how far it is."""
 
-    def __init__(self, progress: Progress, tape: Sequence[_Piece]) -> None:
-        self.progress = progress
-        self.total = sum(piece.work for piece in tape)
-        self.done = 0
+    def __init__(self, progress: Progress, ways: Sequence[_Remembering], checkpoint: Checkpoint) -> None:
+        self.progress, self.ways, self.checkpoint = progress, ways, checkpoint
+        self.total, self.done = sum(piece.work for way in ways for piece in way.tape), 0
+        self.kept = checkpoint.begun()
+        if self.kept:
+            for way, left, numbers in zip(ways, self.kept["left"].tolist(), self.kept["numbers"], strict=True):
+                self.done += sum(piece.work for piece in way.tape[left:])
+                del way.tape[left:]
+                way.numbers = list(numbers) or None
 
-    def through(self, tape: list[_Piece], slope: Moving) -> Moving:
-        while tape:
-            piece = tape.pop()
+    def through(self, way: _Remembering, slope: Moving) -> Moving:
+        """From derivatives by the state at the end of a way to those at its beginning."""
+        number = next(place for place, one in enumerate(self.ways) if one is way)
+        if self.kept and int(self.kept["way"]) == number:
+            slope = self.kept["slope"]
+
+        def standing() -> dict[str, Any]:
+            left = np.asarray([len(one.tape) for one in self.ways])
+            numbers = tuple(tuple(one.numbers or ()) for one in self.ways)
+            return {"way": np.asarray(number), "left": left, "numbers": numbers, "slope": slope}
+
+        while way.tape:
+            piece = way.tape.pop()
             slope = piece.back(slope)
             if piece.work:
                 self.done += piece.work
                 self.progress(f"back through {piece.name}", 0.0, self.done / self.total)
+                self.checkpoint.reached(standing)
         return slope

@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
-from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent
 from gmem_jax.experiment.recall import run
 
 PARAMETERS = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.stiffness"}
@@ -33,6 +34,25 @@ class TunedDrive:
     history: tuple[tuple[dict[str, float], float], ...]
 
 
+def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[float, float]]) -> list[float]:
+    """The values that a search begins with.
+
+    Raises:
+        ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
+    """
+    if not experiments:
+        raise ValueError("a drive is designed for at least one pack")
+    found = []
+    for name, (low, high) in bounds.items():
+        value = float(value_at(experiments[0], PARAMETERS.get(name, name)))
+        if not 0.0 < low <= value <= high:
+            raise ValueError(
+                f"{name}: bounds must be positive and hold the first value {value:g}, got {low:g} to {high:g}"
+            )
+        found.append(value)
+    return found
+
+
 def design_drive(
     experiments: Sequence[Experiment],
     bounds: dict[str, tuple[float, float]],
@@ -40,6 +60,7 @@ def design_drive(
     iterations: int = 6,
     spread: float = 0.2,
     optimiser: optax.GradientTransformation | None = None,
+    keep: Keep = forget,
     progress: Progress = silent,
 ) -> TunedDrive:
     """Choose gamma0 and parameters of the friction law within bounds so that the mean fidelity of some packs grows.
@@ -56,23 +77,16 @@ def design_drive(
         iterations: steps; each costs 2 n + 1 runs a pack for n parameters.
         spread: of the differences at first, in parts of each parameter.
         optimiser: what makes a step of the logarithms of a gradient of length `spread`; default the gradient itself.
+        keep: asked for the fidelity of every run, so that a long search can be resumed (see `gmem_jax.files.parts`).
         progress: told about every run.
 
     Raises:
         ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
         RunFailedError: if a simulation broke down.
     """
-    if not experiments:
-        raise ValueError("a drive is designed for at least one pack")
     names = list(bounds)
     paths = [PARAMETERS.get(name, name) for name in names]
-    start = [float(value_at(experiments[0], path)) for path in paths]
-    for name, value in zip(names, start, strict=True):
-        low, high = bounds[name]
-        if not 0.0 < low <= value <= high:
-            raise ValueError(
-                f"{name}: bounds must be positive and hold the first value {value:g}, got {low:g} to {high:g}"
-            )
+    start = start_within(experiments, bounds)
     lowest, highest = np.log([bounds[name] for name in names]).T
     total, done = (iterations * (2 * len(names) + 1) + 1) * len(experiments), 0
 
@@ -81,7 +95,11 @@ def design_drive(
         found = []
         for experiment in experiments:
             changed = replace(experiment, dict(zip(paths, np.exp(logs), strict=True)))
-            found.append(float(run(changed).fidelity))
+
+            def recall(_: Checkpoint, changed: Experiment = changed) -> jax.Array:
+                return run(changed).fidelity
+
+            found.append(float(keep(f"run-{done:05d}", recall)))
             done += 1
             progress(f"F = {np.mean(found):.4f}", 0.0, done / total)
         return np.asarray(found)

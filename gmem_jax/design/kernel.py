@@ -14,7 +14,7 @@ import numpy as np
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Progress, Walker, silent
+from gmem_jax.experiment.host import Keep, Progress, Walker, forget, silent
 from gmem_jax.experiment.recall import simulate
 from gmem_jax.experiment.signals import BINS, Bumps, Signals, bin_average
 
@@ -143,6 +143,7 @@ def memory_kernel(
     width: float = 0.2,
     *,
     begun: Walker | None = None,
+    keep: Keep = forget,
     progress: Progress = silent,
 ) -> MemoryKernel:
     """Measure the memory kernel of a pack.
@@ -152,6 +153,7 @@ def memory_kernel(
         n: basis waveforms; 2 n + 1 replicas are run.
         width: of the bumps; narrow ones drive the walls faster.
         begun: what `recall.prefix_of` gave for the same pack and law, if there is one.
+        keep: asked for the recalls of the basis, so that a long run can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
 
     Raises:
@@ -164,7 +166,7 @@ def memory_kernel(
     wanted = replace(experiment, signals=both)
     if jnp.ndim(wanted.scale):
         raise ValueError("a kernel is measured at one gamma0 and one delta0, not one for each replica")
-    p_sig = np.asarray(simulate(wanted, begun, progress=progress).p_sig)
+    p_sig = np.asarray(keep("basis", lambda at: simulate(wanted, begun, checkpoint=at, progress=progress).p_sig))
     plus, minus = p_sig[:n], p_sig[n:]
     return MemoryKernel(
         u=(np.arange(BINS) + 0.5) / BINS,

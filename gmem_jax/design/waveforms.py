@@ -16,13 +16,15 @@ import optax
 from gmem_jax.derivatives.gradient import push
 from gmem_jax.design.kernel import FINE, bumps, nearest
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.experiment.host import Keep, Progress, forget, silent, within
 from gmem_jax.experiment.recall import prefix_of, run, simulate
 from gmem_jax.experiment.signals import Signals, Spline, waveform
 
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)
 FRACTIONS = (1.0, 0.5, 0.25)  # of a step that are tried
+BUMPS = 17  # basis waveforms of a design
+TANGENT = 2.5  # cost of a tangent in runs; see benchmarks
 
 
 @dataclass(frozen=True)
@@ -72,15 +74,38 @@ def sampled(signals: Signals, nodes: int = NODES) -> Spline:
     return waveform(values)
 
 
+class _Work:
+    """What a design takes, in runs of its signals, and how much of that is done."""
+
+    def __init__(self, experiment: Experiment, n: int, iterations: int, progress: Progress) -> None:
+        common, own = (sum(stage.bins for stage in some) for some in experiment.phases)
+        self.prefix = common / (own * experiment.replicas)
+        self.jacobian = TANGENT * n
+        self.total = 3.0 + 2.0 * self.prefix + iterations * (self.jacobian + len(FRACTIONS))
+        self._done, self._progress = 0.0, progress
+
+    def next(self, runs: float, name: str = "") -> Progress:
+        """The progress of the next thing to be done."""
+        begun, self._done = self._done / self.total, self._done + runs
+        inner = within(self._progress, begun, self._done / self.total)
+        return lambda stage, moment, fraction: inner(f"{name}, {stage}" if name else stage, moment, fraction)
+
+
+def cost(experiment: Experiment, iterations: int) -> float:
+    """What a design takes, in runs of its signals."""
+    return _Work(experiment, BUMPS, iterations, silent).total
+
+
 def design_waveforms(
     experiment: Experiment,
     *,
     iterations: int = 3,
-    n: int = 17,
+    n: int = BUMPS,
     width: float = 0.2,
     gain: float | None = None,
     damping: Sequence[float] = DAMPING,
     optimiser: optax.GradientTransformation | None = None,
+    keep: Keep = forget,
     progress: Progress = silent,
 ) -> Design:
     """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
@@ -95,6 +120,7 @@ def design_waveforms(
             that follow.
         optimiser: what makes a step of a preconditioned gradient; default the whole step, shortened if the recall
             gets worse.
+        keep: asked for every simulation and Jacobian, so that a design can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
 
     Raises:
@@ -102,9 +128,11 @@ def design_waveforms(
     """
     if jnp.ndim(experiment.scale):
         raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
-    begun = prefix_of(experiment)
+    work = _Work(experiment, n, iterations, progress)
+    begun = prefix_of(experiment, keep=keep, progress=work.next(work.prefix))
     target = np.asarray(experiment.integral())
-    original = simulate(experiment, begun)
+    untouched = keep("untouched", lambda at: simulate(experiment, begun, checkpoint=at, progress=work.next(1.0)).p_sig)
+    original = experiment.compare(jnp.asarray(untouched))
     before, own_gain = float(original.fidelity), float(original.gain)
     gain = 0.5 * own_gain if gain is None else gain
     wanted = gain * float(experiment.scale) * target
@@ -117,43 +145,42 @@ def design_waveforms(
     def make(rows: jax.Array | np.ndarray) -> Experiment:
         return replace(experiment, signals=bumps(rows, width))
 
-    def recall(rows: np.ndarray) -> np.ndarray:
-        return np.asarray(simulate(make(rows), begun).p_sig)
+    def recall(name: str, rows: np.ndarray) -> np.ndarray:
+        on = work.next(len(rows) / count, name)
+        return np.asarray(keep(name, lambda at: simulate(make(rows), begun, checkpoint=at, progress=on).p_sig))
 
-    def jacobians(at: np.ndarray, begun: float, ended: float) -> np.ndarray:
+    def jacobians(name: str, at: np.ndarray) -> np.ndarray:
         """dp_sig / da of every signal, [S, n, 256]."""
-
-        def report(_: str, moment: float, fraction: float) -> None:
-            progress(f"F = {history[-1]:.4f}", moment, begun + (ended - begun) * fraction)
-
         rows, directions = np.repeat(at, n, axis=0), np.tile(np.eye(n), (count, 1))
-        pushed = push(make(rows), {"signals.amplitudes": jnp.asarray(directions)}, progress=report)
-        return np.asarray(pushed.p_sig_slope).reshape(count, n, -1)
+        direction = {"signals.amplitudes": jnp.asarray(directions)}
+        on = work.next(work.jacobian, f"F = {history[-1]:.4f}")
+        slope = keep(name, lambda _: push(make(rows), direction, progress=on).p_sig_slope)
+        return np.asarray(slope).reshape(count, n, -1)
 
-    p_sig = recall(amplitudes)
+    p_sig = recall("projected", amplitudes)
     history = [before]
     for iteration in range(iterations):
-        local = jacobians(amplitudes, iteration / iterations, (iteration + 1) / iterations)
+        local = jacobians(f"jacobian-{iteration}", amplitudes)
         damped = damping[min(iteration, len(damping) - 1)]
         steps = np.stack([_step(*pair, damped) for pair in zip(local, wanted - p_sig, strict=True)])
         updates, memory = optimiser.update(jnp.asarray(-steps), memory, jnp.asarray(amplitudes))
         tried = [bounded(amplitudes + fraction * np.asarray(updates), width) for fraction in FRACTIONS]
         candidates = np.stack([amplitudes, *tried])
-        recalls = np.stack([p_sig, *recall(np.concatenate(tried)).reshape(len(tried), count, -1)])
+        recalls = np.stack([p_sig, *recall(f"tried-{iteration}", np.concatenate(tried)).reshape(len(tried), count, -1)])
         chosen = np.linalg.norm(recalls - wanted, axis=2).argmin(axis=0), np.arange(count)
         amplitudes, p_sig = candidates[chosen], recalls[chosen]
         history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
     signals = sampled(bumps(amplitudes, width))
-    fresh = np.asarray(run(replace(experiment, signals=signals)).p_sig)
+    last = work.next(1.0 + work.prefix, "verified")
+    fresh = np.asarray(keep("verified", lambda _: run(replace(experiment, signals=signals), progress=last).p_sig))
     match = experiment.compare(jnp.asarray(fresh))
-    progress("verified", 0.0, 1.0)
     return Design(
         signals=signals,
         target=target,
         p_sig=fresh,
         fidelity=float(match.fidelity),
         gain=float(match.gain),
-        untouched=np.asarray(original.p_sig),
+        untouched=np.asarray(untouched),
         before=before,
         history=tuple(history),
     )

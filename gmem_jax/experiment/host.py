@@ -1,4 +1,4 @@
-"""Walks on the host: chunks of bins, with what only a host can do: renew a stale list, report progress, stop.
+"""Walks on the host: chunks of bins, with what only a host can do: renew a stale list, report progress, stop, go on.
 
 A chunk that ends with a stale list is thrown away, the list is made anew from the chunk's start, and the chunk is done
 again. What a chunk is may be changed (`Action`): derivatives in forward and reverse mode go through the same chunks.
@@ -6,7 +6,7 @@ again. What a chunk is may be changed (`Action`): derivatives in forward and rev
 
 import functools
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,6 +27,28 @@ Progress = Callable[[str, float, float], None]
 
 CHUNK = 32  # bins per call: some seconds of work at most, a few milliseconds of overhead
 WIDEST = 2.0  # skin beyond which a list that goes stale within a bin is a broken run
+
+
+class Checkpoint:
+    """Where an unfinished part of a long run stands. This one keeps nothing; see `gmem_jax.files.parts`."""
+
+    def begun(self) -> Any:
+        """What was kept when the run was interrupted; None for a run that begins."""
+        return None
+
+    def reached(self, standing: Callable[[], Any], *, milestone: bool = False) -> None:
+        """Keep what `standing` gives, a tree of arrays, if enough time has passed; at milestones less is enough."""
+
+
+NOWHERE = Checkpoint()
+
+Keep = Callable[[str, Callable[[Checkpoint], Any]], Any]
+"""Gives the part of a run of that name: as kept earlier, or by running it from its checkpoint on."""
+
+
+def forget(name: str, run: Callable[[Checkpoint], Any]) -> Any:
+    """Run every part, keep none: a `Keep`."""
+    return run(NOWHERE)
 
 
 class RunFailedError(RuntimeError):
@@ -124,6 +146,16 @@ class Action:
         """The list was made anew: `history` becomes `move(history, blank)`."""
 
 
+def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def _joined(samples: list[Sample]) -> Sample:
+    """The samples of a stage's chunks as one."""
+    joined: Sample = jax.tree.map(lambda *parts: np.concatenate(parts), *samples)
+    return joined
+
+
 @dataclass
 class Walker:
     """A pack on its way through the stages of a protocol.
@@ -160,8 +192,26 @@ class Walker:
         """A walk that begins where this one is, whatever lists were made on the way here."""
         return replace(self, **{"finder": None, "skin": SKIN, "chunk": CHUNK, **changes})
 
-    def play(self, *stages: Stage) -> OrderedDict[str, Sample]:
+    def kept(self) -> dict[str, Any]:
+        """All that `restore` needs to go on from here to the same bits, as a tree of arrays."""
+        counters = np.asarray([self.time, self.work, self.rebuilds, self.skin, self.chunk], float)
+        finder = {} if self.finder is None else self.finder.kept()
+        return {"state": self.state, "pairs": self.course.system.pairs, "counters": counters, "finder": finder}
+
+    def restore(self, kept: Mapping[str, Any]) -> None:
+        """Stand where a walk on the same course stood when it gave `kept`."""
+        self.state, self.course = kept["state"], self.course.with_pairs(kept["pairs"])
+        self.time, self.work, rebuilds, self.skin, chunk = kept["counters"].tolist()
+        self.rebuilds, self.chunk = int(rebuilds), int(chunk)
+        if not _same(kept["finder"], self.finder.kept() if self.finder else {}):
+            self.finder = PairFinder(self.course.system.clump, **kept["finder"]) if kept["finder"] else None
+
+    def play(self, *stages: Stage, checkpoint: Checkpoint = NOWHERE) -> OrderedDict[str, Sample]:
         """Run stages one after the other.
+
+        Args:
+            stages: with names of their own.
+            checkpoint: where to go on, and where to keep how far it is.
 
         Returns:
             Their samples by name, numpy arrays with a leading axis of bins.
@@ -169,10 +219,23 @@ class Walker:
         Raises:
             RunFailedError: if the numbers became meaningless.
         """
-        return OrderedDict((stage.name, self._play(stage)) for stage in stages)
+        played: OrderedDict[str, list[Sample]] = OrderedDict()
+        if begun := checkpoint.begun():
+            self.restore(begun["walker"])
+            played.update((name, [sample]) for name, sample in begun["played"].items())
 
-    def _play(self, stage: Stage) -> Sample:
-        samples, done, most = [], 0, CHUNK
+        def standing() -> dict[str, Any]:
+            return {"walker": self.kept(), "played": OrderedDict((name, _joined(played[name])) for name in played)}
+
+        for stage in stages:
+            samples = played.setdefault(stage.name, [])
+            for milestone in self._play(stage, samples):
+                checkpoint.reached(standing, milestone=milestone)
+        return OrderedDict((stage.name, _joined(played[stage.name])) for stage in stages)
+
+    def _play(self, stage: Stage, samples: list[Sample]) -> Iterator[bool]:
+        """Play what is left of a stage and add to its samples; after each chunk, whether it was the last."""
+        done, most = sum(len(sample.pressure) for sample in samples), CHUNK
         while done < stage.bins:
             first = stage.bin(done)
             count = min(self.chunk, stage.bins - done)
@@ -187,8 +250,7 @@ class Walker:
             done += count
             samples.append(jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], sample))
             self.report(stage.name, state.replicas * count, self._moment(count))
-        joined: Sample = jax.tree.map(lambda *parts: np.concatenate(parts), *samples)
-        return joined
+            yield done == stage.bins
 
     def _moment(self, bins: int) -> float:
         return bins * self.course.steps * float(np.max(self.course.dt))

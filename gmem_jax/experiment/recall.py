@@ -2,7 +2,6 @@
 
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,20 @@ import numpy as np
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Compiled, Progress, Walker, refuse, require_x64, silent, within, worst
+from gmem_jax.experiment.host import (
+    NOWHERE,
+    Checkpoint,
+    Compiled,
+    Keep,
+    Progress,
+    Walker,
+    forget,
+    refuse,
+    require_x64,
+    silent,
+    within,
+    worst,
+)
 from gmem_jax.experiment.pack import smallest_box
 from gmem_jax.experiment.protocol import Stage, table
 from gmem_jax.experiment.signals import BINS, part
@@ -25,14 +37,6 @@ REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than
 COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
 GRAIN_BYTES = 800  # of a grain's own numbers and its spheres'
 LARGEST_BATCH = 63  # signals; with the zero signal they fill whole vectors of every CPU
-
-Keep = Callable[[str, Callable[[], Any]], Any]
-"""Gives the part of a run of that name: as kept earlier, or by running it."""
-
-
-def forget(name: str, run: Callable[[], Any]) -> Any:
-    """Run every part, keep none."""
-    return run()
 
 
 @pytree
@@ -179,7 +183,7 @@ def run(
     Args:
         experiment: the experiment.
         batch: signals that run together; default all of them. Each batch has a zero signal of its own.
-        keep: asked for every finished part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
+        keep: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
 
     Raises:
@@ -196,30 +200,36 @@ def run(
     common, own = experiment.phases
     before, after = (sum(stage.bins for stage in some) for some in (common, own))
     firsts = range(0, count, size)
-
-    def prefix() -> Any:
-        samples = begun.play(*common)
-        return samples, begun.course.system.pairs, begun.state
-
     begun.total_work = float(replica_bins(experiment, size, begun.state.replicas))
-    samples, pairs, state = keep("prefix", prefix)
-    begun = begun.afresh(course=begun.course.with_pairs(pairs), state=state)
-    done = before * state.replicas
+    samples = _play_prefix(begun, experiment, keep)
+    done = before * begun.state.replicas
     parts: list[tuple[dict[str, Sample], jax.Array]] = []
     for number, first in enumerate(firsts):
         last = min(first + size, count)
         few = experiment if size >= count else replace(experiment, signals=part(experiment.signals, first, last))
         on = begun.afresh(work=float(done))
 
-        def run_batch(few: Experiment = few, on: Walker = on) -> Any:
+        def run_batch(checkpoint: Checkpoint, few: Experiment = few, on: Walker = on) -> Any:
             shear(on, few)
-            return on.play(*own), on.state.status
+            return on.play(*own, checkpoint=checkpoint), on.state.status
 
         parts.append(keep(f"batch-{number:04d}", run_batch))
         done += after * (last - first + 1)
     joined, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
     found: Recall = _finish(experiment, samples | joined, jnp.asarray(status))
     return found
+
+
+def _play_prefix(begun: Walker, experiment: Experiment, keep: Keep) -> Any:
+    """Bring a walk to the end of the prefix; its samples."""
+    common, _ = experiment.phases
+
+    def play(checkpoint: Checkpoint) -> Any:
+        return begun.play(*common, checkpoint=checkpoint), begun.kept()
+
+    samples, kept = keep("prefix", play)
+    begun.restore(kept)
+    return samples
 
 
 def replica_bins(experiment: Experiment, batch: int, wide: int = 1) -> int:
@@ -262,8 +272,13 @@ def default_batch(experiment: Experiment, available: int) -> int:
     return int(max(1, min(LARGEST_BATCH, 0.5 * available / _replica_bytes(experiment) - 1)))
 
 
-def prefix_of(experiment: Experiment, *, progress: Progress = silent) -> Walker:
+def prefix_of(experiment: Experiment, *, keep: Keep = forget, progress: Progress = silent) -> Walker:
     """A walk that has done the shear-free prefix, common to all waveforms on this pack; see `simulate`.
+
+    Args:
+        experiment: pack, law and protocol.
+        keep: asked for the part "prefix".
+        progress: told about every chunk.
 
     Raises:
         RunFailedError: if the simulation broke down.
@@ -271,16 +286,23 @@ def prefix_of(experiment: Experiment, *, progress: Progress = silent) -> Walker:
     common, _ = experiment.phases
     begun = walker(experiment, progress=progress)
     begun.total_work = float(begun.state.replicas * sum(stage.bins for stage in common))
-    begun.play(*common)
+    _play_prefix(begun, experiment, keep)
     return begun
 
 
-def simulate(experiment: Experiment, begun: Walker | None = None, *, progress: Progress = silent) -> Recall:
+def simulate(
+    experiment: Experiment,
+    begun: Walker | None = None,
+    *,
+    checkpoint: Checkpoint = NOWHERE,
+    progress: Progress = silent,
+) -> Recall:
     """`run` from a prefix that is done already; the stages of the prefix are not in the result.
 
     Args:
         experiment: the experiment.
         begun: what `prefix_of` gave for the same pack and law; it can be used again. Run here if not given.
+        checkpoint: where to go on, and where to keep how far it is.
         progress: told about every chunk.
 
     Raises:
@@ -292,5 +314,5 @@ def simulate(experiment: Experiment, begun: Walker | None = None, *, progress: P
     work = float(experiment.replicas * sum(stage.bins for stage in own))
     on = begun.afresh(progress=within(progress, share, 1.0), work=0.0, total_work=work)
     shear(on, experiment)
-    found: Recall = _finish(experiment, on.play(*own), on.state.status)
+    found: Recall = _finish(experiment, on.play(*own, checkpoint=checkpoint), on.state.status)
     return found

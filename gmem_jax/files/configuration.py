@@ -15,7 +15,7 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, words
 from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.packs import load_pack
-from gmem_jax.files.provenance import provenance
+from gmem_jax.files.provenance import code, provenance
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.physics.material import Material
@@ -135,12 +135,15 @@ def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) 
     )
 
 
-def key_of_run(experiment: Experiment, batch: int) -> dict[str, Any]:
-    """What the numbers of a run depend on, and no more: for parts of it that may be used again."""
-    facts = provenance()
+def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
+    """What the numbers of a run depend on, and no more: for parts of it that may be used again.
+
+    Args:
+        experiment: what is run.
+        **more: what else they depend on, like the batch.
+    """
     own = {**written(experiment), "pack": pack_fingerprint(experiment.pack)}
-    same = {"versions": facts["versions"], "commit": facts["commit"]}
-    return {**own, "batch": batch, "backend": native.name(experiment.backend, experiment.friction), **same}
+    return {**own, **more, "backend": native.name(experiment.backend, experiment.friction), **code()}
 
 
 def resolved(experiment: Experiment, seconds: float) -> dict[str, Any]:

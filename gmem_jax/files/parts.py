@@ -1,4 +1,4 @@
-"""Finished parts of a long run, kept beside its output until it is whole.
+"""Parts of a long run, kept beside its output until it is whole.
 
 A part is an .npz file: its arrays, how they make up a pytree (JSON), and a checksum of both. Nothing in it is code.
 """
@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import shutil
+import time
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -18,10 +19,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from gmem_jax.experiment.host import Checkpoint, RunFailedError
 from gmem_jax.files.atomic import FileFormatError, atomic, sweep
 from gmem_jax.physics.pytree import KINDS
 
 PART_SCHEMA = "gmem-part/1"
+EVERY = 120.0  # s between checkpoints of an unfinished part: doing it again must cost more than writing them
+AT_MILESTONES = 20.0  # s likewise, where a stage has just ended
 
 
 def _taken_apart(tree: Any, arrays: list[np.ndarray]) -> Any:
@@ -98,13 +102,44 @@ def load_part(path: Path) -> Any:
     return _put_together(json.loads(head["form"]), arrays)
 
 
-class Parts:
-    """Finished parts of a long run, in a folder beside its output: what `gm.run` takes as `keep`.
+class _Standing(Checkpoint):
+    """How far a part is, in two generations: whenever a writer dies, one of them is whole."""
 
-    The folder is locked as long as the object lives in `locked`.
+    def __init__(self, stem: Path) -> None:
+        self._now, self._before = stem.with_name(f"{stem.name}.now"), stem.with_name(f"{stem.name}.before")
+        self._last, self._keeps = time.monotonic(), True
+
+    def begun(self) -> Any:
+        for path in (self._now, self._before):
+            with contextlib.suppress(FileFormatError):
+                return load_part(path)
+        return None
+
+    def reached(self, standing: Callable[[], Any], *, milestone: bool = False) -> None:
+        passed = time.monotonic() - self._last
+        if not self._keeps or passed < (AT_MILESTONES if milestone else EVERY):
+            return
+        if self._now.exists():
+            self._now.replace(self._before)
+        try:
+            save_part(self._now, standing())
+        except TypeError:  # a law of the user's may remember in classes of its own: there is nothing to go on from
+            self._keeps = False
+        self._last = time.monotonic()
+
+    def discard(self) -> None:
+        """Remove both."""
+        for path in (self._now, self._before):
+            path.unlink(missing_ok=True)
+
+
+class Parts:
+    """Parts of a long run, in a folder beside its output: what `gm.run` and others take as `keep`.
+
+    What is finished is kept as it is, what is not as a checkpoint of every few minutes.
 
     Args:
-        folder: made when the first part is stored.
+        folder: made if it is not there.
         key: what the parts depend on; stored with them.
         restart: discard what is there.
 
@@ -115,8 +150,8 @@ class Parts:
 
     def __init__(self, folder: Path, key: dict[str, Any], *, restart: bool = False) -> None:
         self.folder = Path(folder)
-        if restart or (self.folder.exists() and not self.finished()):
-            shutil.rmtree(self.folder, ignore_errors=True)  # parts of which none is finished are worth nothing
+        if restart or not (self.finished() or self.begun()):
+            shutil.rmtree(self.folder, ignore_errors=True)  # a folder without parts is worth nothing
         found, wanted = self.key_of(self.folder), json.loads(json.dumps(key))
         other = [name for name in wanted if found and found.get(name) != wanted[name]]
         if other:
@@ -140,20 +175,29 @@ class Parts:
             key = {}
         return key if isinstance(key, dict) else {}
 
-    def __call__(self, name: str, run: Callable[[], Any]) -> Any:
-        """The part of that name, its arrays as numpy arrays: read if it is there and sound, else run and stored."""
+    def __call__(self, name: str, run: Callable[[Checkpoint], Any]) -> Any:
+        """The part of that name, its arrays as numpy arrays: read if it is there, else run from its checkpoint on."""
         path = self.folder / f"{name}.npz"
         if path.is_file():
             return load_part(path)
-        result = jax.tree.map(np.asarray, run())
-        # A law of the user's may remember in classes of its own: then there is nothing to go on from, and no harm.
-        with contextlib.suppress(TypeError):
+        standing = _Standing(self.folder / name)
+        try:
+            result = jax.tree.map(np.asarray, run(standing))
+        except RunFailedError:
+            standing.discard()  # whoever tries again changes something
+            raise
+        with contextlib.suppress(TypeError):  # see `_Standing`
             save_part(path, result)
+        standing.discard()
         return result
 
     def finished(self) -> int:
         """Number of parts there are."""
         return len(list(self.folder.glob("*.npz")))
+
+    def begun(self) -> int:
+        """Number of parts that are not finished, but have a checkpoint."""
+        return len({path.stem for pattern in ("*.now", "*.before") for path in self.folder.glob(pattern)})
 
     def discard(self) -> None:
         """Remove the folder."""

@@ -37,11 +37,12 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **found}
 
 
+def code() -> dict[str, Any]:
+    """Versions and git commit: what code a number came from."""
+    return {"versions": versions(), "commit": _commit()}
+
+
 def provenance() -> dict[str, Any]:
     """Versions, git commit and device."""
     device = jax.devices()[0]
-    return {
-        "versions": versions(),
-        "commit": _commit(),
-        "device": f"{device.platform}: {device.device_kind}",
-    }
+    return {**code(), "device": f"{device.platform}: {device.device_kind}"}

@@ -45,10 +45,11 @@ class PairFinder:
 
         if not skin > 0.0:
             raise ValueError(f"the skin of a neighbour list must be positive, got {skin}")
-        self.skin = skin
+        self.skin = float(skin)
+        self._extent = np.asarray(extent, dtype=float)
         self._spheres_per_grain = clump.spheres
-        self._capacity = capacity
-        self._per_sphere = per_sphere
+        self._capacity = int(capacity)
+        self._per_sphere = int(per_sphere)
         self._neighbors: Any = None
         free_displacement, _ = space.free()
         body = np.asarray(clump.offsets)
@@ -57,13 +58,18 @@ class PairFinder:
             free_displacement,
             # jax-md keeps box and cutoff in float32 and wraps its cells around: a margin keeps every centre inside,
             # and the float32 rounding of the cutoff harmless.
-            np.asarray(extent, dtype=float) + 1.0,
+            self._extent + 1.0,
             r_cutoff=cutoff + 1e-4,
             dr_threshold=0.0,
             capacity_multiplier=_SPARE,
             format=partition.OrderedSparse,
         )
         self._update = jax.jit(lambda positions, neighbors: neighbors.update(positions))
+
+    def kept(self) -> dict[str, np.ndarray]:
+        """Arguments, apart from the grain, of a finder whose lists have the capacities of this one's."""
+        numbers = {"skin": self.skin, "capacity": self._capacity, "per_sphere": self._per_sphere}
+        return {"extent": self._extent, **{name: np.asarray(number) for name, number in numbers.items()}}
 
     def _grain_pairs(self, centres: np.ndarray) -> np.ndarray:
         """Pairs (i < j) of grains whose centres [N, 3] are within the cutoff, [2, n]."""

@@ -3,7 +3,7 @@
 import json
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,19 @@ import numpy as np
 
 from gmem_jax import native
 from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.host import Compiled, Progress, RunFailedError, Walker, refuse, require_x64, silent, worst
+from gmem_jax.experiment.host import (
+    Checkpoint,
+    Compiled,
+    Keep,
+    Progress,
+    RunFailedError,
+    Walker,
+    forget,
+    refuse,
+    require_x64,
+    silent,
+    worst,
+)
 from gmem_jax.experiment.pack import Pack, find_pairs, smallest_box
 from gmem_jax.experiment.protocol import Stage, preparation_cycle
 from gmem_jax.experiment.signals import BINS
@@ -158,9 +170,11 @@ def _spacing(recipe: Recipe, clump: Clump) -> float:
 class _Preparation:
     """One preparation on its way: a `Walker` with one replica and no friction, and the walls as they are now."""
 
-    def __init__(self, recipe: Recipe, clump: Clump, material: Material, backend: str, progress: Progress) -> None:
+    def __init__(
+        self, recipe: Recipe, clump: Clump, material: Material, backend: str, keep: Keep, progress: Progress
+    ) -> None:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
-        self.recipe = recipe
+        self.recipe, self.keep = recipe, keep
         self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
         steps = max(1, math.ceil(recipe.t0 / (BINS * recipe.dt) * (1.0 - 1e-12)))
         self.dt = recipe.t0 / (BINS * steps)
@@ -182,11 +196,26 @@ class _Preparation:
 
     def press(self, name: str, servo: Servo, duration: float, drag: float) -> Pressed:
         """Run the servo until it has settled or `duration` is over; the list is made anew as often as needed."""
+        kept, pressed = self.keep(name, lambda checkpoint: self._press(checkpoint, name, servo, duration, drag))
+        self.walker.restore(kept)
+        self.box = pressed.box
+        return cast(Pressed, pressed)
+
+    def _press(
+        self, checkpoint: Checkpoint, name: str, servo: Servo, duration: float, drag: float
+    ) -> tuple[Any, Pressed]:
         walker = self.walker
         block, per_bin = BLOCK * self.dt, BLOCK / walker.course.steps
         no = jnp.asarray(False)
         pressed = Pressed(walker.state, self.box, jnp.zeros(1), jnp.asarray(0), no, no)
         left = math.ceil(duration / block)
+        if begun := checkpoint.begun():
+            walker.restore(begun["walker"])
+            pressed, left = begun["pressed"], int(begun["left"])
+
+        def standing() -> dict[str, Any]:
+            return {"walker": walker.kept(), "pressed": pressed, "left": np.asarray(left)}
+
         while left > 0:
             system = walker.course.system
             pressed = _press(system, pressed, servo, self.dt, drag, blocks=min(CALL, left), march=self.march)
@@ -200,7 +229,8 @@ class _Preparation:
             if bool(pressed.crowded):
                 walker.renew(self.box)
                 pressed = replace(pressed, state=walker.state)
-        return pressed
+            checkpoint.reached(standing)
+        return walker.kept(), pressed
 
     def compact(self) -> float:
         """Gas, then pressure: returns p_z once the pack is at rest under it and the wall is fixed."""
@@ -229,9 +259,8 @@ class _Preparation:
             np.asarray(self.box.lower)[:, 0], np.asarray(self.box.upper)[:, 0], recipe.delta0
         )
         walker.renew(self.box)
-        for number in range(1, recipe.cycles + 1):
-            for stage in preparation_cycle(recipe.rest, recipe.hold):
-                self.log |= walker.play(replace(stage, name=f"cycle {number}: {stage.name}"))
+        cycle, numbers = preparation_cycle(recipe.rest, recipe.hold), range(1, recipe.cycles + 1)
+        self._play("cycles", *(replace(stage, name=f"cycle {n}: {stage.name}") for n in numbers for stage in cycle))
         rest = Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1))
         waited = 0.0
         while waited == 0.0 or float(largest_speed(walker.state)) > recipe.quiet:
@@ -239,8 +268,18 @@ class _Preparation:
                 raise RunFailedError(
                     f"rest: largest speed {float(largest_speed(walker.state)):.1e} R/t_c after {waited:g} t_c"
                 )
-            self.log |= walker.play(rest)
+            self._play(f"rest-{waited:g}", rest)
             waited += rest.length * recipe.t0
+
+    def _play(self, name: str, *stages: Stage) -> None:
+        walker = self.walker
+
+        def play(checkpoint: Checkpoint) -> Any:
+            return walker.play(*stages, checkpoint=checkpoint), walker.kept()
+
+        samples, kept = self.keep(name, play)
+        walker.restore(kept)
+        self.log |= samples
 
 
 def prepare(
@@ -251,6 +290,7 @@ def prepare(
     friction: FrictionLaw | None = None,
     name: str = "",
     backend: str = "auto",
+    keep: Keep = forget,
     progress: Progress = silent,
     log: dict[str, Sample] | None = None,
     **changes: Any,
@@ -264,6 +304,7 @@ def prepare(
         friction: law under which the ringing period of the finished pack is measured; default `Hooke()`.
         name: of the pack; default from grain, size and seed.
         backend: "auto", "jax" or "native".
+        keep: asked for every part, so that a long preparation can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
         log: filled with the samples of every cycle stage, if given.
         **changes: fields of the recipe that differ, for example ``prepare(grains=64, seed=3)``.
@@ -275,7 +316,7 @@ def prepare(
     require_x64()
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = grain or tetra(), material or Material()
-    preparation = _Preparation(recipe, clump, material, backend, progress)
+    preparation = _Preparation(recipe, clump, material, backend, keep, progress)
     preparation.compact()
     preparation.cycle()
     if log is not None:
