@@ -10,6 +10,7 @@ from typer.exceptions import TyperException
 
 from gmem_jax.command import benchmark, classify, derive, packs, recalls
 from gmem_jax.command.console import RunInterruptedError, say
+from gmem_jax.command.programs import keep_programs
 from gmem_jax.experiment.host import RunFailedError
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, help="Waveform memory in granular packs.")
@@ -25,6 +26,7 @@ def _one_line(message: Warning | str, *_: Any, **__: Any) -> None:
 def main() -> None:
     """Entry point of the `gmem` command."""
     jax.config.update("jax_enable_x64", True)
+    keep_programs()
     warnings.showwarning = _one_line
     try:
         code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)

@@ -140,7 +140,7 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args(argv)
-    names, chance = options.commands.split(","), random.Random(options.seed)  # noqa: S311
+    names, chance = options.commands.split(","), random.Random(options.seed)
     result = {}
     with tempfile.TemporaryDirectory() as folder:
         if "classify" in names and "recall" not in names:

@@ -1,0 +1,46 @@
+"""Compiled programs kept between runs: half of the time of a short command is XLA compiling the same programs again."""
+
+import hashlib
+import os
+import platform
+import warnings
+from pathlib import Path
+
+import jax
+
+SWITCH = "GMEM_COMPILE_CACHE"  # another folder, or "off"
+
+
+def _processor() -> str:
+    """A few letters that differ between CPUs that cannot run each other's programs; homes are shared in clusters."""
+    facts = Path("/proc/cpuinfo")
+    lines = facts.read_text().splitlines() if facts.is_file() else []
+    known = [line for line in lines if line.startswith(("model name", "flags", "Features"))][:2] or [
+        platform.processor()
+    ]
+    return hashlib.sha256("\n".join(known).encode()).hexdigest()[:8]
+
+
+def keep_programs() -> None:
+    """Turn on JAX's persistent compilation cache, unless the user turned it off or chose one; before JAX computes.
+
+    A folder that cannot be written is no error: then nothing is kept.
+    """
+    chosen = os.environ.get(SWITCH, "")
+    if chosen == "off" or getattr(jax.config, "jax_compilation_cache_dir", None):
+        return
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = Path(chosen) if chosen else home / "gmem_jax" / f"jax-{jax.__version__}-{_processor()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return
+    if not os.access(folder, os.W_OK):
+        return
+    # XLA logs an error for every program that it finds: features of its own that no CPU's list has.
+    if getattr(jax.config, "jax_logging_level", None) == "NOTSET":
+        jax.config.update("jax_logging_level", "CRITICAL")
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+    # What a killed process left half written is compiled again.
+    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
