@@ -29,7 +29,7 @@ def test_programs_are_kept_used_again_in_silence_and_change_no_bit(tmp_path: Pat
     assert any(path.name.startswith("jit_walk_some") for path in kept)
     times = {path: path.stat().st_mtime_ns for path in kept}
     said = recall(tmp_path / "second.h5", **home)
-    assert all(line.startswith((" ", "27 grains", "wrote", "1")) for line in said.splitlines()), said
+    assert "AOT" not in said  # what XLA would say of every program that it finds
     again = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache" / "gmem_jax").rglob("*-cache")}
     assert again.items() >= times.items()
     recall(tmp_path / "third.h5", GMEM_COMPILE_CACHE="off", XDG_CACHE_HOME=str(tmp_path / "none"))
