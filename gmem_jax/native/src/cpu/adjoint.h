@@ -100,7 +100,7 @@ struct Adjoint {
       t.history = carver.take<V>(candidates * Law::kHistory);
       t.layer = carver.take<V>(layers);
       t.reached = carver.take<int>(Law::kLayered ? candidates : 0);
-      if (to) trace[step] = t;
+      if (to && to->rank == 0) trace[step] = t;  // the others see it after the barrier in `load`
     }
     V* state_bar = carver.take<V>(grains * kState);
     V* mid_bar = carver.take<V>(grains * kMid);

@@ -7,6 +7,7 @@
 #include <mutex>
 #include <utility>
 
+#include "cpu/process.h"
 #include "cpu/team.h"
 
 namespace gmem {
@@ -54,10 +55,7 @@ class ScratchPool {
   std::vector<Piece> free_;
 };
 
-ScratchPool& scratch_pool() {
-  static ScratchPool* pool = new ScratchPool;
-  return *pool;
-}
+ScratchPool& scratch_pool() { return of_process<ScratchPool>(); }
 
 }  // namespace
 

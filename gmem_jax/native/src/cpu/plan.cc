@@ -10,6 +10,8 @@
 #include <string>
 #include <tuple>
 
+#include "cpu/process.h"
+
 namespace gmem {
 
 namespace {
@@ -177,26 +179,30 @@ struct Key {
   }
 };
 
+struct Memory {
+  std::mutex mutex;
+  std::deque<std::pair<Key, std::shared_ptr<const PlanStore>>> known;
+};
+
 }  // namespace
 
 std::shared_ptr<const PlanStore> plan_for(const List& list) {
-  static std::mutex mutex;
-  static auto* known = new std::deque<std::pair<Key, std::shared_ptr<const PlanStore>>>;
+  auto& [mutex, known] = of_process<Memory>();
   {
     std::lock_guard<std::mutex> lock(mutex);
-    for (const auto& entry : *known)
+    for (const auto& entry : known)
       if (entry.first.matches(list)) return entry.second;
   }
   auto plan = make_plan(list);
   Key key(list);
   std::lock_guard<std::mutex> lock(mutex);
-  known->emplace_front(std::move(key), plan);
+  known.emplace_front(std::move(key), plan);
   std::size_t bytes = 0, keep = 0;
-  for (const auto& entry : *known) {
+  for (const auto& entry : known) {
     bytes += entry.first.bytes.size() + entry.second->candidate.size() * sizeof(Candidate);
     if (keep == 0 || bytes <= kRemembered) ++keep;
   }
-  known->resize(keep, known->front());
+  known.resize(keep, known.front());
   return plan;
 }
 

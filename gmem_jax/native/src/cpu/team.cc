@@ -1,11 +1,16 @@
 #include "cpu/team.h"
 
+#include <algorithm>
 #include <condition_variable>
 #include <cstdlib>
+#include <deque>
 #include <exception>
 #include <mutex>
+#include <stdexcept>
+#include <string>
 #include <thread>
-#include <vector>
+
+#include "cpu/process.h"
 
 #if defined(__linux__)
 #include <sched.h>
@@ -23,82 +28,114 @@ inline void pause() {
 #endif
 }
 
-// Workers live until the process ends; they sleep on a condition variable between calls.
+int cpus() {
+#if defined(__linux__)
+  cpu_set_t set;
+  if (sched_getaffinity(0, sizeof set, &set) == 0) return CPU_COUNT(&set);
+#endif
+  const unsigned count = std::thread::hardware_concurrency();
+  return count ? static_cast<int>(count) : 1;
+}
+
+// Workers live until the process ends; they sleep between jobs.
 class Pool {
  public:
-  std::mutex busy;  // held by the call that uses the workers
-
   void run(int threads, const std::function<void(int)>& work) {
-    grow(threads - 1);
-    {
-      std::lock_guard<std::mutex> lock(mutex_);
-      work_ = &work;
-      wanted_ = threads - 1;
-      left_ = threads - 1;
-      ++job_;
-    }
+    std::unique_lock<std::mutex> lock(mutex_);
+    // There is a worker for every rank of every job: those of a team wait for each other.
+    for (; workers_ < ranks_ + threads - 1; ++workers_) std::thread([this] { serve(); }).detach();
+    ranks_ += threads - 1;
+    Job job{&work, threads - 1, threads - 1, {}};
+    jobs_.push_back(&job);
+    lock.unlock();
     wake_.notify_all();
     work(0);
+    lock.lock();
+    job.done.wait(lock, [&job] { return job.left == 0; });
+    ranks_ -= threads - 1;
+  }
+
+  int enter(int wanted) {
+    const int most = cpus();
     std::unique_lock<std::mutex> lock(mutex_);
-    done_.wait(lock, [this] { return left_ == 0; });
+    ++calls_;
+    free_.wait(lock, [&] { return used_ < most; });
+    const int count = calls_ == 1 ? wanted : std::min(wanted, std::min(most - used_, std::max(1, most / calls_)));
+    used_ += count;
+    return count;
+  }
+
+  void leave(int count) {
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      --calls_;
+      used_ -= count;
+    }
+    free_.notify_all();
   }
 
  private:
-  void grow(int workers) {
-    while (static_cast<int>(threads_.size()) < workers) {
-      const int number = static_cast<int>(threads_.size());
-      threads_.emplace_back([this, number] { serve(number); });
-      threads_.back().detach();
-    }
-  }
+  struct Job {
+    const std::function<void(int)>* work;
+    int next, left;  // the ranks up to `next` have not begun, `left` of them have not ended
+    std::condition_variable done;
+  };
 
-  void serve(int number) {
+  void serve() {
     std::unique_lock<std::mutex> lock(mutex_);
-    long seen = 0;
     for (;;) {
-      wake_.wait(lock, [&] { return job_ != seen; });
-      seen = job_;
-      if (number >= wanted_) continue;
-      const std::function<void(int)>* work = work_;
+      wake_.wait(lock, [this] { return !jobs_.empty(); });
+      Job& job = *jobs_.front();
+      const int rank = job.next--;
+      if (job.next == 0) jobs_.pop_front();
       lock.unlock();
-      (*work)(number + 1);
+      (*job.work)(rank);
       lock.lock();
-      if (--left_ == 0) done_.notify_one();
+      if (--job.left == 0) job.done.notify_one();
     }
   }
 
   std::mutex mutex_;
-  std::condition_variable wake_, done_;
-  std::vector<std::thread> threads_;
-  const std::function<void(int)>* work_ = nullptr;
-  int wanted_ = 0, left_ = 0;
-  long job_ = 0;
+  std::condition_variable wake_, free_;
+  std::deque<Job*> jobs_;         // with ranks that have not begun
+  int workers_ = 0, ranks_ = 0;   // and how many of them are spoken for
+  int calls_ = 0, used_ = 0;      // calls in progress or waiting, and the threads they have
 };
 
-Pool& pool() {
-  static Pool* pool = new Pool;  // never destroyed: workers outlive static destruction
-  return *pool;
-}
+Pool& pool() { return of_process<Pool>(); }
 
 }  // namespace
 
 void Team::barrier() {
+  constexpr int kSpins = 200, kYields = 50;
   if (size_ == 1) return;
   const int phase = phase_.load(std::memory_order_relaxed);
   if (arrived_.fetch_add(1, std::memory_order_acq_rel) == size_ - 1) {
     arrived_.store(0, std::memory_order_relaxed);
-    phase_.store(phase + 1, std::memory_order_release);
+    phase_.store(phase + 1);
+    wake();
     return;
   }
-  // Spin for some microseconds; then the others may need this CPU.
-  for (int spins = 0; phase_.load(std::memory_order_acquire) == phase; ++spins) {
+  // Look for some microseconds, which on a quiet machine is enough; then let others have this CPU, and then sleep.
+  for (int looks = 0; phase_.load(std::memory_order_acquire) == phase; ++looks) {
     if (failed_.load(std::memory_order_relaxed)) throw Left{};
-    if (spins < 200) {
+    if (looks < kSpins) {
       pause();
-    } else {
+    } else if (looks < kSpins + kYields) {
       std::this_thread::yield();
+    } else {
+      std::unique_lock<std::mutex> lock(mutex_);
+      ++asleep_;  // before looking once more: whoever ends the phase looks for sleepers after it
+      wake_.wait(lock, [&] { return phase_.load() != phase || failed_.load(); });
+      --asleep_;
     }
   }
+}
+
+void Team::wake() {
+  if (asleep_.load() == 0) return;
+  std::lock_guard<std::mutex> lock(mutex_);
+  wake_.notify_all();
 }
 
 void Team::share(Queue queue, int rank, int chunks) {
@@ -133,22 +170,17 @@ void run_ranks(int threads, const std::function<void(int)>& work) {
   if (first) std::rethrow_exception(first);
 }
 
-Threads::Threads(int wanted) : count(wanted > 1 && pool().busy.try_lock() ? wanted : 1) {}
-Threads::~Threads() {
-  if (count > 1) pool().busy.unlock();
-}
+Threads::Threads(int wanted) : count(pool().enter(wanted)) {}
+Threads::~Threads() { pool().leave(count); }
 
 int thread_count() {
-  if (const char* text = std::getenv("GMEM_THREADS")) {
-    const int wanted = std::atoi(text);
-    if (wanted >= 1) return wanted;
-  }
-#if defined(__linux__)
-  cpu_set_t set;
-  if (sched_getaffinity(0, sizeof set, &set) == 0) return CPU_COUNT(&set);
-#endif
-  const unsigned count = std::thread::hardware_concurrency();
-  return count ? static_cast<int>(count) : 1;
+  const char* text = std::getenv("GMEM_THREADS");
+  if (!text || !*text) return cpus();
+  char* end = nullptr;
+  const long wanted = std::strtol(text, &end, 10);
+  if (*end || wanted < 1 || wanted > 4096)
+    throw std::invalid_argument("GMEM_THREADS should be a number of threads from 1 to 4096; it is \"" + std::string(text) + '"');
+  return static_cast<int>(wanted);
 }
 
 }  // namespace gmem

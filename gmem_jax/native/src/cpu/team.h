@@ -1,9 +1,11 @@
-// Threads: a pool that sleeps between calls, and teams of threads that share a block.
+// Threads: a pool that sleeps between jobs, and teams of threads that share a block.
 
 #pragma once
 
 #include <atomic>
+#include <condition_variable>
 #include <functional>
+#include <mutex>
 
 namespace gmem {
 
@@ -24,7 +26,8 @@ class Team {
       work();
     } catch (const Left&) {
     } catch (...) {
-      failed_.store(true, std::memory_order_release);
+      failed_.store(true);
+      wake();
       throw;
     }
   }
@@ -42,14 +45,21 @@ class Team {
     std::atomic<int> last{0};
   };
   struct Left {};  // thrown at a barrier that not all will reach
+
+  void wake();
+
   const int size_;
   std::atomic<bool> failed_{false};
   alignas(64) std::atomic<int> arrived_{0};
   alignas(64) std::atomic<int> phase_{0};
+  std::atomic<int> asleep_{0};
+  std::mutex mutex_;
+  std::condition_variable wake_;
   Share shares_[kQueues][kMaxSize];
 };
 
-// The pool's threads for the length of one call; while another call has them, `count` is 1.
+// Threads for the length of one call, the caller's own among them. Calls at once share out the CPUs; one for which none
+// is left waits until there is.
 class Threads {
  public:
   explicit Threads(int wanted);
@@ -60,11 +70,12 @@ class Threads {
   const int count;
 };
 
-// Run `work(rank)` for rank 0 (here) to threads - 1 (in the pool, whose `Threads` the caller has) and wait for all;
-// then throw what the first of them to fail threw.
+// Run `work(rank)` for rank 0 (here) to threads - 1 (in the pool) and wait for all; then throw what the first of them to
+// fail threw.
 void run_ranks(int threads, const std::function<void(int)>& work);
 
-// Threads to use: the environment's GMEM_THREADS, or the CPUs this process may run on.
+// Threads to use: the environment's GMEM_THREADS, or the CPUs this process may run on. Throws std::invalid_argument if
+// GMEM_THREADS is no number of threads.
 int thread_count();
 
 }  // namespace gmem

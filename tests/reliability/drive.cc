@@ -1,0 +1,184 @@
+// Drives the kernels without Python or XLA, to be compiled with sanitizers: every law and task, thread counts, sizes of
+// batches and lists, calls at once; the numbers must not depend on threads, batches or company. An argument plants a
+// defect: what the library is told about its arrays is then a lie, which the sanitizers must notice in its own code.
+
+#include <cmath>
+#include <cstring>
+#include <deque>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "../native/check.h"
+#include "cpu/blocks.h"
+#include "cpu/plan.h"
+#include "cpu/team.h"
+
+namespace gmem {
+namespace steps { extern const Kernel kernel; }
+namespace derivatives { extern const Kernel kernel; }
+}  // namespace gmem
+
+using namespace gmem;
+using Numbers = std::vector<double>;
+
+constexpr int kSpheres = 2, kSteps = 2;
+constexpr int kSizes[kFields] = {3, 4, 3, 3, 3, 3};
+
+// Something between -1 and 1 that depends on three integers alone.
+double noise(int a, int b, int c) { return std::sin(12.9898 * a + 78.233 * b + 37.719 * c + 1.0); }
+
+struct Case {
+  Law law;
+  Variant variant;
+  Task task;
+  int edge;      // grains along the edge of a block of them, or 0: two grains
+  double reach;  // of the candidates
+  int replicas;
+};
+
+// Grains of two spheres that touch their neighbours and the walls.
+struct Scene {
+  int grains;
+  Numbers position, reference, smallest{1.0, 1.0, 1.0}, offsets{-0.5, 0.0, 0.0, 0.5, 0.0, 0.0};
+  std::vector<int32_t> first, second;
+  std::vector<char> valid;
+
+  explicit Scene(const Case& c) : grains(c.edge ? c.edge * c.edge * c.edge : 2) {
+    const int edge = c.edge ? c.edge : 2;
+    for (int g = 0; g < grains; ++g) {
+      const double x[3] = {2.9 * (g % edge) + 1.45, 1.95 * (g / edge % edge) + 0.97, 1.95 * (g / edge / edge) + 0.97};
+      for (int axis = 0; axis < 3; ++axis) position.push_back(x[axis] + 0.03 * noise(g, axis, 0));
+      for (int k = 0; k < kSpheres; ++k)
+        for (int axis = 0; axis < 3; ++axis) reference.push_back(position[3 * g + axis] + offsets[3 * k + axis]);
+    }
+    for (int i = 0; i < grains * kSpheres; ++i)
+      for (int j = (i / kSpheres + 1) * kSpheres; j < grains * kSpheres; ++j) {
+        double square = 0.0;
+        for (int axis = 0; axis < 3; ++axis) square += std::pow(reference[3 * i + axis] - reference[3 * j + axis], 2);
+        if (square > c.reach * c.reach) continue;
+        if (first.size() % 5 == 2) list(-7, 1 << 30, false);  // padding may hold anything
+        list(i, j, true);
+      }
+  }
+
+  void list(int i, int j, bool is_valid) { first.push_back(i), second.push_back(j), valid.push_back(is_valid); }
+};
+
+// Runs one call; the results of the first replica. `plant` is the defect.
+Numbers run(const Case& c, int threads, const std::string& plant = "") {
+  const Scene scene(c);
+  const int n = scene.grains, b = c.replicas, points = 5, candidates = static_cast<int>(scene.first.size());
+  std::deque<Numbers> arrays;  // each of its very size
+  std::vector<double*> results;
+  const auto array = [&](int rows, bool result, auto number) {
+    Numbers& a = arrays.emplace_back(static_cast<std::size_t>(rows) * b);
+    for (int row = 0; row < rows; ++row)
+      for (int l = 0; l < b; ++l) a[row * b + l] = result ? NAN : number(row, l);
+    if (result) results.insert(results.end(), {a.data(), a.data() + a.size()});
+    return a.data();
+  };
+  const auto small = [](int row, int l) { return 1e-3 * noise(row, l, 1); };
+  const auto positive = [](int row, int l) { return 1e-3 * (1.5 + noise(row, l, 2)); };
+  const auto parameter = [](int row, int) {
+    const double numbers[kParameters] = {0.05, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.06};
+    return numbers[row];
+  };
+  const auto wall = [&](int row, int) { return row % 12 < 3 ? 0.0 : row % 12 < 6 ? 2.9 * (c.edge ? c.edge : 2) : 1e-3; };
+  const auto field = [&](int f) {
+    return [&scene, f](int row, int l) {
+      if (f == 0) return scene.position[row] + 1e-3 * noise(row, l, 3);
+      return f == 1 && row % 4 == 0 ? 1.0 : f == 1 ? 0.0 : 0.01 * noise(row, l, 4 + f);
+    };
+  };
+  const int leaves = c.law == Law::frictionless ? 0 : c.law == Law::hooke ? 1 : 2;
+  const int rows[kMaxHistory] = {3 * (c.law == Law::mindlin ? points : 1) * candidates, candidates};
+  const bool forward = c.task == Task::forward, back = c.task == Task::adjoint;
+
+  Lane lane{}, slope{};
+  lane.steps = slope.steps = kSteps;
+  for (int f = 0; f < kFields; ++f) {
+    lane.grains_in[f] = array(n * kSizes[f] - (plant == "bounds" && f == 5), false, field(f));
+    slope.grains_in[f] = array(n * kSizes[f], false, small);
+    lane.grains_out[f] = slope.grains_out[f] = array(n * kSizes[f], true, small);
+  }
+  if (plant == "alignment") lane.grains_in[4] = reinterpret_cast<double*>(reinterpret_cast<char*>(array(n * 3 + 1, false, small)) + 1);
+  for (int leaf = 0; leaf < leaves; ++leaf) {
+    lane.history_in[leaf] = array(rows[leaf], false, leaf ? positive : small);
+    slope.history_in[leaf] = array(rows[leaf], false, small);
+    lane.history_out[leaf] = slope.history_out[leaf] = array(rows[leaf], true, small);
+  }
+  lane.parameters = array(kParameters, false, parameter);
+  lane.walls = array(kSteps * kWalls, false, wall);
+  slope.parameters = array(kParameters, false, small);
+  slope.walls = array(kSteps * kWalls, false, small);
+  lane.pressure = slope.pressure = array(3, !back, small);
+  if (back) slope.parameters_out = array(kParameters, true, small), slope.walls_out = array(kSteps * kWalls, true, small);
+
+  const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b};
+  const auto store = plan_for({n, kSpheres, candidates, scene.first.data(), scene.second.data(),
+                               reinterpret_cast<const bool*>(scene.valid.data()), scene.reference.data(),
+                               scene.smallest.data()});
+  const Pack pack{&store->plan, scene.offsets.data()};
+  const Kernel& kernel = forward ? steps::kernel : derivatives::kernel;
+  const auto moved = [](Lane of, std::ptrdiff_t l) {
+    for (int f = 0; f < kFields; ++f) of.grains_in[f] += l, of.grains_out[f] += l;
+    for (int leaf = 0; leaf < kMaxHistory; ++leaf)
+      if (of.history_in[leaf]) of.history_in[leaf] += l, of.history_out[leaf] += l;
+    of.parameters += l, of.walls += l, of.pressure += l;
+    if (of.parameters_out) of.parameters_out += l, of.walls_out += l;
+    return of;
+  };
+  std::vector<Lane> lanes, slopes;
+  for (int l = 0; l < b; ++l) lanes.push_back(moved(lane, l)), slopes.push_back(moved(slope.parameters ? slope : lane, l));
+  std::vector<Block> blocks;
+  for (int l = 0; l < b;) {
+    const bool packed = forward && 2 * (b - l) < kernel.width;
+    const int count = packed ? 1 : b - l < kernel.width ? b - l : kernel.width;
+    blocks.push_back({&pack, &lanes[l], &slopes[l], count, packed});
+    l += count;
+  }
+  if (plant == "race") blocks = {blocks[0], blocks[0]};  // two threads write the same results
+  {
+    const Threads held(threads);
+    run_blocks(problem, kernel, blocks, held.count);
+  }
+  Numbers found;
+  for (std::size_t i = 0; i < results.size(); i += 2)
+    for (const double* a = results[i]; a < results[i + 1]; a += b) found.push_back(*a);
+  return found;
+}
+
+bool same(const Numbers& a, const Numbers& b) {
+  return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(double)) == 0);
+}
+
+int main(int count, char** arguments) {
+  if (count > 1) {
+    for (int repeat = 0; repeat < 50; ++repeat) run({Law::hooke, Variant::exact, Task::forward, 4, 4.5, 16}, 2, arguments[1]);
+    return 0;
+  }
+  const struct { Law law; Variant variant; } laws[] = {
+      {Law::frictionless, Variant::exact}, {Law::hooke, Variant::exact},      {Law::mindlin_rescaled, Variant::exact},
+      {Law::mindlin, Variant::exact},      {Law::mindlin, Variant::averaged}, {Law::mindlin, Variant::paper}};
+  const struct { int edge; double reach; } packs[] = {{0, 0.0}, {0, 2.5}, {3, 0.0}, {3, 2.5}, {4, 4.5}};
+  for (const auto& law : laws)
+    for (const Task task : {Task::forward, Task::tangent, Task::adjoint})
+      for (const auto& pack : packs) {
+        const auto with = [&](int replicas) { return Case{law.law, law.variant, task, pack.edge, pack.reach, replicas}; };
+        const Numbers alone = run(with(1), 1);
+        for (const double number : alone) CHECK(std::isfinite(number));
+        for (const int replicas : {2, 7, 9, 17})
+          if (pack.edge < 4) CHECK(same(run(with(replicas), 2), alone));
+        for (const int threads : {2, 5})
+          if (pack.edge == 4) CHECK(same(run(with(1), threads), alone));
+        if (pack.edge == 3) {  // calls at once
+          std::vector<std::thread> callers;
+          std::deque<Numbers> found(4);
+          for (Numbers& one : found) callers.emplace_back([&, to = &one] { *to = run(with(3), 3); });
+          for (std::thread& caller : callers) caller.join();
+          for (const Numbers& one : found) CHECK(same(one, alone));
+        }
+      }
+  return failures != 0;
+}
