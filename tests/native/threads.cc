@@ -1,9 +1,16 @@
 // Threads that fail, and the order and checks of plans.
 
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <algorithm>
 #include <atomic>
+#include <chrono>
+#include <cstdlib>
 #include <new>
 #include <stdexcept>
 #include <string>
+#include <thread>
 #include <vector>
 
 #include "check.h"
@@ -111,7 +118,74 @@ void a_failed_block_fails_the_call_and_not_the_next() {
     }
 }
 
+void calls_at_once_share_out_the_cpus() {
+  for (int repeat = 0; repeat < 20; ++repeat) {
+    std::atomic<int> used{0}, most{0};
+    std::vector<std::thread> callers;
+    for (int n = 0; n < 8; ++n)
+      callers.emplace_back([&] {
+        const Threads held(2);
+        const int now = used += held.count;
+        if (now > most) most = now;
+        std::this_thread::sleep_for(std::chrono::milliseconds(1));
+        used -= held.count;
+      });
+    for (std::thread& caller : callers) caller.join();
+    CHECK(used == 0 && most <= std::max(2u, std::thread::hardware_concurrency()));
+  }
+}
+
+// Whether a child that repeats what its parent did with threads ends well, and soon.
+template <class Work>
+bool survives_a_fork(const Work& work) {
+  work();
+  const pid_t child = fork();
+  if (child == 0) {
+    alarm(20);
+    work();
+    _exit(failures != 0);
+  }
+  int status = -1;
+  return waitpid(child, &status, 0) == child && status == 0;
+}
+
+void a_child_made_by_fork_has_threads_of_its_own() {
+  const auto work = [] {
+    const Threads held(3);
+    std::atomic<int> ranks{0};
+    Team team(held.count);
+    run_ranks(held.count, [&](int) { team.run([&] { team.barrier(), ++ranks, team.barrier(); }); });
+    CHECK(ranks == held.count);
+    plan_for(Row().list());
+  };
+  CHECK(survives_a_fork(work));
+  const Threads held(3);  // by the parent, whose call never ends as seen from the child
+  CHECK(survives_a_fork([] { run_ranks(3, [](int) {}); }));
+  const pid_t child = fork();
+  if (child == 0) {
+    alarm(20);
+    const Threads own(3);
+    _exit(own.count != 3);
+  }
+  int status = -1;
+  CHECK(waitpid(child, &status, 0) == child && status == 0);
+}
+
+void a_bad_number_of_threads_is_refused() {
+  for (const char* bad : {"0", "-2", "two", "2x", "1e3", "99999999999999999999"}) {
+    setenv("GMEM_THREADS", bad, 1);
+    CHECK(thrown<std::invalid_argument>([] { thread_count(); }).find("GMEM_THREADS should be") == 0);
+  }
+  setenv("GMEM_THREADS", "7", 1);
+  CHECK(thread_count() == 7);
+  unsetenv("GMEM_THREADS");
+  CHECK(thread_count() >= 1);
+}
+
 int main() {
+  a_child_made_by_fork_has_threads_of_its_own();
+  a_bad_number_of_threads_is_refused();
+  calls_at_once_share_out_the_cpus();
   a_failed_rank_is_thrown_when_all_have_ended();
   a_team_does_not_wait_for_one_that_failed();
   plans_keep_neighbours_together_and_padding_apart();
