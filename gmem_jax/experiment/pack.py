@@ -86,9 +86,13 @@ def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: 
 
 
 def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: str = "") -> Pack:
-    """The same box and grain with other centres [N, 3] and orientations [N, 4], and their own neighbour list."""
+    """The same box and grain with other centres [N, 3] and orientations [N, 4], and their own neighbour list.
+
+    What was measured of the old ones at rest is no part of its record.
+    """
     pairs = find_pairs(pack.clump, np.asarray(position), np.asarray(quaternion), pack.box, float(pack.delta0))
-    return replace(pack, position=position, quaternion=quaternion, pairs=pairs, name=name or pack.name)
+    record = json.dumps({key: value for key, value in pack.info.items() if key != "at_rest"})
+    return replace(pack, position=position, quaternion=quaternion, pairs=pairs, name=name or pack.name, record=record)
 
 
 def stack(packs: Sequence[Pack]) -> Pack:

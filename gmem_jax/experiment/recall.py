@@ -46,6 +46,7 @@ class Recall:
 
     Attributes:
         u: centres of the bins, [256].
+        shear: the waveforms I there, [S, 256].
         J: integrals of the waveforms, averaged over each bin, [S, 256].
         p_sig: recalled signals, [S, 256], in E.
         gain: G of the set.
@@ -61,6 +62,7 @@ class Recall:
     """
 
     u: jax.Array
+    shear: jax.Array
     J: jax.Array
     p_sig: jax.Array
     gain: jax.Array
@@ -90,8 +92,10 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
     smooth = analysis.compare(
         analysis.running_mean(p_sig, window), analysis.running_mean(integral, window), experiment.scale
     )
+    u = (jnp.arange(BINS) + 0.5) / BINS
     return Recall(
-        u=(jnp.arange(BINS) + 0.5) / BINS,
+        u=u,
+        shear=experiment.signals.shear(u).T,
         J=integral,
         p_sig=p_sig,
         gain=match.gain,

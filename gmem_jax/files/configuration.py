@@ -12,7 +12,7 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, words
+from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, word_bits, words
 from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import code, provenance
@@ -61,7 +61,20 @@ def written_signals(signals: Signals) -> dict[str, Any]:
     return {"kind": type(signals).__name__, "sha256": fingerprint(signals)}
 
 
-def _signals_from(written: Mapping[str, Any]) -> Signals:
+def names_of(signals: Signals) -> list[str]:
+    """What the signals are called: words by their bits, others by their number from 1."""
+    form = written_signals(signals)
+    if form["kind"] == "words":
+        return ["".join(map(str, row)) for row in word_bits(form["bits"])]
+    return [f"signal {number + 1}" for number in range(signals.count)]
+
+
+def signals_from(written: Mapping[str, Any]) -> Signals:
+    """The waveforms of a written form.
+
+    Raises:
+        ValueError: if they are of a kind that has none, or its numbers make no waveforms.
+    """
     kind = written["kind"]
     if kind == "six":
         return six_signals()
@@ -131,7 +144,7 @@ def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) 
     own = {name: _number(value) for name, value in configuration.items() if name not in _PARTS}
     material = {name: _number(value) for name, value in configuration["material"].items()}
     return Experiment(
-        pack, _signals_from(configuration["signals"]), _law_from(configuration["friction"]), Material(**material), **own
+        pack, signals_from(configuration["signals"]), _law_from(configuration["friction"]), Material(**material), **own
     )
 
 
@@ -160,6 +173,7 @@ def resolved(experiment: Experiment, seconds: float) -> dict[str, Any]:
             "diameter": float(pack.clump.diameter),
         },
         "pack_record": pack.info,
+        "signals": names_of(experiment.signals),
         "friction": entry.name if entry else type(law).__name__,
         "mu": _plain(law.mu) if isinstance(law, CoulombLaw) else 0.0,
         "delta0": _plain(experiment.compression),

@@ -1,10 +1,9 @@
 """Parts of a long run, kept beside its output until it is whole.
 
-A part is an .npz file: its arrays, how they make up a pytree (JSON), and a checksum of both. Nothing in it is code.
+A part is a sealed .npz file: its arrays, and how they make up a pytree (JSON). Nothing in it is code.
 """
 
 import contextlib
-import hashlib
 import json
 import os
 import shutil
@@ -21,9 +20,11 @@ import numpy as np
 
 from gmem_jax.experiment.host import Checkpoint, RunFailedError
 from gmem_jax.files.atomic import FileFormatError, atomic, sweep
+from gmem_jax.files.checked import json_of, read_npy, refusing, require
+from gmem_jax.files.seal import BLOCK, seal, sealed
 from gmem_jax.physics.pytree import KINDS
 
-PART_SCHEMA = "gmem-part/1"
+PART_SCHEMA = "gmem-part/2"
 EVERY = 120.0  # s between checkpoints of an unfinished part: doing it again must cost more than writing them
 AT_MILESTONES = 20.0  # s likewise, where a stage has just ended
 
@@ -58,14 +59,6 @@ def _put_together(form: Any, arrays: list[np.ndarray]) -> Any:
     return KINDS[form["kind"]](**{name: _put_together(item, arrays) for name, item in form["fields"].items()})
 
 
-def _checksum(form: str, arrays: list[np.ndarray]) -> str:
-    digest = hashlib.sha256(form.encode())
-    for array in arrays:
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
-
-
 def save_part(path: Path, tree: Any) -> None:
     """Write a tree of arrays.
 
@@ -74,32 +67,46 @@ def save_part(path: Path, tree: Any) -> None:
         OSError: if the path cannot be written.
     """
     arrays: list[np.ndarray] = []
-    form = json.dumps(_taken_apart(tree, arrays))
-    head = json.dumps({"schema": PART_SCHEMA, "form": form, "sha256": _checksum(form, arrays)})
+    head = json.dumps({"schema": PART_SCHEMA, "form": _taken_apart(tree, arrays)}).encode()
     named = {f"array_{number:03d}": array for number, array in enumerate(arrays)}
-    with atomic(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, head=np.asarray(head), **named)  # type: ignore[arg-type]
+    with atomic(path) as temporary:
+        with temporary.open("wb") as file:
+            file.write(bytes(BLOCK))
+            np.savez(file, head=np.frombuffer(head, np.uint8), **named)  # type: ignore[arg-type]
+        seal(temporary)
 
 
 def load_part(path: Path) -> Any:
     """Read what `save_part` wrote, arrays as numpy arrays.
 
     Raises:
+        FileNotFoundError: if there is no such file.
         FileFormatError: if the file is damaged, or none of this schema.
     """
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            head = json.loads(str(file["head"]))
-            if head["schema"] != PART_SCHEMA:
-                raise FileFormatError(f"{path}: schema is {head['schema']!r}, expected {PART_SCHEMA!r}")
-            arrays = [file[f"array_{number:03d}"] for number in range(len(file.files) - 1)]
-    except FileFormatError:
-        raise
-    except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile) as error:
-        raise FileFormatError(f"{path}: not a readable part of a run (truncated?)") from error
-    if _checksum(head["form"], arrays) != head["sha256"]:
-        raise FileFormatError(f"{path}: damaged, its checksum does not fit; remove it")
-    return _put_together(json.loads(head["form"]), arrays)
+    with refusing(path, "part of a run"), path.open("rb") as opened:
+        if not sealed(opened, path):
+            raise FileFormatError(f"{path}: not a readable part of a run (no checksum); remove it")
+        with zipfile.ZipFile(opened) as archive:
+            found = _members(archive, path.stat().st_size)
+        head = json_of(found.pop("head", np.zeros(0, np.uint8)).tobytes(), "head")
+        if head.get("schema") != PART_SCHEMA:
+            raise FileFormatError(f"{path}: schema is {head.get('schema')!r}, expected {PART_SCHEMA!r}")
+        return _put_together(head["form"], [found[name] for name in sorted(found)])
+
+
+def _members(archive: zipfile.ZipFile, size: int) -> dict[str, np.ndarray]:
+    """The arrays of an archive, none of which is larger than the file says: nothing in it is compressed.
+
+    Raises:
+        FileFormatError: if one is.
+    """
+    found = {}
+    for member in archive.infolist():
+        plain = member.compress_type == zipfile.ZIP_STORED and member.file_size == member.compress_size <= size
+        require(plain, f"{member.filename!r} is compressed, or larger than the file")
+        with archive.open(member) as file:
+            found[member.filename.removesuffix(".npy")] = read_npy(file, member.file_size, member.filename)  # type: ignore[arg-type]
+    return found
 
 
 class _Standing(Checkpoint):
@@ -111,7 +118,7 @@ class _Standing(Checkpoint):
 
     def begun(self) -> Any:
         for path in (self._now, self._before):
-            with contextlib.suppress(FileFormatError):
+            with contextlib.suppress(FileFormatError, FileNotFoundError):
                 return load_part(path)
         return None
 

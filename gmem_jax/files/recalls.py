@@ -5,14 +5,41 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-import h5py
+import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.atomic import atomic
-from gmem_jax.files.hdf5 import read_samples, reading, write_samples
+from gmem_jax.experiment.signals import BINS
+from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.checked import (
+    Array,
+    is_number,
+    json_of,
+    numbers,
+    refusing,
+    require,
+    require_fields,
+    require_finite,
+    title,
+    whole,
+)
+from gmem_jax.files.configuration import signals_from
+from gmem_jax.files.hdf5 import Content, reading, write_samples, writing
+from gmem_jax.physics.sample import Sample
+from gmem_jax.physics.state import Status
 
-RECALL_SCHEMA = "gmem-recall/1"
+RECALL_SCHEMA = "gmem-recall/2"
+_BEFORE = "gmem-recall/1"  # without a seal and I(u)
+
+_CURVES = ("shear", "J", "p_sig")
+_MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity", "window")
+_DECLARED = (
+    {"u": Array("real", (BINS,))}
+    | {name: Array("real", ("signals", BINS)) for name in _CURVES}
+    | {name: Array("real") for name in _MEASURES}
+    | {"residual_speed": Array("real", ("replicas",)), "status": Array("whole", ("replicas",))}
+)
+_EVERY_BIT = int(sum(Status))
 
 
 def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> None:
@@ -21,10 +48,8 @@ def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> No
     Raises:
         OSError: if the path cannot be written.
     """
-    with atomic(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs["schema"] = RECALL_SCHEMA
+    with writing(path, RECALL_SCHEMA) as file:
         file.attrs["configuration"] = json.dumps(configuration)
-        file.attrs["units"] = "R = E = rho = 1"
         for entry in fields(recall):
             if entry.name != "stages":
                 file.create_dataset(entry.name, data=np.asarray(getattr(recall, entry.name)))
@@ -36,8 +61,70 @@ def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if the file is not a complete recall of this schema.
+        FileFormatError: if the file is damaged, not a complete recall of this schema, or its numbers do not fit each
+            other.
     """
-    with reading(path, RECALL_SCHEMA) as file:
-        values = {entry.name: file[entry.name][()] for entry in fields(Recall) if entry.name != "stages"}
-        return Recall(**values, stages=read_samples(file["stages"])), json.loads(file.attrs["configuration"])
+    with refusing(path, "recall"):
+        with reading(path, RECALL_SCHEMA, _BEFORE) as content:
+            configuration = json_of(content.text("configuration"), "configuration")
+            _check_configuration(configuration)
+            recall = _recall_of(content, configuration)
+        _check(recall)
+        return recall, configuration
+
+
+def _recall_of(content: Content, configuration: dict[str, Any]) -> Recall:
+    declared = dict(_DECLARED)
+    if content.schema == _BEFORE:
+        del declared["shear"]
+    dt = content.datasets.get("dt")
+    declared["dt"] = Array("real", () if dt is None or dt.shape == () else ("replicas",))
+    found = content.arrays(declared)
+    if content.schema == _BEFORE:
+        found["shear"] = _waveforms(configuration, found["u"], found["J"])
+    return Recall(**found, stages=content.samples("stages"))  # type: ignore[arg-type]
+
+
+def _waveforms(configuration: dict[str, Any], u: np.ndarray, integral: np.ndarray) -> np.ndarray:
+    """I(u) of the signals that a configuration writes down, [S, 256]; NaN for those of own kinds, which it cannot."""
+    try:
+        return np.asarray(signals_from(configuration["experiment"]["signals"]).shear(jnp.asarray(u))).T
+    except (ValueError, KeyError, TypeError):
+        return np.full_like(integral, np.nan)
+
+
+def _check_configuration(configuration: dict[str, Any]) -> None:
+    """What tables and figures rely on."""
+    kinds = {"pack": title, "friction": title, "background": title, "grains": whole, "steps": whole}
+    amounts = dict.fromkeys(("mu", "delta0", "gamma0", "t0", "hold_drag", "dt"), numbers)
+    require_fields(configuration, "configuration", **kinds, **amounts, seconds=is_number)
+    require_fields(configuration.get("grain"), "configuration's grain", shape=title, mass=is_number, diameter=is_number)
+    experiment = configuration.get("experiment", {})
+    require(isinstance(experiment, dict), "its configuration has an impossible 'experiment'")
+    if "target" in configuration:
+        require_fields(configuration["target"], "target", kind=title)
+
+
+def _check(recall: Recall) -> None:
+    signals, replicas = len(recall.J), len(recall.status)
+    status = np.asarray(recall.status)
+    require(signals > 0 and replicas == signals + 1, f"it has {signals} signals and {replicas} replicas, not one more")
+    require((status >= 0) & (status & ~_EVERY_BIT == 0), "its status is none that there is")
+    require(np.abs(np.asarray(recall.u) - (np.arange(BINS) + 0.5) / BINS) < 1e-12, "its u are not the centres of bins")
+    require_finite({name: getattr(recall, name) for name in ("J", "window", "dt")})
+    require((recall.window > 0.0) & np.all(np.asarray(recall.dt) > 0.0), "its time step or ringing period is not positive")
+    if not np.any(status & ~int(Status.NOT_AT_REST)):
+        measured = {name: getattr(recall, name) for name in ("p_sig", *_MEASURES, "residual_speed")}
+        require_finite(measured)
+    if "readout" not in recall.stages:
+        raise FileFormatError("incomplete file, the stage 'readout' is missing")
+    for name, stage in recall.stages.items():
+        require(title(name), "the name of a stage is not a line of text")
+        _check_stage(name, stage, replicas)
+
+
+def _check_stage(name: str, stage: Sample, replicas: int) -> None:
+    bins, wide = np.shape(stage.pressure)[0], np.shape(stage.pressure)[-1]
+    require(bins > 0 and wide in (1, replicas), f"stage {name!r} has {wide} replicas, must have 1 or {replicas}")
+    if "readout" in name:
+        require((bins, wide) == (BINS, replicas), f"stage {name!r} must have {BINS} bins of {replicas} replicas")

@@ -1,11 +1,17 @@
 """Waveforms as tables of samples: CSV and NPY."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 
-from gmem_jax.experiment.signals import Spline
+from gmem_jax.experiment.signals import Signals, Spline
 from gmem_jax.files.atomic import FileFormatError, atomic
+from gmem_jax.files.checked import json_of, read_npy, refusing
+from gmem_jax.files.configuration import signals_from, written_signals
+
+_LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB
+_TARGET = "# target: "
 
 
 def load_waveforms(path: Path) -> np.ndarray:
@@ -19,15 +25,11 @@ def load_waveforms(path: Path) -> np.ndarray:
             not finite.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
+    with refusing(path, "table of numbers"):
+        if path.stat().st_size > _LARGEST:
+            raise FileFormatError(f"{path}: waveforms in a file of more than {_LARGEST >> 20} MB")
         values = _npy(path) if path.suffix.lower() == ".npy" else _csv(path)
-    except FileFormatError:
-        raise
-    except (ValueError, TypeError, EOFError, UnicodeDecodeError, MemoryError) as error:
-        raise FileFormatError(f"{path}: not a table of numbers ({error})") from error
-    if values.ndim != 2 or values.shape[1] < 2:
+    if values.ndim != 2 or values.shape[0] < 1 or values.shape[1] < 2:
         raise FileFormatError(f"{path}: a waveform needs at least 2 samples; found an array of shape {values.shape}")
     if not np.all(np.isfinite(values)):
         where = np.argwhere(~np.isfinite(values))[0]
@@ -35,21 +37,38 @@ def load_waveforms(path: Path) -> np.ndarray:
     return values
 
 
+def load_target(path: Path) -> Signals | None:
+    """The waveforms whose recall those of a designed file imitate; None for a file that was not designed.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if it has a target that cannot be read.
+    """
+    path = Path(path)
+    with refusing(path, "table of numbers"):
+        with path.open("rb") as file:
+            first = file.readline(_LARGEST)
+        if not first.startswith(_TARGET.encode()):
+            return None
+        return signals_from(json_of(first.decode().removeprefix(_TARGET), "target"))
+
+
 def _npy(path: Path) -> np.ndarray:
-    values = np.load(path, allow_pickle=False)
-    if not np.issubdtype(values.dtype, np.floating) and not np.issubdtype(values.dtype, np.integer):
-        raise FileFormatError(f"{path}: samples must be real numbers, found {values.dtype}")
-    return np.atleast_2d(values.astype(float))
+    with path.open("rb") as file:
+        return np.atleast_2d(read_npy(file, path.stat().st_size, "it").astype(float))
 
 
 def _csv(path: Path) -> np.ndarray:
-    lines = [line for line in path.read_text().splitlines() if line.strip()]
-    first = lines[0].split(",") if lines else []
+    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    if not lines:
+        return np.zeros((0, 0))
+    first = lines[0].split(",")
     numbers = [_is_number(cell) for cell in first]
     if any(numbers) and not all(numbers):
         raise FileFormatError(f"{path}: its first line mixes numbers and words ({lines[0].strip()[:40]!r})")
     names = [] if all(numbers) else [cell.strip().lower() for cell in first]
-    values = np.loadtxt(lines[1:] if names else lines, delimiter=",", ndmin=2).T
+    rows = lines[1:] if names else lines
+    values = np.loadtxt(rows, delimiter=",", ndmin=2).T if rows else np.zeros((0, 0))
     u = (np.arange(values.shape[1]) + 1.0) / (values.shape[1] + 1.0)
     if "u" in names or (len(values) > 1 and np.allclose(values[0], u, atol=1e-6)):
         raise FileFormatError(f"{path}: has a column of u; give the waveforms alone, row k at u = k / (n + 1)")
@@ -64,13 +83,20 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def save_waveforms(path: Path, signals: Spline) -> None:
+def save_waveforms(path: Path, signals: Spline, target: Signals | None = None) -> None:
     """Write waveforms as a CSV that `load_waveforms` and `gmem recall --signals` read: a column for every signal.
+
+    Args:
+        path: the file.
+        signals: the waveforms.
+        target: those whose recall they imitate, kept in a comment that `load_target` reads.
 
     Raises:
         OSError: if the path cannot be written.
     """
     values = np.asarray(signals.nodes)[:, 1:-1].T
     header = ",".join(f"signal_{number + 1}" for number in range(values.shape[1]))
+    if target is not None:
+        header = f"{_TARGET}{json.dumps(written_signals(target))}\n{header}"
     with atomic(path) as temporary:
         np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g")

@@ -2,6 +2,7 @@
 
 import json
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -13,11 +14,25 @@ import numpy as np
 import optax
 from flax import serialization
 
+from gmem_jax.experiment.signals import BINS, LONGEST_WORD
 from gmem_jax.files.atomic import FileFormatError, atomic
+from gmem_jax.files.checked import (
+    Array,
+    fit,
+    is_number,
+    json_of,
+    refusing,
+    require,
+    require_fields,
+    require_finite,
+    whole,
+)
+from gmem_jax.files.seal import BLOCK, seal, sealed
 from gmem_jax.reading.lessons import Examples, Lessons, examples
 from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
 
-SCHEMA = "gmem-classifier/1"
+SCHEMA = "gmem-classifier/2"
+_BEFORE = "gmem-classifier/1"  # the same, without a seal
 STEPS = 250  # to a call from the host: a second or so, and one check of the validation accuracy
 QUICK_CHECK = 4_096  # held-out examples tried after every call
 LAST_CHECK = 65_536  # held-out examples, at most, that must agree before training stops early
@@ -175,7 +190,8 @@ def save(path: Path, training: Training) -> None:
         "parameters": jax.tree.map(np.asarray, training.net.parameters),
     }
     with atomic(path) as temporary:
-        temporary.write_bytes(serialization.msgpack_serialize(content))
+        temporary.write_bytes(bytes(BLOCK) + serialization.msgpack_serialize(content))
+        seal(temporary)
 
 
 def load(path: Path) -> Training:
@@ -186,16 +202,61 @@ def load(path: Path) -> Training:
         FileFormatError: if it is not a complete file of this schema.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        content = serialization.msgpack_restore(path.read_bytes())
-    except ValueError as error:
-        raise FileFormatError(f"{path}: not a readable classifier file (truncated?)") from error
-    found = content.get("schema", "none") if isinstance(content, dict) else "none"
-    if found != SCHEMA:
-        raise FileFormatError(f"{path}: schema is {found!r}, expected {SCHEMA!r}")
-    given = json.loads(content["recipe"])
-    lessons = Lessons(**{**given, "hidden": tuple(given["hidden"])})
-    parameters = jax.tree.map(jnp.asarray, content["parameters"])
-    return Training(Net(parameters, lessons), **content["training"])
+    with refusing(path, "classifier file"), path.open("rb") as file:
+        known = sealed(file, path)
+        if not known:
+            file.seek(0)
+        # Nothing that it unpacks to is larger than the file: it has no compression, and no code.
+        content = serialization.msgpack_restore(file.read())
+        found = content.get("schema", "none") if isinstance(content, dict) else "none"
+        if found != (SCHEMA if known else _BEFORE):
+            raise FileFormatError(f"{path}: schema is {found!r}, expected {SCHEMA!r}")
+        recipe = json_of(content.get("recipe"), "recipe")
+        require_fields(recipe, "recipe", **_RECIPE)
+        require(set(recipe) == set(_RECIPE), "its recipe has fields that lessons have not")
+        lessons = Lessons(**{**recipe, "hidden": tuple(recipe["hidden"])})
+        require_fields(content.get("training"), "training", **_TRAINING)
+        require(set(content["training"]) == set(_TRAINING), "its training has fields that it should not have")
+        net = Net(_parameters(content.get("parameters"), lessons), lessons)
+        if not known:
+            warnings.warn(f"{path}: written before files had checksums: its numbers are plausible, no more", stacklevel=2)
+        return Training(net, **content["training"])
+
+
+def _part(value: Any) -> bool:
+    return is_number(value) and 0.0 <= value <= 1.0
+
+
+_RECIPE: dict[str, Callable[[Any], bool]] = {
+    "bits": lambda value: whole(value) and 1 <= value <= LONGEST_WORD,
+    "hidden": lambda value: isinstance(value, list) and len(value) <= 8 and all(whole(one) and one for one in value),
+    **dict.fromkeys(("shifts", "amplitudes", "draws", "batch"), lambda value: whole(value) and value > 0),
+    **dict.fromkeys(("shift", "amplitude", "noise"), lambda value: is_number(value) and value >= 0.0),
+    "held_out": _part,
+    "rate": lambda value: is_number(value) and value > 0.0,
+}
+_TRAINING: dict[str, Callable[[Any], bool]] = {
+    **dict.fromkeys(("seed", "step", "examples"), whole),
+    "loss": lambda value: isinstance(value, float),  # NaN before the first step
+    "validation": _part,
+    "finished": lambda value: isinstance(value, bool),
+    "seconds": is_number,
+}
+
+
+def _parameters(found: Any, lessons: Lessons) -> dict[str, dict[str, jax.Array]]:
+    """Weights and biases of the net of some lessons.
+
+    Raises:
+        FileFormatError: if they are those of another net, or not finite.
+    """
+    widths = (BINS, *lessons.hidden, lessons.classes)
+    layers = [f"Dense_{number}" for number in range(len(widths) - 1)]
+    require(isinstance(found, dict) and sorted(found) == sorted(layers), "its layers are not those of its recipe")
+    for layer, inputs, outputs in zip(layers, widths[:-1], widths[1:], strict=True):
+        own = found[layer]
+        require(isinstance(own, dict) and all(isinstance(array, np.ndarray) for array in own.values()), "no arrays")
+        fit({"kernel": Array("real", (inputs, outputs)), "bias": Array("real", (outputs,))}, own)
+        require_finite({f"{layer}/{name}": array for name, array in own.items()})
+        require(sorted(own) == ["bias", "kernel"], f"{layer} holds more than weights and biases")
+    return {layer: {name: jnp.asarray(array) for name, array in found[layer].items()} for layer in layers}

@@ -1,0 +1,167 @@
+"""What a file must be before its numbers are used: shapes and kinds of its arrays, fields of its JSON, one-line refusals.
+
+One place for packs, recalls, parts, nets and waveforms.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+
+from gmem_jax.files.atomic import FileFormatError
+
+KINDS = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",)}
+NAME = 200  # characters of what is printed
+_SHOWN = 160  # characters of an error of some library
+
+
+@contextmanager
+def refusing(path: Path, what: str) -> Iterator[None]:
+    """Say in one line, naming the file, what any error in the block means: that it is not a readable `what`.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileFormatError: for every other error.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        yield
+    except FileFormatError as error:
+        said = str(error)
+        raise FileFormatError(said if str(path) in said else f"{path}: {said}") from error
+    except Exception as error:  # a broken file may make a parser stumble in any way
+        said = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())[:_SHOWN]
+        raise FileFormatError(f"{path}: not a readable {what} ({said or type(error).__name__})") from error
+
+
+class Array(NamedTuple):
+    """A declared array.
+
+    Attributes:
+        kind: "real", "whole" or "yes or no".
+        shape: lengths; a name is the same length wherever it stands.
+    """
+
+    kind: str
+    shape: tuple[int | str, ...] = ()
+
+
+def fit(declared: Mapping[str, Array], found: Mapping[str, Any]) -> dict[str, int]:
+    """The lengths that the names in a declaration stand for.
+
+    Args:
+        declared: by name of array.
+        found: what has a shape and a dtype, by name; more than is declared is not looked at.
+
+    Raises:
+        FileFormatError: if an array is missing, or has another shape or kind than declared.
+    """
+    lengths: dict[str, int] = {}
+    for name, (kind, shape) in declared.items():
+        if name not in found:
+            raise FileFormatError(f"incomplete file, {name!r} is missing")
+        own, dtype = tuple(found[name].shape), np.dtype(found[name].dtype)
+        if dtype.name not in KINDS[kind] or not dtype.isnative:
+            raise FileFormatError(f"{name!r} holds {dtype}, must hold {' or '.join(KINDS[kind])}")
+        if len(own) == len(shape):
+            for length, symbol in zip(own, shape, strict=True):
+                if isinstance(symbol, str):
+                    lengths.setdefault(symbol, length)
+        wanted = tuple(lengths.get(symbol, -1) if isinstance(symbol, str) else symbol for symbol in shape)
+        if own != wanted:
+            words = ", ".join(str(symbol) for symbol in shape)
+            known = ", ".join(f"{name} = {length}" for name, length in lengths.items() if name in shape)
+            raise FileFormatError(f"{name!r} has shape {list(own)}, must be [{words}]" + (f" with {known}" * bool(known)))
+    return lengths
+
+
+def require(holds: Any, words: str) -> None:
+    """Refuse what does not hold everywhere.
+
+    Raises:
+        FileFormatError: with these words.
+    """
+    if not np.all(holds):
+        raise FileFormatError(words)
+
+
+def require_finite(arrays: Mapping[str, np.ndarray]) -> None:
+    """Refuse numbers that are none.
+
+    Raises:
+        FileFormatError: naming the first array that holds one.
+    """
+    for name, array in arrays.items():
+        require(np.isfinite(array), f"{name} holds numbers that are not finite")
+
+
+def json_of(text: Any, what: str) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        FileFormatError: if the text is none.
+    """
+    try:
+        value = json.loads(text)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise FileFormatError(f"its {what} is not JSON ({error})") from error
+    require(isinstance(value, dict), f"its {what} is not a JSON object")
+    return dict(value)
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a finite real number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
+
+
+def numbers(value: Any) -> bool:
+    """Whether it is a finite real number or a list of them."""
+    return is_number(value) or (isinstance(value, list) and len(value) > 0 and all(map(is_number, value)))
+
+
+def title(value: Any) -> bool:
+    """Whether it is a short text that can be printed in a line."""
+    return isinstance(value, str) and len(value) <= NAME and value.isprintable()
+
+
+def whole(value: Any) -> bool:
+    """Whether it is a whole number from 0."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 53
+
+
+def require_fields(value: Any, what: str, **wanted: Any) -> None:
+    """Refuse a JSON object in which a field is missing or not what its test accepts.
+
+    Raises:
+        FileFormatError: naming the field.
+    """
+    require(isinstance(value, dict), f"its {what} is not a JSON object")
+    for name, accepts in wanted.items():
+        require(name in value, f"its {what} has no {name!r}")
+        require(accepts(value[name]), f"its {what} has an impossible {name!r}")
+
+
+def read_npy(file: BinaryIO, size: int, name: str) -> np.ndarray:
+    """The array of an .npy file of a known size, which is compared with its header before anything is allocated.
+
+    Raises:
+        FileFormatError: if it holds no plain numbers, or other than `size` bytes in all.
+        ValueError: if its header cannot be read.
+    """
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    require(read is not None, f"{name} has a header of another version")
+    assert read is not None
+    shape, fortran, dtype = read(file)
+    require(dtype.kind in "fiub", f"{name}: samples must be real numbers, found {dtype}")
+    require(len(shape) <= 32 and all(isinstance(length, int) and length >= 0 for length in shape), f"{name}: its shape")
+    declared = math.prod(shape) * dtype.itemsize
+    left = size - file.tell()
+    require(declared == left, f"{name} declares shape {list(shape)}, {declared} bytes; the file holds {left} of them")
+    values = np.frombuffer(file.read(declared), dtype).copy()
+    return values.reshape(shape[::-1]).T if fortran else values.reshape(shape)

@@ -1,0 +1,51 @@
+"""The seal of a file: its first 512 bytes hold the SHA-256 of all that follow, so that no flipped byte passes.
+
+HDF5 calls such bytes a user block, zip archives a prefix: their readers step over them. The seal is checked on the raw
+bytes, before any parser sees them. It tells damage, not forgery: whoever can write a file can seal it.
+"""
+
+import hashlib
+from pathlib import Path
+from typing import BinaryIO
+
+from gmem_jax.files.atomic import FileFormatError
+
+BLOCK = 512  # the smallest user block of HDF5
+_MARK = b"gmem sha256 "
+_PIECE = 1 << 20
+
+
+def _block(file: BinaryIO) -> bytes:
+    """What the first bytes of a file must be, from all others."""
+    file.seek(BLOCK)
+    digest = hashlib.sha256()
+    while piece := file.read(_PIECE):
+        digest.update(piece)
+    return (_MARK + digest.hexdigest().encode() + b"\n").ljust(BLOCK, b"\0")
+
+
+def seal(path: Path) -> None:
+    """Fill in the block of a file whose first 512 bytes were left free.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    with path.open("r+b") as file:
+        block = _block(file)
+        file.seek(0)
+        file.write(block)
+
+
+def sealed(file: BinaryIO, path: Path) -> bool:
+    """Whether a file, open for reading, has a seal, which then fits; False for one that never had any.
+
+    Raises:
+        FileFormatError: if the file was damaged after it was sealed.
+    """
+    file.seek(0)
+    found = file.read(BLOCK)
+    if not found.startswith(_MARK):
+        return False
+    if found != _block(file):
+        raise FileFormatError(f"{path}: damaged, its checksum does not fit its content; restore it, or make it anew")
+    return True

@@ -1,0 +1,147 @@
+"""Whether the numbers of a pack can be those of grains at rest in their box: cheap checks of all that a run relies on.
+
+They take some 0.1 s at N = 10,240. The mass of a grain is not integrated anew; it must fit the filling on record.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gmem_jax.files.checked import is_number, numbers, require, require_fields, require_finite, title, whole
+
+UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
+DEEPEST = 0.5  # R, overlap of spheres at rest; packs are at 0.1, and Hertz's law is long wrong at 0.5
+GRAZING = 1e-9  # R: distances that may round to either side of a limit
+_BALL = 4.0 * np.pi / 3.0
+
+Found = Mapping[str, np.ndarray]
+
+
+def check(found: Found, *, isotropic: bool, record: dict[str, Any]) -> None:
+    """Refuse a pack that is impossible.
+
+    Args:
+        found: the arrays of a pack by their path in its file, of the right shapes.
+        isotropic: what the clump says of itself.
+        record: what was measured at the end of the preparation; may be empty.
+
+    Raises:
+        FileFormatError: saying what is wrong.
+    """
+    require_finite(found)
+    _check_clump(found, isotropic)
+    _check_box(found)
+    spheres = _spheres(found)
+    lower, upper = found["lower"], found["upper"]
+    require((spheres > lower) & (spheres < upper), "a grain lies outside the box")
+    _check_list(found, spheres)
+    first, second = found["pairs/candidates"]
+    overlap = 2.0 - np.linalg.norm(spheres[second] - spheres[first], axis=1)
+    deepest = float(overlap.max(initial=0.0))
+    walls = 1.0 - min(np.min(spheres - lower), np.min(upper - spheres))
+    require(
+        max(deepest, walls) < DEEPEST,
+        f"grains or walls overlap by {max(deepest, walls):.2f} R at rest, must be below {DEEPEST} R: not a pack at rest",
+    )
+    _check_record(found, record, overlap)
+
+
+def _check_clump(found: Found, isotropic: bool) -> None:
+    """Bounds on the mass properties of a union of K unit spheres, whichever it is."""
+    offsets, mass = found["clump/offsets"], float(found["clump/mass"])
+    inertia, diameter = found["clump/inertia"], float(found["clump/diameter"])
+    require(len(offsets) > 0, "its grain has no spheres")
+    extent = 2.0 * (1.0 + np.linalg.norm(offsets, axis=1).max())
+    require(abs(diameter - extent) < UNIT * extent, f"the grain's diameter is {diameter:g}, its spheres say {extent:g}")
+    require(
+        0.999 * _BALL < mass < 1.001 * _BALL * len(offsets), f"the mass {mass:g} is not that of {len(offsets)} spheres"
+    )
+    second = 0.5 * float(inertia.sum())  # the integral of r^2 over the grain
+    least, most = 0.6 * mass * (mass / _BALL) ** (2 / 3), mass * (0.5 * extent) ** 2
+    triangle = 2.0 * inertia <= inertia.sum() * (1.0 + UNIT)
+    require(inertia > 0.0, "a moment of inertia is not positive")
+    require(
+        np.all(triangle) and 0.999 * least < second < most, "the moments of inertia are not those of the grain's mass"
+    )
+    require(not isotropic or np.ptp(inertia) < 1e-3 * inertia.mean(), "the grain is not isotropic as it says")
+
+
+def _check_box(found: Found) -> None:
+    lower, upper, delta0 = found["lower"], found["upper"], float(found["delta0"])
+    require(len(found["position"]) > 0, "it holds no grains")
+    require(lower < upper, "a lower wall of the box is not below the upper one")
+    require(0.0 < delta0 < 0.5, f"delta0 must be in (0, 0.5), got {delta0:g}")
+    require(found["ringing_period"] > 0.0, "its ringing period is not positive")
+    norm = np.linalg.norm(found["quaternion"], axis=1)
+    require(np.abs(norm - 1.0) < UNIT, "a quaternion is not of length 1")
+
+
+def _spheres(found: Found) -> np.ndarray:
+    """Sphere centres, [N K, 3]; `pairs.sphere_centres` without JAX, which would compile it for every N."""
+    w, x, y, z = found["quaternion"].T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    turned = np.einsum("ijn,kj->nki", np.array(rows), found["clump/offsets"])
+    return np.asarray((found["position"][:, None] + turned).reshape(-1, 3))
+
+
+def _check_list(found: Found, spheres: np.ndarray) -> None:
+    """The list of candidates is sorted, in range, and holds every pair in reach, as at the list's own configuration."""
+    listed, reference = found["pairs/candidates"].astype(np.int64), found["pairs/reference"]
+    smallest, reach = found["pairs/smallest"], float(found["pairs/reach"])
+    count, per_grain = len(spheres), len(found["clump/offsets"])
+    lengths = found["upper"] - found["lower"]
+    require(len(reference) == count, f"its list is of {len(reference)} spheres, not {count}")
+    require(2.0 < reach < 4.0, f"the reach of its list must be in (2, 4) R, got {reach:g}")
+    require((smallest > 0.5 * lengths) & (smallest <= lengths * (1.0 + UNIT)), "its list is of another box")
+    require((reference > 0.0) & (reference < 1.0), "its list was made of spheres outside the box")
+    require((listed >= 0) & (listed < count), f"a candidate is none of the {count} spheres")
+    require(listed[0] // per_grain < listed[1] // per_grain, "a candidate pairs a grain with itself, or is out of order")
+    keys = listed[0] * count + listed[1]
+    require(np.diff(keys) > 0, "its candidates are not sorted, or listed twice")
+    moved = float(np.linalg.norm(spheres - found["lower"] - reference * lengths, axis=1).max())
+    require(2.0 * moved < reach - 2.0, f"its list is stale: a sphere has moved by {moved:.2f} R since it was made")
+    mapped = reference * smallest
+    certain = _keys_within(mapped, reach - GRAZING, per_grain)
+    require(np.isin(certain, keys, assume_unique=True), "its list misses spheres that are in reach of each other")
+    apart = np.linalg.norm(mapped[listed[0]] - mapped[listed[1]], axis=1)
+    require(apart < reach + GRAZING, "its list pairs spheres that are out of reach of each other")
+
+
+def _keys_within(centres: np.ndarray, reach: float, per_grain: int) -> np.ndarray:
+    """Pairs i < j of spheres of different grains within reach, as numbers i S + j."""
+    from scipy.spatial import cKDTree  # takes a while to load
+
+    pairs = np.sort(cKDTree(centres).query_pairs(reach, output_type="ndarray"), axis=1)
+    first, second = pairs[pairs[:, 0] // per_grain != pairs[:, 1] // per_grain].T
+    return np.asarray(first * np.int64(len(centres)) + second)
+
+
+def _check_record(found: Found, record: dict[str, Any], overlap: np.ndarray) -> None:
+    """What was measured of the pack when it was made is what its numbers still say."""
+    if recipe := record.get("recipe"):
+        require_fields(recipe, "recipe", seed=whole)
+    if "at_rest" not in record:
+        return
+    triple = {"pressure": numbers, "lengths": numbers}
+    single = dict.fromkeys(("filling", "coordination", "contacts", "largest_speed", "largest_overlap"), is_number)
+    rest = record["at_rest"]
+    require_fields(rest, "record", **triple, **single)
+    require(all(np.shape(rest[name]) == (3,) for name in triple), "its record does not name three pressures and lengths")
+    require(title(record.get("grain", "")), "its record names no grain")
+    lengths, grains = found["upper"] - found["lower"], len(found["position"])
+    filling = grains * float(found["clump/mass"]) / float(lengths.prod())
+    touching = overlap > 0.0
+    grazing = int(np.sum(np.abs(overlap) < GRAZING))
+    same = {
+        "box": np.allclose(rest["lengths"], lengths, rtol=UNIT, atol=0.0),
+        "filling": np.isclose(rest["filling"], filling, rtol=UNIT, atol=0.0),
+        "largest overlap": np.isclose(rest["largest_overlap"], overlap.max(initial=-1.0), rtol=0.0, atol=GRAZING),
+        "contacts": abs(0.5 * rest["contacts"] * grains - int(touching.sum())) < grazing + 0.5,
+    }
+    other = [name for name, holds in same.items() if not holds]
+    require(not other, f"the {' and '.join(other)} on record are not those of its grains: they have been changed since")
