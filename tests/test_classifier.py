@@ -199,7 +199,7 @@ def test_broken_and_foreign_files_are_refused(small: classify.Training, tmp_path
     classify.save(file, small)
     whole = file.read_bytes()
     for content, words_said in (
-        (whole[:5000], "not a readable"),
+        (whole[:5000], "its checksum does not fit"),
         (b"", "not a readable"),
         (b"\x01", "schema is 'none'"),
     ):

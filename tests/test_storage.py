@@ -5,13 +5,13 @@ import sys
 from collections import OrderedDict
 from pathlib import Path
 
-import h5py
 import jax
 import numpy as np
 import pytest
 
 import gmem_jax as gm
 from gmem_jax.files.atomic import atomic
+from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.parts import Parts, load_part, locked, save_part
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.state import Grains, State
@@ -33,34 +33,26 @@ def test_a_pack_survives_the_file_bit_for_bit(tmp_path: Path) -> None:
 
 def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
     broken = tmp_path / "broken.h5"
-    broken.write_bytes(PACK.read_bytes()[:3000])
-    with pytest.raises(gm.FileFormatError, match="not a readable HDF5 file"):
-        gm.load_pack(broken)
+    for length, words in ((3000, "its checksum does not fit"), (300, "its checksum"), (5, "not a readable HDF5 file")):
+        broken.write_bytes(PACK.read_bytes()[:length])
+        with pytest.raises(gm.FileFormatError, match=words):
+            gm.load_pack(broken)
 
 
 def test_another_schema_is_refused_and_named(tmp_path: Path) -> None:
     other = tmp_path / "other.h5"
-    with h5py.File(other, "w") as file:
-        file.attrs["schema"] = "gmem-pack/99"
-    with pytest.raises(gm.FileFormatError, match="'gmem-pack/99', expected 'gmem-pack/1'"):
+    with writing(other, "gmem-pack/99"):
+        pass
+    with pytest.raises(gm.FileFormatError, match="'gmem-pack/99', expected 'gmem-pack/2'"):
         gm.load_pack(other)
 
 
 def test_a_file_without_its_data_is_refused(tmp_path: Path) -> None:
     empty = tmp_path / "empty.h5"
-    with h5py.File(empty, "w") as file:
-        file.attrs["schema"] = "gmem-pack/1"
+    with writing(empty, "gmem-pack/2"):
+        pass
     with pytest.raises(gm.FileFormatError, match="incomplete"):
         gm.load_pack(empty)
-
-
-def test_a_pack_with_numbers_that_are_not_finite_is_refused(tmp_path: Path) -> None:
-    bad = tmp_path / "bad.h5"
-    bad.write_bytes(PACK.read_bytes())
-    with h5py.File(bad, "a") as file:
-        file["position"][0, 0] = np.nan
-    with pytest.raises(gm.FileFormatError, match="position"):
-        gm.load_pack(bad)
 
 
 def test_an_unknown_pack_name_lists_the_shipped_ones() -> None:
@@ -132,8 +124,8 @@ def test_parts_of_another_run_are_refused(tmp_path: Path) -> None:
     assert Parts(tmp_path / "parts", {"seed": 1, "pack": "a"}, restart=True).finished() == 0
 
 
-def test_a_part_is_a_table_of_arrays_with_a_checksum(tmp_path: Path) -> None:
-    """What cannot be told from its bytes alone is refused: no code, no damage."""
+def test_a_part_is_a_table_of_arrays(tmp_path: Path) -> None:
+    """What cannot be told from its bytes alone is refused: no code."""
     state = State(Grains(*(np.full((2, 3, 1), float(k)) for k in range(6))), (np.ones(4), ()), np.zeros(1, np.int32))
     tree = (OrderedDict(rest=state, compress=state), np.arange(3))
     save_part(tmp_path / "part.npz", tree)
@@ -142,23 +134,6 @@ def test_a_part_is_a_table_of_arrays_with_a_checksum(tmp_path: Path) -> None:
     assert list(found[0]) == ["rest", "compress"]
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
         np.testing.assert_array_equal(one, other)
-    whole = (tmp_path / "part.npz").read_bytes()
-    for place in range(0, len(whole), 97):
-        damaged = bytearray(whole)
-        damaged[place] ^= 0x10
-        (tmp_path / "bad.npz").write_bytes(bytes(damaged))
-        try:
-            again = load_part(tmp_path / "bad.npz")
-        except gm.FileFormatError:
-            continue
-        # What the archive says of times and permissions may change; the numbers may not.
-        for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(tree), strict=True):
-            np.testing.assert_array_equal(one, other)
-    with np.load(tmp_path / "part.npz") as file:
-        arrays = dict(file)
-    np.savez(tmp_path / "bad.npz", **{**arrays, "array_000": arrays["array_000"] + 1.0})  # an archive without a flaw
-    with pytest.raises(gm.FileFormatError, match="its checksum does not fit"):
-        load_part(tmp_path / "bad.npz")
     with pytest.raises(TypeError, match="cannot be kept"):
         save_part(tmp_path / "part.npz", {"function": print})
 
@@ -177,14 +152,13 @@ def test_an_output_belongs_to_one_run_at_a_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("0,1\n1\n", "not a table"),
+        ("0,1\n1\n", "not a readable table"),
         ("0.5\n", "at least 2 samples"),
         ("0\nnan\n1\n", "sample 2 of signal 1 is not a finite"),
         ("", "at least 2 samples"),
-        ("a\nb\nc\n", "not a table"),
+        ("a\nb\nc\n", "not a readable table"),
     ],
 )
-@pytest.mark.filterwarnings("ignore:loadtxt. input contained no data")
 def test_a_bad_waveform_file_is_refused(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "bad.csv").write_text(text)
     with pytest.raises(gm.FileFormatError, match=words):

@@ -17,8 +17,8 @@ from rich.console import Console
 from gmem_jax.experiment.host import Progress
 from gmem_jax.files.atomic import probe
 
-log = Console(stderr=True, highlight=False)
-out = Console(highlight=False)
+log = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
+out = Console(highlight=False, markup=False)
 
 COST = {
     "native": (0.2, 0.08),

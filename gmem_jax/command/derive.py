@@ -237,7 +237,7 @@ def design_command(
     with resumable(output, key_of_run(experiment, iterations=iterations, gain=gain), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             found = design_waveforms(experiment, iterations=iterations, gain=gain, keep=parts, progress=progress)
-        save_waveforms(output, found.signals)
+        save_waveforms(output, found.signals, experiment.signals)
     if drawn:
         figures.design_figure(drawn, found, float(experiment.scale), pack)
         figures.history_figure(history, {pack: found.history})

@@ -12,8 +12,9 @@ import typer
 from gmem_jax.command.console import InputError, claim
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.signals import LONGEST_WORD, Signals, six_signals, waveform, words
+from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.packs import load_pack
-from gmem_jax.files.waveforms import load_waveforms
+from gmem_jax.files.waveforms import load_target, load_waveforms
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.laws import LAWS, law_named
 
@@ -90,6 +91,18 @@ class Chosen:
         claim(output, suffix, inputs=inputs, force=force)
         drawn = claim(output.with_suffix(".png"), ".png", inputs=inputs, force=force) if picture else None
         return experiments, drawn
+
+    def target(self, count: int) -> Signals | None:
+        """The waveforms that the `count` chosen ones were designed to be recalled as; None if they were not designed.
+
+        Raises:
+            FileFormatError: if their file has another target.
+        """
+        name = self._values["signals"]
+        target = load_target(Path(name)) if Path(name).suffix.lower() == ".csv" else None
+        if target is not None and target.count != count:
+            raise FileFormatError(f"{name}: its target has {target.count} signals, must have {count}")
+        return target
 
     def experiment(self, pack: str) -> Experiment:
         """The experiment on a pack file, or a shipped pack.

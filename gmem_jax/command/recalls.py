@@ -27,8 +27,8 @@ from gmem_jax.command.resuming import Restart, folder_of, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import default_batch, replica_bins, run, run_bytes
-from gmem_jax.experiment.signals import six_signals
-from gmem_jax.files.configuration import key_of_run, resolved
+from gmem_jax.experiment.signals import Signals, six_signals
+from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.packs import PACK_SCHEMA, list_packs, load_pack
 from gmem_jax.files.parts import Parts
@@ -38,11 +38,18 @@ from gmem_jax.show import figures, tables
 
 
 def _run(
-    experiment: Experiment, data: Path, picture: Path | None, batch: int | None = None, *, restart: bool = False
+    experiment: Experiment,
+    data: Path,
+    picture: Path | None,
+    batch: int | None = None,
+    *,
+    restart: bool = False,
+    target: Signals | None = None,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
     began = time.perf_counter()
-    batch = batch or (None if restart else Parts.key_of(folder_of(data)).get("batch"))
+    kept = None if restart else Parts.key_of(folder_of(data)).get("batch")
+    batch = batch or (kept if isinstance(kept, int) and kept > 0 else None)
     batch = batch or default_batch(experiment, psutil.virtual_memory().available)
     work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
     backend = native.name(experiment.backend, experiment.friction)
@@ -53,6 +60,8 @@ def _run(
         with reporting(goes_on=True) as progress:
             recall = jax.block_until_ready(run(experiment, batch=batch, keep=parts, progress=progress))
         configuration = resolved(experiment, time.perf_counter() - began)
+        if target is not None:
+            configuration["target"] = written_signals(target)
         save_recall(data, recall, configuration)
     if picture is not None:
         figures.recall_figure(picture, recall, experiment.scale, configuration["pack"])
@@ -66,6 +75,7 @@ def _run(
 def _tables(row: dict[str, Any], configuration: dict[str, Any]) -> list[Any]:
     """What to print of one recall."""
     more = [tables.backgrounds_table(row), tables.second_readout_lines(row)] if "backgrounds" in row else []
+    more += [tables.target_line(row)] if "target_fidelity" in row else []
     return [tables.recall_table([row], configuration), *more]
 
 
@@ -84,7 +94,8 @@ def recall_command(
 ) -> None:
     """Store waveforms in a pack and recall them."""
     (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
-    row, configuration = _run(experiment, output, drawn, batch, restart=restart)
+    target = chosen.target(experiment.signals.count)
+    row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target)
     emit(as_json, row, *_tables(row, configuration))
 
 

@@ -1,4 +1,4 @@
-"""What a file must be before its numbers are used: shapes and kinds of its arrays, fields of its JSON, one-line refusals.
+"""What a file must be before its numbers are used: shapes and kinds of arrays, fields of JSON, refusals in one line.
 
 One place for packs, recalls, parts, nets and waveforms.
 """
@@ -76,7 +76,9 @@ def fit(declared: Mapping[str, Array], found: Mapping[str, Any]) -> dict[str, in
         if own != wanted:
             words = ", ".join(str(symbol) for symbol in shape)
             known = ", ".join(f"{name} = {length}" for name, length in lengths.items() if name in shape)
-            raise FileFormatError(f"{name!r} has shape {list(own)}, must be [{words}]" + (f" with {known}" * bool(known)))
+            raise FileFormatError(
+                f"{name!r} has shape {list(own)}, must be [{words}]" + (f" with {known}" * bool(known))
+            )
     return lengths
 
 

@@ -67,7 +67,7 @@ class Content(tree.Tree):
         Raises:
             FileFormatError: if it is incomplete, or shapes do not fit each other.
         """
-        orders = {
+        orders: dict[str, Any] = {
             path.removeprefix(f"{group}/"): own.get("order")
             for path, own in self.attributes.items()
             if path.startswith(f"{group}/")
@@ -75,9 +75,10 @@ class Content(tree.Tree):
         if not all(isinstance(order, np.integer) for order in orders.values()):
             raise FileFormatError(f"incomplete file, the stages of {group!r} have no order")
         stages = OrderedDict()
-        for stage in sorted(orders, key=lambda name: int(orders[name])):  # type: ignore[call-overload]
+        for stage in sorted(orders, key=orders.__getitem__):
             found = self.arrays({f"{group}/{stage}/{name}": Array("real", shape) for name, shape in _SAMPLE.items()})
-            stages[stage] = Sample(**{name: found[f"{group}/{stage}/{name}"] for name in _SAMPLE})
+            own: Any = {name: found[f"{group}/{stage}/{name}"] for name in _SAMPLE}
+            stages[stage] = Sample(**own)
         return stages
 
 

@@ -90,7 +90,9 @@ def load_pack(source: str | Path) -> Pack:
             found = content.arrays(_DECLARED)
             label, record, shape = content.text("name"), content.text("record"), content.text("shape", "clump")
             isotropic = content.attributes["clump"].get("isotropic")
-        require(isinstance(isotropic, np.bool_), "incomplete file, attribute 'isotropic' is missing or not a truth value")
+        require(
+            isinstance(isotropic, np.bool_), "incomplete file, attribute 'isotropic' is missing or not a truth value"
+        )
         require(title(label) and title(shape), "its name or that of its grain is not a short line of text")
         soundness.check(found, isotropic=bool(isotropic), record=json_of(record, "record"))
         clump = Clump(

@@ -103,6 +103,7 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
     require(isinstance(experiment, dict), "its configuration has an impossible 'experiment'")
     if "target" in configuration:
         require_fields(configuration["target"], "target", kind=title)
+        signals_from(configuration["target"])
 
 
 def _check(recall: Recall) -> None:
@@ -112,7 +113,9 @@ def _check(recall: Recall) -> None:
     require((status >= 0) & (status & ~_EVERY_BIT == 0), "its status is none that there is")
     require(np.abs(np.asarray(recall.u) - (np.arange(BINS) + 0.5) / BINS) < 1e-12, "its u are not the centres of bins")
     require_finite({name: getattr(recall, name) for name in ("J", "window", "dt")})
-    require((recall.window > 0.0) & np.all(np.asarray(recall.dt) > 0.0), "its time step or ringing period is not positive")
+    require(
+        (recall.window > 0.0) & np.all(np.asarray(recall.dt) > 0.0), "its time step or ringing period is not positive"
+    )
     if not np.any(status & ~int(Status.NOT_AT_REST)):
         measured = {name: getattr(recall, name) for name in ("p_sig", *_MEASURES, "residual_speed")}
         require_finite(measured)

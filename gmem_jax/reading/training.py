@@ -204,8 +204,7 @@ def load(path: Path) -> Training:
     path = Path(path)
     with refusing(path, "classifier file"), path.open("rb") as file:
         known = sealed(file, path)
-        if not known:
-            file.seek(0)
+        file.seek(BLOCK if known else 0)
         # Nothing that it unpacks to is larger than the file: it has no compression, and no code.
         content = serialization.msgpack_restore(file.read())
         found = content.get("schema", "none") if isinstance(content, dict) else "none"
@@ -219,7 +218,9 @@ def load(path: Path) -> Training:
         require(set(content["training"]) == set(_TRAINING), "its training has fields that it should not have")
         net = Net(_parameters(content.get("parameters"), lessons), lessons)
         if not known:
-            warnings.warn(f"{path}: written before files had checksums: its numbers are plausible, no more", stacklevel=2)
+            warnings.warn(
+                f"{path}: written before files had checksums: its numbers are plausible, no more", stacklevel=2
+            )
         return Training(net, **content["training"])
 
 

@@ -5,6 +5,7 @@ import math
 from importlib import resources
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
@@ -13,6 +14,8 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.signals import bin_average
+from gmem_jax.files.configuration import signals_from
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain
 
@@ -58,7 +61,31 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
         "status_text": explain(status),
         **second_readout(recall, configuration),
+        **of_target(recall, configuration),
     }
+
+
+def _scale(configuration: dict[str, Any]) -> jax.Array:
+    """E delta0 gamma0; scalar, or [S, 1] where it differs between signals."""
+    numbers = np.multiply(configuration["delta0"], configuration["gamma0"])
+    return jnp.asarray(numbers if np.ndim(numbers) == 0 else numbers[1:, None])
+
+
+def of_target(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
+    """Gain and fidelity with respect to the J that the waveforms were designed for; {} for waveforms that were not."""
+    if "target" not in configuration:
+        return {}
+    wanted = bin_average(signals_from(configuration["target"]))
+    match = analysis.compare(jnp.asarray(recall.p_sig), wanted, _scale(configuration))
+    return {"target_gain": float(match.gain), "target_fidelity": float(match.fidelity)}
+
+
+def target_line(row: dict[str, Any]) -> str:
+    """The same in words, from such a `summary`."""
+    return (
+        f"designed waveforms: G = {row['target_gain']:.3f}, F = {row['target_fidelity']:.4f} with respect to the\n"
+        "target of their design; the table compares with the J of the waveforms themselves"
+    )
 
 
 def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
@@ -70,8 +97,7 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
     if "readout-2" not in recall.stages:
         return {}
     first, second = (analysis.recalled(recall.stages[name].pressure) for name in ("readout", "readout-2"))
-    numbers = np.multiply(configuration["delta0"], configuration["gamma0"])
-    scale = jnp.asarray(numbers if np.ndim(numbers) == 0 else numbers[1:, None])
+    scale = _scale(configuration)
     matches = analysis.backgrounds(first, second, recall.J, scale)
     rows = {name: {"gain": float(match.gain), "fidelity": float(match.fidelity)} for name, match in matches.items()}
     correlation, left = (spread(values) for values in analysis.remembered_after(second, recall.J, scale))

@@ -158,8 +158,8 @@ def bad_files(folder: Path) -> dict[str, Path]:
     """Files with one thing wrong each."""
     files = {name: folder / name for name in ("truncated.h5", "schema.h5", "nan.csv", "ragged.csv", "short.csv")}
     files["truncated.h5"].write_bytes(PACK.read_bytes()[:2000])
-    with h5py.File(files["schema.h5"], "w") as file:
-        file.attrs["schema"] = "gmem-pack/99"
+    with writing(files["schema.h5"], "gmem-pack/99"):
+        pass
     files["nan.csv"].write_text("0\nnan\n0\n")
     files["ragged.csv"].write_text("0,1\n1\n")
     files["short.csv"].write_text("1\n")
@@ -179,11 +179,11 @@ BAD = [
     (["recall", "{pack}", "--dt", "0.7", "-o", "{out}"], "dt must be in (0, 0.5], got 0.7"),
     (["recall", "{pack}", "--signals", "seven", "-o", "{out}"], "--signals"),
     (["recall", "{pack}", "--signals", "{nan.csv}", "-o", "{out}"], "sample 2 of signal 1 is not a finite number"),
-    (["recall", "{pack}", "--signals", "{ragged.csv}", "-o", "{out}"], "not a table of numbers"),
+    (["recall", "{pack}", "--signals", "{ragged.csv}", "-o", "{out}"], "not a readable table of numbers"),
     (["recall", "{pack}", "--signals", "{short.csv}", "-o", "{out}"], "at least 2 samples"),
     (["recall", "{pack}", "--friction", "glue", "-o", "{out}"], "friction must be one of frictionless, hooke, m1, m2"),
-    (["recall", "{truncated.h5}", "-o", "{out}"], "not a readable HDF5 file"),
-    (["recall", "{schema.h5}", "-o", "{out}"], "schema is 'gmem-pack/99', expected 'gmem-pack/1'"),
+    (["recall", "{truncated.h5}", "-o", "{out}"], "its checksum does not fit its content"),
+    (["recall", "{schema.h5}", "-o", "{out}"], "schema is 'gmem-pack/99', expected 'gmem-pack/2'"),
     (["recall", "no-such-pack", "-o", "{out}"], "neither a file nor a shipped pack"),
     (["recall", "{pack}", "-o", "/proc/recall.h5"], "cannot write there"),
     (["demo", "--packs", "tetra-7"], "no such shipped pack"),
@@ -193,8 +193,8 @@ BAD = [
         "--signals words:13: words need a length from 1 to 12",
     ),
     (["recall", "{pack}", "--signals", "words", "-o", "{out}"], "words need a length from 1 to 12, as in words:3"),
-    (["classify", "{pack}", "-o", "{json}"], "schema is 'gmem-pack/1', expected 'gmem-recall/1'"),
-    (["classify", "{truncated.h5}", "-o", "{json}"], "not a readable HDF5 file"),
+    (["classify", "{pack}", "-o", "{json}"], "schema is 'gmem-pack/2', expected 'gmem-recall/2'"),
+    (["classify", "{truncated.h5}", "-o", "{json}"], "its checksum does not fit its content"),
     (["classify", "nothing.h5", "-o", "{json}"], "nothing.h5: no such file"),
     (["classify", "nothing.h5", "--seeds", "0", "-o", "{out}"], "'--seeds'"),
     (["sing"], "No such command"),
@@ -228,10 +228,10 @@ def test_bad_input_gets_one_clear_line_exit_code_2_and_leaves_nothing(
 def test_a_run_that_breaks_down_exits_with_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
-    broken = gm.load_pack(PACK)
-    position = np.asarray(broken.position).copy()
-    position[0, 0] = float(broken.upper[0]) + 0.5  # a grain outside the box
-    gm.save_pack(tmp_path / "broken.h5", gm.pack_from(broken, position=position, quaternion=broken.quaternion))
-    assert gmem(monkeypatch, "recall", tmp_path / "broken.h5", "-o", tmp_path / "out.h5", *SHORT) == 1
+    def outside(*_: Any, **__: Any) -> None:
+        raise gm.RunFailedError("a grain left the box")
+
+    monkeypatch.setattr(recalls, "run", outside)
+    assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "out.h5", *SHORT) == 1
     assert "the run failed" in capsys.readouterr().err
     assert not (tmp_path / "out.h5").exists()
