@@ -24,6 +24,7 @@ COST = {
     "native": (0.2, 0.08),
     "jax": (2.0, 1.3),
 }  # us a grain-step on two cores, one replica and several; see benchmarks
+LONGEST = 3e9  # seconds, a century: what is longer was not meant
 EVERY = 30.0  # seconds between lines of progress where there is no terminal
 
 Output = Annotated[Path, typer.Option("-o", "--output", help="File to write.")]
@@ -109,6 +110,9 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
     """
     free = psutil.virtual_memory().available
     seconds = 1e-6 * COST[backend][replicas > 1] * grain_steps
+    if not seconds < LONGEST:
+        years = seconds / 3.15e7
+        raise InputError(f"{what} would take {years:.0e} years; choose a larger dt, a smaller t0 or fewer grains")
     units = (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0), ("seconds", 1.0))
     name, unit = next(pair for pair in units if seconds >= 2.0 * pair[1] or pair[1] == 1.0)
     needs = f"some {max(1, round(seconds / unit))} {name} on a free machine and {_bytes(memory)} of memory"

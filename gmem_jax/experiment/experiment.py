@@ -25,6 +25,7 @@ from gmem_jax.physics.step import System, start
 
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
+MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
 LARGEST_STEP = 0.5  # t_c; the stiffest mode has a period near 10 t_c
 BACKENDS = ("auto", "jax", "native")
 AFTER_PREFIX = ("signals", "gamma0")  # fields that the shear-free prefix does not depend on
@@ -116,7 +117,12 @@ class Experiment:
                 "t0 is traced, and the number of steps must not depend on it: give steps, or use gm.replace, which "
                 "keeps those of the experiment"
             )
-        return max(1, math.ceil(float(np.max(self.t0)) / (BINS * self.dt) * (1.0 - 1e-12)))
+        fewest = float(np.max(self.t0)) / BINS / self.dt * (1.0 - 1e-12)
+        if not fewest < MOST_STEPS:
+            raise ValueError(
+                f"dt = {self.dt:g} makes {fewest:g} steps in a bin of t0 / 256, must be below {MOST_STEPS:g}"
+            )
+        return max(1, math.ceil(fewest))
 
     def _check_shapes(self) -> None:
         for name in ("signals", "friction"):

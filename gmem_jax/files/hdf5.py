@@ -26,7 +26,7 @@ from gmem_jax.files.seal import BLOCK, seal, sealed
 from gmem_jax.physics.sample import Sample
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_PATIENCE = 60.0  # seconds that copying an old file may take
+_PATIENCE, _PACE = 5.0, 2e7  # seconds, and bytes a second, that copying an old file may take
 _SAMPLE = {  # what a stage records, by bins and replicas
     entry.name: ("bins", 3, "replicas") if entry.name in ("pressure", "lengths") else ("bins", "replicas")
     for entry in fields(Sample)
@@ -126,10 +126,11 @@ def _resealed(path: Path, raw: BinaryIO, copied: Path) -> Path:
     if raw.read(len(_SIGNATURE)) != _SIGNATURE:
         raise FileFormatError(f"{path}: not a readable HDF5 file (truncated?)")
     command = [sys.executable, "-I", tree.__file__, str(path.absolute()), str(copied)]
+    patience = _PATIENCE + path.stat().st_size / _PACE
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=patience)
     except subprocess.TimeoutExpired:
-        raise FileFormatError(f"{path}: not a readable HDF5 file (reading it takes longer than a minute)") from None
+        raise FileFormatError(f"{path}: not a readable HDF5 file (libhdf5 went on for {patience:.0f} s)") from None
     if done.returncode:
         said = done.stderr.strip().rpartition("\n")[2][:160] if done.returncode == 2 else "libhdf5 broke down"
         raise FileFormatError(f"{path}: not a readable HDF5 file (truncated?): {said}")

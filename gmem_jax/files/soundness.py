@@ -13,6 +13,7 @@ from gmem_jax.files.checked import is_number, numbers, require, require_fields, 
 UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
 DEEPEST = 0.5  # R, overlap of spheres at rest; packs are at 0.1, and Hertz's law is long wrong at 0.5
 GRAZING = 1e-9  # R: distances that may round to either side of a limit
+LOOSEST, DENSEST = 0.1, 0.85  # filling; packs are at 0.68, one squeezed to 0.9 would have 0.93
 WIDEST = 1e5  # R, of a box
 MOST = 256  # spheres of a grain
 _BALL = 4.0 * np.pi / 3.0
@@ -77,8 +78,17 @@ def _check_box(found: Found) -> None:
     require(0.0 < delta0 < 0.5, f"delta0 must be in (0, 0.5), got {delta0:g}")
     require(found["ringing_period"] > 0.0, "its ringing period is not positive")
     require(upper - lower < WIDEST, f"a box wider than {WIDEST:g} R is none of a pack at rest")
+    filling = _filling(found)
+    require(
+        LOOSEST < filling < DENSEST,
+        f"grains fill {filling:.3g} of the box, must be between {LOOSEST} and {DENSEST}: this is no pack at rest",
+    )
     norm = np.linalg.norm(found["quaternion"], axis=1)
     require(np.abs(norm - 1.0) < UNIT, "a quaternion is not of length 1")
+
+
+def _filling(found: Found) -> float:
+    return len(found["position"]) * float(found["clump/mass"]) / float(np.prod(found["upper"] - found["lower"]))
 
 
 def _spheres(found: Found) -> np.ndarray:
@@ -161,12 +171,11 @@ def _check_record(found: Found, record: dict[str, Any], overlap: np.ndarray) -> 
     )
     require(title(record.get("grain", "")), "its record names no grain")
     lengths, grains = found["upper"] - found["lower"], len(found["position"])
-    filling = grains * float(found["clump/mass"]) / float(lengths.prod())
     touching = overlap > 0.0
     grazing = int(np.sum(np.abs(overlap) < GRAZING))
     same = {
         "box": np.allclose(rest["lengths"], lengths, rtol=UNIT, atol=0.0),
-        "filling": np.isclose(rest["filling"], filling, rtol=UNIT, atol=0.0),
+        "filling": np.isclose(rest["filling"], _filling(found), rtol=UNIT, atol=0.0),
         "largest overlap": np.isclose(rest["largest_overlap"], overlap.max(initial=-1.0), rtol=0.0, atol=GRAZING),
         "contacts": abs(0.5 * rest["contacts"] * grains - int(touching.sum())) < grazing + 0.5,
     }

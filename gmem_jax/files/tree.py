@@ -7,6 +7,8 @@ Run as a program it copies OLD to NEW: files from before there were checksums ar
 do no harm. So this module imports nothing of the package.
 """
 
+import contextlib
+import os
 import sys
 from typing import Any
 
@@ -99,8 +101,18 @@ def copy(old: str, new: str) -> None:
             target.create_dataset(path, data=np.asarray(dataset[()]))
 
 
+def _limit(path: str) -> None:
+    """Take little memory, whatever a file declares; where there are no limits, as on Windows, there is none."""
+    with contextlib.suppress(ImportError):
+        import resource
+
+        most = (2 << 30) + 4 * os.path.getsize(path)
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
 if __name__ == "__main__":
     try:
+        _limit(sys.argv[1])
         copy(*sys.argv[1:])
     except Exception as error:  # whatever it is, it is said in one line to the process that asked
         print(" ".join(str(error).split()), file=sys.stderr)

@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import h5py
 import jax
@@ -11,6 +12,8 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.command import app as cli
+from gmem_jax.command import recalls
+from gmem_jax.files.hdf5 import writing
 
 PACK = Path(__file__).parent.parent / "data" / "tetra-27.h5"
 SHORT = ["--t0", "75", "--store", "0.1", "--rest", "0.1", "--hold", "0.1"]

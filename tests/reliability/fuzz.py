@@ -141,7 +141,9 @@ _JSON = st.one_of(
 _H5 = st.one_of(
     st.tuples(st.just("delete"), _PLACE),
     st.tuples(st.just("swap"), _PLACE, _PLACE),
-    st.tuples(st.just("dtype"), _PLACE, st.sampled_from(["f4", "i8", "c16", "S8", "?", ">f8", "u1", "f2", "i4", "str"])),
+    st.tuples(
+        st.just("dtype"), _PLACE, st.sampled_from(["f4", "i8", "c16", "S8", "?", ">f8", "u1", "f2", "i4", "str"])
+    ),
     st.tuples(st.just("shape"), _PLACE, st.integers(0, 5)),
     st.tuples(st.just("value"), _PLACE, _PLACE, _NASTY),
     st.tuples(st.just("scale"), _PLACE, st.sampled_from([0.9, 1.1, 10.0, -1.0, 0.0, 1.0 + 1e-6])),
@@ -341,18 +343,53 @@ def _load_waves(path: Path) -> Any:
 
 _WORDS = st.one_of(
     st.sampled_from(
-        ["nan", "inf", "-inf", "-1", "0", "1", "2", "0.5", "1e308", "-1e308", "1e-320", "9" * 400, "0x10", "1_0", "１２"]
+        [
+            "nan",
+            "inf",
+            "-inf",
+            "-1",
+            "0",
+            "1",
+            "2",
+            "0.5",
+            "1e308",
+            "-1e308",
+            "1e-320",
+            "9" * 400,
+            "0x10",
+            "1_0",
+            "\uff11\uff12",
+        ]
     ),
-    st.sampled_from(["", " ", "-", "--", "---", "=", "null", "None", "True", "\x00", "\ud800", "[/x]", "%s", "{0}", "é"]),
-    st.sampled_from(["six", "words:0", "words:3", "words:99999", "words:", "hooke", "M2", "m1", "frictionless", "sub2"]),
+    st.sampled_from(
+        ["", " ", "-", "--", "---", "=", "null", "None", "True", "\x00", "\ud800", "[/x]", "%s", "{0}", "é"]
+    ),
+    st.sampled_from(
+        ["six", "words:0", "words:3", "words:99999", "words:", "hooke", "M2", "m1", "frictionless", "sub2"]
+    ),
     st.sampled_from(["pack.h5", "recall.h5", "old-pack.h5", "part.npz", "net.msgpack", "waves.csv", "waves.npy"]),
     st.sampled_from(["folder", "pipe.h5", "pipe.csv", ".", "..", "/", "/dev/null", "/dev/zero", "nowhere/x.h5"]),
-    st.sampled_from(["tetra-325-a", "tetra-325-a,tetra-325-b", ",", "out.h5", "out.json", "out.csv", "x" * 300 + ".h5"]),
+    st.sampled_from(
+        ["tetra-325-a", "tetra-325-a,tetra-325-b", ",", "out.h5", "out.json", "out.csv", "x" * 300 + ".h5"]
+    ),
     st.sampled_from(["mu=0.5:2", "mu=2:1", "mu=nan:1", "gamma0=1:2", "=:", "1,8", "1,x", "H,M1", "--help", "--json"]),
     st.text(max_size=6),
 )
-_COMMANDS: dict[str, list[str]] = {
-    name: sorted(option for entry in command.params for option in entry.opts if option.startswith("-"))
+_NUMBERS = st.one_of(_NASTY.map(repr), st.floats().map(repr), st.integers().map(str), st.floats(0.0, 1.0).map(str))
+_COUNTS = st.one_of(st.integers(-2, 40).map(str), st.integers().map(str), st.sampled_from(["1e3", "9" * 30, "-0"]))
+_VALUES = {"float": _NUMBERS, "int": _COUNTS, "bool": st.just("")}
+
+
+def _kind_of(entry: Any) -> str:
+    """What values an option takes: the word of `_VALUES` that its type names first."""
+    said = str(getattr(getattr(entry, "type_descriptor", None), "annotation", ""))
+    return next((kind for kind in _VALUES if kind in said), "text")
+
+
+_COMMANDS: dict[str, list[tuple[str, str]]] = {  # options and the kind of their value
+    name: sorted(
+        (option, _kind_of(entry)) for entry in command.params for option in entry.opts if option.startswith("-")
+    )
     for name, command in app.typer.main.get_command(app.app).commands.items()  # type: ignore[attr-defined]
 }
 _FIRST = {"recall": "pack.h5", "show": "recall.h5", "classify": "recall.h5", "prepare": "-o"}
@@ -365,9 +402,10 @@ def _lines(draw: st.DrawFn) -> Case:
     line = [command] if command else []
     if draw(st.integers(0, 3)):
         line += [_FIRST.get(command, "pack.h5")] if command not in ("info", "demo", "bench", "prepare") else []
-    for option in draw(st.lists(st.sampled_from(_COMMANDS.get(command, ["--mu", "-o"])), max_size=3)):
-        line += [option, draw(_WORDS)] if draw(st.integers(0, 7)) else [option]
-    line += draw(st.lists(_WORDS, max_size=1))
+    for option, kind in draw(st.lists(st.sampled_from(_COMMANDS.get(command, [("--mu", "float")])), max_size=4)):
+        value = draw(_VALUES.get(kind, _WORDS) if draw(st.integers(0, 7)) else _WORDS)
+        line += [option, value] if value else [option]
+    line += [draw(_WORDS)] if not draw(st.integers(0, 5)) else []
     return tuple(line)
 
 
@@ -446,7 +484,13 @@ def _child(folder: Path, kind: Kind, number: int, count: int, pipe: int) -> None
         os.write(pipe, len(packed).to_bytes(4, "little") + packed)
 
     @seed(number)
-    @settings(max_examples=count, database=None, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+    @settings(
+        max_examples=count,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
     @given(kind.cases)
     def one(case: Case) -> None:
         tell("case", repr(case)[:2000])
@@ -513,7 +557,9 @@ def fuzz(count: int, number: int = 0, kinds: tuple[str, ...] = tuple(KINDS)) -> 
                 if os.WIFSIGNALED(status):
                     outcome = "hang" if os.WTERMSIG(status) == signal.SIGALRM else "crash"
                     tally[outcome] += 1
-                    failures.append({"kind": name, "case": case, "outcome": outcome, "said": f"signal {os.WTERMSIG(status)}"})
+                    failures.append(
+                        {"kind": name, "case": case, "outcome": outcome, "said": f"signal {os.WTERMSIG(status)}"}
+                    )
                 elif status or not told:
                     raise RuntimeError(f"a child that tried {name} failed by itself; its last case was {case}")
             table[name], seconds[name] = tally, time.perf_counter() - at
