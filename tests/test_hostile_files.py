@@ -167,3 +167,28 @@ def test_a_pack_from_before_there_were_seals_is_read_with_a_warning(tmp_path: Pa
         warnings.simplefilter("ignore")
         with pytest.raises(gm.FileFormatError, match="a candidate is none"):
             gm.load_pack(old)
+
+
+def test_a_recall_keeps_its_waveforms_and_their_names_and_is_refused_when_its_parts_do_not_fit(tmp_path: Path) -> None:
+    experiment = gm.Experiment(gm.load_pack(PACK), gm.words(1), t0=75.0, store=0.1, rest=0.1, hold=0.1)
+    path, wrong = tmp_path / "recall.h5", tmp_path / "wrong.h5"
+    found = gm.run(experiment)
+    gm.save_recall(path, found, gm.resolved(experiment, 1.0))
+    again, configuration = gm.load_recall(path)
+    np.testing.assert_array_equal(again.shear, np.asarray(experiment.signals.shear(found.u)).T)
+    np.testing.assert_array_equal(again.p_sig, found.p_sig)
+    assert configuration["signals"] == ["0", "1"]
+    assert configuration["experiment"]["signals"] == {"kind": "words", "bits": 1}
+    for change, words in (
+        (lambda file: put(file, "p_sig", file["p_sig"][:1]), r"'p_sig' has shape \[1, 256\]"),
+        (lambda file: put(file, "fidelity", np.asarray(np.nan)), "fidelity holds numbers that are not finite"),
+        (lambda file: put(file, "status", file["status"][()] + 4096), "its status is none that there is"),
+        (lambda file: file.__delitem__("stages/readout"), "the stage 'readout' is missing"),
+        (lambda file: file.attrs.modify("configuration", "{}"), "its configuration has no 'pack'"),
+    ):
+        wrong.write_bytes(path.read_bytes())
+        with h5py.File(wrong, "r+") as file:
+            change(file)
+        seal(wrong)
+        with pytest.raises(gm.FileFormatError, match=words):
+            gm.load_recall(wrong)

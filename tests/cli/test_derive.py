@@ -84,3 +84,28 @@ def test_every_command_takes_the_whole_experiment(
     said = capsys.readouterr().out
     for option in ("--stiffness", "--delta0", "--dt", "--backend", "--hold-drag", "--points", "--variant", "--force"):
         assert option in said
+
+
+def test_a_recall_of_designed_waveforms_is_compared_with_their_target_too(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    waves, out = tmp_path / "designed.csv", tmp_path / "out.h5"
+    own = gm.waveform(np.outer(np.ones(6), np.sin(np.linspace(0.2, 3.0, 8))))
+    gm.save_waveforms(waves, own, gm.six_signals())
+    assert gmem(monkeypatch, "recall", PACK, "-o", out, "--signals", waves, "--no-picture", "--json", *SHORT) == 0
+    said = json.loads(capsys.readouterr().out)
+    recall, configuration = gm.load_recall(out)
+    experiment = gm.Experiment(gm.load_pack(PACK), gm.six_signals())
+    match = experiment.compare(recall.p_sig)
+    assert said["target_fidelity"] == pytest.approx(float(match.fidelity), rel=1e-12)
+    assert said["target_gain"] == pytest.approx(float(match.gain), rel=1e-12)
+    assert said["target_fidelity"] != said["fidelity"]
+    assert configuration["target"] == {"kind": "six"}
+    assert configuration["hold_drag"] == 0.05
+    np.testing.assert_allclose(recall.shear, np.asarray(own.shear(recall.u)).T, atol=1e-15)
+    assert gmem(monkeypatch, "show", out) == 0
+    assert "target of their design" in capsys.readouterr().out
+    gm.save_waveforms(waves, own, gm.words(1))
+    capsys.readouterr()
+    assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "no.h5", "--signals", waves, *SHORT) == 2
+    assert "its target has 2 signals, must have 6" in capsys.readouterr().err
