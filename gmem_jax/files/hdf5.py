@@ -116,7 +116,7 @@ def reading(path: Path, *schemas: str) -> Iterator[Content]:
         with source, h5py.File(source, "r") as file:
             content = Content(file)
             if schemas and content.schema not in schemas:
-                raise FileFormatError(f"{path}: schema is {content.schema!r}, expected {schemas[0]!r}")
+                raise FileFormatError(f"{path}: schema is {content.schema[:40]!r}, expected {schemas[0]!r}")
             yield content
 
 
