@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from gmem_jax.design.drive import TunedDrive, design_drive
     from gmem_jax.design.waveforms import Design, design_waveforms
     from gmem_jax.reading import classify
+    from gmem_jax.sweeps.sweep import sweep
 
 _LATER = {  # what loads flax or optax, by where it is
     "Design": "gmem_jax.design.waveforms",
@@ -45,6 +46,7 @@ _LATER = {  # what loads flax or optax, by where it is
     "TunedDrive": "gmem_jax.design.drive",
     "design_drive": "gmem_jax.design.drive",
     "classify": "gmem_jax.reading.classify",
+    "sweep": "gmem_jax.sweeps.sweep",
 }
 
 
@@ -102,6 +104,7 @@ __all__ = [
     "six_signals",
     "sphere",
     "stack",
+    "sweep",
     "tetra",
     "value_and_grad",
     "waveform",

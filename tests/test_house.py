@@ -17,6 +17,7 @@ FLOORS = (
     "experiment",
     "files",
     "preparation",
+    "sweeps",
     "derivatives",
     "design",
     "reading",

@@ -9,12 +9,14 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from gmem_jax.command.console import InputError, claim
+from gmem_jax.command.console import claim
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.signals import LONGEST_WORD, Signals, six_signals, waveform, words
+from gmem_jax.experiment.signals import Signals
 from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.named import named_experiment
 from gmem_jax.files.packs import load_pack
-from gmem_jax.files.waveforms import load_target, load_waveforms
+from gmem_jax.files.waveforms import load_target
+from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.laws import LAWS, law_named
 
@@ -50,25 +52,6 @@ _OTHERS = {
     "signals": _Option(str, "six; words:L, all words of L bits; or a .csv (a column per signal) or .npy file."),
     "friction": _Option(str, f"Friction law: {_NAMES}, or the paper's H, M1, M2."),
 }
-
-
-def named_signals(name: str) -> Signals:
-    """Waveforms by what the command line calls them.
-
-    Raises:
-        InputError: if the name is none.
-        FileFormatError: if a file cannot be read.
-    """
-    kind, _, length = name.lower().partition(":")
-    if kind == "six":
-        return six_signals()
-    if kind == "words":
-        if not length.isdecimal() or not 1 <= int(length) <= LONGEST_WORD:
-            raise InputError(f"--signals {name}: words need a length from 1 to {LONGEST_WORD}, as in words:3")
-        return words(int(length))
-    if Path(name).suffix.lower() not in (".csv", ".npy"):
-        raise InputError(f'--signals {name}: must be "six", "words:L" or a .csv or .npy file')
-    return waveform(load_waveforms(Path(name)))
 
 
 class Chosen:
@@ -111,13 +94,10 @@ class Chosen:
             ValueError: for impossible values.
             FileNotFoundError: if there is no such pack.
         """
-        values = self._values
-        of_law = {name: values[name] for name in _OF_LAW if values[name] is not None}
-        if values["friction"].lower() == "frictionless" or values["friction"] == "mu = 0":
-            of_law.pop("mu")
-        law = law_named(values["friction"], **of_law)
-        signals = named_signals(values["signals"])
-        return Experiment(load_pack(pack), signals, law, **{name: values[name] for name in _FIELDS})
+        values = dict(self._values)
+        if law_named(values["friction"]) == Frictionless():
+            values["mu"] = None  # the option's default is not for this law
+        return named_experiment(load_pack(pack), values)
 
 
 def _default(name: str) -> Any:

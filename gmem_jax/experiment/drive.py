@@ -36,8 +36,10 @@ class Drive:
     def _shear(self, u: Numbers, sheared: Numbers) -> jax.Array:
         if self.signals is None:
             return jnp.zeros(1)
-        gamma = self.gamma0 * jnp.concatenate([jnp.zeros(1), self.signals.shear(jnp.asarray(u))])
-        return jnp.where(sheared, gamma, 0.0)
+        u = jnp.asarray(u)
+        shapes = jnp.concatenate([jnp.zeros((*u.shape, 1)), self.signals.shear(u)], axis=-1)
+        own = shapes if u.ndim == 0 else jnp.diagonal(shapes)  # each replica at its own u, where t0 differs
+        return jnp.where(sheared, self.gamma0 * own, 0.0)
 
     def box_at(self, row: Bin, time: jax.Array, duration: Numbers) -> Box:
         """Planes and their velocities, [3, B] (or [3, 1] without shear).

@@ -136,7 +136,7 @@ class Experiment:
                 f"an experiment has one pack: positions [N, 3], got {jnp.shape(self.pack.position)}; put a stack of "
                 "packs into jax.vmap"
             )
-        for name, value in _replica_parameters(self).items():
+        for name, value in replica_parameters(self).items():
             if jnp.shape(value) not in ((), (self.replicas,)):
                 raise ValueError(
                     f"{name} must be one number or one for each replica, [S + 1] = [{self.replicas}] with the zero "
@@ -205,7 +205,7 @@ class Experiment:
 
     def begin(self) -> State:
         """The pack at rest with friction switched on: one replica, or all where parameters differ in the prefix."""
-        before = {name: value for name, value in _replica_parameters(self).items() if name not in AFTER_PREFIX}
+        before = {name: value for name, value in replica_parameters(self).items() if name not in AFTER_PREFIX}
         wide = self.replicas if any(jnp.ndim(value) for value in before.values()) else 1
         position, quaternion = replicate((self.pack.position[..., None], self.pack.quaternion[..., None]), wide)
         state = start(self.course(sheared=False).system, position, quaternion, self.pack.box)
@@ -267,7 +267,7 @@ def _static_number(name: str, value: Any) -> float:
     return number
 
 
-def _replica_parameters(experiment: Experiment) -> dict[str, Any]:
+def replica_parameters(experiment: Experiment) -> dict[str, Any]:
     """The parameters that may differ between replicas, by name."""
     own = {name: getattr(experiment, name) for name in ("gamma0", "delta0", "t0", "hold_drag")}
     law: Any = experiment.friction

@@ -154,7 +154,7 @@ def gain(experiment: Experiment) -> jax.Array:
 
 _begin = Experiment.begin
 _fan_out = Compiled(Experiment.fan_out)
-_finish = Compiled(finish)
+finished = Compiled(finish)
 
 
 def walker(experiment: Experiment, **options: Any) -> Walker:
@@ -198,7 +198,7 @@ def run(
     if size < 1:
         raise ValueError(f"batch must be at least 1, got {batch}")
     begun = walker(experiment, progress=progress)
-    _warn_of_another_compression(experiment)
+    warn_of_another_compression(experiment)
     if size < count and (begun.state.replicas > 1 or jnp.ndim(experiment.gamma0)):
         raise ValueError("parameters with a value for each replica need all signals in one batch")
     common, own = experiment.phases
@@ -220,7 +220,7 @@ def run(
         parts.append(keep(f"batch-{number:04d}", run_batch))
         done += after * (last - first + 1)
     joined, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
-    found: Recall = _finish(experiment, samples | joined, jnp.asarray(status))
+    found: Recall = finished(experiment, samples | joined, jnp.asarray(status))
     return found
 
 
@@ -248,7 +248,8 @@ def _join(first: Any, *others: Any) -> np.ndarray:
     return np.concatenate([np.asarray(first), *(np.asarray(other)[..., 1:] for other in others)], axis=-1)
 
 
-def _warn_of_another_compression(experiment: Experiment) -> None:
+def warn_of_another_compression(experiment: Experiment) -> None:
+    """Warn of a delta0 that the pack was not made for."""
     own = float(experiment.pack.delta0)
     if not np.allclose(np.asarray(experiment.compression), own):
         warnings.warn(
@@ -318,5 +319,5 @@ def simulate(
     work = float(experiment.replicas * sum(stage.bins for stage in own))
     on = begun.afresh(progress=within(progress, share, 1.0), work=0.0, total_work=work)
     shear(on, experiment)
-    found: Recall = _finish(experiment, on.play(*own, checkpoint=checkpoint), on.state.status)
+    found: Recall = finished(experiment, on.play(*own, checkpoint=checkpoint), on.state.status)
     return found

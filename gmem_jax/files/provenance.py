@@ -1,5 +1,7 @@
 """Where a result came from: versions, backend and device, for every file and log."""
 
+import functools
+import hashlib
 import platform
 from importlib import metadata
 from pathlib import Path
@@ -40,6 +42,19 @@ def versions() -> dict[str, str]:
 def code() -> dict[str, Any]:
     """Versions and git commit: what code a number came from."""
     return {"versions": versions(), "commit": _commit()}
+
+
+@functools.cache
+def sources() -> dict[str, Any]:
+    """What numbers depend on beside a configuration: a hash of the code that makes them, and versions of libraries."""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for folder in ("physics", "native", "experiment", "preparation"):
+        for path in sorted((root / folder).rglob("*")):
+            if path.suffix in (".py", ".h", ".cc", ".cu"):
+                digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    own = ("jax", "jaxlib", "jax-md", "numpy")
+    return {"sources": digest.hexdigest(), "versions": {name: versions()[name] for name in own}}
 
 
 def provenance() -> dict[str, Any]:

@@ -1,0 +1,182 @@
+"""`gmem sweep`."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, reporting, say
+from gmem_jax.experiment.host import RunFailedError
+from gmem_jax.files.parts import locked
+from gmem_jax.physics.state import SENTENCES, Status
+from gmem_jax.sweeps.executors import executor as executor_named
+from gmem_jax.sweeps.spec import read_spec
+from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.sweep import Conductor
+from gmem_jax.sweeps.table import FORMATS, export, means, rows
+
+VERBS = ("status", "show", "export")
+RUN = ("executor", "workers")
+ABOUT = "F(T1): F after a running mean over the ringing period"
+
+
+def sweep_command(
+    what: Annotated[str, typer.Argument(help="A sweep file (.toml) to be done; or status, show, export.")],
+    folder: Annotated[Path | None, typer.Argument(help="With a verb: the folder of the sweep.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder of the sweep, default the file's name; or of export.")
+    ] = None,
+    executor: Annotated[str, typer.Option(help="processes, slurm or local; default the file's, or processes.")] = "",
+    workers: Annotated[int | None, typer.Option(min=1, help="Workers; default the file's, or 1 for 8 CPUs.")] = None,
+    over: Annotated[str, typer.Option(help="show: names to average over, separated by commas.")] = "",
+    retry: Annotated[bool, typer.Option("--retry", help="Try points that failed again.")] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Vary anything: packs made once, points side by side, results kept by content; resumes, and grows.
+
+    gmem sweep mu.toml; gmem sweep status mu; gmem sweep show mu --over pack; gmem sweep export mu -o mu.csv
+    """
+    if what in VERBS:
+        if folder is None:
+            raise InputError(f"gmem sweep {what}: name the folder of a sweep")
+        store = _there(folder)
+        if what == "export":
+            _export(store, output, force, as_json)
+        else:
+            (_status if what == "status" else _show)(store, over, as_json)
+        return
+    path = Path(what)
+    if path.suffix != ".toml":
+        raise InputError(f"{what}: neither a sweep file (.toml) nor one of {', '.join(VERBS)}")
+    spec = read_spec(path)
+    options = {name: value for name, value in spec.run.items() if name not in RUN}
+    count = workers or spec.run.get("workers")
+    if count is not None and (not isinstance(count, int) or count < 1):
+        raise InputError(f"{path}: workers must be a whole number from 1, got {count!r}")
+    chosen = executor_named(executor or str(spec.run.get("executor", "processes")), count, options)
+    target = output or path.with_suffix("")
+    if not target.parent.is_dir():
+        raise InputError(f"--output {target}: folder {target.parent} does not exist")
+    with locked(target), reporting(goes_on=True) as progress:
+        conductor = Conductor(spec, target, say)
+        conductor.check()
+        if retry and (count := conductor.store.forgive()):
+            say(f"{count} points that failed are tried again")
+        conductor.run(chosen, progress)
+    table = rows(conductor.store)
+    failed = [row for row in table if row["state"] == "failed"]
+    for row in failed[:3]:
+        say(f"failed: {_values(row, spec.names)}: {row['why']}", style="yellow")
+    say(f"{len(table) - len(failed)} of {len(table)} points in {target}; gmem sweep show {target}")
+    emit(as_json, _summary(conductor.store, table), _table(table, spec.names))
+    if failed:
+        raise RunFailedError(f"{len(failed)} of {len(table)} points; again with --retry")
+
+
+def _there(folder: Path) -> Store:
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    if not (folder / "sweep.json").is_file():
+        raise InputError(f"{folder}: no sweep here (no sweep.json)")
+    return Store(folder)
+
+
+def _values(row: dict[str, Any], names: list[str]) -> str:
+    return ", ".join(f"{name} = {row[name]}" for name in names)
+
+
+def _summary(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
+    states = {state: sum(row["state"] == state for row in table) for state in ("done", "failed", "open")}
+    done = [row for row in table if row["state"] == "done"]
+    status = 0
+    for row in done:
+        status |= row["status"]
+    seconds = sum(row["seconds"] for row in done)
+    return {"folder": str(store.folder), **states, "status": status, "seconds": seconds, "points": table}
+
+
+def _status(store: Store, over: str, as_json: bool) -> None:
+    del over
+    table = rows(store)
+    summary = _summary(store, table)
+    lines = [f"{summary[state]} {state}" for state in ("done", "failed", "open")]
+    at_work = [one for one in store.told() if any(job["name"] == one["job"] for job in store.jobs())]
+    busy = [f"{one['what']}, {one['fraction']:.0%}" for one in at_work if one["fraction"] < 1.0]
+    reasons = sorted({row["why"] for row in table if row["state"] == "failed"})
+    emit(as_json, summary, ", ".join(lines), *busy, *(f"failed: {reason}" for reason in reasons))
+
+
+def _show(store: Store, over: str, as_json: bool) -> None:
+    table, names = rows(store), store.card()["names"]
+    averaged = [name for name in over.split(",") if name]
+    if unknown := sorted(set(averaged) - set(names)):
+        raise InputError(f"--over {unknown[0]}: does not vary here; {', '.join(names)} do")
+    if averaged:
+        found = means(table, names, averaged)
+        emit(as_json, {"folder": str(store.folder), "means": found}, _means_table(found))
+    else:
+        emit(as_json, _summary(store, table), _table(table, names))
+
+
+def _export(store: Store, output: Path | None, force: bool, as_json: bool) -> None:
+    if output is None or output.suffix.lower() not in FORMATS:
+        raise InputError(f"gmem sweep export: name a file with -o that ends in one of {', '.join(FORMATS)}")
+    claim(output, "", force=force)
+    export(store, output)
+    say(f"wrote {output}")
+    emit(as_json, {"output": str(output), "status": 0})
+
+
+def _number(value: Any) -> str:
+    """A value as a table shows it; of a file, its name."""
+    text = f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+    return Path(text).stem if text.endswith(".h5") else text
+
+
+def _table(table: list[dict[str, Any]], names: list[str]) -> Table:
+    drawn = Table()
+    for name in (*names, "G", "F", "F(T1)", "status"):
+        drawn.add_column(name, no_wrap=name != "status")
+    for row in table:
+        state = ", ".join(_bits(row["status"])) if row["state"] == "done" else row["state"]
+        numbers = [row[name] for name in ("gain", "fidelity", "windowed_fidelity")]
+        measured = ("" if number is None else f"{number:.3f}" for number in numbers)
+        drawn.add_row(*(_number(row[name]) for name in names), *measured, state or "ok")
+    reasons = {bit for row in table if row["state"] == "done" for bit in Status if row["status"] & bit}
+    drawn.caption = "; ".join([ABOUT, *(f"{_word(bit)}: {SENTENCES[bit]}" for bit in sorted(reasons))])
+    return drawn
+
+
+def _word(bit: Status) -> str:
+    return str(bit.name).lower().replace("_", " ")
+
+
+def _bits(status: int) -> list[str]:
+    return [_word(bit) for bit in Status if status & bit]
+
+
+def _means_table(table: list[dict[str, Any]]) -> Table:
+    names = [
+        name for name in table[0] if name not in ("points", "done") and not name.startswith(("gain", "fid", "win"))
+    ]
+    drawn = Table()
+    for name in (*names, "n", "G", "F", "F(T1)"):
+        drawn.add_column(name, no_wrap=name not in names, min_width=14 if name in ("G", "F", "F(T1)") else None)
+    for row in table:
+        shown = [_with_error(row, name) for name in ("gain", "fidelity", "windowed_fidelity")]
+        drawn.add_row(*(_number(row[name]) for name in names), str(row["done"]), *shown)
+    drawn.caption = f"mean and standard error; {ABOUT}"
+    return drawn
+
+
+def _with_error(row: dict[str, Any], measure: str) -> str:
+    if row[measure] is None:
+        return ""
+    error = row[f"{measure}_se"]
+    return f"{row[measure]:.3f}" + (f" +- {error:.3f}" if math.isfinite(error) else "")
+
+
+COMMANDS = {"sweep": sweep_command}

@@ -1,0 +1,159 @@
+"""Experiments on one pack side by side: those that differ only in what may differ between replicas, as one run.
+
+The shear-free prefix is run once for each set of parameters that act on it, the rest once for each signal of each
+experiment and its zero signal. The numbers are those of the experiments run one by one.
+"""
+
+import dataclasses
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, replace, replica_parameters, value_at
+from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent
+from gmem_jax.experiment.recall import Recall, finished, walker, warn_of_another_compression
+from gmem_jax.experiment.signals import Signals
+from gmem_jax.physics.pytree import pytree
+
+
+@pytree
+@dataclass(frozen=True)
+class Chosen:
+    """Waveforms chosen from some sets; number 0 is no shear, the others count through the sets.
+
+    Attributes:
+        sets: the sets.
+        numbers: of the chosen waveforms, int [S].
+    """
+
+    sets: tuple[Signals, ...]
+    numbers: jax.Array
+
+    @property
+    def count(self) -> int:
+        """Number of signals S."""
+        return int(self.numbers.shape[0])
+
+    def shear(self, u: jax.Array) -> jax.Array:
+        """I_s(u), [..., S]."""
+        return self._chosen([one.shear(u) for one in self.sets], u)
+
+    def integral(self, u: jax.Array) -> jax.Array:
+        """J_s(u), [..., S]."""
+        return self._chosen([one.integral(u) for one in self.sets], u)
+
+    def _chosen(self, values: list[jax.Array], u: jax.Array) -> jax.Array:
+        return jnp.concatenate([jnp.zeros((*u.shape, 1)), *values], axis=-1)[..., self.numbers]
+
+
+def match(one: Experiment, other: Experiment) -> bool:
+    """Whether two experiments may run side by side: the same pack, material, protocol, law, steps and backend.
+
+    The pack must be the same object; whatever else differs must be one number in each.
+    """
+    alike = ("stages", "steps_per_bin", "background", "backend", "material")
+    laws = [str(jax.tree.structure(each.friction)) for each in (one, other)]
+    scalars = all(jnp.ndim(value) == 0 for each in (one, other) for value in replica_parameters(each).values())
+    same = all(getattr(one, name) == getattr(other, name) for name in alike)
+    return scalars and same and one.pack is other.pack and laws[0] == laws[1]
+
+
+class _Side:
+    """Where the replicas of several experiments stand.
+
+    Attributes:
+        prefix: of each experiment, its replica in the prefix, [experiments].
+        first: its zero signal after the prefix, and one more for the end, [experiments + 1].
+    """
+
+    def __init__(self, experiments: Sequence[Experiment]) -> None:
+        self.experiments = experiments
+        # All names of any of them: what one leaves to its default may be a number in another.
+        self.names = list(dict.fromkeys(name for each in experiments for name in replica_parameters(each)))
+        values = [tuple(float(value_at(each, name)) for name in self.names) for each in experiments]
+        acting = [name.split(".")[0] not in AFTER_PREFIX for name in self.names]
+        own = [tuple(value for value, acts in zip(row, acting, strict=True) if acts) for row in values]
+        kinds = list(dict.fromkeys(own))
+        self.prefix = np.asarray([kinds.index(row) for row in own])
+        self.first = np.cumsum([0, *(each.replicas for each in experiments)])
+        self.values = np.asarray(values).T
+
+    def wide(self, owners: np.ndarray, signals: Signals) -> Experiment:
+        """One experiment with a replica for each of some experiments' numbers, [replicas]."""
+        own = dict(zip(self.names, self.values[:, owners], strict=True))
+        changes = {name: row if np.any(row != row[0]) else float(row[0]) for name, row in own.items()}
+        changes = {name: jnp.asarray(row) if isinstance(row, np.ndarray) else row for name, row in changes.items()}
+        first = self.experiments[0]
+        return replace(first, {**changes, "signals": signals, "steps": first.steps_per_bin})
+
+    def signals(self) -> Chosen:
+        """All their waveforms, each set with its zero signal before it; that of the first is replica 0."""
+        sets: list[Signals] = []
+        begun: dict[int, int] = {}
+        numbers: list[int] = []
+        for each in self.experiments:
+            if id(each.signals) not in begun:
+                begun[id(each.signals)] = 1 + sum(one.count for one in sets)
+                sets.append(each.signals)
+            numbers += [0, *(begun[id(each.signals)] + np.arange(each.signals.count)).tolist()]
+        return Chosen(tuple(sets), jnp.asarray(numbers[1:]))
+
+
+def run_several(experiments: Sequence[Experiment], *, keep: Keep = forget, progress: Progress = silent) -> list[Recall]:
+    """Run experiments side by side, as replicas of one run; the recall of each.
+
+    Args:
+        experiments: that `match` each other.
+        keep: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
+        progress: told about every chunk.
+
+    Raises:
+        ValueError: if they do not match, there is none, or 64-bit mode is off.
+        RunFailedError: if the simulation broke down, of all together.
+    """
+    if not experiments or not all(match(experiments[0], each) for each in experiments):
+        raise ValueError("experiments side by side must differ only in what may differ between replicas")
+    side = _Side(experiments)
+    common, own = experiments[0].phases
+    for each in experiments:
+        warn_of_another_compression(each)
+    one_each = np.unique(side.prefix, return_index=True)[1]
+    owners = np.repeat(np.arange(len(experiments)), np.diff(side.first))
+    silence = Chosen(side.signals().sets, jnp.ones(max(1, len(one_each) - 1), int))
+    everything = side.wide(owners, side.signals())
+    on = walker(side.wide(one_each, silence), progress=progress)
+    bins = [sum(stage.bins for stage in stages) for stages in (common, own)]
+    on.total_work = float(bins[0] * on.state.replicas + bins[1] * len(owners))
+
+    def prefix(checkpoint: Checkpoint) -> Any:
+        return on.play(*common, checkpoint=checkpoint), on.kept()
+
+    def rest(checkpoint: Checkpoint) -> Any:
+        # One replica if nothing that acts on the prefix differs.
+        place = side.prefix[owners] if on.state.replicas > 1 else np.zeros(len(owners), int)
+        pairs = on.course.system.pairs
+        if pairs.reference.shape[-1] > 1:
+            pairs = dataclasses.replace(pairs, reference=jnp.asarray(pairs.reference)[..., place])
+        on.course = everything.course(sheared=True).with_pairs(pairs)
+        on.state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., place], on.state)
+        return on.play(*own, checkpoint=checkpoint), on.state.status
+
+    before, kept = keep("prefix", prefix)
+    on.restore(kept)
+    on = on.afresh()
+    after, status = keep("after", rest)
+    found = []
+    for number, each in enumerate(experiments):
+        begun, ended = side.first[number : number + 2]
+        alone = int(side.prefix[number]) if np.shape(before[common[0].name].pressure)[-1] > 1 else 0
+        samples = OrderedDict(
+            [(name, jax.tree.map(lambda leaf, at=alone: leaf[..., at : at + 1], before[name])) for name in before]
+            + [(name, jax.tree.map(lambda leaf, a=begun, b=ended: leaf[..., a:b], after[name])) for name in after]
+        )
+        found.append(finished(each, samples, jnp.asarray(status)[begun:ended]))
+    return found

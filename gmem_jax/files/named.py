@@ -1,0 +1,56 @@
+"""Experiments by the names that the command line and sweep files give to their fields and to those of their law."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.signals import LONGEST_WORD, Signals, six_signals, waveform, words
+from gmem_jax.files.waveforms import load_waveforms
+from gmem_jax.physics.contact.laws import LAWS, law_named
+
+FIELDS = ("gamma0", "delta0", "t0", "rest", "hold", "store", "hold_drag", "dt", "steps", "background", "backend")
+OF_LAW = tuple(dict.fromkeys(field.name for entry in LAWS for field in fields(entry.kind)))
+NAMES = ("signals", "friction", *OF_LAW, *FIELDS)
+
+
+def named_signals(name: str) -> Signals:
+    """Waveforms by what the command line calls them.
+
+    Raises:
+        ValueError: if the name is none.
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if a file cannot be read.
+    """
+    kind, _, length = name.lower().partition(":")
+    if kind == "six":
+        return six_signals()
+    if kind == "words":
+        if not length.isdecimal() or not 1 <= int(length) <= LONGEST_WORD:
+            raise ValueError(f"--signals {name}: words need a length from 1 to {LONGEST_WORD}, as in words:3")
+        return words(int(length))
+    if Path(name).suffix.lower() not in (".csv", ".npy"):
+        raise ValueError(f'--signals {name}: must be "six", "words:L" or a .csv or .npy file')
+    return waveform(load_waveforms(Path(name)))
+
+
+def named_experiment(pack: Pack, values: Mapping[str, Any], signals: Signals | None = None) -> Experiment:
+    """An experiment on a pack.
+
+    Args:
+        pack: the pack.
+        values: by name (`NAMES`; dotted ones like "friction.mu" too); None stands for the default.
+        signals: in the place of those that `values` names.
+
+    Raises:
+        ValueError: for an unknown name, or impossible values.
+    """
+    given = {name.removeprefix("friction."): value for name, value in values.items() if value is not None}
+    if unknown := sorted(set(given) - set(NAMES)):
+        raise ValueError(f"an experiment has no {unknown[0]!r}; it has {', '.join(NAMES)}")
+    of_law = {name: given[name] for name in OF_LAW if name in given}
+    law = law_named(str(given.get("friction", "hooke")), **of_law)
+    own = {name: given[name] for name in FIELDS if name in given}
+    return Experiment(pack, signals or named_signals(str(given.get("signals", "six"))), law, **own)

@@ -1,0 +1,192 @@
+"""Who does the jobs of a sweep: processes on this machine, or SLURM.
+
+An executor keeps workers alive as long as jobs are left that nobody has; the workers find their jobs in the store.
+"""
+
+import itertools
+import os
+import subprocess
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+from gmem_jax.experiment.host import RunFailedError
+from gmem_jax.sweeps import work
+from gmem_jax.sweeps.store import Store
+
+POLL = 0.5  # s
+DEATHS = 3  # of workers one after the other, without a job finished between, that end a sweep
+CORES = 8  # of a worker: more gain little at N = 325
+
+
+class Executor(ABC):
+    """Workers on a store."""
+
+    workers: int
+
+    @abstractmethod
+    def start(self, store: Store, name: str) -> None:
+        """Start a worker.
+
+        Raises:
+            OSError: if it cannot be started.
+        """
+
+    @abstractmethod
+    def alive(self) -> set[str]:
+        """The names of the workers that run, or wait for their turn."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop all workers."""
+
+    def finish(self, store: Store, jobs: list[dict[str, Any]], told: Callable[[float], None]) -> None:
+        """See that jobs are done; `told` is given the fraction of their work that is.
+
+        Raises:
+            RunFailedError: if workers die again and again.
+            OSError: if none can be started.
+        """
+        names = [f"worker-{number}" for number in range(min(self.workers, max(1, len(jobs))))]
+        total = sum(job["work"] for job in jobs) or 1.0
+        deaths, left = 0, len(jobs)
+        try:
+            while True:
+                open_ = [job for job in jobs if not store.finished(job)]
+                now = sum(job["work"] for job in jobs) - sum(job["work"] for job in open_)
+                fractions = {one["job"]: float(one["fraction"]) for one in store.told()}
+                now += sum(min(1.0, fractions.get(job["name"], 0.0)) * job["work"] for job in open_)
+                told(now / total)
+                if not open_:
+                    return
+                deaths = deaths if len(open_) == left else 0
+                left = len(open_)
+                alive = self.alive()
+                if not alive and not any(store.taken(job) for job in open_):
+                    if deaths == DEATHS:
+                        raise RunFailedError(f"workers end without doing their jobs: {self.last_words(store, names)}")
+                    deaths += 1
+                for name in names[: len(open_)]:
+                    if name not in alive and (deaths <= DEATHS):
+                        self.start(store, name)
+                time.sleep(POLL)
+        finally:
+            self.stop()
+
+    @staticmethod
+    def last_words(store: Store, names: list[str]) -> str:
+        """The last line of what the workers said."""
+        lines = [line for name in names if store.log_of(name).is_file() for line in store.log_of(name).open()]
+        return lines[-1].strip() if lines else "they said nothing"
+
+
+def cores() -> list[int]:
+    """The CPUs that this process may use."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+
+
+class Processes(Executor):
+    """Worker processes on this machine, each on CPUs of its own.
+
+    Args:
+        workers: how many; default one for every eight CPUs.
+
+    Raises:
+        ValueError: if there are fewer CPUs than workers.
+    """
+
+    def __init__(self, workers: int | None = None) -> None:
+        own = cores()
+        self.workers = workers or max(1, len(own) // CORES)
+        if self.workers > len(own):
+            raise ValueError(f"{self.workers} workers need as many CPUs; {len(own)} can be used")
+        ends = [len(own) * number // self.workers for number in range(self.workers + 1)]
+        self._cores = [own[first:last] for first, last in itertools.pairwise(ends)]
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, store: Store, name: str) -> None:
+        """Start a process whose log is in the store."""
+        number = int(name.rpartition("-")[2])
+        mine = self._cores[number]
+        environment = {**os.environ, "GMEM_THREADS": str(len(mine))}
+        command = [sys.executable, "-m", work.__name__, str(store.folder), name, ",".join(map(str, mine))]
+        with store.log_of(name).open("ab") as log:
+            self._running[name] = subprocess.Popen(
+                command, stdout=log, stderr=log, env=environment, start_new_session=True
+            )
+
+    def alive(self) -> set[str]:
+        """The names of those that have not ended."""
+        return {name for name, process in self._running.items() if process.poll() is None}
+
+    def stop(self) -> None:
+        """End them all; their checkpoints stay."""
+        for process in self._running.values():
+            if process.poll() is None:
+                process.terminate()
+        for process in self._running.values():
+            process.wait()
+
+
+class Submitted(Executor):
+    """Workers as jobs of a cluster, by submitit.
+
+    Args:
+        cluster: "slurm", or "local" for submitit's own processes.
+        workers: how many.
+        options: of submitit's executor, like slurm_partition, timeout_min, cpus_per_task, mem_gb.
+
+    Raises:
+        ValueError: if submitit is not installed, the scheduler cannot be reached, or an option is none of its.
+    """
+
+    def __init__(self, cluster: str, workers: int | None = None, options: dict[str, Any] | None = None) -> None:
+        try:
+            import submitit
+        except ImportError as error:
+            raise ValueError('executor "slurm" needs submitit: pip install "gmem_jax[slurm]"') from error
+        self.workers, self._cluster = workers or 1, cluster
+        self._options = {"timeout_min": 60, "cpus_per_task": 1, **(options or {})}
+        self._submitit: Any = submitit
+        self._jobs: dict[str, Any] = {}
+        self._executor: Any = None
+        if cluster == "slurm" and submitit.SlurmExecutor.affinity() < 0:
+            raise ValueError("no SLURM here: sbatch is not on the path; run the sweep where it is, or use processes")
+
+    def start(self, store: Store, name: str) -> None:
+        """Submit a job."""
+        try:
+            if self._executor is None:
+                logs = store.folder / "workers" / "submitit"
+                self._executor = self._submitit.AutoExecutor(logs, cluster=self._cluster)
+                self._executor.update_parameters(**self._options)
+            self._jobs[name] = self._executor.submit(work.main, [str(store.folder), name])
+        except (self._submitit.core.utils.FailedJobError, subprocess.SubprocessError, FileNotFoundError) as error:
+            raise OSError(f"the scheduler takes no job: {' '.join(str(error).split())[-300:]}") from error
+
+    def alive(self) -> set[str]:
+        """The names of those that have not ended."""
+        return {name for name, job in self._jobs.items() if not job.done(force_check=True)}
+
+    def stop(self) -> None:
+        """End them all; their checkpoints stay."""
+        for job in self._jobs.values():
+            if not job.done(force_check=True):
+                job.cancel(check=False)
+
+
+def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executor:
+    """An executor by name.
+
+    Raises:
+        ValueError: if there is none of that name, or it cannot be had here.
+    """
+    if kind == "processes":
+        if options:
+            raise ValueError(f"processes have no option {min(options)!r}")
+        return Processes(workers)
+    if kind in ("slurm", "local"):
+        return Submitted(kind, workers, options)
+    raise ValueError(f"executor must be processes, slurm or local, got {kind!r}")

@@ -1,0 +1,124 @@
+"""From points to jobs: points that may run side by side become one run, packs that do not exist yet are made first."""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.recall import default_batch, replica_bins
+from gmem_jax.experiment.several import match
+from gmem_jax.files.configuration import key_of_run, written
+from gmem_jax.files.packs import load_pack
+
+ABREAST = 64  # replicas of a run at most: whole vectors of every CPU, and enough for every thread
+
+
+@dataclass(frozen=True)
+class Point:
+    """An experiment of a sweep.
+
+    Attributes:
+        values: what makes it different from the others, by name.
+        experiment: all of it.
+        key: of everything that its numbers depend on.
+    """
+
+    values: dict[str, Any]
+    experiment: Experiment
+    key: str
+
+
+@dataclass(frozen=True)
+class Job:
+    """Points that are run together.
+
+    Attributes:
+        name: of the job: a hash of its points.
+        points: their keys.
+        configurations: their experiments as written.
+        batch: signals that run together, where there is one point.
+        replicas: side by side.
+        work: grain-steps.
+    """
+
+    name: str
+    points: tuple[str, ...]
+    configurations: tuple[dict[str, Any], ...]
+    batch: int
+    replicas: int
+    work: float
+
+    def asdict(self) -> dict[str, Any]:
+        """As JSON."""
+        return {"kind": "run", **asdict(self)}
+
+
+def digest(value: Any) -> str:
+    """Twenty letters that stand for a JSON value."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:20]
+
+
+def point(values: Mapping[str, Any], experiment: Experiment) -> Point:
+    """A point of a sweep."""
+    return Point(dict(values), experiment, digest(key_of_run(experiment)))
+
+
+def groups(points: Sequence[Point], abreast: int, memory: int) -> Iterator[list[Point]]:
+    """Points that may run side by side, in order, with so many replicas and so much memory at most."""
+    open_: list[list[Point]] = []
+    for one in points:
+        for group in open_:
+            replicas = sum(other.experiment.replicas for other in (*group, one))
+            most = min(abreast, 1 + default_batch(one.experiment, memory))
+            if replicas <= most and match(group[0].experiment, one.experiment):
+                group.append(one)
+                break
+        else:
+            open_.append([one])
+    yield from open_
+
+
+def job(group: Sequence[Point], memory: int) -> Job:
+    """The job of a group of points."""
+    keys = tuple(one.key for one in group)
+    experiments = [one.experiment for one in group]
+    batch = min(default_batch(experiments[0], memory), experiments[0].signals.count)
+    work = sum(each.pack.grains * each.timing.steps * replica_bins(each, batch) for each in experiments)
+    replicas = sum(each.replicas for each in experiments) if len(group) > 1 else batch + 1
+    return Job(digest(keys), keys, tuple(written(each) for each in experiments), batch, replicas, float(work))
+
+
+def plan(points: Sequence[Point], done: set[str], memory: int, *, workers: int = 1) -> list[Job]:
+    """The jobs that compute what is missing, the longest first; each point once, however often it is asked for.
+
+    Args:
+        points: of the sweep.
+        done: keys of points that need not be computed.
+        memory: of one worker, in bytes.
+        workers: that there will be: runs are kept small enough for each to have one.
+    """
+    missing = list({one.key: one for one in points if one.key not in done}.values())
+    replicas = sum(one.experiment.replicas for one in missing)
+    abreast = max(1, min(ABREAST, math.ceil(replicas / max(1, workers))))
+    return sorted((job(group, memory) for group in groups(missing, abreast, memory)), key=lambda one: -one.work)
+
+
+class Packs:
+    """Packs by name, each loaded once: points on one pack can run side by side."""
+
+    def __init__(self) -> None:
+        self._loaded: dict[str, Any] = {}
+
+    def __call__(self, source: str) -> Any:
+        """The pack of a file, or a shipped one.
+
+        Raises:
+            FileNotFoundError: if there is none.
+            FileFormatError: if it is damaged.
+        """
+        if source not in self._loaded:
+            self._loaded[source] = load_pack(source)
+        return self._loaded[source]

@@ -1,0 +1,139 @@
+"""What a sweep varies, as a TOML file says it.
+
+    [experiment]                    # what all points share: the options of `gmem recall`
+    t0 = 1800
+    [vary]                          # every combination of these
+    pack = ["tetra-325-a", "tetra-325-b"]
+    mu = {from = 0.0, to = 1.0, count = 6}
+    [[zip]]                         # lists of one length that go together
+    gamma0 = [1e-3, 2e-3]
+    delta0 = [0.05, 0.05]
+    [[points]]                      # further points, one by one
+    mu = 2.0
+    [prepare]                       # packs to be made, where no pack is named: the options of `gmem prepare`
+    grains = 325
+    [run]                           # how it is done: the options of `gmem sweep`
+    executor = "processes"
+
+A name is an option of `gmem recall`, or one of `gmem prepare` as "prepare.seed".
+"""
+
+import itertools
+import math
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gmem_jax.files.atomic import FileFormatError
+
+TABLES = ("experiment", "vary", "zip", "points", "prepare", "run")
+PREPARE = "prepare."
+MOST = 1_000_000  # points: more are a mistake
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A sweep as it was asked for.
+
+    Attributes:
+        shared: values that all points have, by name.
+        axes: what varies: each axis is some names with as many values each.
+        extra: points beyond the combinations of the axes.
+        run: how it is to be done.
+    """
+
+    shared: dict[str, Any] = field(default_factory=dict)
+    axes: tuple[dict[str, list[Any]], ...] = ()
+    extra: tuple[dict[str, Any], ...] = ()
+    run: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        """The names that vary, in order."""
+        tables: list[Mapping[str, Any]] = [*self.axes, *self.extra]
+        return list(dict.fromkeys(name for table in tables for name in table))
+
+    def combinations(self) -> Iterator[dict[str, Any]]:
+        """The values of every point that differ between points."""
+        steps = [[dict(zip(axis, row, strict=True)) for row in zip(*axis.values(), strict=True)] for axis in self.axes]
+        if self.axes or not self.extra:
+            for chosen in itertools.product(*steps):
+                yield {name: value for part in chosen for name, value in part.items()}
+        yield from self.extra
+
+
+def read_spec(path: Path) -> Spec:
+    """The sweep in a TOML file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if it is no TOML, has an unknown table, or a list that is empty or fits no other.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        tables = tomllib.loads(path.read_text())
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f"{path}: not TOML ({error})") from error
+    try:
+        return spec_of(tables)
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+
+
+def spec_of(tables: Mapping[str, Any]) -> Spec:
+    """The sweep that tables describe.
+
+    Raises:
+        ValueError: saying what is wrong.
+    """
+    if unknown := sorted(set(tables) - set(TABLES)):
+        raise ValueError(f"no table {unknown[0]!r} in a sweep; there are {', '.join(TABLES)}")
+    vary, zipped, extra = tables.get("vary", {}), tables.get("zip", []), tables.get("points", [])
+    shared, prepare, run = (tables.get(name, {}) for name in ("experiment", "prepare", "run"))
+    for name, table in (("vary", vary), ("experiment", shared), ("prepare", prepare), ("run", run)):
+        _require(isinstance(table, dict), f"[{name}] must be a table")
+    for name, list_ in (("zip", zipped), ("points", extra)):
+        _require(isinstance(list_, list) and all(isinstance(one, dict) for one in list_), f"[[{name}]] must be tables")
+    axes = [{name: _values(name, value)} for name, value in vary.items()]
+    axes += [{name: _values(name, value) for name, value in table.items()} for table in zipped]
+    for axis in axes:
+        lengths = {name: len(values) for name, values in axis.items()}
+        _require(len(set(lengths.values())) == 1, f"[[zip]]: {lengths} differ in length")
+    own = {PREPARE + name: value for name, value in prepare.items()}
+    spec = Spec({**shared, **own}, tuple(axes), tuple(extra), run)
+    twice = [name for name in spec.names if sum(name in axis for axis in axes) > 1]
+    _require(not twice, f"{twice[:1]} varies twice")
+    _require(bool(axes or extra), "nothing varies: give a table [vary], [[zip]] or [[points]]")
+    count = math.prod(len(next(iter(axis.values()))) for axis in axes) + len(extra)
+    _require(count <= MOST, f"{count} points; {MOST} at most")
+    return spec
+
+
+def _values(name: str, value: Any) -> list[Any]:
+    """The values on an axis: a list, or numbers from, to, count, evenly spaced or by equal factors."""
+    if isinstance(value, dict):
+        known = {"from", "to", "count", "factors"}
+        _require(
+            {"from", "to", "count"} <= set(value) <= known,
+            f"{name}: give a list, or from, to and count (and factors = true)",
+        )
+        numbers = [value["from"], value["to"]]
+        _require(all(isinstance(one, int | float) and math.isfinite(one) for one in numbers), f"{name}: not numbers")
+        _require(isinstance(value["count"], int) and 2 <= value["count"] <= MOST, f"{name}: count must be 2 or more")
+        low, high, last = float(numbers[0]), float(numbers[1]), value["count"] - 1
+        if value.get("factors", False):
+            _require(low > 0.0 and high > 0.0, f"{name}: equal factors need positive numbers")
+            return [low * (high / low) ** (step / last) for step in range(last)] + [high]
+        return [low + (high - low) * step / last for step in range(last)] + [high]
+    _require(isinstance(value, list), f"{name}: give a list of values, got {value!r}")
+    _require(bool(value), f"{name}: the list is empty, so there are no points")
+    return list(value)
+
+
+def _require(true: bool, problem: str) -> None:
+    if not true:
+        raise ValueError(problem)

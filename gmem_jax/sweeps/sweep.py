@@ -1,0 +1,210 @@
+"""A sweep from its beginning to its end: points, packs, jobs, results."""
+
+import functools
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import psutil
+
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import replace as with_values
+from gmem_jax.experiment.host import Progress, silent, within
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.files.named import named_experiment, named_signals
+from gmem_jax.files.provenance import sources
+from gmem_jax.preparation.preparation import Recipe, grain_steps
+from gmem_jax.sweeps.executors import Executor
+from gmem_jax.sweeps.plan import ABREAST, Packs, Point, digest, groups, plan, point
+from gmem_jax.sweeps.spec import PREPARE, Spec
+from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.work import clump_of, run_group
+
+ANY_PACK = "tetra-325-a"
+GRAIN = {"shape": "tetra", "overlap": 0.6}  # of packs to be made, where nothing else is said
+Tell = Callable[[str], None]
+
+
+class Result(NamedTuple):
+    """A point of a sweep and what it gave back."""
+
+    values: dict[str, Any]
+    recall: Recall
+
+
+def sweep(
+    experiment: Experiment,
+    vary: Mapping[str, Sequence[Any]],
+    folder: Path | str | None = None,
+    *,
+    progress: Progress = silent,
+) -> list[Result]:
+    """Run every combination of some values, in this process; what may run side by side does.
+
+    Args:
+        experiment: what all have in common.
+        vary: values by dotted name, like {"friction.mu": [0.0, 0.5], "pack": packs}; packs also by name.
+        folder: keeps the results; what is there already is not computed again.
+        progress: told about every chunk.
+
+    Returns:
+        The points in the order of `itertools.product`, the last name fastest.
+
+    Raises:
+        ValueError: for a name that is no field, or an impossible value.
+        RunFailedError: if a simulation broke down.
+    """
+    packs = Packs()
+    points = []
+    for row in itertools.product(*vary.values()):
+        values = dict(zip(vary, row, strict=True))
+        own = {**values, "pack": packs(values["pack"])} if isinstance(values.get("pack"), str) else values
+        points.append(point(values, with_values(experiment, own)))
+    store = None if folder is None else Store(Path(folder))
+    if store:
+        store.remember([replace(one, values=_labels(one.values)) for one in points], {}, list(vary))
+    found = {one.key: store.load(one.key)[0] for one in points if store and store.at(one.key).is_file()}
+    missing = list({one.key: one for one in points if one.key not in found}.values())
+    jobs = list(groups(missing, ABREAST, psutil.virtual_memory().available))
+    total, done = sum(one.experiment.replicas for one in missing) or 1, 0
+    for group in jobs:
+        share = sum(one.experiment.replicas for one in group)
+        on = within(progress, done / total, (done + share) / total)
+        keys, experiments = [one.key for one in group], [one.experiment for one in group]
+        found |= run_group(keys, experiments, store=store, progress=on)
+        done += share
+    return [Result(one.values, found[one.key]) for one in points]
+
+
+def _labels(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values as a table shows them."""
+    return {name: _label(value) for name, value in values.items()}
+
+
+def _label(value: Any) -> Any:
+    if isinstance(value, str):
+        return value
+    return value.name if isinstance(value, Pack) else float(value) if np.ndim(value) == 0 else type(value).__name__
+
+
+class Conductor:
+    """A sweep as a file asks for it, done by workers on a store.
+
+    Args:
+        spec: what is asked for.
+        folder: of its store.
+        say: told in a line what is planned, and what happened.
+
+    Raises:
+        FileFormatError: if the folder holds something else.
+    """
+
+    def __init__(self, spec: Spec, folder: Path, say: Tell) -> None:
+        self.spec, self.store, self.say = spec, Store(folder), say
+        self._packs, self._signals = Packs(), functools.cache(named_signals)
+
+    def _recipe(self, values: Mapping[str, Any]) -> tuple[Recipe, dict[str, Any]]:
+        """How a pack is to be made, and of which grain."""
+        own = {name.removeprefix(PREPARE): value for name, value in values.items() if name.startswith(PREPARE)}
+        shape = {name: own.pop(name, default) for name, default in GRAIN.items()}
+        known = {field.name: field for field in fields(Recipe)}
+        if unknown := sorted(set(own) - set(known)):
+            raise ValueError(f"a preparation has no {unknown[0]!r}; it has {', '.join((*GRAIN, *known))}")
+        if shape["shape"] not in ("tetra", "sphere"):
+            raise ValueError(f"shape must be tetra or sphere, got {shape['shape']!r}")
+        return Recipe(**own), shape
+
+    def _pack_job(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        recipe, shape = self._recipe(values)
+        clump = clump_of(shape)
+        made = {"recipe": asdict(recipe), "grain": shape}
+        job = {"kind": "pack", "name": digest({**made, **sources()}), "work": grain_steps(recipe, clump), "replicas": 1}
+        return {**job, **made}
+
+    def pack_jobs(self) -> list[dict[str, Any]]:
+        """The packs that must be made first.
+
+        Raises:
+            ValueError: for an impossible recipe.
+        """
+        wanted = {}
+        for values in self.spec.combinations():
+            all_ = {**self.spec.shared, **values}
+            if "pack" not in all_:
+                job = self._pack_job(all_)
+                wanted[job["name"]] = job
+        return [job for job in wanted.values() if not self.store.pack_at(job["name"]).is_file()]
+
+    def check(self) -> None:
+        """Refuse a sweep before anything is computed: all points are made, on some pack where theirs is not there yet.
+
+        Raises:
+            ValueError: for an unknown name or an impossible value.
+            FileNotFoundError: if there is no such pack.
+        """
+        for values in self.spec.combinations():
+            all_ = {**self.spec.shared, **values}
+            if "pack" not in all_:
+                self._pack_job(all_)
+            self._experiment(all_, self._packs(str(all_.get("pack", ANY_PACK))))
+
+    def _experiment(self, values: Mapping[str, Any], pack: Pack) -> Experiment:
+        own = {name: value for name, value in values.items() if name != "pack" and not name.startswith(PREPARE)}
+        if "pack" in values and (odd := [name for name in values if name.startswith(PREPARE)]):
+            raise ValueError(f"a point has a pack and {odd[0]!r} of one to be made; give one of them")
+        return named_experiment(pack, own, self._signals(str(own.get("signals", "six"))))
+
+    def points(self) -> list[Point]:
+        """All points, once their packs are there; those whose packs could not be made are left out.
+
+        Raises:
+            ValueError: for an unknown name or an impossible value.
+            FileNotFoundError: if there is no such pack.
+        """
+        found = []
+        for values in self.spec.combinations():
+            all_ = {**self.spec.shared, **values}
+            source = all_.get("pack") or str(self.store.pack_at(self._pack_job(all_)["name"]))
+            if "pack" in all_ or Path(source).is_file():
+                found.append(point(values, self._experiment(all_, self._packs(str(source)))))
+        return found
+
+    def run(self, executor: Executor, progress: Progress) -> None:
+        """Do all that is missing.
+
+        Raises:
+            RunFailedError: if workers die again and again.
+            OSError: if none can be started.
+        """
+        if makes := self.pack_jobs():
+            self._announce(f"{len(makes)} packs to be made", makes, executor)
+            self._finish(executor, makes, progress, "packs")
+        points = self.points()
+        self.store.remember(points, self.spec.shared, self.spec.names)
+        for key in self.store.unreadable({one.key for one in points}):
+            self.say(f"{self.store.at(key)}: damaged; computed again")
+            self.store.at(key).unlink()
+        known = self.store.done() | set(self.store.failed())
+        memory = psutil.virtual_memory().available // executor.workers
+        jobs = [job.asdict() for job in plan(points, known, memory, workers=executor.workers)]
+        kept = len({one.key for one in points} & known)
+        if jobs:
+            count = sum(len(job["points"]) for job in jobs)
+            self._announce(f"{count} of {len(points)} points in {len(jobs)} runs", jobs, executor)
+            self._finish(executor, jobs, progress, "points")
+        else:
+            self.say(f"all {kept} points are there")
+
+    def _announce(self, what: str, jobs: list[dict[str, Any]], executor: Executor) -> None:
+        work = sum(job["work"] for job in jobs)
+        widest = max(job["replicas"] for job in jobs)
+        workers = min(executor.workers, len(jobs))
+        self.say(f"{what}, {widest} replicas side by side at most: {work:.2g} grain-steps for {workers} workers")
+
+    def _finish(self, executor: Executor, jobs: list[dict[str, Any]], progress: Progress, what: str) -> None:
+        self.store.order(jobs)
+        executor.finish(self.store, jobs, lambda fraction: progress(what, 0.0, fraction))

@@ -1,0 +1,166 @@
+"""A worker: takes jobs that nobody has, until none is left.
+
+    python -m gmem_jax.sweeps.work FOLDER NAME [CPUS]
+
+Any number of workers, on any machines that see the folder, share a sweep; one that is killed loses what it did since
+its last checkpoint.
+"""
+
+import contextlib
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.host import Progress, RunFailedError, forget, silent
+from gmem_jax.experiment.recall import Recall, run
+from gmem_jax.experiment.several import run_several
+from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.configuration import experiment_from, resolved
+from gmem_jax.files.packs import save_pack
+from gmem_jax.files.parts import Parts
+from gmem_jax.files.programs import keep_programs
+from gmem_jax.physics import grain
+from gmem_jax.physics.sample import Sample
+from gmem_jax.preparation.preparation import Recipe, prepare
+from gmem_jax.sweeps.plan import Packs
+from gmem_jax.sweeps.store import Store
+
+EVERY = 1.0  # s between two reports of progress
+
+
+def clump_of(shape: Mapping[str, Any]) -> grain.Clump:
+    """A grain from its shape and overlap."""
+    return grain.sphere() if shape["shape"] == "sphere" else grain.tetra(float(shape["overlap"]))
+
+
+def run_group(
+    keys: Sequence[str],
+    experiments: Sequence[Experiment],
+    *,
+    store: Store | None = None,
+    batch: int | None = None,
+    keep: Parts | None = None,
+    progress: Progress = silent,
+) -> dict[str, Recall]:
+    """Run points that match each other, and keep their recalls in a store; the recalls by key.
+
+    Raises:
+        RunFailedError: if the simulation broke down.
+    """
+    began = time.perf_counter()
+    if len(experiments) == 1:
+        recalls = [run(experiments[0], batch=batch, keep=keep or forget, progress=progress)]
+    else:
+        recalls = run_several(experiments, keep=keep or forget, progress=progress)
+    seconds = (time.perf_counter() - began) / len(recalls)
+    if store:
+        for key, experiment, recall in zip(keys, experiments, recalls, strict=True):
+            store.save(key, jax.block_until_ready(recall), resolved(experiment, seconds))
+    if keep:
+        keep.discard()
+    return dict(zip(keys, recalls, strict=True))
+
+
+class _Worker:
+    def __init__(self, store: Store, name: str) -> None:
+        self.store, self.name, self.packs = store, name, Packs()
+        self._told = 0.0
+
+    def progress(self, job: str) -> Callable[[str, float, float], None]:
+        def tell(stage: str, _: float, fraction: float) -> None:
+            if time.monotonic() - self._told > EVERY or fraction >= 1.0:
+                self._told = time.monotonic()
+                self.store.tell(self.name, job, fraction, stage)
+
+        return tell
+
+    def do(self, job: dict[str, Any]) -> None:
+        """Do a job; a broken run is written down as failed, with its reason."""
+        keys = [job["name"]] if job["kind"] == "pack" else job["points"]
+        try:
+            (self._prepare if job["kind"] == "pack" else self._run)(job)
+        except (RunFailedError, ValueError, FileNotFoundError) as error:
+            reason = " ".join(str(error).split())
+            if len(keys) > 1:  # one of them broke: the others may be sound
+                self._one_by_one(job)
+            else:
+                self.store.fail(keys[0], reason)
+                print(f"{keys[0]}: {reason}", file=sys.stderr, flush=True)
+
+    def _parts(self, job: dict[str, Any]) -> Parts:
+        key = {"job": job["name"], "batch": job.get("batch")}
+        try:
+            return Parts(self.store.parts(job), key)
+        except FileFormatError:  # begun with another batch
+            return Parts(self.store.parts(job), key, restart=True)
+
+    def _prepare(self, job: dict[str, Any]) -> None:
+        parts = self._parts(job)
+        stages: dict[str, Sample] = {}
+        say = self.progress(job["name"])
+        pack = prepare(Recipe(**job["recipe"]), clump_of(job["grain"]), keep=parts, progress=say, log=stages)
+        save_pack(self.store.pack_at(job["name"]), pack, stages)
+        parts.discard()
+
+    def _experiments(self, job: dict[str, Any]) -> list[Experiment]:
+        written = job["configurations"]
+        return [experiment_from(one, self.packs(one["pack"]["source"])) for one in written]
+
+    def _run(self, job: dict[str, Any]) -> None:
+        experiments = [experiment_from(one, self.packs(one["pack"]["source"])) for one in job["configurations"]]
+        say = self.progress(job["name"])
+        run_group(job["points"], experiments, store=self.store, batch=job["batch"], keep=self._parts(job), progress=say)
+
+    def _one_by_one(self, job: dict[str, Any]) -> None:
+        for number, key in enumerate(job["points"]):
+            if not self.store.at(key).is_file():
+                alone = {"points": [key], "configurations": [job["configurations"][number]]}
+                self.do({**job, **alone, "name": f"{job['name']}-{number}"})
+
+
+def work(folder: Path, name: str) -> int:
+    """Take jobs until none is left that nobody has; how many were done.
+
+    Raises:
+        FileFormatError: if the folder holds no sweep.
+        OSError: if it cannot be written.
+    """
+    worker, done = _Worker(Store(folder), name), 0
+    for job in worker.store.jobs():
+        with contextlib.ExitStack() as mine:
+            try:
+                mine.enter_context(worker.store.mine(job))
+            except FileFormatError:  # another worker has it
+                continue
+            if not worker.store.finished(job):
+                worker.do(job)
+                done += 1
+    return done
+
+
+def main(arguments: list[str]) -> int:
+    """Entry point of a worker's process; 0 if it did what it could."""
+    jax.config.update("jax_enable_x64", True)
+    keep_programs()
+    if len(arguments) > 2 and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, [int(number) for number in arguments[2].split(",")])  # before XLA makes its threads
+    try:
+        work(Path(arguments[0]), arguments[1])
+    except OSError as error:
+        print(f"{arguments[0]}: {error}", file=sys.stderr, flush=True)
+        return 2
+    except Exception:
+        traceback.print_exc()
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,147 @@
+"""What a sweep file may say, how its points become runs, and what is refused in one line."""
+
+from pathlib import Path
+
+import pytest
+
+import gmem_jax as gm
+from gmem_jax.sweeps.executors import executor
+from gmem_jax.sweeps.plan import plan, point
+from gmem_jax.sweeps.spec import read_spec, spec_of
+from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.sweep import Conductor
+
+PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+MEMORY = 1 << 33
+
+
+def conductor(folder: Path, **tables: object) -> Conductor:
+    return Conductor(spec_of(tables), folder / "store", lambda _: None)
+
+
+def test_combinations_are_products_of_axes_and_single_points() -> None:
+    spec = spec_of(
+        {
+            "experiment": {"t0": 360.0},
+            "vary": {"mu": [0.1, 0.2], "gamma0": {"from": 1e-3, "to": 1e-1, "count": 3, "factors": True}},
+            "zip": [{"delta0": [0.04, 0.05], "store": [1.0, 2.0]}],
+            "points": [{"mu": 7.0}],
+            "prepare": {"grains": 64},
+        }
+    )
+    points = list(spec.combinations())
+    assert len(points) == 2 * 3 * 2 + 1
+    assert points[0] == {"mu": 0.1, "gamma0": 1e-3, "delta0": 0.04, "store": 1.0}
+    assert points[1] == {"mu": 0.1, "gamma0": 1e-3, "delta0": 0.05, "store": 2.0}
+    assert points[2]["gamma0"] == pytest.approx(1e-2)
+    assert points[-1] == {"mu": 7.0}
+    assert spec.shared == {"t0": 360.0, "prepare.grains": 64}
+    assert spec.names == ["mu", "gamma0", "delta0", "store"]
+    even = spec_of({"vary": {"mu": {"from": 0.0, "to": 1.0, "count": 5}}})
+    assert [one["mu"] for one in even.combinations()] == [0.0, 0.25, 0.5, 0.75, 1.0]
+
+
+BAD = {
+    "[vary]\nmu = []": "mu: the list is empty",
+    "[vary]\nmu = 0.3": "mu: give a list",
+    "[vary]\nmu = {from = 0, to = 1}": "from, to and count",
+    "[vary]\nmu = {from = 0, to = 1, count = 3, factors = true}": "positive",
+    "[[zip]]\nmu = [1, 2]\ngamma0 = [1e-3]": "differ in length",
+    "[vary]\nmu = [1.0]\n[[zip]]\nmu = [1.0]": "varies twice",
+    "[varied]\nmu = [1.0]": "no table 'varied'",
+    "[experiment]\nmu = 1.0": "nothing varies",
+    "mu = [": "not TOML",
+    "[vary]\nmu = {from = 0, to = 1, count = 2000000}": "count must be",
+    "vary = 3": "must be a table",
+    "points = 3": "must be tables",
+}
+
+
+@pytest.mark.parametrize(("text", "problem"), BAD.items(), ids=range(len(BAD)))
+def test_bad_files_are_refused_with_what_is_wrong(tmp_path: Path, text: str, problem: str) -> None:
+    (tmp_path / "bad.toml").write_text(text)
+    with pytest.raises(gm.FileFormatError, match=r"bad\.toml: ") as refused:
+        read_spec(tmp_path / "bad.toml")
+    assert problem in str(refused.value)
+
+
+UNKNOWN = {
+    "colour": ({"vary": {"colour": [1]}}, "no 'colour'"),
+    "preparation": ({"vary": {"prepare.colour": [1]}}, "no 'colour'"),
+    "both": ({"experiment": {"pack": "tetra-325-a"}, "vary": {"prepare.seed": [1]}}, "give one of them"),
+    "law": ({"experiment": {"pack": str(PACK), "friction": "H3"}, "vary": {"mu": [1.0]}}, "friction must be one of"),
+    "range": ({"experiment": {"pack": str(PACK)}, "vary": {"mu": [1.0, -1.0]}}, "mu must be"),
+    "shape": ({"vary": {"prepare.shape": ["cube"]}}, "tetra or sphere"),
+    "grains": ({"vary": {"prepare.grains": [2]}}, "at least 12"),
+}
+
+
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_impossible_points_are_refused_before_anything_is_computed(tmp_path: Path, name: str) -> None:
+    tables, problem = UNKNOWN[name]
+    with pytest.raises(ValueError, match=problem):
+        conductor(tmp_path, **tables).check()
+
+
+def test_points_that_differ_in_replica_parameters_become_one_run(tmp_path: Path) -> None:
+    made = conductor(
+        tmp_path,
+        experiment={"t0": 150.0},
+        vary={"pack": [str(PACK), "tetra-325-a"], "mu": [0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "background": ["sub0", "sub2"]},
+    )
+    points = made.points()
+    jobs = plan(points, set(), MEMORY)
+    assert sorted(len(job.points) for job in jobs) == [6, 6, 6, 6]
+    assert {job.replicas for job in jobs} == {42}
+    assert [job.work for job in jobs] == sorted((job.work for job in jobs), reverse=True)
+    assert len({key for job in jobs for key in job.points}) == 24
+    # Small enough for every worker to have one; what is done is not done again, in whatever order it is asked for.
+    assert len(plan(points, set(), MEMORY, workers=16)) >= 16
+    assert len(plan(points[::-1], {one.key for one in points[1:]}, MEMORY)[0].points) == 1
+    assert plan(points, {one.key for one in points}, MEMORY) == []
+    # Little memory: fewer side by side.
+    assert max(job.replicas for job in plan(points, set(), 1 << 20)) < 42
+
+
+def test_a_key_stands_for_all_that_numbers_depend_on(tmp_path: Path) -> None:
+    base = gm.Experiment(gm.load_pack(PACK), gm.six_signals(), t0=150.0)
+    pack = gm.load_pack(PACK)
+    moved = gm.pack_from(pack, position=pack.position * (1.0 + 1e-12), quaternion=pack.quaternion)
+    changes = [
+        {},
+        {"friction.mu": 0.5},
+        {"friction": gm.MindlinRescaled()},
+        {"gamma0": 2e-3},
+        {"t0": 151.0},
+        {"dt": 0.2},
+        {"store": 1.0},
+        {"signals": gm.words(2)},
+        {"background": "sub2"},
+        {"backend": "jax"},
+        {"hold_drag": 0.01},
+        {"delta0": 0.04},
+        {"material.poisson": 0.4},
+        {"pack": moved},
+    ]
+    keys = [point({}, gm.replace(base, change)).key for change in changes]
+    assert len(set(keys)) == len(changes)
+    assert point({"named": "otherwise"}, gm.Experiment(pack, gm.six_signals(), t0=150.0)).key == keys[0]
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("all of it")
+    with pytest.raises(gm.FileFormatError, match=r"holds thesis\.tex and no sweep"):
+        Store(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_executors_that_cannot_be_had_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ValueError, match="no SLURM here"):
+        executor("slurm", 1, {})
+    with pytest.raises(ValueError, match="must be processes, slurm or local"):
+        executor("cloud", 1, {})
+    with pytest.raises(ValueError, match="as many CPUs"):
+        executor("processes", 10_000, {})
+    with pytest.raises(ValueError, match="no option 'queue'"):
+        executor("processes", 1, {"queue": "long"})
