@@ -1,0 +1,74 @@
+"""What makes a recall doubtful though nothing broke: the model or the drive has left where it is known to hold.
+
+The numbers stand and bits of `Status` say why not to believe them blindly. Each threshold has its reason beside it;
+what was measured on either side of it is in docs/trust.md. All follows from the samples and the parameters, so that
+traced runs are judged too.
+"""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.signals import BINS
+from gmem_jax.physics.contact.friction import CoulombLaw
+from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.sample import Sample
+from gmem_jax.physics.state import Status
+
+DEEPEST = 0.2  # R; there a contact is 0.32 R in radius, which Hertz takes for small. Packs of delta0 = 0.05 reach 0.17
+FASTEST = 5e-3  # inertial number; F has lost a third at 6e-3 (t0 = 180), and flows leave the quasi-static from 1e-3 on
+RINGING = 0.03  # what averaging over T_1 may add to F: at N = 325 up to 0.005 at t0 = 1.8e3, 0.04 to 0.08 at 360
+LARGEST_SHEAR = 0.25  # of delta0: the gain grows with gamma0, by a third at 0.2, sixfold at 0.6; the paper ends at 0.1
+LARGEST_WAVEFORM = 2.0  # |I|; the paper's signals have 1 at most, and gains are per gamma0
+LARGEST_FRICTION = 10.0  # no pair of materials has it; hardly a contact slides, and more changes G by no more than 2 %
+
+
+def doubts(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Array, windowed: jax.Array) -> jax.Array:
+    """The bits of `Status` that leave the numbers as they are, but for NOT_AT_REST.
+
+    Args:
+        experiment: what was run.
+        stages: samples of its stages by name, leading axis bins; one replica where all are alike.
+        raw: F.
+        windowed: F averaged over the ringing period.
+
+    Returns:
+        int32, broadcasts against [S + 1].
+    """
+    deepest = _most([sample.largest_overlap for sample in stages.values()])
+    fastest = _most([sample.inertial_number for sample in stages.values()])
+    waveform = _largest_waveforms(experiment)
+    shear = jnp.asarray(experiment.gamma0) * waveform / experiment.compression
+    found = {
+        Status.DEEP_OVERLAP: deepest > DEEPEST,
+        Status.NOT_QUASI_STATIC: fastest > FASTEST,
+        Status.RINGING: windowed - raw > RINGING,
+        Status.SHEAR_BEYOND_COMPRESSION: shear > LARGEST_SHEAR,
+        Status.LARGE_WAVEFORM: waveform > LARGEST_WAVEFORM,
+        Status.LARGE_FRICTION: jnp.asarray(_friction(experiment)) > LARGEST_FRICTION,
+    }
+    bits = jnp.zeros(1, jnp.int32)
+    for bit, doubtful in found.items():
+        bits |= jnp.where(doubtful, int(bit), 0).astype(jnp.int32)
+    return bits
+
+
+def _most(values: list[jax.Array]) -> jax.Array:
+    """The largest of each replica over all bins of all stages, [B]."""
+    largest = jnp.asarray(0.0)
+    for value in values:
+        largest = jnp.maximum(largest, jnp.max(value, axis=0))
+    return largest
+
+
+def _largest_waveforms(experiment: Experiment) -> jax.Array:
+    """max |I| of every replica, [S + 1], the zero signal's first."""
+    values = experiment.signals.shear((jnp.arange(BINS) + 0.5) / BINS)
+    return jnp.concatenate([jnp.zeros(1), jnp.max(jnp.abs(values), axis=0)])
+
+
+def _friction(experiment: Experiment) -> Scalar:
+    """mu; 0 of a law that has none."""
+    return experiment.friction.mu if isinstance(experiment.friction, CoulombLaw) else 0.0
