@@ -99,7 +99,7 @@ SHORT = {"store": 0.2, "rest": 0.05, "hold": 0.05}
 
 
 @cache
-def bits_of(t0: float = 900.0, **changes: object) -> Status:
+def bits_of(t0: float = 450.0, **changes: object) -> Status:
     """All bits of a run on 27 grains, which must have given numbers."""
     found = gm.run(gm.replace(gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=t0, **SHORT), changes))
     assert np.isfinite(float(found.gain))
@@ -113,7 +113,7 @@ def bits_of(t0: float = 900.0, **changes: object) -> Status:
     [
         ({"friction.mu": 1e6}, Status.LARGE_FRICTION),
         ({"gamma0": 0.02}, Status.SHEAR_BEYOND_COMPRESSION),
-        ({"delta0": 0.2}, Status.DEEP_OVERLAP),
+        ({"delta0": 0.2, "t0": 150.0}, Status.DEEP_OVERLAP),
         ({"t0": 120.0}, Status.NOT_QUASI_STATIC),
     ],
 )
