@@ -147,7 +147,7 @@ MUTATIONS = (
         "physics/state.py",
         "    | Status.DEEP_OVERLAP\n",
         "",
-        "test_a_run_that_deserves_a_doubt_has_it_and_its_numbers",
+        "test_all_doubts_leave_the_numbers_and_all_else_is_fatal",
     ),
     mutation(
         "stale-too-late",

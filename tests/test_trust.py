@@ -67,6 +67,7 @@ LOUD = gm.Bumps(jnp.asarray([[1.0, 0.0], [1.01 * limits.LARGEST_WAVEFORM, 0.0]])
         ({"overlap": around(limits.DEEPEST)}, Status.DEEP_OVERLAP),
         ({"inertial": around(limits.FASTEST)}, Status.NOT_QUASI_STATIC),
         ({"friction.mu": jnp.asarray(around(limits.LARGEST_FRICTION))}, Status.LARGE_FRICTION),
+        ({"friction.stiffness": jnp.asarray(around(1.5 * 0.62035))[jnp.asarray([1, 1, 2])]}, Status.LARGE_STIFFNESS),
         ({"gamma0": 1.01 * limits.LARGEST_SHEAR * 0.05}, Status.SHEAR_BEYOND_COMPRESSION),
         ({"signals": LOUD, "gamma0": 1e-4}, Status.LARGE_WAVEFORM),
     ],
@@ -112,8 +113,9 @@ def bits_of(t0: float = 450.0, **changes: object) -> Status:
     ("changes", "bit"),
     [
         ({"friction.mu": 1e6}, Status.LARGE_FRICTION),
+        ({"friction.stiffness": 2.0}, Status.LARGE_STIFFNESS),
         ({"gamma0": 0.02}, Status.SHEAR_BEYOND_COMPRESSION),
-        ({"delta0": 0.2, "t0": 150.0}, Status.DEEP_OVERLAP),
+        ({"delta0": 0.1, "t0": 150.0}, Status.DEEP_OVERLAP),
         ({"t0": 120.0}, Status.NOT_QUASI_STATIC),
     ],
 )

@@ -6,6 +6,7 @@ traced runs are judged too.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,9 @@ import jax.numpy as jnp
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.signals import BINS
 from gmem_jax.physics.contact.friction import CoulombLaw
-from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.mindlin import Mindlin
+from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import Status
 
@@ -23,6 +26,7 @@ RINGING = 0.03  # what averaging over T_1 may add to F: at N = 325 up to 0.005 a
 LARGEST_SHEAR = 0.25  # of delta0: the gain grows with gamma0, by a third at 0.2, sixfold at 0.6; the paper ends at 0.1
 LARGEST_WAVEFORM = 2.0  # |I|; the paper's signals have 1 at most, and gains are per gamma0
 LARGEST_FRICTION = 10.0  # no pair of materials has it; hardly a contact slides, and more changes G by no more than 2 %
+LARGEST_STIFFNESS = 1.5  # of friction, in k_n: d f_n / dp is 1.5 k_n sqrt(p), which Mindlin's contacts do not reach
 
 
 def doubts(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Array, windowed: jax.Array) -> jax.Array:
@@ -41,13 +45,17 @@ def doubts(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Array,
     fastest = _most([sample.inertial_number for sample in stages.values()])
     waveform = _largest_waveforms(experiment)
     shear = jnp.asarray(experiment.gamma0) * waveform / experiment.compression
+    law: Any = experiment.friction
+    friction = jnp.asarray(law.mu if isinstance(law, CoulombLaw) else 0.0)
+    stiffness = jnp.asarray(law.stiffness if isinstance(law, Hooke | MindlinRescaled | Mindlin) else 0.0)
     found = {
         Status.DEEP_OVERLAP: deepest > DEEPEST,
         Status.NOT_QUASI_STATIC: fastest > FASTEST,
         Status.RINGING: windowed - raw > RINGING,
         Status.SHEAR_BEYOND_COMPRESSION: shear > LARGEST_SHEAR,
         Status.LARGE_WAVEFORM: waveform > LARGEST_WAVEFORM,
-        Status.LARGE_FRICTION: jnp.asarray(_friction(experiment)) > LARGEST_FRICTION,
+        Status.LARGE_FRICTION: friction > LARGEST_FRICTION,
+        Status.LARGE_STIFFNESS: stiffness > LARGEST_STIFFNESS * experiment.material.normal_stiffness,
     }
     bits = jnp.zeros(1, jnp.int32)
     for bit, doubtful in found.items():
@@ -67,8 +75,3 @@ def _largest_waveforms(experiment: Experiment) -> jax.Array:
     """max |I| of every replica, [S + 1], the zero signal's first."""
     values = experiment.signals.shear((jnp.arange(BINS) + 0.5) / BINS)
     return jnp.concatenate([jnp.zeros(1), jnp.max(jnp.abs(values), axis=0)])
-
-
-def _friction(experiment: Experiment) -> Scalar:
-    """mu; 0 of a law that has none."""
-    return experiment.friction.mu if isinstance(experiment.friction, CoulombLaw) else 0.0

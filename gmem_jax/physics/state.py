@@ -30,6 +30,7 @@ class Status(enum.IntFlag):
     SHEAR_BEYOND_COMPRESSION = 2048
     LARGE_WAVEFORM = 4096
     LARGE_FRICTION = 8192
+    LARGE_STIFFNESS = 16384
 
     @property
     def fatal(self) -> bool:
@@ -45,6 +46,7 @@ DOUBTFUL = (
     | Status.SHEAR_BEYOND_COMPRESSION
     | Status.LARGE_WAVEFORM
     | Status.LARGE_FRICTION
+    | Status.LARGE_STIFFNESS
 )
 """The bits that warn and leave the numbers as they are; where they are set is said in `gmem_jax.experiment.doubts`."""
 
@@ -64,6 +66,7 @@ SENTENCES = {
     Status.SHEAR_BEYOND_COMPRESSION: "the shear exceeds delta0 / 4, where the gain depends on it; use a smaller gamma0",
     Status.LARGE_WAVEFORM: "a waveform exceeds 2, and gains are per gamma0; use waveforms up to 1 and a larger gamma0",
     Status.LARGE_FRICTION: "mu exceeds 10, as no material does, so that contacts hardly slide; use a smaller mu",
+    Status.LARGE_STIFFNESS: "tangential springs are stiffer than a Hertz contact is; use a stiffness below 1.5 k_n",
 }
 
 
