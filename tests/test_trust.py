@@ -58,6 +58,7 @@ def around(limit: float) -> list[float]:
     return [0.0, limit * (1.0 - 1e-6), limit * (1.0 + 1e-6)]
 
 
+STIFFEST = float(limits.LARGEST_STIFFNESS * gm.Material().normal_stiffness)
 LOUD = gm.Bumps(jnp.asarray([[1.0, 0.0], [1.01 * limits.LARGEST_WAVEFORM, 0.0]]), jnp.asarray([[0.3, 0.7]] * 2), 0.2)
 
 
@@ -67,7 +68,7 @@ LOUD = gm.Bumps(jnp.asarray([[1.0, 0.0], [1.01 * limits.LARGEST_WAVEFORM, 0.0]])
         ({"overlap": around(limits.DEEPEST)}, Status.DEEP_OVERLAP),
         ({"inertial": around(limits.FASTEST)}, Status.NOT_QUASI_STATIC),
         ({"friction.mu": jnp.asarray(around(limits.LARGEST_FRICTION))}, Status.LARGE_FRICTION),
-        ({"friction.stiffness": jnp.asarray(around(1.5 * 0.62035))[jnp.asarray([1, 1, 2])]}, Status.LARGE_STIFFNESS),
+        ({"friction.stiffness": jnp.asarray(around(STIFFEST))[jnp.asarray([1, 1, 2])]}, Status.LARGE_STIFFNESS),
         ({"gamma0": 1.01 * limits.LARGEST_SHEAR * 0.05}, Status.SHEAR_BEYOND_COMPRESSION),
         ({"signals": LOUD, "gamma0": 1e-4}, Status.LARGE_WAVEFORM),
     ],
