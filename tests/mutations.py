@@ -136,6 +136,20 @@ MUTATIONS = (
         "test_status_bits_are_sticky",
     ),
     mutation(
+        "doubt-of-the-last-stage-alone",
+        "experiment/doubts.py",
+        "largest = jnp.maximum(largest, jnp.max(value, axis=0))",
+        "largest = jnp.max(value, axis=0)",
+        "test_each_doubt_is_that_of_its_replica_alone",
+    ),
+    mutation(
+        "doubt-kills",
+        "physics/state.py",
+        "    | Status.DEEP_OVERLAP\n",
+        "",
+        "test_all_doubts_leave_the_numbers_and_all_else_is_fatal",
+    ),
+    mutation(
         "stale-too-late",
         "physics/sample.py",
         "slack(system.pairs, spheres, box) <= 0.0",

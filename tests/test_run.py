@@ -114,8 +114,9 @@ def test_a_pack_is_at_rest_below_one_percent_of_the_speed_of_its_walls() -> None
         return finish(experiment, stages, jnp.zeros(7, jnp.int32))
 
     below, above = at(0.01 * (1.0 - 1e-9)), at(0.01 * (1.0 + 1e-9))
-    assert np.all(np.asarray(below.status) == 0)
-    np.testing.assert_array_equal(above.status, [0] + [int(Status.NOT_AT_REST)] * 6)
+    unrest = int(Status.NOT_AT_REST)  # the drive is too fast as well, which is another bit
+    np.testing.assert_array_equal(below.status & unrest, 0)
+    np.testing.assert_array_equal(above.status & unrest, [0] + [unrest] * 6)
     np.testing.assert_allclose(above.residual_speed, [0.005] + [0.01] * 6, rtol=1e-8)
     # A warning, no more: the numbers stand.
     np.testing.assert_array_equal(above.p_sig, found.p_sig)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.doubts import doubts
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import (
     NOWHERE,
@@ -31,7 +32,7 @@ from gmem_jax.experiment.signals import BINS, part
 from gmem_jax.experiment.walk import walk
 from gmem_jax.physics.pytree import Scalar, pytree, traced
 from gmem_jax.physics.sample import Sample
-from gmem_jax.physics.state import Status
+from gmem_jax.physics.state import DOUBTFUL, Status
 
 REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than this part of the walls' speed
 COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
@@ -55,7 +56,8 @@ class Recall:
         windowed_fidelity: F after the same.
         window: that period T_1, in t_c.
         residual_speed: largest grain speed when the readout began, over the walls' speed, [S + 1].
-        status: bits of `Status`, [S + 1]; replica 0 is the zero signal.
+        status: bits of `Status`, [S + 1]; replica 0 is the zero signal. Those of
+            `DOUBTFUL` leave the numbers as they are.
         stages: samples of every stage by name, leading axis bins; one replica before "encode". Ordered: JAX sorts the
             keys of plain dictionaries.
         dt: the time step used, in t_c.
@@ -84,7 +86,7 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
     residual = stages["store"].largest_speed[-1] / wall_speed
     status = status | jnp.where(residual < REST_SPEED, 0, int(Status.NOT_AT_REST)).astype(jnp.int32)
     # A factor, not a choice: the derivative of what is broken must be NaN too.
-    sound = jnp.where(jnp.any(status & ~int(Status.NOT_AT_REST)), jnp.nan, 1.0)
+    sound = jnp.where(jnp.any(status & ~int(DOUBTFUL)), jnp.nan, 1.0)
     p_sig = sound * experiment.recalled({name: stages[name].pressure for name in stages if "readout" in name})
     integral = experiment.integral()
     window = pack.ringing_period * BINS / jnp.max(jnp.asarray(t0))
@@ -104,7 +106,7 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
         windowed_fidelity=smooth.fidelity,
         window=pack.ringing_period,
         residual_speed=residual,
-        status=status,
+        status=status | doubts(experiment, stages, match.fidelity, smooth.fidelity),
         stages=stages,
         dt=step,
     )

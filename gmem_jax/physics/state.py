@@ -24,11 +24,31 @@ class Status(enum.IntFlag):
     STEP_TOO_LARGE = 32
     CAPACITY = 64
     IMPOSSIBLE = 128
+    DEEP_OVERLAP = 256
+    NOT_QUASI_STATIC = 512
+    RINGING = 1024
+    SHEAR_BEYOND_COMPRESSION = 2048
+    LARGE_WAVEFORM = 4096
+    LARGE_FRICTION = 8192
+    LARGE_STIFFNESS = 16384
 
     @property
     def fatal(self) -> bool:
-        """Whether the numbers of the run are meaningless (a pack not yet at rest is only noisy)."""
-        return bool(self & ~Status.NOT_AT_REST)
+        """Whether the numbers of the run are meaningless, and not only doubtful."""
+        return bool(self & ~DOUBTFUL)
+
+
+DOUBTFUL = (
+    Status.NOT_AT_REST
+    | Status.DEEP_OVERLAP
+    | Status.NOT_QUASI_STATIC
+    | Status.RINGING
+    | Status.SHEAR_BEYOND_COMPRESSION
+    | Status.LARGE_WAVEFORM
+    | Status.LARGE_FRICTION
+    | Status.LARGE_STIFFNESS
+)
+"""The bits that warn and leave the numbers as they are; where they are set is said in `gmem_jax.experiment.doubts`."""
 
 
 SENTENCES = {
@@ -40,6 +60,13 @@ SENTENCES = {
     Status.STEP_TOO_LARGE: "the time step exceeds 0.5 t_c; use a smaller dt",
     Status.CAPACITY: "the neighbour list overflowed its capacity; allocate it anew",
     Status.IMPOSSIBLE: "a parameter or a waveform is impossible; use numbers that `Experiment` accepts outside a trace",
+    Status.DEEP_OVERLAP: "an overlap exceeded 0.2 R, and Hertz's law is for small ones; use less compression or shear",
+    Status.NOT_QUASI_STATIC: "the walls move too fast (an inertial number beyond 5e-3); use a larger t0 or less shear",
+    Status.RINGING: "the pack rings: F over its period is larger by 0.03; use a larger t0, or F over T1",
+    Status.SHEAR_BEYOND_COMPRESSION: "the shear exceeds delta0 / 4, where the gain depends on it; use a smaller gamma0",
+    Status.LARGE_WAVEFORM: "a waveform exceeds 2, and gains are per gamma0; use waveforms up to 1 and a larger gamma0",
+    Status.LARGE_FRICTION: "mu exceeds 10, as no material does, so that contacts hardly slide; use a smaller mu",
+    Status.LARGE_STIFFNESS: "tangential springs are stiffer than a Hertz contact is; use a stiffness below 1.5 k_n",
 }
 
 
