@@ -9,10 +9,11 @@ from rich.table import Table
 
 from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, reporting, say
 from gmem_jax.experiment.host import RunFailedError
+from gmem_jax.files.atomic import FileFormatError, probe
 from gmem_jax.files.parts import locked
 from gmem_jax.physics.state import SENTENCES, Status
 from gmem_jax.sweeps.executors import executor as executor_named
-from gmem_jax.sweeps.spec import read_spec
+from gmem_jax.sweeps.spec import Spec, read_spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import Conductor
 from gmem_jax.sweeps.table import FORMATS, export, means, rows
@@ -60,9 +61,12 @@ def sweep_command(
     target = output or path.with_suffix("")
     if not target.parent.is_dir():
         raise InputError(f"--output {target}: folder {target.parent} does not exist")
+    try:
+        probe(target.parent)
+    except OSError as error:
+        raise InputError(f"--output {target}: cannot write there ({error.strerror})") from error
     with locked(target), reporting(goes_on=True) as progress:
-        conductor = Conductor(spec, target, say)
-        conductor.check()
+        conductor = planned(path, spec, target)
         if retry and (count := conductor.store.forgive()):
             say(f"{count} points that failed are tried again")
         conductor.run(chosen, progress)
@@ -74,6 +78,20 @@ def sweep_command(
     emit(as_json, _summary(conductor.store, table), _table(table, spec.names))
     if failed:
         raise RunFailedError(f"{len(failed)} of {len(table)} points; again with --retry")
+
+
+def planned(path: Path, spec: Spec, folder: Path) -> Conductor:
+    """The sweep of a file, once it is sure that its points can be.
+
+    Raises:
+        FileFormatError: if one cannot, or the folder holds something else.
+    """
+    conductor = Conductor(spec, folder, say)
+    try:
+        conductor.check()
+    except (ValueError, TypeError, FileNotFoundError) as error:
+        raise FileFormatError(f"{path}: {' '.join(str(error).split())}") from error
+    return conductor
 
 
 def _there(folder: Path) -> Store:

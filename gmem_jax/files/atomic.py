@@ -1,11 +1,15 @@
 """Files that are whole or not there: written under a temporary name, flushed to disk, and renamed."""
 
 import contextlib
+import errno
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
 
 class FileFormatError(ValueError):
@@ -29,9 +33,18 @@ def atomic(path: Path) -> Iterator[Path]:
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and (reason := _of_the_disk(error)):
+            raise OSError(f"{path}: cannot be written ({reason}); whatever was there is untouched") from error
         raise
+
+
+def _of_the_disk(error: OSError) -> str:
+    """What a disk refused a writer, in words; h5py says the number in its message only."""
+    told = re.search(r"errno = (\d+)", str(error))
+    number = error.errno or (int(told[1]) if told else 0)
+    return os.strerror(number) if number in _DISK else ""
 
 
 def probe(folder: Path) -> None:

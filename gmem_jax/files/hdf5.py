@@ -4,6 +4,7 @@ A file is sealed (see `seal`), holds nothing but what `tree` allows, and every a
 before it is read. Files from before there were seals are copied into sealed ones on the fly.
 """
 
+import io
 import json
 import subprocess
 import sys
@@ -89,11 +90,14 @@ def writing(path: Path, schema: str) -> Iterator[h5py.File]:
     Raises:
         OSError: if the path cannot be written.
     """
+    # In memory first: libhdf5 may crash when a disk is full.
+    content = io.BytesIO()
+    with h5py.File(content, "w", userblock_size=BLOCK) as file:
+        file.attrs["schema"] = schema
+        file.attrs["units"] = "R = E = rho = 1"
+        yield file
     with atomic(path) as temporary:
-        with h5py.File(temporary, "w", userblock_size=BLOCK) as file:
-            file.attrs["schema"] = schema
-            file.attrs["units"] = "R = E = rho = 1"
-            yield file
+        temporary.write_bytes(content.getbuffer())
         seal(temporary)
 
 

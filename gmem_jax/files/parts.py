@@ -229,6 +229,8 @@ def locked(output: Path) -> Iterator[None]:
     with lock.open("a+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.fstat(file.fileno()).st_ino != lock.stat().st_ino:
+                raise OSError  # who had it before us has removed it, and somebody else may have made another
         except OSError:
             raise FileFormatError(f"{output}: another run is writing it; name another output") from None
         try:

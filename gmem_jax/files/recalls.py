@@ -26,7 +26,7 @@ from gmem_jax.files.checked import (
 from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.hdf5 import Content, reading, write_samples, writing
 from gmem_jax.physics.sample import Sample
-from gmem_jax.physics.state import Status
+from gmem_jax.physics.state import DOUBTFUL, Status
 
 RECALL_SCHEMA = "gmem-recall/2"
 _BEFORE = "gmem-recall/1"  # without a seal and I(u)
@@ -116,7 +116,7 @@ def _check(recall: Recall) -> None:
     require(
         (recall.window > 0.0) & np.all(np.asarray(recall.dt) > 0.0), "its time step or ringing period is not positive"
     )
-    if not np.any(status & ~int(Status.NOT_AT_REST)):
+    if not np.any(status & ~int(DOUBTFUL)):
         measured = {name: getattr(recall, name) for name in ("p_sig", *_MEASURES, "residual_speed")}
         require_finite(measured)
     if "readout" not in recall.stages:

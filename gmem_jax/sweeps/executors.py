@@ -66,6 +66,7 @@ class Executor(ABC):
                 alive = self.alive()
                 if not alive and not any(store.taken(job) for job in open_):
                     if deaths == DEATHS:
+                        store.require_room()
                         raise RunFailedError(f"workers end without doing their jobs: {self.last_words(store, names)}")
                     deaths += 1
                 for name in names[: len(open_)]:

@@ -30,7 +30,7 @@ from gmem_jax.files.atomic import FileFormatError
 
 TABLES = ("experiment", "vary", "zip", "points", "prepare", "run")
 PREPARE = "prepare."
-MOST = 1_000_000  # points: more are a mistake
+MOST = 100_000  # points: more are a mistake
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.sweeps.plan import Point
 
 SWEEP_SCHEMA = "gmem-sweep/1"
+ROOM = 1 << 20  # bytes that must be left on the disk: some points of a small pack
 FOLDERS = ("jobs", "points", "failed", "packs", "parts", "workers")
 
 
@@ -56,9 +57,23 @@ class Store:
     def _card(self) -> Path:
         return self.folder / "sweep.json"
 
-    def remember(self, points: Sequence[Point], shared: dict[str, Any], names: Sequence[str]) -> None:
-        """Write down the points of the sweep; results of points that are no longer asked for stay."""
+    def remember(
+        self,
+        points: Sequence[Point],
+        shared: dict[str, Any],
+        names: Sequence[str],
+        impossible: Sequence[tuple[str, dict[str, Any]]] = (),
+    ) -> None:
+        """Write down the points of the sweep; results of points that are no longer asked for stay.
+
+        Args:
+            points: that can be computed.
+            shared: the values that all have.
+            names: of what varies.
+            impossible: keys and values of those that cannot.
+        """
         rows = [{"key": one.key, "values": one.values} for one in points]
+        rows += [{"key": key, "values": values} for key, values in impossible]
         self._write(self._card, {"schema": SWEEP_SCHEMA, "shared": shared, "names": list(names), "points": rows})
 
     def card(self) -> dict[str, Any]:
@@ -126,6 +141,19 @@ class Store:
             except FileFormatError:
                 found.append(key)
         return found
+
+    def require_room(self) -> None:
+        """Make sure that the disk takes more.
+
+        Raises:
+            OSError: if it does not.
+        """
+        trial = self.folder / "trial"
+        try:
+            with atomic(trial) as temporary:
+                temporary.write_bytes(bytes(ROOM))
+        finally:
+            trial.unlink(missing_ok=True)
 
     def fail(self, key: str, reason: str) -> None:
         """Write down why a point has no result."""

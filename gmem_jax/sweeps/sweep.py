@@ -24,6 +24,7 @@ from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import clump_of, run_group
 
+CHECKED = 50  # values of a name that are tried before a sweep begins
 ANY_PACK = "tetra-325-a"
 GRAIN = {"shape": "tetra", "overlap": 0.6}  # of packs to be made, where nothing else is said
 Tell = Callable[[str], None]
@@ -106,6 +107,7 @@ class Conductor:
     def __init__(self, spec: Spec, folder: Path, say: Tell) -> None:
         self.spec, self.store, self.say = spec, Store(folder), say
         self._packs, self._signals = Packs(), functools.cache(named_signals)
+        self.impossible: list[tuple[dict[str, Any], str]] = []
 
     def _recipe(self, values: Mapping[str, Any]) -> tuple[Recipe, dict[str, Any]]:
         """How a pack is to be made, and of which grain."""
@@ -140,13 +142,21 @@ class Conductor:
         return [job for job in wanted.values() if not self.store.pack_at(job["name"]).is_file()]
 
     def check(self) -> None:
-        """Refuse a sweep before anything is computed: all points are made, on some pack where theirs is not there yet.
+        """Refuse a sweep before anything is computed: some points with every value are made, on some pack if need be.
+
+        What is impossible only together with another value fails later, by itself.
 
         Raises:
             ValueError: for an unknown name or an impossible value.
             FileNotFoundError: if there is no such pack.
         """
-        for values in self.spec.combinations():
+        first = {name: values[0] for axis in self.spec.axes for name, values in axis.items()}
+        tried = [first, *self.spec.extra[:CHECKED]]
+        for axis in self.spec.axes:
+            count = len(next(iter(axis.values())))
+            places = sorted({round(step * (count - 1) / CHECKED) for step in range(CHECKED + 1)})
+            tried += [{**first, **{name: values[place] for name, values in axis.items()}} for place in places]
+        for values in tried:
             all_ = {**self.spec.shared, **values}
             if "pack" not in all_:
                 self._pack_job(all_)
@@ -159,18 +169,16 @@ class Conductor:
         return named_experiment(pack, own, self._signals(str(own.get("signals", "six"))))
 
     def points(self) -> list[Point]:
-        """All points, once their packs are there; those whose packs could not be made are left out.
-
-        Raises:
-            ValueError: for an unknown name or an impossible value.
-            FileNotFoundError: if there is no such pack.
-        """
+        """All points that are possible, once their packs are there."""
         found = []
+        self.impossible = []
         for values in self.spec.combinations():
             all_ = {**self.spec.shared, **values}
-            source = all_.get("pack") or str(self.store.pack_at(self._pack_job(all_)["name"]))
-            if "pack" in all_ or Path(source).is_file():
+            try:
+                source = all_.get("pack") or str(self.store.pack_at(self._pack_job(all_)["name"]))
                 found.append(point(values, self._experiment(all_, self._packs(str(source)))))
+            except (ValueError, FileNotFoundError) as error:
+                self.impossible.append((values, " ".join(str(error).split())))
         return found
 
     def run(self, executor: Executor, progress: Progress) -> None:
@@ -184,7 +192,10 @@ class Conductor:
             self._announce(f"{len(makes)} packs to be made", makes, executor)
             self._finish(executor, makes, progress, "packs")
         points = self.points()
-        self.store.remember(points, self.spec.shared, self.spec.names)
+        failed = [(digest([self.spec.shared, values]), values, reason) for values, reason in self.impossible]
+        self.store.remember(points, self.spec.shared, self.spec.names, [(key, values) for key, values, _ in failed])
+        for key, _, reason in failed:
+            self.store.fail(key, reason)
         for key in self.store.unreadable({one.key for one in points}):
             self.say(f"{self.store.at(key)}: damaged; computed again")
             self.store.at(key).unlink()

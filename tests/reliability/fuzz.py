@@ -33,6 +33,7 @@ from hypothesis import strategies as st
 
 import gmem_jax as gm
 from gmem_jax.command import app, derive, packs, recalls
+from gmem_jax.command.sweep import planned
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files import tree
 from gmem_jax.files.atomic import FileFormatError
@@ -40,11 +41,26 @@ from gmem_jax.files.parts import load_part, save_part
 from gmem_jax.files.seal import BLOCK, seal
 from gmem_jax.files.waveforms import load_target
 from gmem_jax.physics.sample import Sample
+from gmem_jax.sweeps.spec import read_spec
 
 PATIENCE = 10.0  # seconds for one input
 MEMORY = 6 << 30  # bytes of address space that a child may add
 BATCH = 250  # inputs to a child
 PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
+SWEEP = f"""[experiment]
+t0 = 150.0
+signals = "six"
+[vary]
+pack = ["{PACK}"]
+mu = {{from = 0.2, to = 1.0, count = 3}}
+[[zip]]
+gamma0 = [1e-3, 2e-3]
+store = [1.0, 2.0]
+[[points]]
+friction = "M1"
+[run]
+workers = 2
+"""
 GOOD = ("refused", "accepted")
 BAD = ("lie", "traceback", "wordy", "hang", "crash")
 
@@ -86,6 +102,7 @@ def make_samples(folder: Path) -> None:
     training.save(folder / "net.msgpack", training.Training(net.initial(small, 0), 0, loss=0.5))
     waves = gm.waveform(np.sin(np.linspace(0.1, 3.0, 9)) * np.ones((6, 1)))
     gm.save_waveforms(folder / "waves.csv", waves, gm.six_signals())
+    (folder / "sweep.toml").write_text(SWEEP)
     np.save(folder / "waves.npy", np.asarray(waves.nodes)[:, 1:-1])
     (folder / "folder").mkdir()
     os.mkfifo(folder / "pipe.h5")
@@ -304,7 +321,7 @@ def file_judge(name: str, load: Callable[[Path], Any], *, sealed: bool = True) -
             path.write_bytes(before)
             mutate_hdf5(path, mutation)
         else:
-            path.write_bytes(mutate_bytes(before, mutation))
+            path.write_bytes(mutation if how == "whole" else mutate_bytes(before, mutation))
             if how == "forged":
                 with path.open("r+b") as file:
                     file.truncate(max(BLOCK, path.stat().st_size))
@@ -416,9 +433,11 @@ def _stop(*_: Any, **__: Any) -> Any:
 def _without_runs() -> None:
     """Every command up to where it would compute."""
     from gmem_jax.bench import measure
+    from gmem_jax.command import sweep
     from gmem_jax.reading import training
 
     recalls.run = packs.prepare = measure.run = training.train = _stop  # type: ignore[assignment]
+    sweep.Conductor.run = _stop  # type: ignore[method-assign]
     for name in ("value_and_grad", "prefix_of", "memory_kernel", "simulate", "design_waveforms", "design_drive"):
         setattr(derive, name, _stop)
 
@@ -453,6 +472,37 @@ def _of(how: str, cases: st.SearchStrategy[Case]) -> st.SearchStrategy[Case]:
 
 
 _RAW, _FORGED, _INSIDE = _of("bytes", _BYTES), _of("forged", _BYTES), _of("hdf5", _H5)
+
+
+def _load_sweep(path: Path) -> Any:
+    """A sweep file, up to its first computation."""
+    return planned(path, read_spec(path), path.parent / f"sweep-{os.getpid()}")
+
+
+# Lines of a sweep file: some say something, most are wrong somewhere.
+_NAMES = st.sampled_from(
+    ["mu", "gamma0", "t0", "pack", "signals", "friction", "prepare.seed", "colour", "steps", "points"]
+)
+_CELLS = st.one_of(
+    st.floats().map(repr),
+    st.integers(-2, 99).map(str),
+    st.sampled_from(['"six"', '"H"', '"tetra-325-a"', "[]", "{}", "1979-05-27"]),
+)
+_AXES = st.one_of(
+    _CELLS,
+    st.lists(_CELLS, max_size=4).map(lambda cells: f"[{', '.join(cells)}]"),
+    st.tuples(_CELLS, _CELLS, _CELLS).map(lambda cells: "{{from = {}, to = {}, count = {}}}".format(*cells)),
+)
+_SWEEP = st.lists(
+    st.one_of(
+        st.sampled_from(["[vary]", "[experiment]", "[prepare]", "[[zip]]", "[[points]]", "[run]", "[odd]"]),
+        st.tuples(st.sampled_from(['"mu"', '"prepare.grains"', "mu", "t0"]) | _NAMES.map(json.dumps), _AXES).map(
+            " = ".join
+        ),
+    ),
+    max_size=8,
+).map(lambda lines: "\n".join(lines).encode())
+
 KINDS: dict[str, Kind] = {
     "packs": Kind(0.24, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("pack.h5", _show(recalls.show))),
     "recalls": Kind(0.20, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("recall.h5", _show(recalls.show))),
@@ -462,7 +512,8 @@ KINDS: dict[str, Kind] = {
     "npy": Kind(0.05, _RAW, file_judge("waves.npy", _load_waves, sealed=False)),
     "packs without a seal": Kind(0.01, _RAW, file_judge("old-pack.h5", gm.load_pack, sealed=False)),
     "recalls without a seal": Kind(0.01, _RAW, file_judge("old-recall.h5", gm.load_recall, sealed=False)),
-    "command lines": Kind(0.21, _lines(), judge_line),
+    "sweeps": Kind(0.05, st.one_of(_RAW, _of("whole", _SWEEP)), file_judge("sweep.toml", _load_sweep, sealed=False)),
+    "command lines": Kind(0.16, _lines(), judge_line),
 }
 
 

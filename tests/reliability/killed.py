@@ -7,10 +7,12 @@ often than a user's run writes them, so that most kills fall near one.
 """
 
 import argparse
+import contextlib
 import hashlib
 import json
 import os
 import random
+import shutil
 import signal
 import sys
 import tempfile
@@ -19,9 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import psutil
 
 from gmem_jax.command import app
 from gmem_jax.files import parts
+from gmem_jax.sweeps import work
 
 PACK = str(Path(__file__).parents[1] / "data" / "tetra-27.h5")
 SHORT = ["--t0", "150", "--store", "0.2"]
@@ -33,8 +37,17 @@ COMMANDS = {
     "gradient": ("gradient.json", ["gradient", PACK, *SHORT, "--no-picture"]),
     "kernel": ("kernel.h5", ["kernel", PACK, "-n", "9", *SHORT, "--no-picture"]),
     "design": ("designed.csv", ["design", PACK, "--iterations", "2", *SHORT, "--no-picture"]),
+    "sweep": ("swept", ["sweep", "{folder}/mu.toml"]),
     "tune": ("tuned.json", ["tune", PACK, "--bounds", "mu=0.5:2", "--iterations", "1", *SHORT, "--no-picture"]),
 }
+SWEEP = f"""[experiment]
+pack = "{PACK}"
+t0 = 150
+store = 0.2
+[vary]
+mu = [0.2, 0.5, 1.0]
+background = ["sub0", "sub2"]
+"""
 LONGEST = 600.0  # s: a run that takes longer hangs
 
 
@@ -75,6 +88,12 @@ def _timeless(value: Any) -> Any:
     return [_timeless(item) for item in value] if isinstance(value, list) else value
 
 
+def contents(path: Path) -> dict[str, str]:
+    """`content` of a file, or of every point of a sweep, by name."""
+    files = sorted((path / "points").glob("*.h5")) if path.is_dir() else [path] if path.exists() else []
+    return {file.name if path.is_dir() else "": content(file) for file in files}
+
+
 def content(path: Path) -> str:
     """SHA-256 of all that a file says, but for the time it took to make."""
     said: dict[str, Any] = {}
@@ -87,10 +106,21 @@ def content(path: Path) -> str:
                 if isinstance(item, h5py.Dataset):
                     said[name] = item[()].tobytes().hex()
         said["@configuration"] = _timeless(json.loads(said.get("@configuration", "{}")))
-        said.pop("@sha256", None)  # of the file, the time included
     else:
         said = _timeless(json.loads(path.read_text())) if path.suffix == ".json" else {"text": path.read_text()}
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+
+def kill_workers(folder: Path) -> int:
+    """Kill every worker of a sweep; how many there were."""
+    found = 0
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            if work.__name__ in process.cmdline() and str(folder) in process.cmdline():
+                process.kill()
+                process.wait()
+                found += 1
+    return found
 
 
 def chain(name: str, kills: int, folder: Path, chance: random.Random) -> dict[str, Any]:
@@ -103,30 +133,36 @@ def chain(name: str, kills: int, folder: Path, chance: random.Random) -> dict[st
     code = wait(start([*arguments, "-o", str(output)], log), LONGEST)
     undisturbed = time.monotonic() - began
     assert code == 0, f"{name}: {log.read_text()}"
-    wanted = content(output)
+    wanted = contents(output)
     found = {"kills": 0, "ends": 0, "wrong": [], "undisturbed_seconds": round(undisturbed, 1)}
-    target = folder / f"killed-{file}"
-    while found["kills"] < kills or not target.exists():
+    target, shortest, began_at = folder / f"killed-{file}", undisturbed, 0.0
+    ended = False
+    while found["kills"] < kills or not ended:
+        fresh, began_at = ended or not found["kills"], time.monotonic()
         child = start([*arguments, "-o", str(target)], log)
-        limit = chance.uniform(0.0, undisturbed) if found["kills"] < kills else LONGEST
+        limit = chance.uniform(0.0, shortest) if found["kills"] < kills else LONGEST
         code = wait(child, limit)
+        if code is None and name == "sweep" and chance.random() < 0.5 and limit < LONGEST:
+            found["kills"] += kill_workers(target)  # the sweep itself goes on, with others
+            code = wait(child, LONGEST)
         if code is None:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
+            kill_workers(target)
             found["kills"] += 1
-            if limit == LONGEST:
-                found["wrong"].append("hangs")
+            found["wrong"] += ["hangs"] if limit == LONGEST else []
         elif code != 0:
             found["wrong"].append(log.read_text()[-300:])
-        else:
-            found["ends"] += 1
-        if target.exists():
-            if content(target) != wanted:
-                found["wrong"].append(f"another {file} after {found['kills']} kills")
-            left = [path.name for path in folder.glob(f"{target.name}.parts")] if code == 0 else []
-            found["wrong"] += [f"{path} is left" for path in left]
+        ended = code == 0
+        shortest = min(shortest, time.monotonic() - began_at) if ended and fresh else shortest
+        found["ends"] += ended
+        there = contents(target)
+        if there != wanted if ended else not there.items() <= wanted.items():
+            found["wrong"].append(f"another {file} after {found['kills']} kills")
+        if ended:
+            found["wrong"] += [f"{path.name} is left" for path in folder.glob(f"{target.name}.parts")]
             if found["kills"] < kills:
-                target.unlink()
+                shutil.rmtree(target) if target.is_dir() else target.unlink()
         if len(found["wrong"]) > 3:
             break
     return found
@@ -143,6 +179,8 @@ def main(argv: list[str] | None = None) -> dict[str, Any]:
     names, chance = options.commands.split(","), random.Random(options.seed)
     result = {}
     with tempfile.TemporaryDirectory() as folder:
+        os.environ["GMEM_COMPILE_CACHE"] = f"{folder}/programs"
+        Path(folder, "mu.toml").write_text(SWEEP)
         if "classify" in names and "recall" not in names:
             wait(start([*COMMANDS["recall"][1], "-o", f"{folder}/recall.h5"], Path(folder) / "log"), LONGEST)
         for name in names:
