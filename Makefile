@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo test check mutations install clean
+.PHONY: demo test check mutations reliability install clean
 
 demo: install
 	$(REBUILD)
@@ -18,6 +18,11 @@ test: install-dev
 # Wrong code that the tests must notice; an hour or two. Names of mutations: make mutations NAMES="step-* native-*"
 mutations: install-dev
 	$(BIN)/python tests/mutations.py $(NAMES)
+
+# Kills, hostile input, full disks, sanitizers, numerical trust: under an hour on two cores; writes docs/reliability.md.
+reliability: install-dev
+	$(REBUILD)
+	$(BIN)/python tests/reliability/run.py
 
 check: install-dev
 	$(BIN)/ruff check .

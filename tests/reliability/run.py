@@ -1,0 +1,148 @@
+"""All of it, in under an hour on two cores, and docs/reliability.md with what was found: `make reliability`.
+
+Two lanes side by side: kills in one; hostile input, disks, sanitizers and numerical trust in the other.
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+PAGE = ROOT / "docs" / "reliability.md"
+STUDIES = ["order", "skin", "dt"]
+
+Piece = tuple[str, list[str]]
+
+
+def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
+    """Name and command of each piece, by lane; what they find goes into JSON files of their names."""
+
+    def script(path: Path, name: str, *more: object) -> Piece:
+        return name, [sys.executable, str(path), *map(str, more), "--json", str(folder / f"{name}.json")]
+
+    kills = script(HERE / "killed.py", "killed", "--kills", max(8, round(104 * scale)))
+    sanitizers = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        str(ROOT / "tests/test_sanitizers.py"),
+    ]
+    others = [
+        script(HERE / "fuzz.py", "fuzz", max(200, round(10_000 * scale)), "--seed", int(time.time()) % 100_000),
+        script(HERE / "disks.py", "disks"),
+        ("sanitizers", sanitizers),
+        script(ROOT / "benchmarks/trust.py", "trust", "--folder", folder / "trust", "--studies", *studies),
+    ]
+    return [kills], others
+
+
+def run(lane: list[Piece], folder: Path) -> dict[str, dict[str, Any]]:
+    """Run the pieces of a lane one after the other."""
+    found = {}
+    for name, command in lane:
+        began = time.perf_counter()
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
+        summary = folder / f"{name}.json"
+        content = json.loads(summary.read_text()) if summary.is_file() else {}
+        seconds = time.perf_counter() - began
+        found[name] = {"code": done.returncode, "seconds": seconds, "found": content, "said": done.stdout[-2000:]}
+        print(f"{name}: exit {done.returncode} after {seconds:.0f} s", flush=True)
+        if done.returncode:
+            print(done.stdout[-3000:], done.stderr[-3000:], flush=True)
+    return found
+
+
+def _kills(found: dict[str, Any]) -> list[str]:
+    lines = ["| command | kills | runs to the end | other than undisturbed |", "|---|---|---|---|"]
+    lines += [f"| {name} | {one['kills']} | {one['ends']} | {len(one['wrong'])} |" for name, one in found.items()]
+    total = sum(one["kills"] for one in found.values())
+    return [f"{total} kills at random moments.", "", *lines]
+
+
+def _inputs(found: dict[str, Any]) -> list[str]:
+    bad = ("lie", "traceback", "wordy", "hang", "crash")
+    lines = ["| input | tried | refused | accepted | " + " | ".join(bad) + " |", "|---" * (4 + len(bad)) + "|"]
+    for name, count in found["inputs"].items():
+        one = found["by_kind"].get(name, {})
+        cells = [count, one.get("refused", 0), one.get("accepted", 0), *(one.get(word, 0) for word in bad)]
+        lines.append(f"| {name} | " + " | ".join(map(str, cells)) + " |")
+    about = (
+        "Refused: one line and exit 2. Accepted: plausible numbers in a file sealed anew or without a seal, or a "
+        "command that came up to its run. Lie: a damaged file that was accepted. Wordy: more than a line."
+    )
+    return [about, "", *lines]
+
+
+def _disks(found: dict[str, Any]) -> list[str]:
+    if not found:
+        return ["Not tried: nothing can be mounted here."]
+    wrong = [name for name, one in found.items() if one["wrong"]]
+    fitted = sum(one["exit"] == 0 for one in found.values())
+    refused = len(found) - fitted - len(wrong)
+    return [
+        f"{len(found)} cases (seven commands; 0, 40 and 150 kB left, and read-only): {refused} refused in one line that "
+        f"names the file, {fitted} fitted, {len(wrong)} wrong: {', '.join(wrong) or 'earlier files were intact in all'}."
+    ]
+
+
+def _trust(found: list[dict[str, Any]]) -> list[str]:
+    lines = ["| varied | value | pack | G | F | p_sig differs by |", "|---|---|---|---|---|---|"]
+    for row in found:
+        away = f"{row['away']:.1e}" if row["away"] else "0"
+        lines.append(f"| {row['study']} | {row['value']} | {row['pack']} | {row['G']:.5f} | {row['F']:.5f} | {away} |")
+    return ["Relative to the first row of the same study and pack. More in [trust.md](trust.md).", "", *lines]
+
+
+def page(found: dict[str, dict[str, Any]], minutes: float) -> str:
+    """The page."""
+    machine = f"{os.cpu_count()} CPUs ({platform.machine()}), Python {platform.python_version()}"
+    sound = "passed" if found["sanitizers"]["code"] == 0 else "FAILED"
+    parts = {
+        "Killed": _kills(found["killed"]["found"]),
+        "Hostile input": _inputs(found["fuzz"]["found"]),
+        "Full and read-only disks": _disks(found["disks"]["found"]),
+        "Native library under sanitizers": [f"ASan, UBSan and TSan over tests/reliability/drive.cc: {sound}."],
+        "Numerical trust": _trust(found["trust"]["found"]),
+    }
+    head = [
+        "# Reliability",
+        "",
+        f"Written by `make reliability` in {minutes:.0f} minutes on {machine}. What the figures mean, and what is not "
+        "promised, stands in [decisions.md](decisions.md) and [trust.md](trust.md).",
+    ]
+    for title, lines in parts.items():
+        head += ["", f"## {title}", "", *lines]
+    return "\n".join(head) + "\n"
+
+
+def main() -> int:
+    """Run all; 0 if nothing was wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scale", type=float, default=1.0, help="of the numbers of kills and inputs")
+    parser.add_argument("--page", type=Path, default=PAGE)
+    options = parser.parse_args()
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(2) as lanes:
+        folder = Path(name)
+        running = [lanes.submit(run, lane, folder) for lane in pieces(folder, options.scale)]
+        found = {key: one for lane in running for key, one in lane.result().items()}
+    options.page.write_text(page(found, (time.perf_counter() - began) / 60.0))
+    print(f"wrote {options.page}")
+    return int(any(one["code"] for one in found.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
