@@ -39,6 +39,7 @@ def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
         "no:cacheprovider",
         str(ROOT / "tests/test_sanitizers.py"),
     ]
+    studies = [*STUDIES, "builds"] if shutil.which("clang++") else STUDIES
     others = [
         script(HERE / "fuzz.py", "fuzz", max(200, round(10_000 * scale)), "--seed", int(time.time()) % 100_000),
         script(HERE / "disks.py", "disks"),
@@ -92,10 +93,9 @@ def _disks(found: dict[str, Any]) -> list[str]:
     wrong = [name for name, one in found.items() if one["wrong"]]
     fitted = sum(one["exit"] == 0 for one in found.values())
     refused = len(found) - fitted - len(wrong)
-    return [
-        f"{len(found)} cases (seven commands; 0, 40 and 150 kB left, and read-only): {refused} refused in one line that "
-        f"names the file, {fitted} fitted, {len(wrong)} wrong: {', '.join(wrong) or 'earlier files were intact in all'}."
-    ]
+    ends = f"{refused} refused in one line that names the file, {fitted} fitted, {len(wrong)} wrong"
+    told = ", ".join(wrong) or "earlier files were intact in all"
+    return [f"{len(found)} cases (seven commands; 0, 40 and 150 kB left, and read-only): {ends}: {told}."]
 
 
 def _trust(found: list[dict[str, Any]]) -> list[str]:
