@@ -1,6 +1,5 @@
 """`gmem bench`."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +7,7 @@ import typer
 
 from gmem_jax.bench import measure
 from gmem_jax.command.console import AsJson, InputError, claim, emit, reporting
+from gmem_jax.files.checked import json_of, refusing
 from gmem_jax.files.packs import list_packs, load_pack
 
 
@@ -32,7 +32,10 @@ def bench_command(
     counts = replicas.split(",")
     if not all(count.isdigit() and int(count) > 0 for count in counts):
         raise InputError(f"--replicas {replicas}: must be positive whole numbers, separated by commas")
-    before = json.loads(baseline.read_text()) if baseline else None
+    before = None
+    if baseline:
+        with refusing(baseline, "bench.json"):
+            before = json_of(baseline.read_text(), "content")
     claim(output.parent / "bench.json" if not output.is_dir() else output / "bench.json", ".json", force=True)
     with reporting() as progress:
         result = measure.run(

@@ -109,11 +109,16 @@ def json_of(text: Any, what: str) -> dict[str, Any]:
         FileFormatError: if the text is none.
     """
     try:
-        value = json.loads(text)
+        value = json.loads(text, parse_int=_whole_or_real)
     except (ValueError, TypeError, RecursionError) as error:
         raise FileFormatError(f"its {what} is not JSON ({error})") from error
     require(isinstance(value, dict), f"its {what} is not a JSON object")
     return dict(value)
+
+
+def _whole_or_real(digits: str) -> int | float:
+    """A number too long for any integer of ours is a float, as JSON has one kind of number."""
+    return int(digits) if len(digits) < 19 else float(digits)
 
 
 def is_number(value: Any) -> bool:

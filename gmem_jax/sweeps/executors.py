@@ -169,12 +169,21 @@ class Submitted(Executor):
 
     def alive(self) -> set[str]:
         """The names of those that have not ended."""
-        return {name for name, job in self._jobs.items() if not job.done(force_check=True)}
+        if self._cluster != "slurm" or not self._jobs:
+            return {name for name, job in self._jobs.items() if not job.done(force_check=True)}
+        # Asked of the queue: sacct, which submitit asks, needs a data base that small clusters do not have.
+        numbers = ",".join(str(job.job_id) for job in self._jobs.values())
+        queue = subprocess.run(
+            ["squeue", "--noheader", "--format=%A", f"--jobs={numbers}"], capture_output=True, text=True
+        )
+        left = set(queue.stdout.split()) if queue.returncode == 0 else set()  # it knows none of them any more
+        return {name for name, job in self._jobs.items() if str(job.job_id) in left}
 
     def stop(self) -> None:
         """End them all; their checkpoints stay."""
-        for job in self._jobs.values():
-            if not job.done(force_check=True):
+        alive = self.alive()
+        for name, job in self._jobs.items():
+            if name in alive:
                 job.cancel(check=False)
 
 

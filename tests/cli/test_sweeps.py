@@ -1,0 +1,177 @@
+"""Sweeps on the command line: done by workers that may die, shown, exported, resumed, and grown."""
+
+import contextlib
+import csv
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+import gmem_jax as gm
+from gmem_jax.command import app
+
+PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
+ENTRY = "from gmem_jax.command.app import main; main()"
+SWEEP = f"""[experiment]
+pack = "{PACK}"
+t0 = 150
+store = 0.2
+[vary]
+mu = [0.2, 1.0]
+background = ["sub0", "sub2"]
+"""
+BROKEN = """[[points]]
+friction = "M2"
+p_max = 1e-4
+points = 8
+"""
+
+
+def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        app.main()
+    return int(ended.value.code or 0)
+
+
+def said(capsys: pytest.CaptureFixture) -> dict:
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of four points and one that breaks down."""
+    folder = tmp_path_factory.mktemp("sweep")
+    (folder / "mu.toml").write_text(SWEEP + BROKEN)
+    done = subprocess.run(
+        [sys.executable, "-c", ENTRY, "sweep", str(folder / "mu.toml"), "--json"], capture_output=True, text=True
+    )
+    assert done.returncode == 1, done.stderr
+    assert "failed: mu = None, background = None" in done.stderr
+    assert "1 of 5 points; again with --retry" in done.stderr
+    table = json.loads(done.stdout)
+    assert (table["done"], table["failed"], table["open"]) == (4, 1, 0)
+    return folder / "mu"
+
+
+def test_points_are_what_recalls_of_them_are(swept: Path) -> None:
+    card = json.loads((swept / "sweep.json").read_text())
+    pack = gm.load_pack(PACK)
+    for row in card["points"][:4]:
+        values = {"friction.mu": row["values"]["mu"], "background": row["values"]["background"]}
+        alone = gm.run(gm.replace(gm.Experiment(pack, gm.six_signals(), t0=150.0, store=0.2), values))
+        kept, configuration = gm.load_recall(swept / "points" / f"{row['key']}.h5")
+        np.testing.assert_array_equal(kept.p_sig, alone.p_sig)
+        again = gm.experiment_from(configuration["experiment"])
+        assert (again.friction.mu, again.background) == tuple(values.values())
+
+
+def test_status_show_and_export_tell_the_same(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, swept: Path, tmp_path: Path
+) -> None:
+    assert gmem(monkeypatch, "sweep", "status", swept, "--json") == 0
+    status = said(capsys)
+    assert (status["done"], status["failed"]) == (4, 1)
+    failed = next(row for row in status["points"] if row["state"] == "failed")
+    assert "p_max" in failed["why"]
+    assert gmem(monkeypatch, "sweep", "show", swept, "--over", "background", "--json") == 0
+    means = said(capsys)["means"]
+    assert [row["done"] for row in means] == [2, 2, 0]
+    two = [row["fidelity"] for row in status["points"][:2]]
+    assert means[0]["fidelity"] == pytest.approx(np.mean(two))
+    assert means[0]["fidelity_se"] == pytest.approx(np.std(two, ddof=1) / np.sqrt(2.0))
+    for suffix in (".csv", ".parquet", ".nc"):
+        assert gmem(monkeypatch, "sweep", "export", swept, "-o", tmp_path / f"table{suffix}") == 0
+    with (tmp_path / "table.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [row["mu"] for row in table] == ["0.2", "0.2", "1.0", "1.0", ""]
+    assert float(table[0]["fidelity"]) == two[0]
+    import pyarrow.parquet
+    import xarray
+
+    assert pyarrow.parquet.read_table(tmp_path / "table.parquet").column("fidelity").to_pylist()[0] == two[0]
+    with xarray.open_dataset(tmp_path / "table.nc", engine="h5netcdf") as data:
+        assert dict(data.sizes) == {"point": 5, "signal": 6, "u": 256}
+        kept, _ = gm.load_recall(swept / "points" / f"{data.key.values[0]}.h5")
+        np.testing.assert_array_equal(data.p_sig[0], kept.p_sig)
+        assert float(data.fidelity[0]) == two[0]
+    assert gmem(monkeypatch, "sweep", "export", swept, "-o", tmp_path / "table.csv") == 2
+    assert "--force" in capsys.readouterr().err
+
+
+def test_a_longer_sweep_computes_only_what_is_new_and_retries_what_failed(swept: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (swept / "points").iterdir()}
+    (swept.parent / "more.toml").write_text(SWEEP.replace("1.0]", "0.6, 1.0]") + BROKEN)
+    command = [sys.executable, "-c", ENTRY, "sweep", str(swept.parent / "more.toml"), "-o", str(swept)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert "2 of 7 points in 2 runs" in done.stderr, done.stderr
+    assert before.items() < {path: path.stat().st_mtime_ns for path in (swept / "points").iterdir()}.items()
+    again = subprocess.run([*command, "--retry"], capture_output=True, text=True)
+    assert "1 points that failed are tried again" in again.stderr
+    assert again.returncode == 1
+
+
+def test_workers_that_are_killed_are_replaced_and_change_no_bit(swept: Path, tmp_path: Path) -> None:
+    (tmp_path / "mu.toml").write_text(SWEEP)
+    command = [sys.executable, "-c", ENTRY, "sweep", str(tmp_path / "mu.toml"), "--executor", "local"]
+    with (tmp_path / "log").open("w") as log:
+        sweep = subprocess.Popen(command, stdout=log, stderr=log)
+    killed = 0
+    deadline = time.monotonic() + 240.0
+    while sweep.poll() is None:
+        assert time.monotonic() < deadline, (tmp_path / "log").read_text()
+        # The first worker of submitit, once it has a job: the sweep must go on with another.
+        if not killed and list((tmp_path / "mu" / "parts").glob("*")):
+            for process in psutil.Process(sweep.pid).children(recursive=True):
+                with contextlib.suppress(psutil.Error):
+                    if "submitit" in " ".join(process.cmdline()):
+                        process.kill()
+                        killed += 1
+        time.sleep(0.05)
+    assert killed
+    assert sweep.returncode == 0, (tmp_path / "log").read_text()
+    for path in (tmp_path / "mu" / "points").iterdir():
+        one, other = (gm.load_recall(folder / "points" / path.name)[0] for folder in (tmp_path / "mu", swept))
+        np.testing.assert_array_equal(one.p_sig, other.p_sig)
+    assert len(list((tmp_path / "mu" / "points").iterdir())) == 4
+
+
+REFUSED = {
+    "no such file": ["nowhere.toml"],
+    "no sweep": ["status", "."],
+    "no such folder": ["show", "nowhere"],
+    "name the folder": ["status"],
+    "neither a sweep file": ["recall.h5"],
+}
+
+
+@pytest.mark.parametrize("problem", REFUSED)
+def test_bad_commands_are_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, problem: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert gmem(monkeypatch, "sweep", *REFUSED[problem]) == 2
+    told = capsys.readouterr()
+    assert problem in told.err
+    assert told.err.count("\n") == 1
+    assert told.out == ""
+
+
+def test_packs_are_made_once_for_all_points(tmp_path: Path) -> None:
+    (tmp_path / "made.toml").write_text(
+        "[prepare]\ngrains = 16\nt0 = 75\n[experiment]\nt0 = 75\n[vary]\nmu = [0.3, 1.0]\n"
+        '"prepare.seed" = [1, 2]\n"prepare.shape" = ["sphere"]\n'
+    )
+    command = [sys.executable, "-c", ENTRY, "sweep", str(tmp_path / "made.toml"), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "2 packs to be made" in done.stderr
+    assert "4 of 4 points in 2 runs" in done.stderr
+    assert len(list((tmp_path / "made" / "packs").iterdir())) == 2
+    again = subprocess.run(command, capture_output=True, text=True)
+    assert "all 4 points are there" in again.stderr
