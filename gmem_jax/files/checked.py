@@ -15,6 +15,7 @@ import numpy as np
 from gmem_jax.files.atomic import FileFormatError
 
 KINDS = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",)}
+LONGEST = 18  # digits of a whole number: no count or seed has more
 NAME = 200  # characters of what is printed
 _SHOWN = 160  # characters of an error of some library
 
@@ -109,16 +110,17 @@ def json_of(text: Any, what: str) -> dict[str, Any]:
         FileFormatError: if the text is none.
     """
     try:
-        value = json.loads(text, parse_int=_whole_or_real)
+        value = json.loads(text, parse_int=_whole)
     except (ValueError, TypeError, RecursionError) as error:
         raise FileFormatError(f"its {what} is not JSON ({error})") from error
     require(isinstance(value, dict), f"its {what} is not a JSON object")
     return dict(value)
 
 
-def _whole_or_real(digits: str) -> int | float:
-    """A number too long for any integer of ours is a float, as JSON has one kind of number."""
-    return int(digits) if len(digits) < 19 else float(digits)
+def _whole(digits: str) -> int:
+    if len(digits) > LONGEST:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return int(digits)
 
 
 def is_number(value: Any) -> bool:
