@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.devices import Spread, local
 from gmem_jax.experiment.pack import SKIN
 from gmem_jax.experiment.protocol import Bin, Stage
 from gmem_jax.experiment.walk import Course, walk_some
@@ -111,7 +112,7 @@ def require_x64() -> None:
 
 def worst(state: State) -> int:
     """All status bits of all replicas."""
-    return int(np.bitwise_or.reduce(np.asarray(state.status)))
+    return int(np.bitwise_or.reduce(local(state.status)))
 
 
 def refuse(status: int, where: str) -> None:
@@ -172,6 +173,7 @@ class Walker:
         time: simulated time so far, in t_c.
         work: work done so far, in replica-bins; `total_work` is all there is to do.
         rebuilds: lists made anew so far.
+        spread: where the replicas are put, if on several devices.
     """
 
     course: Course
@@ -186,21 +188,41 @@ class Walker:
     work: float = 0.0
     total_work: float = 1.0
     rebuilds: int = 0
+    spread: Spread | None = None
     _renewed_at: tuple[str, float] | None = None
 
     def afresh(self, **changes: Any) -> "Walker":
         """A walk that begins where this one is, whatever lists were made on the way here."""
         return replace(self, **{"finder": None, "skin": SKIN, "chunk": CHUNK, **changes})
 
+    def put_on(self, spread: Spread | None) -> None:
+        """Put the replicas on several devices; None leaves them where they are."""
+        self.spread = spread
+        if spread:
+            self.state, self.course = spread.put_state(self.state), spread.put_course(self.course)
+
+    def _here(self, tree: Any) -> Any:
+        """Arrays with the replica axis last, as numpy arrays on this host."""
+        return jax.tree.map(np.asarray, tree) if self.spread is None else self.spread.back(tree)
+
     def kept(self) -> dict[str, Any]:
         """All that `restore` needs to go on from here to the same bits, as a tree of arrays."""
         counters = np.asarray([self.time, self.work, self.rebuilds, self.skin, self.chunk], float)
         finder = {} if self.finder is None else self.finder.kept()
-        return {"state": self.state, "pairs": self.course.system.pairs, "counters": counters, "finder": finder}
+        pairs = self.course.system.pairs
+        if self.spread and pairs.reference.shape[-1] > 1:
+            pairs = replace(pairs, reference=self._here(pairs.reference))
+        return {
+            "state": self._here(self.state) if self.spread else self.state,
+            "pairs": jax.tree.map(local, pairs) if self.spread else pairs,
+            "counters": counters,
+            "finder": finder,
+        }
 
     def restore(self, kept: Mapping[str, Any]) -> None:
         """Stand where a walk on the same course stood when it gave `kept`."""
         self.state, self.course = kept["state"], self.course.with_pairs(kept["pairs"])
+        self.put_on(self.spread)
         self.time, self.work, rebuilds, self.skin, chunk = kept["counters"].tolist()
         self.rebuilds, self.chunk = int(rebuilds), int(chunk)
         if not _same(kept["finder"], self.finder.kept() if self.finder else {}):
@@ -248,12 +270,12 @@ class Walker:
             self.action.accept(self.course, self.state, stage, first, count, more)
             self.state = state
             done += count
-            samples.append(jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], sample))
-            self.report(stage.name, state.replicas * count, self._moment(count))
+            samples.append(jax.tree.map(lambda leaf, count=count: leaf[:count], self._here(sample)))
+            self.report(stage.name, samples[-1].pressure.shape[-1] * count, self._moment(count))
             yield done == stage.bins
 
     def _moment(self, bins: int) -> float:
-        return bins * self.course.steps * float(np.max(self.course.dt))
+        return bins * self.course.steps * float(np.max(local(self.course.dt)))
 
     def report(self, name: str, work: float, time: float) -> None:
         """Count finished work and tell the progress callback."""
@@ -263,6 +285,11 @@ class Walker:
 
     def renew(self, box: Box) -> None:
         """Make the neighbour list anew where the grains are now, between the walls as they are now."""
+        spread, self.spread = self.spread, None
+        if spread:  # the search is the host's
+            kept = replace(self, spread=spread).kept()
+            self.state, self.course = kept["state"], self.course.with_pairs(kept["pairs"])
+            box = jax.tree.map(local, box)
         system, replicas = self.course.system, self.state.replicas
         if self.finder is None:
             self.finder = PairFinder(system.clump, np.asarray(box.lengths).max(axis=1), self.skin)
@@ -273,6 +300,7 @@ class Walker:
         self.state = replace(self.state, history=move(self.state.history, blank))
         self.course = self.course.with_pairs(pairs)
         self.rebuilds += 1
+        self.put_on(spread)
 
     def _renew_again(self, stage: Stage, first: Bin) -> None:
         """Renew a stale list before its chunk is redone; if that was just done, shorten the chunk or widen the skin.

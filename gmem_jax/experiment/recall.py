@@ -2,6 +2,7 @@
 
 import warnings
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.doubts import doubts
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import (
@@ -182,13 +184,21 @@ def shear(walker: Walker, experiment: Experiment) -> None:
 
 
 def run(
-    experiment: Experiment, *, batch: int | None = None, keep: Keep = forget, progress: Progress = silent
+    experiment: Experiment,
+    *,
+    batch: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+    keep: Keep = forget,
+    progress: Progress = silent,
 ) -> Recall:
     """Run an experiment on the host, in chunks: stale neighbour lists are made anew, a broken run raises.
+
+    With several processes (`jax.distributed`) all must call it alike, and all get the recall; one should keep it.
 
     Args:
         experiment: the experiment.
         batch: signals that run together; default all of them. Each batch has a zero signal of its own.
+        devices: that share out the replicas; default all that JAX sees, also those of other processes.
         keep: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
 
@@ -217,7 +227,9 @@ def run(
 
         def run_batch(checkpoint: Checkpoint, few: Experiment = few, on: Walker = on) -> Any:
             shear(on, few)
-            return on.play(*own, checkpoint=checkpoint), on.state.status
+            on.put_on(spread_over(few.replicas, devices))
+            samples = on.play(*own, checkpoint=checkpoint)
+            return samples, on.kept()["state"].status
 
         parts.append(keep(f"batch-{number:04d}", run_batch))
         done += after * (last - first + 1)

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, replace, replica_parameters, value_at
 from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent
 from gmem_jax.experiment.recall import Recall, finished, walker, warn_of_another_compression
@@ -104,11 +105,18 @@ class _Side:
         return Chosen(tuple(sets), jnp.asarray(numbers[1:]))
 
 
-def run_several(experiments: Sequence[Experiment], *, keep: Keep = forget, progress: Progress = silent) -> list[Recall]:
+def run_several(
+    experiments: Sequence[Experiment],
+    *,
+    devices: Sequence[jax.Device] | None = None,
+    keep: Keep = forget,
+    progress: Progress = silent,
+) -> list[Recall]:
     """Run experiments side by side, as replicas of one run; the recall of each.
 
     Args:
         experiments: that `match` each other.
+        devices: that share out the replicas; default all that JAX sees.
         keep: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
 
@@ -141,7 +149,9 @@ def run_several(experiments: Sequence[Experiment], *, keep: Keep = forget, progr
             pairs = dataclasses.replace(pairs, reference=jnp.asarray(pairs.reference)[..., place])
         on.course = everything.course(sheared=True).with_pairs(pairs)
         on.state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., place], on.state)
-        return on.play(*own, checkpoint=checkpoint), on.state.status
+        on.put_on(spread_over(len(owners), devices))
+        samples = on.play(*own, checkpoint=checkpoint)
+        return samples, on.kept()["state"].status
 
     before, kept = keep("prefix", prefix)
     on.restore(kept)

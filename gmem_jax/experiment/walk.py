@@ -54,17 +54,26 @@ def walls(course: Course, row: Bin, replicas: int) -> Box:
     count = row.number * steps + 1 + jnp.arange(steps)
     times = count.reshape(-1, *(1 for _ in dt.shape)) * dt
     boxes = jax.vmap(lambda time: course.drive.box_at(row, time, (row.bins * steps) * dt))(times)
-    wide: Box = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, 3, replicas)), boxes)
+    wide: Box = jax.tree.map(lambda leaf: jnp.broadcast_to(_padded(leaf, replicas), (steps, 3, replicas)), boxes)
     return wide
+
+
+def _padded(leaf: Any, replicas: int) -> Any:
+    """A number for each replica, also for the copies of replica 0 that fill up devices (see `devices`)."""
+    known = jnp.shape(leaf)[-1] if jnp.ndim(leaf) else 1
+    if not 1 < known < replicas:
+        return leaf
+    return jnp.concatenate([leaf, jnp.repeat(leaf[..., :1], replicas - known, axis=-1)], axis=-1)
 
 
 def bin_step(course: Course, state: State, row: Bin) -> tuple[State, Sample]:
     """One bin: its steps, the checks at its end, its sample."""
     with jax.named_scope("drive"):
         boxes = walls(course, row, state.replicas)
-        drag = jnp.where(row.start == row.stop, course.drag, 0.0)
+        drag = _padded(jnp.where(row.start == row.stop, course.drag, 0.0), state.replicas)
     with jax.named_scope("steps"):
-        state, total = native.marcher(course.backend)(course.system, state, boxes, course.dt, drag)
+        dt = _padded(course.dt, state.replicas)
+        state, total = native.marcher(course.backend)(course.system, state, boxes, dt, drag)
     with jax.named_scope("sample"):
         last = jax.tree.map(lambda leaf: leaf[-1], boxes)
         return end_bin(course.system, state, last, total / course.steps)

@@ -1,0 +1,85 @@
+"""Replicas shared out over all devices that JAX sees, of one process or of several: the compiler does the rest.
+
+The replica axis is padded with copies of replica 0 up to a multiple of the number of devices. A step sends nothing
+from one device to another.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from gmem_jax.experiment.walk import Course
+from gmem_jax.physics.state import State
+
+AXIS = "replicas"
+
+
+def local(array: Any) -> np.ndarray:
+    """An array that may lie on several devices, or on those of other processes, on this host."""
+    if isinstance(array, jax.Array) and not array.is_fully_addressable:
+        array = multihost_utils.process_allgather(array, tiled=True)
+    return np.asarray(array)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Where replicas are put.
+
+    Attributes:
+        replicas: how many there are, B.
+        mesh: the devices, on one axis.
+    """
+
+    replicas: int
+    mesh: Mesh
+
+    @property
+    def padded(self) -> int:
+        """B up to a multiple of the devices."""
+        whole: int = -(-self.replicas // self.mesh.size) * self.mesh.size
+        return whole
+
+    def _put(self, leaf: Any, *axes: str | None) -> jax.Array:
+        placed: jax.Array = jax.device_put(local(leaf), NamedSharding(self.mesh, PartitionSpec(*axes)))
+        return placed
+
+    def _put_last(self, leaf: Any) -> jax.Array:
+        """With the replica axis last, [..., B], padded already or not."""
+        leaf = local(leaf)[..., : self.replicas]
+        more = np.repeat(leaf[..., :1], self.padded - leaf.shape[-1], axis=-1)
+        wide = np.concatenate([leaf, more], axis=-1)
+        return self._put(wide, *(None for _ in wide.shape[1:]), AXIS)
+
+    def put_state(self, state: State) -> State:
+        """A state of B replicas."""
+        spread: State = jax.tree.map(self._put_last, state)
+        return spread
+
+    def put_course(self, course: Course) -> Course:
+        """A course: lists and parameters of the law that differ between replicas are split, the rest is everywhere."""
+        system = course.system
+        reference = system.pairs.reference
+        own = self._put_last(reference) if reference.shape[-1] > 1 else self._put(reference)
+        friction = jax.tree.map(self._put_number, system.friction)
+        everywhere: Course = jax.tree.map(self._put, course)
+        pairs = replace(everywhere.system.pairs, reference=own)
+        return replace(everywhere, system=replace(everywhere.system, pairs=pairs, friction=friction))
+
+    def _put_number(self, leaf: Any) -> Any:
+        """A number for all replicas, or one for each, [B]."""
+        return self._put_last(leaf) if np.shape(leaf) in ((self.replicas,), (self.padded,)) else self._put(leaf)
+
+    def back(self, tree: Any) -> Any:
+        """Leaves [..., padded] as numpy arrays [..., B]."""
+        return jax.tree.map(lambda leaf: local(leaf)[..., : self.replicas], tree)
+
+
+def spread_over(replicas: int, devices: Sequence[jax.Device] | None = None) -> Spread | None:
+    """How some replicas are shared out over devices, default all of them; None where there is nothing to share."""
+    found = list(jax.devices() if devices is None else devices)[:replicas]
+    return Spread(replicas, Mesh(np.asarray(found), (AXIS,))) if len(found) > 1 and replicas > 1 else None
