@@ -62,6 +62,7 @@ def test_what_cannot_run_side_by_side_does_not_match(base: gm.Experiment) -> Non
         gm.replace(base, backend="jax"),
         gm.replace(base, gamma0=jnp.full(7, 1e-3)),
         gm.replace(base, {"material.poisson": 0.3}),
+        gm.replace(base, {"friction.mu": 0.0}),
     ]
     for other in others:
         assert not match(base, other)

@@ -87,7 +87,7 @@ def test_points_that_differ_in_replica_parameters_become_one_run(tmp_path: Path)
     made = conductor(
         tmp_path,
         experiment={"t0": 150.0},
-        vary={"pack": [str(PACK), "tetra-325-a"], "mu": [0.0, 0.2, 0.4, 0.6, 0.8, 1.0], "background": ["sub0", "sub2"]},
+        vary={"pack": [str(PACK), "tetra-325-a"], "mu": [0.1, 0.2, 0.4, 0.6, 0.8, 1.0], "background": ["sub0", "sub2"]},
     )
     points = made.points()
     jobs = plan(points, set(), MEMORY)

@@ -12,7 +12,7 @@ from gmem_jax.command.console import AsJson, Force, InputError, Output, announce
 from gmem_jax.command.resuming import Restart, resumable
 from gmem_jax.files.configuration import fingerprint
 from gmem_jax.files.packs import list_packs, save_pack
-from gmem_jax.files.provenance import code, provenance
+from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics import grain
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.sample import Sample
@@ -67,7 +67,7 @@ def prepare_command(
     announce(f"{grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * grains, backend)
     began = time.perf_counter()
     stages: dict[str, Sample] = {}
-    key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, **code()}
+    key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, **sources()}
     with resumable(output, key, restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             pack = prepare(recipe, clump, name=name, backend=backend, keep=parts, progress=progress, log=stages)

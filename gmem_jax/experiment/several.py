@@ -55,12 +55,15 @@ class Chosen:
 def match(one: Experiment, other: Experiment) -> bool:
     """Whether two experiments may run side by side: the same pack, material, protocol, law, steps and backend.
 
-    The pack must be the same object; whatever else differs must be one number in each.
+    The pack must be the same object; whatever else differs must be one number in each. Without friction replicas part
+    and need lists that all would have to go through (six mu with 0 among them: twice the time), so that mu = 0 matches
+    only itself.
     """
     alike = ("stages", "steps_per_bin", "background", "backend", "material")
     laws = [str(jax.tree.structure(each.friction)) for each in (one, other)]
     scalars = all(jnp.ndim(value) == 0 for each in (one, other) for value in replica_parameters(each).values())
-    same = all(getattr(one, name) == getattr(other, name) for name in alike)
+    slips = [float(np.min(getattr(each.friction, "mu", 1.0))) == 0.0 for each in (one, other)]
+    same = slips[0] == slips[1] and all(getattr(one, name) == getattr(other, name) for name in alike)
     return scalars and same and one.pack is other.pack and laws[0] == laws[1]
 
 

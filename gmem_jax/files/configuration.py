@@ -15,7 +15,7 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, word_bits, words
 from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.packs import load_pack
-from gmem_jax.files.provenance import code, provenance
+from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.physics.material import Material
@@ -156,7 +156,7 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
         **more: what else they depend on, like the batch.
     """
     own = {**written(experiment), "pack": pack_fingerprint(experiment.pack)}
-    return {**own, **more, "backend": native.name(experiment.backend, experiment.friction), **code()}
+    return {**own, **more, "backend": native.name(experiment.backend, experiment.friction), **sources()}
 
 
 def resolved(experiment: Experiment, seconds: float) -> dict[str, Any]:

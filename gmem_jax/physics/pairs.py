@@ -146,8 +146,21 @@ def carry_history(history: Any, blank: Any, old: Pairs, new: Pairs) -> Any:
     spheres = np.int64(old.reference.shape[0])
 
     old_keys, new_keys = (one * spheres + other for one, other in (candidates(old), candidates(new)))
-    place = np.searchsorted(old_keys, new_keys)
-    place = np.minimum(place, max(0, old_keys.size - 1))
+    place = np.minimum(np.searchsorted(old_keys, new_keys), max(0, old_keys.size - 1))
     known = (old_keys[place] == new_keys) if old_keys.size else np.zeros(new_keys.size, dtype=bool)
-    source, target = jnp.asarray(place[known]), jnp.asarray(np.flatnonzero(known))
-    return jax.tree.map(lambda leaf, empty: empty.at[target].set(leaf[source]), history, blank)
+    # As long as the new list, so that lists of one capacity are moved by one program.
+    source, carried = np.zeros(new.capacity, np.int32), np.zeros(new.capacity, dtype=bool)
+    source[: place.size], carried[: place.size] = np.where(known, place, 0), known
+    moved: Any = _carried(history, blank, jnp.asarray(source), jnp.asarray(carried))
+    return moved
+
+
+@jax.jit
+def _carried(history: Any, blank: Any, source: jax.Array, carried: jax.Array) -> Any:
+    """Rows `source` of a history where there are any, else those of the blank one."""
+
+    def chosen(leaf: jax.Array, empty: jax.Array) -> jax.Array:
+        kept = carried.reshape(-1, *(1 for _ in empty.shape[1:]))
+        return jnp.where(kept, leaf[source], empty)
+
+    return jax.tree.map(chosen, history, blank)
