@@ -195,7 +195,9 @@ def test_histories_move_by_pair_and_newcomers_start_blank():
 def test_carrying_to_and_from_an_empty_list_gives_blanks():
     none = tabulate(np.zeros((2, 0), int), np.zeros((5, 3, 1)), np.ones(3), 2.4, 1, capacity=4)
     some = tabulate(np.array([[0], [1]]), np.zeros((5, 3, 1)), np.ones(3), 2.4, 1, capacity=4)
-    ones, blank = jnp.ones((4, 3, 1)), jnp.full((4, 3, 1), 7.0)
+    assert none.capacity == some.capacity
+    shape = (some.capacity, 3, 1)
+    ones, blank = jnp.ones(shape), jnp.full(shape, 7.0)
     np.testing.assert_array_equal(carry_history(ones, blank, none, some), blank)
     np.testing.assert_array_equal(carry_history(ones, blank, some, none), blank)
 
