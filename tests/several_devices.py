@@ -14,7 +14,7 @@ import gmem_jax as gm
 from gmem_jax.experiment.several import run_several
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
-SHORT = {"t0": 75.0, "rest": 0.05, "hold": 0.05, "store": 0.1}
+SHORT = {"t0": 75.0, "rest": 0.02, "hold": 0.02, "store": 0.02}  # one step a bin
 
 
 def main(address: str, backend: str, target: str, processes: str = "1", number: str = "0") -> None:
@@ -24,10 +24,10 @@ def main(address: str, backend: str, target: str, processes: str = "1", number: 
         jax.distributed.initialize(address, int(processes), int(number))
     from scenes import with_skin  # which computes
 
-    pack = with_skin(gm.load_pack(PACK), 0.02)  # lists are made anew on the way
+    pack = with_skin(gm.load_pack(PACK), 0.05)  # lists are made anew on the way
     base = gm.Experiment(pack, gm.six_signals(), backend=backend, **SHORT)
     points = [gm.replace(base, {"friction.mu": mu, "gamma0": gamma0}) for mu, gamma0 in ((1.0, 1e-3), (0.4, 2e-3))]
-    recalls = [gm.run(base), gm.run(gm.replace(base, friction=gm.Mindlin(points=20)), batch=4), *run_several(points)]
+    recalls = [gm.run(base, batch=3), *run_several(points)]
     if number == "0":
         named = {f"p_sig-{place}": recall.p_sig for place, recall in enumerate(recalls)}
         status = [np.asarray(recall.status) for recall in recalls]

@@ -24,6 +24,7 @@ from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import clump_of, run_group
 
+COST = 8e-8  # s a grain-step on two cores; see docs/scaling.md
 CHECKED = 50  # values of a name that are tried before a sweep begins
 ANY_PACK = "tetra-325-a"
 GRAIN = {"shape": "tetra", "overlap": 0.6}  # of packs to be made, where nothing else is said
@@ -214,7 +215,9 @@ class Conductor:
         work = sum(job["work"] for job in jobs)
         widest = max(job["replicas"] for job in jobs)
         workers = min(executor.workers, len(jobs))
-        self.say(f"{what}, {widest} replicas side by side at most: {work:.2g} grain-steps for {workers} workers")
+        minutes = max(1, round(COST * work / 60.0))
+        cost = f"{work:.2g} grain-steps, some {minutes} min of two free cores (native, law H)"
+        self.say(f"{what}, {widest} replicas side by side at most, workers: {workers}; {cost}")
 
     def _finish(self, executor: Executor, jobs: list[dict[str, Any]], progress: Progress, what: str) -> None:
         self.store.order(jobs)
