@@ -46,8 +46,10 @@ def sweep_command(
         store = _there(folder)
         if what == "export":
             _export(store, output, force, as_json)
+        elif what == "status":
+            _status(store, as_json)
         else:
-            (_status if what == "status" else _show)(store, over, as_json)
+            _show(store, over, as_json)
         return
     path = Path(what)
     if path.suffix != ".toml":
@@ -116,8 +118,7 @@ def _summary(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
     return {"folder": str(store.folder), **states, "status": status, "seconds": seconds, "points": table}
 
 
-def _status(store: Store, over: str, as_json: bool) -> None:
-    del over
+def _status(store: Store, as_json: bool) -> None:
     table = rows(store)
     summary = _summary(store, table)
     lines = [f"{summary[state]} {state}" for state in ("done", "failed", "open")]
@@ -134,7 +135,11 @@ def _show(store: Store, over: str, as_json: bool) -> None:
         raise InputError(f"--over {unknown[0]}: does not vary here; {', '.join(names)} do")
     if averaged:
         found = means(table, names, averaged)
-        emit(as_json, {"folder": str(store.folder), "means": found}, _means_table(found))
+        emit(
+            as_json,
+            {"folder": str(store.folder), "means": found},
+            _means_table(found, [name for name in names if name not in averaged]),
+        )
     else:
         emit(as_json, _summary(store, table), _table(table, names))
 
@@ -176,10 +181,7 @@ def _bits(status: int) -> list[str]:
     return [_word(bit) for bit in Status if status & bit]
 
 
-def _means_table(table: list[dict[str, Any]]) -> Table:
-    names = [
-        name for name in table[0] if name not in ("points", "done") and not name.startswith(("gain", "fid", "win"))
-    ]
+def _means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
     drawn = Table()
     for name in (*names, "n", "G", "F", "F(T1)"):
         drawn.add_column(name, no_wrap=name not in names, min_width=14 if name in ("G", "F", "F(T1)") else None)

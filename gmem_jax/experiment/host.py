@@ -255,6 +255,22 @@ class Walker:
                 checkpoint.reached(standing, milestone=milestone)
         return OrderedDict((stage.name, _joined(played[stage.name])) for stage in stages)
 
+    def play_part(self, name: str, keep: Keep, *stages: Stage) -> OrderedDict[str, Sample]:
+        """Run stages as one part of a long run, and stand at its end, also where it was kept; see `play`."""
+
+        def part(checkpoint: Checkpoint) -> Any:
+            return self.play(*stages, checkpoint=checkpoint), self.kept()
+
+        samples, kept = keep(name, part)
+        self.restore(kept)
+        found: OrderedDict[str, Sample] = samples
+        return found
+
+    def status(self) -> np.ndarray:
+        """The status of every replica, [B]."""
+        found: np.ndarray = self._here(self.state.status)
+        return found
+
     def _play(self, stage: Stage, samples: list[Sample]) -> Iterator[bool]:
         """Play what is left of a stage and add to its samples; after each chunk, whether it was the last."""
         done, most = sum(len(sample.pressure) for sample in samples), CHUNK

@@ -217,7 +217,7 @@ def run(
     before, after = (sum(stage.bins for stage in some) for some in (common, own))
     firsts = range(0, count, size)
     begun.total_work = float(replica_bins(experiment, size, begun.state.replicas))
-    samples = _play_prefix(begun, experiment, keep)
+    samples = begun.play_part("prefix", keep, *common)
     done = before * begun.state.replicas
     parts: list[tuple[dict[str, Sample], jax.Array]] = []
     for number, first in enumerate(firsts):
@@ -229,25 +229,13 @@ def run(
             shear(on, few)
             on.put_on(spread_over(few.replicas, devices))
             samples = on.play(*own, checkpoint=checkpoint)
-            return samples, on.kept()["state"].status
+            return samples, on.status()
 
         parts.append(keep(f"batch-{number:04d}", run_batch))
         done += after * (last - first + 1)
     joined, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
     found: Recall = finished(experiment, samples | joined, jnp.asarray(status))
     return found
-
-
-def _play_prefix(begun: Walker, experiment: Experiment, keep: Keep) -> Any:
-    """Bring a walk to the end of the prefix; its samples."""
-    common, _ = experiment.phases
-
-    def play(checkpoint: Checkpoint) -> Any:
-        return begun.play(*common, checkpoint=checkpoint), begun.kept()
-
-    samples, kept = keep("prefix", play)
-    begun.restore(kept)
-    return samples
 
 
 def replica_bins(experiment: Experiment, batch: int, wide: int = 1) -> int:
@@ -305,7 +293,7 @@ def prefix_of(experiment: Experiment, *, keep: Keep = forget, progress: Progress
     common, _ = experiment.phases
     begun = walker(experiment, progress=progress)
     begun.total_work = float(begun.state.replicas * sum(stage.bins for stage in common))
-    _play_prefix(begun, experiment, keep)
+    begun.play_part("prefix", keep, *common)
     return begun
 
 

@@ -141,9 +141,6 @@ def run_several(
     bins = [sum(stage.bins for stage in stages) for stages in (common, own)]
     on.total_work = float(bins[0] * on.state.replicas + bins[1] * len(owners))
 
-    def prefix(checkpoint: Checkpoint) -> Any:
-        return on.play(*common, checkpoint=checkpoint), on.kept()
-
     def rest(checkpoint: Checkpoint) -> Any:
         # One replica if nothing that acts on the prefix differs.
         place = side.prefix[owners] if on.state.replicas > 1 else np.zeros(len(owners), int)
@@ -154,10 +151,9 @@ def run_several(
         on.state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., place], on.state)
         on.put_on(spread_over(len(owners), devices))
         samples = on.play(*own, checkpoint=checkpoint)
-        return samples, on.kept()["state"].status
+        return samples, on.status()
 
-    before, kept = keep("prefix", prefix)
-    on.restore(kept)
+    before = on.play_part("prefix", keep, *common)
     on = on.afresh()
     after, status = keep("after", rest)
     found = []

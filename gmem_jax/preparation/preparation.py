@@ -260,7 +260,8 @@ class _Preparation:
         )
         walker.renew(self.box)
         cycle, numbers = preparation_cycle(recipe.rest, recipe.hold), range(1, recipe.cycles + 1)
-        self._play("cycles", *(replace(stage, name=f"cycle {n}: {stage.name}") for n in numbers for stage in cycle))
+        stages = (replace(stage, name=f"cycle {n}: {stage.name}") for n in numbers for stage in cycle)
+        self.log |= walker.play_part("cycles", self.keep, *stages)
         rest = Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1))
         waited = 0.0
         while waited == 0.0 or float(largest_speed(walker.state)) > recipe.quiet:
@@ -268,18 +269,8 @@ class _Preparation:
                 raise RunFailedError(
                     f"rest: largest speed {float(largest_speed(walker.state)):.1e} R/t_c after {waited:g} t_c"
                 )
-            self._play(f"rest-{waited:g}", rest)
+            self.log |= walker.play_part(f"rest-{waited:g}", self.keep, rest)
             waited += rest.length * recipe.t0
-
-    def _play(self, name: str, *stages: Stage) -> None:
-        walker = self.walker
-
-        def play(checkpoint: Checkpoint) -> Any:
-            return walker.play(*stages, checkpoint=checkpoint), walker.kept()
-
-        samples, kept = self.keep(name, play)
-        walker.restore(kept)
-        self.log |= samples
 
 
 def prepare(

@@ -51,11 +51,11 @@ class Executor(ABC):
         """
         names = [f"worker-{number}" for number in range(min(self.workers, max(1, len(jobs))))]
         total = sum(job["work"] for job in jobs) or 1.0
-        deaths, left = 0, len(jobs)
+        deaths, left, open_ = 0, len(jobs), jobs
         try:
             while True:
-                open_ = [job for job in jobs if not store.finished(job)]
-                now = sum(job["work"] for job in jobs) - sum(job["work"] for job in open_)
+                open_ = [job for job in open_ if not store.finished(job)]
+                now = total - sum(job["work"] for job in open_)
                 fractions = {one["job"]: float(one["fraction"]) for one in store.told()}
                 now += sum(min(1.0, fractions.get(job["name"], 0.0)) * job["work"] for job in open_)
                 told(now / total)

@@ -11,7 +11,6 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import default_batch, replica_bins
 from gmem_jax.experiment.several import match
 from gmem_jax.files.configuration import key_of_run, written
-from gmem_jax.files.packs import load_pack
 
 ABREAST = 64  # replicas of a run at most: whole vectors of every CPU, and enough for every thread
 
@@ -104,21 +103,3 @@ def plan(points: Sequence[Point], done: set[str], memory: int, *, workers: int =
     replicas = sum(one.experiment.replicas for one in missing)
     abreast = max(1, min(ABREAST, math.ceil(replicas / max(1, workers))))
     return sorted((job(group, memory) for group in groups(missing, abreast, memory)), key=lambda one: -one.work)
-
-
-class Packs:
-    """Packs by name, each loaded once: points on one pack can run side by side."""
-
-    def __init__(self) -> None:
-        self._loaded: dict[str, Any] = {}
-
-    def __call__(self, source: str) -> Any:
-        """The pack of a file, or a shipped one.
-
-        Raises:
-            FileNotFoundError: if there is none.
-            FileFormatError: if it is damaged.
-        """
-        if source not in self._loaded:
-            self._loaded[source] = load_pack(source)
-        return self._loaded[source]

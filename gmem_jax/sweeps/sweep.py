@@ -16,10 +16,12 @@ from gmem_jax.experiment.host import Progress, silent, within
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.named import named_experiment, named_signals
+from gmem_jax.files.packs import load_pack
+from gmem_jax.files.parts import Parts
 from gmem_jax.files.provenance import sources
 from gmem_jax.preparation.preparation import Recipe, grain_steps
 from gmem_jax.sweeps.executors import Executor
-from gmem_jax.sweeps.plan import ABREAST, Packs, Point, digest, groups, plan, point
+from gmem_jax.sweeps.plan import ABREAST, Point, digest, groups, plan, point
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import clump_of, run_group
@@ -60,7 +62,7 @@ def sweep(
         ValueError: for a name that is no field, or an impossible value.
         RunFailedError: if a simulation broke down.
     """
-    packs = Packs()
+    packs = functools.cache(load_pack)  # points on one pack object can run side by side
     points = []
     for row in itertools.product(*vary.values()):
         values = dict(zip(vary, row, strict=True))
@@ -77,7 +79,8 @@ def sweep(
         share = sum(one.experiment.replicas for one in group)
         on = within(progress, done / total, (done + share) / total)
         keys, experiments = [one.key for one in group], [one.experiment for one in group]
-        found |= run_group(keys, experiments, store=store, progress=on)
+        keep = Parts(store.folder / "parts" / digest(keys), {"keys": keys}) if store else None
+        found |= run_group(keys, experiments, store=store, keep=keep, progress=on)
         done += share
     return [Result(one.values, found[one.key]) for one in points]
 
@@ -107,7 +110,7 @@ class Conductor:
 
     def __init__(self, spec: Spec, folder: Path, say: Tell) -> None:
         self.spec, self.store, self.say = spec, Store(folder), say
-        self._packs, self._signals = Packs(), functools.cache(named_signals)
+        self._packs, self._signals = functools.cache(load_pack), functools.cache(named_signals)
         self.impossible: list[tuple[dict[str, Any], str]] = []
 
     def _recipe(self, values: Mapping[str, Any]) -> tuple[Recipe, dict[str, Any]]:

@@ -7,6 +7,7 @@ its last checkpoint.
 """
 
 import contextlib
+import functools
 import os
 import sys
 import time
@@ -23,13 +24,12 @@ from gmem_jax.experiment.recall import Recall, run
 from gmem_jax.experiment.several import run_several
 from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.configuration import experiment_from, resolved
-from gmem_jax.files.packs import save_pack
+from gmem_jax.files.packs import load_pack, save_pack
 from gmem_jax.files.parts import Parts
 from gmem_jax.files.programs import keep_programs
 from gmem_jax.physics import grain
 from gmem_jax.physics.sample import Sample
 from gmem_jax.preparation.preparation import Recipe, prepare
-from gmem_jax.sweeps.plan import Packs
 from gmem_jax.sweeps.store import Store
 
 EVERY = 1.0  # s between two reports of progress
@@ -70,7 +70,7 @@ def run_group(
 
 class _Worker:
     def __init__(self, store: Store, name: str) -> None:
-        self.store, self.name, self.packs = store, name, Packs()
+        self.store, self.name, self.packs = store, name, functools.cache(load_pack)
         self._told = 0.0
 
     def progress(self, job: str) -> Callable[[str, float, float], None]:

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from test_cli import gmem
 
 import gmem_jax as gm
-from gmem_jax.command import app
 
 PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
 ENTRY = "from gmem_jax.command.app import main; main()"
@@ -30,13 +30,6 @@ friction = "M2"
 p_max = 1e-4
 points = 8
 """
-
-
-def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        app.main()
-    return int(ended.value.code or 0)
 
 
 def said(capsys: pytest.CaptureFixture) -> dict:
