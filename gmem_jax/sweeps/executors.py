@@ -5,6 +5,7 @@ An executor keeps workers alive as long as jobs are left that nobody has; the wo
 
 import itertools
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -19,6 +20,7 @@ from gmem_jax.sweeps.store import Store
 POLL = 0.5  # s
 DEATHS = 3  # of workers one after the other, without a job finished between, that end a sweep
 CORES = 8  # of a worker: more gain little at N = 325
+PATIENCE = 30.0  # s for a controller to answer
 
 
 class Executor(ABC):
@@ -153,8 +155,8 @@ class Submitted(Executor):
         self._submitit: Any = submitit
         self._jobs: dict[str, Any] = {}
         self._executor: Any = None
-        if cluster == "slurm" and submitit.SlurmExecutor.affinity() < 0:
-            raise ValueError("no SLURM here: sbatch is not on the path; run the sweep where it is, or use processes")
+        if cluster == "slurm":
+            _require_slurm()
 
     def start(self, store: Store, name: str) -> None:
         """Submit a job."""
@@ -176,7 +178,9 @@ class Submitted(Executor):
         queue = subprocess.run(
             ["squeue", "--noheader", "--format=%A", f"--jobs={numbers}"], capture_output=True, text=True
         )
-        left = set(queue.stdout.split()) if queue.returncode == 0 else set()  # it knows none of them any more
+        if queue.returncode != 0 and "Invalid job id" not in queue.stderr:
+            return set(self._jobs)  # nobody to ask: jobs outlive their controller's absence
+        left = set(queue.stdout.split())  # none if it knows none of them any more
         return {name for name, job in self._jobs.items() if str(job.job_id) in left}
 
     def stop(self) -> None:
@@ -185,6 +189,25 @@ class Submitted(Executor):
         for name, job in self._jobs.items():
             if name in alive:
                 job.cancel(check=False)
+
+
+def _require_slurm() -> None:
+    """Raise if jobs cannot be submitted from here; sbatch itself would print its own lines, or wait for minutes.
+
+    Raises:
+        ValueError: if there is no SLURM, or its controller does not answer.
+    """
+    elsewhere = "run the sweep where it does, or with --executor processes"
+    if not all(map(shutil.which, ("sbatch", "scontrol"))):
+        raise ValueError(f"no SLURM here, sbatch is not on the path; {elsewhere.replace('does', 'is')}")
+    try:
+        asked = subprocess.run(["scontrol", "ping"], capture_output=True, text=True, timeout=PATIENCE)
+        if asked.returncode == 0:
+            return
+        answer = (asked.stdout.strip() or asked.stderr.strip() or "no reason given").splitlines()[0]
+    except subprocess.TimeoutExpired:
+        answer = f"scontrol waited {PATIENCE:.0f} s"
+    raise ValueError(f"SLURM's controller does not answer ({answer}); {elsewhere}")
 
 
 def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executor:

@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import json
+import os
 import subprocess
 import sys
 import time
@@ -168,3 +169,24 @@ def test_packs_are_made_once_for_all_points(tmp_path: Path) -> None:
     assert len(list((tmp_path / "made" / "packs").iterdir())) == 2
     again = subprocess.run(command, capture_output=True, text=True)
     assert "all 4 points are there" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("scontrol", "said"),
+    [(None, "sbatch is not on the path"), ("echo 'Slurmctld(primary) at n is DOWN'; exit 1", "at n is DOWN")],
+)
+def test_a_scheduler_that_cannot_be_reached_is_said_before_anything_is_written(
+    tmp_path: Path, scontrol: str | None, said: str
+) -> None:
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for name in ("sbatch", "scontrol") if scontrol else ():
+        (programs / name).write_text(f"#!/bin/sh\n{scontrol}\n")
+        (programs / name).chmod(0o755)
+    (tmp_path / "mu.toml").write_text(SWEEP)
+    command = [sys.executable, "-c", ENTRY, "sweep", str(tmp_path / "mu.toml"), "--executor", "slurm"]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "PATH": str(programs)})
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "mu").exists()
