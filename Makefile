@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo test check mutations reliability install clean
+.PHONY: demo test test-slow check mutations reliability install clean
 
 demo: install
 	$(REBUILD)
@@ -13,7 +13,12 @@ demo: install
 
 test: install-dev
 	$(REBUILD)
-	$(BIN)/pytest -n 2 --dist loadgroup
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow"
+
+# What takes minutes for one statement: sanitizers, plain JAX on several devices.
+test-slow: install-dev
+	$(REBUILD)
+	$(BIN)/pytest -n 2 --dist loadgroup -m slow
 
 # Wrong code that the tests must notice; an hour or two. Names of mutations: make mutations NAMES="step-* native-*"
 mutations: install-dev

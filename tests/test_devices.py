@@ -37,7 +37,7 @@ def found(path: Path, devices: int) -> Numbers:
     return numbers
 
 
-@pytest.fixture(scope="module", params=["native", "jax"])
+@pytest.fixture(scope="module", params=["native", pytest.param("jax", marks=pytest.mark.slow)])
 def alone(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Numbers]:
     """The numbers of one device."""
     if request.param == "native" and not BUILT:

@@ -46,6 +46,7 @@ def compiled(sanitizers: str, folder: Path) -> Path:
     return folder / "drive"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sanitizers", SANITIZERS, ids=["address-undefined", "thread"])
 def test_kernels_are_clean_and_defects_are_seen(sanitizers: str, tmp_path: Path) -> None:
     driver = compiled(sanitizers, tmp_path)

@@ -29,7 +29,7 @@ def found(backend: str) -> dict[str, str]:
 
 def cases() -> list[object]:
     built = pytest.mark.skipif(not BUILT, reason=REASON)
-    marks = {"native": [built], "jax": []}
+    marks = {"native": [built], "jax": [pytest.mark.slow]}
     return [
         pytest.param(backend, check.__name__, marks=marks[backend], id=f"{backend}-{check.__name__}")
         for backend, checks in CHECKS.items()
