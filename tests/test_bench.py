@@ -1,5 +1,6 @@
 """The benchmark measures what it says, notices backends that disagree, and prints its ratios."""
 
+import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import pytest
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.bench import measure as bench
-from gmem_jax.bench.measure import Row
+from gmem_jax.bench import table
+from gmem_jax.bench.race import Rival, Row, race
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 
@@ -44,16 +46,24 @@ def test_mirrored_copies_are_at_rest_without_the_walls_between_them(pack: gm.Pac
 
 def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
     rows = [
-        Row("native", "H", 325, 8, 0.05, 1.0),
-        Row("native", "H", 325, 1, 0.15, 1.0),
+        Row("native", "H", 325, 8, 0.05, compile_s=1.0),
+        Row("native", "H", 325, 1, 0.15, compile_s=1.0),
         Row("lammps", "H", 325, 1, 0.8, note="1 core"),
         Row("lammps", "H", 325, 2, 0.4, note="2 serial runs side by side"),
         Row("lammps", "H", 325, 1, 0.45, note="2 ranks"),
     ]
-    facts = {"commit": "0123456789ab", "versions": {"jax": "0"}, "processor": "P", "instruction_set": "avx2"}
+    rows = [replace(row, median=row.us, worst=1.2 * row.us) for row in rows]
+    facts = {
+        "repeats": 5,
+        "commit": "0123456789ab",
+        "versions": {"jax": "0"},
+        "processor": "P",
+        "instruction_set": "avx2",
+    }
     growth = [asdict(Row("native", "H", n, b, us)) for n, us in ((325, 0.1), (650, 0.13)) for b in (1, 8)]
     result = {
         **facts,
+        "repeats": 5,
         "lammps": "L",
         "rows": [asdict(row) for row in rows],
         "growth": growth,
@@ -61,6 +71,7 @@ def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
         "gradient": {
             "grains": 325,
             "commit": None,
+            "t0": 1800.0,
             "forward_s": 5.0,
             "gradient_s": 50.0,
             "forward_bytes": 1e9,
@@ -68,12 +79,60 @@ def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
         },
     }
     before = {"rows": [asdict(replace(row, us=2.0 * row.us)) for row in rows]}
-    text = bench.markdown(result, before)
-    assert "| H | 325 | native | 8 | 0.0500 | 8.0 | 1.0 | 2.00 |" in text
-    assert "| H | 325 | native | 1 | 0.1500 | 3.0 | 1.0 | 2.00 |" in text
-    assert "| 650 | 0.1300 | 1.30 | 0.1300 | 1.30 |" in text
+    text = table.markdown(result, before)
+    assert "| H | 325 | native | 8 | 0.05 - 0.06 | 8.0 | 1.0 | 2.00 |" in text
+    assert "| H | 325 | native | 1 | 0.15 - 0.18 | 3.0 | 1.0 | 2.00 |" in text
+    assert "| 650 | 0.13 | 1.30 | 0.13 | 1.30 |" in text
     assert "H 1.50 kB" in text
     assert "ratio 10.0; peak memory of the process 2.00 GB, 1.00 GB before" in text
+
+    line = "| 325 | 0.15 - 0.18 | 0.05 - 0.06 | 0.4 (2 serial runs side by side); 0.45 (2 ranks) | 3.0 / 8.0 |"
+    assert line in table.short(result)
+    page = table.into(f"a\n{table.BEGIN}\nold\n{table.END}\nb", table.short(result))
+    assert "old" not in page
+    assert line in page
+    assert page.startswith("a\n")
+    assert page.endswith("\nb")
+
+
+def test_rivals_take_turns_and_the_best_counts() -> None:
+    turns: list[str] = []
+
+    def rival(name: str, times: list[float]) -> Rival:
+        left = iter(times)
+
+        def once() -> float:
+            turns.append(name)
+            return next(left)
+
+        return Rival(Row(name, "H", 1, 1), once)
+
+    rows = race([rival("a", [3.0, 1.0, 2.0]), rival("b", [5.0, 6.0, 4.0])], repeats=3)
+    assert turns == list("ababab")
+    assert [(row.us, row.median, row.worst) for row in rows] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
+
+
+def test_what_was_measured_is_kept_at_once(pack: gm.Pack) -> None:
+    kept: list[int] = []
+    result = bench.run(
+        lambda _: pack,
+        ["p"],
+        laws=["H", "M1"],
+        replicas=[2],
+        with_lammps=False,
+        with_jax=False,
+        scaling=False,
+        keep=lambda so_far: kept.append(len(so_far["rows"])),
+    )
+    assert kept == [1, 2]
+    assert "| H | 27 |" in table.markdown(result)
+
+
+def test_the_readme_holds_the_table_that_was_measured() -> None:
+    root = Path(__file__).parents[1]
+    page = (root / "README.md").read_text()
+    stored = json.loads((root / "benchmarks" / "bench.json").read_text())
+    assert page == table.into(page, table.short(stored))
 
 
 def test_a_gradient_is_timed_in_a_process_of_its_own() -> None:

@@ -5,8 +5,6 @@ moving walls, binning and list checks included. Results are checked in the same 
 the same wall pressures.
 """
 
-import functools
-import json
 import math
 import os
 import platform
@@ -16,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -28,6 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from gmem_jax import native
 from gmem_jax.bench import lammps
+from gmem_jax.bench.race import REPEATS, Rival, Row, race
 from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.experiment import Experiment
@@ -58,31 +57,6 @@ Say = Callable[[str, float], None]
 """Called with what is being measured and the fraction done."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One measurement.
-
-    Attributes:
-        engine: "native", "jax" or "lammps".
-        law: "H", "M1" or "M2".
-        grains: number of grains.
-        replicas: replicas side by side, for LAMMPS processes side by side.
-        us: best wall time of a grain-step, in microseconds.
-        compile_s: seconds spent compiling, apart.
-        note: how LAMMPS was run, or what else is special.
-        p_xy: of the last replica at the end, in E; NaN where it cannot be compared.
-    """
-
-    engine: str
-    law: str
-    grains: int
-    replicas: int
-    us: float
-    compile_s: float = 0.0
-    note: str = ""
-    p_xy: float = float("nan")
-
-
 def processor() -> str:
     """The processor's name, and how many cores this process may use."""
     file = Path("/proc/cpuinfo")
@@ -105,34 +79,42 @@ def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str) -> tuple[C
     return course, replicate(experiment.begin(), replicas)
 
 
-def measure(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 1.5) -> Row:
-    """Time a walk of some bins on a backend; the best of as many calls as fit into about `seconds`, two at least."""
+def rival(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 0.5) -> Rival:
+    """A walk of some bins on a backend, compiled; timed for about `seconds` each time.
+
+    Raises:
+        RuntimeError: if the simulation breaks down.
+    """
     course, state = encode(pack, LAWS[law], replicas, backend)
     call = (course, state, ENCODE.bin(0), BINS)
     began = time.perf_counter()
     binary = forward.program.lower(*call, most=BINS).compile()
     compile_s = time.perf_counter() - began
     final, sample = jax.block_until_ready(binary(*call))  # warm-up
-    best, spent, calls = float("inf"), 0.0, 0
-    while calls < 2 or spent < seconds:
-        began = time.perf_counter()
-        final, sample = jax.block_until_ready(binary(*call))
-        taken = time.perf_counter() - began
-        best, spent, calls = min(best, taken), spent + taken, calls + 1
     if Status(worst(final)).fatal:
         raise RuntimeError(f"{backend}, {law}, {pack.name}: {explain(worst(final))}")
     pressure = np.asarray(sample.pressure)
-    cost = 1e6 * best / (BINS * course.steps * pack.grains * replicas)
-    return Row(
-        backend, law, pack.grains, replicas, cost, compile_s, p_xy=float(pressure[-1, 0, -1] - pressure[-1, 1, -1])
-    )
+    p_xy = float(pressure[-1, 0, -1] - pressure[-1, 1, -1])
+
+    def once() -> float:
+        began, calls = time.perf_counter(), 0
+        while calls < 1 or time.perf_counter() - began < seconds:
+            jax.block_until_ready(binary(*call))
+            calls += 1
+        return 1e6 * (time.perf_counter() - began) / (calls * BINS * course.steps * pack.grains * replicas)
+
+    return Rival(Row(backend, law, pack.grains, replicas, compile_s=compile_s, p_xy=p_xy), once)
 
 
-def measure_lammps(pack: Pack, law: str, *, steps: int = 1000) -> list[Row]:
+def measure(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 0.5) -> Row:
+    """Time a walk of some bins on a backend by itself."""
+    return race([rival(pack, backend, law, replicas, seconds=seconds)])[0]
+
+
+def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Rival]:
     """LAMMPS on the same pack with its walls at rest: one core, serial runs side by side, and MPI ranks.
 
-    Its neighbour settings are tuned first, and the better of two runs counts. Law H has no dashpot there (see
-    `lammps.pair_lines`).
+    Its neighbour settings are tuned first. Law H has no dashpot there (see `lammps.pair_lines`).
 
     Raises:
         ValueError: for law M2, which it does not have.
@@ -154,23 +136,22 @@ def measure_lammps(pack: Pack, law: str, *, steps: int = 1000) -> list[Row]:
             script = lammps.scene_script(scene, friction, material, 0.3, folder, skin=skin, every=every)
             return lammps.loop_seconds(script, folder, steps=count, ranks=ranks)
 
-    def best(run: Callable[[], float]) -> float:
-        return min(run(), run())
-
     setting = min(LAMMPS_LISTS, key=lambda setting: seconds(setting, max(100, steps // 4)))
     unit, many = 1e6 / (steps * pack.grains), cores()
     note = f"skin {setting[0]} R, every {setting[1]}"
-    rows = [Row("lammps", law, pack.grains, 1, unit * best(lambda: seconds(setting, steps)), note=f"1 core, {note}")]
+    alone = Row("lammps", law, pack.grains, 1, note=f"1 core, {note}")
+    rivals = [Rival(alone, lambda: unit * seconds(setting, steps))]
     if many > 1:
 
         def together() -> float:
             with ThreadPoolExecutor(many) as pool:
-                return max(pool.map(lambda _: seconds(setting, steps), range(many)))
+                return unit * max(pool.map(lambda _: seconds(setting, steps), range(many))) / many
 
-        beside, ranks = unit * best(together) / many, unit * best(lambda: seconds(setting, steps, many))
-        rows.append(Row("lammps", law, pack.grains, many, beside, note=f"{many} serial runs side by side"))
-        rows.append(Row("lammps", law, pack.grains, 1, ranks, note=f"{many} ranks"))
-    return rows
+        beside = replace(alone, replicas=many, note=f"{many} serial runs side by side")
+        rivals.append(Rival(beside, together))
+        ranks = replace(alone, note=f"{many} ranks")
+        rivals.append(Rival(ranks, lambda: unit * seconds(setting, steps, many)))
+    return rivals
 
 
 def tile(pack: Pack, times: tuple[int, int, int]) -> Pack:
@@ -288,9 +269,12 @@ def run(
     packs: Sequence[str],
     *,
     laws: Sequence[str] = ("H", "M1", "M2"),
-    replicas: Sequence[int] = (1, 8, 16, 32),
+    replicas: Sequence[int] = (1, 8, 32, 64),
     with_lammps: bool = True,
+    with_jax: bool = True,
+    scaling: bool = True,
     sizes: Sequence[tuple[int, int, int]] = ((1, 1, 1), (2, 2, 1), (2, 2, 3), (4, 4, 2), (5, 5, 4)),
+    keep: Callable[[dict[str, Any]], None] = lambda result: None,
     say: Say = lambda what, fraction: None,
 ) -> dict[str, Any]:
     """The whole table.
@@ -301,60 +285,70 @@ def run(
         laws: friction laws.
         replicas: numbers of replicas.
         with_lammps: measure LAMMPS too, if it can run here.
+        with_jax: measure plain JAX too, where the native backend is there.
+        scaling: measure also the cost against N, memory and the cost of a gradient.
         sizes: copies of the first pack along each axis, for the cost against N.
+        keep: is given what has been measured so far, after every race.
         say: see `Say`.
 
     Returns:
-        The machine, rows, cost against N, bytes per grain and replica, cost of a gradient; see `markdown`.
+        The machine, rows, cost against N, bytes per grain and replica, cost of a gradient; see `table.markdown`.
 
     Raises:
         RuntimeError: if backends disagree.
     """
     loaded = {name: load(name) for name in packs}
     first = loaded[packs[0]]
-    backends = ["native", "jax"] if native.available()[0] else ["jax"]
+    fastest = "native" if native.available()[0] else "jax"
+    backends = [fastest, "jax"] if with_jax and fastest != "jax" else [fastest]
     absent = lammps.missing() if with_lammps else "not asked for"
-    plan: list[tuple[str, Callable[[], list[Row]]]] = []
-
-    def timed(pack: Pack, backend: str, law: str, count: int) -> tuple[str, Callable[[], list[Row]]]:
-        what = f"{backend}, {law}, N = {pack.grains}, {count} replicas"
-        return what, lambda: [measure(pack, backend, law, count)]
-
-    for pack in loaded.values():
-        for law in laws:
-            for count in replicas:
-                if fits(pack, law, count):
-                    plan += [
-                        timed(pack, backend, law, count) for backend in backends if _worth(pack, first, backend, law)
-                    ]
-            if absent is None and law in ("H", "M1"):
-                plan.append((f"LAMMPS, {law}, N = {pack.grains}", functools.partial(measure_lammps, pack, law)))
-    rows: list[Row] = []
-    for place, (what, job) in enumerate(plan):
-        say(what, 0.7 * place / len(plan))
-        rows += job()
-    growth = []
-    for place, times in enumerate(sizes):
-        tiled = first if times == (1, 1, 1) else tile(first, times)
-        say(f"cost against N: {tiled.grains}", 0.7 + 0.25 * place / len(sizes))
-        growth += [replace(measure(tiled, backends[0], "H", count), note="tiled") for count in (1, 8)]
-    say("memory", 0.95)
-    largest = max(loaded, key=lambda name: loaded[name].grains)
-    use = {law: memory(load, largest, loaded[largest].grains, backends[0], law) for law in laws if law != "M2"}
-    say("gradient", 0.97)
-    gradient = gradient_cost(load, packs[0], backends[0])
-    if wrong := disagreements(rows):
-        raise RuntimeError("backends disagree: " + "; ".join(wrong))
-    return {
+    result: dict[str, Any] = {
         **provenance(),
         "processor": processor(),
         "lammps": absent or "2025.7.22",
         "instruction_set": native.available()[1],
-        "rows": [asdict(row) for row in rows],
-        "growth": [asdict(row) for row in growth],
-        "bytes_per_grain_replica": use,
-        "gradient": {"grains": first.grains, "commit": provenance()["commit"], **gradient},
+        "repeats": REPEATS,
+        "rows": [],
+        "growth": [],
+        "bytes_per_grain_replica": {},
     }
+
+    def add(where: str, rows: Sequence[Row]) -> None:
+        result[where] += [asdict(row) for row in rows]
+        keep(result)
+
+    cases = [(pack, law) for pack in loaded.values() for law in laws]
+    rows: list[Row] = []
+    for place, (pack, law) in enumerate(cases):
+        say(f"{law}, N = {pack.grains}", (0.7 if scaling else 1.0) * place / len(cases))
+        counts = [count for count in replicas if fits(pack, law, count)]
+        ours = [(backend, count) for backend in backends if _worth(pack, first, backend, law) for count in counts]
+        if law == "M2":  # its histories are large, and it has no rival
+            found = [row for backend, count in ours for row in race([rival(pack, backend, law, count)])]
+        else:
+            theirs = lammps_rivals(pack, law) if absent is None else []
+            found = race([*(rival(pack, backend, law, count) for backend, count in ours), *theirs])
+        rows += found
+        add("rows", found)
+    if wrong := disagreements(rows):
+        raise RuntimeError("backends disagree: " + "; ".join(wrong))
+    if not scaling:
+        return result
+    for place, times in enumerate(sizes):
+        tiled = first if times == (1, 1, 1) else tile(first, times)
+        say(f"cost against N: {tiled.grains}", 0.7 + 0.25 * place / len(sizes))
+        found = race([rival(tiled, fastest, "H", count) for count in (1, 8)])
+        add("growth", [replace(row, note="tiled") for row in found])
+    say("memory", 0.95)
+    largest = max(loaded, key=lambda name: loaded[name].grains)
+    for law in laws:
+        if law != "M2":
+            result["bytes_per_grain_replica"][law] = memory(load, largest, loaded[largest].grains, fastest, law)
+    say("gradient", 0.97)
+    gradient = gradient_cost(load, packs[0], fastest)
+    result["gradient"] = {"grains": first.grains, "t0": T0, "commit": provenance()["commit"], **gradient}
+    keep(result)
+    return result
 
 
 def fits(pack: Pack, law: str, replicas: int, share: float = 0.25) -> bool:
@@ -368,70 +362,3 @@ def fits(pack: Pack, law: str, replicas: int, share: float = 0.25) -> bool:
 def _worth(pack: Pack, first: Pack, backend: str, law: str) -> bool:
     """Plain JAX is timed in full only where a user would wait for it."""
     return backend != "jax" or law == "H" or pack is first
-
-
-def _find(rows: Sequence[dict[str, Any]], **wanted: Any) -> dict[str, Any] | None:
-    return next((row for row in rows if all(row[key] == value for key, value in wanted.items())), None)
-
-
-def markdown(result: dict[str, Any], baseline: dict[str, Any] | None = None) -> str:
-    """The table as Markdown; with a baseline, every row has its ratio to it."""
-    commit = (result["commit"] or "unknown")[:9]
-    versions = result["versions"]
-    lines = [
-        f"{result['processor']} ({result['instruction_set']}), float64, jax {versions['jax']}, "
-        f"LAMMPS {result['lammps']}, commit {commit}",
-        "",
-        "Microseconds of wall time per grain-step, all cores of the machine.",
-        "",
-        "| law | N | engine | replicas | us | LAMMPS / this | compile, s | baseline / this |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    rows = result["rows"]
-    old = baseline["rows"] if baseline else []
-    for row in sorted(rows, key=lambda r: (r["law"], r["grains"], r["engine"], r["replicas"])):
-        rivals = [r["us"] for r in rows if _is_rival(r, row)]
-        rival = f"{min(rivals) / row['us']:.1f}" if rivals and row["engine"] != "lammps" else ""
-        same = {key: row[key] for key in ("engine", "law", "grains", "replicas")}
-        before = _find(old, **same, **({"note": row["note"]} if row["engine"] == "lammps" else {}))
-        ratio = f"{before['us'] / row['us']:.2f}" if before else ""
-        engine = f"LAMMPS, {row['note']}" if row["engine"] == "lammps" else row["engine"]
-        lines.append(
-            f"| {row['law']} | {row['grains']} | {engine} | {row['replicas']} | {row['us']:.4f} | {rival} "
-            f"| {row['compile_s']:.1f} | {ratio} |"
-        )
-    lines += ["", "Cost against size (law H; copies of one pack side by side):", ""]
-    lines += ["| N | 1 replica | growth | 8 replicas | growth |", "|---|---|---|---|---|"]
-    growth = result["growth"]
-    ones, eights = ([row for row in growth if row["replicas"] == count] for count in (1, 8))
-    for one, eight in zip(ones, eights, strict=True):
-        lines.append(
-            f"| {one['grains']} | {one['us']:.4f} | {one['us'] / ones[0]['us']:.2f} "
-            f"| {eight['us']:.4f} | {eight['us'] / eights[0]['us']:.2f} |"
-        )
-    use = ", ".join(f"{law} {bytes_ / 1e3:.2f} kB" for law, bytes_ in result["bytes_per_grain_replica"].items())
-    lines += ["", f"Memory per grain and replica: {use}."]
-    if gradient := result.get("gradient"):
-        lines += [
-            "",
-            f"Gradient of F by 6 x 32 waveform values, whole experiment, N = {gradient['grains']}, t0 = {T0:g}, "
-            f"commit {(gradient['commit'] or 'unknown')[:9]}: "
-            f"{gradient['gradient_s']:.1f} s, one forward run {gradient['forward_s']:.1f} s, "
-            f"ratio {gradient['gradient_s'] / gradient['forward_s']:.1f}; peak memory of the process "
-            f"{gradient['gradient_bytes'] / 1e9:.2f} GB, {gradient['forward_bytes'] / 1e9:.2f} GB before.",
-        ]
-    return "\n".join([*lines, ""])
-
-
-def _is_rival(rival: dict[str, Any], row: dict[str, Any]) -> bool:
-    """LAMMPS' best way to do the same: ranks for one replica, serial runs side by side for several."""
-    if (rival["engine"], rival["law"], rival["grains"]) != ("lammps", row["law"], row["grains"]):
-        return False
-    return "ranks" in rival["note"] if row["replicas"] == 1 else "side by side" in rival["note"] or cores() == 1
-
-
-def save(folder: Path, result: dict[str, Any], text: str) -> None:
-    """Write bench.json and bench.md to `folder`."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "bench.json").write_text(json.dumps(result, indent=1) + "\n")
-    (folder / "bench.md").write_text(text)

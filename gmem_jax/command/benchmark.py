@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from gmem_jax.bench import measure
+from gmem_jax.bench.table import markdown, save
 from gmem_jax.command.console import AsJson, InputError, claim, emit, reporting
 from gmem_jax.files.checked import json_of, refusing
 from gmem_jax.files.packs import list_packs, load_pack
@@ -17,14 +18,16 @@ def bench_command(
     laws: Annotated[str, typer.Option(help="Friction laws among H, M1, M2, separated by commas.")] = "H,M1,M2",
     replicas: Annotated[str, typer.Option(help="Numbers of replicas, separated by commas.")] = "1,8,16,32",
     with_lammps: Annotated[bool, typer.Option("--lammps/--no-lammps", help="Measure LAMMPS beside us.")] = True,
+    with_jax: Annotated[bool, typer.Option("--jax/--no-jax", help="Measure plain JAX beside us.")] = True,
+    scaling: Annotated[bool, typer.Option("--scaling/--no-scaling", help="Cost against N, memory, gradient.")] = True,
     baseline: Annotated[Path | None, typer.Option(help="A bench.json to compare with.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure what a grain-step costs: native backend, plain JAX and LAMMPS, side by side.
 
-    The folder's bench.json and bench.md are replaced.
+    The folder's bench.json and bench.md are replaced, and hold what has been measured so far.
     """
-    shipped = [f"tetra-{size}-a" for size in (325, 1024, 3267)]
+    shipped = [f"tetra-{size}-a" for size in (325, 1024, 3267, 10240)]
     names = packs.split(",") if packs else [name for name in shipped if name in list_packs()]
     chosen = laws.split(",")
     if unknown := [law for law in chosen if law not in measure.LAWS]:
@@ -44,11 +47,12 @@ def bench_command(
             laws=chosen,
             replicas=[int(count) for count in counts],
             with_lammps=with_lammps,
+            with_jax=with_jax,
+            scaling=scaling,
+            keep=lambda so_far: save(output, so_far, markdown(so_far, before)),
             say=lambda what, fraction: progress(what, 0.0, fraction),
         )
-    text = measure.markdown(result, before)
-    measure.save(output, result, text)
-    emit(as_json, {**result, "status": 0}, text)
+    emit(as_json, {**result, "status": 0}, markdown(result, before))
 
 
 COMMANDS = {"bench": bench_command}
