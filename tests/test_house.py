@@ -23,6 +23,7 @@ FLOORS = (
     "reading",
     "show",
     "bench",
+    "reproduce",
     "command",
 )
 

@@ -14,7 +14,8 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
+    """Matplotlib's pyplot, drawing to files."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -23,11 +24,22 @@ def _pyplot() -> Any:
     return plt
 
 
-def _save(path: Path, figure: Any) -> None:
+def save(path: Path, figure: Any, *, also: Sequence[str] = ()) -> None:
+    """Write a figure whole, and close it.
+
+    Args:
+        path: in the format of its suffix.
+        figure: of matplotlib.
+        also: further suffixes to write it under.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
     figure.tight_layout()
-    with atomic(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=130)
-    _pyplot().close(figure)
+    for target in (path, *(path.with_suffix(suffix) for suffix in also)):
+        with atomic(target) as temporary:
+            figure.savefig(temporary, format=target.suffix.removeprefix("."), dpi=130)
+    pyplot().close(figure)
 
 
 def recall_figure(path: Path, recall: Recall, scale: Scalar, title: str) -> None:
@@ -42,7 +54,7 @@ def recall_figure(path: Path, recall: Recall, scale: Scalar, title: str) -> None
     Raises:
         OSError: if the path cannot be written.
     """
-    plt = _pyplot()
+    plt = pyplot()
     unit = Material().modulus
     u, signals, integrals = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J))
     scaled_integrals = float(recall.gain) * np.asarray(scale) * integrals
@@ -67,7 +79,7 @@ def recall_figure(path: Path, recall: Recall, scale: Scalar, title: str) -> None
         axis.set_ylabel("stress (Pa)")
     axes[0, 0].legend(fontsize=7, frameon=False)
     figure.suptitle(f"{title}: G = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}", fontsize=10)
-    _save(path, figure)
+    save(path, figure)
 
 
 def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:
@@ -76,7 +88,7 @@ def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:
     Raises:
         OSError: if the path cannot be written.
     """
-    plt = _pyplot()
+    plt = pyplot()
     count = len(table)
     bits = count.bit_length() - 1
     figure, axes = plt.subplots(figsize=(5.6, 5.0))
@@ -95,7 +107,7 @@ def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:
     axes.set_ylabel("word stored")
     axes.set_title(title, fontsize=10)
     figure.colorbar(image, label="part of the readings", shrink=0.8)
-    _save(path, figure)
+    save(path, figure)
 
 
 def gradient_figure(path: Path, rows: Sequence[tuple[np.ndarray, np.ndarray]], title: str) -> None:
@@ -104,13 +116,13 @@ def gradient_figure(path: Path, rows: Sequence[tuple[np.ndarray, np.ndarray]], t
     Raises:
         OSError: if the path cannot be written.
     """
-    figure, axis = _pyplot().subplots(figsize=(6.4, 3.6))
+    figure, axis = pyplot().subplots(figsize=(6.4, 3.6))
     for number, (place, slope) in enumerate(rows):
         axis.plot(place, slope, "o-", markersize=4, linewidth=0.8, label=f"signal {number + 1}")
     axis.axhline(0.0, color="0.8", linewidth=0.8)
     axis.set(xlabel="compression variable u", ylabel="dF / d amplitude", title=title)
     axis.legend(fontsize=7, frameon=False)
-    _save(path, figure)
+    save(path, figure)
 
 
 def kernel_figure(path: Path, kernel: MemoryKernel, noise: float, title: str) -> None:
@@ -119,7 +131,7 @@ def kernel_figure(path: Path, kernel: MemoryKernel, noise: float, title: str) ->
     Raises:
         OSError: if the path cannot be written.
     """
-    figure, (left, right) = _pyplot().subplots(1, 2, figsize=(9.6, 3.9))
+    figure, (left, right) = pyplot().subplots(1, 2, figsize=(9.6, 3.9))
     values = kernel.kernel() / kernel.delta0
     limit = float(np.abs(values).max())
     image = left.pcolormesh(kernel.centres, kernel.u, values, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="nearest")
@@ -131,7 +143,7 @@ def kernel_figure(path: Path, kernel: MemoryKernel, noise: float, title: str) ->
     right.axhline(noise * Material().modulus, color="C3", linestyle="--", linewidth=0.8, label="noise")
     right.set(xlabel="number", ylabel="singular value (Pa)", title="recall of the n-th best waveform")
     right.legend(frameon=False, fontsize=8)
-    _save(path, figure)
+    save(path, figure)
 
 
 def history_figure(path: Path, histories: dict[str, Sequence[float]]) -> None:
@@ -140,12 +152,12 @@ def history_figure(path: Path, histories: dict[str, Sequence[float]]) -> None:
     Raises:
         OSError: if the path cannot be written.
     """
-    figure, axis = _pyplot().subplots(figsize=(5.2, 3.6))
+    figure, axis = pyplot().subplots(figsize=(5.2, 3.6))
     for name, history in histories.items():
         axis.semilogy(range(len(history)), 1.0 - np.asarray(history), "o-", markersize=4, label=name)
     axis.set(xlabel="iteration", ylabel="1 - F")
     axis.legend(frameon=False, fontsize=8)
-    _save(path, figure)
+    save(path, figure)
 
 
 def design_figure(path: Path, design: Design, unit: float, title: str) -> None:
@@ -163,7 +175,7 @@ def design_figure(path: Path, design: Design, unit: float, title: str) -> None:
     shown = min(len(design.target), 6)
     u = (np.arange(design.target.shape[1]) + 0.5) / design.target.shape[1]
     pascal = Material().modulus
-    figure, axes = _pyplot().subplots(2, shown, figsize=(2.6 * shown, 4.8), sharex=True, sharey="row", squeeze=False)
+    figure, axes = pyplot().subplots(2, shown, figsize=(2.6 * shown, 4.8), sharex=True, sharey="row", squeeze=False)
     nodes = np.linspace(0.0, 1.0, design.signals.nodes.shape[1])
     for number in range(shown):
         axes[0, number].plot(nodes, np.asarray(design.signals.nodes[number]), color="C2")
@@ -177,4 +189,4 @@ def design_figure(path: Path, design: Design, unit: float, title: str) -> None:
     axes[1, 0].set_ylabel("stress (Pa)")
     axes[1, 0].legend(fontsize=6, frameon=False)
     figure.suptitle(f"{title}: F {design.before:.3f} -> {design.fidelity:.3f}", fontsize=10)
-    _save(path, figure)
+    save(path, figure)

@@ -103,13 +103,14 @@ class Conductor:
         spec: what is asked for.
         folder: of its store.
         say: told in a line what is planned, and what happened.
+        cost: seconds a grain-step, for that.
 
     Raises:
         FileFormatError: if the folder holds something else.
     """
 
-    def __init__(self, spec: Spec, folder: Path, say: Tell) -> None:
-        self.spec, self.store, self.say = spec, Store(folder), say
+    def __init__(self, spec: Spec, folder: Path, say: Tell, *, cost: float = COST) -> None:
+        self.spec, self.store, self.say, self.cost = spec, Store(folder), say, cost
         self._packs, self._signals = functools.cache(load_pack), functools.cache(named_signals)
         self.impossible: list[tuple[dict[str, Any], str]] = []
 
@@ -218,8 +219,9 @@ class Conductor:
         work = sum(job["work"] for job in jobs)
         widest = max(job["replicas"] for job in jobs)
         workers = min(executor.workers, len(jobs))
-        minutes = max(1, round(COST * work / 60.0))
-        cost = f"{work:.2g} grain-steps, some {minutes} min of two free cores (native, law H)"
+        minutes = max(1, round(self.cost * work / 60.0))
+        where = "here" if self.cost != COST else "of two free cores (native, law H)"
+        cost = f"{work:.2g} grain-steps, some {minutes} min {where}"
         self.say(f"{what}, {widest} replicas side by side at most, workers: {workers}; {cost}")
 
     def _finish(self, executor: Executor, jobs: list[dict[str, Any]], progress: Progress, what: str) -> None:

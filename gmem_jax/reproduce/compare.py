@@ -1,0 +1,222 @@
+"""Our points beside the published ones, each with its spread, and the difference in units of the combined error."""
+
+import csv
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gmem_jax.experiment.analysis import spread
+from gmem_jax.files.atomic import atomic
+from gmem_jax.physics.contact.laws import LAWS
+from gmem_jax.show.tables import published, summary
+from gmem_jax.sweeps.store import Store
+
+PAPER_GRAINS = 10_240
+RINGS = 1.8e4  # t_c: drives faster than this ring, and their F is taken after averaging over the ringing period
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What a point is measured at, packs aside.
+
+    Attributes:
+        law: "H", "M1" or "M2", and its variant if that is not the default.
+        shape: "tetra" or "sphere".
+        overlap: O of a tetra grain; 1 for spheres.
+        grains: N.
+        mu: friction.
+        delta0: compression.
+        gamma0: amplitude.
+        bits: length of words; 0 for the six signals.
+        background: of the measure.
+    """
+
+    law: str
+    shape: str
+    overlap: float
+    grains: int
+    mu: float
+    delta0: float
+    gamma0: float
+    bits: int
+    background: str
+
+
+class Point(NamedTuple):
+    """One pack at some conditions: `show.tables.summary` of its recall, and where that lies."""
+
+    conditions: Conditions
+    numbers: dict[str, Any]
+    key: str
+
+
+class Estimate(NamedTuple):
+    """A mean over packs; SD and SE are NaN for one pack."""
+
+    mean: float
+    sd: float
+    packs: int
+
+    @property
+    def error(self) -> float:
+        """Standard error of the mean."""
+        return self.sd / math.sqrt(self.packs)
+
+
+class Compared(NamedTuple):
+    """A measure at some conditions.
+
+    Attributes:
+        conditions: ours.
+        measure: "F", "G" or "accuracy" and a reader of words.
+        ours: over our packs.
+        theirs: the published one, of the same conditions or, at another N, the closest there is; None if there is none.
+        grains: N of the published point.
+        status: all status bits of our recalls.
+    """
+
+    conditions: Conditions
+    measure: str
+    ours: Estimate
+    theirs: Estimate | None
+    grains: int
+    status: int
+
+    @property
+    def errors_apart(self) -> float:
+        """(ours - theirs) over the combined standard error, for the same N; NaN where it cannot be said.
+
+        One pack of ours counts with the published scatter of packs.
+        """
+        if self.theirs is None or self.grains != self.conditions.grains:
+            return math.nan
+        own = self.ours.error if self.ours.packs > 1 else self.theirs.sd
+        combined = math.hypot(own, self.theirs.error)
+        return (self.ours.mean - self.theirs.mean) / combined if combined > 0.0 else math.nan
+
+
+def conditions_of(configuration: dict[str, Any]) -> Conditions:
+    """What a recall was measured at, from its configuration."""
+    law = configuration["experiment"]["friction"]
+    entry = next(entry for entry in LAWS if entry.name == configuration["friction"])
+    variant = law.get("variant", "averaged")
+    shape, _, overlap = configuration["grain"]["shape"].partition("(")
+    signals = configuration["experiment"]["signals"]
+    return Conditions(
+        law=entry.paper + ("" if variant == "averaged" else f", {variant}"),
+        shape=shape,
+        overlap=float(overlap.rstrip(")")) if overlap else 1.0,
+        grains=configuration["grains"],
+        mu=float(configuration["mu"]),
+        delta0=round(float(configuration["delta0"]), 12),
+        gamma0=float(configuration["gamma0"]),
+        bits=signals.get("bits", 0) if signals["kind"] == "words" else 0,
+        background=configuration["background"],
+    )
+
+
+def points_of(store: Store) -> list[Point]:
+    """Every finished point of the sweep that a store was last asked for."""
+    found = []
+    done = store.done()
+    for row in store.card()["points"]:
+        if row["key"] in done:
+            recall, configuration = store.load(row["key"])
+            found.append(Point(conditions_of(configuration), summary(recall, configuration), row["key"]))
+    return found
+
+
+def _measures(point: Point, t0: float) -> dict[Conditions, tuple[float, float]]:
+    """G and F of a point by its conditions: one for every background that it has."""
+    at = asdict(point.conditions)
+    if "backgrounds" in point.numbers:
+        rows = point.numbers["backgrounds"].items()
+        return {Conditions(**{**at, "background": name}): (row["gain"], row["fidelity"]) for name, row in rows}
+    windowed = "windowed_" if t0 < RINGS else ""
+    return {point.conditions: (point.numbers[f"{windowed}gain"], point.numbers[f"{windowed}fidelity"])}
+
+
+def compare(points: Iterable[Point], t0: float) -> list[Compared]:
+    """Means over packs beside the published points, in the order in which the conditions come.
+
+    Args:
+        points: of any number of packs.
+        t0: at which they were run: below the paper's, F and G are those after averaging over the ringing period.
+    """
+    groups: dict[Conditions, list[tuple[float, float, int]]] = {}
+    for point in points:
+        for conditions, (gain, fidelity) in _measures(point, t0).items():
+            groups.setdefault(conditions, []).append((gain, fidelity, point.numbers["status"]))
+    found = []
+    for conditions, members in groups.items():
+        status = 0
+        for *_, bits in members:
+            status |= bits
+        found += [compared(conditions, "F", [fidelity for _, fidelity, _ in members], status)]
+        found += [compared(conditions, "G", [gain for gain, *_ in members], status)]
+    return found
+
+
+def compared(conditions: Conditions, measure: str, values: Sequence[float], status: int) -> Compared:
+    """The mean of a measure over packs, beside what is published of it."""
+    mean, deviation, _ = spread(values)
+    theirs, grains = _published(conditions, measure)
+    return Compared(conditions, measure, Estimate(mean, deviation, len(values)), theirs, grains, status)
+
+
+def _published(at: Conditions, measure: str) -> tuple[Estimate | None, int]:
+    """The published estimate of a measure, and its N: that of the same N if there is one, else the paper's usual."""
+    if at.bits:
+        column = f"fidelity_{at.background.replace('-', '_')}" if measure == "F" else "classifier_accuracy"
+        if measure not in ("F", "accuracy net") or at.law != "H":
+            return None, 0
+        rows = [
+            {"n_grains": PAPER_GRAINS, "mean": row[column]} for row in published("binary_words.csv", word_bits=at.bits)
+        ]
+        return _closest(rows, at.grains, "mean", "", 1)
+    same: dict[str, str | float] = {"shape": at.shape, "overlap": at.overlap, "delta0": at.delta0, "gamma0": at.gamma0}
+    if at.law == "H":
+        name = {"F": "fidelity", "G": "gain"}[measure]
+        return _closest(published("six_signals.csv", mu=at.mu, **same), at.grains, f"{name}_mean", f"{name}_sd")
+    if measure == "G" or same != {"shape": "tetra", "overlap": 0.6, "delta0": 0.05, "gamma0": 1e-3} or at.mu != 1.0:
+        return None, 0
+    return _closest(published("models.csv", law=at.law.partition(",")[0]), at.grains, "fidelity", "", 1)
+
+
+def _closest(
+    rows: Sequence[dict[str, Any]], grains: int, mean: str, sd: str, packs: int = 0
+) -> tuple[Estimate | None, int]:
+    if not rows:
+        return None, 0
+    row = min(rows, key=lambda row: (row["n_grains"] != grains, row["n_grains"] != PAPER_GRAINS))
+    return Estimate(row[mean], row[sd] if sd else math.nan, packs or int(row["n_packs"])), int(row["n_grains"])
+
+
+def write_csv(path: Path, rows: Sequence[Compared]) -> None:
+    """A line for each measure: conditions, ours, the published, the difference.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    lines = []
+    for row in rows:
+        theirs = row.theirs or Estimate(math.nan, math.nan, 0)
+        lines.append(
+            asdict(row.conditions)
+            | {"measure": row.measure, "mean": row.ours.mean, "sd": row.ours.sd, "packs": row.ours.packs}
+            | {"published_grains": row.grains, "published_mean": theirs.mean, "published_sd": theirs.sd}
+            | {"published_packs": theirs.packs, "combined_errors_apart": row.errors_apart, "status": row.status}
+        )
+    with atomic(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(lines[0]))
+        writer.writeheader()
+        for line in lines:
+            writer.writerow({name: _cell(value) for name, value in line.items()})
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, float):
+        return "" if math.isnan(value) else f"{value:.6g}"
+    return value

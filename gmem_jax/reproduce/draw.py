@@ -1,0 +1,210 @@
+"""The figures as pictures: ours with error bars, the published points as stars."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.sample import Sample
+from gmem_jax.reading.readers import stored_words
+from gmem_jax.reproduce.compare import Compared, Conditions
+from gmem_jax.show.figures import pyplot, save
+
+LABELS = {
+    "mu": "friction coefficient $\\mu$",
+    "law": "friction law",
+    "delta0": "compression $\\delta_0$",
+    "gamma0": "shear amplitude $\\gamma_0$",
+    "grains": "number of grains N",
+    "bits": "length of words L (bits)",
+}
+PANELS = {"F": "fidelity F", "G": "gain G", "accuracy": "part of the words read right"}
+LOGARITHMIC = ("gamma0", "grains")
+SYMBOLS = "osD^v<>pPX"
+VECTOR = (".svg",)
+
+
+def _panel(measure: str) -> str:
+    return PANELS[measure.split()[0]]
+
+
+def _series(row: Compared, across: str, varied: Sequence[str]) -> str:
+    """What tells a row's curve from the others."""
+    at = asdict(row.conditions)
+    shown = [f"{name} = {at[name]:g}" if isinstance(at[name], float | int) else str(at[name]) for name in varied]
+    reader = [" ".join(row.measure.split()[1:])]
+    return ", ".join(filter(None, [*shown, *reader])) or "gmem_jax"
+
+
+def against(path: Path, rows: Sequence[Compared], across: str, title: str) -> None:
+    """G and F against one condition, with the published points; a curve for each combination of the others that vary.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    plt = pyplot()
+    all_ = [asdict(row.conditions) for row in rows]
+    fields = [name for name in Conditions.__dataclass_fields__ if name != across]
+    varied = [name for name in fields if len({at[name] for at in all_}) > 1]
+    panels: dict[str, list[Compared]] = {}
+    for row in rows:
+        panels.setdefault(_panel(row.measure), []).append(row)
+    figure, axes = plt.subplots(1, len(panels), figsize=(5.2 * len(panels), 4.0), squeeze=False)
+    words = sorted({at[across] for at in all_}) if across == "law" else []
+    for axis, (panel, inside) in zip(axes[0], panels.items(), strict=True):
+        curves: dict[str, list[Compared]] = {}
+        for row in inside:
+            curves.setdefault(_series(row, across, varied), []).append(row)
+        for place, (label, members) in enumerate(curves.items()):
+            _curve(axis, members, across, words, label, place)
+        _axis(axis, across, words, panel)
+        if across == "grains" and panel == PANELS["G"]:
+            _power_law(axis, [row for members in curves.values() for row in members])
+        axis.legend(fontsize=7, frameon=False)
+    figure.suptitle(title, fontsize=10)
+    save(path, figure, also=VECTOR)
+
+
+def _place(row: Compared, across: str, words: Sequence[str]) -> float:
+    value = getattr(row.conditions, across)
+    return float(words.index(value) if words else value)
+
+
+def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str], label: str, place: int) -> None:
+    colour, symbol = f"C{place % 10}", SYMBOLS[place % len(SYMBOLS)]
+    rows = sorted(rows, key=lambda row: _place(row, across, words))
+    x = [_place(row, across, words) for row in rows]
+    y, error = [row.ours.mean for row in rows], [np.nan_to_num(row.ours.error) for row in rows]
+    joined = "-" if len(rows) > 1 and not words else "none"
+    axis.errorbar(
+        x, y, error, color=colour, marker=symbol, markersize=4, capsize=3, linewidth=1, ls=joined, label=label
+    )
+    for grains in sorted({row.grains for row in rows if row.theirs}):
+        theirs = [(row, row.theirs) for row in rows if row.theirs and row.grains == grains]
+        same = all(row.conditions.grains == grains for row, _ in theirs)
+        axis.errorbar(
+            [_place(row, across, words) for row, _ in theirs],
+            [estimate.mean for _, estimate in theirs],
+            [np.nan_to_num(estimate.error) for _, estimate in theirs],
+            color=colour,
+            marker="*",
+            markersize=10,
+            markerfacecolor=colour if same else "none",
+            capsize=2,
+            ls="none",
+            label=f"published, N = {grains:,} (mean ± SE)",
+        )
+
+
+def _axis(axis: Any, across: str, words: Sequence[str], label: str) -> None:
+    axis.set_xlabel(LABELS[across])
+    axis.set_ylabel(label)
+    if label != PANELS["G"]:
+        axis.set_ylim(0.0, 1.03)
+    if words:
+        axis.set_xticks(range(len(words)), words)
+        axis.margins(x=0.2)
+    if across == "bits":
+        axis.xaxis.get_major_locator().set_params(integer=True)
+    if across in LOGARITHMIC:
+        axis.set_xscale("log")
+
+
+def power(rows: Sequence[Compared], published: bool = False) -> float:
+    """The exponent of G ~ N^k by least squares over sizes; NaN for fewer than two."""
+    both = [(row.conditions.grains, row.theirs if published else row.ours, row) for row in rows if row.measure == "G"]
+    known = [(n, e.mean) for n, e, row in both if e is not None and (not published or row.grains == n) and e.mean > 0.0]
+    if len({n for n, _ in known}) < 2:
+        return math.nan
+    size, gain = np.log(np.array(known, float)).T
+    return float(np.polyfit(size, gain, 1)[0])
+
+
+def _power_law(axis: Any, rows: Sequence[Compared]) -> None:
+    ours, theirs = power(rows), power(rows, published=True)
+    axis.set_yscale("log")
+    axis.set_title(f"ours $N^{{{ours:.3f}}}$, published points here $N^{{{theirs:.3f}}}$", fontsize=8)
+
+
+def through_time(path: Path, recall: Recall, signal: int, title: str) -> None:
+    """phi, Z, pressures and p_xy of every stage, with a signal and with none, like the paper's Fig. 4.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    plt = pyplot()
+    unit = Material().modulus / 1e3
+    stages = list(recall.stages.items())
+    rows = [
+        ("filling $\\phi$", lambda s: s.filling, 1.0),
+        ("Z", lambda s: s.coordination, 1.0),
+        ("$p_x$ (kPa)", lambda s: s.pressure[:, 0], unit),
+        ("$p_y$ (kPa)", lambda s: s.pressure[:, 1], unit),
+        ("$p_z$ (kPa)", lambda s: s.pressure[:, 2], unit),
+        ("$p_{xy}$ (Pa)", lambda s: s.pressure[:, 0] - s.pressure[:, 1], 1e3 * unit),
+    ]
+    figure, axes = plt.subplots(len(rows), 1, figsize=(8.0, 9.5), sharex=True)
+
+    def column(stage: Sample, get: Any, replica: int) -> np.ndarray:
+        values = np.asarray(get(stage))
+        return values[:, min(replica, values.shape[1] - 1)]
+
+    starts = np.cumsum([0, *(len(np.asarray(stage.filling)) for _, stage in stages)]) / 256.0
+    for axis, (label, get, scale) in zip(axes, rows, strict=True):
+        for replica, style, name in ((0, "C7-", "no signal"), (signal, "C0-", f"signal {signal}")):
+            y = scale * np.concatenate([column(stage, get, replica) for _, stage in stages])
+            axis.plot((np.arange(len(y)) + 0.5) / 256.0, y, style, linewidth=1.0, label=name)
+        for start in starts[1:-1]:
+            axis.axvline(start, color="0.85", linewidth=0.7, zorder=0)
+        axis.set_ylabel(label)
+    for (name, _), start, end in zip(stages, starts, starts[1:], strict=False):
+        axes[0].text(0.5 * (start + end), 1.02, name, transform=axes[0].get_xaxis_transform(), ha="center", fontsize=6)
+    axes[0].legend(fontsize=7, frameon=False)
+    axes[-1].set_xlabel("time ($t_0$)")
+    figure.suptitle(title, fontsize=10)
+    save(path, figure, also=VECTOR)
+
+
+def words(
+    path: Path, recalls: Sequence[tuple[Recall, dict[str, Any]]], shown: Sequence[Sequence[int]], title: str
+) -> None:
+    """Recalled words (SUB2-BL) beside their scaled integrals, a line of panels for each length, like Fig. 13.
+
+    Args:
+        path: file to write.
+        recalls: of all words of a length, with their configurations.
+        shown: which words of each to draw.
+        title: over the picture.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    plt = pyplot()
+    columns = max(map(len, shown))
+    figure, axes = plt.subplots(
+        len(recalls), columns, figsize=(1.9 * columns, 2.1 * len(recalls) + 0.5), sharex=True, squeeze=False
+    )
+    unit = Material().modulus
+    for line, (recall, configuration), chosen in zip(axes, recalls, shown, strict=True):
+        stored = stored_words(recall)
+        scale = unit * float(recall.gain) * configuration["delta0"] * configuration["gamma0"]
+        for axis, word in zip(line, chosen, strict=False):
+            axis.axhline(0.0, color="0.8", linewidth=0.8)
+            axis.plot(recall.u, unit * stored.signals[word], linewidth=1.0, label="recalled, SUB2-BL")
+            axis.plot(
+                recall.u, scale * stored.templates[word], "C3--", linewidth=1.0, label=r"$G E \delta_0 \gamma_0 J$"
+            )
+            axis.set_title(f"{word:0{stored.bits}b}", fontsize=8)
+        for axis in line[len(chosen) :]:
+            axis.set_visible(False)
+        line[0].set_ylabel(f"L = {stored.bits}\nF = {float(recall.fidelity):.2f}\nstress (Pa)", fontsize=8)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=7, frameon=False, loc="upper right", ncols=2)
+    for axis in axes[-1]:
+        axis.set_xlabel("u")
+    figure.suptitle(title, fontsize=10)
+    save(path, figure, also=VECTOR)

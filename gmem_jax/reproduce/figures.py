@@ -1,0 +1,148 @@
+"""Which points each figure of the paper needs, at three scales.
+
+A figure is a sweep: all figures share one store, so that a point that two of them need is computed once.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from gmem_jax.files.packs import list_packs
+from gmem_jax.sweeps.spec import PREPARE, Spec
+
+Values = dict[str, Any]
+"""Names of a sweep file with the values of one point."""
+
+PAPER_T0 = 1.8e4  # t_c
+DELTA0 = 0.05  # the paper's compression, and that of every shipped pack
+MADE = 101  # seed of the first pack that is made: the shipped ones have small seeds
+SHOWN_WORD = 683  # of ten bits, in the paper's Fig. 13
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large and slow the experiments of a figure are.
+
+    Attributes:
+        t0: duration of one compression, in t_c.
+        grains: N of the figures that vary something else.
+        packs: packs a point.
+        few: packs a point where each point needs packs of its own.
+        sizes: N of the figures that vary it.
+        lengths: of words, in bits.
+        nets: trained for each length of words, from different seeds.
+        budget: longest training of one, in seconds.
+    """
+
+    t0: float
+    grains: int
+    packs: int
+    few: int
+    sizes: tuple[int, ...]
+    lengths: tuple[int, ...]
+    nets: int
+    budget: float
+
+
+SCALES = {
+    "laptop": Scale(1.8e3, 325, 5, 2, (325, 1024, 3267), (3, 4, 5), 1, 120.0),
+    "workstation": Scale(5.4e3, 3267, 3, 2, (325, 1024, 3267, 10240), (3, 5, 7), 2, 600.0),
+    "paper": Scale(PAPER_T0, 10240, 5, 2, (325, 1024, 3267, 10240, 31680, 100450), (3, 5, 7, 9, 10), 3, 3600.0),
+}
+
+
+class Figure(NamedTuple):
+    """A figure of the paper.
+
+    Attributes:
+        title: what it shows.
+        points: the values of every point at a scale.
+        across: the condition on the horizontal axis, where there is one; see `compare.Conditions`.
+    """
+
+    title: str
+    points: Callable[[Scale], list[Values]]
+    across: str = ""
+
+
+def packs(scale: Scale, grains: int, count: int, delta0: float = DELTA0, **grain: Any) -> list[Values]:
+    """What names `count` packs of a size: shipped ones as far as there are any, then some to be made at the scale's t0.
+
+    Args:
+        scale: for the rate of preparation.
+        grains: N.
+        count: how many.
+        delta0: compression that they are cycled with.
+        grain: shape and overlap, if not the paper's tetra grain.
+    """
+    shipped = [name for name in list_packs() if name.startswith(f"tetra-{grains}-")]
+    if delta0 != DELTA0 or grain:
+        shipped = []
+    recipe = {"grains": grains, "t0": scale.t0, "delta0": delta0, **grain}
+    made = [{PREPARE + name: value for name, value in {**recipe, "seed": MADE + n}.items()} for n in range(count)]
+    found: list[Values] = [{"pack": name} for name in shipped[:count]]
+    return [*found, *made[: count - len(found)]]
+
+
+def crossed(ones: Sequence[Values], others: Sequence[Values]) -> list[Values]:
+    """Every combination of the values of both."""
+    return [{**one, **other} for one in ones for other in others]
+
+
+def _standard(scale: Scale) -> list[Values]:
+    return packs(scale, scale.grains, scale.packs)
+
+
+def _one(scale: Scale) -> list[Values]:
+    return packs(scale, scale.grains, 1)
+
+
+def _friction(scale: Scale) -> list[Values]:
+    return crossed(_standard(scale), [{"mu": mu} for mu in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)])
+
+
+def _laws(scale: Scale) -> list[Values]:
+    laws: list[Values] = [{"friction": law} for law in ("H", "M1", "M2")]
+    return crossed(_standard(scale)[: scale.few], [*laws, {"friction": "M2", "variant": "paper"}])
+
+
+def _compression(
+    scale: Scale, values: Sequence[float] = (0.01, 0.02, 0.03, 0.04, 0.05, 0.06, 0.07, 0.08)
+) -> list[Values]:
+    return [pack for delta0 in values for pack in packs(scale, scale.grains, scale.few, delta0)]
+
+
+def _amplitudes(scale: Scale) -> list[Values]:
+    gammas: list[Values] = [{"gamma0": gamma0} for gamma0 in (3e-4, 1e-3, 3e-3)]
+    shapes: list[Values] = [{"shape": "sphere"}, *({"overlap": overlap} for overlap in (0.7, 0.8, 0.9))]
+    inset = [pack for shape in shapes for pack in packs(scale, scale.grains, scale.few, **shape)]
+    return [*crossed(_compression(scale, (0.02, 0.05, 0.08)), gammas), *inset]
+
+
+def _sizes(scale: Scale) -> list[Values]:
+    return [
+        pack for grains in scale.sizes for pack in packs(scale, grains, scale.packs if grains < 3000 else scale.few)
+    ]
+
+
+def _words(scale: Scale) -> list[Values]:
+    lengths: list[Values] = [{"signals": f"words:{length}", "background": "sub2-bl"} for length in scale.lengths]
+    return crossed(_one(scale), lengths)
+
+
+FIGURES = {
+    "fig04": Figure("phi, Z and pressures through the experiment, with signal 5 and with none", _one),
+    "fig06": Figure("six recalled waveforms beside their integrals", _standard),
+    "fig08": Figure("G and F against friction", _friction, "mu"),
+    "fig09": Figure("G and F under the three friction laws", _laws, "law"),
+    "fig11": Figure("G and F against compression and amplitude, and the shape of the grains", _amplitudes, "gamma0"),
+    "fig12a": Figure("G and F against compression", _compression, "delta0"),
+    "fig12b": Figure("G and F against the number of grains", _sizes, "grains"),
+    "fig13": Figure("recalled words", _words),
+    "fig14": Figure("F by three backgrounds, and accuracy, against the length of words", _words, "bits"),
+}
+
+
+def spec_of(figure: Figure, scale: Scale) -> Spec:
+    """The sweep that a figure needs."""
+    return Spec(shared={"t0": scale.t0}, extra=tuple(figure.points(scale)))

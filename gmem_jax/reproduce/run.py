@@ -1,0 +1,180 @@
+"""A figure from its sweep to its picture and its table."""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gmem_jax import native
+from gmem_jax.bench.measure import rival
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.files.packs import list_packs, load_pack
+from gmem_jax.physics.contact.laws import entry_of, law_named
+from gmem_jax.reading.lessons import Lessons
+from gmem_jax.reading.readers import stored_words
+from gmem_jax.reading.report import reading
+from gmem_jax.reading.training import train
+from gmem_jax.reproduce import draw
+from gmem_jax.reproduce.compare import Compared, Conditions, Point, compare, compared, points_of, write_csv
+from gmem_jax.reproduce.figures import FIGURES, SCALES, SHOWN_WORD, Figure, Scale, Values, spec_of
+from gmem_jax.show.figures import recall_figure
+from gmem_jax.sweeps.executors import Executor, Processes
+from gmem_jax.sweeps.spec import PREPARE
+from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.sweep import Conductor
+
+RUNS = "runs"  # the folder of the sweep that all figures share
+SIDE_BY_SIDE = 8  # replicas of the quick measurement: a block
+MOST_SHOWN = 8  # words of a length in Fig. 13
+Tell = Callable[[str], None]
+
+
+class Outcome(NamedTuple):
+    """What a figure came to.
+
+    Attributes:
+        name: of the figure.
+        rows: its measures beside the published ones.
+        files: what was written.
+        failed: reasons of points that failed.
+    """
+
+    name: str
+    rows: list[Compared]
+    files: list[Path]
+    failed: list[str]
+
+
+def quick_cost(points: Sequence[Values]) -> float:
+    """Seconds a grain-step here, over some points: a second's measurement for each law, on the pack nearest in size."""
+    work: dict[tuple[str, str], float] = {}
+    for values in points:
+        law = entry_of(law_named(str(values.get("friction", "H"))))
+        assert law is not None
+        grains = int(values.get(f"{PREPARE}grains", 0)) or load_pack(values["pack"]).grains
+        near = min(list_packs(), key=lambda name: abs(math.log(int(name.split("-")[1]) / grains)))
+        work[law.paper, near] = work.get((law.paper, near), 0.0) + grains
+    backend = native.name("auto", Experiment.friction)
+    timed = {(law, near): rival(load_pack(near), backend, law, SIDE_BY_SIDE, seconds=1.0).once() for law, near in work}
+    return 1e-6 * sum(timed[case] * weight for case, weight in work.items()) / sum(work.values())
+
+
+def reproduce(
+    name: str,
+    folder: Path | str = "reproduce",
+    scale: str = "laptop",
+    executor: Executor | None = None,
+    progress: Progress = silent,
+    say: Tell = print,
+) -> Outcome:
+    """Run what is missing of a figure, and write its picture (PNG, SVG) and its table (CSV).
+
+    Args:
+        name: one of `FIGURES`.
+        folder: for them, and for the runs that all figures share.
+        scale: one of `SCALES`.
+        executor: does the runs; default processes of this machine.
+        progress: told about them.
+        say: told in a line what is planned, and what happened.
+
+    Raises:
+        ValueError: if there is no such figure or scale.
+        RunFailedError: if workers die again and again.
+        OSError: if something cannot be written, or no worker started.
+    """
+    if name not in FIGURES or scale not in SCALES:
+        raise ValueError(f"no figure {name!r} at scale {scale!r}; there are {', '.join((*FIGURES, *SCALES))}")
+    size, folder = SCALES[scale], Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    spec = spec_of(FIGURES[name], size)
+    conductor = Conductor(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
+    conductor.run(executor or Processes(), progress)
+    store = conductor.store
+    points = points_of(store)
+    target = folder / f"{name}-{scale}.png"
+    failed = sorted(store.failed().get(row["key"], "") for row in store.card()["points"])
+    if not points:
+        return Outcome(name, [], [], [reason for reason in failed if reason])
+    rows = compare(points, size.t0)
+    if name == "fig14":
+        rows += read_words(folder, store, points, size, say)
+    write_csv(target.with_suffix(".csv"), rows)
+    title = f"{FIGURES[name].title} ({scale}: t$_0$ = {size.t0:g} t$_c$)"
+    _draw(FIGURES[name], name, target, rows, points, store, title)
+    files = [target, target.with_suffix(".svg"), target.with_suffix(".csv")]
+    return Outcome(name, rows, files, [reason for reason in failed if reason])
+
+
+def _draw(
+    figure: Figure,
+    name: str,
+    target: Path,
+    rows: Sequence[Compared],
+    points: Sequence[Point],
+    store: Store,
+    title: str,
+) -> None:
+    if figure.across:
+        draw.against(target, rows, figure.across, title)
+        return
+    recall, configuration = store.load(points[0].key)
+    if name == "fig04":
+        draw.through_time(target, recall, 5, f"{configuration['pack']}: {title}")
+    elif name == "fig06":
+        scale = float(configuration["delta0"]) * float(configuration["gamma0"])
+        for suffix in (".png", ".svg"):
+            recall_figure(target.with_suffix(suffix), recall, scale, str(points[0].numbers["pack"]))
+    else:
+        kept = [store.load(point.key) for point in points]
+        draw.words(target, kept, [_shown(point.conditions.bits) for point in points], title)
+
+
+def read_words(folder: Path, store: Store, points: Sequence[Point], scale: Scale, say: Tell) -> list[Compared]:
+    """How well recalled words are read, by nets that have seen inputs only, and by the baselines.
+
+    Nets are trained once and kept in the folder.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    (folder / "nets").mkdir(exist_ok=True)
+    found: dict[tuple[Conditions, str], list[float]] = {}
+    for length in sorted({point.conditions.bits for point in points}):
+        nets = []
+        for seed in range(scale.nets):
+            file = folder / "nets" / f"words-{length}-{seed}.msgpack"
+            nets.append(train(Lessons(length), seed, budget=scale.budget, checkpoint=file))
+            say(f"net {seed} for {length} bits: {nets[-1].step} steps, held-out accuracy {nets[-1].validation:.4f}")
+        for point in points:
+            if point.conditions.bits == length:
+                read = reading(stored_words(store.load(point.key)[0]), nets)["readers"]
+                for reader, row in read.items():
+                    found.setdefault((point.conditions, f"accuracy {reader}"), []).append(row["accuracy"])
+    return [compared(conditions, measure, values, 0) for (conditions, measure), values in found.items()]
+
+
+def _shown(bits: int) -> list[int]:
+    """Words of a length that are drawn: all eight of three bits; of longer ones some, and the paper's of ten."""
+    count = 1 << bits
+    chosen = sorted({round((k + 0.5) * count / MOST_SHOWN - 0.5) for k in range(MOST_SHOWN)})
+    return [SHOWN_WORD - 1] if bits == 10 else chosen
+
+
+def summary_of(outcome: Outcome) -> dict[str, Any]:
+    """An outcome as JSON."""
+    lines = [
+        {
+            **row.conditions.__dict__,
+            "measure": row.measure,
+            "mean": row.ours.mean,
+            "sd": row.ours.sd,
+            "packs": row.ours.packs,
+            "published": row.theirs.mean if row.theirs else None,
+            "published_grains": row.grains or None,
+            "combined_errors_apart": row.errors_apart,
+            "status": row.status,
+        }
+        for row in outcome.rows
+    ]
+    return {"figure": outcome.name, "rows": lines, "files": list(map(str, outcome.files)), "failed": outcome.failed}
