@@ -112,9 +112,18 @@ def test_decompression_retraces_compression():
 
 
 def test_walls_stand_still_when_u_does():
-    box = at(ramp(start=1.0, stop=1.0), 7.0)
+    box = at(ramp(start=1.0, stop=1.0, sheared=False), 7.0)
     assert np.all(np.asarray(box.upper_velocity) == 0.0)
     np.testing.assert_allclose(box.lengths[0] / LENGTHS[0], np.sqrt(0.95), rtol=1e-14)
+
+
+def test_where_u_stands_still_the_waveform_runs_in_time():
+    pulse = ramp(start=0.0, stop=0.0)
+    for time in (0.0, 12.0, 28.0, 40.0):
+        box = at(pulse, time)
+        expected = 0.5 * 0.02 * np.concatenate([[0.0], np.asarray(SIGNALS.shear(jnp.asarray(time / 40.0)))])
+        np.testing.assert_allclose(1.0 - box.lengths[0] / LENGTHS[0], expected, atol=1e-15)
+        np.testing.assert_allclose(box.lengths[1] / LENGTHS[1] - 1.0, expected, atol=1e-15)
 
 
 def memory(rest=0.2, hold=0.2, store=2.0, second_readout=False) -> tuple[Stage, ...]:

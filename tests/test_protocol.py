@@ -39,6 +39,15 @@ def test_only_the_encoding_is_sheared_and_all_before_it_is_common() -> None:
     assert own[0].name == "encode"
 
 
+def test_a_pulse_before_the_compression_takes_the_shear_from_it() -> None:
+    stages = memory_protocol(REST, HOLD, STORE, second_readout=False, shear="before")
+    assert [stage.name for stage in stages if stage.sheared] == ["pulse"]
+    assert [stage.name for stage in stages][4:7] == ["rest-2", "pulse", "encode"]
+    assert (stages[5].start, stages[5].stop, stages[5].bins) == (0.0, 0.0, 256)
+    _, own = split(stages)
+    assert own[0].name == "pulse"
+
+
 @pytest.mark.parametrize(
     ("length", "bins"),
     [(0.0, 1), (0.001, 1), (1 / 256, 1), (0.1, 26), (0.2, 52), (0.25, 64), (0.3, 77), (1.0, 256), (2.0, 512)],

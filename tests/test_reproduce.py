@@ -1,6 +1,7 @@
 """Figures of the paper: their points, how they stand beside the published ones, and that none is computed twice."""
 
 import csv
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.experiment.host import silent
-from gmem_jax.reproduce import figures
+from gmem_jax.reproduce import claims, figures
 from gmem_jax.reproduce import run as reproducing
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, Point, compare, compared
 from gmem_jax.reproduce.draw import power
@@ -145,3 +146,30 @@ def test_the_physics_gives_the_stored_numbers() -> None:
     stored = (0.284106, 0.683584, 0.684873)
     found = (recall.gain, recall.fidelity, recall.windowed_fidelity)
     np.testing.assert_allclose([float(number) for number in found], stored, atol=1e-6)
+
+
+def test_claims_are_judged_by_their_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setitem(SCALES, "tiny", TINY)
+    monkeypatch.setattr(reproducing, "packs", lambda *_, **__: [{"pack": PACK}])
+    monkeypatch.setattr(reproducing, "quick_cost", lambda points: 1e-7)
+    found = reproducing.judge(tmp_path, "tiny", Here(), silent, lambda line: None)
+    assert [row["claim"] for row in json.loads((tmp_path / "claims-tiny.json").read_text())] == [v.claim for v in found]
+    assert len(found) == 8
+    by_claim = {verdict.claim: verdict for verdict in found}
+    order = by_claim["shear before the compression leaves nothing"]
+    before = gm.run(gm.Experiment(gm.load_pack(PACK), gm.six_signals(), t0=150.0, shear="before"))
+    assert order.values["G"] == float(before.windowed_gain)
+    moved = by_claim["tetra grains rearrange less than spheres, and less than without friction"].values
+    assert 0.0 < moved["tetra"] == moved["sphere"] < moved["tetra without friction"]
+
+
+def test_a_claim_that_fails_is_said_to() -> None:
+    pack = gm.load_pack(PACK)
+    recall = gm.run(gm.Experiment(pack, gm.six_signals(), t0=150.0))
+    assert not claims.order_matters(recall, recall).holds
+    assert claims.order_matters(recall, replace(recall, p_sig=0.0 * recall.p_sig, windowed_gain=0.0)).holds
+    louder = replace(recall, windowed_gain=1.2 * recall.windowed_gain)
+    assert not claims.proportional({1e-3: recall, 3e-3: louder}).holds
+    assert claims.proportional({1e-3: recall, 3e-3: recall}).holds
+    worse = replace(recall, windowed_fidelity=recall.windowed_fidelity - 0.03)
+    assert not claims.storage_costs_nothing({0.5: recall, 2.0: worse}).holds

@@ -212,6 +212,8 @@ def kernel_command(
 def _needs_sub0(experiment: Experiment) -> None:
     if experiment.background != "sub0":
         raise InputError(f"--background {experiment.background}: designs are made with sub0")
+    if experiment.shear != "during":
+        raise InputError(f"--shear {experiment.shear}: designs are of what is encoded during the compression")
 
 
 @with_experiment

@@ -38,6 +38,7 @@ _FIELDS = {  # of an experiment
     "store": _Option(float, "Storage, in t0."),
     "hold_drag": _Option(float | None, "Drag in holds, 1/t_c; default 0.05 if t0 < 18000."),
     "background": _Option(str, "sub0, sub2 or sub2-bl."),
+    "shear": _Option(str, "during the compression, or before it (in time, at u = 0)."),
     "backend": _Option(str, "auto, jax or native."),
 }
 _OF_LAW = {  # of its friction law

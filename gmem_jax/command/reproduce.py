@@ -12,12 +12,12 @@ from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.parts import locked
 from gmem_jax.reproduce.figures import FIGURES, SCALES
-from gmem_jax.reproduce.run import Outcome, reproduce, summary_of
+from gmem_jax.reproduce.run import Outcome, judge, reproduce, summary_of
 from gmem_jax.sweeps.executors import executor as executor_named
 
 
 def reproduce_command(
-    what: Annotated[str, typer.Argument(help=f"{', '.join(FIGURES)}, or all.")],
+    what: Annotated[str, typer.Argument(help=f"{', '.join(FIGURES)}, claims, or all.")],
     scale: Annotated[str, typer.Option(help=f"How large and slow: {', '.join(SCALES)}.")] = "laptop",
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for pictures, tables and runs.")] = Path(
         "reproduce"
@@ -31,17 +31,20 @@ def reproduce_command(
     Says what it will cost, resumes, and computes no point twice, whichever figures need it. Writes NAME-SCALE.png,
     .svg and .csv, each of our points beside the published one.
     """
-    if what != "all" and what not in FIGURES:
-        raise InputError(f"reproduce {what}: no such figure; there are {', '.join(FIGURES)}, and all")
+    if what not in (*FIGURES, "claims", "all"):
+        raise InputError(f"reproduce {what}: no such figure; there are {', '.join(FIGURES)}, claims and all")
     if scale not in SCALES:
         raise InputError(f"--scale {scale}: must be one of {', '.join(SCALES)}")
     if not output.parent.is_dir():
         raise InputError(f"--output {output}: folder {output.parent} does not exist")
     probe(output.parent)
     output.mkdir(exist_ok=True)
-    outcomes = []
+    outcomes, verdicts = [], []
     with locked(output / "figures"):
-        for name in FIGURES if what == "all" else (what,):
+        if what in ("claims", "all"):
+            with reporting(goes_on=True) as progress:
+                verdicts = judge(output, scale, executor_named(executor, workers, {}), progress, say)
+        for name in FIGURES if what == "all" else [name for name in FIGURES if name == what]:
             say(f"{name}: {FIGURES[name].title}")
             with reporting(goes_on=True) as progress:
                 outcome = reproduce(name, output, scale, executor_named(executor, workers, {}), progress, say)
@@ -54,7 +57,10 @@ def reproduce_command(
     for outcome in outcomes:
         for row in outcome.rows:
             status |= row.status
-    emit(as_json, {"figures": [summary_of(outcome) for outcome in outcomes], "status": status}, *map(_table, outcomes))
+    figures = [summary_of(outcome) for outcome in outcomes]
+    result = {"figures": figures, "claims": [verdict._asdict() for verdict in verdicts], "status": status}
+    lines = [f"{'yes' if verdict.holds else 'NO ':4}{verdict.claim}\n    {verdict.numbers}" for verdict in verdicts]
+    emit(as_json, result, *lines, *map(_table, outcomes))
     if broken := sum(len(outcome.failed) for outcome in outcomes):
         raise RunFailedError(f"{broken} points")
 

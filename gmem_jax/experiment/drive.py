@@ -14,7 +14,7 @@ from gmem_jax.physics.state import Box
 @pytree
 @dataclass(frozen=True)
 class Drive:
-    """Prescribed walls: u runs linearly during a stage, the shear follows a waveform of u.
+    """Prescribed walls: u runs linearly during a stage, the shear follows a waveform of u (of time, if u stands still).
 
     L_x = X (1 - gamma/2), L_y = Y (1 + gamma/2) with X, Y = L0 (1 - (1 - sqrt(1 - delta0)) u); z does not move. The
     box stays centred. Half of gamma on each axis is this project's reading of the paper.
@@ -51,9 +51,10 @@ class Drive:
         """
 
         def lengths(moment: jax.Array) -> jax.Array:
-            u = row.start + (row.stop - row.start) * (moment / duration)
+            passed = moment / duration
+            u = row.start + (row.stop - row.start) * passed
             squeeze = 1.0 - (1.0 - jnp.sqrt(1.0 - self.delta0)) * u
-            half = 0.5 * self._shear(u, row.sheared)
+            half = 0.5 * self._shear(jnp.where(row.start == row.stop, passed, u), row.sheared)
             scale = jnp.stack(jnp.broadcast_arrays(squeeze * (1.0 - half), squeeze * (1.0 + half), jnp.ones(1)))
             return (self.upper - self.lower) * scale
 

@@ -62,6 +62,7 @@ class Experiment:
         hold: holds at u = 1, in t0.
         store: storage, in t0.
         background: "sub0", "sub2" or "sub2-bl" (in any case); the last two add a second readout.
+        shear: when the waveforms are applied: "during" the compression, or "before" it, as functions of time at u = 0.
         backend: "jax", the definition; "native", C++ on CPUs; "auto", native where it is built and knows the law.
 
     Raises:
@@ -83,6 +84,7 @@ class Experiment:
     hold: float = static(0.2)
     store: float = static(2.0)
     background: str = static("sub0")
+    shear: str = static("during")
     backend: str = static("auto")
     steps_per_bin: int = dataclasses.field(init=False, default=1, metadata={"static": True})
 
@@ -93,6 +95,8 @@ class Experiment:
         settle(self)
         if self.background not in analysis.BACKGROUNDS:
             raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {self.background!r}")
+        if self.shear not in ("during", "before"):
+            raise ValueError(f"shear must be during or before, got {self.shear!r}")
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
         if not 0.0 < self.dt <= LARGEST_STEP:
@@ -182,7 +186,8 @@ class Experiment:
     @property
     def stages(self) -> tuple[Stage, ...]:
         """The protocol."""
-        return memory_protocol(self.rest, self.hold, self.store, second_readout=self.background != "sub0")
+        again = self.background != "sub0"
+        return memory_protocol(self.rest, self.hold, self.store, second_readout=again, shear=self.shear)
 
     @property
     def phases(self) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
@@ -293,6 +298,7 @@ class Changes(TypedDict, total=False):
     hold: float
     store: float
     background: str
+    shear: str
     backend: str
 
 

@@ -41,7 +41,7 @@ class Stage:
         start: u at its beginning.
         stop: u at its end.
         length: duration in units of t0.
-        sheared: whether the waveform is applied.
+        sheared: whether the waveform is applied: as a function of u, or, where u stands still, of time from 0 to 1.
     """
 
     name: str
@@ -80,15 +80,20 @@ def preparation_cycle(rest: float, hold: float) -> tuple[Stage, ...]:
     )
 
 
-def memory_protocol(rest: float, hold: float, store: float, *, second_readout: bool) -> tuple[Stage, ...]:
+def memory_protocol(
+    rest: float, hold: float, store: float, *, second_readout: bool, shear: str = "during"
+) -> tuple[Stage, ...]:
     """The experiment of Sec. II, lengths in t0: a shear-free cycle, rest, encode, store, readout (6.6 t0 in all).
 
-    With `second_readout`, Sec. III's: another rest, compression, hold and readout (9 t0 in all).
+    With `second_readout`, Sec. III's: another rest, compression, hold and readout (9 t0 in all). With shear "before",
+    the waveform is gone through in t0 at u = 0 before the compression ("pulse"), which is without shear then.
     """
+    before = (Stage("pulse", 0.0, 0.0, 1.0, sheared=True),) if shear == "before" else ()
     first = (
         *preparation_cycle(rest, hold),
         Stage("rest-2", 0.0, 0.0, rest),
-        Stage("encode", 0.0, 1.0, 1.0, sheared=True),
+        *before,
+        Stage("encode", 0.0, 1.0, 1.0, sheared=not before),
         Stage("store", 1.0, 1.0, store),
         Stage("readout", 1.0, 0.0, 1.0),
     )

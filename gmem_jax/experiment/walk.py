@@ -70,7 +70,8 @@ def bin_step(course: Course, state: State, row: Bin) -> tuple[State, Sample]:
     """One bin: its steps, the checks at its end, its sample."""
     with jax.named_scope("drive"):
         boxes = walls(course, row, state.replicas)
-        drag = _padded(jnp.where(row.start == row.stop, course.drag, 0.0), state.replicas)
+        still = (row.start == row.stop) & ~jnp.asarray(row.sheared, bool)
+        drag = _padded(jnp.where(still, course.drag, 0.0), state.replicas)
     with jax.named_scope("steps"):
         dt = _padded(course.dt, state.replicas)
         state, total = native.marcher(course.backend)(course.system, state, boxes, dt, drag)

@@ -21,6 +21,7 @@ from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.physics.material import Material
 
 _SIGNALS = {"bumps": Bumps, "spline": Spline}
+_OLDER = {"shear": "during"}  # what files from before there was such a field did
 _PARTS = ("pack", "signals", "friction", "material")
 
 
@@ -133,6 +134,7 @@ def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) 
         FileFormatError: if the pack is another one than was written, or the form is not one of an experiment.
         ValueError: for impossible numbers, or own laws and signals, which have no written form.
     """
+    configuration = {**_OLDER, **configuration}
     known = {entry.name for entry in fields(Experiment) if entry.init}
     if odd := sorted(known ^ set(configuration)):
         problem = "its {} is missing" if odd[0] in known else "it has no field {}"

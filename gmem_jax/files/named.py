@@ -11,7 +11,20 @@ from gmem_jax.experiment.signals import LONGEST_WORD, Signals, six_signals, wave
 from gmem_jax.files.waveforms import load_waveforms
 from gmem_jax.physics.contact.laws import LAWS, law_named
 
-FIELDS = ("gamma0", "delta0", "t0", "rest", "hold", "store", "hold_drag", "dt", "steps", "background", "backend")
+FIELDS = (
+    "gamma0",
+    "delta0",
+    "t0",
+    "rest",
+    "hold",
+    "store",
+    "hold_drag",
+    "dt",
+    "steps",
+    "background",
+    "shear",
+    "backend",
+)
 OF_LAW = tuple(dict.fromkeys(field.name for entry in LAWS for field in fields(entry.kind)))
 NAMES = ("signals", "friction", *OF_LAW, *FIELDS)
 

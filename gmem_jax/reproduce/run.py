@@ -1,5 +1,6 @@
 """A figure from its sweep to its picture and its table."""
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,18 +10,20 @@ from gmem_jax import native
 from gmem_jax.bench.measure import rival
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.files.atomic import atomic
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reading.report import reading
 from gmem_jax.reading.training import train
-from gmem_jax.reproduce import draw
+from gmem_jax.reproduce import claims, draw
+from gmem_jax.reproduce.claims import Verdict
 from gmem_jax.reproduce.compare import Compared, Conditions, Point, compare, compared, points_of, write_csv
-from gmem_jax.reproduce.figures import FIGURES, SCALES, SHOWN_WORD, Figure, Scale, Values, spec_of
+from gmem_jax.reproduce.figures import FIGURES, SCALES, SHOWN_WORD, Figure, Scale, Values, packs, spec_of
 from gmem_jax.show.figures import recall_figure
 from gmem_jax.sweeps.executors import Executor, Processes
-from gmem_jax.sweeps.spec import PREPARE
+from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import Conductor
 
@@ -28,6 +31,34 @@ RUNS = "runs"  # the folder of the sweep that all figures share
 SIDE_BY_SIDE = 8  # replicas of the quick measurement: a block
 MOST_SHOWN = 8  # words of a length in Fig. 13
 Tell = Callable[[str], None]
+
+
+def judge(
+    folder: Path | str = "reproduce",
+    scale: str = "laptop",
+    executor: Executor | None = None,
+    progress: Progress = silent,
+    say: Tell = print,
+) -> list[Verdict]:
+    """Run what the claims of the paper need, on one pack, and judge them; writes claims-SCALE.json.
+
+    Args and errors are those of `reproduce`.
+    """
+    size, folder = SCALES[scale], Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (named,) = packs(size, size.grains, 1)
+    (spheres,) = packs(size, size.grains, 1, shape="sphere")
+    spec = Spec(shared={"t0": size.t0}, extra=(*claims.points([named]), spheres))
+    conductor = Conductor(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
+    conductor.run(executor or Processes(), progress)
+    store = conductor.store
+    runs = [(row["values"], *store.load(row["key"])) for row in store.card()["points"]]
+    tetra, sphere = (load_pack(runs[place][2]["pack"]) for place in (0, -1))
+    own = [(values, recall) for values, recall, _ in runs[:-1]]
+    found = claims.verdicts(tetra, size.t0, own, {"sphere": sphere})
+    with atomic(folder / f"claims-{scale}.json") as path:
+        path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n")
+    return found
 
 
 class Outcome(NamedTuple):

@@ -1,0 +1,226 @@
+"""What the paper says in words, put to the test: one verdict a claim, with its numbers."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment import analysis
+from gmem_jax.experiment.analysis import compare, recalled, remembered_after, spread
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.recall import Recall, shear, walker
+from gmem_jax.experiment.signals import BINS, six_signals
+from gmem_jax.physics.contact.frictionless import Frictionless
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.pairs import sphere_centres
+from gmem_jax.physics.state import State
+from gmem_jax.reproduce.figures import Values, crossed
+
+STORES = (0.5, 2.0, 8.0)  # t0
+STANDARD = 2.0
+AMPLITUDES = (3e-4, 1e-3, 3e-3)
+VARIED = ("gamma0", "store", "background", "shear", "hold_drag")
+LITTLE = 0.1  # of what is recalled: below it, a claim that nothing is left holds
+
+
+class Verdict(NamedTuple):
+    """What became of a claim.
+
+    Attributes:
+        claim: in the words of the paper's subject.
+        holds: whether it does here.
+        numbers: what was measured, in a line.
+        values: the same as numbers.
+    """
+
+    claim: str
+    holds: bool
+    numbers: str
+    values: dict[str, Any]
+
+
+def stress_is_minus_j(recall: Recall) -> Verdict:
+    """p_xy at u = 1 is -C J(1): of what was applied, the pack keeps the integral of the shear."""
+    p_xy = recalled(jnp.asarray(recall.stages["readout"].pressure))
+    kept = np.asarray(p_xy[1:, -1] - p_xy[0, -1])  # u ascends: the readout begins with the last
+    whole = np.asarray(recall.J)[:, -1]
+    slope = float(whole @ kept / (whole @ whole))
+    left = float(np.sqrt(np.sum((kept - slope * whole) ** 2) / np.sum(kept**2)))
+    return Verdict(
+        "p_xy at u = 1 is -C J(1)",
+        slope < 0.0 and left < 0.5,
+        f"C = {-slope:.2e} E; without it {left:.0%} of the stresses are left (root mean square)",
+        {"C": -slope, "left": left},
+    )
+
+
+def speeds_decay(free: Recall, t0: float) -> Verdict:
+    """In storage, without any drag, the largest grain speed decays exponentially."""
+    speed = np.asarray(free.stages["store"].largest_speed).max(axis=-1)
+    time = (np.arange(len(speed)) + 0.5) * t0 / BINS
+    rate, start = np.polyfit(time, np.log(speed), 1)
+    scatter = float(np.exp(np.std(np.log(speed) - rate * time - start)))
+    falls = float(speed[0] / speed[-1])
+    return Verdict(
+        "in storage the largest grain speed decays exponentially",
+        bool(rate < 0.0 and falls > 10.0),
+        f"by e in {-1.0 / rate:.0f} t_c, {falls:.0f} times in all; scatter about it a factor {scatter:.2f}",
+        {"decay_time": -1.0 / rate, "falls": falls, "scatter": scatter},
+    )
+
+
+def storage_costs_nothing(recalls: Mapping[float, Recall]) -> Verdict:
+    """F does not depend on how long the waveform is stored."""
+    found = {store: float(recall.windowed_fidelity) for store, recall in sorted(recalls.items())}
+    wide = max(found.values()) - min(found.values())
+    said = ", ".join(f"{fidelity:.3f} after {store:g} t0" for store, fidelity in found.items())
+    return Verdict("F does not depend on the storage", wide < 0.02, f"F = {said}", {"F": found, "spread": wide})
+
+
+def reading_erases(recall: Recall, scale: float) -> Verdict:
+    """The first readout erases the memory: the second is uncorrelated with J."""
+    first, second = (recalled(jnp.asarray(recall.stages[name].pressure)) for name in ("readout", "readout-2"))
+    gain = float(compare(analysis.subtract("sub0", first), recall.J, scale).gain)
+    correlation, left = (spread(values) for values in remembered_after(second, recall.J, scale))
+    return Verdict(
+        "the first readout erases the memory",
+        abs(left[0]) < LITTLE * gain,
+        f"gain of the second {left[0]:.4f} +- {left[2]:.4f} beside {gain:.3f}; "
+        f"correlation with J {correlation[0]:.2f} +- {correlation[2]:.2f} (mean and SE over signals)",
+        {"gain": gain, "second_gain": left[0], "correlation": correlation[0]},
+    )
+
+
+def order_matters(standard: Recall, before: Recall) -> Verdict:
+    """A shear pulse before the compression leaves nothing to be read."""
+    ratio = float(np.sqrt(np.sum(np.asarray(before.p_sig) ** 2) / np.sum(np.asarray(standard.p_sig) ** 2)))
+    return Verdict(
+        "shear before the compression leaves nothing",
+        abs(float(before.windowed_gain)) < LITTLE * float(standard.windowed_gain),
+        f"G = {float(before.windowed_gain):.3f}, F = {float(before.windowed_fidelity):.3f} beside "
+        f"{float(standard.windowed_gain):.3f} and {float(standard.windowed_fidelity):.3f}; p_sig {ratio:.0%} as large",
+        {"G": float(before.windowed_gain), "F": float(before.windowed_fidelity), "size": ratio},
+    )
+
+
+def proportional(recalls: dict[float, Recall]) -> Verdict:
+    """p_sig is proportional to gamma0 while gamma0 << delta0: G does not depend on it."""
+    gains = {gamma0: float(recall.windowed_gain) for gamma0, recall in recalls.items()}
+    wide = max(gains.values()) / min(gains.values()) - 1.0
+    said = ", ".join(f"{gain:.3f} at {gamma0:g}" for gamma0, gain in gains.items())
+    return Verdict("p_sig is proportional to gamma0", wide < 0.1, f"G = {said}", {"G": gains, "spread": wide})
+
+
+def non_affine(before: State, after: State) -> float:
+    """Root mean square displacement of grains between two states in one box, of one replica, in R."""
+    moved = np.asarray(after.grains.position - before.grains.position)[..., 0]
+    return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+
+
+def rearrangement(pack: Pack, friction: Any, t0: float) -> float:
+    """How far grains are from where they were after one cycle without shear, in R; root mean square."""
+    experiment = Experiment(pack, six_signals(), friction, t0=t0)
+    on = walker(experiment)
+    before = on.state
+    common, _ = experiment.phases
+    on.play(*common[:4])
+    return non_affine(before, on.state)
+
+
+def rearranges(packs: dict[str, Pack], t0: float) -> Verdict:
+    """Tetra grains rearrange less than spheres over a cycle, and grains without friction most."""
+    found = {name: rearrangement(pack, Hooke(), t0) for name, pack in packs.items()}
+    found["tetra without friction"] = rearrangement(packs["tetra"], Frictionless(), t0)
+    said = ", ".join(f"{moved:.1e} R ({name})" for name, moved in found.items())
+    order = found["tetra"] < found.get("sphere", np.inf) and found["tetra"] < found["tetra without friction"]
+    return Verdict(
+        "tetra grains rearrange less than spheres, and less than without friction",
+        bool(order),
+        f"displacement that a cycle leaves: {said}",
+        found,
+    )
+
+
+def normal_forces(experiment: Experiment, state: State) -> np.ndarray:
+    """Overlaps to the power 3/2 of all sphere contacts, to which Hertz' forces are proportional, [P, B]; 0 apart."""
+    centres = np.asarray(sphere_centres(state.grains, experiment.pack.clump))
+    pairs = experiment.pack.pairs
+    valid = np.asarray(pairs.valid)
+    first, second = (np.asarray(index)[valid] for index in (pairs.first, pairs.second))
+    overlap = 2.0 - np.linalg.norm(centres[first] - centres[second], axis=1)
+    forces: np.ndarray = np.maximum(overlap, 0.0) ** 1.5
+    return forces
+
+
+def forces_tell_nothing(experiment: Experiment) -> Verdict:
+    """The distribution of contact forces at u = 1 does not tell signals from none.
+
+    Kolmogorov's distance between the distributions with and without a signal, beside that of two halves of one pack's
+    contacts, which is what chance makes.
+    """
+    on = walker(experiment)
+    common, own = experiment.phases
+    on.play(*common)
+    shear(on, experiment)
+    on.play(own[0])
+    forces = normal_forces(experiment, on.state)
+    samples = [np.sort(column[column > 0.0]) for column in forces.T]
+    scaled = [sample / sample.mean() for sample in samples]
+    distance = max(_kolmogorov(scaled[0], other) for other in scaled[1:])
+    halves = np.random.default_rng(0).permutation(scaled[0])
+    chance = _kolmogorov(np.sort(halves[::2]), np.sort(halves[1::2]))
+    return Verdict(
+        "contact-force distributions carry no trace of the signal",
+        distance < chance,
+        f"largest distance to that without signal {distance:.4f}, between halves of one {chance:.4f} (Kolmogorov)",
+        {"distance": distance, "chance": chance},
+    )
+
+
+def _kolmogorov(one: np.ndarray, other: np.ndarray) -> float:
+    every = np.concatenate([one, other])
+    ranks = (np.searchsorted(sample, every, side="right") / len(sample) for sample in (one, other))
+    return float(np.max(np.abs(np.subtract(*ranks))))
+
+
+def points(packs: Sequence[Values]) -> list[Values]:
+    """The runs that claims need, on each of some packs."""
+    amplitudes: list[Values] = [{"gamma0": gamma0} for gamma0 in AMPLITUDES]
+    stores: list[Values] = [{"store": store} for store in STORES if store != STANDARD]
+    more: list[Values] = [{"background": "sub2"}, {"shear": "before"}, {"store": max(STORES), "hold_drag": 0.0}]
+    return crossed(packs, [*amplitudes, *stores, *more])
+
+
+def verdicts(
+    pack: Pack, t0: float, runs: Sequence[tuple[Values, Recall]], others: Mapping[str, Pack] | None = None
+) -> list[Verdict]:
+    """Every claim on one pack.
+
+    Args:
+        pack: of tetra grains.
+        t0: duration of one compression, in t_c.
+        runs: of `points` on this pack, with their values.
+        others: packs of other grains by their names, for the claim on rearrangement.
+    """
+
+    def having(**wanted: Any) -> Recall:
+        own = ({name: values[name] for name in VARIED if name in values} for values, _ in runs)
+        return next(recall for values, (_, recall) in zip(own, runs, strict=True) if values == wanted)
+
+    amplitudes = {gamma0: having(gamma0=gamma0) for gamma0 in AMPLITUDES}
+    plain = amplitudes[1e-3]
+    standard = Experiment(pack, six_signals(), t0=t0)
+    stores = {store: plain if store == STANDARD else having(store=store) for store in STORES}
+    scale = float(np.asarray(standard.compression)) * 1e-3
+    return [
+        stress_is_minus_j(plain),
+        speeds_decay(having(store=max(STORES), hold_drag=0.0), t0),
+        storage_costs_nothing(stores),
+        reading_erases(having(background="sub2"), scale),
+        order_matters(plain, having(shear="before")),
+        proportional(amplitudes),
+        rearranges({"tetra": pack, **(others or {})}, t0),
+        forces_tell_nothing(standard),
+    ]
