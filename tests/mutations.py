@@ -584,9 +584,23 @@ MUTATIONS = (
     mutation(
         "drag-under-moving-walls",
         "experiment/walk.py",
-        "jnp.where(row.start == row.stop, course.drag, 0.0)",
+        "jnp.where(still, course.drag, 0.0)",
         "jnp.asarray(course.drag)",
         "test_only_while_the_walls_stand_still_is_there_a_drag",
+    ),
+    mutation(
+        "pulse-at-one-u",
+        "experiment/drive.py",
+        "jnp.where(row.start == row.stop, passed, u)",
+        "u",
+        "test_where_u_stands_still_the_waveform_runs_in_time",
+    ),
+    mutation(
+        "pulse-and-encoding-sheared",
+        "experiment/protocol.py",
+        "sheared=not before)",
+        "sheared=True)",
+        "test_a_pulse_before_the_compression_takes_the_shear_from_it",
     ),
     mutation(
         "chunk-redone-on-the-stale-list",
