@@ -66,8 +66,9 @@ def test_a_march_is_a_step_for_each_box() -> None:
         np.testing.assert_allclose(summed, total, rtol=1e-9)
 
 
-def test_a_replica_is_bitwise_the_same_in_any_place_of_a_batch() -> None:
-    system = System(PACK.clump, gm.Hooke(), PACK.pairs)
+@pytest.mark.parametrize("law", [gm.Hooke(), gm.Mindlin()], ids=lambda law: type(law).__name__)
+def test_a_replica_is_bitwise_the_same_in_any_place_of_a_batch(law: object) -> None:
+    system = System(PACK.clump, law, PACK.pairs)
     state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
     heights = jnp.asarray([0.3, -1.0, 1.0, 0.5, 0.1, -0.2, 0.7, 0.9, -0.4, 0.6, 0.2])
 

@@ -31,6 +31,7 @@ LAWS: dict[str, Any] = {
     "H": gm.Hooke(mu=0.3),
     "M1": gm.MindlinRescaled(mu=0.3),
     "M2": gm.Mindlin(mu=0.3, points=8),
+    "narrow rings": gm.Mindlin(mu=0.3, points=60, p_max=0.02),  # some reached in one step, and overlaps beyond them
 }
 DT = 0.3
 STEPS = 40

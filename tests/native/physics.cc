@@ -13,19 +13,6 @@ namespace GMEM_ISA {
 
 constexpr int kPoints = 6, kResults = 64;
 
-template <class V>
-struct Layers {
-  V* at;
-
-  int points() const { return kPoints; }
-  Vec<V> get(int j) const { return load_vec(at + 3 * j); }
-  Vec<V> stored(int j) const { return get(j); }
-  void set(int j, Vec<V> f) { store_vec(at + 3 * j, f); }
-  void keep(int kept) {
-    for (int j = kept; j < kPoints; ++j) set(j, Vec<V>{});
-  }
-};
-
 // A contact of two spheres `apart` from each other that slides, with a history; appends to `to` what came out.
 template <class V, class Law>
 V* touch(Law law, V apart, V* to) {
@@ -35,23 +22,30 @@ V* touch(Law law, V apart, V* to) {
   const auto vec = [](double x, double y, double z) { return Vec<V>{splat<V>(x), splat<V>(y), splat<V>(z)}; };
   const Meeting<V> meeting{apart * vec(0.6, 0.8, 0.0),   vec(0.5, 0.7, 0.1),   vec(-0.4, -0.6, 0.1),
                          vec(2e-3, -1e-3, 3e-3),       vec(1e-3, 4e-3, 0.0), vec(0.0, -2e-3, 1e-3)};
-  V history[4] = {splat<V>(2e-4), splat<V>(-1e-4), splat<V>(5e-4), splat<V>(0.03)}, layer[3 * kPoints];
-  for (int q = 0; q < 3 * kPoints; ++q) layer[q] = splat<V>(1e-4 * (q % 5 - 2));
+  V history[4] = {splat<V>(2e-4), splat<V>(-1e-4), splat<V>(5e-4), splat<V>(0.03)};
   if (Law::kLayered) history[0] = splat<V>(0.01);
   Contact<V> contact;
   meet(meeting, dot(meeting.separation, meeting.separation), contact);
   contact.history = history;
   close(&contact, 1, row);
   const LawParameters<V> parameters(row + kLaw, row[kDt]);
+  Run<V> run[kPoints];
+  int stored;
+  StoredRuns<V> runs{run, 1, &stored, kPoints};
   if constexpr (Law::kLayered) {
-    friction(law, contact, parameters, Layers<V>{layer});
+    const auto ring = [&](int j) { return splat<V>(1e-4) * vec(j / 2, 1 - j / 3, 2 - j / 4); };
+    runs.load(Reach<V, Law::variant>(history[0], parameters, kPoints).outer, false, ring);
+    friction(law, contact, parameters, runs);
   } else {
     friction(law, &contact, 1, parameters);
   }
   const Push<V> found = push(contact);
   for (const Vec<V>& part : {found.force, found.torque_one, found.torque_other}) store_vec(to, part), to += 3;
   for (int q = 0; q < Law::kHistory; ++q) *to++ = history[q];
-  for (int q = 0; Law::kLayered && q < 3 * kPoints; ++q) *to++ = layer[q];
+  if constexpr (Law::kLayered) {
+    const V outer = Reach<V, Law::variant>(history[0], parameters, kPoints).outer;
+    runs.unload(outer, kPoints, [&](int, Vec<V> f) { store_vec(to, f), to += 3; });
+  }
   return to;
 }
 

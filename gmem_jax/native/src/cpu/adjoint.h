@@ -80,7 +80,7 @@ struct Adjoint {
   V* mid_bar;      // [N, kMid]
   V* sphere_bar;   // [S, 3]
   V* guest_bar;    // [guests, kGuest]
-  V* history_bar;  // [candidates, kHistory and Mindlin's layers, 3 Q]
+  V* history_bar;  // [candidates, kHistory and the forces of Mindlin's runs, 3 Q]
   V* domain_bar;   // [domains, kParameters]
   V* chunk_bar;    // [chunks, kParameters]
   V* wall_bar;     // [chunks, kWalls], of one step
@@ -90,7 +90,7 @@ struct Adjoint {
     Forward::carve(p, block, carver, to ? &to->forward : nullptr);
     const Plan& plan = *block.pack->plan;
     const std::size_t steps = block.lanes[0].steps, grains = p.grains, candidates = plan.candidates;
-    const std::size_t layers = Law::kLayered ? candidates * p.points * 3 : 0;
+    const std::size_t layered = Law::kLayered ? candidates : 0;
     V* state = carver.take<V>(steps * grains * kState);
     V* total = carver.take<V>(steps * grains * 6);
     Trace<V>* trace = carver.take<Trace<V>>(steps);
@@ -98,8 +98,8 @@ struct Adjoint {
       Trace<V> t;
       t.touched = carver.take<bool>(candidates + 1);
       t.history = carver.take<V>(candidates * Law::kHistory);
-      t.layer = carver.take<V>(layers);
-      t.reached = carver.take<int>(Law::kLayered ? candidates : 0);
+      t.run = carver.take<Run<V>>(layered * p.points);
+      t.runs = carver.take<int>(layered);
       if (to && to->rank == 0) trace[step] = t;  // the others see it after the barrier in `load`
     }
     V* state_bar = carver.take<V>(grains * kState);
@@ -124,6 +124,7 @@ struct Adjoint {
     Carver carver{static_cast<char*>(scratch)};
     carve(problem, block, carver, this);
     forward.mode.hot = forward.hot;
+    forward.mode.apart = true;
   }
 
   // Numbers in the history of a contact.
@@ -225,11 +226,30 @@ struct Adjoint {
       for_history(plan.candidate[c].row, [&](int leaf, std::ptrdiff_t row, int q) {
         history_of(c)[q] = forward.mode.gather(block.slopes, [leaf](const Lane& lane) { return lane.history_in[leaf]; }, row);
       });
+    if constexpr (Law::kLayered)
+      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c) add_up_runs(c);
     if (rank == 0) {
       std::memset(domain_bar, 0, sizeof(V) * plan.domains * kParameters);
       std::memset(chunk_bar, 0, sizeof(V) * chunks() * kParameters);
     }
     team.barrier();
+  }
+
+  // From the bars of rings to those of the runs that they are in at the end.
+  void add_up_runs(std::size_t c) {
+    const StoredRuns<V> runs = forward.mode.runs_of(c);
+    const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
+    const V outer = Reach<V, Law::variant>(forward.mode.history[c], law, problem.points).outer;
+    V* bar = history_of(c) + Law::kHistory;
+    for (int l = 0; l < W; ++l)
+      for (int k = 0, j = 0; j < problem.points; ++j) {
+        if (k + 1 < runs.count() && runs.get(k + 1).start[l] <= j) ++k;
+        for (int axis = 0; axis < 3; ++axis) {
+          const double of_ring = bar[3 * j + axis][l];
+          bar[3 * j + axis][l] = 0.0;
+          if (j <= outer[l]) bar[3 * k + axis][l] += of_ring;
+        }
+      }
   }
 
   void unload_bars() {
@@ -289,25 +309,19 @@ struct Adjoint {
     parameter.add_bars(chunk_bar + static_cast<std::size_t>(chunk) * kParameters);
   }
 
-  // Mindlin's layers of one contact, on the tape.
-  struct Layers {
-    const V* before;
-    int reached, count;
-    std::vector<int>* leaves;      // first of each layer that was stored
-    std::vector<Vec<Taped>>* now;  // what the law left
+  // Mindlin's runs of one contact, on the tape: as they were, then as the law left them.
+  struct Runs {
+    int rings;
+    std::vector<Run<Taped>>* now;
 
-    int points() const { return count; }
-    Vec<Taped> get(int j) const {
-      if (j > reached) return Vec<Taped>{};
-      leaves->push_back(tape->mark().slots);
-      return leaf(load_vec(before + 3 * j));
+    int points() const { return rings; }
+    int count() const { return static_cast<int>(now->size()); }
+    const Run<Taped>& get(int k) const { return (*now)[k]; }
+    void set(int k, const Run<Taped>& run) {
+      if (k == count()) now->push_back(run);
+      (*now)[k] = run;
     }
-    Vec<Taped> stored(int j) const { return (*now)[j]; }
-    void set(int j, Vec<Taped> f) {
-      if (static_cast<int>(now->size()) <= j) now->resize(j + 1);
-      (*now)[j] = f;
-    }
-    void keep(int kept) { now->resize(kept); }
+    void keep(Taped counts) { now->resize(static_cast<std::size_t>(largest(counts))); }
   };
 
   // The contacts of one domain.
@@ -350,11 +364,14 @@ struct Adjoint {
     contact.history = memory;
     meet(meeting, dot(meeting.separation, meeting.separation), contact);
     close(&contact, 1, parameter);
-    std::vector<int> leaves;
-    std::vector<Vec<Taped>> now;
+    std::vector<Run<Taped>> now;
+    const int leaves = recorded.mark().slots, before = Law::kLayered ? seen.runs[c] : 0;
+    for (int k = 0; k < before; ++k) {
+      const Run<V>& run = seen.run[c * problem.points + k];
+      now.push_back({leaf(run.force), constant(run.start)});
+    }
     if constexpr (Law::kLayered) {
-      friction(Law{}, contact, law,
-               Layers{seen.layer + c * problem.points * 3, seen.reached[c], problem.points, &leaves, &now});
+      friction(Law{}, contact, law, Runs{problem.points, &now});
     } else {
       friction(Law{}, &contact, 1, law);
     }
@@ -367,12 +384,12 @@ struct Adjoint {
     seed(found.torque_one, load_vec(one + kMidTorque));
     seed(found.torque_other, load_vec(other + kMidTorque));
     for (int q = 0; q < Law::kHistory; ++q) seed(memory[q], bar[q]);
-    for (std::size_t j = 0; j < now.size(); ++j) seed(now[j], load_vec(bar + Law::kHistory + 3 * j));
+    for (std::size_t k = 0; k < now.size(); ++k) seed(now[k].force, load_vec(bar + Law::kHistory + 3 * k));
     recorded.reverse(mark);
 
     for (int q = 0; q < Law::kHistory; ++q) bar[q] = recorded.bar(mark.slots + kMeeting + q);
     for (int q = Law::kHistory; q < remembered(problem); ++q) bar[q] = V{};
-    for (std::size_t j = 0; j < leaves.size(); ++j) store_vec(bar + Law::kHistory + 3 * j, bars(leaves[j]));
+    for (int k = 0; k < before; ++k) store_vec(bar + Law::kHistory + 3 * k, bars(leaves + 3 * k));
     share_out(pair, mark.slots);
   }
 

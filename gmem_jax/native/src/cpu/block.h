@@ -180,7 +180,8 @@ struct Engine {
   void load() {
     const int units = Mode::units(problem);
     for (int u = share_begin(units); u < share_begin(units, 1); ++u) mode.load_unit(u, hot, cold);
-    for (int c = share_begin(plan.candidates); c < share_begin(plan.candidates, 1); ++c) mode.load_history(c);
+    const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
+    for (int c = share_begin(plan.candidates); c < share_begin(plan.candidates, 1); ++c) mode.load_history(c, law);
     if (rank == 0) mode.load_dummies();
     team.barrier();
   }
@@ -196,8 +197,9 @@ struct Engine {
     if (rank == 0) mode.unload_pressure(pressure, steps_done);
     const int units = Mode::units(problem);
     for (int u = share_begin(units); u < share_begin(units, 1); ++u) mode.unload_unit(u, hot, cold, steps_done);
+    const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
     for (int c = share_begin(plan.candidates); c < share_begin(plan.candidates, 1); ++c)
-      mode.unload_history(c, steps_done);
+      mode.unload_history(c, law, steps_done);
     for (int c = share_begin(plan.padding); c < share_begin(plan.padding, 1); ++c) mode.unload_padding(c, steps_done);
     team.barrier();
   }

@@ -30,7 +30,7 @@ struct Packed {
   GrainRows* grain;  // [N + 1]
   Row* guest;        // [guests, 2]: force and torque
   Row* history;      // [candidates + 1]
-  double* layer;     // [candidates + 1, Q, 3] of the Mindlin law
+  Row* run;          // [Q, candidates + 1] of the Mindlin law: those that are few lie together
   Marks marks;
 
   Packed(const Problem& problem, const Block& block)
@@ -48,8 +48,8 @@ struct Packed {
     Row* history = carver.take<Row>(Law::kHistory ? candidates : 0);
     if (mode) mode->sphere = sphere, mode->grain = grain, mode->guest = guest, mode->history = history;
     carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
-    double* layer = carver.take<double>(Law::kLayered ? candidates * p.points * 3 : 0);
-    if (mode) mode->layer = layer;
+    Row* run = carver.take<Row>(Law::kLayered ? candidates * p.points : 0);
+    if (mode) mode->run = run;
     return carver.used;
   }
 
@@ -83,7 +83,16 @@ struct Packed {
     }
   }
 
-  void load_history(std::ptrdiff_t c) {
+  std::ptrdiff_t run_stride() const { return plan.candidates + 1; }
+  // A run's four numbers are a row.
+  StoredRuns<double> runs_of(std::size_t c) const {
+    return {reinterpret_cast<Run<double>*>(run + c), run_stride(), marks.runs + c, problem.points};
+  }
+  double outermost(std::size_t c, const LawParameters<V>& law) const {
+    return Reach<V, Law::variant>(splat<V>(history[c][0]), law, problem.points).outer[0];
+  }
+
+  void load_history(std::ptrdiff_t c, const LawParameters<V>& law) {
     const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = false;
     marks.wake[c] = -1.0;  // not looked at yet
@@ -92,25 +101,27 @@ struct Packed {
       history[c][q] = lane.history_in[place.leaf][place.row * problem.stride];
     }
     if constexpr (Law::kLayered) {
-      const int reached = layer_of(problem, lane, history[c][0]);
-      marks.reached[c] = marks.reached_first[c] = reached;
-      const std::ptrdiff_t from = row * problem.points * 3, to = c * problem.points * 3;
-      for (int q = 0; q < 3 * (reached + 1); ++q) layer[to + q] = lane.history_in[0][(from + q) * problem.stride];
+      const double outer = outermost(c, law);
+      marks.rings[c] = rings_of(problem, outer);
+      runs_of(c).load(outer, false, [&](int j) {
+        const double* from = lane.history_in[0] + (row * problem.points + j) * 3 * problem.stride;
+        return Vec<double>{from[0], from[problem.stride], from[2 * problem.stride]};
+      });
     }
   }
 
-  void unload_history(std::ptrdiff_t c, int) const {
+  void unload_history(std::ptrdiff_t c, const LawParameters<V>& law, int) const {
     const std::ptrdiff_t row = plan.candidate[c].row;
     for (int q = 0; q < Law::kHistory; ++q) {
       const Place place = place_of<Law>(row, q);
       lane.history_out[place.leaf][place.row * problem.stride] = history[c][q];
     }
     if constexpr (Law::kLayered) {
-      const std::ptrdiff_t to = row * problem.points * 3, from = c * problem.points * 3;
-      const int stored = 3 * (marks.reached[c] + 1);
-      const int stale = 3 * (problem.history_aliased ? marks.reached_first[c] + 1 : problem.points);
-      for (int q = 0; q < stored; ++q) lane.history_out[0][(to + q) * problem.stride] = layer[from + q];
-      for (int q = stored; q < stale; ++q) lane.history_out[0][(to + q) * problem.stride] = 0.0;
+      const double outer = outermost(c, law);
+      runs_of(c).unload(outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Vec<double> f) {
+        double* to = lane.history_out[0] + (row * problem.points + j) * 3 * problem.stride;
+        to[0] = f.x, to[problem.stride] = f.y, to[2 * problem.stride] = f.z;
+      });
     }
   }
 
@@ -138,7 +149,7 @@ struct Packed {
     sphere[dummy_sphere() + 1] = Row{4.0};
     grain[dummy_grain()] = GrainRows{};
     if constexpr (Law::kHistory > 0) history[plan.candidates] = Row{};
-    if constexpr (Law::kLayered) marks.reached[plan.candidates] = -1;
+    if constexpr (Law::kLayered) marks.runs[plan.candidates] = 0;
   }
 
   // --- what the grains tell the contacts, and the contacts the grains
@@ -189,28 +200,27 @@ struct Packed {
 
   // --- contacts
 
-  struct Layers {
-    double* at[W];
-    int* last[W];
-    int count;
+  // Of W contacts.
+  struct Runs {
+    Row* first[W];
+    int* stored[W];
+    std::ptrdiff_t stride;
+    int rings, most;
 
-    int points() const { return count; }
-    Vec<V> get(int j) const {
-      Vec<V> f{};
-      for (int l = 0; l < W; ++l)
-        if (j <= *last[l]) f.x[l] = at[l][3 * j], f.y[l] = at[l][3 * j + 1], f.z[l] = at[l][3 * j + 2];
-      return f;
+    int points() const { return rings; }
+    int count() const { return most; }
+    Run<V> get(int k) const {
+      const Row none{0.0, 0.0, 0.0, kNowhere};
+      const Rows rows = load_rows([&](int l) { return k < *stored[l] ? first[l] + k * stride : &none; });
+      return {columns(rows), spare_column(rows)};
     }
-    Vec<V> stored(int j) const {
-      Vec<V> f;
-      for (int l = 0; l < W; ++l) f.x[l] = at[l][3 * j], f.y[l] = at[l][3 * j + 1], f.z[l] = at[l][3 * j + 2];
-      return f;
+    void set(int k, const Run<V>& run) {
+      const Rows rows = rows_of(run.force, run.start);
+      for (int l = 0; l < W; ++l) first[l][k * stride] = row_of(rows, l);
     }
-    void set(int j, Vec<V> f) {
-      for (int l = 0; l < W; ++l) at[l][3 * j] = f.x[l], at[l][3 * j + 1] = f.y[l], at[l][3 * j + 2] = f.z[l];
-    }
-    void keep(int kept) {
-      for (int l = 0; l < W; ++l) *last[l] = kept - 1;
+    void keep(V counts) {
+      for (int l = 0; l < W; ++l) *stored[l] = static_cast<int>(counts[l]);
+      most = static_cast<int>(largest(counts));
     }
   };
 
@@ -256,7 +266,7 @@ struct Packed {
 
   void blank(std::size_t c) {
     if constexpr (Law::kHistory > 0) history[c] = Row{};
-    if constexpr (Law::kLayered) marks.reached[c] = -1;
+    if constexpr (Law::kLayered) marks.runs[c] = 0;
     const int n = plan.candidate[c].guest;
     if (n >= 0) guest[2 * static_cast<std::size_t>(n)] = guest[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
@@ -277,7 +287,7 @@ struct Packed {
     close(contact, groups, parameter);
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
     if constexpr (Law::kLayered) {
-      for (int n = 0; n < groups; ++n) friction(Law{}, contact[n], law, layers_of(group[n]));
+      for (int n = 0; n < groups; ++n) friction(Law{}, contact[n], law, runs_of(group[n]));
     } else {
       friction(Law{}, contact, groups, law);
     }
@@ -336,14 +346,17 @@ struct Packed {
     }
   }
 
-  Layers layers_of(const Group& g) {
-    Layers layers;
-    layers.count = problem.points;
+  Runs runs_of(const Group& g) {
+    Runs runs;
+    runs.stride = run_stride();
+    runs.rings = problem.points;
+    runs.most = 0;
     for (int l = 0; l < W; ++l) {
-      layers.at[l] = layer + static_cast<std::size_t>(g.c[l]) * problem.points * 3;
-      layers.last[l] = marks.reached + g.c[l];
+      runs.first[l] = run + g.c[l];
+      runs.stored[l] = marks.runs + g.c[l];
+      runs.most = *runs.stored[l] > runs.most ? *runs.stored[l] : runs.most;
     }
-    return layers;
+    return runs;
   }
 
   GMEM_INLINE void add(const Group& g, const Push<V>& push) {

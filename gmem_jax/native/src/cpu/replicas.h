@@ -18,8 +18,8 @@ template <class V>
 struct Trace {
   bool* touched = nullptr;  // [candidates]
   V* history;               // [candidates, kHistory] of the law
-  V* layer;                 // [candidates, Q, 3]
-  int* reached;             // [candidates]
+  Run<V>* run;              // [candidates, Q]
+  int* runs;                // [candidates]
 };
 
 // How numbers are put together from the arrays of a block, and which of them are results.
@@ -47,9 +47,10 @@ struct Replicas {
   V* sphere;      // [S, 3]: centres
   V* guest;       // [guests, 6]: force and torque
   V* history;     // [candidates, Law::kHistory]
-  V* layer;       // [candidates, Q, 3] of the Mindlin law
+  Run<V>* run;    // [Q, candidates] of the Mindlin law: those that are few lie together
   Marks marks;
   Trace<V> trace;
+  bool apart = false;  // Mindlin's rings each by itself, for their derivatives
 
   Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
     adjacent = block.count == W;
@@ -76,8 +77,8 @@ struct Replicas {
     V* history = carver.take<V>(candidates * Law::kHistory);
     if (mode) mode->sphere = sphere, mode->guest = guest, mode->history = history;
     carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
-    V* layer = carver.take<V>(Law::kLayered ? candidates * p.points * 3 : 0);
-    if (mode) mode->layer = layer;
+    Run<V>* run = carver.take<Run<V>>(Law::kLayered ? candidates * p.points : 0);
+    if (mode) mode->run = run;
     return carver.used;
   }
 
@@ -144,7 +145,9 @@ struct Replicas {
     }
   }
 
-  void load_history(std::ptrdiff_t c) {
+  StoredRuns<V> runs_of(std::size_t c) const { return {run + c, plan.candidates, marks.runs + c, problem.points}; }
+
+  void load_history(std::ptrdiff_t c, const LawParameters<V>& law) {
     const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = true;
     marks.wake[c] = 0.0;
@@ -154,19 +157,17 @@ struct Replicas {
           read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row);
     }
     if constexpr (Law::kLayered) {
-      int reached = -1;
-      for (int l = 0; l < block.count; ++l) {
-        const int of_lane = layer_of(problem, block.lanes[l], history[c][l]);
-        reached = of_lane > reached ? of_lane : reached;
-      }
-      marks.reached[c] = marks.reached_first[c] = reached;
-      const std::ptrdiff_t from = row * problem.points * 3, to = c * problem.points * 3;
-      for (int q = 0; q < 3 * (reached + 1); ++q)
-        layer[to + q] = read([](const Lane& lane) { return lane.history_in[0]; }, from + q);
+      const V outer = Reach<V, Law::variant>(history[c], law, problem.points).outer;
+      marks.rings[c] = rings_of(problem, outer);
+      runs_of(c).load(outer, apart, [&](int j) {
+        const auto in = [](const Lane& lane) { return lane.history_in[0]; };
+        const std::ptrdiff_t from = (row * problem.points + j) * 3;
+        return Vec<V>{read(in, from), read(in, from + 1), read(in, from + 2)};
+      });
     }
   }
 
-  void unload_history(std::ptrdiff_t c, int steps_done) const {
+  void unload_history(std::ptrdiff_t c, const LawParameters<V>& law, int steps_done) const {
     const std::ptrdiff_t row = plan.candidate[c].row;
     for (int q = 0; q < Law::kHistory; ++q) {
       const Place place = place_of<Law>(row, q);
@@ -174,12 +175,14 @@ struct Replicas {
             history[c * Law::kHistory + q], steps_done);
     }
     if constexpr (Law::kLayered) {
-      const std::ptrdiff_t to = row * problem.points * 3, from = c * problem.points * 3;
-      const auto out = [](const Lane& lane) { return lane.history_out[0]; };
-      const int stored = 3 * (marks.reached[c] + 1);
-      const int stale = 3 * (problem.history_aliased ? marks.reached_first[c] + 1 : problem.points);
-      for (int q = 0; q < stored; ++q) write(out, to + q, layer[from + q], steps_done);
-      for (int q = stored; q < stale; ++q) write(out, to + q, V{}, steps_done);
+      const V outer = Reach<V, Law::variant>(history[c], law, problem.points).outer;
+      runs_of(c).unload(outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Vec<V> f) {
+        const auto out = [](const Lane& lane) { return lane.history_out[0]; };
+        const std::ptrdiff_t to = (row * problem.points + j) * 3;
+        write(out, to, f.x, steps_done);
+        write(out, to + 1, f.y, steps_done);
+        write(out, to + 2, f.z, steps_done);
+      });
     }
   }
 
@@ -234,25 +237,12 @@ struct Replicas {
 
   // --- contacts
 
-  struct Layers {
-    V* at;
-    int* last;
-    int count;
-
-    int points() const { return count; }
-    Vec<V> get(int j) const { return j <= *last ? stored(j) : Vec<V>{}; }
-    Vec<V> stored(int j) const { return load_vec(at + 3 * j); }
-    void set(int j, Vec<V> f) { store_vec(at + 3 * j, f); }
-    void keep(int kept) { *last = kept - 1; }
-  };
-
   void remember(std::size_t c) {
     trace.touched[c] = true;
     for (int q = 0; q < Law::kHistory; ++q) trace.history[c * Law::kHistory + q] = history[c * Law::kHistory + q];
     if constexpr (Law::kLayered) {
-      trace.reached[c] = marks.reached[c];
-      const std::size_t first = c * problem.points * 3;
-      for (int q = 0; q < 3 * (marks.reached[c] + 1); ++q) trace.layer[first + q] = layer[first + q];
+      trace.runs[c] = marks.runs[c];
+      for (int k = 0; k < marks.runs[c]; ++k) trace.run[c * problem.points + k] = runs_of(c).get(k);
     }
   }
 
@@ -298,7 +288,7 @@ struct Replicas {
     if constexpr (Law::kLayered) {
       for (int n = 0; n < count; ++n) {
         const std::size_t c = touching[n];
-        friction(Law{}, contact[n], law, Layers{layer + c * problem.points * 3, marks.reached + c, problem.points});
+        friction(Law{}, contact[n], law, runs_of(c));
       }
     } else {
       friction(Law{}, contact, count, law);
@@ -309,7 +299,7 @@ struct Replicas {
   void forget(std::size_t c, const Candidate& pair) {
     marks.touched[c] = false;
     for (int q = 0; q < Law::kHistory; ++q) history[c * Law::kHistory + q] = V{};
-    if constexpr (Law::kLayered) marks.reached[c] = -1;
+    if constexpr (Law::kLayered) marks.runs[c] = 0;
     if (pair.guest >= 0)
       for (int q = 0; q < 6; ++q) guest[6 * static_cast<std::size_t>(pair.guest) + q] = V{};
   }

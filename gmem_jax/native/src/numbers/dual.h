@@ -44,6 +44,12 @@ struct Dual {
   friend double smallest(Dual a) { return smallest(a.value); }
   friend Dual floor_of(Dual a) { return {floor_of(a.value), R{}}; }
 
+  friend Bits differ(Dual a, Dual b) { return differ(a.value, b.value) | differ(a.slope, b.slope); }
+  friend void copy_lane(Dual& to, int l, Dual from) {
+    copy_lane(to.value, l, from.value);
+    copy_lane(to.slope, l, from.slope);
+  }
+
   // At zero, where it has none, the root's derivative is taken as zero.
   friend Dual root(Dual a) {
     const R value = root(a.value);
@@ -54,6 +60,9 @@ struct Dual {
     return {value, splat<R>(-0.5) * (((a.slope * value) * value) * value)};
   }
 };
+
+template <class R>
+constexpr int kLanes<Dual<R>> = kLanes<R>;
 
 }  // namespace GMEM_ISA
 }  // namespace gmem

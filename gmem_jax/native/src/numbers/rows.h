@@ -48,12 +48,17 @@ inline Vec<Real> columns(const Rows& r) {
           shuffle<0, 1, 2, 3, 8, 9, 10, 11>(s, t)};
 }
 
-inline Rows rows_of(Vec<Real> a) {
-  const Real zero{};
+inline Real spare_column(const Rows& r) {
+  const Real s = shuffle<2, 6, 10, 14, 3, 7, 11, 15>(r.part[0], r.part[1]);
+  const Real t = shuffle<2, 6, 10, 14, 3, 7, 11, 15>(r.part[2], r.part[3]);
+  return shuffle<4, 5, 6, 7, 12, 13, 14, 15>(s, t);
+}
+
+inline Rows rows_of(Vec<Real> a, Real spare = Real{}) {
   const Real p = shuffle<0, 8, 1, 9, 2, 10, 3, 11>(a.x, a.y);
   const Real q = shuffle<4, 12, 5, 13, 6, 14, 7, 15>(a.x, a.y);
-  const Real s = shuffle<0, 8, 1, 9, 2, 10, 3, 11>(a.z, zero);
-  const Real t = shuffle<4, 12, 5, 13, 6, 14, 7, 15>(a.z, zero);
+  const Real s = shuffle<0, 8, 1, 9, 2, 10, 3, 11>(a.z, spare);
+  const Real t = shuffle<4, 12, 5, 13, 6, 14, 7, 15>(a.z, spare);
   return {{shuffle<0, 1, 8, 9, 2, 3, 10, 11>(p, s), shuffle<4, 5, 12, 13, 6, 7, 14, 15>(p, s),
            shuffle<0, 1, 8, 9, 2, 3, 10, 11>(q, t), shuffle<4, 5, 12, 13, 6, 7, 14, 15>(q, t)}};
 }
@@ -79,12 +84,17 @@ inline Vec<Real> columns(const Rows& r) {
           shuffle<2, 3, 6, 7>(p, q)};
 }
 
-inline Rows rows_of(Vec<Real> a) {
-  const Real zero{};
+inline Real spare_column(const Rows& r) {
+  const Real s = shuffle<1, 5, 3, 7>(r.part[0], r.part[1]);
+  const Real t = shuffle<1, 5, 3, 7>(r.part[2], r.part[3]);
+  return shuffle<2, 3, 6, 7>(s, t);
+}
+
+inline Rows rows_of(Vec<Real> a, Real spare = Real{}) {
   const Real p = shuffle<0, 4, 2, 6>(a.x, a.y);  // x0 y0 x2 y2
   const Real q = shuffle<1, 5, 3, 7>(a.x, a.y);
-  const Real s = shuffle<0, 4, 2, 6>(a.z, zero);
-  const Real t = shuffle<1, 5, 3, 7>(a.z, zero);
+  const Real s = shuffle<0, 4, 2, 6>(a.z, spare);
+  const Real t = shuffle<1, 5, 3, 7>(a.z, spare);
   return {{shuffle<0, 1, 4, 5>(p, s), shuffle<0, 1, 4, 5>(q, t),
            shuffle<2, 3, 6, 7>(p, s), shuffle<2, 3, 6, 7>(q, t)}};
 }
@@ -104,10 +114,11 @@ inline Vec<Real> columns(const Rows& r) {
           shuffle<0, 2>(r.part[1], r.part[3])};
 }
 
-inline Rows rows_of(Vec<Real> a) {
-  const Real zero{};
-  return {{shuffle<0, 2>(a.x, a.y), shuffle<0, 2>(a.z, zero),
-           shuffle<1, 3>(a.x, a.y), shuffle<1, 3>(a.z, zero)}};
+inline Real spare_column(const Rows& r) { return shuffle<1, 3>(r.part[1], r.part[3]); }
+
+inline Rows rows_of(Vec<Real> a, Real spare = Real{}) {
+  return {{shuffle<0, 2>(a.x, a.y), shuffle<0, 2>(a.z, spare),
+           shuffle<1, 3>(a.x, a.y), shuffle<1, 3>(a.z, spare)}};
 }
 
 inline Row row_of(const Rows& r, int l) {

@@ -33,6 +33,10 @@ inline V splat(double a) {
   }
 }
 
+// Numbers that a V is made of, to be calculated side by side.
+template <class V>
+constexpr int kLanes = 1;
+
 inline double select(bool m, double a, double b) { return m ? a : b; }
 inline double zero_unless(bool m, double a) { return m ? a : 0.0; }
 
@@ -56,7 +60,10 @@ inline double floor_of(double a) { return __builtin_floor(a); }
 inline double fms(double a, double b, double c) { return fma(a, b, -c); }
 inline double fnma(double a, double b, double c) { return fma(-a, b, c); }
 inline double max(double a, double b) { return a > b ? a : b; }
+inline unsigned bits(bool m) { return m; }
 inline unsigned bits_less(double a, double b) { return a < b; }
+inline bool differ(double a, double b) { return a != b; }
+inline void copy_lane(double& to, int, double from) { to = from; }
 inline double largest(double a) { return a; }
 inline double smallest(double a) { return a; }
 

@@ -85,6 +85,12 @@ inline Real floor_of(Real a) {
   return nearest - zero_unless(nearest > a, splat<Real>(1.0));
 }
 
+template <>
+constexpr int kLanes<Real> = W;
+inline unsigned bits(Bits m) { return bits_less(zero_unless(m, splat<Real>(-1.0)), Real{}); }
+inline Bits differ(Real a, Real b) { return a != b; }
+inline void copy_lane(Real& to, int l, Real from) { to[l] = from[l]; }
+
 inline double largest(Real a) {
   double m = a[0];
   for (int l = 1; l < W; ++l) m = a[l] > m ? a[l] : m;

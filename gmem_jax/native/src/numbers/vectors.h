@@ -22,6 +22,10 @@ template <class V>
 inline Vec<V> operator*(V s, Vec<V> a) { return {s * a.x, s * a.y, s * a.z}; }
 template <class V>
 inline Vec<V> zero_unless(Mask<V> m, Vec<V> a) { return {zero_unless(m, a.x), zero_unless(m, a.y), zero_unless(m, a.z)}; }
+template <class V>
+inline Vec<V> select(Mask<V> m, Vec<V> a, Vec<V> b) { return {select(m, a.x, b.x), select(m, a.y, b.y), select(m, a.z, b.z)}; }
+template <class V>
+inline Mask<V> differ(Vec<V> a, Vec<V> b) { return differ(a.x, b.x) | differ(a.y, b.y) | differ(a.z, b.z); }
 
 // s a + b
 template <class V>

@@ -4,6 +4,7 @@
 
 #include "numbers/vectors.h"
 #include "physics/parameters.h"
+#include "physics/runs.h"
 
 namespace gmem {
 namespace GMEM_ISA {
@@ -151,96 +152,104 @@ GMEM_INLINE void friction(Rescaled, Contact<V>* c, int count, const LawParameter
   }
 }
 
-// Where a contact stands in its rings: `x` rings reached, the outermost number `outer` filled in part.
+// Where a contact stands in its rings: `x` of them reached, the outermost, number `outer`, in part; -1 where none is
+// attached.
 // gmem_jax/physics/contact/mindlin.py: Mindlin.outermost
-template <class V>
+template <class V, Variant variant>
 struct Reach {
   V x, outer;
 
-  Reach(V root_overlap, const LawParameters<V>& law, int points) : x(root_overlap * law.inverse_spacing) {
-    const V last = splat<V>(points - 2.0);
-    outer = select(x < last, floor_of(select(x < last, x, V{})), last);
+  Reach(V overlap, const LawParameters<V>& law, int points)
+      : x(root(zero_unless(overlap > V{}, overlap)) * law.inverse_spacing) {
+    const V last = splat<V>(points - 2.0), begin = splat<V>(variant == Variant::paper ? 0.5 : 0.0);
+    const V ring = select(x < last, floor_of(select(x < last, x, V{})), last);
+    outer = select(x > begin, ring, splat<V>(-1.0));
   }
 };
 
-// How much point `j` counts, by "exact" weights.
-// gmem_jax/physics/contact/mindlin.py: Mindlin.weights
+// `Transport` of many forces of one contact: a matrix.
+// gmem_jax/physics/contact/mindlin.py: transport_layers
 template <class V>
-inline V weight(const Reach<V>& r, V j) {
-  return zero_unless(j <= r.outer, select(j < r.outer, splat<V>(1.0), r.x - j));
-}
+struct TransportOfMany {
+  Vec<V> normal, column[3];
+  V denominator2;
 
-// One contact. `layers` has `get(j)`, zero beyond the layers that are stored; `set(j, f)`; `stored(j)`, what `set`
-// stored; and `keep(count)`, after which the others are zero.
+  GMEM_INLINE explicit TransportOfMany(const Contact<V>& c) : normal(c.normal) {
+    const Transport<V> single(c);
+    const Vec<V> turned = single.sine * normal, scaled = single.cosine * normal;
+    column[0] = fnma(normal.x, scaled, Vec<V>{single.cosine, turned.z, -turned.y});
+    column[1] = fnma(normal.y, scaled, Vec<V>{-turned.z, single.cosine, turned.x});
+    column[2] = fnma(normal.z, scaled, Vec<V>{turned.y, -turned.x, single.cosine});
+    denominator2 = single.denominator2;
+  }
+
+  // First part: moves `force`; returns the square whose inverse root the second part wants.
+  GMEM_INLINE V move(Vec<V>& force, V& before) const {
+    const V along_normal = dot(force, normal);
+    before = dot(force, force);
+    force = fma(force.x, column[0], fma(force.y, column[1], force.z * column[2]));
+    return (before * denominator2) * fnma(along_normal, along_normal, before);
+  }
+
+  // By what it is to be multiplied then; see `Transport.restore`.
+  GMEM_INLINE V restoring(V square, V before, V inverse) const {
+    return select(square > splat<V>(1e-280), before * inverse, splat<V>(1.0));
+  }
+};
+
+// One contact. `runs` has `points()`; `count()`, of the lane that has most; `get(k)` and `set(k, run)`; and
+// `keep(counts)`, of each lane.
 // gmem_jax/physics/contact/mindlin.py: Mindlin.__call__
-template <class V, Variant variant, class Layers>
-void friction(Layered<variant>, Contact<V>& c, const LawParameters<V>& law, Layers layers) {
+template <class V, Variant variant, class Runs>
+void friction(Layered<variant>, Contact<V>& c, const LawParameters<V>& law, Runs runs) {
   const V one = splat<V>(1.0), half = splat<V>(0.5);
-  const Mask<V> touching = c.touching();
-  const Transport<V> transport(c);
-  const Reach<V> now(c.root_overlap, law, layers.points());
-  const Vec<V> half_step = law.half_step * c.sliding;
-  Mask<V> attached = touching;
-  V total = now.x;
-  if (variant == Variant::paper) {
-    attached &= now.x > half;
-    total = select(now.x > half, now.x - half, one);
-  }
-  const Reach<V> before(variant == Variant::averaged ? root(c.history[0]) : V{}, law, layers.points());
+  const Reach<V, variant> before(c.history[0], law, runs.points()), now(c.overlap, law, runs.points());
+  if (bits_less(before.outer, now.outer) | bits_less(now.outer, before.outer)) reattach(runs, before.outer, now.outer);
 
-  // Rings below `whole` are filled in every lane, before and now, and need no masks.
-  const int end = static_cast<int>(largest(zero_unless(touching, now.outer))) + 1;
-  const bool all = !bits_less(zero_unless(attached, one), one);
-  int whole = all ? static_cast<int>(smallest(now.outer)) : 0;
-  if (variant == Variant::averaged) {
-    const int whole_before = static_cast<int>(smallest(before.outer));
-    whole = whole < whole_before ? whole : whole_before;
-  }
-  constexpr int kLayers = 8;  // taken along together, for the same reason as contacts
-  Vec<V> f[kLayers];
-  V squared[kLayers], product[kLayers], inverse[kLayers];
+  // The force in a ring that fills stays: Mindlin._diluted.
+  const V filled = before.x - before.outer;
+  const V fills = select(before.outer < now.outer, one, now.x - before.outer);
+  const Mask<V> grows = filled < fills;
+  const V dilution = select(grows, filled / select(grows, fills, one), one);
+
+  const TransportOfMany<V> transport(c);
+  const Vec<V> half_step = law.half_step * c.sliding;
+  constexpr int kRuns = 8;  // taken along together, for the same reason as contacts
+  Run<V> run[kRuns];
+  V squared[kRuns], product[kRuns], inverse[kRuns];
   Vec<V> sum{};
-  for (int first = 0; first < end; first += kLayers) {
-    const int count = end - first < kLayers ? end - first : kLayers;
+  const int stored = runs.count();
+  for (int first = 0; first < stored; first += kRuns) {
+    const int count = stored - first < kRuns ? stored - first : kRuns;
     for (int n = 0; n < count; ++n) {
-      f[n] = layers.get(first + n);
-      product[n] = transport.flatten(f[n], squared[n]);
+      run[n] = runs.get(first + n);
+      product[n] = transport.move(run[n].force, squared[n]);
     }
     for (int n = 0; n < count; ++n) inverse[n] = inverse_root(product[n]);
+    const V next = first + count < stored ? runs.get(first + count).start : splat<V>(kNowhere);
     for (int n = 0; n < count; ++n) {
-      const int j = first + n;
-      const V at = splat<V>(j);
-      Vec<V> carried = transport.restore(f[n], squared[n], product[n], inverse[n]);
-      if (j < whole) {
-        carried = carried + half_step;
-        sum = variant == Variant::paper && j == 0 ? half * carried : sum + carried;
-      } else {
-        V w = weight(now, at);
-        if (variant == Variant::averaged) {  // the force in a ring that fills stays: Mindlin._diluted
-          const V filled = weight(before, at);
-          const Mask<V> grows = filled < w;
-          carried = select(grows, filled / select(grows, w, one), one) * carried;
-        }
-        if (variant == Variant::paper && j == 0) w = w - half;
-        const Mask<V> inside = attached & (at <= now.outer);
-        carried = zero_unless(inside, carried + half_step);
-        sum = fma(zero_unless(inside, w), carried, sum);
-      }
-      layers.set(j, carried);
+      const V start = run[n].start, end = n + 1 < count ? run[n + 1].start : next;
+      V scale = transport.restoring(product[n], squared[n], inverse[n]);
+      if (variant == Variant::averaged) scale = select(start < before.outer, one, dilution) * scale;
+      V weight = select(end < now.x, end, now.x) - start;
+      if (variant == Variant::paper && first + n == 0) weight = weight - half;
+      run[n].force = fma(scale, run[n].force, half_step);
+      sum = fma(zero_unless(start <= now.x, weight), run[n].force, sum);
+      runs.set(first + n, run[n]);
     }
   }
+  const Mask<V> attached = now.outer > V{} - half;
+  const V total = select(attached, variant == Variant::paper ? now.x - half : now.x, one);
   const Vec<V> trial = fma(law.spacing, sum, (law.dashpot * c.root_overlap) * c.sliding);
   c.force = trial;
   coulomb(&c, 1, law.mu);
   const Vec<V> correction = fma(one / (law.spacing * total), c.force - trial, half_step);
-  int j = 0;
-  for (; j < whole; ++j) layers.set(j, layers.stored(j) + correction);
-  for (; j < end; ++j) {
-    const Mask<V> inside = attached & (splat<V>(j) <= now.outer);
-    layers.set(j, zero_unless(inside, layers.stored(j) + correction));
+  for (int k = 0; k < stored; ++k) {
+    Run<V> last = runs.get(k);
+    last.force = zero_unless(last.start <= now.x, last.force + correction);
+    runs.set(k, last);
   }
-  layers.keep(end);
-  c.history[0] = zero_unless(touching, c.overlap);
+  c.history[0] = zero_unless(c.touching(), c.overlap);
 }
 
 }  // namespace GMEM_ISA
