@@ -283,12 +283,22 @@ struct Replicas {
     compute(touching, count, contact, parameter, law);
   }
 
+  // Has the runs of a contact brought near: they lie too far apart for the processor to see what comes next.
+  void fetch(std::size_t c) const {
+    for (int k = 0; k < marks.runs[c]; ++k) {
+      const char* at = reinterpret_cast<const char*>(&runs_of(c).get(k));
+      for (std::size_t line = 0; line < sizeof(Run<V>); line += 64) __builtin_prefetch(at + line, 1);
+    }
+  }
+
   void compute(const int* touching, int count, Contact<V>* contact, const V* parameter, const LawParameters<V>& law) {
+    if constexpr (Law::kLayered)
+      if (count) fetch(touching[0]);
     close(contact, count, parameter);
     if constexpr (Law::kLayered) {
       for (int n = 0; n < count; ++n) {
-        const std::size_t c = touching[n];
-        friction(Law{}, contact[n], law, runs_of(c));
+        if (n + 1 < count) fetch(touching[n + 1]);
+        friction(Law{}, contact[n], law, runs_of(touching[n]));
       }
     } else {
       friction(Law{}, contact, count, law);
