@@ -435,18 +435,11 @@ MUTATIONS = (
         "test_unit_tests_in_cpp[runs]",
     ),
     mutation(
-        "native-runs-of-contacts-side-by-side",
-        "packed.h",
-        "k < *stored[l] ? first[l] + k * stride : &none",
-        "first[l] + k * stride",
-        f"{DOMAINS}[1-M2]",
-    ),
-    mutation(
         "adjoint-bars-of-rings-lost",
         "adjoint.h",
         "+= of_ring",
         "= of_ring",
-        f"{ACROSS}[M2]",
+        f"{ACROSS}[narrow rings]",
     ),
     mutation(
         "tangent-of-a-product",

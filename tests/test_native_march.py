@@ -119,7 +119,8 @@ def random_like(tree: Any, seed: int) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(generator.normal(size=jnp.shape(leaf))), tree)
 
 
-@pytest.mark.parametrize("law", ["H", "M2"])  # one history of each kind; what crosses is the same for all
+# One history of each kind, and new runs of several rings; what crosses is the same for all.
+@pytest.mark.parametrize("law", ["H", "M2", "narrow rings"])
 def test_both_modes_of_derivatives_cross_the_domains_as_defined(law: str) -> None:
     system, _ = thrown(law)
     state = first(as_defined(law)[0], 2)
