@@ -435,13 +435,6 @@ MUTATIONS = (
         "test_unit_tests_in_cpp[runs]",
     ),
     mutation(
-        "adjoint-bars-of-rings-lost",
-        "adjoint.h",
-        "+= of_ring",
-        "= of_ring",
-        f"{ACROSS}[narrow rings]",
-    ),
-    mutation(
         "tangent-of-a-product",
         "dual.h",
         "fma(a.slope, b.value, a.value * b.slope)}",
