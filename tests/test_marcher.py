@@ -15,7 +15,7 @@ from jax import export
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import calls
+from gmem_jax.native import calls, gpu
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import System, start
@@ -70,21 +70,47 @@ def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     native._warn_once.cache_clear()
 
 
+CALLS_ALLOWED = [export.DisabledSafetyCheck.custom_call(target) for target in calls.TARGETS]
+
+
+def lowered(march: native.March, platform: str) -> str:
+    """The program of a sweep's derivatives on a platform."""
+    program = jax.jit(derivatives(march))
+    return export.export(program, platforms=[platform], disabled_checks=CALLS_ALLOWED)(MUS, RATES).mlir_module()
+
+
 @needs_library
-def test_auto_is_the_library_on_cpus_and_the_definition_elsewhere() -> None:
-    program = jax.jit(derivatives(native.marcher("auto")))
-    calls_allowed = [export.DisabledSafetyCheck.custom_call(target) for target in calls.TARGETS]
-    here = export.export(program, platforms=["cpu"], disabled_checks=calls_allowed)(MUS, RATES).mlir_module()
-    elsewhere = export.export(program, platforms=["cuda"])(MUS, RATES).mlir_module()
-    for target in ("gmem_advance", "gmem_adjoint"):
-        assert f"custom_call @{target}" in here
-        assert f"custom_call @{target}" not in elsewhere
+def test_auto_is_the_library_where_it_runs_and_the_definition_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu, "missing", lambda: "")
+    auto = native.marcher("auto")
+    found = {
+        platform: {target for target in calls.TARGETS if f"custom_call @{target}" in lowered(auto, platform)}
+        for platform in ("cpu", "cuda", "tpu")
+    }
+    # Reverse mode on GPUs is that of the definition.
+    assert found == {"cpu": {"gmem_advance", "gmem_adjoint"}, "cuda": {"gmem_advance"}, "tpu": set()}
+    assert "custom_call @gmem_advance" in lowered(native.march, "cuda")
+
+
+@needs_library
+def test_a_gpu_without_nvrtc_runs_plain_jax_and_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu, "missing", lambda: "NVRTC was not found")
+    gpu.warn_once.cache_clear()
+    with pytest.warns(UserWarning, match=r"plain JAX runs on the GPU.*NVRTC"):
+        program = lowered(native.marcher("auto"), "cuda")
+    assert "custom_call @gmem" not in program
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        lowered(native.marcher("auto"), "cuda")
+    gpu.warn_once.cache_clear()
+    with pytest.raises(NotImplementedError, match="NVRTC was not found"):
+        lowered(native.march, "cuda")
 
 
 @needs_library
 def test_native_is_refused_where_it_cannot_run() -> None:
     with pytest.raises(NotImplementedError, match="backend='auto'"):
-        export.export(jax.jit(derivatives(native.march)), platforms=["cuda"])(MUS, RATES)
+        lowered(native.march, "tpu")
 
 
 @needs_library

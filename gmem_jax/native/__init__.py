@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.extend.backend import get_backend
 
-from gmem_jax.native import calls
+from gmem_jax.native import calls, gpu
 from gmem_jax.native.calls import Arrays, Call, Fixed, Results
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -48,7 +49,7 @@ def _path() -> Path:
 @functools.cache
 def _load() -> tuple[str, str]:
     """Load and register the library, once; returns its instruction set, and why that failed ("" if it did not)."""
-    from gmem_jax.native.build import is_stale  # here, as in `_path`
+    from gmem_jax.native.build import SOURCES, is_stale  # here, as in `_path`
 
     path = _path()
     if not path.exists():
@@ -59,6 +60,7 @@ def _load() -> tuple[str, str]:
             return "", "its library is older than its sources; rebuild it: python -m gmem_jax.native.build"
         for target in calls.TARGETS:
             jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
+        gpu.register(library, SOURCES)
         library.gmem_instruction_set.restype = ctypes.c_char_p
         return library.gmem_instruction_set().decode(), ""
     except (OSError, AttributeError) as error:
@@ -80,7 +82,11 @@ def name(backend: str, law: FrictionLaw) -> str:
     """What "auto" means for this friction law on JAX's default device, "jax" or "native"; others are themselves."""
     if backend != "auto":
         return backend
-    return "native" if available()[0] and supports(law) and jax.default_backend() == "cpu" else "jax"
+    if not available()[0] or not supports(law):
+        return "jax"
+    client = get_backend()
+    on_gpu = client.platform == "gpu" and "cuda" in client.platform_version and not gpu.missing()
+    return "native" if client.platform == "cpu" or on_gpu else "jax"
 
 
 def marcher(backend: str = "auto") -> March:
@@ -88,7 +94,8 @@ def marcher(backend: str = "auto") -> March:
 
     Args:
         backend: "jax", the definition; "native", this library, which is refused where there is none; or "auto": native
-            in what is compiled for CPUs, where the library is at hand and knows the friction law, else plain JAX.
+            in what is compiled for CPUs and CUDA GPUs, where the library is at hand and knows the friction law, else
+            plain JAX.
 
     Raises:
         ValueError: if the backend is unknown or not available.
@@ -116,13 +123,13 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
     Raises:
         ValueError: if the backend is not available, does not know the friction law, or the state is not float64; or if
             an argument does not fit the number of replicas.
-        NotImplementedError: if it is compiled for anything but a CPU.
+        NotImplementedError: if it is compiled for anything but a CPU or a CUDA GPU, or for that without NVRTC.
     """
     return _march(system, state, boxes, dt, drag, anywhere=False)
 
 
 def _march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
-    """`march` on CPUs, its definition elsewhere."""
+    """`march` on CPUs and CUDA GPUs, its definition elsewhere."""
     if not supports(system.friction):
         return dynamics.march(system, state, boxes, dt, drag)
     if not available()[0]:
@@ -180,7 +187,7 @@ def _bin(
         The grains, the history, and the sum over the steps of the wall pressures, [3, B].
     """
     arrays = _arrays(system, grains, history, boxes, numbers)
-    definition = _Definition.of(system, history) if anywhere else None
+    definition = _Definition.of(system, history, anywhere)
     return _result(grains, history, calls.forward(_call(system, history), definition, _fixed(system), arrays))
 
 
@@ -205,7 +212,7 @@ def _bin_jvp(anywhere: bool, primals: tuple[Any, ...], tangents: tuple[Any, ...]
         _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
         return _bin(anywhere, *primals), slope
     arrays, along = jax.jvp(lambda *varied: _arrays(*filled(varied)), varied, directions)
-    definition = _Definition.of(system, history) if anywhere else None
+    definition = _Definition.of(system, history, anywhere)
     change = calls.tangent(_call(system, history), definition, _fixed(system), arrays, along)
     return _bin(anywhere, *primals), _result(primals[1], history, change)
 
@@ -242,14 +249,16 @@ class _Definition:
     Attributes:
         system: structure of the `System`.
         history: structure of the history.
+        anywhere: see `gmem_jax.native.calls.Definition`.
     """
 
     system: Any
     history: Any
+    anywhere: bool = True
 
     @classmethod
-    def of(cls, system: System, history: Any) -> "_Definition":
-        return cls(jax.tree.structure(system), jax.tree.structure(history))
+    def of(cls, system: System, history: Any, anywhere: bool = True) -> "_Definition":
+        return cls(jax.tree.structure(system), jax.tree.structure(history), anywhere)
 
     def __call__(self, fixed: Fixed, arrays: Arrays) -> Results:
         empty: System = jax.tree.unflatten(self.system, [None] * self.system.num_leaves)

@@ -64,7 +64,7 @@ def headers() -> Path:
 
 def source_hash() -> str:
     """What the library would be compiled from: a hash of its sources and flags; "" where the sources are not there."""
-    files = sorted(path for path in SOURCES.rglob("*") if path.suffix in (".cc", ".h"))
+    files = sorted(path for path in SOURCES.rglob("*") if path.suffix in (".cc", ".h", ".cu"))
     if not files:
         return ""
     found = hashlib.sha256(repr((FLAGS, INSTRUCTION_SETS)).encode())
@@ -103,6 +103,8 @@ def build(target: Path) -> None:
     jobs: list[tuple[str, str, tuple[str, ...]]] = [(f"cpu/{name}.cc", f"{name}.o", ()) for name in names]
     stamp = f'-DGMEM_SOURCE_HASH="{source_hash()}"'
     jobs.append(("call/handler.cc", "handler.o", (stamp, "-isystem", str(include))))
+    jobs.append(("cuda/handler.cc", "gpu_handler.o", ("-isystem", str(include))))
+    jobs += [(f"cuda/{name}.cc", f"gpu_{name}.o", (stamp,)) for name in ("compile", "launch")]
     # From the lowest instruction set up: the linker keeps the first copy of what they share, of the standard library.
     for name, flags in sets.items():
         jobs.append(("cpu/kernel.cc", f"{name}.o", (f"-DGMEM_ISA={name}", *flags)))
@@ -129,7 +131,7 @@ def build(target: Path) -> None:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             objects = list(pool.map(compile_one, jobs))
         linked = Path(folder) / LIBRARY
-        run([*cxx, "-shared", "-pthread", *objects, "-o", str(linked)])
+        run([*cxx, "-shared", "-pthread", *objects, "-ldl", "-o", str(linked)])
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(linked, target.with_suffix(".new"))
         target.with_suffix(".new").replace(target)  # atomically: a running process may have the old one loaded

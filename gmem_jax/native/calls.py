@@ -4,7 +4,8 @@ The tangent is a primitive of JAX with a rule for its transpose, so that `jax.jv
 their compositions with `jax.vmap` and `jax.checkpoint` all come out of the two calls. Forward mode runs the steps in
 numbers that carry a derivative; reverse mode redoes them, remembers each step, and goes back (src/cpu/adjoint.h).
 
-Which code runs is settled when a program is lowered: the library on CPUs, the definition in plain JAX elsewhere.
+Which code runs is settled when a program is lowered: the library on CPUs and, forwards, on CUDA GPUs (see `gpu`); the
+definition in plain JAX elsewhere.
 Replicas know nothing of each other, so a call on arrays that are sharded by replicas runs on each device by itself.
 """
 
@@ -12,7 +13,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.sharding import NamedSharding, PartitionSpec
 
+from gmem_jax.native import gpu
 from gmem_jax.physics.step import together
 
 TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint")
@@ -92,21 +94,32 @@ class Results(NamedTuple):
     history: list[jax.Array]
 
 
-Definition = Callable[[Fixed, Arrays], Results]
-"""The same steps in plain JAX, for platforms without a library; hashable, for it is part of a program."""
+class Definition(Protocol):
+    """The same steps in plain JAX, for platforms without a library; hashable, for it is part of a program.
+
+    Attributes:
+        anywhere: whether it may stand in for the library where there could be one.
+    """
+
+    @property
+    def anywhere(self) -> bool:
+        """See above."""
+
+    def __call__(self, fixed: Fixed, arrays: Arrays) -> Results:
+        """The steps."""
 
 
-def forward(call: Call, definition: Definition | None, fixed: Fixed, arrays: Arrays) -> Results:
-    """All steps; not differentiable by itself. Without a definition they run on CPUs only."""
+def forward(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays) -> Results:
+    """All steps; not differentiable by itself."""
     return _results(arrays, _bind(_forward_p, call, definition, fixed, arrays))
 
 
-def tangent(call: Call, definition: Definition | None, fixed: Fixed, arrays: Arrays, along: Arrays) -> Results:
+def tangent(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, along: Arrays) -> Results:
     """The derivative of `forward` along a direction, linear in it."""
     return _results(arrays, _bind(_tangent_p, call, definition, fixed, arrays, along))
 
 
-def _bind(primitive: Primitive, call: Call, definition: Definition | None, *parts: Any) -> list[jax.Array]:
+def _bind(primitive: Primitive, call: Call, definition: Definition, *parts: Any) -> list[jax.Array]:
     leaves, tree = jax.tree.flatten(together(parts))
     found: list[jax.Array] = primitive.bind(*leaves, tree=tree, call=call, definition=definition)
     return found
@@ -251,9 +264,15 @@ def _primitive(
         results = primitive.bind(*moved, **static)
         return results, [0] * len(results)
 
-    def library(context: mlir.LoweringRuleContext, *values: Any, tree: Any, call: Call, **_: Any) -> Any:
+    def library(
+        context: mlir.LoweringRuleContext, *values: Any, tree: Any, call: Call, on_gpu: bool = False, **_: Any
+    ) -> Any:
         def here(*leaves: jax.Array) -> Sequence[jax.Array]:
-            return _library(target, outputs, call, in_place, jax.tree.unflatten(tree, leaves))
+            parts = jax.tree.unflatten(tree, leaves)
+            if on_gpu:
+                shapes = outputs(parts)
+                return gpu.run(target, call, in_place, parts, shapes)[: len(shapes)]
+            return _library(target, outputs, call, in_place, parts)
 
         def shared_out(*leaves: jax.Array) -> Any:
             return _sharded(here, jax.tree.unflatten(tree, leaves), outputs)(*leaves)
@@ -262,17 +281,32 @@ def _primitive(
         alone = getattr(context.module_context.axis_context, "num_devices", None) == 1
         return mlir.lower_fun(here if alone else shared_out, multiple_results=True)(context, *values)
 
-    def elsewhere(*leaves: jax.Array, tree: Any, call: Call, definition: Definition | None) -> Any:
-        if definition is None:
-            raise NotImplementedError("the native backend runs on CPUs; elsewhere use backend='auto' or 'jax'")
+    def elsewhere(*leaves: jax.Array, tree: Any, call: Call, definition: Definition) -> Any:
         parts = jax.tree.unflatten(tree, leaves)
         return jax.tree.leaves(_over(functools.partial(plain, definition), _leading(parts))(*parts))
+
+    in_plain_jax = mlir.lower_fun(elsewhere, multiple_results=True)
+
+    def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
+        if target in gpu.TARGETS and not gpu.missing():
+            return library(context, *values, on_gpu=True, **static)
+        if target in gpu.TARGETS and not definition.anywhere:
+            raise NotImplementedError(f"the native backend does not run on this GPU: {gpu.missing()}")
+        if target in gpu.TARGETS:
+            gpu.warn_once(gpu.missing())
+        return in_plain_jax(context, *values, definition=definition, **static)
+
+    def on_others(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
+        if not definition.anywhere:
+            raise NotImplementedError("the native backend runs on CPUs and CUDA GPUs; use backend='auto' or 'jax'")
+        return in_plain_jax(context, *values, definition=definition, **static)
 
     primitive.def_impl(jax.jit(primitive.bind, static_argnames=("tree", "call", "definition")))
     primitive.def_abstract_eval(abstract)
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, library, platform="cpu")
-    mlir.register_lowering(primitive, mlir.lower_fun(elsewhere, multiple_results=True))
+    mlir.register_lowering(primitive, on_cuda, platform="cuda")
+    mlir.register_lowering(primitive, on_others)
     # `custom_partitioning` wants to know the devices, and JAX has no public name for saying so.
     dispatch.prim_requires_devices_during_lowering.add(primitive)
     return primitive
@@ -312,9 +346,7 @@ _tangent_p = _primitive("gmem_tangent", _of_results, _plain_tangent)
 _adjoint_p = _primitive("gmem_adjoint", _of_arrays, _plain_adjoint)
 
 
-def _transpose(
-    slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition | None
-) -> list[Any]:
+def _transpose(slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition) -> list[Any]:
     """From derivatives by the results to derivatives by what the tangent was linear in."""
     fixed, arrays, _ = jax.tree.unflatten(tree, arguments)
     known = len(jax.tree.leaves((fixed, arrays)))

@@ -15,7 +15,7 @@
 #include <string>
 #include <vector>
 
-#include "call/arguments.h"
+#include "call/signature.h"
 #include "cpu/blocks.h"
 #include "cpu/plan.h"
 #include "cpu/problem.h"
@@ -55,24 +55,6 @@ const Kernel& best_kernel(Task task) {
 enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kOffsets, kParameterRows, kWallRows, kHistoryIn };
 constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
 
-// Axes are grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
-// Mindlin's points Q, replicas B.
-using Wants = std::vector<Wanted>;
-
-Wants operator+(Wants one, const Wants& other) {
-  one.insert(one.end(), other.begin(), other.end());
-  return one;
-}
-
-Wants histories(Law law) {
-  switch (law) {
-    case Law::hooke: return {{"forces", "P3B"}};
-    case Law::mindlin_rescaled: return {{"forces", "P3B"}, {"overlaps", "P1B"}};
-    case Law::mindlin: return {{"layers", "PQ3B"}, {"overlaps", "P1B"}};
-    default: return {};
-  }
-}
-
 struct Signature {
   Wants arguments, results;
 };
@@ -81,14 +63,12 @@ struct Signature {
 // results' or arguments' own; see `Task`.
 // gmem_jax/native/calls.py: _library, _of_results, _of_arrays
 Signature signature(Task task, Law law) {
-  const Wants fields = {{"positions", "N3B"}, {"quaternions", "N4B"},   {"velocities", "N3B"},
-                        {"spins", "N3B"},     {"accelerations", "N3B"}, {"spin rates", "N3B"}};
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
                       {"validities", "P", ffi::PRED},   {"reference centres", "S3"},
                       {"smallest lengths", "3"},        {"offsets", "K3"}};
-  const Wants numbers = {{"parameters", "RB"}, {"walls", "TWB"}};
-  const Wants history = histories(law), arguments = fields + pack + numbers + history;
-  const Wants arrays = fields + numbers + history, moved = fields + Wants{{"pressures", "3B"}} + history;
+  const Wants fields = fields_of_grains(), numbers = numbers_of_steps(), history = histories(law);
+  const Wants arguments = fields + pack + numbers + history, arrays = fields + numbers + history;
+  const Wants moved = fields + pressures() + history;
   switch (task) {
     case Task::tangent: return {arguments + arrays, moved};
     case Task::adjoint: return {arguments + moved, arrays};
@@ -98,15 +78,12 @@ Signature signature(Task task, Law law) {
 
 ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
                 ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  require(0 <= law && law <= static_cast<int64_t>(Law::mindlin), "no friction law has number " + std::to_string(law));
-  require(0 <= variant && variant <= static_cast<int64_t>(Variant::paper),
-          "no variant of the Mindlin law has number " + std::to_string(variant));
+  require_law(law, variant, points);
   Problem problem{};
   problem.task = task;
   problem.law = static_cast<Law>(law);
   problem.variant = static_cast<Variant>(variant);
   problem.isotropic = isotropic != 0;
-  require(problem.law != Law::mindlin || points >= 2, "the Mindlin law needs two points or more");
   const Signature wanted = signature(task, problem.law);
   require(static_cast<std::size_t>(leaves) == histories(problem.law).size() && args.size() == wanted.arguments.size() &&
               rets.size() == wanted.results.size(),
@@ -215,18 +192,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 template <Task task>
 ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
                   ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  const auto error = [](ffi::ErrorCode code, const char* what) {
-    return ffi::Error(code, std::string("gmem_jax native: ") + what);
-  };
-  try {
-    return call(task, law, variant, points, isotropic, leaves, args, rets);
-  } catch (const std::invalid_argument& wrong) {
-    return error(ffi::ErrorCode::kInvalidArgument, wrong.what());
-  } catch (const std::bad_alloc&) {
-    return error(ffi::ErrorCode::kResourceExhausted, "out of memory; use fewer replicas");
-  } catch (const std::exception& other) {
-    return error(ffi::ErrorCode::kInternal, other.what());
-  }
+  return in_words([&] { return call(task, law, variant, points, isotropic, leaves, args, rets); });
 }
 
 auto binding() {

@@ -12,14 +12,7 @@
 
 namespace gmem {
 
-constexpr int kFields = 6;  // position, quaternion, velocity, spin, acceleration, spin rate
-constexpr int kWalls = 12;  // lower, upper, lower velocity, upper velocity
-constexpr int kMaxHistory = 2;
 constexpr int kMaxWidth = 8;
-
-// What is wanted: all steps; their derivative along a direction; or, back from derivatives by all results, those by all
-// arguments.
-enum class Task { forward, tangent, adjoint };
 
 // Sizes common to all replicas, and what they run.
 struct Problem {

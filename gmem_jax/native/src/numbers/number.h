@@ -8,3 +8,16 @@
 #if !defined(__CUDACC__) && !defined(__CUDACC_RTC__)
 #include "numbers/simd.h"
 #endif
+
+namespace gmem {
+namespace GMEM_ISA {
+
+// How many chains of operations that wait for nothing of each other are taken along together; a GPU has threads for it.
+#if defined(__CUDA_ARCH__)
+constexpr int kTogether = 1;
+#else
+constexpr int kTogether = 8;
+#endif
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

@@ -214,7 +214,7 @@ void friction(Layered<variant>, Contact<V>& c, const LawParameters<V>& law, Runs
 
   const TransportOfMany<V> transport(c);
   const Vec<V> half_step = law.half_step * c.sliding;
-  constexpr int kRuns = 8;  // taken along together, for the same reason as contacts
+  constexpr int kRuns = kTogether;
   Run<V> run[kRuns];
   V squared[kRuns], product[kRuns], inverse[kRuns];
   Vec<V> sum{};

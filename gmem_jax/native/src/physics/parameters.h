@@ -1,8 +1,16 @@
-// The contact laws by name and by type, and the rows in which their parameters come.
+// What a call is asked to do, the contact laws by name and by type, and the rows in which their parameters come.
 
 #pragma once
 
 namespace gmem {
+
+constexpr int kFields = 6;  // position, quaternion, velocity, spin, acceleration, spin rate
+constexpr int kWalls = 12;  // lower, upper, lower velocity, upper velocity
+constexpr int kMaxHistory = 2;
+
+// What is wanted: all steps; their derivative along a direction; or, back from derivatives by all results, those by all
+// arguments.
+enum class Task { forward, tangent, adjoint };
 
 // In the order of
 // gmem_jax/physics/contact/laws.py: LAWS

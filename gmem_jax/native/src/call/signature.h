@@ -1,0 +1,67 @@
+// What every platform's handler asks of a call, and what it says when that is not met.
+
+#pragma once
+
+#include <cstdint>
+#include <exception>
+#include <new>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "call/arguments.h"
+#include "physics/parameters.h"
+
+namespace gmem {
+
+// Axes are grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
+// Mindlin's points Q, replicas B.
+using Wants = std::vector<Wanted>;
+
+inline Wants operator+(Wants one, const Wants& other) {
+  one.insert(one.end(), other.begin(), other.end());
+  return one;
+}
+
+inline Wants histories(Law law) {
+  switch (law) {
+    case Law::hooke: return {{"forces", "P3B"}};
+    case Law::mindlin_rescaled: return {{"forces", "P3B"}, {"overlaps", "P1B"}};
+    case Law::mindlin: return {{"layers", "PQ3B"}, {"overlaps", "P1B"}};
+    default: return {};
+  }
+}
+
+inline Wants fields_of_grains() {
+  return {{"positions", "N3B"}, {"quaternions", "N4B"},   {"velocities", "N3B"},
+          {"spins", "N3B"},     {"accelerations", "N3B"}, {"spin rates", "N3B"}};
+}
+inline Wants numbers_of_steps() { return {{"parameters", "RB"}, {"walls", "TWB"}}; }
+inline Wants pressures() { return {{"pressures", "3B"}}; }
+
+inline void require_law(int64_t law, int64_t variant, int64_t points) {
+  require(0 <= law && law <= static_cast<int64_t>(Law::mindlin), "no friction law has number " + std::to_string(law));
+  require(0 <= variant && variant <= static_cast<int64_t>(Variant::paper),
+          "no variant of the Mindlin law has number " + std::to_string(variant));
+  require(static_cast<Law>(law) != Law::mindlin || points >= 2, "the Mindlin law needs two points or more");
+}
+
+// What `call` gives, its exceptions as errors of XLA.
+template <class Call>
+xla::ffi::Error in_words(const Call& call) {
+  using xla::ffi::ErrorCode;
+  const auto error = [](ErrorCode code, const char* what) {
+    return xla::ffi::Error(code, std::string("gmem_jax native: ") + what);
+  };
+  try {
+    return call();
+  } catch (const std::invalid_argument& wrong) {
+    return error(ErrorCode::kInvalidArgument, wrong.what());
+  } catch (const std::bad_alloc&) {
+    return error(ErrorCode::kResourceExhausted, "out of memory; use fewer replicas");
+  } catch (const std::exception& other) {
+    return error(ErrorCode::kInternal, other.what());
+  }
+}
+
+}  // namespace gmem

@@ -1,0 +1,166 @@
+#include "cuda/compile.h"
+
+#include <dlfcn.h>
+#include <unistd.h>
+
+#include <cstdio>
+#include <fstream>
+#include <iterator>
+#include <mutex>
+#include <sstream>
+#include <stdexcept>
+#include <type_traits>
+#include <vector>
+
+namespace gmem {
+namespace cuda {
+
+namespace {
+
+// Where things lie, as Python says.
+struct Paths {
+  std::string nvrtc, sources, cache;
+};
+
+Paths& paths() {
+  static Paths known;
+  return known;
+}
+
+using Program = void*;
+
+// NVRTC, as far as it is used.
+struct Nvrtc {
+  int (*version)(int*, int*);
+  int (*create)(Program*, const char*, const char*, int, const char* const*, const char* const*);
+  int (*compile)(Program, int, const char* const*);
+  int (*log_size)(Program, std::size_t*);
+  int (*log)(Program, char*);
+  int (*code_size)(Program, std::size_t*);
+  int (*code)(Program, char*);
+  int (*destroy)(Program*);
+
+  Nvrtc() {
+    void* library = open_library(paths().nvrtc, "pip install 'gmem-jax[cuda13]'");
+    const auto find = [library](auto& function, const char* name) {
+      function = reinterpret_cast<std::remove_reference_t<decltype(function)>>(symbol_of(library, name));
+    };
+    find(version, "nvrtcVersion");
+    find(create, "nvrtcCreateProgram");
+    find(compile, "nvrtcCompileProgram");
+    find(log_size, "nvrtcGetProgramLogSize");
+    find(log, "nvrtcGetProgramLog");
+    find(code_size, "nvrtcGetCUBINSize");
+    find(code, "nvrtcGetCUBIN");
+    find(destroy, "nvrtcDestroyProgram");
+  }
+};
+
+std::string contents(const std::string& path) {
+  std::ifstream file(path, std::ios::binary);
+  return {std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>()};
+}
+
+// A file that is there is whole. One that cannot be kept is compiled again next time.
+void keep(const std::string& path, const std::string& code) {
+  if (paths().cache.empty()) return;
+  const std::string unfinished = path + "." + std::to_string(getpid());
+  std::ofstream file(unfinished, std::ios::binary);
+  file.write(code.data(), static_cast<std::streamsize>(code.size()));
+  file.close();
+  if (!file || std::rename(unfinished.c_str(), path.c_str()) != 0) std::remove(unfinished.c_str());
+}
+
+std::string law_as_type(const Which& which) {
+  static const char* const variants[] = {"exact", "averaged", "paper"};
+  switch (which.law) {
+    case Law::hooke: return "Hooke";
+    case Law::mindlin_rescaled: return "Rescaled";
+    case Law::mindlin: return std::string("Layered<Variant::") + variants[static_cast<int>(which.variant)] + ">";
+    default: return "Frictionless";
+  }
+}
+
+std::string compiled(const Nvrtc& nvrtc, const std::string& architecture, const Which& which, std::string* log) {
+  const std::string source = contents(paths().sources + "/cuda/kernel.cu");
+  if (source.empty()) throw std::runtime_error("the sources of the GPU's kernels are not in " + paths().sources);
+  std::vector<std::string> options = {
+      "--gpu-architecture=" + architecture, "--std=c++17", "--device-as-default-execution-space",
+      "--fmad=false",  // as on CPUs: a fused multiply-add is where the sources say so
+      "-I" + paths().sources, "-DGMEM_ISA=gpu", "-DGMEM_BLOCK=" + std::to_string(kBlock), "-DGMEM_LAW=" + law_as_type(which),
+      std::string("-DGMEM_NUMBER=") + (which.task == Task::forward ? "double" : "Dual<double>")};
+  if (log) options.emplace_back("--ptxas-options=-v");
+  std::vector<const char*> words;
+  for (const std::string& option : options) words.push_back(option.c_str());
+  Program program = nullptr;
+  if (nvrtc.create(&program, source.c_str(), "kernel.cu", 0, nullptr, nullptr) != 0)
+    throw std::runtime_error("NVRTC failed");
+  const int failed = nvrtc.compile(program, static_cast<int>(words.size()), words.data());
+  const auto text = [program](auto size_of, auto get) {
+    std::size_t size = 0;
+    size_of(program, &size);
+    std::string found(size, '\0');
+    get(program, &found[0]);
+    return found;
+  };
+  const std::string said = text(nvrtc.log_size, nvrtc.log), code = failed ? "" : text(nvrtc.code_size, nvrtc.code);
+  nvrtc.destroy(&program);
+  if (log) *log = said;
+  if (failed) throw std::runtime_error("NVRTC does not compile the kernels for " + architecture + ": " + said.substr(0, said.find('\n')));
+  return code;
+}
+
+}  // namespace
+
+void* open_library(const std::string& names, const std::string& help) {
+  std::istringstream each(names);
+  for (std::string name; std::getline(each, name, ':');)
+    if (void* library = dlopen(name.c_str(), RTLD_NOW)) return library;
+  throw std::runtime_error(names.substr(0, names.find(':')) + " could not be loaded; " + help);
+}
+
+void* symbol_of(void* library, const char* name) {
+  if (void* symbol = dlsym(library, name)) return symbol;
+  throw std::runtime_error(std::string("the CUDA libraries here are too old: they have no ") + name);
+}
+
+std::string code_for(const std::string& architecture, const Which& which, std::string* log) {
+  static std::mutex one_at_a_time;
+  const std::lock_guard<std::mutex> lock(one_at_a_time);
+  static const Nvrtc nvrtc;
+  int major = 0, minor = 0;
+  nvrtc.version(&major, &minor);
+  const std::string path = paths().cache + "/" + GMEM_SOURCE_HASH + "-" + architecture + "-nvrtc" + std::to_string(major) +
+                           "." + std::to_string(minor) + "-law" + std::to_string(static_cast<int>(which.law)) +
+                           std::to_string(static_cast<int>(which.variant)) +
+                           (which.task == Task::forward ? "" : "-tangent") + ".cubin";
+  std::string code = log || paths().cache.empty() ? "" : contents(path);
+  if (code.empty()) {
+    code = compiled(nvrtc, architecture, which, log);
+    keep(path, code);
+  }
+  return code;
+}
+
+}  // namespace cuda
+}  // namespace gmem
+
+// Where NVRTC (see `open_library`), the sources and the folder for compiled kernels are.
+extern "C" void gmem_cuda_paths(const char* nvrtc, const char* sources, const char* cache) {
+  gmem::cuda::paths() = {nvrtc, sources, cache};
+}
+
+// For a test: 0 if the kernels compile; what the assembler says of them, or why they do not, in `said`.
+extern "C" int gmem_cuda_compile(const char* architecture, int law, int variant, int tangent, char* said, int size) {
+  std::string log;
+  int failed = 0;
+  try {
+    const auto task = tangent ? gmem::Task::tangent : gmem::Task::forward;
+    gmem::cuda::code_for(architecture, {static_cast<gmem::Law>(law), static_cast<gmem::Variant>(variant), task}, &log);
+  } catch (const std::exception& error) {
+    log = error.what();
+    failed = 1;
+  }
+  std::snprintf(said, static_cast<std::size_t>(size), "%s", log.c_str());
+  return failed;
+}

@@ -1,0 +1,121 @@
+// The driver is opened while the program runs, so that the library loads where there is none.
+
+#include "cuda/launch.h"
+
+#include <array>
+#include <map>
+#include <mutex>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <type_traits>
+
+namespace gmem {
+namespace cuda {
+
+namespace {
+
+using Handle = void*;  // the driver's contexts, modules, functions and streams
+using Kernels = std::array<Handle, 4>;
+constexpr const char* kNames[] = {"enter", "advance", "collect", "leave"};
+constexpr int kRelaxed = 2, kMajor = 75, kMinor = 76;  // of cuda.h
+
+struct Driver {
+  int (*context_of)(Handle, Handle*);
+  int (*push)(Handle);
+  int (*pop)(Handle*);
+  int (*device_of)(int*);
+  int (*attribute)(int*, int, int);
+  int (*load)(Handle*, const void*);
+  int (*function)(Handle*, Handle, const char*);
+  int (*launch)(Handle, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, Handle, void**, void**);
+  int (*exchange_mode)(int*);
+  int (*describe)(int, const char**);
+
+  Driver() {
+    void* library = open_library("libcuda.so.1", "is there a driver for the GPU?");
+    const auto find = [library](auto& function, const char* name) {
+      function = reinterpret_cast<std::remove_reference_t<decltype(function)>>(symbol_of(library, name));
+    };
+    find(context_of, "cuStreamGetCtx");
+    find(push, "cuCtxPushCurrent_v2");
+    find(pop, "cuCtxPopCurrent_v2");
+    find(device_of, "cuCtxGetDevice");
+    find(attribute, "cuDeviceGetAttribute");
+    find(load, "cuModuleLoadData");
+    find(function, "cuModuleGetFunction");
+    find(launch, "cuLaunchKernel");
+    find(exchange_mode, "cuThreadExchangeStreamCaptureMode");
+    find(describe, "cuGetErrorString");
+  }
+
+  void must(int result, const char* what) const {
+    const char* why = nullptr;
+    if (result != 0 && (describe(result, &why) != 0 || !why)) why = "unknown";
+    if (result != 0) throw std::runtime_error(std::string("the GPU's driver: ") + what + ": " + why);
+  }
+};
+
+const Driver& driver() {
+  static const Driver only;
+  return only;
+}
+
+// The kernels in the current context; kept until the process ends.
+const Kernels* kernels_of(Handle context, const Which& which) {
+  static std::mutex mutex;
+  static std::map<std::tuple<Handle, Law, Variant, Task>, Kernels> known;
+  const std::lock_guard<std::mutex> lock(mutex);
+  const auto key = std::make_tuple(context, which.law, which.variant, which.task);
+  const auto found = known.find(key);
+  if (found != known.end()) return &found->second;
+  const Driver& d = driver();
+  int device = 0, major = 0, minor = 0;
+  d.must(d.device_of(&device), "which device");
+  d.must(d.attribute(&major, kMajor, device), "which architecture");
+  d.must(d.attribute(&minor, kMinor, device), "which architecture");
+  const std::string code = code_for("sm_" + std::to_string(major) + std::to_string(minor), which);
+  // The stream may be on its way into a graph: loading is no part of that.
+  int mode = kRelaxed;
+  d.must(d.exchange_mode(&mode), "mode of capture");
+  Handle module = nullptr;
+  Kernels kernels{};
+  const int loaded = d.load(&module, code.data());
+  int got = loaded;
+  for (std::size_t i = 0; i < kernels.size() && got == 0; ++i) got = d.function(&kernels[i], module, kNames[i]);
+  d.exchange_mode(&mode);
+  d.must(got, "loading the kernels");
+  return &known.emplace(key, kernels).first->second;
+}
+
+}  // namespace
+
+Launcher::Launcher(void* stream, const Which& which) : stream_(stream) {
+  const Driver& d = driver();
+  Handle context = nullptr;
+  d.must(d.context_of(stream, &context), "context of the stream");
+  d.must(d.push(context), "context");
+  try {
+    kernels_ = kernels_of(context, which);
+  } catch (...) {
+    d.pop(&context);
+    throw;
+  }
+}
+
+Launcher::~Launcher() {
+  Handle context = nullptr;
+  driver().pop(&context);
+}
+
+void Launcher::operator()(Kernel kernel, int threads, const Arguments& arguments, int step) const {
+  if (threads == 0) return;
+  const Driver& d = driver();
+  void* parameters[] = {const_cast<Arguments*>(&arguments), &step};
+  const Handle function = (*static_cast<const Kernels*>(kernels_))[static_cast<std::size_t>(kernel)];
+  const unsigned blocks = (static_cast<unsigned>(threads) + kBlock - 1) / kBlock;
+  d.must(d.launch(function, blocks, 1, 1, kBlock, 1, 1, 0, stream_, parameters, nullptr), "launch");
+}
+
+}  // namespace cuda
+}  // namespace gmem

@@ -1,0 +1,307 @@
+// The time step on a GPU: a thread is one grain of one lane.
+//
+// `advance` is one step and one launch: the contacts of the grain, the end of this step, the beginning of the next. Both
+// grains of a contact compute it, each with its own copy of the history and in the listed order, so that they get the
+// same bits, nothing races, and forces are summed in an order of their own. `enter` and `leave` copy from and to the
+// arrays of the call. For V = double, or numbers that carry a derivative, whose results are the derivatives alone.
+
+#pragma once
+
+#include "cuda/arguments.h"
+#include "numbers/dual.h"
+#include "physics/contact.h"
+#include "physics/motion.h"
+
+namespace gmem {
+namespace GMEM_ISA {
+
+using cuda::Arguments;
+using cuda::kChunk;
+using cuda::Side;
+using cuda::Table;
+
+// The numbers of one lane in a table.
+template <class V>
+struct Column {
+  double* value;
+  double* slope;
+  long long stride;
+
+  V operator[](long long row) const {
+    if constexpr (__is_class(V)) {
+      return {value[row * stride], slope[row * stride]};
+    } else {
+      return value[row * stride];
+    }
+  }
+  void put(long long row, V a) const {
+    if constexpr (__is_class(V)) {
+      value[row * stride] = a.value, slope[row * stride] = a.slope;
+    } else {
+      value[row * stride] = a;
+    }
+  }
+  Vec<V> vec(long long row) const { return {(*this)[row], (*this)[row + 1], (*this)[row + 2]}; }
+  void put(long long row, Vec<V> a) const { put(row, a.x), put(row + 1, a.y), put(row + 2, a.z); }
+};
+
+inline double result(double a) { return a; }
+inline double result(Dual<double> a) { return a.slope; }
+inline bool is_zero(double a) { return a == 0.0; }
+inline bool is_zero(Dual<double> a) { return a.value == 0.0 && a.slope == 0.0; }
+
+template <class V>
+struct Lane {
+  const Arguments& a;
+  int lane, entry, replica;
+
+  Lane(const Arguments& a, int lane) : a(a), lane(lane), entry(lane / a.replicas), replica(lane % a.replicas) {}
+
+  Column<V> in(const Table& t) const {
+    return {t.value.of(entry) + replica, __is_class(V) ? t.slope.of(entry) + replica : nullptr, t.stride};
+  }
+  Column<double> out(const Table& t) const { return {t.value.of(entry) + replica, nullptr, t.stride}; }
+
+  WallState<V> walls(int step) const {
+    const Column<V> w = in(a.walls);
+    const long long row = static_cast<long long>(step) * kWalls;
+    return {w.vec(row), w.vec(row + 3), w.vec(row + 6), w.vec(row + 9)};
+  }
+
+  // The last layer that an overlap fills, and one more: its root may differ from JAX's in the last digit.
+  int layer_of(double overlap, double spacing) const {
+    if (!(overlap > 0.0)) return -1;
+    const double last = a.points - 1.0, filled = root(overlap) / spacing + 1.0;
+    return static_cast<int>(filled < last ? filled : last);
+  }
+};
+
+// Where number `q` of a contact's history lies in the call: leaf 0 is the force (or the layers), leaf 1 the overlap.
+template <class Law>
+struct Place {
+  int leaf;
+  long long row;
+
+  Place(long long row, int q)
+      : leaf(q < Law::kVectors ? 0 : 1), row(q < Law::kVectors ? row * Law::kVectors + q : row) {}
+};
+
+// The layers of one side, in one lane.
+template <class V>
+struct Layers {
+  Column<V> at;
+  long long first;  // row of the first
+  int* last;
+  int count;
+
+  int points() const { return count; }
+  Vec<V> get(int j) const { return j <= *last ? stored(j) : Vec<V>{}; }
+  Vec<V> stored(int j) const { return at.vec(first + 3 * j); }
+  void set(int j, Vec<V> f) const { at.put(first + 3 * j, f); }
+  void keep(int kept) const { *last = kept - 1; }
+};
+
+template <class V>
+Layers<V> layers_of(const Lane<V>& on, long long side) {
+  const Arguments& a = on.a;
+  return {on.in(a.layers), side * a.points * 3, a.reached + side * a.lanes + on.lane, a.points};
+}
+
+// Begins a step whose numbers go to side `next` of the double tables.
+template <class V>
+GMEM_INLINE void begin(const Lane<V>& on, int grain, const GrainParameters<V>& constants, const Grain<V>& from, int next) {
+  const Arguments& a = on.a;
+  const Midway<V> m = begin_step(constants, from);
+  const Column<V> hot = on.in(a.hot[next]), cold = on.in(a.cold), sphere = on.in(a.sphere[next]);
+  const long long h = grain * 9ll, c = grain * 10ll;
+  hot.put(h, m.position), hot.put(h + 3, m.velocity), hot.put(h + 6, m.spin);
+  cold.put(c, m.orientation.w), cold.put(c + 1, m.orientation.v);
+  cold.put(c + 4, m.half_velocity), cold.put(c + 7, m.half_spin);
+  const Matrix<V> rotation = matrix(m.orientation);
+  for (int k = 0; k < a.spheres; ++k) {
+    const double* body = a.offsets.of(on.entry) + 3 * k;
+    const Vec<V> lever = rotation * Vec<V>{splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])};
+    sphere.put(3 * (static_cast<long long>(grain) * a.spheres + k), m.position + lever);
+  }
+}
+
+template <class V>
+inline void deliver(const Lane<V>& on, int grain, const Grain<V>& g) {
+  const V number[kFields][4] = {{g.position.x, g.position.y, g.position.z},
+                                {g.orientation.w, g.orientation.v.x, g.orientation.v.y, g.orientation.v.z},
+                                {g.velocity.x, g.velocity.y, g.velocity.z},
+                                {g.spin.x, g.spin.y, g.spin.z},
+                                {g.acceleration.x, g.acceleration.y, g.acceleration.z},
+                                {g.spin_rate.x, g.spin_rate.y, g.spin_rate.z}};
+  for (int f = 0; f < kFields; ++f) {
+    const int size = f == 1 ? 4 : 3;
+    for (int q = 0; q < size; ++q) on.out(on.a.grains_out[f]).put(static_cast<long long>(grain) * size + q, result(number[f][q]));
+  }
+}
+
+template <class V>
+GrainParameters<V> read_parameters(const Lane<V>& on, V* parameter) {
+  for (int row = 0; row < kParameters; ++row) parameter[row] = on.in(on.a.parameters)[row];
+  return GrainParameters<V>(parameter);
+}
+
+// From the arrays of the call. Thread of grain and lane.
+template <class V, class Law>
+void enter(const Arguments& a, int thread) {
+  if (thread >= a.grains * a.lanes) return;
+  const Lane<V> on(a, thread % a.lanes);
+  const int grain = thread / a.lanes;
+  V parameter[kParameters];
+  const GrainParameters<V> constants = read_parameters(on, parameter);
+  const auto field = [&](int f) { return on.in(a.grains_in[f]).vec(grain * 3ll); };
+  const Column<V> q = on.in(a.grains_in[1]);
+  const Grain<V> from{field(0), {q[grain * 4ll], q.vec(grain * 4ll + 1)}, field(2), field(3), field(4), field(5)};
+  for (int side = a.start.of(on.entry)[grain]; side < a.start.of(on.entry)[grain + 1]; ++side) {
+    const int row = a.side.of(on.entry)[side].row;
+    const Column<V> history = on.in(a.history);
+    for (int n = 0; n < Law::kHistory; ++n) {
+      const Place<Law> place(row, n);
+      history.put(side * static_cast<long long>(Law::kHistory) + n, on.in(a.history_in[place.leaf])[place.row]);
+    }
+    if constexpr (Law::kLayered) {
+      const Layers<V> layers = layers_of(on, side);
+      *layers.last = on.layer_of(history.value[side * history.stride], on.in(a.parameters).value[(kLaw + 3) * a.parameters.stride]);
+      for (int j = 0; j <= *layers.last; ++j)
+        layers.set(j, on.in(a.history_in[0]).vec(3 * (static_cast<long long>(row) * a.points + j)));
+    }
+  }
+  on.in(a.pressure).put(grain * 3ll, Vec<V>{});
+  if (a.steps == 0) return deliver(on, grain, from);
+  begin(on, grain, constants, from, 0);
+}
+
+// What a side does to its grain.
+template <class V>
+struct Load {
+  Vec<V> force, torque;
+};
+
+// The contact of one side, which touches.
+template <class V, class Law>
+GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side& side, const Midway<V>& own, Vec<V> here,
+                       Vec<V> there, const V* parameter, const LawParameters<V>& law, Load<V>& load) {
+  const Arguments& a = on.a;
+  const bool first = side.other >= 0;
+  const int other = (first ? side.other : ~side.other) / a.spheres;
+  const Column<V> theirs = on.in(a.hot[now]), stored = on.in(a.history);
+  const Vec<V> position = theirs.vec(other * 9ll), velocity = theirs.vec(other * 9ll + 3), spin = theirs.vec(other * 9ll + 6);
+  const Vec<V> gap = there - here, point = splat<V>(0.5) * (here + there);
+  // As listed: from the first sphere to the second.
+  const auto pick = [first](Vec<V> one, Vec<V> two) {
+    return Vec<V>{select(first, one.x, two.x), select(first, one.y, two.y), select(first, one.z, two.z)};
+  };
+  const Meeting<V> meeting{pick(gap, -gap),
+                           pick(point - own.position, point - position),
+                           pick(point - position, point - own.position),
+                           pick(velocity - own.velocity, own.velocity - velocity),
+                           pick(own.spin, spin),
+                           pick(spin, own.spin)};
+  V history[Law::kHistory + 1];
+  for (int n = 0; n < Law::kHistory; ++n) history[n] = stored[number * Law::kHistory + n];
+  Contact<V> contact;
+  meet(meeting, dot(gap, gap), contact);
+  contact.history = history;
+  close(&contact, 1, parameter);
+  if constexpr (Law::kLayered) {
+    friction(Law{}, contact, law, layers_of(on, number));
+  } else {
+    friction(Law{}, &contact, 1, law);
+  }
+  for (int n = 0; n < Law::kHistory; ++n) stored.put(number * Law::kHistory + n, history[n]);
+  const Push<V> p = push(contact);
+  load.force = load.force + pick(p.force, -p.force);
+  load.torque = load.torque + pick(p.torque_one, p.torque_other);
+}
+
+// A side whose spheres are apart has nothing to remember.
+template <class V, class Law>
+inline void forget(const Lane<V>& on, long long number) {
+  const Column<V> stored = on.in(on.a.history);
+  for (int n = 0; n < Law::kHistory; ++n)
+    if (!is_zero(stored[number * Law::kHistory + n])) stored.put(number * Law::kHistory + n, V{});
+  if constexpr (Law::kLayered) layers_of(on, number).keep(0);
+}
+
+// One step. Thread of grain and lane.
+template <class V, class Law>
+void advance(const Arguments& a, int step, int thread) {
+  if (thread >= a.grains * a.lanes) return;
+  const Lane<V> on(a, thread % a.lanes);
+  const int grain = thread / a.lanes, now = step & 1;
+  V parameter[kParameters];
+  const GrainParameters<V> constants = read_parameters(on, parameter);
+  const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
+  const Column<V> hot = on.in(a.hot[now]), cold = on.in(a.cold), sphere = on.in(a.sphere[now]);
+  const long long h = grain * 9ll, c = grain * 10ll;
+  Midway<V> own{hot.vec(h), {}, hot.vec(h + 3), hot.vec(h + 6), {}, {}};
+  Load<V> load{};
+  const int end = a.start.of(on.entry)[grain + 1];
+  for (int number = a.start.of(on.entry)[grain]; number < end; ++number) {
+    const Side side = a.side.of(on.entry)[number];
+    const Vec<V> here = sphere.vec(side.mine * 3ll);
+    const Vec<V> there = sphere.vec((side.other >= 0 ? side.other : ~side.other) * 3ll);
+    const Vec<V> gap = there - here;
+    if (bits_less(dot(gap, gap), splat<V>(4.0))) {
+      touch<V, Law>(on, now, number, side, own, here, there, parameter, law, load);
+    } else {
+      forget<V, Law>(on, number);
+    }
+  }
+  own.orientation = {cold[c], cold.vec(c + 1)};
+  own.half_velocity = cold.vec(c + 4), own.half_spin = cold.vec(c + 7);
+  const WallState<V> box = on.walls(step);
+  WallForces<V> walls{};
+  if (spheres_of(constants, own, a.offsets.of(on.entry), a.spheres, *a.arm.of(on.entry), box, walls, [](int, Vec<V>) {})) {
+    const Column<V> sum = on.in(a.pressure);
+    sum.put(grain * 3ll, sum.vec(grain * 3ll) + pressure(box, walls.lower + walls.upper));
+  }
+  const Grain<V> after = end_step(constants, a.isotropic, own, load.force + walls.force, load.torque + walls.torque);
+  if (step + 1 == a.steps) return deliver(on, grain, after);
+  begin(on, grain, constants, after, 1 - now);
+}
+
+// Sums of pressures over a chunk of grains, in the place of its first. Thread of chunk, axis and lane.
+template <class V>
+void collect(const Arguments& a, int thread) {
+  const int axis = thread / a.lanes % 3, first = thread / (3 * a.lanes) * kChunk;
+  if (first >= a.grains) return;
+  const Column<V> sum = Lane<V>(a, thread % a.lanes).in(a.pressure);
+  const int end = first + kChunk < a.grains ? first + kChunk : a.grains;
+  V total{};
+  for (int grain = first; grain < end; ++grain) total = total + sum[grain * 3ll + axis];
+  sum.put(first * 3ll + axis, total);
+}
+
+// Histories and pressures to the arrays of the call. Thread of row and lane; the first also of axis and lane.
+template <class V, class Law>
+void leave(const Arguments& a, int thread) {
+  const Lane<V> on(a, thread % a.lanes);
+  const int row = thread / a.lanes;
+  if (row < 3) {
+    V total{};
+    for (int grain = 0; grain < a.grains; grain += kChunk) total = total + on.in(a.pressure)[grain * 3ll + row];
+    on.out(a.pressure_out).put(row, result(total));
+  }
+  if (row >= a.rows) return;
+  const long long side = a.place.of(on.entry)[row];
+  for (int n = 0; n < Law::kHistory; ++n) {
+    const Place<Law> place(row, n);
+    const V number = side < 0 ? V{} : on.in(a.history)[side * Law::kHistory + n];
+    on.out(a.history_out[place.leaf]).put(place.row, result(number));
+  }
+  if constexpr (Law::kLayered) {
+    const Column<double> out = on.out(a.history_out[0]);
+    for (int j = 0; j < a.points; ++j) {
+      const Vec<V> f = side < 0 ? Vec<V>{} : layers_of(on, side).get(j);
+      out.put(3 * (static_cast<long long>(row) * a.points + j), Vec<double>{result(f.x), result(f.y), result(f.z)});
+    }
+  }
+}
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

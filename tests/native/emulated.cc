@@ -1,0 +1,75 @@
+// The GPU's half of the library on a CPU: the same handler and the same kernels, a launch being a loop over threads.
+
+#include "cuda/handler.cc"
+#include "cuda/step.h"
+
+namespace gmem {
+namespace cuda {
+
+namespace {
+
+template <class Function>
+void with_law(const Which& which, const Function& function) {
+  switch (which.law) {
+    case Law::hooke: return function(Hooke{});
+    case Law::mindlin_rescaled: return function(Rescaled{});
+    case Law::mindlin:
+      switch (which.variant) {
+        case Variant::averaged: return function(Layered<Variant::averaged>{});
+        case Variant::paper: return function(Layered<Variant::paper>{});
+        default: return function(Layered<Variant::exact>{});
+      }
+    default: return function(Frictionless{});
+  }
+}
+
+template <class V, class Law>
+void run(Kernel kernel, int threads, const Arguments& a, int step) {
+  namespace k = gmem::GMEM_ISA;
+  threads = (threads + kBlock - 1) / kBlock * kBlock;  // blocks are whole
+  for (int thread = 0; thread < threads; ++thread) {
+    switch (kernel) {
+      case Kernel::enter: k::enter<V, Law>(a, thread); break;
+      case Kernel::advance: k::advance<V, Law>(a, step, thread); break;
+      case Kernel::collect: k::collect<V>(a, thread); break;
+      case Kernel::leave: k::leave<V, Law>(a, thread); break;
+    }
+  }
+}
+
+template <Task task>
+xla::ffi::Error emulate(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
+                        xla::ffi::RemainingArgs args, xla::ffi::RemainingRets rets) {
+  return handle<task>(nullptr, law, variant, points, isotropic, leaves, args, rets);
+}
+
+auto without_stream() {
+  return xla::ffi::Ffi::Bind()
+      .Attr<int64_t>("law")
+      .Attr<int64_t>("variant")
+      .Attr<int64_t>("points")
+      .Attr<int64_t>("isotropic")
+      .Attr<int64_t>("leaves")
+      .RemainingArgs()
+      .RemainingRets();
+}
+
+}  // namespace
+
+Launcher::Launcher(void* stream, const Which& which) : stream_(stream), kernels_(new Which(which)) {}
+Launcher::~Launcher() { delete static_cast<const Which*>(kernels_); }
+
+void Launcher::operator()(Kernel kernel, int threads, const Arguments& a, int step) const {
+  const Which& which = *static_cast<const Which*>(kernels_);
+  with_law(which, [&](auto law) {
+    using L = decltype(law);
+    if (which.task == Task::forward) return run<double, L>(kernel, threads, a, step);
+    run<gmem::GMEM_ISA::Dual<double>, L>(kernel, threads, a, step);
+  });
+}
+
+}  // namespace cuda
+}  // namespace gmem
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_emulated_advance, gmem::cuda::emulate<gmem::Task::forward>, gmem::cuda::without_stream());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_emulated_tangent, gmem::cuda::emulate<gmem::Task::tangent>, gmem::cuda::without_stream());
