@@ -58,6 +58,7 @@ def mutation(name: str, file: str, text: str, wrong: str, *tests: str) -> Mutati
 
 DOMAINS = "test_spinning_sliding_grains_of_several_domains_move_as_defined"
 ACROSS = "test_both_modes_of_derivatives_cross_the_domains_as_defined"
+KERNELS = "test_the_kernels_give_the_values_and_tangents_of_the_definition"
 AFAR = "test_grains_that_come_from_afar_meet_when_they_should"
 GAS = "test_the_gas_has_the_speeds_and_spins_of_the_recipe_each_at_random"
 MEAN = "test_a_running_mean_is_the_mean_over_the_part_of_its_window_that_is_inside"
@@ -475,6 +476,56 @@ MUTATIONS = (
         "(material.normal_stiffness, material.normal_damping, material.wall_stiffness)",
         "(material.wall_stiffness, material.normal_damping, material.normal_stiffness)",
         f"{DOMAINS}[1-H]",
+    ),
+    # ---------------------------------------------------------------- the GPU's half of it
+    mutation(
+        "gpu-neighbours-of-the-next-step",
+        "cuda/step.h",
+        "theirs = on.in(a.hot[now])",
+        "theirs = on.in(a.hot[1 - now])",
+        KERNELS + "[H]",
+    ),
+    mutation(
+        "gpu-torque-on-the-other",
+        "cuda/step.h",
+        "pick(p.torque_one, p.torque_other)",
+        "pick(p.torque_other, p.torque_one)",
+        KERNELS + "[H]",
+    ),
+    mutation(
+        "gpu-history-outlives-the-contact",
+        "cuda/step.h",
+        "if (!is_zero(stored[number * Law::kHistory + n]))",
+        "if (false)",
+        KERNELS + "[H]",
+    ),
+    mutation(
+        "gpu-layers-beyond-the-last",
+        "cuda/step.h",
+        "return j <= *last ? stored(j) : Vec<V>{};",
+        "return stored(j);",
+        KERNELS + "[M2-averaged]",
+    ),
+    mutation(
+        "gpu-each-side-in-its-own-order",
+        "cuda/step.h",
+        "const auto pick = [first](Vec<V> one, Vec<V> two) {",
+        "const auto pick = [first = true](Vec<V> one, Vec<V> two) {",
+        "test_both_sides_of_a_contact_remember_the_same_bits[H]",
+    ),
+    mutation(
+        "gpu-pressure-of-the-first-chunk",
+        "cuda/step.h",
+        "grain < a.grains; grain += kChunk",
+        "grain < kChunk; grain += kChunk",
+        KERNELS + "[H]",
+    ),
+    mutation(
+        "gpu-list-taken-on-trust",
+        "native/gpu.py",
+        " & (listed == mine)",
+        "",
+        "test_a_broken_list_gives_no_numbers",
     ),
     # ---------------------------------------------------------------- analysis and signals
     mutation(

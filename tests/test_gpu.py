@@ -72,7 +72,7 @@ def walls(begun: int, lower: Any, upper: Any) -> Box:
 
 
 def thrown(system: System, state: Any, lower: Any, upper: Any) -> Scene:
-    """Grains that fly, spin and touch, 40 steps after they were thrown, before 10 more; replicas differ in everything."""
+    """Grains that fly, spin and touch, 40 steps after they were thrown; replicas differ in all their numbers."""
     draws = np.random.default_rng(0).normal(size=(2, *state.grains.position.shape[:2], REPLICAS))
     state = replicate(state, REPLICAS)
     grains = replace(state.grains, velocity=jnp.asarray(5e-3 * draws[0]), spin=jnp.asarray(5e-3 * draws[1]))
@@ -230,40 +230,23 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         jax.block_until_ready(emulate(call._replace(law=9), fixed, arrays))
 
 
-def compiled(architecture: str, law: Any, tangent: bool) -> str:
-    """What NVRTC's assembler says of the kernels."""
-    call, said = native._call(System(PACK.clump, law, PACK.pairs), ()), ctypes.create_string_buffer(1 << 16)
-    library = ctypes.CDLL(str(native._path()))
-    failed = library.gmem_cuda_compile(architecture.encode(), call.law, call.variant, int(tangent), said, len(said))
-    assert not failed, said.value.decode()
-    return said.value.decode()
-
-
-def needs(kernel: str, said: str) -> tuple[int, int]:
-    """Registers, and bytes of spills, of a kernel."""
-    part = said.split(f"'{kernel}'")[1].split("Compiling")[0]
-    spills = re.findall(r"(\d+) bytes spill", part)
-    return int(re.findall(r"Used (\d+) registers", part)[0]), sum(map(int, spills))
-
-
 @needs_nvrtc
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("architecture", ["sm_80", "sm_90", "sm_100", "sm_120"])
 def test_plain_numbers_fit_into_the_registers(architecture: str, law: str) -> None:
-    said = compiled(architecture, LAWS[law], tangent=False)
-    for kernel in ("enter", "advance", "collect", "leave"):
-        registers, spilt = needs(kernel, said)
-        # 255 is what a thread can have; with up to 255 two blocks of 128 threads share a multiprocessor.
-        assert spilt == 0
-        assert registers < 255
+    kernels = native.needs(LAWS[law], architecture)
+    assert set(kernels) == {"enter", "advance", "collect", "leave"}
+    for kernel in kernels.values():
+        # A thread can have 255: two blocks of 128 threads then share a multiprocessor.
+        assert kernel.spilt == 0
+        assert kernel.registers < 255
 
 
 @needs_nvrtc
 @pytest.mark.parametrize("law", ["H", "M2-averaged"])
 def test_numbers_with_derivatives_spill_little(law: str) -> None:
-    _, spilt = needs("advance", compiled("sm_90", LAWS[law], tangent=True))
-    # Twice as many numbers as registers hold. Seen: 0.9 kB for H, 1.4 kB for M2 with NVRTC 13.
-    assert spilt < 2500
+    # Twice as many numbers as there are registers for. Seen: 0.9 kB for H, 1.4 kB for M2 (NVRTC 13.5).
+    assert native.needs(LAWS[law], "sm_90", tangent=True)["advance"].spilt < 2500
 
 
 ALONE = """

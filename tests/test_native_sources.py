@@ -60,6 +60,8 @@ def test_every_compiler_at_hand_takes_the_sources(name: str) -> None:
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     for flags in (build.INSTRUCTION_SETS["avx512"] if x86 else (), ("-DGMEM_DERIVATIVES",)):
         compiled([name], "-fsyntax-only", "-DGMEM_ISA=some", *flags, str(build.SOURCES / "cpu" / "kernel.cc"))
+    gpu = [*map(str, sorted((build.SOURCES / "cuda").glob("*.cc"))), str(HERE / "emulated.cc")]
+    compiled([name], "-fsyntax-only", '-DGMEM_SOURCE_HASH="some"', *gpu)
 
 
 def test_older_compilers_are_refused_in_one_line() -> None:

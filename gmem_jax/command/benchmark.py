@@ -1,11 +1,11 @@
 """`gmem bench`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from gmem_jax.bench import measure
+from gmem_jax.bench import gpu, measure
 from gmem_jax.bench.table import markdown, save
 from gmem_jax.command.console import AsJson, InputError, claim, emit, reporting
 from gmem_jax.files.checked import json_of, refusing
@@ -21,12 +21,17 @@ def bench_command(
     with_jax: Annotated[bool, typer.Option("--jax/--no-jax", help="Measure plain JAX beside us.")] = True,
     scaling: Annotated[bool, typer.Option("--scaling/--no-scaling", help="Cost against N, memory, gradient.")] = True,
     baseline: Annotated[Path | None, typer.Option(help="A bench.json to compare with.")] = None,
+    device: Annotated[
+        Literal["cpu", "gpu"], typer.Option(help="gpu: the native backend there, at N = 1,024 and 10,240; no files.")
+    ] = "cpu",
     as_json: AsJson = False,
 ) -> None:
     """Measure what a grain-step costs: native backend, plain JAX and LAMMPS, side by side.
 
     The folder's bench.json and bench.md are replaced, and hold what has been measured so far.
     """
+    if device == "gpu":
+        return _on_gpu(as_json)
     shipped = [f"tetra-{size}-a" for size in (325, 1024, 3267, 10240)]
     names = packs.split(",") if packs else [name for name in shipped if name in list_packs()]
     chosen = laws.split(",")
@@ -53,6 +58,17 @@ def bench_command(
             say=lambda what, fraction: progress(what, 0.0, fraction),
         )
     emit(as_json, {**result, "status": 0}, markdown(result, before))
+
+
+def _on_gpu(as_json: bool) -> None:
+    try:
+        gpu.device()
+    except ValueError as error:
+        raise InputError(f"--device gpu: {error}") from error
+    with reporting() as progress:
+        times = gpu.timed(load_pack, say=lambda what, fraction: progress(what, 0.0, fraction))
+    facts = gpu.described(load_pack)
+    emit(as_json, {**facts, **times, "status": 0}, gpu.markdown(facts, times))
 
 
 COMMANDS = {"bench": bench_command}

@@ -78,6 +78,23 @@ def supports(law: FrictionLaw) -> bool:
     return entry_of(law) is not None
 
 
+def needs(law: FrictionLaw, architecture: str, *, tangent: bool = False) -> dict[str, gpu.Needs]:
+    """What the kernels of a law take of a GPU, compiled for its architecture ("sm_90") on this machine.
+
+    Args:
+        law: one that the backend knows.
+        architecture: as NVRTC calls it.
+        tangent: of numbers that carry derivatives.
+
+    Raises:
+        RuntimeError: if there is no NVRTC, or it does not know the architecture.
+        ValueError: if the backend is not available.
+    """
+    _require_library()
+    numbers = _entry(law).native, _variant(law)
+    return gpu.needs(ctypes.CDLL(str(_path())), *numbers, architecture, tangent=tangent)
+
+
 def name(backend: str, law: FrictionLaw) -> str:
     """What "auto" means for this friction law on JAX's default device, "jax" or "native"; others are themselves."""
     if backend != "auto":
@@ -279,12 +296,16 @@ class _Definition:
         return Results(jax.tree.leaves(grains), total, jax.tree.leaves(history))
 
 
+def _variant(law: FrictionLaw) -> int:
+    return _VARIANTS.index(law.variant) if isinstance(law, Mindlin) else 0
+
+
 def _call(system: System, history: Any) -> Call:
     """What the library is told beside arrays."""
     law = system.friction
     return Call(
         law=_entry(law).native,
-        variant=_VARIANTS.index(law.variant) if isinstance(law, Mindlin) else 0,
+        variant=_variant(law),
         points=law.points if isinstance(law, Mindlin) else 0,
         isotropic=int(system.clump.isotropic),
         leaves=len(jax.tree.leaves(history)),

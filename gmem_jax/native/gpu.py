@@ -9,6 +9,7 @@ import ctypes
 import functools
 import math
 import os
+import re
 import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -69,6 +70,45 @@ def register(library: ctypes.CDLL, sources: Path) -> None:
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, symbol)), platform="CUDA")
     nvrtc = ":".join([_packaged(), *_NAMES]).lstrip(":")
     library.gmem_cuda_paths(*(ctypes.c_char_p(path.encode()) for path in (nvrtc, str(sources), _cache())))
+
+
+class Needs(NamedTuple):
+    """What a kernel takes of a multiprocessor.
+
+    Attributes:
+        registers: of a thread.
+        spilt: bytes of a thread that go to memory and back, because it has no more registers.
+    """
+
+    registers: int
+    spilt: int
+
+
+def needs(
+    library: ctypes.CDLL, law: int, variant: int, architecture: str, *, tangent: bool = False
+) -> dict[str, Needs]:
+    """The kernels, compiled for an architecture without a GPU, by their names.
+
+    Args:
+        library: the native library.
+        law: its number, as of `gmem_jax.native.calls.Call`.
+        variant: alike.
+        architecture: as "sm_90".
+        tangent: of numbers that carry derivatives.
+
+    Raises:
+        RuntimeError: if there is no NVRTC, or it fails.
+    """
+    said = ctypes.create_string_buffer(1 << 16)
+    failed = library.gmem_cuda_compile(architecture.encode(), law, variant, int(tangent), said, len(said))
+    text = said.value.decode()
+    if failed:
+        raise RuntimeError(text)
+    found = {}
+    for part in text.split("Compiling entry function '")[1:]:
+        spilt = sum(map(int, re.findall(r"(\d+) bytes spill", part)))
+        found[part.split("'")[0]] = Needs(int(re.findall(r"Used (\d+) registers", part)[0]), spilt)
+    return found
 
 
 class Sides(NamedTuple):
