@@ -91,13 +91,22 @@ def thrown(system: System, state: Any, lower: Any, upper: Any) -> Scene:
 
 
 @functools.cache
+def at_rest() -> Any:
+    """The pack's state before it was thrown; blank histories of any law give the same."""
+    system = System(PACK.clump, LAWS["H"], PACK.pairs)
+    return jax.jit(start, compiler_options=QUICKLY)(
+        system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box
+    )
+
+
+@functools.cache
 def packed(law: str, isotropic: bool = True) -> Scene:
     """A pack of 325 grains, whose list is padded."""
     moments = PACK.clump.inertia * (1.0 if isotropic else jnp.asarray([0.8, 1.0, 1.3]))
     clump = replace(PACK.clump, isotropic=isotropic, inertia=moments)
     system = System(clump, LAWS[law], PACK.pairs)
-    state = jax.jit(start)(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
-    return thrown(system, state, PACK.lower, PACK.upper)
+    history = system.friction.init(PACK.pairs.capacity, 1, np.dtype(float))
+    return thrown(system, replace(at_rest(), history=history), PACK.lower, PACK.upper)
 
 
 def spheres() -> Scene:
@@ -110,7 +119,7 @@ def spheres() -> Scene:
     return thrown(system, state, *edges)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
 def emulate(call: calls.Call, fixed: calls.Fixed, arrays: calls.Arrays) -> tuple[calls.Results, list[jax.Array]]:
     """What a GPU would give, and what it had between steps."""
     shapes = calls._of_results((fixed, arrays))
@@ -118,7 +127,7 @@ def emulate(call: calls.Call, fixed: calls.Fixed, arrays: calls.Arrays) -> tuple
     return calls._results(arrays, found[: len(shapes)]), list(found[len(shapes) :])
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
 def emulate_tangent(call: calls.Call, fixed: calls.Fixed, arrays: calls.Arrays, along: calls.Arrays) -> calls.Results:
     shapes = calls._of_results((fixed, arrays))
     found = gpu.run("gmem_emulated_tangent", call, False, (fixed, arrays, along), shapes)
