@@ -4,14 +4,15 @@ import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import gmem_jax as gm
 from gmem_jax import native
+from gmem_jax.bench import gpu, table
 from gmem_jax.bench import measure as bench
-from gmem_jax.bench import table
 from gmem_jax.bench.race import Rival, Row, race
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
@@ -144,3 +145,34 @@ def test_a_gradient_is_timed_in_a_process_of_its_own() -> None:
 def test_large_histories_are_left_out(pack: gm.Pack) -> None:
     assert bench.fits(pack, "H", 32)
     assert not bench.fits(pack, "M2", 1_000_000)
+
+
+def test_the_table_of_a_gpu_has_what_was_timed_or_says_that_nothing_was() -> None:
+    needs = {"H": {name: (188, 0) for name in gpu.ARCHITECTURES}}
+    facts = {"registers": needs, "bytes": {"tetra-27": gpu.bytes_per_grain_step(gm.load_pack(PACK))}}
+    text = gpu.markdown(facts, None)
+    assert "| H | 188, 0 | 188, 0 | 188, 0 | 188, 0 |" in text
+    assert "Not timed: no GPU was at hand." in text
+    row = {"pack": "tetra-27", "grains": 27, "replicas": 8, "us": 2e-3, "compile_s": 1.0}
+    text = gpu.markdown(facts, {"device": "G", "copied_bytes_per_s": 2e12, "rows": [row]})
+    assert "G; a copy moves 2000 GB/s" in text
+    assert f"| 27 | 8 | 2.000 | {facts['bytes']['tetra-27']['memory'] / 2.0:.0f} | 1.0 |" in text
+
+
+def test_bytes_of_a_grain_step_are_those_counted_by_hand() -> None:
+    pack = gm.load_pack(PACK)
+    count = gpu.bytes_per_grain_step(pack)
+    sides = 2 * int(np.asarray(pack.pairs.valid).sum()) / 27
+    # Twice 9 + 10 + 12 numbers, and a history of three of each candidate, written where it touches (half at most).
+    assert 8 * (62 + 3 * sides) < count["memory"] < 8 * (62 + 4.5 * sides + 27)
+    assert count["gathered"] > 8 * 3 * sides
+    assert count["held"] > count["memory"] / 2
+
+
+def test_without_a_gpu_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none(platform: str) -> None:
+        raise RuntimeError(f"no {platform}")
+
+    monkeypatch.setattr(jax, "devices", none)
+    with pytest.raises(ValueError, match=r"JAX sees no CUDA GPU here .with one: pip install 'gmem-jax.cuda13.'."):
+        gpu.device()

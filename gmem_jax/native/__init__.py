@@ -4,6 +4,8 @@ One call into the library runs all steps of one bin for all replicas; walls, che
 It works under `jax.jit`, `jax.vmap`, `jax.shard_map`, on sharded arrays, and in both modes of differentiation, whose
 derivatives are computed in the library too; see `gmem_jax.native.calls`.
 
+On CUDA GPUs the same C++ runs as kernels; see `gmem_jax.native.gpu` and docs/gpu.md. What follows is said of CPUs.
+
 Numbers depend neither on threads nor on what else is in a batch, and are the same with AVX2 and AVX-512. CPUs without
 fused multiply-add ("baseline" in `available`) differ from those in last digits, fidelities by some 1e-11. Calls at once
 share out the CPUs; GMEM_THREADS limits the threads of each. JAX does not survive os.fork: start processes by "spawn".

@@ -54,14 +54,10 @@ def warn_once(reason: str) -> None:
 def _cache() -> str:
     """The folder for compiled kernels; "" where nothing is to be kept."""
     chosen = os.environ.get("GMEM_COMPILE_CACHE", "")
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = (Path(chosen) if chosen else home / "gmem_jax") / "kernels"
-    try:
-        if chosen != "off":
-            folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+    if chosen == "off":
         return ""
-    return "" if chosen == "off" else str(folder)
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return str((Path(chosen) if chosen else home / "gmem_jax") / "kernels")
 
 
 def register(library: ctypes.CDLL, sources: Path) -> None:

@@ -4,6 +4,7 @@
 #include <unistd.h>
 
 #include <cstdio>
+#include <filesystem>
 #include <fstream>
 #include <iterator>
 #include <mutex>
@@ -64,6 +65,8 @@ std::string contents(const std::string& path) {
 // A file that is there is whole. One that cannot be kept is compiled again next time.
 void keep(const std::string& path, const std::string& code) {
   if (paths().cache.empty()) return;
+  std::error_code unable;
+  std::filesystem::create_directories(paths().cache, unable);
   const std::string unfinished = path + "." + std::to_string(getpid());
   std::ofstream file(unfinished, std::ios::binary);
   file.write(code.data(), static_cast<std::streamsize>(code.size()));
