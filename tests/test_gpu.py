@@ -177,9 +177,8 @@ def test_both_sides_of_a_contact_remember_the_same_bits(law: str) -> None:
     assert np.array_equal(rows[pair[:, 0]], rows[pair[:, 1]])
     memories = [np.asarray(between[4])[0, 0]]
     if call.points:
-        layers, reached = np.asarray(between[5])[0, 0], np.asarray(between[6])[0]
-        stored = np.arange(call.points)[:, None, None] <= reached[:, None, None]
-        memories += [np.where(stored, layers, 0.0), reached]
+        runs, stored = np.asarray(between[5])[0, 0], np.asarray(between[6])[0]
+        memories += [np.where(np.arange(call.points)[:, None, None] < stored[:, None, None], runs, 0.0), stored]
     for memory in memories:
         assert np.any(memory[pair[:, 0]] != 0.0)
         np.testing.assert_array_equal(memory[pair[:, 0]], memory[pair[:, 1]])

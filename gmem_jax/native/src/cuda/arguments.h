@@ -49,9 +49,9 @@ struct Arguments {
   Table sphere[2];  // centres, [N K, 3, L]
   Table cold;       // orientation, half-step velocity and spin, [N, 10, L]
   Table pressure;   // summed over steps, [N, 3, L]
-  Table history;    // beside layers, [2 P, kHistory, L]
-  Table layers;     // of the Mindlin law, [2 P, Q, 3, L]
-  int* reached;     // ... the last of them that is stored, [2 P, L]
+  Table history;    // beside rings, [2 P, kHistory, L]
+  Table runs;       // of rings of the Mindlin law: force and first ring, [2 P, Q, 4, L]
+  int* stored;      // ... how many, [2 P, L]
 };
 
 enum class Kernel { enter, advance, collect, leave };

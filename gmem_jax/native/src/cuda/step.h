@@ -67,13 +67,6 @@ struct Lane {
     const long long row = static_cast<long long>(step) * kWalls;
     return {w.vec(row), w.vec(row + 3), w.vec(row + 6), w.vec(row + 9)};
   }
-
-  // The last layer that an overlap fills, and one more: its root may differ from JAX's in the last digit.
-  int layer_of(double overlap, double spacing) const {
-    if (!(overlap > 0.0)) return -1;
-    const double last = a.points - 1.0, filled = root(overlap) / spacing + 1.0;
-    return static_cast<int>(filled < last ? filled : last);
-  }
 };
 
 // Where number `q` of a contact's history lies in the call: leaf 0 is the force (or the layers), leaf 1 the overlap.
@@ -86,25 +79,51 @@ struct Place {
       : leaf(q < Law::kVectors ? 0 : 1), row(q < Law::kVectors ? row * Law::kVectors + q : row) {}
 };
 
-// The layers of one side, in one lane.
+// The runs of one side, in one lane; see physics/runs.h.
 template <class V>
-struct Layers {
+struct Runs {
   Column<V> at;
-  long long first;  // row of the first
-  int* last;
-  int count;
+  int* stored;
+  int rings;
 
-  int points() const { return count; }
-  Vec<V> get(int j) const { return j <= *last ? stored(j) : Vec<V>{}; }
-  Vec<V> stored(int j) const { return at.vec(first + 3 * j); }
-  void set(int j, Vec<V> f) const { at.put(first + 3 * j, f); }
-  void keep(int kept) const { *last = kept - 1; }
+  int points() const { return rings; }
+  int count() const { return *stored; }
+  Run<V> get(int k) const { return {at.vec(4 * k), at[4 * k + 3]}; }
+  void set(int k, const Run<V>& run) const { at.put(4 * k, run.force), at.put(4 * k + 3, run.start); }
+  void keep(V counts) const { *stored = static_cast<int>(largest(counts)); }
+
+  // From rings up to `outer`, of which `ring(j)` reads one.
+  template <class Ring>
+  void load(int outer, const Ring& ring) const {
+    Vec<V> previous{};
+    int found = 0;
+    for (int j = 0; j <= outer; ++j) {
+      const Vec<V> force = ring(j);
+      if (j == 0 || j == outer || differ(force, previous)) set(found++, {force, splat<V>(j)});
+      previous = force;
+    }
+    *stored = found;
+  }
+
+  // All rings of a contact that reaches to `outer`, to `put(j, f)`.
+  template <class Put>
+  void unload(int outer, const Put& put) const {
+    int next = 0;
+    Vec<V> force{};
+    for (int j = 0; j < rings; ++j) {
+      if (next < *stored && !bits_less(splat<V>(j), get(next).start)) force = get(next++).force;
+      put(j, j <= outer ? force : Vec<V>{});
+    }
+  }
 };
 
 template <class V>
-Layers<V> layers_of(const Lane<V>& on, long long side) {
+Runs<V> runs_of(const Lane<V>& on, long long side) {
   const Arguments& a = on.a;
-  return {on.in(a.layers), side * a.points * 3, a.reached + side * a.lanes + on.lane, a.points};
+  Column<V> at = on.in(a.runs);
+  at.value += side * a.points * 4 * at.stride;
+  if (__is_class(V)) at.slope += side * a.points * 4 * at.stride;
+  return {at, a.stored + side * a.lanes + on.lane, a.points};
 }
 
 // Begins a step whose numbers go to side `next` of the double tables.
@@ -153,6 +172,7 @@ void enter(const Arguments& a, int thread) {
   const int grain = thread / a.lanes;
   V parameter[kParameters];
   const GrainParameters<V> constants = read_parameters(on, parameter);
+  const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
   const auto field = [&](int f) { return on.in(a.grains_in[f]).vec(grain * 3ll); };
   const Column<V> q = on.in(a.grains_in[1]);
   const Grain<V> from{field(0), {q[grain * 4ll], q.vec(grain * 4ll + 1)}, field(2), field(3), field(4), field(5)};
@@ -164,10 +184,10 @@ void enter(const Arguments& a, int thread) {
       history.put(side * static_cast<long long>(Law::kHistory) + n, on.in(a.history_in[place.leaf])[place.row]);
     }
     if constexpr (Law::kLayered) {
-      const Layers<V> layers = layers_of(on, side);
-      *layers.last = on.layer_of(history.value[side * history.stride], on.in(a.parameters).value[(kLaw + 3) * a.parameters.stride]);
-      for (int j = 0; j <= *layers.last; ++j)
-        layers.set(j, on.in(a.history_in[0]).vec(3 * (static_cast<long long>(row) * a.points + j)));
+      const V outer = Reach<V, Law::variant>(history[side], law, a.points).outer;
+      runs_of(on, side).load(static_cast<int>(largest(outer)), [&](int j) {
+        return on.in(a.history_in[0]).vec(3 * (static_cast<long long>(row) * a.points + j));
+      });
     }
   }
   on.in(a.pressure).put(grain * 3ll, Vec<V>{});
@@ -208,7 +228,7 @@ GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side&
   contact.history = history;
   close(&contact, 1, parameter);
   if constexpr (Law::kLayered) {
-    friction(Law{}, contact, law, layers_of(on, number));
+    friction(Law{}, contact, law, runs_of(on, number));
   } else {
     friction(Law{}, &contact, 1, law);
   }
@@ -224,7 +244,7 @@ inline void forget(const Lane<V>& on, long long number) {
   const Column<V> stored = on.in(on.a.history);
   for (int n = 0; n < Law::kHistory; ++n)
     if (!is_zero(stored[number * Law::kHistory + n])) stored.put(number * Law::kHistory + n, V{});
-  if constexpr (Law::kLayered) layers_of(on, number).keep(0);
+  if constexpr (Law::kLayered) runs_of(on, number).keep(V{});
 }
 
 // One step. Thread of grain and lane.
@@ -296,9 +316,17 @@ void leave(const Arguments& a, int thread) {
   }
   if constexpr (Law::kLayered) {
     const Column<double> out = on.out(a.history_out[0]);
-    for (int j = 0; j < a.points; ++j) {
-      const Vec<V> f = side < 0 ? Vec<V>{} : layers_of(on, side).get(j);
+    const auto put = [&](int j, Vec<V> f) {
       out.put(3 * (static_cast<long long>(row) * a.points + j), Vec<double>{result(f.x), result(f.y), result(f.z)});
+    };
+    if (side < 0) {
+      for (int j = 0; j < a.points; ++j) put(j, Vec<V>{});
+    } else {
+      V parameter[kParameters];
+      read_parameters(on, parameter);
+      const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
+      const V outer = Reach<V, Law::variant>(on.in(a.history)[side], law, a.points).outer;
+      runs_of(on, side).unload(static_cast<int>(largest(outer)), put);
     }
   }
 }

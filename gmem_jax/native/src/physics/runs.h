@@ -4,8 +4,6 @@
 
 #pragma once
 
-#include <cstddef>
-
 #include "numbers/vectors.h"
 
 namespace gmem {
@@ -59,7 +57,7 @@ void reattach(Runs& runs, V before, V outer) {
 template <class V>
 struct StoredRuns {
   Run<V>* first;
-  std::ptrdiff_t stride;
+  long long stride;
   int* stored;  // in the lane that has most
   int rings;
 
