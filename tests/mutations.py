@@ -500,10 +500,10 @@ MUTATIONS = (
         KERNELS + "[H]",
     ),
     mutation(
-        "gpu-layers-beyond-the-last",
+        "gpu-outermost-ring-among-others",
         "cuda/step.h",
-        "return j <= *last ? stored(j) : Vec<V>{};",
-        "return stored(j);",
+        "j == 0 || j == outer || differ(force, previous)",
+        "j == 0 || differ(force, previous)",
         KERNELS + "[M2-averaged]",
     ),
     mutation(

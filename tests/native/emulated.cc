@@ -71,5 +71,7 @@ void Launcher::operator()(Kernel kernel, int threads, const Arguments& a, int st
 }  // namespace cuda
 }  // namespace gmem
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_emulated_advance, gmem::cuda::emulate<gmem::Task::forward>, gmem::cuda::without_stream());
-XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_emulated_tangent, gmem::cuda::emulate<gmem::Task::tangent>, gmem::cuda::without_stream());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_emulated_advance, gmem::cuda::emulate<gmem::Task::forward>,
+                              gmem::cuda::without_stream());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_emulated_tangent, gmem::cuda::emulate<gmem::Task::tangent>,
+                              gmem::cuda::without_stream());

@@ -1,7 +1,7 @@
 // What the kernels are given: plain structures that the host and the device share.
 //
-// A lane is one replica: of B in each of the entries of the call's leading axis, L = entries times B in all. N grains of K
-// spheres have P listed candidates. A candidate has two sides, its two grains, and each has a copy of the history.
+// A lane is one replica: of B in each of the entries of the call's leading axis, L = entries times B in all. N grains
+// of K spheres have P listed candidates. A candidate has two sides, its two grains, and each has a copy of the history.
 
 #pragma once
 

@@ -90,7 +90,8 @@ std::string compiled(const Nvrtc& nvrtc, const std::string& architecture, const 
   std::vector<std::string> options = {
       "--gpu-architecture=" + architecture, "--std=c++17", "--device-as-default-execution-space",
       "--fmad=false",  // as on CPUs: a fused multiply-add is where the sources say so
-      "-I" + paths().sources, "-DGMEM_ISA=gpu", "-DGMEM_BLOCK=" + std::to_string(kBlock), "-DGMEM_LAW=" + law_as_type(which),
+      "-I" + paths().sources, "-DGMEM_ISA=gpu", "-DGMEM_BLOCK=" + std::to_string(kBlock),
+      "-DGMEM_LAW=" + law_as_type(which),
       std::string("-DGMEM_NUMBER=") + (which.task == Task::forward ? "double" : "Dual<double>")};
   if (log) options.emplace_back("--ptxas-options=-v");
   std::vector<const char*> words;
@@ -109,8 +110,9 @@ std::string compiled(const Nvrtc& nvrtc, const std::string& architecture, const 
   const std::string said = text(nvrtc.log_size, nvrtc.log), code = failed ? "" : text(nvrtc.code_size, nvrtc.code);
   nvrtc.destroy(&program);
   if (log) *log = said;
-  if (failed) throw std::runtime_error("NVRTC does not compile the kernels for " + architecture + ": " + said.substr(0, said.find('\n')));
-  return code;
+  if (!failed) return code;
+  const std::string first = said.substr(0, said.find('\n'));
+  throw std::runtime_error("NVRTC does not compile the kernels for " + architecture + ": " + first);
 }
 
 }  // namespace
@@ -133,10 +135,11 @@ std::string code_for(const std::string& architecture, const Which& which, std::s
   static const Nvrtc nvrtc;
   int major = 0, minor = 0;
   nvrtc.version(&major, &minor);
-  const std::string path = paths().cache + "/" + GMEM_SOURCE_HASH + "-" + architecture + "-nvrtc" + std::to_string(major) +
-                           "." + std::to_string(minor) + "-law" + std::to_string(static_cast<int>(which.law)) +
-                           std::to_string(static_cast<int>(which.variant)) +
-                           (which.task == Task::forward ? "" : "-tangent") + ".cubin";
+  const std::string compiler = "-nvrtc" + std::to_string(major) + "." + std::to_string(minor);
+  const std::string law = "-law" + std::to_string(static_cast<int>(which.law)) +
+                          std::to_string(static_cast<int>(which.variant)) +
+                          (which.task == Task::forward ? "" : "-tangent");
+  const std::string path = paths().cache + "/" + GMEM_SOURCE_HASH + "-" + architecture + compiler + law + ".cubin";
   std::string code = log || paths().cache.empty() ? "" : contents(path);
   if (code.empty()) {
     code = compiled(nvrtc, architecture, which, log);

@@ -1,9 +1,9 @@
 // The time step on a GPU: a thread is one grain of one lane.
 //
-// `advance` is one step and one launch: the contacts of the grain, the end of this step, the beginning of the next. Both
-// grains of a contact compute it, each with its own copy of the history and in the listed order, so that they get the
-// same bits, nothing races, and forces are summed in an order of their own. `enter` and `leave` copy from and to the
-// arrays of the call. For V = double, or numbers that carry a derivative, whose results are the derivatives alone.
+// `advance` is one step and one launch: the contacts of the grain, the end of this step, the beginning of the next.
+// Both grains of a contact compute it, each with its own copy of the history and in the listed order, so that they get
+// the same bits, nothing races, and forces are summed in an order of their own. `enter` and `leave` copy from and to
+// the arrays of the call. For V = double, or numbers that carry a derivative, whose results are the derivatives alone.
 
 #pragma once
 
@@ -69,7 +69,7 @@ struct Lane {
   }
 };
 
-// Where number `q` of a contact's history lies in the call: leaf 0 is the force (or the layers), leaf 1 the overlap.
+// Where number `q` of a contact's history lies in the call: leaf 0 is the force (or the rings), leaf 1 the overlap.
 template <class Law>
 struct Place {
   int leaf;
@@ -128,7 +128,8 @@ Runs<V> runs_of(const Lane<V>& on, long long side) {
 
 // Begins a step whose numbers go to side `next` of the double tables.
 template <class V>
-GMEM_INLINE void begin(const Lane<V>& on, int grain, const GrainParameters<V>& constants, const Grain<V>& from, int next) {
+GMEM_INLINE void begin(const Lane<V>& on, int grain, const GrainParameters<V>& constants, const Grain<V>& from,
+                       int next) {
   const Arguments& a = on.a;
   const Midway<V> m = begin_step(constants, from);
   const Column<V> hot = on.in(a.hot[next]), cold = on.in(a.cold), sphere = on.in(a.sphere[next]);
@@ -154,7 +155,8 @@ inline void deliver(const Lane<V>& on, int grain, const Grain<V>& g) {
                                 {g.spin_rate.x, g.spin_rate.y, g.spin_rate.z}};
   for (int f = 0; f < kFields; ++f) {
     const int size = f == 1 ? 4 : 3;
-    for (int q = 0; q < size; ++q) on.out(on.a.grains_out[f]).put(static_cast<long long>(grain) * size + q, result(number[f][q]));
+    const Column<double> out = on.out(on.a.grains_out[f]);
+    for (int q = 0; q < size; ++q) out.put(static_cast<long long>(grain) * size + q, result(number[f][q]));
   }
 }
 
@@ -203,13 +205,14 @@ struct Load {
 
 // The contact of one side, which touches.
 template <class V, class Law>
-GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side& side, const Midway<V>& own, Vec<V> here,
-                       Vec<V> there, const V* parameter, const LawParameters<V>& law, Load<V>& load) {
+GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side& side, const Midway<V>& own,
+                       Vec<V> here, Vec<V> there, const V* parameter, const LawParameters<V>& law, Load<V>& load) {
   const Arguments& a = on.a;
   const bool first = side.other >= 0;
   const int other = (first ? side.other : ~side.other) / a.spheres;
   const Column<V> theirs = on.in(a.hot[now]), stored = on.in(a.history);
-  const Vec<V> position = theirs.vec(other * 9ll), velocity = theirs.vec(other * 9ll + 3), spin = theirs.vec(other * 9ll + 6);
+  const long long h = other * 9ll;
+  const Vec<V> position = theirs.vec(h), velocity = theirs.vec(h + 3), spin = theirs.vec(h + 6);
   const Vec<V> gap = there - here, point = splat<V>(0.5) * (here + there);
   // As listed: from the first sphere to the second.
   const auto pick = [first](Vec<V> one, Vec<V> two) {
@@ -276,7 +279,8 @@ void advance(const Arguments& a, int step, int thread) {
   own.half_velocity = cold.vec(c + 4), own.half_spin = cold.vec(c + 7);
   const WallState<V> box = on.walls(step);
   WallForces<V> walls{};
-  if (spheres_of(constants, own, a.offsets.of(on.entry), a.spheres, *a.arm.of(on.entry), box, walls, [](int, Vec<V>) {})) {
+  const double arm = *a.arm.of(on.entry);
+  if (spheres_of(constants, own, a.offsets.of(on.entry), a.spheres, arm, box, walls, [](int, Vec<V>) {})) {
     const Column<V> sum = on.in(a.pressure);
     sum.put(grain * 3ll, sum.vec(grain * 3ll) + pressure(box, walls.lower + walls.upper));
   }
