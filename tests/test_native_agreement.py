@@ -108,7 +108,7 @@ def test_unknown_backends_and_laws_are_refused() -> None:
         compress(native.march, Own(), 1)
 
 
-@pytest.mark.parametrize("replicas", [1, 9])
+@pytest.mark.parametrize("replicas", [1, 25])
 @pytest.mark.parametrize("law", [gm.Hooke(), gm.Mindlin(points=20)], ids=lambda law: type(law).__name__)
 def test_any_number_of_threads_gives_the_same_bits(monkeypatch: pytest.MonkeyPatch, law: object, replicas: int) -> None:
     pack = gm.load_pack("tetra-325-a")  # large enough for the threads to share one replica's contacts
@@ -117,13 +117,14 @@ def test_any_number_of_threads_gives_the_same_bits(monkeypatch: pytest.MonkeyPat
     motion = Motion(pack.lower[:, None], pack.upper[:, None], 0.05, 0.0, 1.0, 300.0)
     run = jax.jit(lambda s: advance_by(native.march)(system, s, motion, 0.3, bins=2, steps=30))
 
-    def end(threads: int) -> list[jax.Array]:
+    def end(threads: int, megabytes: float) -> list[jax.Array]:
         monkeypatch.setenv("GMEM_THREADS", str(threads))
+        monkeypatch.setenv("GMEM_CACHE", str(megabytes))  # decides which threads share a block
         return jax.tree.leaves(jax.block_until_ready(run(state)))
 
-    alone = end(1)
-    for threads in (2, 5):
-        for one, other in zip(end(threads), alone, strict=True):
+    alone = end(1, 1000)
+    for threads, megabytes in ((2, 0.1), (5, 8), (5, 1000)):
+        for one, other in zip(end(threads, megabytes), alone, strict=True):
             np.testing.assert_array_equal(one, other)
 
 

@@ -41,7 +41,7 @@ def compiled(sanitizers: str, folder: Path) -> Path:
         objects.append(str(folder / f"{name}.o"))
         kernel = ["-c", str(cpu / "kernel.cc"), f"-DGMEM_ISA={name}", *flags]
         subprocess.run([*command, *kernel, "-o", objects[-1]], check=True)
-    sources = [str(DRIVER), *(str(cpu / f"{name}.cc") for name in ("team", "plan", "blocks"))]
+    sources = [str(DRIVER), *(str(cpu / f"{name}.cc") for name in ("team", "cache", "plan", "blocks"))]
     subprocess.run([*command, *sources, *objects, "-o", str(folder / "drive")], check=True)
     return folder / "drive"
 

@@ -8,7 +8,9 @@ On CUDA GPUs the same C++ runs as kernels; see `gmem_jax.native.gpu` and docs/gp
 
 Numbers depend neither on threads nor on what else is in a batch, and are the same with AVX2 and AVX-512. CPUs without
 fused multiply-add ("baseline" in `available`) differ from those in last digits, fidelities by some 1e-11. Calls at once
-share out the CPUs; GMEM_THREADS limits the threads of each. JAX does not survive os.fork: start processes by "spawn".
+share out the CPUs; GMEM_THREADS limits the threads of each, and GMEM_CACHE (in MB) stands for the caches that are found
+when it is not right about how many blocks of replicas fit into them. JAX does not survive os.fork: start processes by
+"spawn".
 """
 
 import ctypes

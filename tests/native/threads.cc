@@ -15,6 +15,7 @@
 
 #include "check.h"
 #include "cpu/blocks.h"
+#include "cpu/cache.h"
 #include "cpu/plan.h"
 #include "cpu/team.h"
 
@@ -149,6 +150,48 @@ bool survives_a_fork(const Work& work) {
   return waitpid(child, &status, 0) == child && status == 0;
 }
 
+// A kernel that notes how many threads share each block, whose size in kB is its number of lanes.
+std::size_t own_kilobytes(const Problem&, const Block& block) { return 1000 * static_cast<std::size_t>(block.count); }
+std::atomic<int> done[65];  // by size of the team
+void note(const Problem&, const Block&, Team& team, int rank, void*) {
+  team.barrier();
+  if (rank == 0) ++done[team.size()];
+  team.barrier();
+}
+
+// How many of `count` blocks of so many kB were done by teams of 1, 2, 3 and 4 of four threads, with 1 MB of cache.
+std::vector<int> teams_of(int kilobytes, int count, int domains) {
+  const Kernel kernel{"test", 1, own_kilobytes, note};
+  Plan plan{};
+  plan.domains = domains;
+  const Pack pack{&plan, nullptr};
+  for (auto& size : done) size = 0;
+  setenv("GMEM_CACHE", "1", 1);
+  run_blocks(Problem{}, kernel, std::vector<Block>(count, {&pack, nullptr, nullptr, kilobytes, false}), 4);
+  unsetenv("GMEM_CACHE");
+  return {done[1], done[2], done[3], done[4]};
+}
+
+void blocks_run_side_by_side_as_far_as_they_fit_into_the_cache() {
+  using Teams = std::vector<int>;
+  CHECK((teams_of(100, 8, 64) == Teams{8, 0, 0, 0}));
+  CHECK((teams_of(100, 9, 64) == Teams{8, 0, 0, 1}));  // what is left over is shared by all
+  CHECK((teams_of(240, 4, 64) == Teams{0, 4, 0, 0}));
+  CHECK((teams_of(600, 5, 64) == Teams{0, 0, 0, 5}));
+  CHECK((teams_of(600, 2, 2) == Teams{0, 2, 0, 0}));  // a block of two domains has no work for four
+}
+
+void a_bad_size_of_the_cache_is_refused() {
+  for (const char* bad : {"0", "-1", "32M", "nan"}) {
+    setenv("GMEM_CACHE", bad, 1);
+    CHECK(thrown<std::invalid_argument>([] { cache_bytes(); }).find("GMEM_CACHE should be") == 0);
+  }
+  setenv("GMEM_CACHE", "32.5", 1);
+  CHECK(cache_bytes() == 32500000);
+  unsetenv("GMEM_CACHE");
+  CHECK(cache_bytes() >= 100000);
+}
+
 void a_child_made_by_fork_has_threads_of_its_own() {
   const auto work = [] {
     const Threads held(3);
@@ -191,5 +234,7 @@ int main() {
   plans_keep_neighbours_together_and_padding_apart();
   lists_that_lead_astray_are_refused();
   a_failed_block_fails_the_call_and_not_the_next();
+  blocks_run_side_by_side_as_far_as_they_fit_into_the_cache();
+  a_bad_size_of_the_cache_is_refused();
   return failures != 0;
 }

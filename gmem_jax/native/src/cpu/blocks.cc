@@ -7,12 +7,15 @@
 #include <mutex>
 #include <utility>
 
+#include "cpu/cache.h"
 #include "cpu/process.h"
 #include "cpu/team.h"
 
 namespace gmem {
 
 namespace {
+
+constexpr double kShare = 0.5;  // of the cache that is for blocks: the arrays of the call and other processes want some
 
 // Memory that outlives a call, so that the next one does not fault its pages in again.
 class ScratchPool {
@@ -57,46 +60,48 @@ class ScratchPool {
 
 ScratchPool& scratch_pool() { return of_process<ScratchPool>(); }
 
+// Some blocks by so many teams, all `threads` shared out to them.
+void run_teams(const Problem& problem, const Kernel& kernel, const Block* blocks, int count, int teams, int threads,
+               std::size_t bytes) {
+  std::vector<std::unique_ptr<Team>> team;
+  std::vector<ScratchPool::Piece> scratch;
+  std::vector<std::pair<int, int>> place;  // team, and rank in it, of each thread
+  for (int i = 0; i < teams; ++i) {
+    const int size = std::min(threads * (i + 1) / teams - threads * i / teams, Team::kMaxSize);
+    team.emplace_back(new Team(size));
+    scratch.push_back(scratch_pool().take(bytes));
+    for (int rank = 0; rank < size; ++rank) place.push_back({i, rank});
+  }
+  std::atomic<int> next{0};
+  run_ranks(static_cast<int>(place.size()), [&](int thread) {
+    const auto [i, rank] = place[thread];
+    team[i]->run([&, i = i, rank = rank] {
+      for (int block; (block = team[i]->next(next, rank)) < count;)
+        kernel.run(problem, blocks[block], *team[i], rank, scratch[i].aligned());
+    });
+  });
+  for (auto& piece : scratch) scratch_pool().give(std::move(piece));
+}
+
 }  // namespace
 
-// Blocks one by one to single threads as long as that keeps all busy, then the rest to teams.
+// As many blocks at once as fit into the cache, each by a team: side by side they would push each other out. More where
+// threads would have nothing to do otherwise.
 void run_blocks(const Problem& problem, const Kernel& kernel, const std::vector<Block>& blocks, int threads) {
   const int count = static_cast<int>(blocks.size());
   if (count == 0) return;
-  const int alone = count / threads * threads, rest = count - alone;
   std::size_t bytes = 0;
-  int domains = 0;
+  int domains = 1;
   for (const Block& block : blocks) {
     bytes = std::max(bytes, kernel.scratch_bytes(problem, block));
     domains = std::max(domains, block.pack->plan->domains);
   }
-  if (alone > 0) {
-    std::atomic<int> next{0};
-    const int ranks = std::min(threads, alone);
-    std::vector<ScratchPool::Piece> scratch;
-    for (int rank = 0; rank < ranks; ++rank) scratch.push_back(scratch_pool().take(bytes));
-    run_ranks(ranks, [&](int rank) {
-      for (int i; (i = next.fetch_add(1)) < alone;) {
-        Team team(1);
-        kernel.run(problem, blocks[i], team, 0, scratch[rank].aligned());
-      }
-    });
-    for (auto& piece : scratch) scratch_pool().give(std::move(piece));
-  }
-  if (rest > 0) {
-    const int size = std::min({threads / rest, domains, Team::kMaxSize});
-    std::vector<std::unique_ptr<Team>> teams;
-    std::vector<ScratchPool::Piece> scratch;
-    for (int i = 0; i < rest; ++i) {
-      teams.emplace_back(new Team(size));
-      scratch.push_back(scratch_pool().take(bytes));
-    }
-    run_ranks(rest * size, [&](int rank) {
-      const int i = rank / size;
-      teams[i]->run([&] { kernel.run(problem, blocks[alone + i], *teams[i], rank % size, scratch[i].aligned()); });
-    });
-    for (auto& piece : scratch) scratch_pool().give(std::move(piece));
-  }
+  const int fit = static_cast<int>(std::min<std::size_t>(threads, kShare * cache_bytes() / std::max<std::size_t>(bytes, 1)));
+  const int busy = (threads + domains - 1) / domains;
+  const int teams = std::min(count, std::max({1, fit, busy}));
+  const int even = count / teams * teams, rest = count - even;
+  run_teams(problem, kernel, blocks.data(), even, teams, threads, bytes);
+  if (rest > 0) run_teams(problem, kernel, blocks.data() + even, rest, rest, threads, bytes);
 }
 
 }  // namespace gmem

@@ -132,6 +132,12 @@ void Team::barrier() {
   }
 }
 
+int Team::next(std::atomic<int>& counter, int rank) {
+  if (rank == 0) drawn_ = counter.fetch_add(1);
+  barrier();
+  return drawn_;
+}
+
 void Team::wake() {
   if (asleep_.load() == 0) return;
   std::lock_guard<std::mutex> lock(mutex_);

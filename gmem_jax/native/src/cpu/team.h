@@ -32,6 +32,9 @@ class Team {
     }
   }
 
+  // The next number of a counter that several teams share, the same for all threads of a team. Between two calls there
+  // must be a barrier.
+  int next(std::atomic<int>& counter, int rank);
   // Wait for the whole team.
   void barrier();
   // Open the share of `rank` in a phase of `chunks` chunks. The queue must have been emptied before.
@@ -49,6 +52,7 @@ class Team {
   void wake();
 
   const int size_;
+  int drawn_ = 0;
   std::atomic<bool> failed_{false};
   alignas(64) std::atomic<int> arrived_{0};
   alignas(64) std::atomic<int> phase_{0};
