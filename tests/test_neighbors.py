@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scenes import SPHERE, blank_state, cached_tetra, cluster27, make_grains, orientations, squeeze
 
+from gmem_jax import native
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import clump
@@ -64,6 +65,33 @@ def test_the_list_is_the_one_found_by_brute_force_in_canonical_order(case):
         expected = brute_force(mapped, clump.spheres, 2.4)
         assert expected.shape[1] > 100
         np.testing.assert_array_equal(candidates(pairs), expected)
+
+
+@pytest.mark.skipif(native.search() is None, reason=native.available()[1])
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("skin", [0.05, 0.4, 9.0])  # with the last, more than is expected
+def test_the_library_finds_the_pairs_that_jax_md_finds(case, skin):
+    clump, lengths, smallest = CASES[case]
+    for seed in range(2):
+        grains, box = random_grains(clump, lengths, seed), unshifted_box(lengths)
+        by_jax_md, by_library = (
+            PairFinder(clump, np.array(lengths), skin, search=search)(grains, clump, box, np.array(smallest))
+            for search in (None, native.search())
+        )
+        assert by_jax_md.capacity > 8
+        jax.tree.map(np.testing.assert_array_equal, by_library, by_jax_md)
+
+
+@pytest.mark.skipif(native.search() is None, reason=native.available()[1])
+def test_the_library_lists_no_pairs_of_what_is_far_apart_or_not_finite():
+    search = native.search()
+    far = np.array([[0.0, 0.0, 0.0], [1e9, -1e9, 1e9], [1e9, 2.5 - 1e9, 1e9]])  # more cells than there is memory for
+    np.testing.assert_array_equal(search(far, 1, 2.6), [1 * 3 + 2])
+    np.testing.assert_array_equal(search(far, 3, 2.6), [])
+    np.testing.assert_array_equal(search(np.zeros((0, 3)), 4, 2.6), [])
+    far[1, 1] = np.nan
+    with pytest.raises(ValueError, match="finite"):
+        search(far, 1, 2.6)
 
 
 @pytest.mark.parametrize("skin", [0.1, 0.3, 0.4, 1.0])

@@ -31,7 +31,7 @@ from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.host import forward, worst
-from gmem_jax.experiment.pack import SKIN, Pack, smallest_box
+from gmem_jax.experiment.pack import SKIN, Pack, pair_finder, smallest_box
 from gmem_jax.experiment.protocol import Stage
 from gmem_jax.experiment.recall import run as gmem_run
 from gmem_jax.experiment.signals import Bumps
@@ -43,7 +43,6 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.rotation import matrix
-from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Grains, State, Status, explain, replicate, still_box
 from gmem_jax.physics.step import System
 
@@ -179,7 +178,7 @@ def tile(pack: Pack, times: tuple[int, int, int]) -> Pack:
     at = jnp.asarray(np.concatenate(places))[..., None]
     still = jnp.zeros_like(at)
     grains = Grains(at, jnp.asarray(quaternion)[..., None], still, still, still, still)
-    pairs = PairFinder(pack.clump, upper, SKIN)(
+    pairs = pair_finder(pack.clump, upper, SKIN)(
         grains, pack.clump, box, smallest_box(np.zeros(3), upper, float(pack.delta0))
     )
     return replace(

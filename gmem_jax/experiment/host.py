@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.devices import Spread, local
-from gmem_jax.experiment.pack import SKIN
+from gmem_jax.experiment.pack import SKIN, pair_finder
 from gmem_jax.experiment.protocol import Bin, Stage
 from gmem_jax.experiment.walk import Course, walk_some
 from gmem_jax.physics.pairs import carry_history
@@ -226,7 +226,7 @@ class Walker:
         self.time, self.work, rebuilds, self.skin, chunk = kept["counters"].tolist()
         self.rebuilds, self.chunk = int(rebuilds), int(chunk)
         if not _same(kept["finder"], self.finder.kept() if self.finder else {}):
-            self.finder = PairFinder(self.course.system.clump, **kept["finder"]) if kept["finder"] else None
+            self.finder = pair_finder(self.course.system.clump, **kept["finder"]) if kept["finder"] else None
 
     def play(self, *stages: Stage, checkpoint: Checkpoint = NOWHERE) -> OrderedDict[str, Sample]:
         """Run stages one after the other.
@@ -308,7 +308,7 @@ class Walker:
             box = jax.tree.map(local, box)
         system, replicas = self.course.system, self.state.replicas
         if self.finder is None:
-            self.finder = PairFinder(system.clump, np.asarray(box.lengths).max(axis=1), self.skin)
+            self.finder = pair_finder(system.clump, np.asarray(box.lengths).max(axis=1), self.skin)
         pairs = self.finder(self.state.grains, system.clump, box, self.smallest)
         blank = system.friction.init(pairs.capacity, replicas, self.state.grains.position.dtype)
         move = functools.partial(carry_history, old=system.pairs, new=pairs)

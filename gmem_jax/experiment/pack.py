@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax import native
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree
@@ -77,12 +78,17 @@ def smallest_box(lower: np.ndarray, upper: np.ndarray, delta0: float) -> np.ndar
     return lengths
 
 
+def pair_finder(clump: Clump, extent: np.ndarray, skin: float, **sizes: Any) -> PairFinder:
+    """A `PairFinder` that searches in the library where there is one."""
+    return PairFinder(clump, extent, skin, search=native.search(), **sizes)
+
+
 def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: Box, delta0: float) -> Pairs:
     """The candidate contacts of a whole experiment on a pack (positions [N, 3], quaternions [N, 4])."""
     smallest = smallest_box(np.asarray(box.lower)[:, 0], np.asarray(box.upper)[:, 0], delta0)
     still = jnp.zeros((*np.shape(position), 1))
     grains = Grains(jnp.asarray(position)[..., None], jnp.asarray(quaternion)[..., None], still, still, still, still)
-    return PairFinder(clump, smallest, SKIN)(grains, clump, box, smallest)
+    return pair_finder(clump, smallest, SKIN)(grains, clump, box, smallest)
 
 
 def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: str = "") -> Pack:

@@ -27,11 +27,13 @@ from jax.extend.backend import get_backend
 
 from gmem_jax.native import calls, gpu
 from gmem_jax.native.calls import Arrays, Call, Fixed, Results
+from gmem_jax.native.search import searcher
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import Entry, entry_of
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.search import Search
 from gmem_jax.physics.state import Box, Grains, State
 from gmem_jax.physics.step import System
 
@@ -75,6 +77,12 @@ def available() -> tuple[bool, str]:
     """Whether the native backend can run on this machine's CPU, and the instruction set it uses (or why not)."""
     instructions, reason = _load()
     return not reason, reason or instructions
+
+
+@functools.cache
+def search() -> Search | None:
+    """The search for candidate contacts in the library; None where it is not available."""
+    return searcher(_path()) if available()[0] else None
 
 
 def supports(law: FrictionLaw) -> bool:

@@ -99,7 +99,7 @@ def build(target: Path) -> None:
     cxx, include = compiler(), headers()
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     sets = INSTRUCTION_SETS if x86 else {"baseline": ()}
-    names = ("team", "cache", "plan", "blocks")
+    names = ("team", "cache", "plan", "blocks", "search")
     jobs: list[tuple[str, str, tuple[str, ...]]] = [(f"cpu/{name}.cc", f"{name}.o", ()) for name in names]
     stamp = f'-DGMEM_SOURCE_HASH="{source_hash()}"'
     jobs.append(("call/handler.cc", "handler.o", (stamp, "-isystem", str(include))))

@@ -103,14 +103,15 @@ def tabulate(
     """
     pairs, count = found.shape[1], reference.shape[0]
     capacity = bucket(max(8, capacity, pairs))  # a gas may have no candidates, but arrays need rows
-    owners = found.ravel()
-    rows = np.concatenate([np.arange(pairs), capacity + np.arange(pairs)])
-    order = np.argsort(owners, kind="stable")
-    owners, rows = owners[order], rows[order]
-    place = np.arange(2 * pairs) - np.searchsorted(owners, owners)
-    per_sphere = -(-max(1, per_sphere, place.max(initial=-1) + 1) // 4) * 4
+    # Of a sphere's contacts those in which it is first come first, in the order of the list.
+    as_first, as_second = (np.bincount(side, minlength=count) for side in found)
+    per_sphere = -(-max(1, per_sphere, (as_first + as_second).max(initial=0)) // 4) * 4
     incidence = np.full((count, per_sphere), 2 * capacity, dtype=np.int32)
-    incidence[owners, place] = rows
+    for side, listed, number, after in ((0, as_first, 0, 0 * as_first), (1, as_second, capacity, as_first)):
+        order = np.argsort(found[side], kind="stable")
+        owners = found[side][order]
+        place = np.arange(pairs) - (np.cumsum(listed) - listed)[owners] + after[owners]
+        incidence[owners, place] = number + order
     padded = np.zeros((2, capacity), dtype=np.int32)
     padded[:, :pairs] = found
     grains = padded // spheres_per_grain

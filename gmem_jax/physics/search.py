@@ -6,6 +6,7 @@ displacements use up its skin (a whole experiment needs about 0.2 R).
 
 import functools
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,6 +16,10 @@ import numpy as np
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, sphere_centres, tabulate
 from gmem_jax.physics.state import Box, Grains
+
+Search = Callable[[np.ndarray, int, float], np.ndarray]
+"""From sphere centres [S, 3], spheres per grain and a reach to the sorted numbers i S + j of all pairs i < j of spheres
+of different grains that are closer."""
 
 _SPARE = 1.15  # capacity allocated over what is needed now: a list that is built again should fit the same program
 
@@ -32,17 +37,22 @@ class PairFinder:
         skin: distance beyond contact that is still listed, in R.
         capacity: rows to allocate at least.
         per_sphere: contacts per sphere to allocate at least.
+        search: finds the same pairs in place of jax-md.
 
     Raises:
         ValueError: if the skin is not positive.
     """
 
     def __init__(
-        self, clump: Clump, extent: np.ndarray, skin: float, *, capacity: int = 0, per_sphere: int = 0
+        self,
+        clump: Clump,
+        extent: np.ndarray,
+        skin: float,
+        *,
+        capacity: int = 0,
+        per_sphere: int = 0,
+        search: Search | None = None,
     ) -> None:
-        # Imported here because jax-md takes seconds to load, and most commands never look for neighbours.
-        from jax_md import partition, space
-
         if not skin > 0.0:
             raise ValueError(f"the skin of a neighbour list must be positive, got {skin}")
         self.skin = float(skin)
@@ -50,21 +60,29 @@ class PairFinder:
         self._spheres_per_grain = clump.spheres
         self._capacity = int(capacity)
         self._per_sphere = int(per_sphere)
+        self._search = search
         self._neighbors: Any = None
-        free_displacement, _ = space.free()
         body = np.asarray(clump.offsets)
-        cutoff = 2.0 * (1.0 + float(np.linalg.norm(body - body.mean(axis=0), axis=1).max())) + skin
-        self._fns = partition.neighbor_list(
+        self._cutoff = 2.0 * (1.0 + float(np.linalg.norm(body - body.mean(axis=0), axis=1).max())) + skin
+
+    @functools.cached_property
+    def _list(self) -> tuple[Any, Any]:
+        """How jax-md makes a list from positions, and a jitted way to make another like it."""
+        # Imported here because jax-md takes seconds to load, and most commands never look for neighbours.
+        from jax_md import partition, space
+
+        free_displacement, _ = space.free()
+        functions = partition.neighbor_list(
             free_displacement,
             # jax-md keeps box and cutoff in float32 and wraps its cells around: a margin keeps every centre inside,
             # and the float32 rounding of the cutoff harmless.
             self._extent + 1.0,
-            r_cutoff=cutoff + 1e-4,
+            r_cutoff=self._cutoff + 1e-4,
             dr_threshold=0.0,
             capacity_multiplier=_SPARE,
             format=partition.OrderedSparse,
         )
-        self._update = jax.jit(lambda positions, neighbors: neighbors.update(positions))
+        return functions.allocate, jax.jit(lambda positions, neighbors: neighbors.update(positions))
 
     def kept(self) -> dict[str, np.ndarray]:
         """Arguments, apart from the grain, of a finder whose lists have the capacities of this one's."""
@@ -74,18 +92,21 @@ class PairFinder:
     def _grain_pairs(self, centres: np.ndarray) -> np.ndarray:
         """Pairs (i < j) of grains whose centres [N, 3] are within the cutoff, [2, n]."""
         positions = jnp.asarray(centres)
+        allocate, update = self._list
         with warnings.catch_warnings():
             # jax-md 0.2.29 scatters 64-bit indices into its 32-bit tables, and jax warns of it.
             warnings.filterwarnings("ignore", message="scatter inputs have incompatible types")
             if self._neighbors is not None:
-                self._neighbors = self._update(positions, self._neighbors)
+                self._neighbors = update(positions, self._neighbors)
             if self._neighbors is None or bool(self._neighbors.did_buffer_overflow):
-                self._neighbors = self._fns.allocate(positions)
+                self._neighbors = allocate(positions)
         found = np.sort(np.asarray(self._neighbors.idx), axis=0)
         return found[:, found[1] < len(centres)]
 
     def _keys(self, mapped: np.ndarray) -> np.ndarray:
         """Pairs i < j of spheres of different grains within reach, of centres [S, 3], as sorted numbers i S + j."""
+        if self._search:
+            return self._search(mapped, self._spheres_per_grain, 2.0 + self.skin)
         spheres = np.int64(len(mapped))
         mapped = mapped.reshape(-1, self._spheres_per_grain, 3)
         one, other = self._grain_pairs(mapped.mean(axis=1))

@@ -24,7 +24,7 @@ from gmem_jax.experiment.host import (
     silent,
     worst,
 )
-from gmem_jax.experiment.pack import Pack, find_pairs, smallest_box
+from gmem_jax.experiment.pack import Pack, find_pairs, pair_finder, smallest_box
 from gmem_jax.experiment.protocol import Stage, preparation_cycle
 from gmem_jax.experiment.signals import BINS
 from gmem_jax.experiment.walk import Course
@@ -36,13 +36,16 @@ from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, tetra
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.sample import Sample
-from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Grains, still_box
 from gmem_jax.physics.step import System, accelerate, start
 from gmem_jax.preparation.piston import BLOCK, Pressed, Servo, largest_speed, press
 from gmem_jax.preparation.ringing import ringing_period
 
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
+FREE_CANDIDATES, FREE_CONTACTS = (
+    68,
+    48,
+)  # a grain, and a sphere, of a pressed pack with that skin: one program for all lists
 SETTLING = 6.0e3  # t_c that coming to rest under the piston took at N = 325 to 3,267, for the progress bar
 CYCLE_SKIN = 0.5  # in R; frictionless grains turn freely, so a list lasts only some 50 t_c
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles
@@ -178,7 +181,9 @@ class _Preparation:
         self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
         steps = max(1, math.ceil(recipe.t0 / (BINS * recipe.dt) * (1.0 - 1e-12)))
         self.dt = recipe.t0 / (BINS * steps)
-        finder = PairFinder(clump, lengths, FREE_SKIN)
+        finder = pair_finder(
+            clump, lengths, FREE_SKIN, capacity=FREE_CANDIDATES * recipe.grains, per_sphere=FREE_CONTACTS
+        )
         at = jnp.asarray(position)[..., None]
         still = jnp.zeros_like(at)
         grains = Grains(at, quaternion[..., None], velocity[..., None], spin[..., None], still, still)

@@ -83,6 +83,17 @@ void check(const List& list) {
   }
 }
 
+// Sorts by a number from 0 to `end`; what has the same stays in order.
+template <class Number>
+void sort_by(std::vector<Candidate>& candidates, int end, const Number& number) {
+  std::vector<int32_t> next(end + 1, 0);
+  for (const Candidate& c : candidates) ++next[number(c) + 1];
+  std::partial_sum(next.begin(), next.end(), next.begin());
+  std::vector<Candidate> sorted(candidates.size());
+  for (const Candidate& c : candidates) sorted[next[number(c)]++] = c;
+  candidates.swap(sorted);
+}
+
 std::shared_ptr<const PlanStore> make_plan(const List& list) {
   check(list);
   auto store = std::make_shared<PlanStore>();
@@ -103,9 +114,8 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
   }
   const auto home = [](const Candidate& c) { return std::min(c.grain_one, c.grain_other); };
   const auto away = [](const Candidate& c) { return std::max(c.grain_one, c.grain_other); };
-  std::sort(candidates.begin(), candidates.end(), [&](const Candidate& a, const Candidate& b) {
-    return std::make_tuple(home(a), away(a), a.row) < std::make_tuple(home(b), away(b), b.row);
-  });
+  sort_by(candidates, list.grains, away);  // by rows they are
+  sort_by(candidates, list.grains, home);
 
   // Domains end between grains.
   const int count = static_cast<int>(candidates.size());

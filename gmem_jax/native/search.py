@@ -1,0 +1,31 @@
+"""The search for candidate contacts in the library: the pairs of `gmem_jax.physics.search`, some ten times faster."""
+
+import ctypes
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+
+def searcher(path: Path) -> Callable[[np.ndarray, int, float], np.ndarray]:
+    """A `gmem_jax.physics.search.Search` by the library at `path`."""
+    call = ctypes.CDLL(str(path)).gmem_search
+    call.restype = ctypes.c_int64
+    pointer, integer = ctypes.c_void_p, ctypes.c_int64
+    call.argtypes = [pointer, integer, integer, ctypes.c_double, pointer, integer]
+
+    def search(centres: np.ndarray, spheres_per_grain: int, reach: float) -> np.ndarray:
+        if not np.isfinite(centres).all():
+            raise ValueError("sphere centres must be finite to look for neighbours")
+        # In a dense pack a sphere has six candidates with a skin of 0.5 R, sixteen with 1 R.
+        centres, room = np.ascontiguousarray(centres, dtype=np.float64), 32 * len(centres)
+        while True:
+            keys = np.empty(room, dtype=np.int64)
+            found = call(centres.ctypes.data, len(centres), spheres_per_grain, reach, keys.ctypes.data, room)
+            if found < 0:
+                raise MemoryError("no memory to look for neighbours")
+            if found <= room:
+                return keys[:found].copy()
+            room = found
+
+    return search
