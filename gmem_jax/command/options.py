@@ -40,6 +40,7 @@ _FIELDS = {  # of an experiment
     "background": _Option(str, "sub0, sub2 or sub2-bl."),
     "shear": _Option(str, "during the compression, or before it (in time, at u = 0)."),
     "backend": _Option(str, "auto, jax or native."),
+    "precision": _Option(str, "double; or mixed, contacts in single precision (native)."),
 }
 _OF_LAW = {  # of its friction law
     "mu": _Option(float, "Friction coefficient."),

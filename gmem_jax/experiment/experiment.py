@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.drive import Drive
 from gmem_jax.experiment.pack import Pack
@@ -64,6 +65,7 @@ class Experiment:
         background: "sub0", "sub2" or "sub2-bl" (in any case); the last two add a second readout.
         shear: when the waveforms are applied: "during" the compression, or "before" it, as functions of time at u = 0.
         backend: "jax", the definition; "native", C++ on CPUs; "auto", native where it is built and knows the law.
+        precision: "double"; or "mixed", contacts in single precision on the native backend, without derivatives.
 
     Raises:
         ValueError: for impossible numbers or waveforms, and shapes that do not fit. What is traced cannot be refused:
@@ -86,6 +88,7 @@ class Experiment:
     background: str = static("sub0")
     shear: str = static("during")
     backend: str = static("auto")
+    precision: str = static("double")
     steps_per_bin: int = dataclasses.field(init=False, default=1, metadata={"static": True})
 
     def __post_init__(self) -> None:
@@ -99,6 +102,7 @@ class Experiment:
             raise ValueError(f"shear must be during or before, got {self.shear!r}")
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
+        native.require_precision(self.precision, self.backend, self.friction)
         if not 0.0 < self.dt <= LARGEST_STEP:
             raise ValueError(f"dt must be in (0, {LARGEST_STEP}], got {self.dt:g}")
         if self.steps is not None and not (isinstance(self.steps, int) and self.steps >= 1):
@@ -206,6 +210,7 @@ class Experiment:
             self.drag,
             steps=steps,
             backend=self.backend,
+            precision=self.precision,
         )
 
     def begin(self) -> State:
@@ -300,6 +305,7 @@ class Changes(TypedDict, total=False):
     background: str
     shear: str
     backend: str
+    precision: str
 
 
 def replace(

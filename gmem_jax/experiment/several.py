@@ -53,13 +53,13 @@ class Chosen:
 
 
 def match(one: Experiment, other: Experiment) -> bool:
-    """Whether two experiments may run side by side: the same pack, material, protocol, law, steps and backend.
+    """Whether two experiments may run side by side: the same pack, material, protocol, law, steps and arithmetic.
 
     The pack must be the same object; whatever else differs must be one number in each. Without friction replicas part
     and need lists that all would have to go through (six mu with 0 among them: twice the time), so that mu = 0 matches
     only itself.
     """
-    alike = ("stages", "steps_per_bin", "background", "backend", "material")
+    alike = ("stages", "steps_per_bin", "background", "backend", "precision", "material")
     laws = [str(jax.tree.structure(each.friction)) for each in (one, other)]
     scalars = all(jnp.ndim(value) == 0 for each in (one, other) for value in replica_parameters(each).values())
     slips = [float(np.min(getattr(each.friction, "mu", 1.0))) == 0.0 for each in (one, other)]

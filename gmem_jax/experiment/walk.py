@@ -34,6 +34,7 @@ class Course:
         drag: viscous drag while the walls stand still, 1 / t_c; scalar or [B].
         steps: steps in a bin.
         backend: who does them; see `native.marcher`.
+        precision: of contacts, likewise.
     """
 
     system: System
@@ -42,6 +43,7 @@ class Course:
     drag: Scalar = 0.0
     steps: int = static(1)
     backend: str = static("auto")
+    precision: str = static("double")
 
     def with_pairs(self, pairs: Pairs) -> "Course":
         """The same with another list of candidates."""
@@ -74,7 +76,7 @@ def bin_step(course: Course, state: State, row: Bin) -> tuple[State, Sample]:
         drag = _padded(jnp.where(still, course.drag, 0.0), state.replicas)
     with jax.named_scope("steps"):
         dt = _padded(course.dt, state.replicas)
-        state, total = native.marcher(course.backend)(course.system, state, boxes, dt, drag)
+        state, total = native.marcher(course.backend, course.precision)(course.system, state, boxes, dt, drag)
     with jax.named_scope("sample"):
         last = jax.tree.map(lambda leaf: leaf[-1], boxes)
         return end_bin(course.system, state, last, total / course.steps)

@@ -21,7 +21,7 @@ from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.physics.material import Material
 
 _SIGNALS = {"bumps": Bumps, "spline": Spline}
-_OLDER = {"shear": "during"}  # what files from before there was such a field did
+_OLDER = {"precision": "double", "shear": "during"}  # what files from before there was such a field did
 _PARTS = ("pack", "signals", "friction", "material")
 
 
@@ -185,6 +185,7 @@ def resolved(experiment: Experiment, seconds: float) -> dict[str, Any]:
         "dt": _plain(dt),
         "steps": steps,
         "background": experiment.background,
+        "precision": experiment.precision,
         "seconds": seconds,
         **provenance(),
         "backend": native.name(experiment.backend, experiment.friction),

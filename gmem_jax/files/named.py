@@ -24,6 +24,7 @@ FIELDS = (
     "background",
     "shear",
     "backend",
+    "precision",
 )
 OF_LAW = tuple(dict.fromkeys(field.name for entry in LAWS for field in fields(entry.kind)))
 NAMES = ("signals", "friction", *OF_LAW, *FIELDS)

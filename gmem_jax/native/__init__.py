@@ -41,6 +41,7 @@ March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 """The signature of `gmem_jax.physics.step.march`."""
 
 BACKENDS = ("auto", "jax", "native")
+PRECISIONS = ("double", "mixed")
 
 _LAW_NUMBERS = 4  # rows of the parameter array for a law's own, as in parameters.h
 _VARIANTS = ("exact", "averaged", "paper")
@@ -118,21 +119,42 @@ def name(backend: str, law: FrictionLaw) -> str:
     return "native" if client.platform == "cpu" or on_gpu else "jax"
 
 
-def marcher(backend: str = "auto") -> March:
+def require_precision(precision: str, backend: str, law: FrictionLaw) -> None:
+    """Refuse a precision that is unknown, or not to be had.
+
+    Raises:
+        ValueError: saying why.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
+    if precision == "mixed" and name(backend, law) != "native":
+        why = "" if backend == "jax" or available()[0] else f", which is not available: {available()[1]}"
+        raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")
+    if precision == "mixed" and get_backend().platform != "cpu":
+        raise ValueError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
+
+
+def marcher(backend: str = "auto", precision: str = "double") -> March:
     """The `march` of a backend.
 
     Args:
         backend: "jax", the definition; "native", this library, which is refused where there is none; or "auto": native
             in what is compiled for CPUs and CUDA GPUs, where the library is at hand and knows the friction law, else
             plain JAX.
+        precision: "double", or "mixed": contacts and their histories in single precision, on the native backend; see
+            `_march_mixed`.
 
     Raises:
-        ValueError: if the backend is unknown or not available.
+        ValueError: if the backend is unknown or not available, or the precision is not its own.
     """
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
-    if backend == "native":
+    if precision not in PRECISIONS or (precision == "mixed" and backend == "jax"):
+        raise ValueError(f"precision {precision!r} is not one of the backend {backend!r}")
+    if backend == "native" or precision == "mixed":
         _require_library()
+    if precision == "mixed":
+        return _march_mixed
     return {"jax": dynamics.march, "native": march, "auto": _march_anywhere}[backend]
 
 
@@ -154,7 +176,16 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
             an argument does not fit the number of replicas.
         NotImplementedError: if it is compiled for anything but a CPU or a CUDA GPU, or for that without NVRTC.
     """
-    return _march(system, state, boxes, dt, drag, anywhere=False)
+    return _march(system, state, boxes, dt, drag, _Mode())
+
+
+def _march_mixed(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
+    """`march` with contacts in single precision: their forces, torques and histories.
+
+    Positions, orientations, velocities, the sums of forces and the gaps of contacts are in double precision, and the
+    gaps rounded. It pays from many replicas side by side, so that a lone one runs in double precision.
+    """
+    return _march(system, state, boxes, dt, drag, _Mode(mixed=state.replicas > 1))
 
 
 def _march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
@@ -164,7 +195,7 @@ def _march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: 
     if not available()[0]:
         _warn_once(available()[1])
         return dynamics.march(system, state, boxes, dt, drag)
-    return _march(system, state, boxes, dt, drag, anywhere=True)
+    return _march(system, state, boxes, dt, drag, _Mode(anywhere=True))
 
 
 @functools.cache
@@ -191,15 +222,25 @@ def _require(system: System, state: State) -> None:
         raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
 
 
-def _march(
-    system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, *, anywhere: bool
-) -> tuple[State, jax.Array]:
+class _Mode(NamedTuple):
+    """How the steps of a bin are done.
+
+    Attributes:
+        anywhere: their definition stands for them where there is no library.
+        mixed: contacts in single precision.
+    """
+
+    anywhere: bool = False
+    mixed: bool = False
+
+
+def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, mode: _Mode) -> tuple[State, jax.Array]:
     _require(system, state)
     law = {field.name: getattr(system.friction, field.name) for field in fields(system.friction)}  # type: ignore[arg-type]
     dynamics.require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass, **law)
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
     system, state, boxes, dt, drag = dynamics.together((system, state, boxes, jnp.asarray(dt), jnp.asarray(drag)))
-    grains, history, total = _bin(anywhere, system, state.grains, state.history, boxes, (dt, drag))
+    grains, history, total = _bin(mode, system, state.grains, state.history, boxes, (dt, drag))
     return State(grains, history, state.status), total
 
 
@@ -208,7 +249,7 @@ _Result = tuple[Grains, Any, jax.Array]
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _bin(
-    anywhere: bool, system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]
+    mode: _Mode, system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]
 ) -> _Result:
     """The steps whose walls are `boxes` ([steps, 3, B]); `numbers` are (dt, drag).
 
@@ -216,13 +257,16 @@ def _bin(
         The grains, the history, and the sum over the steps of the wall pressures, [3, B].
     """
     arrays = _arrays(system, grains, history, boxes, numbers)
-    definition = _Definition.of(system, history, anywhere)
-    return _result(grains, history, calls.forward(_call(system, history), definition, _fixed(system), arrays))
+    definition = _Definition.of(system, history, mode.anywhere)
+    call = _call(system, history)._replace(mixed=int(mode.mixed))
+    return _result(grains, history, calls.forward(call, definition, _fixed(system), arrays))
 
 
 @functools.partial(_bin.defjvp, symbolic_zeros=True)
-def _bin_jvp(anywhere: bool, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
+def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
     """The tangent with respect to what is being differentiated and no more."""
+    if mode.mixed:
+        raise NotImplementedError("there are no derivatives in mixed precision; use precision='double'")
     leaves, structure = jax.tree.flatten(primals)
     slopes = jax.tree.leaves(tangents)
     active = [place for place, slope in enumerate(slopes) if not _is_zero(slope)]
@@ -239,11 +283,11 @@ def _bin_jvp(anywhere: bool, primals: tuple[Any, ...], tangents: tuple[Any, ...]
     if not all(map(_is_zero, jax.tree.leaves((tangents[0].pairs, tangents[0].clump.offsets)))):
         # The library has no derivatives by these.
         _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
-        return _bin(anywhere, *primals), slope
+        return _bin(mode, *primals), slope
     arrays, along = jax.jvp(lambda *varied: _arrays(*filled(varied)), varied, directions)
-    definition = _Definition.of(system, history, anywhere)
+    definition = _Definition.of(system, history, mode.anywhere)
     change = calls.tangent(_call(system, history), definition, _fixed(system), arrays, along)
-    return _bin(anywhere, *primals), _result(primals[1], history, change)
+    return _bin(mode, *primals), _result(primals[1], history, change)
 
 
 def _is_zero(slope: Any) -> bool:

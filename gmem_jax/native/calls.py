@@ -39,6 +39,7 @@ class Call(NamedTuple):
         points: Q of the Mindlin law.
         isotropic: whether all moments of inertia are equal.
         leaves: arrays of the history.
+        mixed: whether contacts are computed in single precision.
     """
 
     law: int
@@ -46,6 +47,7 @@ class Call(NamedTuple):
     points: int
     isotropic: int
     leaves: int
+    mixed: int = 0
 
 
 class Fixed(NamedTuple):
@@ -288,6 +290,8 @@ def _primitive(
     in_plain_jax = mlir.lower_fun(elsewhere, multiple_results=True)
 
     def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
+        if static["call"].mixed:
+            raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
         if target in gpu.TARGETS and not gpu.missing():
             return library(context, *values, on_gpu=True, **static)
         if target in gpu.TARGETS and not definition.anywhere:

@@ -39,8 +39,8 @@ void run(Kernel kernel, int threads, const Arguments& a, int step) {
 
 template <Task task>
 xla::ffi::Error emulate(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                        xla::ffi::RemainingArgs args, xla::ffi::RemainingRets rets) {
-  return handle<task>(nullptr, law, variant, points, isotropic, leaves, args, rets);
+                        int64_t mixed, xla::ffi::RemainingArgs args, xla::ffi::RemainingRets rets) {
+  return handle<task>(nullptr, law, variant, points, isotropic, leaves, mixed, args, rets);
 }
 
 auto without_stream() {
@@ -50,6 +50,7 @@ auto without_stream() {
       .Attr<int64_t>("points")
       .Attr<int64_t>("isotropic")
       .Attr<int64_t>("leaves")
+      .Attr<int64_t>("mixed")
       .RemainingArgs()
       .RemainingRets();
 }

@@ -77,13 +77,16 @@ Signature signature(Task task, Law law) {
 }
 
 ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                ffi::RemainingArgs args, ffi::RemainingRets rets) {
+                int64_t mixed, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   require_law(law, variant, points);
   Problem problem{};
   problem.task = task;
   problem.law = static_cast<Law>(law);
   problem.variant = static_cast<Variant>(variant);
   problem.isotropic = isotropic != 0;
+  problem.mixed = mixed != 0;
+  require(!problem.mixed || (task == Task::forward && problem.law != Law::mindlin),
+          "there is no mixed precision for derivatives and the Mindlin law");
   const Signature wanted = signature(task, problem.law);
   require(static_cast<std::size_t>(leaves) == histories(problem.law).size() && args.size() == wanted.arguments.size() &&
               rets.size() == wanted.results.size(),
@@ -179,6 +182,9 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
     const int count = static_cast<int>(lanes[i].size());
     int done = 0;
     // Replicas side by side share much work: a vector that is half full is cheaper than they are one by one.
+    for (; problem.mixed && done < count; done += 2 * kernel.width)
+      whole.push_back({packs[i].get(), &lanes[i][done], nullptr, std::min(2 * kernel.width, count - done), false,
+                       count - done > kernel.width});
     for (; 2 * (count - done) >= kernel.width || (task != Task::forward && done < count); done += kernel.width)
       whole.push_back({packs[i].get(), &lanes[i][done], &slopes[i][done], std::min(kernel.width, count - done), false});
     for (; done < count; ++done) packed.push_back({packs[i].get(), &lanes[i][done], nullptr, 1, true});
@@ -190,9 +196,9 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 }
 
 template <Task task>
-ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
+ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves, int64_t mixed,
                   ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  return in_words([&] { return call(task, law, variant, points, isotropic, leaves, args, rets); });
+  return in_words([&] { return call(task, law, variant, points, isotropic, leaves, mixed, args, rets); });
 }
 
 auto binding() {
@@ -202,6 +208,7 @@ auto binding() {
       .Attr<int64_t>("points")
       .Attr<int64_t>("isotropic")
       .Attr<int64_t>("leaves")
+      .Attr<int64_t>("mixed")
       .RemainingArgs()
       .RemainingRets();
 }

@@ -13,6 +13,7 @@
 #include "cpu/problem.h"
 #include "cpu/team.h"
 #include "physics/contact.h"
+#include "numbers/single.h"
 #include "physics/motion.h"
 
 namespace gmem {
@@ -86,13 +87,19 @@ struct Engine {
     return {load_vec(w), load_vec(w + 3), load_vec(w + 6), load_vec(w + 9)};
   }
 
+  // Unit u between two steps.
+  Grain<V> still(int u) const {
+    const V* h = hot + static_cast<std::size_t>(u) * kHot;
+    const V* c = cold + static_cast<std::size_t>(u) * kCold;
+    return {load_vec(h + kPosition), {c[kQuaternion], load_vec(c + kQuaternion + 1)}, load_vec(h + kVelocity),
+            load_vec(h + kSpin),     load_vec(c + kAcceleration),                    load_vec(c + kSpinRate)};
+  }
+
   // First half of a step of unit u, and wall forces.
-  void begin(int u, const WallState<V>& box, double* wall_sums, V* speeds) {
+  void begin(int u, const Grain<V>& grain, const WallState<V>& box, double* wall_sums, V* speeds) {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
-    const Midway<V> m = begin_step(constants, {load_vec(h + kPosition), {c[kQuaternion], load_vec(c + kQuaternion + 1)},
-                                            load_vec(h + kVelocity), load_vec(h + kSpin), load_vec(c + kAcceleration),
-                                            load_vec(c + kSpinRate)});
+    const Midway<V> m = begin_step(constants, grain);
     speeds[0] = max(speeds[0], dot(m.half_velocity, m.half_velocity));
     speeds[1] = max(speeds[1], dot(m.half_spin, m.half_spin));
     c[kQuaternion] = m.orientation.w;
@@ -100,8 +107,10 @@ struct Engine {
     store_vec(c + kAcceleration, m.half_velocity);
     store_vec(c + kSpinRate, m.half_spin);
     store_vec(h + kPosition, m.position);
-    store_vec(h + kVelocity, m.velocity);
-    store_vec(h + kSpin, m.spin);
+    if constexpr (!Mode::kLooks) {
+      store_vec(h + kVelocity, m.velocity);
+      store_vec(h + kSpin, m.spin);
+    }
     WallForces<V> on{};
     const bool near = spheres_of(constants, m, block.pack->offsets, problem.spheres_per_grain, arm, box, on,
                                  [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
@@ -109,21 +118,24 @@ struct Engine {
     if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
   }
 
-  // What `begin` left of unit u.
+  // What `begin` left of unit u: the same places.
   Midway<V> midway(int u) const {
-    const V* h = hot + static_cast<std::size_t>(u) * kHot;
-    const V* c = cold + static_cast<std::size_t>(u) * kCold;
-    return {load_vec(h + kPosition), {c[kQuaternion], load_vec(c + kQuaternion + 1)}, load_vec(h + kVelocity),
-            load_vec(h + kSpin),     load_vec(c + kAcceleration),                    load_vec(c + kSpinRate)};
+    const Grain<V> g = still(u);
+    Midway<V> m{g.position, g.orientation, g.velocity, g.spin, g.acceleration, g.spin_rate};
+    if constexpr (Mode::kLooks) mode.look(u, m.velocity, m.spin);
+    return m;
   }
 
   // Second half: accelerations and velocities.
-  void finish(int u) {
-    V* h = hot + static_cast<std::size_t>(u) * kHot;
-    V* c = cold + static_cast<std::size_t>(u) * kCold;
+  Grain<V> finish(int u) const {
     Vec<V> force, torque;
     mode.total_force(u, force, torque);
-    const Grain<V> g = end_step(constants, problem.isotropic, midway(u), force, torque);
+    return end_step(constants, problem.isotropic, midway(u), force, torque);
+  }
+
+  void keep(int u, const Grain<V>& g) {
+    V* h = hot + static_cast<std::size_t>(u) * kHot;
+    V* c = cold + static_cast<std::size_t>(u) * kCold;
     store_vec(h + kVelocity, g.velocity);
     store_vec(h + kSpin, g.spin);
     store_vec(c + kAcceleration, g.acceleration);
@@ -143,8 +155,9 @@ struct Engine {
       }
       const int first = Mode::unit_of(chunk * kChunk), last = Mode::unit_of((chunk + 1) * kChunk);
       for (int u = first; u < last && u < Mode::units(problem); ++u) {
-        if (ends) finish(u);
-        if (begins) begin(u, box, sums, speeds);
+        const Grain<V> grain = ends ? finish(u) : still(u);
+        if (begins) begin(u, grain, box, sums, speeds);
+        else keep(u, grain);
       }
     }
     team.barrier();
@@ -163,7 +176,10 @@ struct Engine {
   }
 
   void contacts() {
-    const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
+    using C = typename Mode::OfContacts;
+    C parameter[kParameters];
+    for (int row = 0; row < kParameters; ++row) parameter[row] = convert<C>(this->parameter[row]);
+    const LawParameters<C> law(parameter + kLaw, parameter[kDt]);
     team.share(Team::kContacts, rank, plan.domains);
     for (int domain; team.take(Team::kContacts, rank, &domain);)
       mode.contacts(plan.domain_candidate[domain], plan.domain_candidate[domain + 1], parameter, law, travel);

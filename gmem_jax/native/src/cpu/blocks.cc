@@ -3,13 +3,19 @@
 #include <algorithm>
 #include <atomic>
 #include <cstdint>
+#include <cstdlib>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <utility>
 
 #include "cpu/cache.h"
 #include "cpu/process.h"
 #include "cpu/team.h"
+
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 namespace gmem {
 
@@ -20,12 +26,13 @@ constexpr double kShare = 0.5;  // of the cache that is for blocks: the arrays o
 // Memory that outlives a call, so that the next one does not fault its pages in again.
 class ScratchPool {
  public:
+  struct Free {
+    void operator()(char* memory) const { std::free(memory); }
+  };
   struct Piece {
-    std::unique_ptr<char[]> memory;
+    std::unique_ptr<char, Free> memory;
     std::size_t bytes = 0;
-    void* aligned() const {
-      return reinterpret_cast<void*>((reinterpret_cast<std::uintptr_t>(memory.get()) + 63) / 64 * 64);
-    }
+    void* aligned() const { return memory.get(); }
   };
 
   Piece take(std::size_t bytes) {
@@ -38,7 +45,14 @@ class ScratchPool {
         return found;
       }
     }
-    return {std::unique_ptr<char[]>(new char[bytes + 64]), bytes};
+    // In large pages, where the system has them to give: those of 4 kB are more than a CPU has translations for.
+    const std::size_t alignment = bytes < kLargePage ? 64 : kLargePage, whole = (bytes / alignment + 1) * alignment;
+    Piece piece{std::unique_ptr<char, Free>(static_cast<char*>(std::aligned_alloc(alignment, whole))), bytes};
+    if (!piece.memory) throw std::bad_alloc();
+#if defined(MADV_HUGEPAGE)
+    if (alignment == kLargePage) madvise(piece.memory.get(), whole, MADV_HUGEPAGE);
+#endif
+    return piece;
   }
 
   void give(Piece piece) {
@@ -53,6 +67,7 @@ class ScratchPool {
   }
 
  private:
+  static constexpr std::size_t kLargePage = std::size_t{2} << 20;
   static constexpr std::size_t kKept = std::size_t{512} << 20;
   std::mutex mutex_;
   std::vector<Piece> free_;

@@ -20,6 +20,8 @@ template <class Law>
 struct Packed {
   using Number = Real;
   using V = Real;
+  using OfContacts = Real;
+  static constexpr bool kLooks = false;
 
   const Problem& problem;
   const Block& block;
@@ -232,7 +234,7 @@ struct Packed {
   };
 
   void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel) {
-    constexpr int kLook = 256, kBatch = 8 * W;
+    constexpr int kLook = 256, kBatch = 8 * W, kAhead = 8;
     int awake[kLook + 1], touching[kBatch];
     int count = 0;
     for (int look = first; look < end; look += kLook) {
@@ -244,6 +246,14 @@ struct Packed {
       }
       for (int n = 0; n < found; ++n) {
         const int c = awake[n];
+        // Large packs are in no cache: ask in time for what does not lie in a row with what others want.
+        if (n + kAhead < found) {
+          const std::size_t later = awake[n + kAhead];
+          const GrainRows* other = grain + plan.candidate[later].grain_other;
+          __builtin_prefetch(sphere + plan.candidate[later].other);
+          __builtin_prefetch(history + later);
+          if (marks.touched[later]) __builtin_prefetch(other), __builtin_prefetch(&other->spin), __builtin_prefetch(&other->torque);
+        }
         if (!marks.touched[c] && !touches(c, travel)) continue;
         touching[count++] = c;
         if (count < kBatch) continue;

@@ -20,6 +20,7 @@ struct Problem {
   Law law;
   Variant variant;
   bool isotropic;
+  bool mixed;             // contacts in single precision; forward only
   bool history_aliased;   // the histories' results already hold the arguments
   int points;             // Q of the Mindlin law
   int grains;             // N
@@ -75,8 +76,9 @@ struct Block {
   const Pack* pack;
   const Lane* lanes;
   const Lane* slopes;  // the derivatives, where they are wanted
-  int count;           // 1 to W
+  int count;           // 1 to W, or to 2 W where it is wide
   bool packed;         // the lanes of the CPU are grains and contacts of one replica
+  bool wide = false;   // in mixed precision: two vectors of doubles to one of floats
 };
 
 // The threads that share one block; see team.h.

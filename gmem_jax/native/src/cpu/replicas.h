@@ -9,6 +9,7 @@
 #include "cpu/block.h"
 #include "cpu/marks.h"
 #include "numbers/dual.h"
+#include "numbers/single.h"
 
 namespace gmem {
 namespace GMEM_ISA {
@@ -22,21 +23,44 @@ struct Trace {
   int* runs;                // [candidates]
 };
 
-// How numbers are put together from the arrays of a block, and which of them are results.
+template <class V>
+constexpr int kReplicas = std::is_same<V, Pair>::value ? 2 * W : W;
+
+// How numbers are put together from the arrays of a block, and which of them are results. `gather` has a vector of
+// lanes from the given one on.
 template <class V, class Gather>
 inline V of_lanes(const Block& block, const Gather& gather) {
   if constexpr (std::is_same<V, Real>::value) {
-    return gather(block.lanes);
+    return gather(block.lanes, 0);
+  } else if constexpr (std::is_same<V, Pair>::value) {
+    return {gather(block.lanes, 0), gather(block.lanes, W)};
   } else {
-    return {gather(block.lanes), gather(block.slopes)};
+    return {gather(block.lanes, 0), gather(block.slopes, 0)};
   }
 }
 inline Real result(Real a) { return a; }
+inline Pair result(Pair a) { return a; }
 inline Real result(Dual<Real> a) { return a.slope; }
 
-template <class Law, class V>
+// Overlaps are small differences of distances: `before` holds that of their squares, taken in double precision.
+template <int N>
+GMEM_INLINE Single<N> overlap_of(const Contact<Single<N>>& c) {
+  return c.before / fma(c.square, c.inverse, Single<N>::of(2.0));
+}
+
+// What contacts look up of a grain, in their precision.
+template <class C>
+struct Looks {
+  C velocity[3], spin[3];
+};
+
+// V is the number of grains, C that of contacts and their histories: the same, or single precision.
+template <class Law, class V, class C = V>
 struct Replicas {
   using Number = V;
+  using OfContacts = C;
+  static constexpr bool kMixed = !std::is_same<V, C>::value;
+  static constexpr bool kLooks = kMixed;
 
   const Problem& problem;
   const Block& block;
@@ -45,15 +69,16 @@ struct Replicas {
   bool together;  // they all have the same number of steps
   V* hot;         // the engine's
   V* sphere;      // [S, 3]: centres
-  V* guest;       // [guests, 6]: force and torque
-  V* history;     // [candidates, Law::kHistory]
-  Run<V>* run;    // [Q, candidates] of the Mindlin law: those that are few lie together
+  Looks<C>* looks;  // [N], in mixed precision; in the other, `hot` has all
+  C* guest;       // [guests, 6]: force and torque
+  C* history;     // [candidates, Law::kHistory]
+  Run<C>* run;    // [Q, candidates] of the Mindlin law: those that are few lie together
   Marks marks;
-  Trace<V> trace;
+  Trace<C> trace;
   bool apart = false;  // Mindlin's rings each by itself, for their derivatives
 
   Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
-    adjacent = block.count == W;
+    adjacent = block.count == kReplicas<V>;
     together = true;
     const Lane& a = block.lanes[0];
     for (int l = 1; l < block.count; ++l) {
@@ -73,44 +98,46 @@ struct Replicas {
   static std::size_t carve(const Problem& p, const Plan& plan, Carver& carver, Replicas* mode) {
     const std::size_t candidates = plan.candidates;
     V* sphere = carver.take<V>(static_cast<std::size_t>(p.spheres()) * 3);
-    V* guest = carver.take<V>(static_cast<std::size_t>(plan.guests) * 6);
-    V* history = carver.take<V>(candidates * Law::kHistory);
-    if (mode) mode->sphere = sphere, mode->guest = guest, mode->history = history;
+    Looks<C>* looks = carver.take<Looks<C>>(kMixed ? p.grains : 0);
+    C* guest = carver.take<C>(static_cast<std::size_t>(plan.guests) * 6);
+    C* history = carver.take<C>(candidates * Law::kHistory);
+    if (mode) mode->sphere = sphere, mode->looks = looks, mode->guest = guest, mode->history = history;
     carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
-    Run<V>* run = carver.take<Run<V>>(Law::kLayered ? candidates * p.points : 0);
+    Run<C>* run = carver.take<Run<C>>(Law::kLayered ? candidates * p.points : 0);
     if (mode) mode->run = run;
     return carver.used;
   }
 
   // Number `row` of an array in every lane; a short block repeats its last replica.
   template <class Pointer>
-  Real gather(const Lane* lanes, const Pointer& pointer, std::ptrdiff_t row) const {
+  Real gather(const Lane* lanes, const Pointer& pointer, std::ptrdiff_t row, int first = 0) const {
     Real a;
-    for (int l = 0; l < W; ++l) a[l] = pointer(lanes[l < block.count ? l : block.count - 1])[row * problem.stride];
+    for (int l = 0; l < W; ++l)
+      a[l] = pointer(lanes[first + l < block.count ? first + l : block.count - 1])[row * problem.stride];
     return a;
   }
 
   V per_lane(const double* Lane::*array, std::ptrdiff_t row) const {
-    return of_lanes<V>(block, [&](const Lane* lanes) {
-      return gather(lanes, [array](const Lane& lane) { return lane.*array; }, row);
+    return of_lanes<V>(block, [&](const Lane* lanes, int first) {
+      return gather(lanes, [array](const Lane& lane) { return lane.*array; }, row, first);
     });
   }
 
   // --- copying in and out
 
-  const Lane* results() const { return std::is_same<V, Real>::value ? block.lanes : block.slopes; }
+  const Lane* results() const { return problem.task == Task::forward ? block.lanes : block.slopes; }
 
   template <class Pointer>
   V read(const Pointer& pointer, std::ptrdiff_t row) const {
-    return of_lanes<V>(block, [&](const Lane* lanes) {
-      return adjacent ? load(pointer(lanes[0]) + row * problem.stride) : gather(lanes, pointer, row);
+    return of_lanes<V>(block, [&](const Lane* lanes, int first) {
+      return adjacent ? load(pointer(lanes[first]) + row * problem.stride) : gather(lanes, pointer, row, first);
     });
   }
 
   // Only lanes that have done all their steps.
   template <class Pointer>
   void write(const Pointer& pointer, std::ptrdiff_t row, V number, int steps_done) const {
-    const Real a = result(number);
+    const auto a = result(number);
     const Lane* lanes = results();
     if (adjacent && together) return store(pointer(lanes[0]) + row * problem.stride, a);
     for (int l = 0; l < block.count; ++l)
@@ -154,7 +181,7 @@ struct Replicas {
     for (int q = 0; q < Law::kHistory; ++q) {
       const Place place = place_of<Law>(row, q);
       history[c * Law::kHistory + q] =
-          read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row);
+          convert<C>(read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row));
     }
     if constexpr (Law::kLayered) {
       const V outer = Reach<V, Law::variant>(history[c], law, problem.points).outer;
@@ -172,7 +199,7 @@ struct Replicas {
     for (int q = 0; q < Law::kHistory; ++q) {
       const Place place = place_of<Law>(row, q);
       write([place](const Lane& lane) { return lane.history_out[place.leaf]; }, place.row,
-            history[c * Law::kHistory + q], steps_done);
+            convert<V>(history[c * Law::kHistory + q]), steps_done);
     }
     if constexpr (Law::kLayered) {
       const V outer = Reach<V, Law::variant>(history[c], law, problem.points).outer;
@@ -205,17 +232,28 @@ struct Replicas {
     store_vec(sphere + 3 * (static_cast<std::size_t>(u) * problem.spheres_per_grain + k), centre);
   }
 
-  void put_grain(int u, Vec<V>, Vec<V>, Vec<V>, Vec<V> force, Vec<V> torque) {
+  void put_grain(int u, Vec<V>, [[maybe_unused]] Vec<V> velocity, [[maybe_unused]] Vec<V> spin, Vec<V> force,
+                 Vec<V> torque) {
+    if constexpr (kMixed) {
+      store_vec(looks[u].velocity, convert<C>(velocity));
+      store_vec(looks[u].spin, convert<C>(spin));
+    }
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kForce, force);
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque, torque);
+  }
+
+  // Velocities that `put_grain` left: drag and gyroscopic torques are in the precision of contacts.
+  void look(int u, Vec<V>& velocity, Vec<V>& spin) const {
+    velocity = convert<V>(load_vec(looks[u].velocity));
+    spin = convert<V>(load_vec(looks[u].spin));
   }
 
   void total_force(int u, Vec<V>& force, Vec<V>& torque) const {
     force = load_vec(hot + static_cast<std::size_t>(u) * kHot + kForce);
     torque = load_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque);
     for (int n = plan.guest_start[u]; n < plan.guest_start[u + 1]; ++n) {
-      force = force + load_vec(guest + 6 * static_cast<std::size_t>(n));
-      torque = torque + load_vec(guest + 6 * static_cast<std::size_t>(n) + 3);
+      force = force + convert<V>(load_vec(guest + 6 * static_cast<std::size_t>(n)));
+      torque = torque + convert<V>(load_vec(guest + 6 * static_cast<std::size_t>(n) + 3));
     }
   }
 
@@ -246,11 +284,11 @@ struct Replicas {
     }
   }
 
-  void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel) {
-    constexpr int kLook = 256, kBatch = 8;
+  void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel) {
+    constexpr int kLook = 256, kBatch = 8, kAhead = 6;
     const V contact_square = splat<V>(4.0);
     int awake[kLook + 1], touching[kBatch];
-    Contact<V> contact[kBatch];
+    Contact<C> contact[kBatch];
     int count = 0;
     for (int look = first; look < end; look += kLook) {
       const int look_end = look + kLook < end ? look + kLook : end;
@@ -262,6 +300,16 @@ struct Replicas {
       for (int n = 0; n < found; ++n) {
         const int c = awake[n];
         const Candidate& pair = plan.candidate[c];
+        // Large packs are in no cache: ask in time for what does not lie in a row with what others want. (In a function of
+        // its own GCC takes this for nothing.)
+        if (n + kAhead < found) {
+          const std::size_t later = awake[n + kAhead];
+          const char* centre = reinterpret_cast<const char*>(sphere + 3 * static_cast<std::size_t>(plan.candidate[later].other));
+          const char* remembered = reinterpret_cast<const char*>(history + later * Law::kHistory);
+          for (std::size_t at = 0; at < 3 * sizeof(V); at += 64) __builtin_prefetch(centre + at);
+          if (marks.touched[later])
+            for (std::size_t at = 0; at < Law::kHistory * sizeof(C); at += 64) __builtin_prefetch(remembered + at);
+        }
         const Vec<V> one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
         const Vec<V> other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
         const V square = dot(other - one, other - one);
@@ -272,7 +320,8 @@ struct Replicas {
         }
         marks.touched[c] = true;
         if (trace.touched) remember(c);
-        meet(meeting(pair, one, other), square, contact[count]);
+        meet(meeting(pair, one, other), convert<C>(square), contact[count]);
+        if constexpr (kMixed) contact[count].before = convert<C>(contact_square - square);
         contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
         touching[count++] = c;
         if (count < kBatch) continue;
@@ -287,11 +336,11 @@ struct Replicas {
   void fetch(std::size_t c) const {
     for (int k = 0; k < marks.runs[c]; ++k) {
       const char* at = reinterpret_cast<const char*>(&runs_of(c).get(k));
-      for (std::size_t line = 0; line < sizeof(Run<V>); line += 64) __builtin_prefetch(at + line, 1);
+      for (std::size_t line = 0; line < sizeof(Run<C>); line += 64) __builtin_prefetch(at + line, 1);
     }
   }
 
-  void compute(const int* touching, int count, Contact<V>* contact, const V* parameter, const LawParameters<V>& law) {
+  void compute(const int* touching, int count, Contact<C>* contact, const C* parameter, const LawParameters<C>& law) {
     if constexpr (Law::kLayered)
       if (count) fetch(touching[0]);
     close(contact, count, parameter);
@@ -308,15 +357,25 @@ struct Replicas {
 
   void forget(std::size_t c, const Candidate& pair) {
     marks.touched[c] = false;
-    for (int q = 0; q < Law::kHistory; ++q) history[c * Law::kHistory + q] = V{};
+    for (int q = 0; q < Law::kHistory; ++q) history[c * Law::kHistory + q] = C{};
     if constexpr (Law::kLayered) marks.runs[c] = 0;
     if (pair.guest >= 0)
-      for (int q = 0; q < 6; ++q) guest[6 * static_cast<std::size_t>(pair.guest) + q] = V{};
+      for (int q = 0; q < 6; ++q) guest[6 * static_cast<std::size_t>(pair.guest) + q] = C{};
   }
 
-  GMEM_INLINE Meeting<V> meeting(const Candidate& pair, Vec<V> centre_one, Vec<V> centre_other) const {
+  GMEM_INLINE Meeting<C> meeting(const Candidate& pair, Vec<V> centre_one, Vec<V> centre_other) const {
     const V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
     const V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
+    if constexpr (kMixed) {
+      const Looks<C>&of_one = looks[pair.grain_one], &of_other = looks[pair.grain_other];
+      const Vec<C> separation = convert<C>(centre_other - centre_one), half = splat<C>(0.5) * separation;
+      return {separation,
+              convert<C>(centre_one - load_vec(one + kPosition)) + half,
+              convert<C>(centre_other - load_vec(other + kPosition)) - half,
+              load_vec(of_other.velocity) - load_vec(of_one.velocity),
+              load_vec(of_one.spin),
+              load_vec(of_other.spin)};
+    } else {
     const Vec<V> point = splat<V>(0.5) * (centre_one + centre_other);
     return {centre_other - centre_one,
             point - load_vec(one + kPosition),
@@ -324,23 +383,24 @@ struct Replicas {
             load_vec(other + kVelocity) - load_vec(one + kVelocity),
             load_vec(one + kSpin),
             load_vec(other + kSpin)};
+    }
   }
 
   // The lower-numbered grain is at home in this domain, the other may be elsewhere.
-  GMEM_INLINE void add(const Candidate& pair, const Push<V>& push) {
+  GMEM_INLINE void add(const Candidate& pair, const Push<C>& push) {
     V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
     V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
     const bool away_is_one = pair.grain_one > pair.grain_other;
     if (pair.guest < 0 || !away_is_one) {
-      store_vec(one + kForce, load_vec(one + kForce) + push.force);
-      store_vec(one + kTorque, load_vec(one + kTorque) + push.torque_one);
+      store_vec(one + kForce, load_vec(one + kForce) + convert<V>(push.force));
+      store_vec(one + kTorque, load_vec(one + kTorque) + convert<V>(push.torque_one));
     }
     if (pair.guest < 0 || away_is_one) {
-      store_vec(other + kForce, load_vec(other + kForce) - push.force);
-      store_vec(other + kTorque, load_vec(other + kTorque) + push.torque_other);
+      store_vec(other + kForce, load_vec(other + kForce) - convert<V>(push.force));
+      store_vec(other + kTorque, load_vec(other + kTorque) + convert<V>(push.torque_other));
     }
     if (pair.guest >= 0) {
-      V* to = guest + 6 * static_cast<std::size_t>(pair.guest);
+      C* to = guest + 6 * static_cast<std::size_t>(pair.guest);
       store_vec(to, away_is_one ? push.force : -push.force);
       store_vec(to + 3, away_is_one ? push.torque_one : push.torque_other);
     }

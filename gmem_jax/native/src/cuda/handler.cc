@@ -151,8 +151,11 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 
 template <Task task>
 ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t,
-                  ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  return in_words([&] { return call(task, law, variant, points, isotropic, stream, args, rets); });
+                  int64_t mixed, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  return in_words([&] {
+    require(mixed == 0, "there is no mixed precision on GPUs");
+    return call(task, law, variant, points, isotropic, stream, args, rets);
+  });
 }
 
 auto binding() {
@@ -163,6 +166,7 @@ auto binding() {
       .Attr<int64_t>("points")
       .Attr<int64_t>("isotropic")
       .Attr<int64_t>("leaves")
+      .Attr<int64_t>("mixed")
       .RemainingArgs()
       .RemainingRets();
 }

@@ -37,6 +37,10 @@ inline V splat(double a) {
 template <class V>
 constexpr int kLanes = 1;
 
+// The square of a force below which it has no magnitude worth restoring: its own square would underflow.
+template <class V>
+constexpr double kTiny = 1e-280;
+
 inline double select(bool m, double a, double b) { return m ? a : b; }
 inline double zero_unless(bool m, double a) { return m ? a : 0.0; }
 

@@ -28,11 +28,15 @@ GMEM_INLINE void meet(const Meeting<V>& m, V square, Contact<V>& c) {
   c.spin_sum = m.spin_one + m.spin_other;
 }
 
+// From the square of the distance and the inverse distance.
+template <class V>
+GMEM_INLINE V overlap_of(const Contact<V>& c) { return fnma(c.square, c.inverse, splat<V>(2.0)); }
+
 // From what `meet` left to normals, sliding velocities and normal forces. The second part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
 template <class V>
 inline void close(Contact<V>* c, int count, const V* parameter) {
-  const V two = splat<V>(2.0), quarter_dt = splat<V>(0.25) * parameter[kDt];
+  const V quarter_dt = splat<V>(0.25) * parameter[kDt];
   invert_roots(c, count);
   for (int n = 0; n < count; ++n) {
     const Vec<V> normal = c[n].inverse * c[n].normal;
@@ -41,7 +45,7 @@ inline void close(Contact<V>* c, int count, const V* parameter) {
     c[n].sliding = fnma(along, normal, c[n].sliding);
     c[n].normal_force = -along;  // for now, the closing velocity
     c[n].turned = quarter_dt * dot(c[n].spin_sum, normal);  // with the mean spin of the two grains
-    c[n].overlap = fnma(c[n].square, c[n].inverse, two);
+    c[n].overlap = overlap_of(c[n]);
     c[n].square = c[n].safe_overlap();
   }
   invert_roots(c, count);

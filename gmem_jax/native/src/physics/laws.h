@@ -83,9 +83,8 @@ struct Transport {
     return (before * denominator2) * fnma(along_normal, along_normal, before);
   }
 
-  // Forces below 1e-70, whose squares would underflow, are not worth a magnitude.
   GMEM_INLINE Vec<V> restore(Vec<V> flat, V before, V square, V inverse) const {
-    const V scale = select(square > splat<V>(1e-280), before * inverse, splat<V>(1.0));
+    const V scale = select(square > splat<V>(kTiny<V>), before * inverse, splat<V>(1.0));
     return fma(scale * sine, cross(normal, flat), (scale * cosine) * flat);
   }
 };
