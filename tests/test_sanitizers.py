@@ -37,7 +37,7 @@ def compiler(sanitizers: str, folder: Path) -> list[str]:
 def compiled(sanitizers: str, folder: Path) -> Path:
     command = compiler(sanitizers, folder)
     cpu, objects = build.SOURCES / "cpu", []
-    for name, flags in {"steps": (), "derivatives": ("-DGMEM_DERIVATIVES",)}.items():
+    for name, flags in {"steps": ("-DGMEM_DOUBLE_ONLY",), "derivatives": ("-DGMEM_DERIVATIVES",)}.items():
         objects.append(str(folder / f"{name}.o"))
         kernel = ["-c", str(cpu / "kernel.cc"), f"-DGMEM_ISA={name}", *flags]
         subprocess.run([*command, *kernel, "-o", objects[-1]], check=True)

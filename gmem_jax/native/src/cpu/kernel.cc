@@ -43,10 +43,12 @@ auto with_worker(const Problem& problem, [[maybe_unused]] const Block& block, co
 #ifdef GMEM_DERIVATIVES
     return problem.task == Task::tangent ? function(As<Engine<Replicas<L, Dual<Real>>>>{}) : function(As<Adjoint<L>>{});
 #else
+#ifndef GMEM_DOUBLE_ONLY  // for sanitizers, under which these take many minutes to compile
     if constexpr (!L::kLayered) {
       if (problem.mixed && block.wide) return function(As<Engine<Replicas<L, Pair, Single<2 * W>>>>{});
       if (problem.mixed) return function(As<Engine<Replicas<L, Real, Single<W>>>>{});
     }
+#endif
     return block.packed ? function(As<Engine<Packed<L>>>{}) : function(As<Engine<Replicas<L, Real>>>{});
 #endif
   });

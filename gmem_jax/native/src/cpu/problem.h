@@ -20,12 +20,12 @@ struct Problem {
   Law law;
   Variant variant;
   bool isotropic;
-  bool mixed;             // contacts in single precision; forward only
   bool history_aliased;   // the histories' results already hold the arguments
   int points;             // Q of the Mindlin law
   int grains;             // N
   int spheres_per_grain;  // K
   std::ptrdiff_t stride;  // doubles between two rows of an array: replicas B of the innermost axis
+  bool mixed = false;     // contacts in single precision; forward only
 
   int spheres() const { return grains * spheres_per_grain; }
 };
