@@ -21,7 +21,7 @@ BUILT, REASON = native.available()
 pytestmark = pytest.mark.skipif(not BUILT, reason=REASON)
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
-LAWS = [gm.Frictionless(), gm.Hooke(mu=0.5), gm.MindlinRescaled(mu=0.5), gm.Mindlin(mu=0.5, points=20)]
+LAWS = [gm.Frictionless(), gm.Hooke(mu=0.5), gm.MindlinRescaled(mu=0.5)]
 REPLICAS = 21  # a wide block and a narrow one, whatever the CPU's vectors
 every_law = pytest.mark.parametrize("law", LAWS, ids=lambda law: type(law).__name__)
 
@@ -100,6 +100,8 @@ def test_what_cannot_be_had_in_mixed_precision_is_refused_in_a_line() -> None:
         gm.Experiment(PACK, signals, precision="half")
     with pytest.raises(ValueError, match=r"precision='mixed' is a mode of the native backend; here plain JAX"):
         gm.Experiment(PACK, signals, backend="jax", precision="mixed")
+    with pytest.raises(ValueError, match="precision='mixed' is not for the Mindlin law"):
+        gm.Experiment(PACK, signals, gm.Mindlin(), precision="mixed")
     experiment = gm.Experiment(PACK, signals, precision="mixed")
     with pytest.raises(NotImplementedError, match=r"no derivatives in mixed precision; use precision='double'"):
         jax.grad(lambda gamma0: gm.fidelity(gm.replace(experiment, gamma0=gamma0)))(1e-3)

@@ -132,6 +132,8 @@ def require_precision(precision: str, backend: str, law: FrictionLaw) -> None:
         raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")
     if precision == "mixed" and get_backend().platform != "cpu":
         raise ValueError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
+    if precision == "mixed" and isinstance(law, Mindlin):
+        raise ValueError("precision='mixed' is not for the Mindlin law, whose rings are kept in double precision")
 
 
 def marcher(backend: str = "auto", precision: str = "double") -> March:
@@ -185,6 +187,7 @@ def _march_mixed(system: System, state: State, boxes: Box, dt: Scalar, drag: Sca
     Positions, orientations, velocities, the sums of forces and the gaps of contacts are in double precision, and the
     gaps rounded. It pays from many replicas side by side, so that a lone one runs in double precision.
     """
+    require_precision("mixed", "native", system.friction)
     return _march(system, state, boxes, dt, drag, _Mode(mixed=state.replicas > 1))
 
 
