@@ -16,7 +16,7 @@ def bench_command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for bench.json and bench.md.")] = Path("bench"),
     packs: Annotated[str, typer.Option(help="Packs, separated by commas; default one of each shipped size.")] = "",
     laws: Annotated[str, typer.Option(help="Friction laws among H, M1, M2, separated by commas.")] = "H,M1,M2",
-    replicas: Annotated[str, typer.Option(help="Numbers of replicas, separated by commas.")] = "1,8,16,32",
+    replicas: Annotated[str, typer.Option(help="Numbers of replicas, separated by commas.")] = "1,8,32,64",
     with_lammps: Annotated[bool, typer.Option("--lammps/--no-lammps", help="Measure LAMMPS beside us.")] = True,
     with_jax: Annotated[bool, typer.Option("--jax/--no-jax", help="Measure plain JAX beside us.")] = True,
     scaling: Annotated[bool, typer.Option("--scaling/--no-scaling", help="Cost against N, memory, gradient.")] = True,
