@@ -12,7 +12,7 @@ import pytest
 from gmem_jax import native
 
 Numbers = dict[str, np.ndarray]
-pytestmark = pytest.mark.xdist_group("devices")  # the numbers of one device are computed once
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("devices")]  # the numbers of one device are computed once
 HERE = Path(__file__).parent
 BUILT, REASON = native.available()
 
@@ -37,7 +37,7 @@ def found(path: Path, devices: int) -> Numbers:
     return numbers
 
 
-@pytest.fixture(scope="module", params=["native", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["native", "jax"])
 def alone(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Numbers]:
     """The numbers of one device."""
     if request.param == "native" and not BUILT:

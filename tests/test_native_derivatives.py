@@ -129,6 +129,7 @@ def test_both_modes_agree_with_plain_jax(name: str, isotropic: bool) -> None:
     assert_close(fast, plain)
 
 
+@pytest.mark.slow
 def test_derivatives_through_200_steps_are_those_of_the_definition() -> None:
     def last(march: native.March, mu: jax.Array) -> jax.Array:
         system = System(PACK.clump, gm.Hooke(mu=mu), PACK.pairs)

@@ -98,6 +98,7 @@ def test_the_way_back_goes_on(tmp_path: Path) -> None:
     _same(run, tmp_path / "parts", [4, 6, 17])
 
 
+@pytest.mark.slow
 def test_a_design_goes_on(tmp_path: Path) -> None:
     experiment = gm.Experiment(gm.load_pack(PACK), ONE, **SHORT)
 

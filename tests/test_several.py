@@ -20,7 +20,7 @@ def base() -> gm.Experiment:
     return gm.Experiment(gm.load_pack(PACK), gm.six_signals(), **SHORT)
 
 
-@pytest.mark.parametrize("backend", ["native", "jax"])
+@pytest.mark.parametrize("backend", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_points_side_by_side_are_the_points_alone(base: gm.Experiment, backend: str) -> None:
     if backend == "native" and not native.available()[0]:
         pytest.skip("no native library")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 
 PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
 ENTRY = "from gmem_jax.command.app import main; main()"
@@ -38,6 +39,7 @@ def test_programs_are_kept_used_again_in_silence_and_change_no_bit(tmp_path: Pat
         np.testing.assert_array_equal(one["p_sig"], other["p_sig"])
 
 
+@pytest.mark.slow
 def test_a_cache_that_is_damaged_or_cannot_be_written_is_no_error(tmp_path: Path) -> None:
     folder = tmp_path / "cache"
     recall(tmp_path / "first.h5", GMEM_COMPILE_CACHE=str(folder))

@@ -114,9 +114,11 @@ void run_blocks(const Problem& problem, const Kernel& kernel, const std::vector<
   const int fit = static_cast<int>(std::min<std::size_t>(threads, kShare * cache_bytes() / std::max<std::size_t>(bytes, 1)));
   const int busy = (threads + domains - 1) / domains;
   const int teams = std::min(count, std::max({1, fit, busy}));
-  const int even = count / teams * teams, rest = count - even;
-  run_teams(problem, kernel, blocks.data(), even, teams, threads, bytes);
-  if (rest > 0) run_teams(problem, kernel, blocks.data() + even, rest, rest, threads, bytes);
+  // A team does one block: what its threads hand on to each other is of that block.
+  for (int first = 0; first < count; first += teams) {
+    const int some = std::min(teams, count - first);
+    run_teams(problem, kernel, blocks.data() + first, some, some, threads, bytes);
+  }
 }
 
 }  // namespace gmem
