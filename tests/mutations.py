@@ -471,6 +471,13 @@ MUTATIONS = (
         f"{ACROSS}[M2]",
     ),
     mutation(
+        "native-chunk-of-an-empty-share",
+        "team.cc",
+        "if (any(taken)) return true;",
+        "return true;",
+        "test_native_sources.py::test_unit_tests_in_cpp[threads]",
+    ),
+    mutation(
         "native-walls-and-spheres",
         "native/__init__.py",
         "(material.normal_stiffness, material.normal_damping, material.wall_stiffness)",

@@ -42,10 +42,8 @@ from gmem_jax.preparation.piston import BLOCK, Pressed, Servo, largest_speed, pr
 from gmem_jax.preparation.ringing import ringing_period
 
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
-FREE_CANDIDATES, FREE_CONTACTS = (
-    68,
-    48,
-)  # a grain, and a sphere, of a pressed pack with that skin: one program for all lists
+FREE_CANDIDATES = 68  # a grain of a pressed pack with that skin: one program for all lists
+FREE_CONTACTS = 48  # a sphere
 SETTLING = 6.0e3  # t_c that coming to rest under the piston took at N = 325 to 3,267, for the progress bar
 CYCLE_SKIN = 0.5  # in R; frictionless grains turn freely, so a list lasts only some 50 t_c
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles

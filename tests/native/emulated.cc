@@ -43,17 +43,7 @@ xla::ffi::Error emulate(int64_t law, int64_t variant, int64_t points, int64_t is
   return handle<task>(nullptr, law, variant, points, isotropic, leaves, mixed, args, rets);
 }
 
-auto without_stream() {
-  return xla::ffi::Ffi::Bind()
-      .Attr<int64_t>("law")
-      .Attr<int64_t>("variant")
-      .Attr<int64_t>("points")
-      .Attr<int64_t>("isotropic")
-      .Attr<int64_t>("leaves")
-      .Attr<int64_t>("mixed")
-      .RemainingArgs()
-      .RemainingRets();
-}
+auto without_stream() { return with_arguments(xla::ffi::Ffi::Bind()); }
 
 }  // namespace
 

@@ -62,6 +62,27 @@ void a_team_does_not_wait_for_one_that_failed() {
   CHECK(through == 0);
 }
 
+// New teams, since the first time that a share is opened is not like the others; and phases of more and fewer chunks than
+// the one before, since a rank that is done with its own looks into shares that were not yet opened.
+void every_chunk_of_a_phase_is_done_once() {
+  constexpr int kPhases = 4, kChunks[kPhases] = {1, 3, 0, 5};
+  int wrong = 0;
+  for (int repeat = 0; repeat < 50000; ++repeat) {
+    Team team(2);
+    std::atomic<int> times[kPhases][5] = {};
+    run_ranks(team.size(), [&](int rank) {
+      for (int phase = 0; phase < kPhases; ++phase) {
+        team.barrier();
+        team.share(Team::kGrains, rank, kChunks[phase]);
+        for (int chunk; team.take(Team::kGrains, rank, &chunk);) ++times[phase][chunk];
+      }
+    });
+    for (int phase = 0; phase < kPhases; ++phase)
+      for (int chunk = 0; chunk < 5; ++chunk) wrong += times[phase][chunk] != (chunk < kChunks[phase]);
+  }
+  CHECK(wrong == 0);
+}
+
 // Four grains of one sphere in a row, far ones first in the list.
 struct Row {
   std::vector<int32_t> first{2, 0, 0, 1}, second{3, 0, 1, 2};
@@ -178,6 +199,7 @@ void blocks_run_side_by_side_as_far_as_they_fit_into_the_cache() {
   CHECK((teams_of(100, 9, 64) == Teams{8, 0, 0, 1}));  // what is left over is shared by all
   CHECK((teams_of(240, 4, 64) == Teams{0, 4, 0, 0}));
   CHECK((teams_of(600, 5, 64) == Teams{0, 0, 0, 5}));
+  CHECK((teams_of(600, 1, 1) == Teams{1, 0, 0, 0}));
   CHECK((teams_of(600, 2, 2) == Teams{0, 2, 0, 0}));  // a block of two domains has no work for four
 }
 
@@ -231,6 +253,7 @@ int main() {
   calls_at_once_share_out_the_cpus();
   a_failed_rank_is_thrown_when_all_have_ended();
   a_team_does_not_wait_for_one_that_failed();
+  every_chunk_of_a_phase_is_done_once();
   plans_keep_neighbours_together_and_padding_apart();
   lists_that_lead_astray_are_refused();
   a_failed_block_fails_the_call_and_not_the_next();

@@ -201,17 +201,7 @@ ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropi
   return in_words([&] { return call(task, law, variant, points, isotropic, leaves, mixed, args, rets); });
 }
 
-auto binding() {
-  return ffi::Ffi::Bind()
-      .Attr<int64_t>("law")
-      .Attr<int64_t>("variant")
-      .Attr<int64_t>("points")
-      .Attr<int64_t>("isotropic")
-      .Attr<int64_t>("leaves")
-      .Attr<int64_t>("mixed")
-      .RemainingArgs()
-      .RemainingRets();
-}
+auto binding() { return with_arguments(ffi::Ffi::Bind()); }
 
 }  // namespace
 }  // namespace gmem

@@ -7,6 +7,7 @@
 #include <new>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "call/arguments.h"
@@ -44,6 +45,20 @@ inline void require_law(int64_t law, int64_t variant, int64_t points) {
   require(0 <= variant && variant <= static_cast<int64_t>(Variant::paper),
           "no variant of the Mindlin law has number " + std::to_string(variant));
   require(static_cast<Law>(law) != Law::mindlin || points >= 2, "the Mindlin law needs two points or more");
+}
+
+// A binding with what a call is given: numbers by name, in the order of a handler's arguments, then arrays.
+template <class Binding>
+auto with_arguments(Binding&& binding) {
+  return std::forward<Binding>(binding)
+      .template Attr<int64_t>("law")
+      .template Attr<int64_t>("variant")
+      .template Attr<int64_t>("points")
+      .template Attr<int64_t>("isotropic")
+      .template Attr<int64_t>("leaves")
+      .template Attr<int64_t>("mixed")
+      .RemainingArgs()
+      .RemainingRets();
 }
 
 // What `call` gives, its exceptions as errors of XLA.

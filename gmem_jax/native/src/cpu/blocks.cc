@@ -1,7 +1,6 @@
 #include "cpu/blocks.h"
 
 #include <algorithm>
-#include <atomic>
 #include <cstdint>
 #include <cstdlib>
 #include <memory>
@@ -75,25 +74,21 @@ class ScratchPool {
 
 ScratchPool& scratch_pool() { return of_process<ScratchPool>(); }
 
-// Some blocks by so many teams, all `threads` shared out to them.
-void run_teams(const Problem& problem, const Kernel& kernel, const Block* blocks, int count, int teams, int threads,
+// Some blocks at once, each by a team; `threads` are shared out to them, to each at most one per domain.
+void run_teams(const Problem& problem, const Kernel& kernel, const Block* blocks, int count, int threads, int domains,
                std::size_t bytes) {
   std::vector<std::unique_ptr<Team>> team;
   std::vector<ScratchPool::Piece> scratch;
   std::vector<std::pair<int, int>> place;  // team, and rank in it, of each thread
-  for (int i = 0; i < teams; ++i) {
-    const int size = std::min(threads * (i + 1) / teams - threads * i / teams, Team::kMaxSize);
+  for (int i = 0; i < count; ++i) {
+    const int size = std::min({threads * (i + 1) / count - threads * i / count, domains, Team::kMaxSize});
     team.emplace_back(new Team(size));
     scratch.push_back(scratch_pool().take(bytes));
     for (int rank = 0; rank < size; ++rank) place.push_back({i, rank});
   }
-  std::atomic<int> next{0};
   run_ranks(static_cast<int>(place.size()), [&](int thread) {
     const auto [i, rank] = place[thread];
-    team[i]->run([&, i = i, rank = rank] {
-      for (int block; (block = team[i]->next(next, rank)) < count;)
-        kernel.run(problem, blocks[block], *team[i], rank, scratch[i].aligned());
-    });
+    team[i]->run([&, i = i, rank = rank] { kernel.run(problem, blocks[i], *team[i], rank, scratch[i].aligned()); });
   });
   for (auto& piece : scratch) scratch_pool().give(std::move(piece));
 }
@@ -114,11 +109,8 @@ void run_blocks(const Problem& problem, const Kernel& kernel, const std::vector<
   const int fit = static_cast<int>(std::min<std::size_t>(threads, kShare * cache_bytes() / std::max<std::size_t>(bytes, 1)));
   const int busy = (threads + domains - 1) / domains;
   const int teams = std::min(count, std::max({1, fit, busy}));
-  // A team does one block: what its threads hand on to each other is of that block.
-  for (int first = 0; first < count; first += teams) {
-    const int some = std::min(teams, count - first);
-    run_teams(problem, kernel, blocks.data() + first, some, some, threads, bytes);
-  }
+  for (int first = 0; first < count; first += teams)
+    run_teams(problem, kernel, blocks.data() + first, std::min(teams, count - first), threads, domains, bytes);
 }
 
 }  // namespace gmem

@@ -132,12 +132,6 @@ void Team::barrier() {
   }
 }
 
-int Team::next(std::atomic<int>& counter, int rank) {
-  if (rank == 0) drawn_ = counter.fetch_add(1);
-  barrier();
-  return drawn_;
-}
-
 void Team::wake() {
   if (asleep_.load() == 0) return;
   std::lock_guard<std::mutex> lock(mutex_);
@@ -145,18 +139,20 @@ void Team::wake() {
 }
 
 void Team::share(Queue queue, int rank, int chunks) {
-  Share& mine = shares_[queue][rank];
-  mine.last.store(static_cast<int>(static_cast<long>(chunks) * (rank + 1) / size_), std::memory_order_relaxed);
-  mine.next.store(static_cast<int>(static_cast<long>(chunks) * rank / size_), std::memory_order_release);
+  const auto begin = [&](int of) { return static_cast<std::uint64_t>(chunks) * of / size_; };
+  shares_[queue][rank].range.store(begin(rank + 1) << 32 | begin(rank), std::memory_order_release);
 }
 
 bool Team::take(Queue queue, int rank, int* chunk) {
+  const auto next = [](std::uint64_t range) { return static_cast<std::uint32_t>(range); };
+  const auto any = [&](std::uint64_t range) { return next(range) < range >> 32; };
   for (int i = 0; i < size_; ++i) {
-    Share& share = shares_[queue][(rank + i) % size_];
+    std::atomic<std::uint64_t>& range = shares_[queue][(rank + i) % size_].range;
     // Look before adding: counters of finished shares must not run away.
-    if (share.next.load(std::memory_order_acquire) >= share.last.load(std::memory_order_relaxed)) continue;
-    *chunk = share.next.fetch_add(1, std::memory_order_acq_rel);
-    if (*chunk < share.last.load(std::memory_order_relaxed)) return true;
+    if (!any(range.load(std::memory_order_acquire))) continue;
+    const std::uint64_t taken = range.fetch_add(1, std::memory_order_acq_rel);
+    *chunk = static_cast<int>(next(taken));
+    if (any(taken)) return true;
   }
   return false;
 }

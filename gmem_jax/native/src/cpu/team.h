@@ -4,6 +4,7 @@
 
 #include <atomic>
 #include <condition_variable>
+#include <cstdint>
 #include <functional>
 #include <mutex>
 
@@ -32,27 +33,24 @@ class Team {
     }
   }
 
-  // The next number of a counter that several teams share, the same for all threads of a team. Between two calls there
-  // must be a barrier.
-  int next(std::atomic<int>& counter, int rank);
   // Wait for the whole team.
   void barrier();
-  // Open the share of `rank` in a phase of `chunks` chunks. The queue must have been emptied before.
+  // Open the share of `rank` in a phase of `chunks` chunks. Since the queue was emptied there must have been a barrier.
   void share(Queue queue, int rank, int chunks);
   // The next chunk for `rank`; false when all have been taken.
   bool take(Queue queue, int rank, int* chunk);
 
  private:
+  // The next chunk in the lower half, the end in the upper: in one word, since who takes while the share is being opened
+  // must not see one of them without the other.
   struct alignas(64) Share {
-    std::atomic<int> next{0};
-    std::atomic<int> last{0};
+    std::atomic<std::uint64_t> range{0};
   };
   struct Left {};  // thrown at a barrier that not all will reach
 
   void wake();
 
   const int size_;
-  int drawn_ = 0;
   std::atomic<bool> failed_{false};
   alignas(64) std::atomic<int> arrived_{0};
   alignas(64) std::atomic<int> phase_{0};

@@ -10,7 +10,6 @@
 #include <mutex>
 #include <sstream>
 #include <stdexcept>
-#include <type_traits>
 #include <vector>
 
 namespace gmem {
@@ -43,17 +42,14 @@ struct Nvrtc {
 
   Nvrtc() {
     void* library = open_library(paths().nvrtc, "pip install 'gmem-jax[cuda13]'");
-    const auto find = [library](auto& function, const char* name) {
-      function = reinterpret_cast<std::remove_reference_t<decltype(function)>>(symbol_of(library, name));
-    };
-    find(version, "nvrtcVersion");
-    find(create, "nvrtcCreateProgram");
-    find(compile, "nvrtcCompileProgram");
-    find(log_size, "nvrtcGetProgramLogSize");
-    find(log, "nvrtcGetProgramLog");
-    find(code_size, "nvrtcGetCUBINSize");
-    find(code, "nvrtcGetCUBIN");
-    find(destroy, "nvrtcDestroyProgram");
+    find(library, "nvrtcVersion", version);
+    find(library, "nvrtcCreateProgram", create);
+    find(library, "nvrtcCompileProgram", compile);
+    find(library, "nvrtcGetProgramLogSize", log_size);
+    find(library, "nvrtcGetProgramLog", log);
+    find(library, "nvrtcGetCUBINSize", code_size);
+    find(library, "nvrtcGetCUBIN", code);
+    find(library, "nvrtcDestroyProgram", destroy);
   }
 };
 

@@ -24,8 +24,12 @@ std::string code_for(const std::string& architecture, const Which& which, std::s
 
 // Opens the first library that there is among paths and names joined by ":", or throws with what would help.
 void* open_library(const std::string& names, const std::string& help);
-// A function of it.
+// A function of it, by name.
 void* symbol_of(void* library, const char* name);
+template <class Function>
+void find(void* library, const char* name, Function*& function) {
+  function = reinterpret_cast<Function*>(symbol_of(library, name));
+}
 
 }  // namespace cuda
 }  // namespace gmem

@@ -158,18 +158,7 @@ ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, in
   });
 }
 
-auto binding() {
-  return ffi::Ffi::Bind()
-      .Ctx<ffi::PlatformStream<void*>>()
-      .Attr<int64_t>("law")
-      .Attr<int64_t>("variant")
-      .Attr<int64_t>("points")
-      .Attr<int64_t>("isotropic")
-      .Attr<int64_t>("leaves")
-      .Attr<int64_t>("mixed")
-      .RemainingArgs()
-      .RemainingRets();
-}
+auto binding() { return with_arguments(ffi::Ffi::Bind().Ctx<ffi::PlatformStream<void*>>()); }
 
 }  // namespace
 }  // namespace cuda

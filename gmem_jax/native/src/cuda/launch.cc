@@ -8,7 +8,6 @@
 #include <stdexcept>
 #include <string>
 #include <tuple>
-#include <type_traits>
 
 namespace gmem {
 namespace cuda {
@@ -34,19 +33,16 @@ struct Driver {
 
   Driver() {
     void* library = open_library("libcuda.so.1", "is there a driver for the GPU?");
-    const auto find = [library](auto& function, const char* name) {
-      function = reinterpret_cast<std::remove_reference_t<decltype(function)>>(symbol_of(library, name));
-    };
-    find(context_of, "cuStreamGetCtx");
-    find(push, "cuCtxPushCurrent_v2");
-    find(pop, "cuCtxPopCurrent_v2");
-    find(device_of, "cuCtxGetDevice");
-    find(attribute, "cuDeviceGetAttribute");
-    find(load, "cuModuleLoadData");
-    find(function, "cuModuleGetFunction");
-    find(launch, "cuLaunchKernel");
-    find(exchange_mode, "cuThreadExchangeStreamCaptureMode");
-    find(describe, "cuGetErrorString");
+    find(library, "cuStreamGetCtx", context_of);
+    find(library, "cuCtxPushCurrent_v2", push);
+    find(library, "cuCtxPopCurrent_v2", pop);
+    find(library, "cuCtxGetDevice", device_of);
+    find(library, "cuDeviceGetAttribute", attribute);
+    find(library, "cuModuleLoadData", load);
+    find(library, "cuModuleGetFunction", function);
+    find(library, "cuLaunchKernel", launch);
+    find(library, "cuThreadExchangeStreamCaptureMode", exchange_mode);
+    find(library, "cuGetErrorString", describe);
   }
 
   void must(int result, const char* what) const {
