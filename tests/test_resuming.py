@@ -70,7 +70,7 @@ def _same(run: Callable[[Keep], Any], folder: Path, deaths: list[int]) -> None:
 def test_a_run_goes_on_with_the_lists_it_had(law: Any, tmp_path: Path) -> None:
     pack = with_skin(gm.load_pack(PACK), 0.02)  # its lists are made anew on the way
     experiment = gm.Experiment(pack, ONE, law, **SHORT)
-    _same(lambda keep: gm.run(experiment, keep=keep), tmp_path / "parts", [3, 9, 11])
+    _same(lambda keep: gm.run(experiment, keep=keep, frames=8), tmp_path / "parts", [3, 9, 11])
 
 
 def test_a_preparation_goes_on(tmp_path: Path) -> None:
@@ -78,9 +78,10 @@ def test_a_preparation_goes_on(tmp_path: Path) -> None:
 
     def run(keep: Keep) -> Any:
         log: dict = {}
-        pack = gm.prepare(recipe, gm.sphere(), keep=keep, log=log)
+        film: list = []
+        pack = gm.prepare(recipe, gm.sphere(), keep=keep, log=log, frames=9, film=film)
         record = {name: value for name, value in pack.info.items() if name in ("rebuilds", "simulated_time")}
-        return dataclasses.replace(pack, record="{}"), log, record
+        return dataclasses.replace(pack, record="{}"), log, record, film
 
     _same(run, tmp_path / "parts", [2, 5, 40])
 

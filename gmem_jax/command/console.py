@@ -31,6 +31,9 @@ Output = Annotated[Path, typer.Option("-o", "--output", help="File to write.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; logs go to stderr.")]
 Picture = Annotated[bool, typer.Option(help="Also draw it, beside the output.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")]
+KeptFrames = Annotated[
+    int, typer.Option("--frames", min=0, help="Configurations along the run to keep, the first and last among them.")
+]
 PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a shipped pack.")]
 
 

@@ -8,15 +8,27 @@ import jax
 import typer
 
 from gmem_jax import native
-from gmem_jax.command.console import AsJson, Force, InputError, Output, announce, claim, emit, reporting, say
+from gmem_jax.command.console import (
+    AsJson,
+    Force,
+    InputError,
+    KeptFrames,
+    Output,
+    announce,
+    claim,
+    emit,
+    reporting,
+    say,
+)
 from gmem_jax.command.resuming import Restart, resumable
+from gmem_jax.experiment.frames import Frames
 from gmem_jax.files.configuration import fingerprint
 from gmem_jax.files.packs import list_packs, save_pack
 from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics import grain
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.sample import Sample
-from gmem_jax.preparation.preparation import Recipe, grain_steps, prepare
+from gmem_jax.preparation.preparation import Recipe, film_of, grain_steps, prepare
 from gmem_jax.show import tables
 
 
@@ -53,6 +65,7 @@ def prepare_command(
     dt: Annotated[float, typer.Option(help="Largest time step, t_c.")] = _DEFAULT.dt,
     name: Annotated[str, typer.Option(help="Name of the pack; default from grain, size and seed.")] = "",
     backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",
+    frames: KeptFrames = 0,
     restart: Restart = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -62,16 +75,19 @@ def prepare_command(
         raise InputError(f"--shape must be tetra or sphere, got {shape!r}")
     clump = grain.tetra(overlap) if shape == "tetra" else grain.sphere()
     recipe = Recipe(grains=grains, seed=seed, delta0=delta0, t0=t0, dt=dt)
+    film_of(recipe, frames)  # refuses what cannot be before anything is begun
     claim(output, ".h5", force=force)
     backend = native.name(backend, Frictionless())
     announce(f"{grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * grains, backend)
     began = time.perf_counter()
     stages: dict[str, Sample] = {}
-    key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, **sources()}
+    film: list[Frames] = []
+    key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
     with resumable(output, key, restart=restart) as parts:
         with reporting(goes_on=True) as progress:
-            pack = prepare(recipe, clump, name=name, backend=backend, keep=parts, progress=progress, log=stages)
-        save_pack(output, pack, stages)
+            kept: Any = {"log": stages, "frames": frames, "film": film}
+            pack = prepare(recipe, clump, name=name, backend=backend, keep=parts, progress=progress, **kept)
+        save_pack(output, pack, stages, *film)
     seconds = time.perf_counter() - began
     rest = pack.info["at_rest"]
     say(f"at rest: largest grain speed {rest['largest_speed']:.1e} R/t_c; wrote {output} in {seconds:.0f} s")

@@ -14,6 +14,7 @@ from gmem_jax.command.console import (
     AsJson,
     Force,
     InputError,
+    KeptFrames,
     Output,
     PackName,
     Picture,
@@ -27,7 +28,7 @@ from gmem_jax.command.options import Chosen, with_experiment
 from gmem_jax.command.resuming import Restart, folder_of, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.recall import default_batch, replica_bins, run, run_bytes
+from gmem_jax.experiment.recall import default_batch, film_of, replica_bins, run, run_bytes
 from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.hdf5 import schema_of
@@ -46,6 +47,8 @@ def _run(
     *,
     restart: bool = False,
     target: Signals | None = None,
+    frames: int = 0,
+    frames_of: int = 1,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
     began = time.perf_counter()
@@ -57,9 +60,10 @@ def _run(
     side_by_side = min(batch, experiment.signals.count)
     what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
     announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
-    with resumable(data, key_of_run(experiment, batch=batch), restart=restart) as parts:
+    film: Any = {"frames": frames, "frames_of": frames_of}
+    with resumable(data, key_of_run(experiment, batch=batch, **film), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
-            recall = jax.block_until_ready(run(experiment, batch=batch, keep=parts, progress=progress))
+            recall = jax.block_until_ready(run(experiment, batch=batch, keep=parts, progress=progress, **film))
         configuration = resolved(experiment, time.perf_counter() - began)
         if target is not None:
             configuration["target"] = written_signals(target)
@@ -88,6 +92,8 @@ def recall_command(
     batch: Annotated[
         int | None, typer.Option(min=1, help="Signals run together; default what fits the free memory.")
     ] = None,
+    frames: KeptFrames = 0,
+    frames_of: Annotated[int, typer.Option(min=0, help="Signal whose configurations they are; 0: no shear.")] = 1,
     restart: Restart = False,
     picture: Picture = True,
     force: Force = False,
@@ -96,7 +102,9 @@ def recall_command(
     """Store waveforms in a pack and recall them."""
     (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
     target = chosen.target(experiment.signals.count)
-    row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target)
+    film_of(experiment, frames, frames_of)  # refuses what cannot be before anything is begun
+    film: Any = {"frames": frames, "frames_of": frames_of}
+    row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
     emit(as_json, row, *_tables(row, configuration))
 
 

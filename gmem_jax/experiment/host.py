@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.devices import Spread, local
+from gmem_jax.experiment.frames import Film, Frame, Taken, take
 from gmem_jax.experiment.pack import SKIN, pair_finder
 from gmem_jax.experiment.protocol import Bin, Stage
 from gmem_jax.experiment.walk import Course, walk_some
@@ -174,6 +175,8 @@ class Walker:
         work: work done so far, in replica-bins; `total_work` is all there is to do.
         rebuilds: lists made anew so far.
         spread: where the replicas are put, if on several devices.
+        film: which configurations are kept.
+        taken: those that were, so far.
     """
 
     course: Course
@@ -189,6 +192,8 @@ class Walker:
     total_work: float = 1.0
     rebuilds: int = 0
     spread: Spread | None = None
+    film: Film = field(default_factory=Film)
+    taken: Taken = field(default_factory=dict)
     _renewed_at: tuple[str, float] | None = None
 
     def afresh(self, **changes: Any) -> "Walker":
@@ -217,6 +222,7 @@ class Walker:
             "pairs": jax.tree.map(local, pairs) if self.spread else pairs,
             "counters": counters,
             "finder": finder,
+            "taken": dict(self.taken),
         }
 
     def restore(self, kept: Mapping[str, Any]) -> None:
@@ -224,7 +230,7 @@ class Walker:
         self.state, self.course = kept["state"], self.course.with_pairs(kept["pairs"])
         self.put_on(self.spread)
         self.time, self.work, rebuilds, self.skin, chunk = kept["counters"].tolist()
-        self.rebuilds, self.chunk = int(rebuilds), int(chunk)
+        self.rebuilds, self.chunk, self.taken = int(rebuilds), int(chunk), kept["taken"]
         if not _same(kept["finder"], self.finder.kept() if self.finder else {}):
             self.finder = pair_finder(self.course.system.clump, **kept["finder"]) if kept["finder"] else None
 
@@ -274,6 +280,9 @@ class Walker:
     def _play(self, stage: Stage, samples: list[Sample]) -> Iterator[bool]:
         """Play what is left of a stage and add to its samples; after each chunk, whether it was the last."""
         done, most = sum(len(sample.pressure) for sample in samples), CHUNK
+        if done == 0 and stage.name == self.film.from_the_beginning:
+            drive = self.course.drive
+            self.take(stage.name, self.state, np.asarray(drive.lower), np.asarray(drive.upper), stage.start)
         while done < stage.bins:
             first = stage.bin(done)
             count = min(self.chunk, stage.bins - done)
@@ -284,11 +293,48 @@ class Walker:
                 continue
             refuse(status, stage.name)
             self.action.accept(self.course, self.state, stage, first, count, more)
+            for bins in self.film.between(stage.name, done, done + count):
+                self._take_after(stage, done, bins - done, count, state, sample)
             self.state = state
             done += count
             samples.append(jax.tree.map(lambda leaf, count=count: leaf[:count], self._here(sample)))
             self.report(stage.name, samples[-1].pressure.shape[-1] * count, self._moment(count))
             yield done == stage.bins
+
+    def _take_after(self, stage: Stage, done: int, bins: int, count: int, state: State, sample: Sample) -> None:
+        """Take a configuration `bins` after the `done` ones of a stage, within a chunk of `count` that ended so."""
+        if bins < count:
+            state, sample, _ = self.action.chunk(self.course, self.state, stage.bin(done), bins, CHUNK)
+        half = 0.5 * self._here(sample.lengths)[bins - 1]
+        drive = self.course.drive
+        centre = 0.5 * np.asarray(drive.lower + drive.upper)
+        u = stage.start + (stage.stop - stage.start) * (done + bins) / stage.bins
+        self.take(stage.name, state, centre - half, centre + half, u, self._moment(bins))
+
+    def take(self, name: str, state: State, lower: np.ndarray, upper: np.ndarray, u: float, later: float = 0.0) -> None:
+        """Keep a configuration.
+
+        Args:
+            name: of the stage.
+            state: on this walk.
+            lower: planes of the box, [3, 1] or [3, B].
+            upper: planes, likewise.
+            u: compression.
+            later: time from now to then, in t_c.
+        """
+        one, system = self.film.replica if state.replicas > 1 else 0, self.course.system
+        own = (state.replicas,)
+        friction, dt = jax.tree.map(
+            lambda leaf: local(leaf)[one : one + 1] if np.shape(leaf) == own else local(leaf),
+            (system.friction, self.course.dt),
+        )
+        state, lower, upper = jax.tree.map(
+            lambda leaf: leaf[..., one : one + 1] if np.shape(leaf)[-1] > 1 else leaf, (self._here(state), lower, upper)
+        )
+        time = (self.time + later) * float(np.max(dt)) / float(np.max(local(self.course.dt)))
+        system = replace(jax.tree.map(local, system), friction=friction)
+        frame: Frame = take(system, state, lower[:, 0], upper[:, 0], time, u)
+        self.taken = {**self.taken, name: (*self.taken.get(name, ()), frame)}
 
     def _moment(self, bins: int) -> float:
         return bins * self.course.steps * float(np.max(local(self.course.dt)))

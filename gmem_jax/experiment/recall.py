@@ -1,5 +1,6 @@
 """What a pack gives back: an experiment run, its background subtracted, compared with the integrals (Secs. II, III)."""
 
+import dataclasses
 import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -14,7 +15,9 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.doubts import doubts
 from gmem_jax.experiment.experiment import Experiment, replace
+from gmem_jax.experiment.frames import Film, Frames, Taken, joined, places
 from gmem_jax.experiment.host import (
+    CHUNK,
     NOWHERE,
     Checkpoint,
     Compiled,
@@ -63,6 +66,7 @@ class Recall:
         stages: samples of every stage by name, leading axis bins; one replica before "encode". Ordered: JAX sorts the
             keys of plain dictionaries.
         dt: the time step used, in t_c.
+        frames: configurations of one replica along the run, if they were asked for.
     """
 
     u: jax.Array
@@ -78,6 +82,7 @@ class Recall:
     status: jax.Array
     stages: OrderedDict[str, Sample]
     dt: Scalar
+    frames: Frames | None = None
 
 
 def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
@@ -188,6 +193,8 @@ def run(
     *,
     batch: int | None = None,
     devices: Sequence[jax.Device] | None = None,
+    frames: int = 0,
+    frames_of: int = 1,
     keep: Keep = forget,
     progress: Progress = silent,
 ) -> Recall:
@@ -199,17 +206,21 @@ def run(
         experiment: the experiment.
         batch: signals that run together; default all of them. Each batch has a zero signal of its own.
         devices: that share out the replicas; default all that JAX sees, also those of other processes.
+        frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
+        frames_of: the signal whose they are, from 1; 0 for the zero signal.
         keep: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
 
     Raises:
-        ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches.
+        ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
+            for too many or too few frames, or a signal that there is not.
         RunFailedError: if the simulation broke down.
     """
     count, size = experiment.signals.count, batch or experiment.signals.count
     if size < 1:
         raise ValueError(f"batch must be at least 1, got {batch}")
-    begun = walker(experiment, progress=progress)
+    film = film_of(experiment, frames, frames_of)
+    begun = walker(experiment, progress=progress, film=film)
     warn_of_another_compression(experiment)
     if size < count and (begun.state.replicas > 1 or jnp.ndim(experiment.gamma0)):
         raise ValueError("parameters with a value for each replica need all signals in one batch")
@@ -220,22 +231,42 @@ def run(
     samples = begun.play_part("prefix", keep, *common)
     done = before * begun.state.replicas
     parts: list[tuple[dict[str, Sample], jax.Array]] = []
+    taken: Taken = {}
     for number, first in enumerate(firsts):
         last = min(first + size, count)
         few = experiment if size >= count else replace(experiment, signals=part(experiment.signals, first, last))
-        on = begun.afresh(work=float(done))
+        filmed = first < frames_of <= last or frames_of == first == 0
+        own_film = Film(film.wanted, max(0, frames_of - first)) if filmed else Film()
+        on = begun.afresh(work=float(done), film=own_film)
 
         def run_batch(checkpoint: Checkpoint, few: Experiment = few, on: Walker = on) -> Any:
             shear(on, few)
             on.put_on(spread_over(few.replicas, devices))
             samples = on.play(*own, checkpoint=checkpoint)
-            return samples, on.status()
+            return (samples, on.status()), on.taken
 
-        parts.append(keep(f"batch-{number:04d}", run_batch))
+        found_part, all_taken = keep(f"batch-{number:04d}", run_batch)
+        parts.append(found_part)
+        taken = all_taken if filmed else taken
         done += after * (last - first + 1)
-    joined, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
-    found: Recall = finished(experiment, samples | joined, jnp.asarray(status))
-    return found
+    after_prefix, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
+    found: Recall = finished(experiment, samples | after_prefix, jnp.asarray(status))
+    return (
+        found
+        if frames == 0
+        else dataclasses.replace(found, frames=joined(taken, np.asarray(experiment.pack.clump.offsets), frames_of))
+    )
+
+
+def film_of(experiment: Experiment, frames: int, of: int) -> Film:
+    """What is to be taken of a run: `frames` configurations of the replica of a signal.
+
+    Raises:
+        ValueError: for too many or too few, or a signal that there is not.
+    """
+    if not 0 <= of <= experiment.signals.count:
+        raise ValueError(f"frames of signal {of}: there are signals 1 to {experiment.signals.count}, and 0 for none")
+    return Film(places(experiment.stages, frames, CHUNK), of) if frames else Film()
 
 
 def replica_bins(experiment: Experiment, batch: int, wide: int = 1) -> int:

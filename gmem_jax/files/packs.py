@@ -7,9 +7,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.frames import Frames
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files import soundness
 from gmem_jax.files.checked import Array, json_of, refusing, require, title
+from gmem_jax.files.frames import write_frames
 from gmem_jax.files.hdf5 import reading, write_samples, writing
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import candidates, tabulate
@@ -45,8 +47,8 @@ _DECLARED = (
 )
 
 
-def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None) -> None:
-    """Write a pack, and the time series of its preparation if given.
+def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None, frames: Frames | None = None) -> None:
+    """Write a pack, and the time series of its preparation and configurations along it if given.
 
     Raises:
         OSError: if the path cannot be written.
@@ -68,6 +70,8 @@ def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None) -
             pairs.create_dataset(key, data=np.asarray(getattr(pack.pairs, key)))
         if stages:
             write_samples(file.create_group("stages"), stages)
+        if frames is not None:
+            write_frames(file, frames)
 
 
 def load_pack(source: str | Path) -> Pack:

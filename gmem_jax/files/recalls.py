@@ -24,6 +24,7 @@ from gmem_jax.files.checked import (
     whole,
 )
 from gmem_jax.files.configuration import signals_from
+from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_samples, writing
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Status
@@ -51,9 +52,11 @@ def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> No
     with writing(path, RECALL_SCHEMA) as file:
         file.attrs["configuration"] = json.dumps(configuration)
         for entry in fields(recall):
-            if entry.name != "stages":
+            if entry.name not in ("stages", "frames"):
                 file.create_dataset(entry.name, data=np.asarray(getattr(recall, entry.name)))
         write_samples(file.create_group("stages"), recall.stages)
+        if recall.frames is not None:
+            write_frames(file, recall.frames)
 
 
 def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
@@ -82,7 +85,7 @@ def _recall_of(content: Content, configuration: dict[str, Any]) -> Recall:
     found = content.arrays(declared)
     if content.schema == _BEFORE:
         found["shear"] = _waveforms(configuration, found["u"], found["J"])
-    return Recall(**found, stages=content.samples("stages"))  # type: ignore[arg-type]
+    return Recall(**found, stages=content.samples("stages"), frames=read_frames(content))  # type: ignore[arg-type]
 
 
 def _waveforms(configuration: dict[str, Any], u: np.ndarray, integral: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from gmem_jax.physics.contact.friction import FrictionLaw
-from gmem_jax.physics.contact.kinematics import kinematics
+from gmem_jax.physics.contact.kinematics import Kinematics, kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.contact.wall import wall_forces
 from gmem_jax.physics.grain import Clump
@@ -65,7 +65,7 @@ def together(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: lax.pcast(leaf, tuple(sorted(union - axes(leaf))), to="varying"), tree)
 
 
-def _sphere_table(clump: Clump, grains: Grains) -> tuple[jax.Array, jax.Array]:
+def sphere_table(clump: Clump, grains: Grains) -> tuple[jax.Array, jax.Array]:
     """Sphere centres, their velocities and spins as rows [S, 9, B], and the arms from the grain centre [N, K, 3, B]."""
     arms = sphere_offsets(grains.quaternion, clump)
     spin = jnp.broadcast_to(grains.spin[:, None], arms.shape)
@@ -75,6 +75,36 @@ def _sphere_table(clump: Clump, grains: Grains) -> tuple[jax.Array, jax.Array]:
     return rows.reshape(-1, *rows.shape[2:]), arms
 
 
+def relative_motion(pairs: Pairs, table: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Separations and relative velocities of candidates, and the sums of their spins, [P, 3, B] each."""
+    one, other = table[pairs.first], table[pairs.second]
+    difference = other[:, :6] - one[:, :6]
+    return difference[:, :3], difference[:, 3:], other[:, 6:] + one[:, 6:]
+
+
+def contact_loads(
+    system: System, separation: jax.Array, velocity: jax.Array, spin_sum: jax.Array, history: Any, dt: jax.Array
+) -> tuple[Kinematics, jax.Array, jax.Array, Any]:
+    """The law of a contact: of every candidate its kinematics, the repulsive normal force [P, 1, B], the tangential
+    force on the first sphere [P, 3, B], and the new history.
+
+    Args:
+        system: the system.
+        separation: see `relative_motion`.
+        velocity: likewise.
+        spin_sum: likewise.
+        history: the friction law's.
+        dt: time step; 0 leaves the histories as they are.
+    """
+    kin = kinematics(separation, velocity, spin_sum, system.pairs.valid, dt)
+    material = system.material
+    normal_force = hertz(
+        kin.safe_overlap, kin.closing, kin.touching, material.normal_stiffness, material.normal_damping
+    )
+    tangential, new_history = system.friction(kin, normal_force, history)
+    return kin, normal_force, tangential, new_history
+
+
 def contact_forces(
     system: System, table: jax.Array, history: Any, dt: jax.Array, alive: jax.Array
 ) -> tuple[jax.Array, Any]:
@@ -82,7 +112,7 @@ def contact_forces(
 
     Args:
         system: the system.
-        table: rows of `_sphere_table`, [S, 9, B].
+        table: rows of `sphere_table`, [S, 9, B].
         history: the friction law's.
         dt: time step.
         alive: see `_apart`.
@@ -90,19 +120,10 @@ def contact_forces(
     Returns:
         [S, 6, B], and the new history.
     """
-    pairs, material = system.pairs, system.material
-
-    def gather(table: jax.Array) -> tuple[jax.Array, ...]:
-        one, other = table[pairs.first], table[pairs.second]
-        difference = other[:, :6] - one[:, :6]
-        return difference[:, :3], difference[:, 3:], other[:, 6:] + one[:, 6:]
+    pairs = system.pairs
 
     def law(separation: jax.Array, velocity: jax.Array, spin_sum: jax.Array, history: Any) -> tuple[jax.Array, Any]:
-        kin = kinematics(separation, velocity, spin_sum, pairs.valid, dt)
-        normal_force = hertz(
-            kin.safe_overlap, kin.closing, kin.touching, material.normal_stiffness, material.normal_damping
-        )
-        tangential, new_history = system.friction(kin, normal_force, history)
+        kin, normal_force, tangential, new_history = contact_loads(system, separation, velocity, spin_sum, history, dt)
         force = tangential - normal_force * kin.normal
         # The surface force on j is opposite and so is its arm: the tangential torque is the same on both.
         torque = kin.arm * cross(kin.normal, tangential)
@@ -110,7 +131,7 @@ def contact_forces(
         stack = [jnp.concatenate([force, torque], axis=1), jnp.concatenate([-force, torque], axis=1), nothing]
         return jnp.concatenate(stack, axis=0), new_history
 
-    stack, history = _apart(alive, law, *_apart(alive, gather, table), history)
+    stack, history = _apart(alive, law, *_apart(alive, lambda table: relative_motion(pairs, table), table), history)
     return _apart(alive, lambda rows: jnp.sum(rows[pairs.incidence], axis=1), stack), history
 
 
@@ -121,7 +142,7 @@ def _loads(
     """Of every sphere: its arm [N, K, 3, B], contact forces and torques [S, 6, B], wall forces; and the new history."""
     material = system.material
     with jax.named_scope("spheres"):
-        table, arms = _apart(alive, lambda grains: _sphere_table(system.clump, grains), grains)
+        table, arms = _apart(alive, lambda grains: sphere_table(system.clump, grains), grains)
     with jax.named_scope("contacts"):
         contact, history = contact_forces(system, table, history, dt, alive)
     with jax.named_scope("walls"):

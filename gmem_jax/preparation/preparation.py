@@ -11,6 +11,7 @@ import numpy as np
 
 from gmem_jax import native
 from gmem_jax.experiment.drive import Drive
+from gmem_jax.experiment.frames import Film, Frames, joined, places
 from gmem_jax.experiment.host import (
     Checkpoint,
     Compiled,
@@ -168,14 +169,49 @@ def _spacing(recipe: Recipe, clump: Clump) -> float:
     return max(side, 1.02 * float(clump.diameter))
 
 
+FILMED = ("gas", "press", "settle")  # stages after which a configuration is taken, if any are
+
+
+def _cycles(recipe: Recipe) -> tuple[Stage, ...]:
+    cycle = preparation_cycle(recipe.rest, recipe.hold)
+    return tuple(
+        replace(stage, name=f"cycle {n}: {stage.name}") for n in range(1, recipe.cycles + 1) for stage in cycle
+    )
+
+
+def film_of(recipe: Recipe, frames: int) -> Film:
+    """What is to be taken of the cycles: of `frames` configurations those beside the lattice, `FILMED` and the pack.
+
+    Raises:
+        ValueError: for too many or too few.
+    """
+    always, stages = len(FILMED) + 2, _cycles(recipe)
+    bins = sum(stage.bins for stage in stages)
+    if frames and not always <= frames <= always + bins:
+        raise ValueError(f"frames must be 0 for none, or {always} to {always + bins} for this recipe; got {frames}")
+    if frames <= always:
+        return Film()
+    wanted = places(stages, frames - always + 1, CYCLE_CHUNK)
+    wanted[stages[0].name].remove(0)  # where "settle" ended
+    return Film(wanted)
+
+
 class _Preparation:
     """One preparation on its way: a `Walker` with one replica and no friction, and the walls as they are now."""
 
     def __init__(
-        self, recipe: Recipe, clump: Clump, material: Material, backend: str, keep: Keep, progress: Progress
+        self,
+        recipe: Recipe,
+        clump: Clump,
+        material: Material,
+        backend: str,
+        frames: int,
+        keep: Keep,
+        progress: Progress,
     ) -> None:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
-        self.recipe, self.keep = recipe, keep
+        self.recipe, self.keep, self.filmed = recipe, keep, frames > 0
+        film = film_of(recipe, frames)
         self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
         steps = max(1, math.ceil(recipe.t0 / (BINS * recipe.dt) * (1.0 - 1e-12)))
         self.dt = recipe.t0 / (BINS * steps)
@@ -191,17 +227,24 @@ class _Preparation:
         expected = expected_time(recipe, float(lengths[2])) / (self.dt * steps)
         self.march = native.marcher(native.name(backend, system.friction))
         course = Course(system, self._drive(), self.dt, recipe.drag, steps=steps, backend=backend)
-        self.walker = Walker(course, state, finder=finder, progress=progress, total_work=expected)
+        self.walker = Walker(course, state, finder=finder, progress=progress, total_work=expected, film=film)
         self.log: dict[str, Sample] = {}
+        self.take("gas")
 
     def _drive(self) -> Drive:
         return Drive(self.box.lower, self.box.upper, self.recipe.delta0)
+
+    def take(self, name: str) -> None:
+        """Keep the configuration that there is now, at u = 0, if any are to be kept."""
+        if self.filmed:
+            self.walker.take(name, self.walker.state, np.asarray(self.box.lower), np.asarray(self.box.upper), 0.0)
 
     def press(self, name: str, servo: Servo, duration: float, drag: float) -> Pressed:
         """Run the servo until it has settled or `duration` is over; the list is made anew as often as needed."""
         kept, pressed = self.keep(name, lambda checkpoint: self._press(checkpoint, name, servo, duration, drag))
         self.walker.restore(kept)
         self.box = pressed.box
+        self.take(name)
         return cast(Pressed, pressed)
 
     def _press(
@@ -262,9 +305,7 @@ class _Preparation:
             np.asarray(self.box.lower)[:, 0], np.asarray(self.box.upper)[:, 0], recipe.delta0
         )
         walker.renew(self.box)
-        cycle, numbers = preparation_cycle(recipe.rest, recipe.hold), range(1, recipe.cycles + 1)
-        stages = (replace(stage, name=f"cycle {n}: {stage.name}") for n in numbers for stage in cycle)
-        self.log |= walker.play_part("cycles", self.keep, *stages)
+        self.log |= walker.play_part("cycles", self.keep, *_cycles(recipe))
         rest = Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1))
         waited = 0.0
         while waited == 0.0 or float(largest_speed(walker.state)) > recipe.quiet:
@@ -274,6 +315,7 @@ class _Preparation:
                 )
             self.log |= walker.play_part(f"rest-{waited:g}", self.keep, rest)
             waited += rest.length * recipe.t0
+        self.take(rest.name)
 
 
 def prepare(
@@ -287,6 +329,8 @@ def prepare(
     keep: Keep = forget,
     progress: Progress = silent,
     log: dict[str, Sample] | None = None,
+    frames: int = 0,
+    film: list[Frames] | None = None,
     **changes: Any,
 ) -> Pack:
     """Prepare a pack: gas, pressure, frictionless cycles, rest.
@@ -301,6 +345,9 @@ def prepare(
         keep: asked for every part, so that a long preparation can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
         log: filled with the samples of every cycle stage, if given.
+        frames: configurations to keep: the lattice, the ends of gas, pressing and settling, the pack, and from six on
+            some of the cycles (see `frames.places`). The pack stays as it is.
+        film: where to put them.
         **changes: fields of the recipe that differ, for example ``prepare(grains=64, seed=3)``.
 
     Raises:
@@ -310,11 +357,14 @@ def prepare(
     require_x64()
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = grain or tetra(), material or Material()
-    preparation = _Preparation(recipe, clump, material, backend, keep, progress)
+    preparation = _Preparation(recipe, clump, material, backend, frames, keep, progress)
     preparation.compact()
     preparation.cycle()
     if log is not None:
         log.update(preparation.log)
+    if film is not None and frames:
+        centre = np.asarray(0.5 * (preparation.box.lower + preparation.box.upper))[:, 0]  # the origin of the pack
+        film.append(joined(preparation.walker.taken, np.asarray(clump.offsets), centre=centre))
     return _finish(preparation, material, friction or Hooke(), name)
 
 

@@ -1,0 +1,228 @@
+"""Configurations along a run: grains, walls and contact forces of one replica at some moments, kept to be looked at.
+
+Watching changes nothing: frames are taken from states that a walk goes through anyway, or that it goes through again.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment.protocol import Stage
+from gmem_jax.physics.pytree import pytree, static
+from gmem_jax.physics.state import State
+from gmem_jax.physics.step import System, contact_loads, relative_motion, sphere_table
+
+FEWEST = 2  # the first configuration and the last
+
+
+@pytree
+@dataclass(frozen=True)
+class Frame:
+    """One configuration of N grains with M touching pairs of spheres; see `Frames`."""
+
+    time: np.ndarray
+    u: np.ndarray
+    position: np.ndarray
+    quaternion: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    spheres: np.ndarray
+    normal_force: np.ndarray
+    friction_force: np.ndarray
+
+
+@pytree
+@dataclass(frozen=True)
+class Frames:
+    """F configurations of one replica, in the order of the run (R = E = rho = 1).
+
+    Sphere k of grain n, centred at offsets[k] in the grain's frame, has the number n K + k. Contacts of all frames
+    stand one after the other: those of frame f are start[f] to start[f + 1].
+
+    Attributes:
+        time: since the beginning, [F], in t_c.
+        u: compression, 0 to 1, [F].
+        position: grain centres, [F, N, 3], in R.
+        quaternion: body-to-lab rotations (w, x, y, z), [F, N, 4].
+        lower: lower planes of the box, [F, 3], in R.
+        upper: upper planes, [F, 3].
+        start: where the contacts of a frame begin, and where the last ends, whole, [F + 1].
+        spheres: numbers i < j of the two that touch, whole, [M, 2]; walls are not listed.
+        normal_force: by which they repel each other, [M], in E R^2.
+        friction_force: tangential force on sphere i, the opposite of that on j, [M, 3]. Half of the next step's
+            increment is in it, as in the history that a law keeps.
+        offsets: sphere centres of a grain in its own frame, [K, 3], in R.
+        stages: the stage that each frame ends or is in, [F].
+        signal: whose replica it is: from 1, or 0 for no signal.
+    """
+
+    time: np.ndarray
+    u: np.ndarray
+    position: np.ndarray
+    quaternion: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    start: np.ndarray
+    spheres: np.ndarray
+    normal_force: np.ndarray
+    friction_force: np.ndarray
+    offsets: np.ndarray
+    stages: tuple[str, ...] = static(())
+    signal: int = static(0)
+
+    @property
+    def count(self) -> int:
+        """Number of configurations F."""
+        return len(self.stages)
+
+    def centres(self, frame: int) -> np.ndarray:
+        """Sphere centres of a frame, [N K, 3], in R."""
+        return sphere_places(self.position[frame], self.quaternion[frame], self.offsets)
+
+
+def sphere_places(position: np.ndarray, quaternion: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Sphere centres [N K, 3] of grains [N, 3], [N, 4]; `pairs.sphere_centres` without JAX, which compiles for each N.
+
+    Args:
+        position: grain centres, in R.
+        quaternion: body-to-lab rotations (w, x, y, z).
+        offsets: of the spheres in the grain's frame, [K, 3], in R.
+    """
+    w, x, y, z = np.asarray(quaternion).T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    turned = np.einsum("ijn,kj->nki", np.array(rows), offsets)
+    return np.asarray((np.asarray(position)[:, None] + turned).reshape(-1, 3))
+
+
+Taken = Mapping[str, tuple[Frame, ...]]
+"""Frames by stage, in the order of the run."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """Which configurations of a walk are taken.
+
+    Attributes:
+        wanted: finished bins of a stage after which one is, by the stage's name.
+        replica: whose, once there are several.
+    """
+
+    wanted: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    replica: int = 0
+
+    def between(self, stage: str, first: int, last: int) -> list[int]:
+        """The wanted numbers of finished bins above `first` and up to `last`."""
+        return [bins for bins in self.wanted.get(stage, ()) if first < bins <= last]
+
+    @property
+    def from_the_beginning(self) -> str:
+        """The stage before which one is taken; "" for none."""
+        return next((name for name, places in self.wanted.items() if 0 in places), "")
+
+
+def places(stages: Sequence[Stage], count: int, every: int) -> dict[str, list[int]]:
+    """Moments of `count` configurations along some stages, as finished bins by the stage's name.
+
+    The first and the last; then always the longest stretch without one is halved, as well as can be at the end of a
+    stage, or else after a multiple of `every` bins; where neither lies in the middle half of it, in its middle. So the
+    ends of encoding, storage and readout are there from five on, and those of fewer are among those of more.
+
+    Args:
+        stages: with names of their own.
+        count: how many, at least 2.
+        every: bins that are run in one go: to stop there costs nothing.
+
+    Raises:
+        ValueError: if that is too few, or more than there are bins.
+    """
+    ends = list(itertools.accumulate(stage.bins for stage in stages))
+    if not FEWEST <= count <= ends[-1] + 1:
+        raise ValueError(f"frames must be 0 for none, or {FEWEST} to {ends[-1] + 1} for this run; got {count}")
+    starts = [0, *ends[:-1]]
+    cheap = [place for start, end in zip(starts, ends, strict=True) for place in range(start + every, end, every)]
+    chosen = [0, ends[-1]]
+    while len(chosen) < count:
+        first, last = max(itertools.pairwise(chosen), key=lambda stretch: stretch[1] - stretch[0])
+        middle, quarter = (first + last) // 2, (last - first) / 4
+        near = [[place for place in known if abs(place - middle) <= quarter] for known in (ends, cheap)]
+        chosen = sorted([*chosen, min(near[0] or near[1] or [middle], key=lambda place: abs(place - middle))])
+    found = {stages[0].name: [0]}
+    for place in chosen[1:]:
+        number = next(number for number, end in enumerate(ends) if place <= end)
+        found.setdefault(stages[number].name, []).append(place - starts[number])
+    return found
+
+
+@jax.jit
+def _contacts(system: System, state: State) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Of every candidate: whether it touches, its normal force and its friction, [P, 1, B] and [P, 3, B]."""
+    table, _ = sphere_table(system.clump, state.grains)
+    still = jnp.zeros(())  # in no time a history stays as it is
+    motion = relative_motion(system.pairs, table)
+    kin, normal, friction, _ = contact_loads(system, *motion, state.history, still)
+    return kin.touching, normal, friction
+
+
+def take(system: System, state: State, lower: np.ndarray, upper: np.ndarray, time: float, u: float) -> Frame:
+    """A configuration.
+
+    Args:
+        system: what the state is one of.
+        state: of one replica.
+        lower: planes of the box, [3].
+        upper: planes, [3].
+        time: since the beginning, in t_c.
+        u: compression.
+    """
+    touching, normal, friction = (np.asarray(leaf)[..., 0] for leaf in _contacts(system, state))
+    listed = np.flatnonzero(touching[:, 0])
+    spheres = np.stack([np.asarray(system.pairs.first), np.asarray(system.pairs.second)], axis=1)
+    position, quaternion = np.asarray(state.grains.position), np.asarray(state.grains.quaternion)
+    return Frame(
+        time=np.asarray(time, float),
+        u=np.asarray(u, float),
+        position=position[..., 0],
+        quaternion=quaternion[..., 0],
+        lower=np.array(lower, float),
+        upper=np.array(upper, float),
+        spheres=spheres[listed],
+        normal_force=normal[listed, 0],
+        friction_force=friction[listed],
+    )
+
+
+def joined(taken: Taken, offsets: np.ndarray, signal: int = 0, centre: np.ndarray | float = 0.0) -> Frames:
+    """Frames as one.
+
+    Args:
+        taken: by stage, at least one.
+        offsets: of a grain's spheres, [K, 3].
+        signal: whose replica it is.
+        centre: what becomes the origin, [3].
+    """
+    every = [frame for frames in taken.values() for frame in frames]
+    stacked = {name: np.stack([getattr(frame, name) for frame in every]) for name in ("time", "u", "quaternion")}
+    moved = {
+        name: np.stack([getattr(frame, name) - centre for frame in every]) for name in ("position", "lower", "upper")
+    }
+    contacts = {
+        name: np.concatenate([getattr(frame, name) for frame in every])
+        for name in ("spheres", "normal_force", "friction_force")
+    }
+    return Frames(
+        **stacked,
+        **moved,
+        **contacts,
+        start=np.cumsum([0, *(len(frame.spheres) for frame in every)]),
+        offsets=np.asarray(offsets),
+        stages=tuple(name for name, frames in taken.items() for _ in frames),
+        signal=signal,
+    )
