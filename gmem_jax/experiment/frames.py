@@ -103,7 +103,7 @@ def sphere_places(position: np.ndarray, quaternion: np.ndarray, offsets: np.ndar
 
 
 Taken = Mapping[str, tuple[Frame, ...]]
-"""Frames by stage, in the order of the run."""
+"""Frames by stage, in the order of the run: an ordered dictionary, since JAX sorts the keys of plain ones."""
 
 
 @dataclass(frozen=True)

@@ -222,7 +222,7 @@ class Walker:
             "pairs": jax.tree.map(local, pairs) if self.spread else pairs,
             "counters": counters,
             "finder": finder,
-            "taken": dict(self.taken),
+            "taken": OrderedDict(self.taken),
         }
 
     def restore(self, kept: Mapping[str, Any]) -> None:
@@ -334,7 +334,7 @@ class Walker:
         time = (self.time + later) * float(np.max(dt)) / float(np.max(local(self.course.dt)))
         system = replace(jax.tree.map(local, system), friction=friction)
         frame: Frame = take(system, state, lower[:, 0], upper[:, 0], time, u)
-        self.taken = {**self.taken, name: (*self.taken.get(name, ()), frame)}
+        self.taken = OrderedDict({**self.taken, name: (*self.taken.get(name, ()), frame)})
 
     def _moment(self, bins: int) -> float:
         return bins * self.course.steps * float(np.max(local(self.course.dt)))
