@@ -27,6 +27,7 @@ from gmem_jax.command.resuming import Restart, resumable
 from gmem_jax.derivatives.gradient import Gradient, value_and_grad
 from gmem_jax.design.drive import PARAMETERS, design_drive, start_within
 from gmem_jax.design.kernel import memory_kernel, relative_error
+from gmem_jax.design.stored import save_kernel
 from gmem_jax.design.waveforms import BUMPS, cost, design_waveforms
 from gmem_jax.experiment.experiment import Experiment, value_at
 from gmem_jax.experiment.host import CHUNK, Checkpoint, Keep, within
@@ -34,12 +35,10 @@ from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run_byte
 from gmem_jax.experiment.signals import Bumps, Spline
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.configuration import key_of_run, pack_fingerprint, resolved
-from gmem_jax.files.hdf5 import save_arrays
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
 from gmem_jax.show import figures
 
-KERNEL_SCHEMA = "gmem-kernel/1"
 GRADIENT = 11.0  # cost of a gradient in runs; see benchmarks
 
 
@@ -198,9 +197,7 @@ def kernel_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        arrays = {name: getattr(kernel, name) for name in ("u", "centres", "width", "odd", "even", "gamma0", "delta0")}
-        configuration = resolved(experiment, time.perf_counter() - began)
-        save_arrays(output, KERNEL_SCHEMA, configuration, kernel=kernel.kernel(), **arrays)
+        save_kernel(output, kernel, resolved(experiment, time.perf_counter() - began))
     if drawn:
         figures.kernel_figure(drawn, kernel, floor, pack)
     lines = [f"{key}: {result[key]:.3f}" for key in ("gain", "distance", "asymmetry", "resolution")]

@@ -31,7 +31,7 @@ from gmem_jax.experiment.recall import default_batch, replica_bins, run, run_byt
 from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.hdf5 import schema_of
-from gmem_jax.files.packs import PACK_SCHEMA, list_packs, load_pack
+from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.parts import Parts
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.physics.contact.hooke import Hooke
@@ -140,7 +140,7 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """What a file holds."""
-    if str(file) in list_packs() or schema_of(file) == PACK_SCHEMA:
+    if str(file) in list_packs() or schema_of(file).startswith("gmem-pack/"):
         pack = load_pack(file)
         facts = {"pack": pack.name, "grains": pack.grains, "ringing_period": float(pack.ringing_period), **pack.info}
         emit(as_json, facts, tables.pack_table(pack))

@@ -1,7 +1,7 @@
 """Recall files: what was measured, and the configuration that it belongs to."""
 
 import json
-from dataclasses import fields
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +24,13 @@ from gmem_jax.files.checked import (
     whole,
 )
 from gmem_jax.files.configuration import signals_from
-from gmem_jax.files.hdf5 import Content, reading, write_samples, writing
+from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
+from gmem_jax.files.schemas import RECALL
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Status
 
-RECALL_SCHEMA = "gmem-recall/2"
-_BEFORE = "gmem-recall/1"  # without a seal and I(u)
-
-_CURVES = ("shear", "J", "p_sig")
+_OLDEST = "gmem-recall/1"
 _MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity", "window")
-_DECLARED = (
-    {"u": Array("real", (BINS,))}
-    | {name: Array("real", ("signals", BINS)) for name in _CURVES}
-    | {name: Array("real") for name in _MEASURES}
-    | {"residual_speed": Array("real", ("replicas",)), "status": Array("whole", ("replicas",))}
-)
 _EVERY_BIT = int(sum(Status))
 
 
@@ -48,12 +40,25 @@ def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> No
     Raises:
         OSError: if the path cannot be written.
     """
-    with writing(path, RECALL_SCHEMA) as file:
+    names = np.asarray([name.encode() for name in signal_names(recall, configuration)])
+    if names.dtype.itemsize == 1:
+        names = names.astype("S2")  # single letters are characters of one text to netCDF
+    with writing(path, RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
-        for entry in fields(recall):
-            if entry.name != "stages":
-                file.create_dataset(entry.name, data=np.asarray(getattr(recall, entry.name)))
+        write_arrays(file, _declared(np.ndim(recall.dt)), {**vars(recall), "signal": names})
         write_samples(file.create_group("stages"), recall.stages)
+
+
+def signal_names(recall: Recall, configuration: Mapping[str, Any]) -> list[str]:
+    """What the signals are called: words by their bits, others by their number from 1."""
+    names = configuration.get("signals")
+    fit = isinstance(names, list) and len(names) == len(recall.J) and all(map(title, names))
+    return list(names) if fit and names else [f"signal {number + 1}" for number in range(len(recall.J))]
+
+
+def _declared(dt_dimensions: int) -> dict[str, Array]:
+    dt = RECALL.arrays["dt"]
+    return {**RECALL.arrays, "dt": dt._replace(shape=("replica",) if dt_dimensions else ())}
 
 
 def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
@@ -65,7 +70,7 @@ def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
             other.
     """
     with refusing(path, "recall"):
-        with reading(path, RECALL_SCHEMA, _BEFORE) as content:
+        with reading(path, RECALL.name, *RECALL.before) as content:
             configuration = json_of(content.text("configuration"), "configuration")
             _check_configuration(configuration)
             recall = _recall_of(content, configuration)
@@ -74,13 +79,15 @@ def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
 
 
 def _recall_of(content: Content, configuration: dict[str, Any]) -> Recall:
-    declared = dict(_DECLARED)
-    if content.schema == _BEFORE:
-        del declared["shear"]
     dt = content.datasets.get("dt")
-    declared["dt"] = Array("real", () if dt is None or dt.shape == () else ("replicas",))
+    declared = _declared(0 if dt is None else len(dt.shape))
+    if content.schema != RECALL.name:
+        del declared["signal"]
+    if content.schema == _OLDEST:
+        del declared["shear"]
     found = content.arrays(declared)
-    if content.schema == _BEFORE:
+    found.pop("signal", None)  # the configuration has them too, in all versions
+    if content.schema == _OLDEST:
         found["shear"] = _waveforms(configuration, found["u"], found["J"])
     return Recall(**found, stages=content.samples("stages"))  # type: ignore[arg-type]
 
