@@ -1,6 +1,5 @@
 """`gmem gradient`, `gmem kernel`, `gmem design`, `gmem tune`."""
 
-import json
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +18,6 @@ from gmem_jax.command.console import (
     announce,
     claim,
     emit,
-    finite,
     reporting,
 )
 from gmem_jax.command.options import Chosen, with_experiment
@@ -33,20 +31,14 @@ from gmem_jax.experiment.experiment import Experiment, value_at
 from gmem_jax.experiment.host import CHUNK, Checkpoint, Keep, within
 from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run_bytes, simulate
 from gmem_jax.experiment.signals import Bumps, Spline
-from gmem_jax.files.atomic import atomic
+from gmem_jax.files import schemas
 from gmem_jax.files.configuration import key_of_run, pack_fingerprint, resolved
+from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
 from gmem_jax.show import figures
 
 GRADIENT = 11.0  # cost of a gradient in runs; see benchmarks
-
-
-def _write(output: Path, result: dict[str, Any], experiment: Experiment) -> None:
-    """A result as JSON, with its configuration."""
-    configuration = resolved(experiment, result["seconds"])
-    with atomic(output) as temporary:
-        temporary.write_text(json.dumps(finite({**result, "configuration": configuration}), allow_nan=False))
 
 
 def _announce(experiment: Experiment, what: str, runs: float, side_by_side: int, memory: float = 1.0) -> None:
@@ -102,7 +94,7 @@ def gradient_command(
             **{name: slope.tolist() for name, slope in slopes.items()},
             "waveform": [row[1].tolist() for row in rows],
         }
-        result = {
+        result: dict[str, Any] = {
             "pack": pack,
             "fidelity": float(found.value),
             "places": [row[0].tolist() for row in rows],
@@ -110,7 +102,7 @@ def gradient_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        _write(output, result, experiment)
+        save_result(output, schemas.GRADIENT, {**result, "configuration": resolved(experiment, result["seconds"])})
     if drawn:
         figures.gradient_figure(drawn, rows, f"{pack}: F = {result['fidelity']:.4f}")
     lines = [f"F = {result['fidelity']:.4f}"]
@@ -236,7 +228,8 @@ def design_command(
     with resumable(output, key_of_run(experiment, iterations=iterations, gain=gain), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             found = design_waveforms(experiment, iterations=iterations, gain=gain, keep=parts, progress=progress)
-        save_waveforms(output, found.signals, experiment.signals)
+        way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
+        save_waveforms(output, found.signals, experiment.signals, design=way)
     if drawn:
         figures.design_figure(drawn, found, float(experiment.scale), pack)
         figures.history_figure(history, {pack: found.history})
@@ -299,7 +292,7 @@ def tune_command(
     with resumable(output, key, restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             found = design_drive(experiments, limits, iterations=iterations, keep=parts, progress=progress)
-        result = {
+        result: dict[str, Any] = {
             "packs": names,
             "before": found.before,
             "fidelity": found.fidelity,
@@ -310,7 +303,7 @@ def tune_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        _write(output, result, first)
+        save_result(output, schemas.TUNED, {**result, "configuration": resolved(first, result["seconds"])})
     if drawn:
         figures.history_figure(drawn, {" ".join(names): [value for _, value in found.history]})
     values = ", ".join(f"{name} = {value:.4g}" for name, value in found.values.items())

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +25,7 @@ from gmem_jax.files.checked import (
 )
 from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
+from gmem_jax.files.labelled import recall_csv, recall_dataset
 from gmem_jax.files.schemas import RECALL
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Status
@@ -61,8 +62,37 @@ def _declared(dt_dimensions: int) -> dict[str, Array]:
     return {**RECALL.arrays, "dt": dt._replace(shape=("replica",) if dt_dimensions else ())}
 
 
-def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
-    """Read a recall and its configuration.
+class StoredRecall(NamedTuple):
+    """A recall that was read from a file, and what it belongs to.
+
+    Attributes:
+        recall: the recall.
+        configuration: the resolved configuration that made it.
+    """
+
+    recall: Recall
+    configuration: dict[str, Any]
+
+    @property
+    def names(self) -> list[str]:
+        """What the signals are called: words by their bits, others by their number from 1."""
+        return signal_names(self.recall, self.configuration)
+
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset with names, units and descriptions; the samples of all stages are joined along `time`.
+
+        Raises:
+            ValueError: if xarray is not installed.
+        """
+        return recall_dataset(self.recall, self.names, self.configuration)
+
+    def to_csv(self) -> str:
+        """The recalled signals as CSV: u, and p_sig of every signal in E."""
+        return recall_csv(self.recall, self.names)
+
+
+def load_recall(path: Path) -> StoredRecall:
+    """Read a recall and its configuration, which the result can be unpacked into.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -75,7 +105,7 @@ def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
             _check_configuration(configuration)
             recall = _recall_of(content, configuration)
         _check(recall)
-        return recall, configuration
+        return StoredRecall(recall, configuration)
 
 
 def _recall_of(content: Content, configuration: dict[str, Any]) -> Recall:

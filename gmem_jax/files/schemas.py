@@ -1,7 +1,4 @@
-"""What every kind of file holds, with units: the one table that is written from, read by, and printed in docs/files.md.
-
-python -m gmem_jax.files.schemas > docs/files.md
-"""
+"""What every kind of file holds, with units: the one table to write from, read by, and print in docs/files.md."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -108,9 +105,7 @@ RECALL = Schema(
         "windowed_gain": Array("real", (), "1", "G after a running mean over the ringing period"),
         "windowed_fidelity": Array("real", (), "1", "F after a running mean over the ringing period"),
         "window": Array("real", (), "t_c", "T1, that period"),
-        "residual_speed": Array(
-            "real", ("replica",), "1", "largest speed of a grain before the readout, over the walls'"
-        ),
+        "residual_speed": Array("real", ("replica",), "1", "largest grain speed before the readout, over the walls'"),
         "status": Array("whole", ("replica",), "1", "bits of gm.Status; 0 is sound"),
         "dt": Array("real", (), "t_c", "time step; [replica] where t0 differs between replicas"),
     },
@@ -151,8 +146,8 @@ GRADIENT = Schema(
         "places": Array("rows", ("signal", "place"), "1", "u where each waveform can be changed"),
         "gradient/waveform": Array("rows", ("signal", "place"), "1", "dF by the height of the waveform there"),
         "gradient/gamma0": Array("real", (), "1", "dF/dgamma0"),
-        "gradient/mu": Array("real", (), "1", "dF/dmu; where the law has one"),
-        "gradient/stiffness": Array("real", (), "1/(E R)", "dF/dk_H, or dF/dk_M in 1/(E R^0.5); where the law has one"),
+        "gradient/mu": Array("real, if any", (), "1", "dF/dmu; where the law has one"),
+        "gradient/stiffness": Array("real, if any", (), "1/(E R)", "dF/dk_H (or k_M, 1/(E R^0.5)); where there is one"),
         **_MADE,
     },
     before={"": "without `schema` and `about`"},
@@ -247,11 +242,11 @@ def page() -> str:
 
 _INTRODUCTION = """# What the files hold
 
-<!-- made by python -m gmem_jax.files.schemas -->
+<!-- made by experiments/files_page.py -->
 
-Units are R = E = rho = 1, time in t_c = R sqrt(rho / E); `gm.Material` converts to SI. What is in parts of a duration is
-in t0. `gmem show FILE` prints what any of these files holds, `gmem show FILE --plot WHAT -o x.png` draws it, and
-`gmem show FILE --csv` gives the recalled signals of a recall.
+Units are R = E = rho = 1, time in t_c = R sqrt(rho / E); `gm.Material` converts to SI. The time axis of stages is in
+t0, the duration of one compression. `gmem show FILE` prints what any of these files holds, `gmem show FILE --plot WHAT
+-o x.png` draws it (`--plot list` says what there is), and `gmem show FILE --csv` gives the recalled signals.
 
 HDF5 files open without this package. Every dataset has the attributes `units` and `description`, and a dimension scale
 for each of its dimensions (those that are no dataset of the tables below count from 0):
@@ -263,9 +258,9 @@ xarray.open_dataset("recall.h5", engine="h5netcdf").p_sig.sel(signal="signal 1")
 xarray.open_dataset("recall.h5", engine="h5netcdf", group="stages/readout").pressure
 ```
 
-With it, `gm.load_recall("recall.h5").to_xarray()` is the same with stages side by side. The first 512 bytes are a SHA-256
-of the rest: a file that was changed by another program is refused here. JSON files carry their fields' units and
-descriptions in `about`.
+With it, `gm.load_recall("recall.h5").to_xarray()` is one dataset, its stages one after the other along `time`. The
+first 512 bytes are a SHA-256 of the rest: a file that was changed by another program is refused here. JSON files carry
+their fields' units and descriptions in `about`.
 """
 
 
@@ -290,7 +285,3 @@ def _table(arrays: Mapping[str, Array]) -> list[str]:
         sizes = ", ".join(f"{name} ({FIXED[name]})" if name in FIXED else str(name) for name in map(str, shape))
         lines.append(f"| `{path}` | {f'[{sizes}]' if sizes else ''} | {units} | {words} |")
     return lines
-
-
-if __name__ == "__main__":
-    print(page(), end="")

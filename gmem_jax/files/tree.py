@@ -1,7 +1,8 @@
 """What an HDF5 file declares, looked at before anything is read; and old files, copied in a process of their own.
 
-Files of this package hold groups, short attributes, and arrays of numbers or names in one piece. All else that HDF5 can hold is
-refused: links to elsewhere, storage elsewhere, virtual, compressed or unwritten data, objects, strings without end.
+Files of this package hold groups, short attributes, and arrays of numbers or names in one piece. All else that HDF5 can
+hold is refused: links to elsewhere, storage elsewhere, virtual, compressed or unwritten data, objects, strings without
+end.
 
 Run as a program it copies OLD to NEW: files from before there were checksums are parsed there, where a broken one can
 do no harm. So this module imports nothing of the package.
