@@ -1,4 +1,4 @@
-"""Result files say what they hold: units, names and axes on every array, to whoever opens them; and old ones are read."""
+"""Result files say what they hold: units, names and axes on every array. Old ones are still read."""
 
 import json
 from pathlib import Path

@@ -37,6 +37,7 @@ from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
 from gmem_jax.show import figures
+from gmem_jax.show.kinds import kernel_facts
 
 GRADIENT = 11.0  # cost of a gradient in runs; see benchmarks
 
@@ -169,20 +170,13 @@ def kernel_command(
             kernel = memory_kernel(experiment, n, width, begun=begun, keep=parts, progress=most)
             rest = within(progress, 0.05 + 0.95 * runs / (1.0 + runs), 1.0)
             p_sig = parts("check", lambda at: simulate(experiment, begun, checkpoint=at, progress=rest).p_sig)
-        modulus = float(Material().modulus)
-        floor = noise / modulus
         signals = experiment.signals
         result = {
             "pack": pack,
             "noise_pa": noise,
             "n": n,
             "width": width,
-            "gain": kernel.gain(),
-            "distance": kernel.distance(),
-            "asymmetry": kernel.asymmetry(),
-            "capacity": kernel.capacity(floor),
-            "resolution": kernel.resolution(floor),
-            "singular_values_pa": (kernel.singular_values() * modulus).tolist(),
+            **kernel_facts(kernel, noise),
             "prediction_error": relative_error(kernel.predict(signals), p_sig).tolist(),
             "prediction_error_linear": relative_error(kernel.predict(signals, even=False), p_sig).tolist(),
             "output": str(output),
@@ -191,7 +185,7 @@ def kernel_command(
         }
         save_kernel(output, kernel, resolved(experiment, time.perf_counter() - began))
     if drawn:
-        figures.kernel_figure(drawn, kernel, floor, pack)
+        figures.kernel_figure(drawn, kernel, noise / float(Material().modulus), pack)
     lines = [f"{key}: {result[key]:.3f}" for key in ("gain", "distance", "asymmetry", "resolution")]
     lines.append(f"values above {noise:g} Pa: {result['capacity']} of {n}")
     lines.append("superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"]))

@@ -1,5 +1,6 @@
 """Pack files, and the packs that ship with the package."""
 
+from collections import OrderedDict
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -50,13 +51,7 @@ def load_pack(source: str | Path) -> Pack:
         FileFormatError: if the file is damaged, not a complete pack of this schema, or its numbers are not those of
             grains at rest in their box (see `soundness`).
     """
-    name = str(source)
-    if name in list_packs():
-        path = Path(str(resources.files("gmem_jax") / "packs" / f"{name}.h5"))
-    else:
-        path = Path(source)
-        if not path.is_file() and path.suffix == "":
-            raise FileNotFoundError(f"{name}: neither a file nor a shipped pack ({', '.join(list_packs())})")
+    path = _path_of(source)
     with refusing(path, "pack"):
         with reading(path, PACK.name, *PACK.before) as content:
             found = content.arrays(PACK.arrays)
@@ -73,7 +68,29 @@ def load_pack(source: str | Path) -> Pack:
         listed, reference, smallest, reach = (found[f"pairs/{key}"] for key in _PAIRS)
         pairs = tabulate(listed, reference[..., None], smallest, float(reach), clump.spheres)
         numbers: dict[str, Any] = {key: jnp.asarray(found[key]) for key in _OWN}
-        return Pack(clump=clump, pairs=pairs, name=label, record=record, source=name, **numbers)
+        return Pack(clump=clump, pairs=pairs, name=label, record=record, source=str(source), **numbers)
+
+
+def load_stages(source: str | Path) -> OrderedDict[str, Sample]:
+    """The samples of a pack's preparation, where its file keeps them; else empty.
+
+    Raises:
+        FileNotFoundError: if there is neither such a file nor such a shipped pack.
+        FileFormatError: if they are incomplete.
+    """
+    path = _path_of(source)
+    with refusing(path, "pack"), reading(path, PACK.name, *PACK.before) as content:
+        return content.samples("stages")
+
+
+def _path_of(source: str | Path) -> Path:
+    name = str(source)
+    if name in list_packs():
+        return Path(str(resources.files("gmem_jax") / "packs" / f"{name}.h5"))
+    path = Path(source)
+    if not path.is_file() and path.suffix == "":
+        raise FileNotFoundError(f"{name}: neither a file nor a shipped pack ({', '.join(list_packs())})")
+    return path
 
 
 def list_packs() -> list[str]:
