@@ -116,7 +116,7 @@ CHANGES = [
     (not_a_number, "position holds numbers that are not finite"),
     (
         lambda file: put(file, "quaternion", file["quaternion"][:, :3]),
-        r"'quaternion' has shape \[27, 3\], must be \[N, 4\]",
+        r"'quaternion' has shape \[27, 3\], must be \[grain, 4\]",
     ),
     (lambda file: put(file, "position", file["position"][()].astype(complex)), "'position' is not an array of numbers"),
     (

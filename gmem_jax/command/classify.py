@@ -1,7 +1,6 @@
 """`gmem classify`."""
 
 import contextlib
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,8 +10,9 @@ import typer
 from rich import progress
 
 from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, emit, log, say
-from gmem_jax.files.atomic import atomic
 from gmem_jax.files.recalls import load_recall
+from gmem_jax.files.results import save_result
+from gmem_jax.files.schemas import READING
 from gmem_jax.show import figures, tables
 
 if TYPE_CHECKING:
@@ -94,8 +94,7 @@ def classify_command(
     result = report.reading(stored, trained)
     seconds = time.perf_counter() - began
     result = {"recall": str(recall), "pack": configuration["pack"], "status": 0, "seconds": seconds, **result}
-    with atomic(output) as temporary:
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
+    save_result(output, READING, result)
     if drawn:
         net = result["readers"]["net"]
         title = f"{configuration['pack']}, {stored.bits} bits: accuracy {net['accuracy']:.3f} ({seeds} nets)"

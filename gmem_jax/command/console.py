@@ -16,6 +16,7 @@ from rich.console import Console
 
 from gmem_jax.experiment.host import Progress
 from gmem_jax.files.atomic import probe
+from gmem_jax.files.results import finite
 
 log = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
 out = Console(highlight=False, markup=False)
@@ -53,15 +54,6 @@ def emit(as_json: bool, result: Any, *tables: Any) -> None:
     else:
         for table in tables:
             out.print(table)
-
-
-def finite(value: Any) -> Any:
-    """The same with null for numbers that are none, which JSON does not have."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool, option: str = "--output") -> Path:

@@ -1,6 +1,5 @@
 """`gmem gradient`, `gmem kernel`, `gmem design`, `gmem tune`."""
 
-import json
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +18,6 @@ from gmem_jax.command.console import (
     announce,
     claim,
     emit,
-    finite,
     reporting,
 )
 from gmem_jax.command.options import Chosen, with_experiment
@@ -27,27 +25,21 @@ from gmem_jax.command.resuming import Restart, resumable
 from gmem_jax.derivatives.gradient import Gradient, value_and_grad
 from gmem_jax.design.drive import PARAMETERS, design_drive, start_within
 from gmem_jax.design.kernel import memory_kernel, relative_error
+from gmem_jax.design.stored import save_kernel
 from gmem_jax.design.waveforms import BUMPS, cost, design_waveforms
 from gmem_jax.experiment.experiment import Experiment, value_at
 from gmem_jax.experiment.host import CHUNK, Checkpoint, Keep, within
 from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run_bytes, simulate
 from gmem_jax.experiment.signals import Bumps, Spline
-from gmem_jax.files.atomic import atomic
+from gmem_jax.files import schemas
 from gmem_jax.files.configuration import key_of_run, pack_fingerprint, resolved
-from gmem_jax.files.hdf5 import save_arrays
+from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
 from gmem_jax.show import figures
+from gmem_jax.show.kinds import kernel_facts
 
-KERNEL_SCHEMA = "gmem-kernel/1"
 GRADIENT = 11.0  # cost of a gradient in runs; see benchmarks
-
-
-def _write(output: Path, result: dict[str, Any], experiment: Experiment) -> None:
-    """A result as JSON, with its configuration."""
-    configuration = resolved(experiment, result["seconds"])
-    with atomic(output) as temporary:
-        temporary.write_text(json.dumps(finite({**result, "configuration": configuration}), allow_nan=False))
 
 
 def _announce(experiment: Experiment, what: str, runs: float, side_by_side: int, memory: float = 1.0) -> None:
@@ -103,7 +95,7 @@ def gradient_command(
             **{name: slope.tolist() for name, slope in slopes.items()},
             "waveform": [row[1].tolist() for row in rows],
         }
-        result = {
+        result: dict[str, Any] = {
             "pack": pack,
             "fidelity": float(found.value),
             "places": [row[0].tolist() for row in rows],
@@ -111,7 +103,7 @@ def gradient_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        _write(output, result, experiment)
+        save_result(output, schemas.GRADIENT, {**result, "configuration": resolved(experiment, result["seconds"])})
     if drawn:
         figures.gradient_figure(drawn, rows, f"{pack}: F = {result['fidelity']:.4f}")
     lines = [f"F = {result['fidelity']:.4f}"]
@@ -178,31 +170,22 @@ def kernel_command(
             kernel = memory_kernel(experiment, n, width, begun=begun, keep=parts, progress=most)
             rest = within(progress, 0.05 + 0.95 * runs / (1.0 + runs), 1.0)
             p_sig = parts("check", lambda at: simulate(experiment, begun, checkpoint=at, progress=rest).p_sig)
-        modulus = float(Material().modulus)
-        floor = noise / modulus
         signals = experiment.signals
         result = {
             "pack": pack,
             "noise_pa": noise,
             "n": n,
             "width": width,
-            "gain": kernel.gain(),
-            "distance": kernel.distance(),
-            "asymmetry": kernel.asymmetry(),
-            "capacity": kernel.capacity(floor),
-            "resolution": kernel.resolution(floor),
-            "singular_values_pa": (kernel.singular_values() * modulus).tolist(),
+            **kernel_facts(kernel, noise),
             "prediction_error": relative_error(kernel.predict(signals), p_sig).tolist(),
             "prediction_error_linear": relative_error(kernel.predict(signals, even=False), p_sig).tolist(),
             "output": str(output),
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        arrays = {name: getattr(kernel, name) for name in ("u", "centres", "width", "odd", "even", "gamma0", "delta0")}
-        configuration = resolved(experiment, time.perf_counter() - began)
-        save_arrays(output, KERNEL_SCHEMA, configuration, kernel=kernel.kernel(), **arrays)
+        save_kernel(output, kernel, resolved(experiment, time.perf_counter() - began))
     if drawn:
-        figures.kernel_figure(drawn, kernel, floor, pack)
+        figures.kernel_figure(drawn, kernel, noise / float(Material().modulus), pack)
     lines = [f"{key}: {result[key]:.3f}" for key in ("gain", "distance", "asymmetry", "resolution")]
     lines.append(f"values above {noise:g} Pa: {result['capacity']} of {n}")
     lines.append("superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"]))
@@ -239,7 +222,8 @@ def design_command(
     with resumable(output, key_of_run(experiment, iterations=iterations, gain=gain), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             found = design_waveforms(experiment, iterations=iterations, gain=gain, keep=parts, progress=progress)
-        save_waveforms(output, found.signals, experiment.signals)
+        way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
+        save_waveforms(output, found.signals, experiment.signals, design=way)
     if drawn:
         figures.design_figure(drawn, found, float(experiment.scale), pack)
         figures.history_figure(history, {pack: found.history})
@@ -302,7 +286,7 @@ def tune_command(
     with resumable(output, key, restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             found = design_drive(experiments, limits, iterations=iterations, keep=parts, progress=progress)
-        result = {
+        result: dict[str, Any] = {
             "packs": names,
             "before": found.before,
             "fidelity": found.fidelity,
@@ -313,7 +297,7 @@ def tune_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        _write(output, result, first)
+        save_result(output, schemas.TUNED, {**result, "configuration": resolved(first, result["seconds"])})
     if drawn:
         figures.history_figure(drawn, {" ".join(names): [value for _, value in found.history]})
     values = ", ".join(f"{name} = {value:.4g}" for name, value in found.values.items())

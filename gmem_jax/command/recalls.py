@@ -1,4 +1,4 @@
-"""`gmem recall`, `gmem demo`, `gmem show`."""
+"""`gmem recall`, `gmem demo`."""
 
 import time
 from pathlib import Path
@@ -31,10 +31,9 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import default_batch, film_of, replica_bins, run, run_bytes
 from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.files.configuration import key_of_run, resolved, written_signals
-from gmem_jax.files.hdf5 import schema_of
-from gmem_jax.files.packs import PACK_SCHEMA, list_packs, load_pack
+from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.parts import Parts
-from gmem_jax.files.recalls import load_recall, save_recall
+from gmem_jax.files.recalls import save_recall
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.show import figures, tables
 
@@ -69,19 +68,13 @@ def _run(
             configuration["target"] = written_signals(target)
         save_recall(data, recall, configuration)
     if picture is not None:
-        figures.recall_figure(picture, recall, experiment.scale, configuration["pack"])
+        title = f"{configuration['pack']}: {tables.conditions(configuration)}"
+        figures.recall_figure(picture, recall, experiment.scale, title, configuration["signals"])
     say(f"wrote {data}" + (f" and {picture}" if picture else ""))
     row = {**tables.summary(recall, configuration), "seconds": configuration["seconds"], "output": str(data)}
     if row["status"]:
         say(f"warning: {row['status_text']}", style="yellow")
     return row, configuration
-
-
-def _tables(row: dict[str, Any], configuration: dict[str, Any]) -> list[Any]:
-    """What to print of one recall."""
-    more = [tables.backgrounds_table(row), tables.second_readout_lines(row)] if "backgrounds" in row else []
-    more += [tables.target_line(row)] if "target_fidelity" in row else []
-    return [tables.recall_table([row], configuration), *more]
 
 
 @with_experiment
@@ -105,7 +98,7 @@ def recall_command(
     film_of(experiment, frames, frames_of)  # refuses what cannot be before anything is begun
     film: Any = {"frames": frames, "frames_of": frames_of}
     row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
-    emit(as_json, row, *_tables(row, configuration))
+    emit(as_json, row, *tables.recall_lines(row, configuration))
 
 
 def demo(
@@ -143,19 +136,4 @@ def demo(
     emit(as_json, {**means, **total, "packs": rows}, tables.recall_table(rows, configuration))
 
 
-def show(
-    file: Annotated[Path, typer.Argument(help="A pack or a recall file, or the name of a shipped pack.")],
-    as_json: AsJson = False,
-) -> None:
-    """What a file holds."""
-    if str(file) in list_packs() or schema_of(file) == PACK_SCHEMA:
-        pack = load_pack(file)
-        facts = {"pack": pack.name, "grains": pack.grains, "ringing_period": float(pack.ringing_period), **pack.info}
-        emit(as_json, facts, tables.pack_table(pack))
-        return
-    recall, configuration = load_recall(file)
-    row = tables.summary(recall, configuration)
-    emit(as_json, {**row, "configuration": configuration}, *_tables(row, configuration))
-
-
-COMMANDS = {"recall": recall_command, "demo": demo, "show": show}
+COMMANDS = {"recall": recall_command, "demo": demo}

@@ -43,13 +43,13 @@ def sweep_command(
     if what in VERBS:
         if folder is None:
             raise InputError(f"gmem sweep {what}: name the folder of a sweep")
-        store = _there(folder)
+        store = there(folder)
         if what == "export":
             _export(store, output, force, as_json)
         elif what == "status":
             _status(store, as_json)
         else:
-            _show(store, over, as_json)
+            show(store, over, as_json)
         return
     path = Path(what)
     if path.suffix != ".toml":
@@ -96,7 +96,12 @@ def planned(path: Path, spec: Spec, folder: Path) -> Conductor:
     return conductor
 
 
-def _there(folder: Path) -> Store:
+def there(folder: Path) -> Store:
+    """The sweep in a folder.
+
+    Raises:
+        InputError: if there is none.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     if not (folder / "sweep.json").is_file():
@@ -128,7 +133,8 @@ def _status(store: Store, as_json: bool) -> None:
     emit(as_json, summary, ", ".join(lines), *busy, *(f"failed: {reason}" for reason in reasons))
 
 
-def _show(store: Store, over: str, as_json: bool) -> None:
+def show(store: Store, over: str, as_json: bool) -> None:
+    """Print the points of a sweep, or means over some names, separated by commas."""
     table, names = rows(store), store.card()["names"]
     averaged = [name for name in over.split(",") if name]
     if unknown := sorted(set(averaged) - set(names)):

@@ -104,6 +104,14 @@ def memory_protocol(
     return (*first, *repeated, replace(last, name="readout-2"))
 
 
+def compression_at(name: str, passed: np.ndarray) -> np.ndarray:
+    """u where parts `passed` of a stage are over, by its name (that of `memory_protocol`, or of a preparation)."""
+    kind = name.rpartition(": ")[2].partition("-")[0]
+    ends = {stage.name: (stage.start, stage.stop) for stage in memory_protocol(0, 0, 0, second_readout=False)}
+    start, stop = ends.get(kind, (0.0, 0.0))  # a pulse is at u = 0, like a rest
+    return np.asarray(start + (stop - start) * passed)
+
+
 def split(stages: tuple[Stage, ...]) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
     """The stages before the first sheared one, common to all signals and run once; and those from it on."""
     common = tuple(itertools.takewhile(lambda stage: not stage.sheared, stages))

@@ -12,9 +12,11 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from gmem_jax.experiment.signals import BINS
 from gmem_jax.files.atomic import FileFormatError
 
-KINDS = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",)}
+KINDS = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",), "text": ("bytes",)}
+FIXED = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that have one length in every file
 LONGEST = 18  # digits of a whole number: no count or seed has more
 NAME = 200  # characters of what is printed
 _SHOWN = 160  # characters of an error of some library
@@ -44,12 +46,16 @@ class Array(NamedTuple):
     """A declared array.
 
     Attributes:
-        kind: "real", "whole" or "yes or no".
-        shape: lengths; a name is the same length wherever it stands.
+        kind: "real", "whole", "yes or no" or "text".
+        shape: names of its dimensions, or lengths; a name is the same length wherever it stands.
+        units: of its numbers.
+        words: what it is, in a line.
     """
 
     kind: str
     shape: tuple[int | str, ...] = ()
+    units: str = "1"
+    words: str = ""
 
 
 def fit(declared: Mapping[str, Array], found: Mapping[str, Any]) -> dict[str, int]:
@@ -62,12 +68,12 @@ def fit(declared: Mapping[str, Array], found: Mapping[str, Any]) -> dict[str, in
     Raises:
         FileFormatError: if an array is missing, or has another shape or kind than declared.
     """
-    lengths: dict[str, int] = {}
-    for name, (kind, shape) in declared.items():
+    lengths = dict(FIXED)
+    for name, (kind, shape, *_) in declared.items():
         if name not in found:
             raise FileFormatError(f"incomplete file, {name!r} is missing")
         own, dtype = tuple(found[name].shape), np.dtype(found[name].dtype)
-        if dtype.name not in KINDS[kind] or not dtype.isnative:
+        if not dtype.name.startswith(KINDS[kind]) or not dtype.isnative:
             raise FileFormatError(f"{name!r} holds {dtype}, must hold {' or '.join(KINDS[kind])}")
         if len(own) == len(shape):
             for length, symbol in zip(own, shape, strict=True):
@@ -75,8 +81,8 @@ def fit(declared: Mapping[str, Array], found: Mapping[str, Any]) -> dict[str, in
                     lengths.setdefault(symbol, length)
         wanted = tuple(lengths.get(symbol, -1) if isinstance(symbol, str) else symbol for symbol in shape)
         if own != wanted:
-            words = ", ".join(str(symbol) for symbol in shape)
-            known = ", ".join(f"{name} = {length}" for name, length in lengths.items() if name in shape)
+            words = ", ".join(str(FIXED.get(str(symbol), symbol)) for symbol in shape)
+            known = ", ".join(f"{name} = {lengths[name]}" for name in lengths if name in shape and name not in FIXED)
             raise FileFormatError(
                 f"{name!r} has shape {list(own)}, must be [{words}]" + (f" with {known}" * bool(known))
             )

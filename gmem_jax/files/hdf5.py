@@ -5,7 +5,6 @@ before it is read. Files from before there were seals are copied into sealed one
 """
 
 import io
-import json
 import subprocess
 import sys
 import tempfile
@@ -20,18 +19,18 @@ from typing import Any, BinaryIO
 import h5py
 import numpy as np
 
+from gmem_jax.experiment.protocol import compression_at
+from gmem_jax.experiment.signals import BINS
 from gmem_jax.files import tree
 from gmem_jax.files.atomic import FileFormatError, atomic
 from gmem_jax.files.checked import Array, fit, refusing
+from gmem_jax.files.schemas import DIMENSIONS, STAGE
 from gmem_jax.files.seal import BLOCK, seal, sealed
 from gmem_jax.physics.sample import Sample
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PATIENCE, _PACE = 5.0, 2e7  # seconds, and bytes a second, that copying an old file may take
-_SAMPLE = {  # what a stage records, by bins and replicas
-    entry.name: ("bins", 3, "replicas") if entry.name in ("pressure", "lengths") else ("bins", "replicas")
-    for entry in fields(Sample)
-}
+_SAMPLE = tuple(entry.name for entry in fields(Sample))
 
 
 class Content(tree.Tree):
@@ -77,7 +76,7 @@ class Content(tree.Tree):
             raise FileFormatError(f"incomplete file, the stages of {group!r} have no order")
         stages = OrderedDict()
         for stage in sorted(orders, key=orders.__getitem__):
-            found = self.arrays({f"{group}/{stage}/{name}": Array("real", shape) for name, shape in _SAMPLE.items()})
+            found = self.arrays({f"{group}/{stage}/{name}": STAGE[name] for name in _SAMPLE})
             own: Any = {name: found[f"{group}/{stage}/{name}"] for name in _SAMPLE}
             stages[stage] = Sample(**own)
         return stages
@@ -153,22 +152,55 @@ def schema_of(path: Path) -> str:
         return content.schema
 
 
-def write_samples(group: h5py.Group, stages: dict[str, Sample]) -> None:
+def write_arrays(group: h5py.Group, declared: Mapping[str, Array], values: Mapping[str, Any]) -> None:
+    """Write arrays at their paths, each with its units, its description, and scales for its dimensions.
+
+    The scale of a dimension is the array of that name, in the group or in the file; where there is none, one that
+    counts from 0 is put into the file.
+
+    Raises:
+        FileFormatError: if a value is missing, or has another shape or kind than declared.
+    """
+    arrays = {path: np.asarray(values[path]) for path in declared if path in values}
+    fit(declared, arrays)
+    written = {path: _described(group, path, arrays[path], declared[path]) for path in declared}
+    for path, dataset in written.items():
+        for place, name in enumerate(map(str, declared[path].shape)):
+            if path != name:
+                dataset.dims[place].attach_scale(_scale(group, name, dataset.shape[place]))
+
+
+def _described(group: h5py.Group, path: str, values: np.ndarray, declared: Array) -> h5py.Dataset:
+    dataset = group.create_dataset(path, data=values)
+    dataset.attrs["units"], dataset.attrs["description"] = declared.units, declared.words
+    if values.dtype.kind == "S":
+        dataset.attrs["_Encoding"] = "utf-8"  # tells xarray that these bytes are texts
+    return dataset
+
+
+def _scale(group: h5py.Group, name: str, length: int) -> h5py.Dataset:
+    at = group if name in group else group.file
+    if name not in at:
+        _described(at, name, np.arange(length, dtype="i4"), Array("whole", (name,), "1", DIMENSIONS[name]))
+    if not at[name].is_scale:
+        at[name].make_scale(name)
+    return at[name]
+
+
+def write_samples(group: h5py.Group, stages: Mapping[str, Sample]) -> None:
     """A group for every stage, in order, with a dataset for each quantity."""
+    passed = 0
     for number, (name, sample) in enumerate(stages.items()):
         stage = group.create_group(name)
         stage.attrs["order"] = number
-        for entry in fields(sample):
-            stage.create_dataset(entry.name, data=np.asarray(getattr(sample, entry.name)))
+        bins, wide = np.shape(sample.filling)
+        ends = np.arange(1, bins + 1)
+        values = {**vars(sample), "time": (passed + ends) / BINS, "u": compression_at(name, ends / bins)}
+        passed += bins
+        write_arrays(stage, STAGE if wide > 1 else _COMMON, values)
 
 
-def save_arrays(path: Path, schema: str, configuration: dict[str, Any], **arrays: np.ndarray | float) -> None:
-    """Write named arrays with the configuration that made them.
-
-    Raises:
-        OSError: if the path cannot be written.
-    """
-    with writing(path, schema) as file:
-        file.attrs["configuration"] = json.dumps(configuration)
-        for name, array in arrays.items():
-            file.create_dataset(name, data=np.asarray(array))
+_COMMON = {
+    name: array._replace(shape=tuple("common" if one == "replica" else one for one in array.shape))
+    for name, array in STAGE.items()
+}

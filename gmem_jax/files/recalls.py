@@ -1,9 +1,9 @@
 """Recall files: what was measured, and the configuration that it belongs to."""
 
 import json
-from dataclasses import fields
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,21 +25,14 @@ from gmem_jax.files.checked import (
 )
 from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.frames import read_frames, write_frames
-from gmem_jax.files.hdf5 import Content, reading, write_samples, writing
+from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
+from gmem_jax.files.labelled import recall_csv, recall_dataset
+from gmem_jax.files.schemas import RECALL
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Status
 
-RECALL_SCHEMA = "gmem-recall/2"
-_BEFORE = "gmem-recall/1"  # without a seal and I(u)
-
-_CURVES = ("shear", "J", "p_sig")
+_OLDEST = "gmem-recall/1"
 _MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity", "window")
-_DECLARED = (
-    {"u": Array("real", (BINS,))}
-    | {name: Array("real", ("signals", BINS)) for name in _CURVES}
-    | {name: Array("real") for name in _MEASURES}
-    | {"residual_speed": Array("real", ("replicas",)), "status": Array("whole", ("replicas",))}
-)
 _EVERY_BIT = int(sum(Status))
 
 
@@ -49,18 +42,60 @@ def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> No
     Raises:
         OSError: if the path cannot be written.
     """
-    with writing(path, RECALL_SCHEMA) as file:
+    names = np.asarray([name.encode() for name in signal_names(recall, configuration)])
+    if names.dtype.itemsize == 1:
+        names = names.astype("S2")  # single letters are characters of one text to netCDF
+    with writing(path, RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
-        for entry in fields(recall):
-            if entry.name not in ("stages", "frames"):
-                file.create_dataset(entry.name, data=np.asarray(getattr(recall, entry.name)))
+        write_arrays(file, _declared(np.ndim(recall.dt)), {**vars(recall), "signal": names})
         write_samples(file.create_group("stages"), recall.stages)
         if recall.frames is not None:
             write_frames(file, recall.frames)
 
 
-def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
-    """Read a recall and its configuration.
+def signal_names(recall: Recall, configuration: Mapping[str, Any]) -> list[str]:
+    """What the signals are called: words by their bits, others by their number from 1."""
+    names = configuration.get("signals")
+    fit = isinstance(names, list) and len(names) == len(recall.J) and all(map(title, names))
+    return list(names) if fit and names else [f"signal {number + 1}" for number in range(len(recall.J))]
+
+
+def _declared(dt_dimensions: int) -> dict[str, Array]:
+    dt = RECALL.arrays["dt"]
+    return {**RECALL.arrays, "dt": dt._replace(shape=("replica",) if dt_dimensions else ())}
+
+
+class StoredRecall(NamedTuple):
+    """A recall that was read from a file, and what it belongs to.
+
+    Attributes:
+        recall: the recall.
+        configuration: the resolved configuration that made it.
+    """
+
+    recall: Recall
+    configuration: dict[str, Any]
+
+    @property
+    def names(self) -> list[str]:
+        """What the signals are called: words by their bits, others by their number from 1."""
+        return signal_names(self.recall, self.configuration)
+
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset with names, units and descriptions; the samples of all stages are joined along `time`.
+
+        Raises:
+            ValueError: if xarray is not installed.
+        """
+        return recall_dataset(self.recall, self.names, self.configuration)
+
+    def to_csv(self) -> str:
+        """The recalled signals as CSV: u, and p_sig of every signal in E."""
+        return recall_csv(self.recall, self.names)
+
+
+def load_recall(path: Path) -> StoredRecall:
+    """Read a recall and its configuration, which the result can be unpacked into.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -68,22 +103,24 @@ def load_recall(path: Path) -> tuple[Recall, dict[str, Any]]:
             other.
     """
     with refusing(path, "recall"):
-        with reading(path, RECALL_SCHEMA, _BEFORE) as content:
+        with reading(path, RECALL.name, *RECALL.before) as content:
             configuration = json_of(content.text("configuration"), "configuration")
             _check_configuration(configuration)
             recall = _recall_of(content, configuration)
         _check(recall)
-        return recall, configuration
+        return StoredRecall(recall, configuration)
 
 
 def _recall_of(content: Content, configuration: dict[str, Any]) -> Recall:
-    declared = dict(_DECLARED)
-    if content.schema == _BEFORE:
-        del declared["shear"]
     dt = content.datasets.get("dt")
-    declared["dt"] = Array("real", () if dt is None or dt.shape == () else ("replicas",))
+    declared = _declared(0 if dt is None else len(dt.shape))
+    if content.schema != RECALL.name:
+        del declared["signal"]
+    if content.schema == _OLDEST:
+        del declared["shear"]
     found = content.arrays(declared)
-    if content.schema == _BEFORE:
+    found.pop("signal", None)  # the configuration has them too, in all versions
+    if content.schema == _OLDEST:
         found["shear"] = _waveforms(configuration, found["u"], found["J"])
     return Recall(**found, stages=content.samples("stages"), frames=read_frames(content))  # type: ignore[arg-type]
 

@@ -1,7 +1,8 @@
 """What an HDF5 file declares, looked at before anything is read; and old files, copied in a process of their own.
 
-Files of this package hold groups, short attributes, and arrays of numbers in one piece. All else that HDF5 can hold is
-refused: links to elsewhere, storage elsewhere, virtual, compressed or unwritten data, objects, strings without end.
+Files of this package hold groups, short attributes, and arrays of numbers or names in one piece. All else that HDF5 can
+hold is refused: links to elsewhere, storage elsewhere, virtual, compressed or unwritten data, objects, strings without
+end.
 
 Run as a program it copies OLD to NEW: files from before there were checksums are parsed there, where a broken one can
 do no harm. So this module imports nothing of the package.
@@ -18,7 +19,7 @@ import numpy as np
 DEPTH = 4  # groups within groups
 ITEMS = 10_000  # datasets and groups of a file
 ATTRIBUTE = 1 << 26  # bytes of an attribute
-KINDS = "fiub"  # of numpy: real numbers, integers, booleans
+KINDS = "fiubS"  # of numpy: real numbers, integers, booleans; texts of one length, which lie in one piece too
 
 
 class Tree:
@@ -26,7 +27,8 @@ class Tree:
 
     Attributes:
         attributes: of every group, by its path ("" is the file).
-        datasets: by path; nothing of them has been read.
+        datasets: by path; nothing of them has been read. Their attributes (units, descriptions, scales) are for other
+            programs, and never are.
 
     Raises:
         ValueError: if there is anything that a file of this package never holds, naming it.

@@ -1,17 +1,19 @@
 """Waveforms as tables of samples: CSV and NPY."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gmem_jax.experiment.signals import Signals, Spline
 from gmem_jax.files.atomic import FileFormatError, atomic
-from gmem_jax.files.checked import json_of, read_npy, refusing
+from gmem_jax.files.checked import json_of, numbers, read_npy, refusing, require_fields, title
 from gmem_jax.files.configuration import signals_from, written_signals
 
 _LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB
-_TARGET = "# target: "
+_TARGET, _DESIGN = "# target: ", "# design: "
 
 
 def load_waveforms(path: Path) -> np.ndarray:
@@ -46,11 +48,33 @@ def load_target(path: Path) -> Signals | None:
     """
     path = Path(path)
     with refusing(path, "table of numbers"):
-        with path.open("rb") as file:
-            first = file.readline(_LARGEST)
-        if not first.startswith(_TARGET.encode()):
-            return None
-        return signals_from(json_of(first.decode().removeprefix(_TARGET), "target"))
+        found = _comment(path, _TARGET)
+        return signals_from(found) if found else None
+
+
+def load_design(path: Path) -> dict[str, Any]:
+    """How the design of a designed file went: pack, before, fidelity, gain, history; {} if the file does not say.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if what it says cannot be read.
+    """
+    with refusing(path, "table of numbers"):
+        found = _comment(Path(path), _DESIGN)
+        if found:
+            amounts = dict.fromkeys(("before", "fidelity", "gain", "history"), numbers)
+            require_fields(found, "design", pack=title, **amounts)
+        return found
+
+
+def _comment(path: Path, mark: str) -> dict[str, Any]:
+    """The JSON of a comment in one of the first two lines; {} if there is none."""
+    with path.open("rb") as file:
+        lines = [file.readline(_LARGEST) for _ in range(2)]
+    for line in lines:
+        if line.startswith(mark.encode()):
+            return json_of(line.decode().removeprefix(mark), mark.strip("# :"))
+    return {}
 
 
 def _npy(path: Path) -> np.ndarray:
@@ -83,19 +107,24 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def save_waveforms(path: Path, signals: Spline, target: Signals | None = None) -> None:
+def save_waveforms(
+    path: Path, signals: Spline, target: Signals | None = None, *, design: Mapping[str, Any] | None = None
+) -> None:
     """Write waveforms as a CSV that `load_waveforms` and `gmem recall --signals` read: a column for every signal.
 
     Args:
         path: the file.
         signals: the waveforms.
         target: those whose recall they imitate, kept in a comment that `load_target` reads.
+        design: how that went, kept in a comment that `load_design` reads.
 
     Raises:
         OSError: if the path cannot be written.
     """
     values = np.asarray(signals.nodes)[:, 1:-1].T
     header = ",".join(f"signal_{number + 1}" for number in range(values.shape[1]))
+    if design is not None:
+        header = f"{_DESIGN}{json.dumps(design)}\n{header}"
     if target is not None:
         header = f"{_TARGET}{json.dumps(written_signals(target))}\n{header}"
     with atomic(path) as temporary:

@@ -12,6 +12,7 @@ from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
+from gmem_jax.show.recalls import signals_drawing
 
 
 def pyplot() -> Any:
@@ -42,44 +43,21 @@ def save(path: Path, figure: Any, *, also: Sequence[str] = ()) -> None:
     pyplot().close(figure)
 
 
-def recall_figure(path: Path, recall: Recall, scale: Scalar, title: str) -> None:
-    """p_sig of every signal and its scaled integral G E delta0 gamma0 J, like the paper's Fig. 6; at most 12 panels.
+def recall_figure(path: Path, recall: Recall, scale: Scalar, title: str, names: Sequence[str] | None = None) -> None:
+    """p_sig of every signal, its scaled integral G E delta0 gamma0 J, and I(u), like the paper's Fig. 6.
 
     Args:
         path: file to write.
         recall: what to draw.
         scale: delta0 gamma0, scalar or [S, 1].
         title: over the picture.
+        names: of the signals; default their numbers.
 
     Raises:
         OSError: if the path cannot be written.
     """
-    plt = pyplot()
-    unit = Material().modulus
-    u, signals, integrals = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J))
-    scaled_integrals = float(recall.gain) * np.asarray(scale) * integrals
-    shown = min(len(signals), 12)
-    columns = min(shown, 3)
-    lines = -(-shown // columns)
-    figure, axes = plt.subplots(
-        lines, columns, figsize=(3.4 * columns, 2.5 * lines + 0.6), sharex=True, sharey=True, squeeze=False
-    )
-    for number, axis in enumerate(axes.flat):
-        if number >= shown:
-            axis.set_visible(False)
-            continue
-        axis.axhline(0.0, color="0.8", linewidth=0.8)
-        axis.plot(u, unit * signals[number], color="C0", linewidth=1.2, label="recalled $p_{sig}$")
-        scaled = scaled_integrals[number]
-        axis.plot(u, unit * scaled, color="C3", linewidth=1.2, linestyle="--", label=r"$G E \delta_0 \gamma_0 J$")
-        axis.set_title(f"signal {number + 1}", fontsize=9)
-    for axis in axes[-1]:
-        axis.set_xlabel("compression variable u")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("stress (Pa)")
-    axes[0, 0].legend(fontsize=7, frameon=False)
-    figure.suptitle(f"{title}: G = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}", fontsize=10)
-    save(path, figure)
+    called = names or [f"signal {number + 1}" for number in range(len(recall.J))]
+    signals_drawing(recall, called, title, scale).save(path)
 
 
 def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:

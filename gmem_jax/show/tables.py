@@ -65,8 +65,8 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _scale(configuration: dict[str, Any]) -> jax.Array:
-    """E delta0 gamma0; scalar, or [S, 1] where it differs between signals."""
+def relative_scale(configuration: dict[str, Any]) -> jax.Array:
+    """delta0 gamma0; scalar, or [S, 1] where it differs between signals."""
     numbers = np.multiply(configuration["delta0"], configuration["gamma0"])
     return jnp.asarray(numbers if np.ndim(numbers) == 0 else numbers[1:, None])
 
@@ -76,7 +76,7 @@ def of_target(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
     if "target" not in configuration:
         return {}
     wanted = bin_average(signals_from(configuration["target"]))
-    match = analysis.compare(jnp.asarray(recall.p_sig), wanted, _scale(configuration))
+    match = analysis.compare(jnp.asarray(recall.p_sig), wanted, relative_scale(configuration))
     return {"target_gain": float(match.gain), "target_fidelity": float(match.fidelity)}
 
 
@@ -97,12 +97,22 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
     if "readout-2" not in recall.stages:
         return {}
     first, second = (analysis.recalled(recall.stages[name].pressure) for name in ("readout", "readout-2"))
-    scale = _scale(configuration)
+    scale = relative_scale(configuration)
     matches = analysis.backgrounds(first, second, recall.J, scale)
     rows = {name: {"gain": float(match.gain), "fidelity": float(match.fidelity)} for name, match in matches.items()}
     correlation, left = (spread(values) for values in analysis.remembered_after(second, recall.J, scale))
     rest = {"correlation": correlation[0], "correlation_se": correlation[2], "gain": left[0], "gain_se": left[2]}
     return {"backgrounds": rows, "second_readout": rest}
+
+
+def recall_lines(row: dict[str, Any], configuration: dict[str, Any]) -> list[Any]:
+    """What to print of one recall, from its `summary`."""
+    more: list[Any] = []
+    if "backgrounds" in row:
+        more += [backgrounds_table(row), second_readout_lines(row)]
+    if "target_fidelity" in row:
+        more += [target_line(row)]
+    return [recall_table([row], configuration), *more]
 
 
 def backgrounds_table(row: dict[str, Any]) -> Table:
@@ -131,7 +141,7 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
         rows: a `summary` for each pack; several get a line of mean and standard deviation.
         configuration: resolved, of any of them.
     """
-    table = Table(title="Recall of the waveforms")
+    table = Table(title="Recall of the waveforms", caption=conditions(configuration))
     for column in ("pack", "G", "F", "G over T1", "F over T1", "T1", "status"):
         words = column in ("pack", "status")  # may wrap in a narrow terminal; numbers are never cut
         table.add_column(column, justify="left" if words else "right", no_wrap=not words, overflow="fold")
@@ -149,6 +159,23 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
         fidelity = f"{point['fidelity_mean']:.3f}\n± {point['fidelity_sd']:.3f}"
         table.add_row(f"published ({point['n_packs']:.0f})", gain, fidelity)
     return table
+
+
+def conditions(configuration: dict[str, Any]) -> str:
+    """What a recall depends on first of all: law, mu, gamma0, delta0, t0, signals."""
+    amounts = ("mu", "gamma0", "delta0", "t0")
+    known = ", ".join(f"{name} = {_amount(configuration[name])}" for name in amounts)
+    form = configuration.get("experiment", {}).get("signals", {})
+    count = len(configuration.get("signals", ()))
+    kind = form.get("kind") if isinstance(form, dict) else None
+    named = {"six": "the six signals", "words": f"all {count} words of {form.get('bits')} bits"}
+    stored = named.get(str(kind), f"{count} signals" if count else "")
+    return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", stored)))
+
+
+def _amount(value: Any) -> str:
+    low, high = np.min(value), np.max(value)
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:

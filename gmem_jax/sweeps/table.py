@@ -10,6 +10,7 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.files.atomic import atomic
+from gmem_jax.files.labelled import described, library
 from gmem_jax.physics.state import explain
 from gmem_jax.sweeps.store import Store
 
@@ -78,7 +79,7 @@ def export(store: Store, path: Path) -> None:
             writer.writeheader()
             writer.writerows(table)
     elif suffix == ".parquet":
-        pyarrow, parquet = _library("pyarrow"), _library("pyarrow.parquet")
+        pyarrow, parquet = library("pyarrow"), library("pyarrow.parquet")
         with atomic(path) as temporary:
             parquet.write_table(pyarrow.Table.from_pylist(table), temporary)
     elif suffix in (".h5", ".nc"):
@@ -88,19 +89,10 @@ def export(store: Store, path: Path) -> None:
         raise ValueError(f"{path}: must end in one of {', '.join(FORMATS)}")
 
 
-def _library(name: str) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ValueError(f'{name.split(".")[0]} is not installed: pip install "gmem_jax[export]"') from error
-
-
 def _dataset(store: Store, table: Sequence[dict[str, Any]]) -> Any:
     """The table as an xarray.Dataset over points; signals where all points have as many."""
-    xarray = _library("xarray")
-    _library("h5netcdf")
+    xarray = library("xarray")
+    library("h5netcdf")
     card = store.card()
     columns = {name: ("point", _column([row[name] for row in table])) for name in table[0]}
     data = xarray.Dataset(columns, attrs={"schema": "gmem-sweep-table/1", "shared": json.dumps(card["shared"])})
@@ -109,12 +101,12 @@ def _dataset(store: Store, table: Sequence[dict[str, Any]]) -> Any:
     if len(shapes) == 1:
         (shape,) = shapes
         blank = np.full(shape, np.nan)
-        for name, units in (("p_sig", "E"), ("J", "1")):
+        for name in ("p_sig", "J", "shear"):
             stacked = [
                 np.asarray(getattr(recalls[row["key"]], name)) if row["key"] in recalls else blank for row in table
             ]
-            data[name] = (("point", "signal", "u"), np.stack(stacked), {"units": units})
-        data = data.assign_coords(u=np.asarray(next(iter(recalls.values())).u))
+            data[name] = (("point", "signal", "u"), np.stack(stacked), described(name))
+        data = data.assign_coords(u=("u", np.asarray(next(iter(recalls.values())).u), described("u")))
     return data
 
 

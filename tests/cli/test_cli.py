@@ -126,7 +126,10 @@ def test_recalled_words_are_classified_and_the_nets_are_used_again(
     assert gmem(monkeypatch, *arguments, "--json") == 0
     spoken = capsys.readouterr()
     said = json.loads(spoken.out)
-    assert said == json.loads(target.read_text())
+    stored = json.loads(target.read_text())
+    assert stored.pop("schema") == "gmem-reading/1"
+    assert set(stored.pop("about")) == set(said)
+    assert stored == said
     assert (said["bits"], said["background"], said["status"]) == (1, "sub2-bl", 0)
     assert [net["finished"] for net in said["nets"]] == [True, True]
     assert set(said["readers"]) == {"net", "nearest template", "linear decoder"}

@@ -9,7 +9,7 @@ import pytest
 from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
-from gmem_jax.command import derive
+from gmem_jax.files.schemas import KERNEL
 
 
 def test_kernel_and_design_write_what_they_say(
@@ -21,7 +21,7 @@ def test_kernel_and_design_write_what_they_say(
     assert len(said["singular_values_pa"]) == said["n"] == 5
     with h5py.File(target) as file:
         assert file["kernel"].shape == (256, 5)
-        assert file.attrs["schema"] == derive.KERNEL_SCHEMA
+        assert file.attrs["schema"] == KERNEL.name
     waves = tmp_path / "designed.csv"
     assert gmem(monkeypatch, "design", PACK, "-o", waves, "--iterations", 1, "--json", *SHORT) == 0
     said = json.loads(capsys.readouterr().out)

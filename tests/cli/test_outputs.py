@@ -8,7 +8,7 @@ import pytest
 from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
-from gmem_jax.command.console import finite
+from gmem_jax.files.results import finite
 from gmem_jax.show import tables
 
 

@@ -33,6 +33,7 @@ from hypothesis import strategies as st
 
 import gmem_jax as gm
 from gmem_jax.command import app, derive, packs, recalls
+from gmem_jax.command import show as showing
 from gmem_jax.command.sweep import planned
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files import tree
@@ -504,8 +505,8 @@ _SWEEP = st.lists(
 ).map(lambda lines: "\n".join(lines).encode())
 
 KINDS: dict[str, Kind] = {
-    "packs": Kind(0.24, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("pack.h5", _show(recalls.show))),
-    "recalls": Kind(0.20, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("recall.h5", _show(recalls.show))),
+    "packs": Kind(0.24, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("pack.h5", _show(showing.show))),
+    "recalls": Kind(0.20, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("recall.h5", _show(showing.show))),
     "parts": Kind(0.12, st.one_of(_RAW, _FORGED), file_judge("part.npz", load_part)),
     "nets": Kind(0.10, st.one_of(_RAW, _FORGED), file_judge("net.msgpack", _load_net)),
     "csv": Kind(0.06, _RAW, file_judge("waves.csv", _load_waves, sealed=False)),

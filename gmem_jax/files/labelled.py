@@ -1,0 +1,92 @@
+"""Results with names on their axes: xarray (an extra of the package), and CSV."""
+
+import csv
+import importlib
+import io
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gmem_jax.experiment.protocol import compression_at
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.signals import BINS
+from gmem_jax.files.schemas import RECALL, STAGE
+
+
+def library(name: str) -> Any:
+    """A library of the extra "export".
+
+    Raises:
+        ValueError: if it is not installed, and how it would be.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ValueError(f'{name.split(".")[0]} is not installed: pip install "gmem_jax[export]"') from error
+
+
+def described(name: str) -> dict[str, str]:
+    """Units and description of an array of a recall."""
+    array = RECALL.arrays[name]
+    return {"units": array.units, "description": array.words}
+
+
+def recall_dataset(recall: Recall, names: list[str], configuration: Mapping[str, Any]) -> Any:
+    """A recall as an xarray.Dataset: its arrays, and the samples of all stages one after the other along `time`.
+
+    Args:
+        recall: the recall; stages that were run once for all replicas are repeated for each.
+        names: of its S signals.
+        configuration: the resolved one, for its attributes; may be empty.
+
+    Raises:
+        ValueError: if xarray is not installed.
+    """
+    xarray = library("xarray")
+    stages, replicas = recall.stages, len(recall.status)
+    bins = {name: len(sample.filling) for name, sample in stages.items()}
+    ends = [compression_at(name, np.arange(1, count + 1) / count) for name, count in bins.items()]
+    joined: dict[str, Any] = {
+        "time": np.arange(1, sum(bins.values()) + 1) / BINS,
+        "u_of_time": np.concatenate(ends),
+        "stage": np.repeat(list(bins), list(bins.values())),
+    }
+    data = {}
+    for name, array in STAGE.items():
+        about = {"units": array.units, "description": array.words}
+        if name in ("time", "u"):
+            at = "u_of_time" if name == "u" else name
+            joined[at] = ("time", joined[at], about)
+            continue
+        own = (np.asarray(getattr(sample, name)) for sample in stages.values())
+        wide = [np.broadcast_to(values, (*values.shape[:-1], replicas)) for values in own]
+        data[name] = (array.shape, np.concatenate(wide), about)
+    for name, array in RECALL.arrays.items():
+        if name not in ("u", "signal"):
+            values = np.asarray(getattr(recall, name))
+            data[name] = (array.shape if values.ndim == len(array.shape) else ("replica",), values, described(name))
+    coordinates = {
+        "signal": ("signal", names, described("signal")),
+        "u": ("u", np.asarray(recall.u), described("u")),
+        "replica": np.arange(replicas),
+        "axis": ["x", "y", "z"],
+        **joined,
+        "stage": ("time", joined["stage"]),
+    }
+    facts = {
+        name: configuration[name] for name in ("pack", "grains", "friction", "background") if name in configuration
+    }
+    facts |= {name: configuration[name] for name in ("mu", "gamma0", "delta0", "t0") if name in configuration}
+    about = {"schema": RECALL.name, "units": "R = E = rho = 1", **facts, "configuration": json.dumps(configuration)}
+    return xarray.Dataset(data, coordinates, about)
+
+
+def recall_csv(recall: Recall, names: list[str]) -> str:
+    """The recalled signals as CSV: u, and p_sig of every signal in E."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["u", *(f"p_sig of {name} (E)" for name in names)])
+    writer.writerows(np.column_stack([recall.u, np.asarray(recall.p_sig).T]).tolist())
+    return text.getvalue()

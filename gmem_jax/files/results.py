@@ -1,0 +1,92 @@
+"""Results as JSON: of a schema, with every field's units and description beside it."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gmem_jax.files.atomic import FileFormatError, atomic
+from gmem_jax.files.checked import is_number, json_of, refusing, require, title, whole
+from gmem_jax.files.schemas import GRADIENT, READING, TUNED, Schema
+
+_LARGEST = 1 << 28  # bytes
+_KINDS = (GRADIENT, TUNED, READING)
+
+
+def finite(value: Any) -> Any:
+    """The same with null for numbers that are none, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def save_result(path: Path, schema: Schema, result: dict[str, Any]) -> None:
+    """Write the fields of a result.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    about = {
+        name: " ".join(filter(None, (field.words, f"({field.units})" if field.units else "")))
+        for name, field in schema.arrays.items()
+    }
+    with atomic(path) as temporary:
+        content = finite({"schema": schema.name, **result, "about": about})
+        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def load_result(path: Path) -> tuple[Schema, dict[str, Any]]:
+    """Read what `save_result` wrote, and what commands wrote before there were schemas.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if it is no result, or a field is missing or not what it must be.
+    """
+    path = Path(path)
+    with refusing(path, "result"):
+        require(path.stat().st_size <= _LARGEST, f"a result of more than {_LARGEST >> 20} MB")
+        found = json_of(path.read_text(), "content")
+        schema = _schema_of(found)
+        for name, field in schema.arrays.items():
+            value, missing = _at(found, name)
+            if not (missing and field.kind == "real, if any"):
+                require(not missing, f"incomplete file, {name!r} is missing")
+                require(_ACCEPTS[field.kind](value), f"it has an impossible {name!r}")
+        return schema, found
+
+
+def _schema_of(found: dict[str, Any]) -> Schema:
+    told = found.get("schema")
+    for schema in _KINDS:
+        own = {name.partition("/")[0] for name in schema.arrays}
+        if told == schema.name or (told is None and own <= set(found)):
+            return schema
+    names = ", ".join(schema.name for schema in _KINDS)
+    raise FileFormatError(f"schema is {str(told)[:40]!r}, expected one of {names}")
+
+
+def _at(found: Any, path: str) -> tuple[Any, bool]:
+    """A value by its path, and whether there is none."""
+    for name in path.split("/"):
+        if not isinstance(found, dict) or name not in found:
+            return None, True
+        found = found[name]
+    return found, False
+
+
+def _real(value: Any) -> bool:
+    return value is None or is_number(value) or (isinstance(value, list) and all(map(_real, value)))
+
+
+_ACCEPTS: dict[str, Callable[[Any], bool]] = {
+    "real": _real,
+    "real, if any": _real,
+    "rows": lambda value: isinstance(value, list) and all(isinstance(row, list) and _real(row) for row in value),
+    "whole": whole,
+    "text": title,
+    "list": lambda value: isinstance(value, list),
+    "object": lambda value: isinstance(value, dict),
+}

@@ -1,0 +1,287 @@
+"""What every kind of file holds, with units: the one table to write from, read by, and print in docs/files.md."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from gmem_jax.files.checked import FIXED, Array
+
+DIMENSIONS = {  # names of lengths, and what the scales of those say that no array of a file is a scale of
+    "u": "bin of the compression variable",
+    "axis": "x, y, z",
+    "component": "w, x, y, z of a quaternion",
+    "side": "the two spheres of a candidate contact",
+    "grain": "number of the grain",
+    "sphere": "number of the sphere: grain K + place in the grain",
+    "part": "place of the sphere in its grain",
+    "candidate": "number of the candidate contact",
+    "signal": "number of the signal",
+    "replica": "0 is the zero signal, k the k-th signal",
+    "common": "the one run that all replicas have in common",
+    "time": "end of the bin",
+    "bump": "number of the basis waveform",
+}
+
+
+class Schema(NamedTuple):
+    """A kind of file.
+
+    Attributes:
+        name: with its version, as it stands in the file.
+        title: what it is called.
+        words: what it is and what makes it.
+        arrays: every array by its path, or every field of JSON.
+        texts: attributes, by name.
+        before: older versions that are still read, and how they differ.
+    """
+
+    name: str
+    title: str
+    words: str
+    arrays: Mapping[str, Array]
+    texts: Mapping[str, str] = {}
+    before: Mapping[str, str] = {}
+
+
+_CONFIGURATION = {
+    "configuration": "JSON: every parameter of the experiment, what its defaults came to, versions, commit, device"
+}
+_UNSEALED = "without a checksum"
+
+STAGE = {  # of a recall or a preparation, in stages/NAME; `common` is the last dimension where there is one run for all
+    "time": Array("real", ("time",), "t0", "end of the bin, since the first stage in the file began"),
+    "u": Array("real", ("time",), "1", "compression variable at the end of the bin"),
+    "pressure": Array("real", ("time", "axis", "replica"), "E", "p_x, p_y, p_z on the walls, averaged over the bin"),
+    "lengths": Array("real", ("time", "axis", "replica"), "R", "edges of the box at the end of the bin"),
+    "kinetic_energy": Array("real", ("time", "replica"), "E R^3", "translation and rotation, at the end of the bin"),
+    "largest_speed": Array("real", ("time", "replica"), "R/t_c", "of a grain, at the end of the bin"),
+    "coordination": Array("real", ("time", "replica"), "1", "Z, touching grains per grain, rattlers included"),
+    "contacts": Array("real", ("time", "replica"), "1", "touching spheres per grain, times two"),
+    "filling": Array("real", ("time", "replica"), "1", "phi, volume of the grains over that of the box"),
+    "largest_overlap": Array("real", ("time", "replica"), "R", "deepest contact at the end of the bin"),
+    "inertial_number": Array("real", ("time", "replica"), "1", "I of the compression; 0 without pressure"),
+}
+
+PACK = Schema(
+    "gmem-pack/2",
+    "Pack (.h5)",
+    "Grains at rest in their box: `gmem prepare`, `gm.save_pack`.",
+    {
+        "position": Array("real", ("grain", "axis"), "R", "centres of the grains"),
+        "quaternion": Array("real", ("grain", "component"), "1", "orientations of the grains"),
+        "lower": Array("real", ("axis",), "R", "lower planes of the box"),
+        "upper": Array("real", ("axis",), "R", "upper planes of the box"),
+        "delta0": Array("real", (), "1", "areal compression that the pack was cycled with"),
+        "ringing_period": Array("real", (), "t_c", "T1, period of the slowest shear mode of the box"),
+        "clump/offsets": Array("real", ("part", "axis"), "R", "centres of the spheres of a grain, in its own frame"),
+        "clump/mass": Array("real", (), "rho R^3", "mass of a grain"),
+        "clump/inertia": Array("real", ("axis",), "rho R^5", "principal moments of inertia of a grain"),
+        "clump/diameter": Array("real", (), "R", "largest extent of a grain"),
+        "pairs/candidates": Array("whole", ("side", "candidate"), "1", "numbers of the spheres that may touch"),
+        "pairs/reference": Array("real", ("sphere", "axis"), "1", "where the list was made, in parts of the box"),
+        "pairs/smallest": Array("real", ("axis",), "R", "edges of the box at u = 1, for which the list was made"),
+        "pairs/reach": Array("real", (), "R", "distance up to which spheres are listed"),
+    },
+    {
+        "name": "of the pack",
+        "record": "JSON: the recipe with its seed, what was measured at rest, versions, commit, device",
+        "clump: shape": 'like "tetra(0.6)"',
+        "clump: isotropic": "whether its three moments are equal",
+    },
+    {"gmem-pack/1": _UNSEALED},
+)
+
+RECALL = Schema(
+    "gmem-recall/3",
+    "Recall (.h5)",
+    "What a pack gave back of S signals: `gmem recall`, `gmem demo`, the points of a sweep, `gm.save_recall`.",
+    {
+        "u": Array("real", ("u",), "1", "compression variable, centres of the bins"),
+        "signal": Array("text", ("signal",), "1", "names of the signals; words by their bits"),
+        "shear": Array("real", ("signal", "u"), "1", "I(u), the waveforms as applied, in parts of gamma0"),
+        "J": Array("real", ("signal", "u"), "1", "J(u), their integrals averaged over each bin"),
+        "p_sig": Array("real", ("signal", "u"), "E", "recalled signals, the background subtracted"),
+        "gain": Array("real", (), "1", "G of the set"),
+        "fidelity": Array("real", (), "1", "F of the set"),
+        "windowed_gain": Array("real", (), "1", "G after a running mean over the ringing period"),
+        "windowed_fidelity": Array("real", (), "1", "F after a running mean over the ringing period"),
+        "window": Array("real", (), "t_c", "T1, that period"),
+        "residual_speed": Array("real", ("replica",), "1", "largest grain speed before the readout, over the walls'"),
+        "status": Array("whole", ("replica",), "1", "bits of gm.Status; 0 is sound"),
+        "dt": Array("real", (), "t_c", "time step; [replica] where t0 differs between replicas"),
+    },
+    _CONFIGURATION,
+    {"gmem-recall/2": "without names, time and u of the stages", "gmem-recall/1": f"{_UNSEALED} and I(u)"},
+)
+
+KERNEL = Schema(
+    "gmem-kernel/1",
+    "Memory kernel (.h5)",
+    "The linear part of a pack's memory, measured on n bumps: `gmem kernel`.",
+    {
+        "u": Array("real", ("u",), "1", "compression variable where it is read, centres of the bins"),
+        "centres": Array("real", ("bump",), "1", "v, where the bumps of shear lie"),
+        "width": Array("real", (), "1", "width of the bumps, in u"),
+        "kernel": Array("real", ("u", "bump"), "E", "M(u, v), recall over the integral of the bump"),
+        "odd": Array("real", ("bump", "u"), "E", "half the difference of the recalls of a bump and its opposite"),
+        "even": Array("real", ("bump", "u"), "E", "half their sum; 0 for a linear memory"),
+        "gamma0": Array("real", (), "1", "shear amplitude they were measured at"),
+        "delta0": Array("real", (), "1", "areal compression"),
+    },
+    _CONFIGURATION,
+)
+
+_RUN = {
+    "seconds": Array("real", (), "s", "wall time of the run"),
+    "status": Array("whole", (), "1", "bits of gm.Status; 0 is sound"),
+}
+_MADE = {**_RUN, "configuration": Array("object", (), "", _CONFIGURATION["configuration"])}
+
+GRADIENT = Schema(
+    "gmem-gradient/1",
+    "Gradient (.json)",
+    "Exact derivatives of the fidelity: `gmem gradient`.",
+    {
+        "pack": Array("text", (), "", "its file or name"),
+        "fidelity": Array("real", (), "1", "F"),
+        "places": Array("rows", ("signal", "place"), "1", "u where each waveform can be changed"),
+        "gradient/waveform": Array("rows", ("signal", "place"), "1", "dF by the height of the waveform there"),
+        "gradient/gamma0": Array("real", (), "1", "dF/dgamma0"),
+        "gradient/mu": Array("real, if any", (), "1", "dF/dmu; where the law has one"),
+        "gradient/stiffness": Array("real, if any", (), "1/(E R)", "dF/dk_H (or k_M, 1/(E R^0.5)); where there is one"),
+        **_MADE,
+    },
+    before={"": "without `schema` and `about`"},
+)
+
+TUNED = Schema(
+    "gmem-tuned/1",
+    "Tuned drive (.json)",
+    "The drive with the best mean fidelity of some packs: `gmem tune`.",
+    {
+        "packs": Array("list", ("pack",), "", "their files or names"),
+        "before": Array("real", (), "1", "mean F of the drive that was begun with"),
+        "fidelity": Array("real", (), "1", "mean F of the best drive"),
+        "each": Array("real", ("pack",), "1", "F of every pack with it"),
+        "values": Array("object", (), "", "gamma0 (1), mu (1) and stiffness (E R) of the best drive"),
+        "history": Array("list", ("iteration",), "", "those values and their mean F after every iteration"),
+        **_MADE,
+    },
+    before={"": "without `schema` and `about`"},
+)
+
+READING = Schema(
+    "gmem-reading/1",
+    "Classification (.json)",
+    "How well the words of a recall are read: `gmem classify`.",
+    {
+        "recall": Array("text", (), "", "the file that was read"),
+        "pack": Array("text", (), "", "its pack"),
+        "bits": Array("whole", (), "1", "length L of the words"),
+        "words": Array("whole", (), "1", "number of words, 2^L"),
+        "background": Array("text", (), "", "how the background was subtracted"),
+        "readers": Array(
+            "object",
+            (),
+            "",
+            "by reader: accuracy and its SD over nets, error rate of each bit, information in bits, the word read "
+            "for each word stored (of every net, for nets)",
+        ),
+        "nets": Array(
+            "list", ("net",), "", "seed, accuracy, cross-entropy (nats), validation accuracy, steps, seconds"
+        ),
+        **_RUN,
+    },
+    before={"": "without `schema` and `about`"},
+)
+
+DESIGN = Schema(
+    "",
+    "Waveforms (.csv)",
+    "A column for each signal, row k of n at u = k / (n + 1), 0 at both ends: for `gmem recall --signals`. `gmem "
+    "design` writes comments above: `# target:` the waveforms whose recall they imitate, `# design:` how it went.",
+    {
+        "signal_1, ...": Array("real", ("sample",), "1", "I(u) in parts of gamma0"),
+        "# target": Array("object", (), "", "JSON: the wanted waveforms, as in a configuration"),
+        "# design": Array("object", (), "", "JSON: pack, F before and after, gain, F after every iteration"),
+    },
+)
+
+NET = Schema(
+    "gmem-classifier/2",
+    "Net (.msgpack)",
+    "The reader of words of one length and seed, finished or not: `gmem classify --nets`. 512 bytes of checksum, then "
+    "MessagePack as flax writes it.",
+    {
+        "recipe": Array("text", (), "", "JSON: gm.classify.Lessons, what it was built and taught from"),
+        "training": Array("object", (), "", "seed, steps, loss (nats), validation accuracy, seconds"),
+        "parameters/Dense_k/kernel": Array("real", ("inputs", "outputs"), "1", "weights of layer k, float32"),
+        "parameters/Dense_k/bias": Array("real", ("outputs",), "1", "biases of layer k, float32"),
+    },
+    before={"gmem-classifier/1": _UNSEALED},
+)
+
+SWEEP = Schema(
+    "gmem-sweep/1",
+    "Sweep (a folder)",
+    "`gmem sweep`: points/KEY.h5 are recalls, packs/KEY.h5 packs; `gmem sweep export` makes one table of them. "
+    "sweep.json holds:",
+    {
+        "names": Array("list", ("name",), "", "what varies"),
+        "shared": Array("object", (), "", "the values that all points have"),
+        "points": Array("list", ("point",), "", "values and key of each point; what is not computed has no file"),
+    },
+)
+
+SCHEMAS = (RECALL, PACK, KERNEL, GRADIENT, TUNED, READING, DESIGN, NET, SWEEP)
+
+
+def page() -> str:
+    """docs/files.md."""
+    return "\n".join([_INTRODUCTION, *(_section(schema) for schema in SCHEMAS)])
+
+
+_INTRODUCTION = """# What the files hold
+
+<!-- made by experiments/files_page.py -->
+
+Units are R = E = rho = 1, time in t_c = R sqrt(rho / E); `gm.Material` converts to SI. The time axis of stages is in
+t0, the duration of one compression. `gmem show FILE` prints what any of these files holds, `gmem show FILE --plot WHAT
+-o x.png` draws it (`--plot list` says what there is), and `gmem show FILE --csv` gives the recalled signals.
+
+HDF5 files open without this package. Every dataset has the attributes `units` and `description`, and a dimension scale
+for each of its dimensions (those that are no dataset of the tables below count from 0):
+
+```python
+import h5py, xarray
+h5py.File("recall.h5")["p_sig"].attrs["units"]
+xarray.open_dataset("recall.h5", engine="h5netcdf").p_sig.sel(signal="signal 1").plot()
+xarray.open_dataset("recall.h5", engine="h5netcdf", group="stages/readout").pressure
+```
+
+With it, `gm.load_recall("recall.h5").to_xarray()` is one dataset, its stages one after the other along `time`. The
+first 512 bytes are a SHA-256 of the rest: a file that was changed by another program is refused here. JSON files carry
+their fields' units and descriptions in `about`.
+"""
+
+
+def _section(schema: Schema) -> str:
+    name = f"`{schema.name}`. " if schema.name else ""
+    lines = [f"## {schema.title}", "", f"{name}{schema.words}", ""]
+    lines += _table(schema.arrays)
+    if schema is RECALL or schema is PACK:
+        lines += ["", "In `stages/NAME`, in the order of the attribute `order` (in packs where they were kept):", ""]
+        lines += _table(STAGE)
+    if schema.texts:
+        lines += ["", "Attributes: " + "; ".join(f"`{name}`, {words}" for name, words in schema.texts.items()) + "."]
+    if schema.before:
+        older = (f"`{name}`, {words}" if name else f"files {words}" for name, words in schema.before.items())
+        lines += ["", f"Still read: {'; '.join(older)}."]
+    return "\n".join([*lines, ""])
+
+
+def _table(arrays: Mapping[str, Array]) -> list[str]:
+    lines = ["| name | shape | units | |", "|---|---|---|---|"]
+    for path, (_, shape, units, words) in arrays.items():
+        sizes = ", ".join(f"{name} ({FIXED[name]})" if name in FIXED else str(name) for name in map(str, shape))
+        lines.append(f"| `{path}` | {f'[{sizes}]' if sizes else ''} | {units} | {words} |")
+    return lines

@@ -1,0 +1,132 @@
+"""Pictures of recalled signals."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.pytree import Scalar
+from gmem_jax.show.drawing import Drawing, blank
+
+MOST = 64  # panels of one picture
+
+
+def signals_drawing(recall: Recall, names: Sequence[str], title: str, scale: Scalar | None = None) -> Drawing:
+    """p_sig of every signal, its scaled integral, and the waveform, like the paper's Fig. 6; at most 64 panels.
+
+    Args:
+        recall: what to draw.
+        names: of its S signals.
+        title: over the picture.
+        scale: delta0 gamma0, scalar or [S, 1]; without it the integral that comes nearest is drawn, which is the same
+            where all signals have one scale.
+    """
+    pascal = Material().modulus
+    u, signals, integrals, waves = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J, recall.shear))
+    if scale is None:
+        fitted = integrals * np.sum(integrals * signals) / np.sum(integrals * integrals)
+    else:
+        fitted = float(recall.gain) * np.asarray(scale) * integrals
+    shown = min(len(signals), MOST)
+    drawing, axes = _panels(shown)
+    rights = []
+    for number, axis in enumerate(axes.flat[:shown]):
+        right = axis.twinx()
+        rights.append(right)
+        wave = right.fill_between(u, waves[number], color="0.88", linewidth=0)
+        axis.set_zorder(right.get_zorder() + 1)
+        axis.patch.set_visible(False)
+        axis.axhline(0.0, color="0.8", linewidth=0.6)
+        (recalled,) = axis.plot(u, pascal * signals[number], color="C0", linewidth=1.2)
+        (scaled,) = axis.plot(u, pascal * fitted[number], color="C3", linewidth=1.2, linestyle="--")
+        axis.set_title(names[number], fontsize=9 if shown <= 16 else 7, pad=3)
+    highest = 1.05 * max(float(np.nanmax(np.abs(waves[:shown]), initial=0.0)), 1e-12)
+    largest = 1.05 * pascal * float(np.nanmax(np.abs([signals[:shown], fitted[:shown]]), initial=0.0))
+    axes[0, 0].set_ylim(-(largest or 1.0), largest or 1.0)  # both zeros lie in the middle
+    for number, right in enumerate(rights):
+        right.set_ylim(-highest, highest)
+        last = (number + 1) % axes.shape[1] == 0 or number == shown - 1
+        right.tick_params(labelright=last, labelsize=7, colors="0.5")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("stress (Pa)", fontsize=9)
+    _u_below(axes, shown)
+    for right in rights[axes.shape[1] - 1 :: axes.shape[1]] or rights[-1:]:
+        right.set_ylabel(r"$I(u) = \gamma / \gamma_0$", fontsize=8, color="0.5")
+    handles = [recalled, scaled, wave]
+    labels = ["recalled $p_{sig}$", r"$G E \delta_0 \gamma_0 J$", "waveform $I(u)$"]
+    drawing.figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    drawing.figure.suptitle(_heading(recall, title, shown, len(signals)), fontsize=10)
+    return drawing
+
+
+def waveforms_drawing(recall: Recall, names: Sequence[str], title: str) -> Drawing:
+    """I(u) as applied, and J(u), of every signal; at most 64 panels."""
+    shown = min(len(recall.J), MOST)
+    drawing, axes = _panels(shown)
+    for number, axis in enumerate(axes.flat[:shown]):
+        axis.axhline(0.0, color="0.8", linewidth=0.6)
+        axis.plot(recall.u, recall.shear[number], color="C2", linewidth=1.2, label="$I(u)$")
+        axis.plot(recall.u, recall.J[number], color="C3", linewidth=1.2, linestyle="--", label="$J(u)$")
+        axis.set_title(names[number], fontsize=9 if shown <= 16 else 7, pad=3)
+    _u_below(axes, shown)
+    axes[0, 0].legend(fontsize=7, frameon=False)
+    drawing.figure.suptitle(f"{title}{_part(shown, len(recall.J))}", fontsize=10)
+    return drawing
+
+
+def image_drawing(recall: Recall, names: Sequence[str], title: str) -> Drawing:
+    """p_sig and J of all signals, however many, as a picture: a row for each."""
+    count = len(recall.J)
+    drawing, ((left, right),) = blank(1, 2, size=(9.6, min(9.0, 3.0 + 0.12 * count)), sharey=True)
+    pairs = (
+        (left, Material().modulus * np.asarray(recall.p_sig), "recalled $p_{sig}$ (Pa)"),
+        (right, np.asarray(recall.J), "$J(u)$"),
+    )
+    for axis, values, label in pairs:
+        limit = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
+        image = axis.imshow(
+            values,
+            cmap="RdBu_r",
+            vmin=-limit,
+            vmax=limit,
+            aspect="auto",
+            interpolation="nearest",
+            extent=(0.0, 1.0, count - 0.5, -0.5),
+        )
+        drawing.figure.colorbar(image, ax=axis, label=label)
+        axis.set_xlabel("compression variable u")
+    step = -(-count // 64)
+    left.set_yticks(range(0, count, step), list(names)[::step], fontsize=8 if count <= 16 else 6)
+    drawing.figure.suptitle(_heading(recall, title, count, count), fontsize=10)
+    return drawing
+
+
+def _panels(count: int) -> tuple[Drawing, Any]:
+    columns = min(count, 3) if count <= 12 else min(8, math.ceil(math.sqrt(count)))
+    rows = -(-count // columns)
+    width, height = (3.4, 2.4) if count <= 12 else (2.1, 1.7)
+    size = (max(width * columns, 5.0) + 0.4, height * rows + 0.9)
+    drawing, axes = blank(rows, columns, size=size, sharex=True, sharey=True)
+    for axis in axes.flat[count:]:
+        axis.set_visible(False)
+    return drawing, axes
+
+
+def _u_below(axes: Any, shown: int) -> None:
+    """Label u under the lowest panel of each column."""
+    columns = axes.shape[1]
+    for number in range(max(0, shown - columns), shown):
+        axis = axes[number // columns, number % columns]
+        axis.tick_params(labelbottom=True)
+        axis.set_xlabel("compression variable u" if columns <= 3 else "u", fontsize=9)
+
+
+def _heading(recall: Recall, title: str, shown: int, count: int) -> str:
+    return f"{title}\nG = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}{_part(shown, count)}"
+
+
+def _part(shown: int, count: int) -> str:
+    return f" (the first {shown} of {count} signals are shown)" if shown < count else ""
