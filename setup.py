@@ -4,6 +4,7 @@ import importlib.util
 from pathlib import Path
 
 from setuptools import Distribution, setup
+from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
 
 SOURCE = Path(__file__).parent / "gmem_jax" / "native" / "build.py"
@@ -31,6 +32,14 @@ class BuildWithNative(build_py):
             print(f"gmem_jax: no native backend, plain JAX will be used: {reason}")
 
 
+class OneWheel(bdist_wheel):
+    """ctypes loads the library, which knows no Python: a wheel serves all versions."""
+
+    def get_tag(self):
+        """The platform's tag alone."""
+        return "py3", "none", super().get_tag()[2]
+
+
 class PlatformDistribution(Distribution):
     """The wheel holds a library: it belongs to one platform."""
 
@@ -39,4 +48,4 @@ class PlatformDistribution(Distribution):
         return True
 
 
-setup(cmdclass={"build_py": BuildWithNative}, distclass=PlatformDistribution)
+setup(cmdclass={"build_py": BuildWithNative, "bdist_wheel": OneWheel}, distclass=PlatformDistribution)

@@ -22,7 +22,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gmem_jax import native
 from gmem_jax.bench import lammps
@@ -159,6 +158,8 @@ def tile(pack: Pack, times: tuple[int, int, int]) -> Pack:
     A rigid frictionless wall is a mirror plane, so the copies are at rest without it: a larger pack with the same
     contacts, which shows what size alone costs.
     """
+    from scipy.spatial.transform import Rotation  # here: it takes half a second to load
+
     lengths = np.asarray(pack.upper - pack.lower)
     offsets = np.asarray(pack.clump.offsets)
     across = offsets[0] - offsets[-1] if len(offsets) > 1 else np.array([1.0, 0.0, 0.0])
