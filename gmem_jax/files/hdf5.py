@@ -32,6 +32,7 @@ _SAMPLE = {  # what a stage records, by bins and replicas
     entry.name: ("bins", 3, "replicas") if entry.name in ("pressure", "lengths") else ("bins", "replicas")
     for entry in fields(Sample)
 }
+_LATER = "wall_contacts"  # NaN in older files, which lack it
 
 
 class Content(tree.Tree):
@@ -77,8 +78,11 @@ class Content(tree.Tree):
             raise FileFormatError(f"incomplete file, the stages of {group!r} have no order")
         stages = OrderedDict()
         for stage in sorted(orders, key=orders.__getitem__):
-            found = self.arrays({f"{group}/{stage}/{name}": Array("real", shape) for name, shape in _SAMPLE.items()})
-            own: Any = {name: found[f"{group}/{stage}/{name}"] for name in _SAMPLE}
+            path = f"{group}/{stage}/"
+            known = [name for name in _SAMPLE if name != _LATER or path + name in self.datasets]
+            found = self.arrays({path + name: Array("real", _SAMPLE[name]) for name in known})
+            own: Any = {name: found[path + name] for name in known}
+            own.setdefault(_LATER, np.full_like(own["contacts"], np.nan))
             stages[stage] = Sample(**own)
         return stages
 

@@ -15,7 +15,7 @@ from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.host import Progress, silent, within
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.named import named_experiment, named_signals
+from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
 from gmem_jax.files.provenance import sources
@@ -171,7 +171,7 @@ class Conductor:
         own = {name: value for name, value in values.items() if name != "pack" and not name.startswith(PREPARE)}
         if "pack" in values and (odd := [name for name in values if name.startswith(PREPARE)]):
             raise ValueError(f"a point has a pack and {odd[0]!r} of one to be made; give one of them")
-        return named_experiment(pack, own, self._signals(str(own.get("signals", "six"))))
+        return named_experiment(pack, own, self._signals(*waveforms_of(own)))
 
     def points(self) -> list[Point]:
         """All points that are possible, once their packs are there."""
