@@ -12,6 +12,8 @@ from gmem_jax.reproduce.compare import RINGS, Estimate
 from gmem_jax.reproduce.figures import SCALES, Scale, Values, crossed
 from gmem_jax.show.figures import pyplot, save
 
+_NOTHING: Values = {}
+
 
 class Choice(NamedTuple):
     """Something that has to be chosen.
@@ -26,7 +28,7 @@ class Choice(NamedTuple):
     name: str
     words: str
     values: tuple[Any, ...]
-    shared: Values = {}
+    shared: Values = _NOTHING
 
 
 _WORDS: Values = {"signals": "words:3", "background": "sub2-bl"}
@@ -111,11 +113,11 @@ def _effect(choice: Choice, value: Any, pairs: Sequence[tuple[Any, Any]], window
     gain, fidelity = f"{windowed}gain", f"{windowed}fidelity"
     of_gain = [tried[gain] / default[gain] - 1.0 for default, tried in pairs]
     of_fidelity = [tried[fidelity] - default[fidelity] for default, tried in pairs]
-    own = ([tried[name] for _, tried in pairs] for name in (gain, fidelity))
+    own = [_estimate([tried[name] for _, tried in pairs]) for name in (gain, fidelity)]
     status = 0
     for _, tried in pairs:
         status |= tried["status"]
-    return Effect(choice, value, *(_estimate(numbers) for numbers in (*own, of_gain, of_fidelity)), status)
+    return Effect(choice, value, own[0], own[1], _estimate(of_gain), _estimate(of_fidelity), status)
 
 
 def _estimate(values: Sequence[float]) -> Estimate:
@@ -125,12 +127,17 @@ def _estimate(values: Sequence[float]) -> Estimate:
 
 def _row(effect: Effect) -> dict[str, Any]:
     named = {"G": effect.gain, "F": effect.fidelity, "dG_over_G": effect.of_gain, "dF": effect.of_fidelity}
-    numbers = {}
+    numbers: dict[str, str] = {}
     for name, estimate in named.items():
         numbers |= {name: f"{estimate.mean:.4f}", f"{name}_sd": "" if estimate.packs < 2 else f"{estimate.sd:.4f}"}
     at = " ".join(f"{name}={value}" for name, value in effect.choice.shared.items())
     about = {"choice": effect.choice.name, "meaning": effect.choice.words, "with": at, "value": effect.value}
     return {**about, "default": int(effect.default), **numbers, "packs": effect.gain.packs, "status": effect.status}
+
+
+def rows(found: Sequence[Effect]) -> list[dict[str, Any]]:
+    """Every value of every choice as a line of a table."""
+    return [_row(effect) for effect in found]
 
 
 def write_csv(path: Path, found: Sequence[Effect]) -> None:
@@ -139,11 +146,11 @@ def write_csv(path: Path, found: Sequence[Effect]) -> None:
     Raises:
         OSError: if it cannot be written.
     """
-    rows = [_row(effect) for effect in found]
+    lines = rows(found)
     with atomic(path) as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
+        writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(lines)
 
 
 def draw(path: Path, found: Sequence[Effect], title: str) -> None:

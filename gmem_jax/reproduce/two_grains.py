@@ -1,9 +1,9 @@
 """The two-grain picture of the memory (Fig. 7): a contact that forms on the way in keeps the shear it formed at.
 
 Two grains move with the walls, apart by a gap that the compression closes at some u_c. From then on their friction
-force follows the shear: k (gamma(u) - gamma(u_c)) R. At u = 1 the shear is gone and -k gamma(u_c) R is left: one contact
-keeps one value of the waveform. On the way back it is let go where it was taken up, at u_c. Contacts of all u_c together
-hold the integral of gamma, and lose it from its end: they read it out reversed.
+force follows the shear: k (gamma(u) - gamma(u_c)) R. At u = 1 the shear is gone and -k gamma(u_c) R is left: one
+contact keeps one value of the waveform. On the way back it is let go where it was taken up, at u_c. Contacts of all
+u_c together hold the integral of gamma, and lose it from its end: they read it out reversed.
 """
 
 from dataclasses import dataclass
