@@ -32,6 +32,23 @@ def table(path: Path) -> list[str]:
     return lines
 
 
+def choices(path: Path) -> list[str]:
+    """The table of what the paper leaves open as Markdown; defaults in bold."""
+    lines = ["| choice | value | G | F | change of G | change of F | packs |", "|---|---|---|---|---|---|---|"]
+    with path.open() as file:
+        for row in csv.DictReader(file):
+            own = [_with(row[name], row[f"{name}_sd"]) for name in ("G", "F")]
+            of_gain = f"{100.0 * float(row['dG_over_G']):+.1f} %"
+            if row["dG_over_G_sd"]:
+                of_gain += f" ± {100.0 * float(row['dG_over_G_sd']):.1f}"
+            of_fidelity = f"{float(row['dF']):+.3f}" + (f" ± {float(row['dF_sd']):.3f}" if row["dF_sd"] else "")
+            default = row["default"] == "1"
+            value = f"**{row['value']}**" if default else row["value"]
+            change = ["", ""] if default else [of_gain, of_fidelity]
+            lines.append(f"| {' | '.join([row['meaning'], value, *own, *change, row['packs']])} |")
+    return lines
+
+
 def _with(mean: str, deviation: str) -> str:
     return f"{float(mean):.3f}" + (f" ± {float(deviation):.3f}" if deviation else "")
 
@@ -46,9 +63,13 @@ def main() -> None:
                 said = "yes" if verdict["holds"] else "no"
                 lines.append(f"| {verdict['claim']} | {said} | {verdict['numbers']} |")
             lines.append("")
-        for path in sorted(folder.glob("fig*.csv")):
-            picture = path.with_suffix(".png")
-            lines += [f"## {path.stem}", "", f"![{path.stem}]({picture.relative_to(HERE)})", "", *table(path), ""]
+        for picture in sorted((*folder.glob("choices-*.png"), *folder.glob("fig*.png"))):
+            name, numbers = picture.stem, picture.with_suffix(".csv")
+            lines += [f"## {name}", "", f"![{name}]({picture.relative_to(HERE)})", ""]
+            if name.startswith("choices"):
+                lines += [*choices(numbers), ""]
+            elif numbers.is_file():
+                lines += [*table(numbers), ""]
     page = HERE / "README.md"
     before, _, rest = page.read_text().partition(BEGIN)
     page.write_text(f"{before}{BEGIN}\n\n" + "\n".join(lines) + f"{END}{rest.partition(END)[2]}")

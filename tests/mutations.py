@@ -295,8 +295,8 @@ MUTATIONS = (
     mutation(
         "spheres-as-stiff-as-walls",
         "physics/material.py",
-        "self.wall_stiffness * 2.0**-1.5",
-        "self.wall_stiffness * 2.0**-0.5",
+        "self.plane_stiffness * 2.0**-1.5",
+        "self.plane_stiffness * 2.0**-0.5",
         "test_stiffnesses_are_those_of_the_specification",
     ),
     # ---------------------------------------------------------------- the native library
@@ -651,8 +651,8 @@ MUTATIONS = (
     mutation(
         "gamma-on-each-axis",
         "experiment/drive.py",
-        "half = 0.5 * self._shear",
-        "half = 1.0 * self._shear",
+        "share: Scalar = 0.5",
+        "share: Scalar = 1.0",
         "test_half_of_gamma_goes_to_each_axis_with_opposite_signs",
     ),
     mutation(

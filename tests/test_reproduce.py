@@ -165,9 +165,12 @@ def test_claims_are_judged_by_their_runs(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 def test_a_claim_that_fails_is_said_to() -> None:
     pack = gm.load_pack(PACK)
-    recall = gm.run(gm.Experiment(pack, gm.six_signals(), t0=150.0))
-    assert not claims.order_matters(recall, recall).holds
-    assert claims.order_matters(recall, replace(recall, p_sig=0.0 * recall.p_sig, windowed_gain=0.0)).holds
+    experiment = gm.Experiment(pack, gm.six_signals(), t0=150.0)
+    recall, scale = gm.run(experiment), float(experiment.scale)
+    assert not claims.order_matters(recall, recall, scale).holds
+    assert claims.order_matters(recall, replace(recall, p_sig=0.0 * recall.p_sig), scale).holds
+    offset = replace(recall, p_sig=0.0 * recall.p_sig + 1e-6)  # the same at every u: no waveform
+    assert claims.order_matters(recall, offset, scale).holds
     louder = replace(recall, windowed_gain=1.2 * recall.windowed_gain)
     assert not claims.proportional({1e-3: recall, 3e-3: louder}).holds
     assert claims.proportional({1e-3: recall, 3e-3: recall}).holds

@@ -30,6 +30,7 @@ class _Option(NamedTuple):
 
 _FIELDS = {  # of an experiment
     "gamma0": _Option(float, "Shear amplitude."),
+    "shear_share": _Option(float, "Part of gamma by which L_x shrinks and L_y grows."),
     "delta0": _Option(float | None, "Areal compression; default the pack's own."),
     "t0": _Option(float, "Duration of one compression, t_c (the paper's is 18000)."),
     "dt": _Option(float, "Largest time step, t_c."),
@@ -46,12 +47,16 @@ _OF_LAW = {  # of its friction law
     "mu": _Option(float, "Friction coefficient."),
     "stiffness": _Option(float | None, "k_H in E R, or k_M in E R^0.5; default the law's."),
     "damping_time": _Option(float | None, "Tangential damping over stiffness, t_c; default the law's."),
+    "spinning": _Option(float | None, "1: the history turns with a contact about its normal; 0: not."),
     "p_max": _Option(float | None, "m2: largest overlap of its history, R."),
     "points": _Option(int | None, "m2: points of its history."),
     "variant": _Option(str | None, "m2: averaged, exact or paper."),
 }
 _OTHERS = {
     "signals": _Option(str, "six; words:L, all words of L bits; or a .csv (a column per signal) or .npy file."),
+    "word_pad": _Option(float | None, "words: bits left free at either end; default 2."),
+    "word_width": _Option(float | None, "words: width of bumps, in bits; default 1."),
+    "wall_rigidity": _Option(float | None, "Stiffness of walls over that of rigid ones; default 1."),
     "friction": _Option(str, f"Friction law: {_NAMES}, or the paper's H, M1, M2."),
 }
 

@@ -1,23 +1,38 @@
 """`gmem reproduce`."""
 
 import math
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
 from gmem_jax.command.console import AsJson, InputError, emit, reporting, say
-from gmem_jax.experiment.host import RunFailedError
+from gmem_jax.experiment.host import Progress, RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.parts import locked
+from gmem_jax.reproduce import choices
+from gmem_jax.reproduce.choices import Effect
 from gmem_jax.reproduce.figures import FIGURES, SCALES
-from gmem_jax.reproduce.run import Outcome, judge, reproduce, summary_of
+from gmem_jax.reproduce.run import (
+    GALLERY,
+    PICTURES,
+    Outcome,
+    Weighed,
+    judge,
+    picture,
+    reproduce,
+    summary_of,
+    weigh,
+)
 from gmem_jax.sweeps.executors import executor as executor_named
+
+NAMES = sorted((*FIGURES, *PICTURES, GALLERY, "claims", "choices"))
 
 
 def reproduce_command(
-    what: Annotated[str, typer.Argument(help=f"{', '.join(FIGURES)}, claims, or all.")],
+    what: Annotated[str, typer.Argument(help=f"{', '.join(NAMES)}, or all.")],
     scale: Annotated[str, typer.Option(help=f"How large and slow: {', '.join(SCALES)}.")] = "laptop",
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for pictures, tables and runs.")] = Path(
         "reproduce"
@@ -31,38 +46,75 @@ def reproduce_command(
     Says what it will cost, resumes, and computes no point twice, whichever figures need it. Writes NAME-SCALE.png,
     .svg and .csv, each of our points beside the published one.
     """
-    if what not in (*FIGURES, "claims", "all"):
-        raise InputError(f"reproduce {what}: no such figure; there are {', '.join(FIGURES)}, claims and all")
+    if what not in (*NAMES, "all"):
+        raise InputError(f"reproduce {what}: no such figure; there are {', '.join(NAMES)} and all")
     if scale not in SCALES:
         raise InputError(f"--scale {scale}: must be one of {', '.join(SCALES)}")
     if not output.parent.is_dir():
         raise InputError(f"--output {output}: folder {output.parent} does not exist")
     probe(output.parent)
     output.mkdir(exist_ok=True)
-    outcomes, verdicts = [], []
+    outcomes, verdicts, weighed, drawn = [], [], Weighed([], [], []), []
+
+    def wanted(names: Iterable[str]) -> list[str]:
+        return [name for name in names if what in (name, "all")]
+
+    def how(progress: Progress) -> tuple[Any, ...]:
+        return output, scale, executor_named(executor, workers, {}), progress, say
+
     with locked(output / "figures"):
-        if what in ("claims", "all"):
+        for name in wanted((GALLERY, *PICTURES)):
             with reporting(goes_on=True) as progress:
-                verdicts = judge(output, scale, executor_named(executor, workers, {}), progress, say)
-        for name in FIGURES if what == "all" else [name for name in FIGURES if name == what]:
+                drawn += picture(name, *how(progress))
+            say(f"wrote {drawn[-1]}")
+        if wanted(["claims"]):
+            with reporting(goes_on=True) as progress:
+                verdicts = judge(*how(progress))
+        if wanted(["choices"]):
+            with reporting(goes_on=True) as progress:
+                weighed = weigh(*how(progress))
+            _say_written(weighed)
+        for name in wanted(FIGURES):
             say(f"{name}: {FIGURES[name].title}")
             with reporting(goes_on=True) as progress:
-                outcome = reproduce(name, output, scale, executor_named(executor, workers, {}), progress, say)
-            outcomes.append(outcome)
-            for reason in sorted(set(outcome.failed)):
-                say(f"failed: {reason}", style="yellow")
-            if outcome.files:
-                say(f"wrote {', '.join(map(str, outcome.files))}")
+                outcomes.append(reproduce(name, *how(progress)))
+            _say_written(outcomes[-1])
+    rows: list[Any] = [*weighed.effects, *(row for outcome in outcomes for row in outcome.rows)]
     status = 0
-    for outcome in outcomes:
-        for row in outcome.rows:
-            status |= row.status
-    figures = [summary_of(outcome) for outcome in outcomes]
-    result = {"figures": figures, "claims": [verdict._asdict() for verdict in verdicts], "status": status}
+    for row in rows:
+        status |= row.status
+    result = {
+        "figures": [summary_of(outcome) for outcome in outcomes],
+        "claims": [verdict._asdict() for verdict in verdicts],
+        "choices": choices.rows(weighed.effects),
+        "pictures": [str(path) for path in drawn],
+        "status": status,
+    }
     lines = [f"{'yes' if verdict.holds else 'NO ':4}{verdict.claim}\n    {verdict.numbers}" for verdict in verdicts]
-    emit(as_json, result, *lines, *map(_table, outcomes))
-    if broken := sum(len(outcome.failed) for outcome in outcomes):
+    more = [_choices_table(weighed.effects)] if weighed.effects else []
+    emit(as_json, result, *lines, *more, *map(_table, outcomes))
+    if broken := len(weighed.failed) + sum(len(outcome.failed) for outcome in outcomes):
         raise RunFailedError(f"{broken} points")
+
+
+def _say_written(done: Outcome | Weighed) -> None:
+    for reason in sorted(set(done.failed)):
+        say(f"failed: {reason}", style="yellow")
+    if done.files:
+        say(f"wrote {', '.join(map(str, done.files))}")
+
+
+def _choices_table(effects: Sequence[Effect]) -> Table:
+    """How much each choice matters; the default of each is in bold."""
+    table = Table(title="What the paper leaves open", caption="mean ± SE over packs; changes on the same packs")
+    for name in ("choice", "value", "G", "F", "change of G", "change of F"):
+        table.add_column(name, justify="left" if name == "choice" else "right")
+    for effect in effects:
+        own = [f"{one.mean:.3f}{_error(one.error)}" for one in (effect.gain, effect.fidelity)]
+        change = [f"{100.0 * effect.of_gain.mean:+.1f} %", f"{effect.of_fidelity.mean:+.3f}"]
+        known = (effect.choice.words, str(effect.value), *own, *(["", ""] if effect.default else change))
+        table.add_row(*known, style="bold" if effect.default else None)
+    return table
 
 
 def _table(outcome: Outcome) -> Table:

@@ -16,8 +16,8 @@ from gmem_jax.physics.state import Box
 class Drive:
     """Prescribed walls: u runs linearly during a stage, the shear follows a waveform of u (of time, if u stands still).
 
-    L_x = X (1 - gamma/2), L_y = Y (1 + gamma/2) with X, Y = L0 (1 - (1 - sqrt(1 - delta0)) u); z does not move. The
-    box stays centred. Half of gamma on each axis is this project's reading of the paper.
+    L_x = X (1 - share gamma), L_y = Y (1 + share gamma) with X, Y = L0 (1 - (1 - sqrt(1 - delta0)) u); z does not
+    move. The box stays centred.
 
     Attributes:
         lower: lower planes at u = 0, [3, 1].
@@ -25,6 +25,7 @@ class Drive:
         delta0: areal compression at u = 1, scalar or [B].
         gamma0: shear amplitude, scalar or [B].
         signals: the waveforms of the replicas, or None for no shear; replica 0 is always the zero signal.
+        share: of gamma on each axis, scalar or [B]. The paper does not say; a half is this project's reading.
     """
 
     lower: jax.Array
@@ -32,6 +33,7 @@ class Drive:
     delta0: Scalar
     gamma0: Scalar = 0.0
     signals: Signals | None = None
+    share: Scalar = 0.5
 
     def _shear(self, u: Numbers, sheared: Numbers) -> jax.Array:
         if self.signals is None:
@@ -54,8 +56,8 @@ class Drive:
             passed = moment / duration
             u = row.start + (row.stop - row.start) * passed
             squeeze = 1.0 - (1.0 - jnp.sqrt(1.0 - self.delta0)) * u
-            half = 0.5 * self._shear(jnp.where(row.start == row.stop, passed, u), row.sheared)
-            scale = jnp.stack(jnp.broadcast_arrays(squeeze * (1.0 - half), squeeze * (1.0 + half), jnp.ones(1)))
+            sheared = self.share * self._shear(jnp.where(row.start == row.stop, passed, u), row.sheared)
+            scale = jnp.stack(jnp.broadcast_arrays(squeeze * (1.0 - sheared), squeeze * (1.0 + sheared), jnp.ones(1)))
             return (self.upper - self.lower) * scale
 
         now, rate = jax.jvp(lengths, (time,), (jnp.ones_like(time),))

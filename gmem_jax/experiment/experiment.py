@@ -29,7 +29,7 @@ HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N 
 MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
 LARGEST_STEP = 0.5  # t_c; the stiffest mode has a period near 10 t_c
 BACKENDS = ("auto", "jax", "native")
-AFTER_PREFIX = ("signals", "gamma0")  # fields that the shear-free prefix does not depend on
+AFTER_PREFIX = ("signals", "gamma0", "shear_share")  # fields that the shear-free prefix does not depend on
 
 
 class Timing(NamedTuple):
@@ -44,8 +44,8 @@ class Timing(NamedTuple):
 class Experiment:
     """Everything a recall depends on. S signals make S + 1 replicas; replica 0 is the zero signal.
 
-    A pytree: its floats can be differentiated and vmapped. The friction law's parameters, gamma0, delta0, t0 and
-    hold_drag are one number or one for each replica, [S + 1].
+    A pytree: its floats can be differentiated and vmapped. The friction law's parameters, gamma0, shear_share, delta0,
+    t0 and hold_drag are one number or one for each replica, [S + 1].
 
     Attributes:
         pack: the pack at rest.
@@ -53,6 +53,8 @@ class Experiment:
         friction: the friction law.
         material: the elastic solid.
         gamma0: shear amplitude.
+        shear_share: of it on each axis: L_x shrinks and L_y grows by this part of gamma; see
+            `gmem_jax.experiment.drive.Drive`.
         delta0: areal compression; default the pack's own. Another value makes `run` warn.
         t0: duration of one compression, in t_c. The paper's is 1.8e4.
         hold_drag: viscous drag while the walls stand still, 1 / t_c; default 0.05 for t0 below the paper's, else 0.
@@ -77,6 +79,7 @@ class Experiment:
     friction: FrictionLaw = Hooke()
     material: Material = Material()
     gamma0: Scalar = parameter(1e-3, "(0, 0.5)")
+    shear_share: Scalar = parameter(0.5, "(0, 1]")
     delta0: Scalar | None = parameter(None, "(0, 0.5)")
     t0: Scalar = parameter(1.8e3, "(0, inf)")
     hold_drag: Scalar | None = parameter(None, "[0, inf)")
@@ -205,7 +208,7 @@ class Experiment:
         dt, steps = self.timing
         return Course(
             System(self.pack.clump, self.friction, self.pack.pairs, self.material),
-            Drive(lower, upper, self.compression, gamma0, signals),
+            Drive(lower, upper, self.compression, gamma0, signals, self.shear_share),
             dt,
             self.drag,
             steps=steps,
@@ -279,7 +282,7 @@ def _static_number(name: str, value: Any) -> float:
 
 def replica_parameters(experiment: Experiment) -> dict[str, Any]:
     """The parameters that may differ between replicas, by name."""
-    own = {name: getattr(experiment, name) for name in ("gamma0", "delta0", "t0", "hold_drag")}
+    own = {name: getattr(experiment, name) for name in ("gamma0", "shear_share", "delta0", "t0", "hold_drag")}
     law: Any = experiment.friction
     of_law = {f"friction.{field.name}": getattr(law, field.name) for field in fields(law)} if is_dataclass(law) else {}
     numbers = {**own, **of_law}
@@ -294,6 +297,7 @@ class Changes(TypedDict, total=False):
     friction: FrictionLaw
     material: Material
     gamma0: Scalar
+    shear_share: Scalar
     delta0: Scalar | None
     t0: Scalar
     hold_drag: Scalar | None

@@ -5,6 +5,7 @@ All waveforms vanish at u = 0 and u = 1, so that the box is unsheared outside th
 """
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -15,7 +16,8 @@ import numpy as np
 from gmem_jax.physics.pytree import Scalar, pytree, traced
 
 LONGEST_WORD = 12  # bits
-PAD = 2  # bits left free at either end of a word
+PAD = 2.0  # bits left free at either end of a word
+WIDTH = 1.0  # of the bumps of a word, in bits
 BINS = 256  # bins of u in the paper: the resolution of every recorded signal
 
 
@@ -158,29 +160,34 @@ def word_bits(bits: int) -> np.ndarray:
     return np.arange(2**bits)[:, None] >> places & 1
 
 
-def words(bits: int) -> Bumps:
+def words(bits: int, pad: float = PAD, width: float = WIDTH) -> Bumps:
     """All binary words of a length (App. A): J is a plateau of height +u_b / pi for a 1 and -u_b / pi for a 0.
 
-    A bit is u_b = 1 / (bits + 4) wide, two of these are left free at either end, and plateaus that differ are joined
-    by bumps of width u_b. Signal s, from 1 to 2^bits, is the number s - 1, its most significant bit at small u. The
-    scale is the paper's: amplitudes of 1 between bits, 1/2 at the ends, whatever the word.
+    A bit is u_b = 1 / (bits + 2 pad) wide, `pad` of these are left free at either end, and plateaus that differ are
+    joined by bumps. Signal s, from 1 to 2^bits, is the number s - 1, its most significant bit at small u. The scale is
+    the paper's: amplitudes of 1 between bits, 1/2 at the ends, whatever the word.
+
+    Args:
+        bits: L.
+        pad: free bits at either end.
+        width: of the bumps, in bits; plateaus are as high as this.
 
     Raises:
-        ValueError: if `bits` is not a whole number from 1 to 12.
+        ValueError: if `bits` is not a whole number from 1 to 12, or bumps of this width do not fit into [0, 1].
     """
     value = word_bits(bits)
-    width = bit_width(bits)
+    if not 0.0 < width <= 2.0 * pad < math.inf:
+        raise ValueError(f"the bumps of a word must be in (0, 2 pad] = (0, {2.0 * pad:g}] bits wide, got {width:g}")
+    bit = bit_width(bits, pad)
     level = np.pad(value - 0.5, ((0, 0), (1, 1)))  # a word begins and ends half-way between its two plateaus
     amplitudes = np.diff(level, axis=1)
-    centres = (PAD + np.arange(bits + 1)) * width
-    return Bumps(
-        amplitudes=jnp.asarray(amplitudes), centres=jnp.asarray(np.tile(centres, (len(value), 1))), width=width
-    )
+    centres = np.tile((pad + np.arange(bits + 1)) * bit, (len(value), 1))
+    return Bumps(amplitudes=jnp.asarray(amplitudes), centres=jnp.asarray(centres), width=width * bit)
 
 
-def bit_width(bits: int) -> float:
+def bit_width(bits: int, pad: float = PAD) -> float:
     """u_b, the width of a bit in u."""
-    return 1.0 / (bits + 2 * PAD)
+    return 1.0 / (bits + 2.0 * pad)
 
 
 def waveform(samples: jax.typing.ArrayLike) -> Spline:

@@ -12,7 +12,18 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, word_bits, words
+from gmem_jax.experiment.signals import (
+    LONGEST_WORD,
+    PAD,
+    WIDTH,
+    Bumps,
+    Signals,
+    Spline,
+    bit_width,
+    six_signals,
+    word_bits,
+    words,
+)
 from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import provenance, sources
@@ -21,7 +32,9 @@ from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.physics.material import Material
 
 _SIGNALS = {"bumps": Bumps, "spline": Spline}
-_OLDER = {"precision": "double", "shear": "during"}  # what files from before there was such a field did
+# What files from before there was such a field did; laws, material and words: their defaults of today.
+_OLDER = {"precision": "double", "shear": "during", "shear_share": 0.5}
+DIGITS = 9  # of the pad and width of words
 _PARTS = ("pack", "signals", "friction", "material")
 
 
@@ -53,13 +66,28 @@ def written_signals(signals: Signals) -> dict[str, Any]:
     """Waveforms as JSON: by name where they have one, else by their numbers."""
     if _equal(signals, six_signals()):
         return {"kind": "six"}
-    bits = signals.count.bit_length() - 1
-    if signals.count == 1 << bits and 1 <= bits <= 12 and _equal(signals, words(bits)):
-        return {"kind": "words", "bits": bits}
+    if form := _as_words(signals):
+        return {"kind": "words", **form}
     for kind, known in _SIGNALS.items():
         if isinstance(signals, known):
             return {"kind": kind, **{entry.name: _plain(getattr(signals, entry.name)) for entry in fields(known)}}
     return {"kind": type(signals).__name__, "sha256": fingerprint(signals)}
+
+
+def _as_words(signals: Signals) -> dict[str, Any]:
+    """The arguments of `words` that give these waveforms; {} if none do."""
+    bits = signals.count.bit_length() - 1
+    if not isinstance(signals, Bumps) or signals.count != 1 << bits or not 1 <= bits <= LONGEST_WORD:
+        return {}
+    first = float(signals.centres[0, 0])  # pad / (bits + 2 pad)
+    if np.ndim(signals.width) != 0 or not 0.0 < first < 0.5:
+        return {}
+    pad = round(bits * first / (1.0 - 2.0 * first), DIGITS)
+    form = {"bits": bits, "pad": pad, "width": round(float(signals.width) / bit_width(bits, pad), DIGITS)}
+    try:
+        return form if _equal(signals, words(**form)) else {}
+    except ValueError:
+        return {}
 
 
 def names_of(signals: Signals) -> list[str]:
@@ -80,7 +108,7 @@ def signals_from(written: Mapping[str, Any]) -> Signals:
     if kind == "six":
         return six_signals()
     if kind == "words":
-        return words(written["bits"])
+        return words(written["bits"], written.get("pad", PAD), written.get("width", WIDTH))
     if kind not in _SIGNALS:
         raise ValueError(f"signals of kind {kind!r} cannot be read back")
     numbers = {name: value for name, value in written.items() if name != "kind"}

@@ -31,6 +31,7 @@ from gmem_jax.physics.sample import Sample
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PATIENCE, _PACE = 5.0, 2e7  # seconds, and bytes a second, that copying an old file may take
 _SAMPLE = tuple(entry.name for entry in fields(Sample))
+_LATER = "wall_contacts"  # NaN in older files, which lack it
 
 
 class Content(tree.Tree):
@@ -76,8 +77,11 @@ class Content(tree.Tree):
             raise FileFormatError(f"incomplete file, the stages of {group!r} have no order")
         stages = OrderedDict()
         for stage in sorted(orders, key=orders.__getitem__):
-            found = self.arrays({f"{group}/{stage}/{name}": STAGE[name] for name in _SAMPLE})
-            own: Any = {name: found[f"{group}/{stage}/{name}"] for name in _SAMPLE}
+            path = f"{group}/{stage}/"
+            known = [name for name in _SAMPLE if name != _LATER or path + name in self.datasets]
+            found = self.arrays({path + name: STAGE[name] for name in known})
+            own: Any = {name: found[path + name] for name in known}
+            own.setdefault(_LATER, np.full_like(own["contacts"], np.nan))
             stages[stage] = Sample(**own)
         return stages
 

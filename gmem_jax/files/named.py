@@ -10,9 +10,11 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import LONGEST_WORD, Signals, six_signals, waveform, words
 from gmem_jax.files.waveforms import load_waveforms
 from gmem_jax.physics.contact.laws import LAWS, law_named
+from gmem_jax.physics.material import Material
 
 FIELDS = (
     "gamma0",
+    "shear_share",
     "delta0",
     "t0",
     "rest",
@@ -27,24 +29,33 @@ FIELDS = (
     "precision",
 )
 OF_LAW = tuple(dict.fromkeys(field.name for entry in LAWS for field in fields(entry.kind)))
-NAMES = ("signals", "friction", *OF_LAW, *FIELDS)
+OF_WORDS = ("word_pad", "word_width")
+NAMES = ("signals", *OF_WORDS, "friction", *OF_LAW, "wall_rigidity", *FIELDS)
 
 
-def named_signals(name: str) -> Signals:
+def named_signals(name: str, pad: float | None = None, width: float | None = None) -> Signals:
     """Waveforms by what the command line calls them.
 
+    Args:
+        name: "six", "words:3" or a file.
+        pad: of words; None stands for the default.
+        width: of their bumps.
+
     Raises:
-        ValueError: if the name is none.
+        ValueError: if the name is none, or words are given a pad or width that they cannot have.
         FileNotFoundError: if there is no such file.
         FileFormatError: if a file cannot be read.
     """
     kind, _, length = name.lower().partition(":")
+    shape = {name: float(value) for name, value in (("pad", pad), ("width", width)) if value is not None}
+    if shape and kind != "words":
+        raise ValueError(f"--signals {name}: word_pad and word_width are for words:L only")
     if kind == "six":
         return six_signals()
     if kind == "words":
         if not length.isdecimal() or not 1 <= int(length) <= LONGEST_WORD:
             raise ValueError(f"--signals {name}: words need a length from 1 to {LONGEST_WORD}, as in words:3")
-        return words(int(length))
+        return words(int(length), **shape)
     if Path(name).suffix.lower() not in (".csv", ".npy"):
         raise ValueError(f'--signals {name}: must be "six", "words:L" or a .csv or .npy file')
     return waveform(load_waveforms(Path(name)))
@@ -67,4 +78,10 @@ def named_experiment(pack: Pack, values: Mapping[str, Any], signals: Signals | N
     of_law = {name: given[name] for name in OF_LAW if name in given}
     law = law_named(str(given.get("friction", "hooke")), **of_law)
     own = {name: given[name] for name in FIELDS if name in given}
-    return Experiment(pack, signals or named_signals(str(given.get("signals", "six"))), law, **own)
+    material = Material(**{name: given[name] for name in ("wall_rigidity",) if name in given})
+    return Experiment(pack, signals or named_signals(*waveforms_of(given)), law, material, **own)
+
+
+def waveforms_of(values: Mapping[str, Any]) -> tuple[Any, ...]:
+    """The arguments of `named_signals` among named values."""
+    return str(values.get("signals", "six")), *(values.get(name) for name in OF_WORDS)

@@ -43,7 +43,7 @@ March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 BACKENDS = ("auto", "jax", "native")
 PRECISIONS = ("double", "mixed")
 
-_LAW_NUMBERS = 4  # rows of the parameter array for a law's own, as in parameters.h
+_LAW_NUMBERS = 5  # rows of the parameter array for a law's own, as in parameters.h
 _VARIANTS = ("exact", "averaged", "paper")
 
 

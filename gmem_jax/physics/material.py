@@ -23,6 +23,7 @@ class Material:
         poisson: Poisson's ratio nu.
         normal_damping: ratio gamma_n / k_n of the Hertz contact, in t_c.
         tangential_damping: ratio gamma / k of a tangential spring, in t_c.
+        wall_rigidity: stiffness of a wall contact over that with a rigid plane; 1/2 for walls as soft as the grains.
 
     Raises:
         ValueError: if a value is outside its physical range.
@@ -34,6 +35,7 @@ class Material:
     poisson: Scalar = parameter(0.49, "(-1, 0.5]")
     normal_damping: Scalar = parameter(0.23, "[0, inf)")
     tangential_damping: Scalar = parameter(0.069, "[0, inf)")
+    wall_rigidity: Scalar = parameter(1.0, "(0, inf)")
 
     def __post_init__(self) -> None:
         settle(self)
@@ -45,15 +47,21 @@ class Material:
         return unit
 
     @property
-    def wall_stiffness(self) -> Scalar:
-        """k_w of a sphere on a rigid plane, f = k_w p^1.5 (Hertz; effective radius R), in E R^0.5."""
+    def plane_stiffness(self) -> Scalar:
+        """Of a sphere on a rigid plane, f = k p^1.5 (Hertz; effective radius R), in E R^0.5."""
         stiffness: Scalar = (4.0 / 3.0) / ((1.0 - self.poisson) * (1.0 + self.poisson))
+        return stiffness
+
+    @property
+    def wall_stiffness(self) -> Scalar:
+        """k_w of a sphere on a wall, f = k_w p^1.5, in E R^0.5."""
+        stiffness: Scalar = self.wall_rigidity * self.plane_stiffness
         return stiffness
 
     @property
     def normal_stiffness(self) -> Scalar:
         """k_n of two equal spheres, f = k_n p^1.5 (Hertz; effective radius R/2, two compliant bodies)."""
-        stiffness: Scalar = self.wall_stiffness * 2.0**-1.5
+        stiffness: Scalar = self.plane_stiffness * 2.0**-1.5
         return stiffness
 
     @property

@@ -27,6 +27,7 @@ class Sample:
         largest_speed: at the end of the bin, [B], in R / t_c.
         coordination: Z, touching grain pairs per grain times two, rattlers included, walls not, [B].
         contacts: touching sphere pairs per grain times two, [B].
+        wall_contacts: spheres touching a wall per grain, once for each wall, [B]; NaN in files from before it was kept.
         filling: phi, volume of the grains over that of the box, [B].
         largest_overlap: deepest sphere-sphere contact at the end of the bin, [B], in R.
         inertial_number: I = (strain rate of the x axis) sqrt(m / (D p)), p the mean of p_x and p_y, [B]; 0 without p.
@@ -38,9 +39,19 @@ class Sample:
     largest_speed: jax.Array
     coordination: jax.Array
     contacts: jax.Array
+    wall_contacts: jax.Array
     filling: jax.Array
     largest_overlap: jax.Array
     inertial_number: jax.Array
+
+    @property
+    def contacts_per_grain(self) -> jax.Array:
+        """Sphere contacts per grain, each counted once, those with walls too, [B].
+
+        What the paper's "average number of contacts on a grain" compares with: it grows alike in a compression, the
+        `coordination` half as much (docs/decisions.md).
+        """
+        return 0.5 * self.contacts + self.wall_contacts
 
 
 def check(system: System, state: State, box: Box) -> State:
@@ -80,6 +91,7 @@ def observe(system: System, state: State, box: Box, pressure: jax.Array) -> Samp
         largest_speed=jnp.sqrt(jnp.max(jnp.sum(lax.stop_gradient(grains.velocity) ** 2, axis=1), axis=0)),
         coordination=2.0 * jnp.sum(jnp.maximum(touching_pairs, 0), axis=0) / count,
         contacts=2.0 * jnp.sum(touching, axis=0) / count,
+        wall_contacts=jnp.sum((spheres - box.lower < 1.0) * 1 + (box.upper - spheres < 1.0), axis=(0, 1)) / count,
         filling=count * clump.mass / jnp.prod(lengths, axis=0),
         largest_overlap=jnp.max(lax.stop_gradient(overlap), axis=0),
         inertial_number=jnp.where(loaded, inertial, 0.0),

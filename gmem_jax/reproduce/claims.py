@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -93,16 +94,28 @@ def reading_erases(recall: Recall, scale: float) -> Verdict:
     )
 
 
-def order_matters(standard: Recall, before: Recall) -> Verdict:
-    """A shear pulse before the compression leaves nothing to be read."""
+def order_matters(standard: Recall, before: Recall, scale: float) -> Verdict:
+    """A shear pulse before the compression leaves nothing to be read: no waveform, that is.
+
+    What it moved for good leaves an offset, about as large at every u, and the same for one bump early, one late or
+    two (docs/decisions.md). J has a sign for most of the signals, so that an offset alone has a gain. The verdict is on
+    p_sig and J less their means over u.
+    """
     ratio = float(np.sqrt(np.sum(np.asarray(before.p_sig) ** 2) / np.sum(np.asarray(standard.p_sig) ** 2)))
+    waved, wave = (float(compare(_less_mean(one.p_sig), _less_mean(one.J), scale).gain) for one in (before, standard))
+    gain, fidelity = float(before.windowed_gain), float(before.windowed_fidelity)
     return Verdict(
         "shear before the compression leaves nothing",
-        abs(float(before.windowed_gain)) < LITTLE * float(standard.windowed_gain),
-        f"G = {float(before.windowed_gain):.3f}, F = {float(before.windowed_fidelity):.3f} beside "
-        f"{float(standard.windowed_gain):.3f} and {float(standard.windowed_fidelity):.3f}; p_sig {ratio:.0%} as large",
-        {"G": float(before.windowed_gain), "F": float(before.windowed_fidelity), "size": ratio},
+        abs(waved) < LITTLE * abs(wave),
+        f"less its mean over u, what is left has G = {waved:.3f} beside {wave:.3f}; with it G = {gain:.3f}, "
+        f"F = {fidelity:.3f} beside {float(standard.windowed_gain):.3f} and {float(standard.windowed_fidelity):.3f}; "
+        f"p_sig {ratio:.0%} as large",
+        {"G": gain, "F": fidelity, "size": ratio, "G_less_mean": waved, "standard_G_less_mean": wave},
     )
+
+
+def _less_mean(rows: jax.Array) -> jax.Array:
+    return rows - jnp.mean(rows, axis=-1, keepdims=True)
 
 
 def proportional(recalls: dict[float, Recall]) -> Verdict:
@@ -219,7 +232,7 @@ def verdicts(
         speeds_decay(having(store=max(STORES), hold_drag=0.0), t0),
         storage_costs_nothing(stores),
         reading_erases(having(background="sub2"), scale),
-        order_matters(plain, having(shear="before")),
+        order_matters(plain, having(shear="before"), scale),
         proportional(amplitudes),
         rearranges({"tetra": pack, **(others or {})}, t0),
         forces_tell_nothing(standard),

@@ -6,9 +6,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.signals import Bumps, six_signals
+from gmem_jax.experiment.signals import words as all_words
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.sample import Sample
 from gmem_jax.reading.readers import stored_words
@@ -132,7 +135,7 @@ def _power_law(axis: Any, rows: Sequence[Compared]) -> None:
 
 
 def through_time(path: Path, recall: Recall, signal: int, title: str) -> None:
-    """phi, Z, pressures and p_xy of every stage, with a signal and with none, like the paper's Fig. 4.
+    """phi, Z, contacts, pressures and p_xy of every stage, with a signal and with none, like the paper's Fig. 4.
 
     Raises:
         OSError: if it cannot be written.
@@ -143,12 +146,13 @@ def through_time(path: Path, recall: Recall, signal: int, title: str) -> None:
     rows = [
         ("filling $\\phi$", lambda s: s.filling, 1.0),
         ("Z", lambda s: s.coordination, 1.0),
+        ("contacts per grain", lambda s: s.contacts_per_grain, 1.0),
         ("$p_x$ (kPa)", lambda s: s.pressure[:, 0], unit),
         ("$p_y$ (kPa)", lambda s: s.pressure[:, 1], unit),
         ("$p_z$ (kPa)", lambda s: s.pressure[:, 2], unit),
         ("$p_{xy}$ (Pa)", lambda s: s.pressure[:, 0] - s.pressure[:, 1], 1e3 * unit),
     ]
-    figure, axes = plt.subplots(len(rows), 1, figsize=(8.0, 9.5), sharex=True)
+    figure, axes = plt.subplots(len(rows), 1, figsize=(8.0, 10.8), sharex=True)
 
     def column(stage: Sample, get: Any, replica: int) -> np.ndarray:
         values = np.asarray(get(stage))
@@ -167,6 +171,35 @@ def through_time(path: Path, recall: Recall, signal: int, title: str) -> None:
     axes[0].legend(fontsize=7, frameon=False)
     axes[-1].set_xlabel("time ($t_0$)")
     figure.suptitle(title, fontsize=10)
+    save(path, figure, also=VECTOR)
+
+
+def waveforms(path: Path, bits: int = 5) -> None:
+    """The six waveforms and some words of a length: I solid, J dashed, like the paper's Fig. 5.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    u = jnp.linspace(0.0, 1.0, 2001)
+    six = [f"signal {number + 1}" for number in range(6)]
+    chosen = np.linspace(0, (1 << bits) - 1, len(six)).round().astype(int).tolist()
+    words_ = [f"word {word:0{bits}b}" for word in chosen]
+    rows: list[tuple[Bumps, Sequence[int], list[str]]] = [
+        (six_signals(), range(6), six),
+        (all_words(bits), chosen, words_),
+    ]
+    figure, axes = pyplot().subplots(2, len(six), figsize=(2.1 * len(six), 4.6), sharex=True, sharey="row")
+    for line, (signals, numbers, names) in zip(axes, rows, strict=True):
+        shear, integral = np.asarray(signals.shear(u)), np.asarray(signals.integral(u))
+        scale = np.abs(shear).max() / np.abs(integral).max()
+        for axis, number, name in zip(line, numbers, names, strict=True):
+            axis.axhline(0.0, color="0.8", linewidth=0.8)
+            axis.plot(u, shear[:, number], linewidth=1.2, label="I(u)")
+            axis.plot(u, scale * integral[:, number], "--", linewidth=1.2, label=f"{scale:.3g} J(u)")
+            axis.set_title(name, fontsize=9)
+        line[0].legend(fontsize=7, frameon=False)
+    for axis in axes[-1]:
+        axis.set_xlabel("u")
     save(path, figure, also=VECTOR)
 
 

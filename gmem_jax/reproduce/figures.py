@@ -16,6 +16,7 @@ Values = dict[str, Any]
 PAPER_T0 = 1.8e4  # t_c
 DELTA0 = 0.05  # the paper's compression, and that of every shipped pack
 MADE = 101  # seed of the first pack that is made: the shipped ones have small seeds
+SHAPES: list[Values] = [{"shape": "sphere"}, *({"overlap": overlap} for overlap in (0.7, 0.8, 0.9))]
 SHOWN_WORD = 683  # of ten bits, in the paper's Fig. 13
 
 
@@ -97,6 +98,14 @@ def _one(scale: Scale) -> list[Values]:
     return packs(scale, scale.grains, 1)
 
 
+def shown_packs(scale: Scale) -> list[Values]:
+    """The packs of Fig. 3: every size, and every shape of Fig. 11's inset; the same packs as there."""
+    return [
+        *(packs(scale, grains, 1)[0] for grains in scale.sizes),
+        *(packs(scale, scale.grains, 1, **shape)[0] for shape in SHAPES),
+    ]
+
+
 def _friction(scale: Scale) -> list[Values]:
     return crossed(_standard(scale), [{"mu": mu} for mu in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)])
 
@@ -114,8 +123,7 @@ def _compression(
 
 def _amplitudes(scale: Scale) -> list[Values]:
     gammas: list[Values] = [{"gamma0": gamma0} for gamma0 in (3e-4, 1e-3, 3e-3)]
-    shapes: list[Values] = [{"shape": "sphere"}, *({"overlap": overlap} for overlap in (0.7, 0.8, 0.9))]
-    inset = [pack for shape in shapes for pack in packs(scale, scale.grains, scale.few, **shape)]
+    inset = [pack for shape in SHAPES for pack in packs(scale, scale.grains, scale.few, **shape)]
     return [*crossed(_compression(scale, (0.02, 0.05, 0.08)), gammas), *inset]
 
 

@@ -17,11 +17,16 @@ from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reading.report import reading
 from gmem_jax.reading.training import train
-from gmem_jax.reproduce import claims, draw
+from gmem_jax.reproduce import choices, claims, draw
+from gmem_jax.reproduce.choices import Effect
 from gmem_jax.reproduce.claims import Verdict
 from gmem_jax.reproduce.compare import Compared, Conditions, Point, compare, compared, points_of, write_csv
-from gmem_jax.reproduce.figures import FIGURES, SCALES, SHOWN_WORD, Figure, Scale, Values, packs, spec_of
+from gmem_jax.reproduce.figures import FIGURES, SCALES, SHOWN_WORD, Figure, Scale, Values, packs, shown_packs, spec_of
+from gmem_jax.reproduce.single_contact import convergence_figure, laws_figure
+from gmem_jax.reproduce.two_grains import two_grains_figure
 from gmem_jax.show.figures import recall_figure
+from gmem_jax.show.render import packs_figure
+from gmem_jax.show.tables import summary
 from gmem_jax.sweeps.executors import Executor, Processes
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
@@ -31,6 +36,106 @@ RUNS = "runs"  # the folder of the sweep that all figures share
 SIDE_BY_SIDE = 8  # replicas of the quick measurement: a block
 MOST_SHOWN = 8  # words of a length in Fig. 13
 Tell = Callable[[str], None]
+
+
+class Picture(NamedTuple):
+    """A figure of the paper that no experiment has to be run for.
+
+    Attributes:
+        title: what it shows.
+        draw: writes it to a file, as SVG and, where it has numbers, as CSV beside it; what came out, for a line.
+    """
+
+    title: str
+    draw: Callable[[Path], object]
+
+
+PICTURES = {
+    "fig05": Picture("the waveforms and some words, with their integrals", draw.waveforms),
+    "fig07": Picture("two grains, and how their contact keeps a shear", two_grains_figure),
+    "fig10": Picture("one contact under every law, beside closed forms", laws_figure),
+    "fig15": Picture("M2 with more and more points", convergence_figure),
+}
+GALLERY = "fig03"  # pictures of packs, which may have to be made
+
+
+def _run(spec: Spec, folder: Path, executor: Executor | None, progress: Progress, say: Tell) -> Store:
+    """Do what is missing of a sweep."""
+    conductor = Conductor(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
+    conductor.run(executor or Processes(), progress)
+    return conductor.store
+
+
+def _failed(store: Store) -> list[str]:
+    """Why points of the last sweep failed, in a list as long as they are many."""
+    return sorted(reason for row in store.card()["points"] if (reason := store.failed().get(row["key"])))
+
+
+def picture(
+    name: str,
+    folder: Path | str = "reproduce",
+    scale: str = "laptop",
+    executor: Executor | None = None,
+    progress: Progress = silent,
+    say: Tell = print,
+) -> list[Path]:
+    """Draw a figure that needs no experiments: one of `PICTURES`, or the packs of `GALLERY`; the files written.
+
+    Args and errors are those of `reproduce`; nothing but `GALLERY` depends on the scale.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if name != GALLERY:
+        target = folder / f"{name}.png"
+        say(f"{name}: {PICTURES[name].draw(target) or 'drawn'}")
+        return [path for suffix in (".png", ".svg", ".csv") if (path := target.with_suffix(suffix)).is_file()]
+    size = SCALES[scale]
+    spec = Spec(shared={"t0": size.t0}, extra=tuple(shown_packs(size)))
+    shown = Conductor(spec, folder / RUNS, say).packs(executor or Processes(), progress)
+    target = folder / f"{name}-{scale}.png"
+    packs_figure(target, shown, "Packs at rest, by size and by shape")
+    return [target]
+
+
+class Weighed(NamedTuple):
+    """What the paper leaves open came to.
+
+    Attributes:
+        effects: of every value of every choice.
+        files: what was written.
+        failed: reasons of points that failed.
+    """
+
+    effects: list[Effect]
+    files: list[Path]
+    failed: list[str]
+
+
+def weigh(
+    folder: Path | str = "reproduce",
+    scale: str = "laptop",
+    executor: Executor | None = None,
+    progress: Progress = silent,
+    say: Tell = print,
+) -> Weighed:
+    """Run every choice that the paper leaves open with other values, on the same packs; writes choices-SCALE.
+
+    Args and errors are those of `reproduce`.
+    """
+    size, folder = choices.SIZES[scale], Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    named = packs(size, size.grains, size.few)
+    store = _run(Spec(shared={"t0": size.t0}, extra=tuple(choices.points(named))), folder, executor, progress, say)
+    done = store.done()
+    rows = [row for row in store.card()["points"] if row["key"] in done]
+    runs = [(row["values"], summary(*store.load(row["key"]))) for row in rows]
+    found, target = choices.effects(named, runs, size.t0), folder / f"choices-{scale}.png"
+    if not found:
+        return Weighed([], [], _failed(store))
+    choices.write_csv(target.with_suffix(".csv"), found)
+    what = f"{size.grains:,} grains, t$_0$ = {size.t0:g} t$_c$, {found[0].gain.packs} packs"
+    choices.draw(target, found, f"What the paper leaves open ({scale}: {what})")
+    return Weighed(found, [target, target.with_suffix(".svg"), target.with_suffix(".csv")], _failed(store))
 
 
 def judge(
@@ -49,9 +154,7 @@ def judge(
     (named,) = packs(size, size.grains, 1)
     (spheres,) = packs(size, size.grains, 1, shape="sphere")
     spec = Spec(shared={"t0": size.t0}, extra=(*claims.points([named]), spheres))
-    conductor = Conductor(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
-    conductor.run(executor or Processes(), progress)
-    store = conductor.store
+    store = _run(spec, folder, executor, progress, say)
     runs = [(row["values"], *store.load(row["key"])) for row in store.card()["points"]]
     tetra, sphere = (load_pack(runs[place][2]["pack"]) for place in (0, -1))
     own = [(values, recall) for values, recall, _ in runs[:-1]]
@@ -118,15 +221,12 @@ def reproduce(
         raise ValueError(f"no figure {name!r} at scale {scale!r}; there are {', '.join((*FIGURES, *SCALES))}")
     size, folder = SCALES[scale], Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    spec = spec_of(FIGURES[name], size)
-    conductor = Conductor(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
-    conductor.run(executor or Processes(), progress)
-    store = conductor.store
+    store = _run(spec_of(FIGURES[name], size), folder, executor, progress, say)
     points = points_of(store)
     target = folder / f"{name}-{scale}.png"
-    failed = sorted(store.failed().get(row["key"], "") for row in store.card()["points"])
+    failed = _failed(store)
     if not points:
-        return Outcome(name, [], [], [reason for reason in failed if reason])
+        return Outcome(name, [], [], failed)
     rows = compare(points, size.t0)
     if name == "fig14":
         rows += read_words(folder, store, points, size, say)
@@ -134,7 +234,7 @@ def reproduce(
     title = f"{FIGURES[name].title} ({scale}: t$_0$ = {size.t0:g} t$_c$)"
     _draw(FIGURES[name], name, target, rows, points, store, title)
     files = [target, target.with_suffix(".svg"), target.with_suffix(".csv")]
-    return Outcome(name, rows, files, [reason for reason in failed if reason])
+    return Outcome(name, rows, files, failed)
 
 
 def _draw(

@@ -54,6 +54,7 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "inertial_number": float(np.max(np.asarray(readout.inertial_number))),
         "filling": [float(np.asarray(readout.filling)[k, 0]) for k in (-1, 0)],
         "coordination": [float(np.asarray(readout.coordination)[k, 0]) for k in (-1, 0)],
+        "contacts_per_grain": [_known(np.asarray(readout.contacts_per_grain)[k, 0]) for k in (-1, 0)],
         "pressure_pa": [float(pressure[k, :2, 0].mean() * unit) for k in (-1, 0)],
         "largest_signal_pa": float(np.max(np.abs(np.asarray(recall.p_sig))) * unit),
         "dt": float(recall.dt),
@@ -63,6 +64,10 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         **second_readout(recall, configuration),
         **of_target(recall, configuration),
     }
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def relative_scale(configuration: dict[str, Any]) -> jax.Array:
@@ -240,8 +245,13 @@ def pack_table(pack: Pack) -> Table:
         pressures = ", ".join(f"{p * unit / 1e3:.2f}" for p in rest["pressure"])
         rows += [
             ("filling phi", f"{rest['filling']:.4f}"),
-            ("coordination Z", f"{rest['coordination']:.2f}"),
-            ("contacts per grain", f"{rest['contacts']:.2f}"),
+            ("coordination Z (grain pairs)", f"{rest['coordination']:.2f}"),
+            ("sphere contacts, times two, per grain", f"{rest['contacts']:.2f}"),
+            *(
+                [("contacts per grain, with walls", f"{0.5 * rest['contacts'] + rest['wall_contacts']:.2f}")]
+                if "wall_contacts" in rest
+                else []
+            ),
             ("p_x, p_y, p_z", f"{pressures} kPa"),
             ("largest speed", f"{rest['largest_speed']:.1e} R/t_c"),
         ]

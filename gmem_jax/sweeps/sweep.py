@@ -15,7 +15,7 @@ from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.host import Progress, silent, within
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.named import named_experiment, named_signals
+from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
 from gmem_jax.files.provenance import sources
@@ -171,7 +171,23 @@ class Conductor:
         own = {name: value for name, value in values.items() if name != "pack" and not name.startswith(PREPARE)}
         if "pack" in values and (odd := [name for name in values if name.startswith(PREPARE)]):
             raise ValueError(f"a point has a pack and {odd[0]!r} of one to be made; give one of them")
-        return named_experiment(pack, own, self._signals(str(own.get("signals", "six"))))
+        return named_experiment(pack, own, self._signals(*waveforms_of(own)))
+
+    def _pack(self, values: Mapping[str, Any]) -> Pack:
+        return self._packs(str(values.get("pack") or self.store.pack_at(self._pack_job(values)["name"])))
+
+    def packs(self, executor: Executor, progress: Progress) -> list[Pack]:
+        """The packs of all points, in order; those that do not exist yet are made.
+
+        Raises:
+            RunFailedError: if workers die again and again.
+            OSError: if none can be started.
+            FileNotFoundError: if there is no such pack, or it could not be made.
+        """
+        if makes := self.pack_jobs():
+            self._announce(f"{len(makes)} packs to be made", makes, executor)
+            self._finish(executor, makes, progress, "packs")
+        return [self._pack({**self.spec.shared, **values}) for values in self.spec.combinations()]
 
     def points(self) -> list[Point]:
         """All points that are possible, once their packs are there."""
@@ -180,8 +196,7 @@ class Conductor:
         for values in self.spec.combinations():
             all_ = {**self.spec.shared, **values}
             try:
-                source = all_.get("pack") or str(self.store.pack_at(self._pack_job(all_)["name"]))
-                found.append(point(values, self._experiment(all_, self._packs(str(source)))))
+                found.append(point(values, self._experiment(all_, self._pack(all_))))
             except (ValueError, FileNotFoundError) as error:
                 self.impossible.append((values, " ".join(str(error).split())))
         return found

@@ -17,7 +17,7 @@ constexpr int kPoints = 6, kResults = 64;
 template <class V, class Law>
 V* touch(Law law, V apart, V* to) {
   V row[kParameters];
-  const double numbers[kParameters] = {0.3, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.06};
+  const double numbers[kParameters] = {0.3, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.9, 0.06};
   for (int r = 0; r < kParameters; ++r) row[r] = splat<V>(numbers[r]);
   const auto vec = [](double x, double y, double z) { return Vec<V>{splat<V>(x), splat<V>(y), splat<V>(z)}; };
   const Meeting<V> meeting{apart * vec(0.6, 0.8, 0.0),   vec(0.5, 0.7, 0.1),   vec(-0.4, -0.6, 0.1),

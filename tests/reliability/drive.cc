@@ -81,7 +81,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   const auto small = [](int row, int l) { return 1e-3 * noise(row, l, 1); };
   const auto positive = [](int row, int l) { return 1e-3 * (1.5 + noise(row, l, 2)); };
   const auto parameter = [](int row, int) {
-    const double numbers[kParameters] = {0.05, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.06};
+    const double numbers[kParameters] = {0.05, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.9, 0.06};
     return numbers[row];
   };
   const auto wall = [&](int row, int) { return row % 12 < 3 ? 0.0 : row % 12 < 6 ? 2.9 * (c.edge ? c.edge : 2) : 1e-3; };

@@ -21,11 +21,14 @@ class Hooke:
         stiffness: k_H in E R; scalar or [B]. The paper gives "a typical inverse transverse compliance" of the
             Mindlin law: k_M <sqrt(p)> is 0.10 to 0.145 over the compression.
         damping_time: gamma_H / k_H in t_c; scalar or [B].
+        spinning: 1 where the history turns with a contact about its normal, 0 where it does not (as in LAMMPS, which
+            only tumbles it); scalar or [B].
     """
 
     mu: Scalar = parameter(1.0, "[0, inf)")
     stiffness: Scalar = parameter(0.145, "(0, inf)")
     damping_time: Scalar = parameter(0.069, "[0, inf)")
+    spinning: Scalar = parameter(1.0, "[0, 1]")
 
     def __post_init__(self) -> None:
         settle(self)
@@ -38,7 +41,7 @@ class Hooke:
         """Tangential force on sphere i and the new history; see `FrictionLaw`."""
         half_step = (0.5 * self.stiffness * kin.dt) * kin.sliding
         dashpot = (self.stiffness * self.damping_time) * kin.sliding
-        elastic = transport(history, kin) + half_step
+        elastic = transport(history, kin, self.spinning) + half_step
         force, _ = coulomb(elastic + dashpot, self.mu * normal_force)
         force = jnp.where(kin.touching, force, 0.0)
         return force, jnp.where(kin.touching, force - dashpot + half_step, 0.0)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.physics.pytree import pytree
+from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import cross, dot
 
 
@@ -73,17 +73,17 @@ def kinematics(
     )
 
 
-def transport(force: jax.Array, kin: Kinematics) -> jax.Array:
+def transport(force: jax.Array, kin: Kinematics, spinning: Scalar = 1.0) -> jax.Array:
     """Carry a tangential force [P, 3, B] along with its contact through one step.
 
     Tumbling: project on the new tangent plane and restore the magnitude. Spinning: turn about n by twist * dt
-    (Cayley map, right to third order in the angle of one step).
+    (Cayley map, right to third order in the angle of one step), times `spinning`: 1, or 0 to leave it out.
     """
     flat = force - dot(force, kin.normal) * kin.normal
     before, after = dot(force, force), dot(flat, flat)
     alive = after > 0.0
     stretch = jnp.where(alive, jnp.sqrt(jnp.where(alive, before, 1.0) / jnp.where(alive, after, 1.0)), 1.0)
-    half = 0.5 * kin.twist * kin.dt
+    half = 0.5 * spinning * kin.twist * kin.dt
     shrink = 1.0 / (1.0 + half * half)
     cosine, sine = (1.0 - half * half) * shrink, 2.0 * half * shrink
     flat = stretch * flat

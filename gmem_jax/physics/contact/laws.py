@@ -25,14 +25,14 @@ class Entry(NamedTuple):
     paper: str
     kind: Any
     native: int
-    numbers: tuple[str, ...] = ("mu", "stiffness", "damping_time")
+    numbers: tuple[str, ...] = ("mu", "stiffness", "damping_time", "spinning")
 
 
 LAWS = (
     Entry("frictionless", "mu = 0", Frictionless, 0, ()),
     Entry("hooke", "H", Hooke, 1),
     Entry("m1", "M1", MindlinRescaled, 2),
-    Entry("m2", "M2", Mindlin, 3, ("mu", "stiffness", "damping_time", "spacing")),
+    Entry("m2", "M2", Mindlin, 3, ("mu", "stiffness", "damping_time", "spinning", "spacing")),
 )
 
 

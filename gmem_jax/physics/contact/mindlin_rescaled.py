@@ -40,11 +40,13 @@ class MindlinRescaled:
         mu: friction coefficient; scalar or [B].
         stiffness: k_M in E R^0.5; scalar or [B].
         damping_time: gamma_M / k_M in t_c; scalar or [B].
+        spinning: see `gmem_jax.physics.contact.hooke.Hooke`.
     """
 
     mu: Scalar = parameter(1.0, "[0, inf)")
     stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)")
     damping_time: Scalar = parameter(Material().tangential_damping, "[0, inf)")
+    spinning: Scalar = parameter(1.0, "[0, 1]")
 
     def __post_init__(self) -> None:
         settle(self)
@@ -62,7 +64,7 @@ class MindlinRescaled:
         spring = self.stiffness * jnp.sqrt(kin.safe_overlap)
         half_step = (0.5 * kin.dt) * spring * kin.sliding
         dashpot = self.damping_time * spring * kin.sliding
-        elastic = jnp.sqrt(ratio) * transport(history.force, kin) + half_step
+        elastic = jnp.sqrt(ratio) * transport(history.force, kin, self.spinning) + half_step
         force, _ = coulomb(elastic + dashpot, self.mu * normal_force)
         force = jnp.where(kin.touching, force, 0.0)
         return force, RescaledHistory(

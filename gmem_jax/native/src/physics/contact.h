@@ -36,7 +36,7 @@ GMEM_INLINE V overlap_of(const Contact<V>& c) { return fnma(c.square, c.inverse,
 // gmem_jax/physics/contact/kinematics.py: kinematics
 template <class V>
 inline void close(Contact<V>* c, int count, const V* parameter) {
-  const V quarter_dt = splat<V>(0.25) * parameter[kDt];
+  const V quarter_dt = splat<V>(0.25) * parameter[kDt] * parameter[kSpinning];
   invert_roots(c, count);
   for (int n = 0; n < count; ++n) {
     const Vec<V> normal = c[n].inverse * c[n].normal;

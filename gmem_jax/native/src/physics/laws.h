@@ -47,8 +47,8 @@ struct LawParameters {
   V half_dt;
 
   LawParameters(const V* rows, V dt)
-      : mu(rows[0]), stiffness(rows[1]), damping_time(rows[2]), spacing(rows[3]),
-        inverse_spacing(splat<V>(1.0) / rows[3]),
+      : mu(rows[0]), stiffness(rows[1]), damping_time(rows[2]), spacing(rows[4]),
+        inverse_spacing(splat<V>(1.0) / rows[4]),
         half_step(splat<V>(0.5) * rows[1] * dt), dashpot(rows[1] * rows[2]), half_dt(splat<V>(0.5) * dt) {}
 };
 

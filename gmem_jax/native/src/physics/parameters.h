@@ -20,8 +20,9 @@ enum class Variant { exact = 0, averaged = 1, paper = 2 };
 // Rows of the parameter array; a law's own follow.
 // gmem_jax/native/__init__.py: _parameters
 enum Parameter { kDt, kDrag, kMass, kInertia, kNormalStiffness = kInertia + 3, kNormalDamping, kWallStiffness, kLaw };
-constexpr int kLawParameters = 4;  // mu, stiffness, damping time, spacing of Mindlin's points
+constexpr int kLawParameters = 5;  // mu, stiffness, damping time, spinning, spacing of Mindlin's points
 constexpr int kParameters = kLaw + kLawParameters;
+constexpr int kSpinning = kLaw + 3;
 
 // The laws as types.
 struct Frictionless {

@@ -1,0 +1,185 @@
+"""What the paper leaves open, and how much G and F change with each choice, on the same packs."""
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from gmem_jax.experiment.analysis import spread
+from gmem_jax.files.atomic import atomic
+from gmem_jax.reproduce.compare import RINGS, Estimate
+from gmem_jax.reproduce.figures import SCALES, Scale, Values, crossed
+from gmem_jax.show.figures import pyplot, save
+
+_NOTHING: Values = {}
+
+
+class Choice(NamedTuple):
+    """Something that has to be chosen.
+
+    Attributes:
+        name: of a sweep file.
+        words: what it is.
+        values: that are tried, the default first.
+        shared: what all its points have besides.
+    """
+
+    name: str
+    words: str
+    values: tuple[Any, ...]
+    shared: Values = _NOTHING
+
+
+_WORDS: Values = {"signals": "words:3", "background": "sub2-bl"}
+CHOICES = (
+    Choice("shear_share", "part of gamma on each axis", (0.5, 0.25, 1.0)),
+    Choice("stiffness", "k_H (E R)", (0.145, 0.10, 0.125, 0.18)),
+    Choice("wall_rigidity", "stiffness of walls over rigid ones", (1.0, 0.5, 2.0)),
+    Choice("spinning", "history turns about the normal", (1.0, 0.0)),
+    Choice("rest", "rests (t0)", (0.2, 0.05, 0.8)),
+    Choice("dt", "time step (t_c)", (0.3, 0.15, 0.365)),
+    Choice("variant", "M2's outermost ring", ("averaged", "exact", "paper"), {"friction": "M2"}),
+    Choice("word_pad", "free bits at the ends of words", (2.0, 1.0, 3.0), _WORDS),
+    Choice("word_width", "width of the bumps of words (bits)", (1.0, 0.5, 1.5), _WORDS),
+)
+# Smaller packs than the figures': there are many points.
+SIZES: dict[str, Scale] = SCALES | {"workstation": replace(SCALES["workstation"], t0=3.6e3, grains=1024)}
+
+
+class Effect(NamedTuple):
+    """What a value of a choice does.
+
+    Attributes:
+        choice: the choice.
+        value: that was tried.
+        gain: G over packs.
+        fidelity: F over packs.
+        of_gain: G less that of the default on the same pack, in parts of it, over packs; NaN for the default.
+        of_fidelity: F less that of the default on the same pack, over packs; NaN for the default.
+        status: all status bits of the recalls.
+    """
+
+    choice: Choice
+    value: Any
+    gain: Estimate
+    fidelity: Estimate
+    of_gain: Estimate
+    of_fidelity: Estimate
+    status: int
+
+    @property
+    def default(self) -> bool:
+        """Whether this is what is chosen unless something else is asked for."""
+        return bool(self.value == self.choice.values[0])
+
+
+def _values(choice: Choice, value: Any) -> Values:
+    """A point's values, packs aside. The default is left out, so that all choices share that point."""
+    return choice.shared if value == choice.values[0] else {**choice.shared, choice.name: value}
+
+
+def points(packs: Sequence[Values]) -> list[Values]:
+    """The runs that the table needs, on some packs; none twice."""
+    tried = [_values(choice, value) for choice in CHOICES for value in choice.values]
+    return crossed(packs, [values for place, values in enumerate(tried) if values not in tried[:place]])
+
+
+def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]]], t0: float) -> list[Effect]:
+    """Every value of every choice beside its default, pack by pack.
+
+    Args:
+        packs: what names them.
+        runs: values of points and summaries of their recalls (`show.tables.summary`); points that failed are missing.
+        t0: at which they were run: below the paper's, G and F are those after averaging over the ringing period.
+    """
+    windowed = "windowed_" if t0 < RINGS else ""
+    known = list(runs)
+
+    def at(pack: Values, values: Values) -> dict[str, Any] | None:
+        return next((numbers for own, numbers in known if own == {**pack, **values}), None)
+
+    found = []
+    for choice in CHOICES:
+        for value in choice.values:
+            both = [(at(pack, choice.shared), at(pack, _values(choice, value))) for pack in packs]
+            pairs = [(default, tried) for default, tried in both if default and tried]
+            if pairs:
+                found.append(_effect(choice, value, pairs, windowed))
+    return found
+
+
+def _effect(choice: Choice, value: Any, pairs: Sequence[tuple[Any, Any]], windowed: str) -> Effect:
+    gain, fidelity = f"{windowed}gain", f"{windowed}fidelity"
+    of_gain = [tried[gain] / default[gain] - 1.0 for default, tried in pairs]
+    of_fidelity = [tried[fidelity] - default[fidelity] for default, tried in pairs]
+    own = [_estimate([tried[name] for _, tried in pairs]) for name in (gain, fidelity)]
+    status = 0
+    for _, tried in pairs:
+        status |= tried["status"]
+    return Effect(choice, value, own[0], own[1], _estimate(of_gain), _estimate(of_fidelity), status)
+
+
+def _estimate(values: Sequence[float]) -> Estimate:
+    mean, deviation, _ = spread(values)
+    return Estimate(mean, deviation, len(values))
+
+
+def _row(effect: Effect) -> dict[str, Any]:
+    named = {"G": effect.gain, "F": effect.fidelity, "dG_over_G": effect.of_gain, "dF": effect.of_fidelity}
+    numbers: dict[str, str] = {}
+    for name, estimate in named.items():
+        numbers |= {name: f"{estimate.mean:.4f}", f"{name}_sd": "" if estimate.packs < 2 else f"{estimate.sd:.4f}"}
+    at = " ".join(f"{name}={value}" for name, value in effect.choice.shared.items())
+    about = {"choice": effect.choice.name, "meaning": effect.choice.words, "with": at, "value": effect.value}
+    return {**about, "default": int(effect.default), **numbers, "packs": effect.gain.packs, "status": effect.status}
+
+
+def rows(found: Sequence[Effect]) -> list[dict[str, Any]]:
+    """Every value of every choice as a line of a table."""
+    return [_row(effect) for effect in found]
+
+
+def write_csv(path: Path, found: Sequence[Effect]) -> None:
+    """A line for each value of each choice.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    lines = rows(found)
+    with atomic(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(lines[0]))
+        writer.writeheader()
+        writer.writerows(lines)
+
+
+def draw(path: Path, found: Sequence[Effect], title: str) -> None:
+    """The change of G and of F with every value that is not the default, with standard errors over packs.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    shown = [effect for effect in found if not effect.default]
+    figure, axes = pyplot().subplots(1, 2, figsize=(10.5, 0.3 * len(shown) + 1.6), sharey=True)
+    places = range(len(shown))
+    for axis, label, numbers, unit in (
+        (axes[0], "change of G (%)", [effect.of_gain for effect in shown], 100.0),
+        (axes[1], "change of F", [effect.of_fidelity for effect in shown], 1.0),
+    ):
+        means = [unit * one.mean for one in numbers]
+        errors = [unit * one.error if one.packs > 1 else 0.0 for one in numbers]
+        names = list(dict.fromkeys(effect.choice.name for effect in shown))
+        colours = [f"C{names.index(effect.choice.name) % 10}" for effect in shown]
+        axis.barh(places, means, xerr=errors, color=colours, height=0.6, capsize=2)
+        axis.axvline(0.0, color="0.3", linewidth=0.8)
+        axis.set_xlabel(label)
+    axes[0].set_yticks(places, [_label(effect) for effect in shown], fontsize=8)
+    axes[0].invert_yaxis()
+    figure.suptitle(title, fontsize=10)
+    save(path, figure, also=(".svg",))
+
+
+def _label(effect: Effect) -> str:
+    default = effect.choice.values[0]
+    shown = [f"{value:g}" if isinstance(value, float) else str(value) for value in (effect.value, default)]
+    return f"{effect.choice.words}: {shown[0]} for {shown[1]}"
