@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo test test-slow check mutations reliability install clean
+.PHONY: demo test test-slow check docs mutations reliability install clean
 
 demo: install
 	$(REBUILD)
@@ -34,6 +34,10 @@ check: install-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The site, in site/: every link and anchor must lead somewhere.
+docs: install-dev
+	$(BIN)/mkdocs build --strict --quiet
+
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
 
@@ -50,4 +54,4 @@ $(VENV)/.installed-dev: pyproject.toml $(BIN)/python
 	touch $@ $(VENV)/.installed
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist site *.egg-info
