@@ -36,7 +36,7 @@ check: install-dev
 
 # The site, in site/: every link and anchor must lead somewhere.
 docs: install-dev
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
