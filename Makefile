@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo test test-slow check mutations reliability wheel install clean
+.PHONY: demo test test-slow check docs mutations reliability wheel install clean
 
 demo: install
 	$(REBUILD)
@@ -43,6 +43,10 @@ wheel: $(BIN)/python
 	rm dist/*-linux_*.whl
 	$(BIN)/python -m twine check --strict dist/*
 
+# The site, in site/: every link and anchor must lead somewhere.
+docs: install-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
 
@@ -59,4 +63,4 @@ $(VENV)/.installed-dev: pyproject.toml $(BIN)/python
 	touch $@ $(VENV)/.installed
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info
+	rm -rf $(VENV) build dist site *.egg-info

@@ -129,9 +129,9 @@ def test_what_was_measured_is_kept_at_once(pack: gm.Pack) -> None:
     assert "| H | 27 |" in table.markdown(result)
 
 
-def test_the_readme_holds_the_table_that_was_measured() -> None:
+def test_the_page_on_speed_holds_the_table_that_was_measured() -> None:
     root = Path(__file__).parents[1]
-    page = (root / "README.md").read_text()
+    page = (root / "docs" / "speed.md").read_text()
     stored = json.loads((root / "benchmarks" / "bench.json").read_text())
     assert page == table.into(page, table.short(stored))
 

@@ -1,4 +1,4 @@
-"""Measurements as Markdown: the whole table, and the short one of the README."""
+"""Measurements as Markdown: the whole table, and the short one of docs/speed.md."""
 
 import json
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from typing import Any
 
 from gmem_jax.files.atomic import atomic
 
-BEGIN, END = "<!-- made by benchmarks/readme.py -->", "<!-- end -->"
+BEGIN, END = "<!-- made by benchmarks/short_table.py -->", "<!-- end -->"
 
 
 def _find(rows: Sequence[dict[str, Any]], **wanted: Any) -> dict[str, Any] | None:

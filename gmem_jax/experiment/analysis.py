@@ -1,4 +1,4 @@
-"""From wall pressures to the recalled signal, its gain and its fidelity (paper, Sec. II; spec, section 7)."""
+"""From wall pressures to the recalled signal, its gain and its fidelity (paper, Sec. II)."""
 
 import math
 from collections.abc import Sequence

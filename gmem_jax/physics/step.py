@@ -177,7 +177,7 @@ def _angular_acceleration(clump: Clump, grains: Grains, torque: jax.Array) -> ja
 def step(
     system: System, state: State, box: Box, dt: jax.Array, drag: Scalar, alive: jax.Array
 ) -> tuple[State, jax.Array]:
-    """One velocity-Verlet step (spec: forces use velocities predicted to the end of the step).
+    """One velocity-Verlet step; forces use velocities predicted to its end (docs/physics.md, "Time integration").
 
     Args:
         system: the system.

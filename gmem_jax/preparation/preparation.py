@@ -1,4 +1,4 @@
-"""Preparation of a pack without friction: gas, pressure, compression cycles, rest (spec, section 4)."""
+"""Preparation of a pack without friction: gas, pressure, compression cycles, rest (paper, Sec. II)."""
 
 import json
 import math
@@ -57,7 +57,7 @@ _press = Compiled(press, static_argnames=("blocks", "march"))
 
 @dataclass(frozen=True)
 class Recipe:
-    """The numbers of a preparation; every [I] and [C] of the spec is a field here.
+    """The numbers of a preparation; what the paper leaves open is a field here (docs/physics.md, "Preparation").
 
     Attributes:
         grains: number of grains N.

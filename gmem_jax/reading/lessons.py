@@ -1,4 +1,4 @@
-"""What the paper's reader learns from: the inputs J_s alone, shifted, scaled, with noise (Sec. III; spec, section 7).
+"""What the paper's reader learns from: the inputs J_s alone, shifted, scaled, with noise (paper, Sec. III).
 
 Nothing of the training set is stored but the shifted J_s, [S, shifts, 256]: an example follows from the numbers of its
 word, shift, amplitude and draw, and from the seed. All functions are pure.

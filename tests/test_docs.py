@@ -1,0 +1,156 @@
+"""The pages: links, commands, names and examples are right. Whether the site builds is for `make docs` to say."""
+
+import ast
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+import typer
+
+import gmem_jax as gm
+from gmem_jax.command.app import app
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", *DOCS.rglob("*.md"), *ROOT.glob("benchmarks/*.md")])
+HOW_TO = [DOCS / "tutorial.md", DOCS / "own_law.md", *sorted((DOCS / "howto").glob("*.md"))]
+SMALL = ROOT / "tests" / "data" / "tetra-27.h5"
+SHORT: dict[str, Any] = {"t0": 75.0, "store": 0.1, "rest": 0.1, "hold": 0.1}
+
+
+def name(page: Path) -> str:
+    """A page's path in the repository."""
+    return str(page.relative_to(ROOT))
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of a page."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
+def commands(page: Path) -> list[list[str]]:
+    """The shell commands of a page's indented blocks, as words, a command to a list."""
+    lines = re.findall(r"^ {4}((?:gmem|make|python) .*)$", page.read_text(), re.MULTILINE)
+    return [shlex.split(part, comments=True) for line in lines for part in line.split("&&")]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_between_files_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#\s]+)", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL))
+    gone = [link for link in links if ":" not in link and not (page.parent / link).exists()]
+    assert not gone
+
+
+@pytest.mark.parametrize("source", ["gmem_jax", "tests", "experiments", "benchmarks", "Makefile"])
+def test_pages_that_the_code_names_are_there(source: str) -> None:
+    path = ROOT / source
+    files = [path] if path.is_file() else [one for one in path.rglob("*") if one.suffix in (".py", ".h", ".cc", ".cu")]
+    named = {page for file in files for page in re.findall(r"\bdocs/[\w/]+\.md", file.read_text())}
+    assert not [page for page in named if not (ROOT / page).is_file()]
+
+
+COMMANDS: Any = typer.main.get_command(app).commands
+
+
+def parsed(words: list[str]) -> None:
+    """Parse a command of gmem as the command line would, and run nothing.
+
+    Raises:
+        Exception: of typer, if there is no such command or option.
+    """
+    COMMANDS[words[1]].make_context(words[1], words[2:])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_commands_are_there_with_the_options_that_pages_give_them(page: Path) -> None:
+    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for words in commands(page):
+        if words[0] == "make":
+            assert {word for word in words[1:] if "=" not in word} <= set(targets), words
+        elif words[0] == "python":
+            assert (ROOT / words[1]).is_file(), words
+        else:
+            parsed(words)
+    for told in re.findall(r"`gmem ([^`]+)`", page.read_text()):  # in a sentence, where arguments may be missing
+        command, *words = shlex.split(told)
+        options = {option for one in COMMANDS.get(command).params for option in [*one.opts, *one.secondary_opts]}
+        assert {word for word in words if word.startswith("-")} <= {*options, "--help"}, told
+
+
+def test_a_command_that_is_not_there_is_noticed() -> None:
+    with pytest.raises(KeyError):
+        parsed(["gmem", "remember"])
+    with pytest.raises(Exception, match="--muu"):
+        parsed(["gmem", "recall", "pack.h5", "--muu", "1"])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_python_is_python_and_names_of_the_library_are_there(page: Path) -> None:
+    for block in blocks(page, "python"):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "gm":
+                assert hasattr(gm, node.attr), node.attr
+
+
+def test_inline_names_of_the_library_are_there() -> None:
+    named = {one for page in PAGES for one in re.findall(r"`gm\.(\w+)", page.read_text())}
+    assert not [one for one in named if not hasattr(gm, one)]
+
+
+def test_every_public_name_is_in_the_reference() -> None:
+    page = (DOCS / "api.md").read_text()
+    shown = set(re.findall(r"^::: gmem_jax\.(\w+)$", page, re.MULTILINE))
+    assert shown == set(gm.__all__) - {"classify"}
+    assert "::: gmem_jax.reading.classify" in page
+
+
+def test_every_record_is_in_the_table_of_contents() -> None:
+    listed = re.findall(r"^- \[(.+)\]\((decisions/\w+\.md)#", (DOCS / "decisions.md").read_text(), re.MULTILINE)
+    records = [
+        (title, f"decisions/{page.name}")
+        for page in (DOCS / "decisions").glob("*.md")
+        for title in re.findall(r"^## (.+)$", page.read_text(), re.MULTILINE)
+    ]
+    assert sorted(listed) == sorted(records)
+
+
+def test_the_readme_is_one_screen() -> None:
+    page = (ROOT / "README.md").read_text()
+    assert len(page.splitlines()) < 80
+    assert len(page.split()) < 600
+
+
+def test_the_tutorial_needs_no_setting_but_double_precision() -> None:
+    first = blocks(DOCS / "tutorial.md", "python")[0]
+    assert "jax_enable_x64" in first
+    assert jax.config.jax_enable_x64
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", HOW_TO, ids=name)
+def test_examples_run(page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """All blocks of a page, one after the other, on a pack of 27 grains and a short experiment."""
+    monkeypatch.chdir(tmp_path)
+    small, experiment, train = gm.load_pack(SMALL), gm.Experiment, gm.classify.train
+    monkeypatch.setattr(gm, "load_pack", lambda _: small)
+    monkeypatch.setattr(gm, "prepare", lambda **_: small)
+    monkeypatch.setattr(gm, "Experiment", lambda *parts, **fields: experiment(*parts, **{**fields, **SHORT}))
+    monkeypatch.setattr(gm.classify, "train", lambda *parts, **given: train(*parts, **{**given, "budget": 1.0}))
+    names: dict[str, Any] = {"__name__": "example"}
+    for number, block in enumerate(blocks(page, "python")):
+        exec(compile(block, f"{page.name}, block {number + 1}", "exec"), names)
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path) -> None:
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    notebook = nbformat.read(DOCS / "first_recall.ipynb", as_version=4)
+    nbclient.NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": tmp_path}}
+    ).execute()
+    printed = json.dumps([cell.get("outputs", []) for cell in notebook.cells])
+    assert "mu = 1.0: F = 0.6" in printed
