@@ -35,6 +35,7 @@ from gmem_jax.physics.state import Status, explain
 from gmem_jax.preparation.preparation import Recipe, prepare
 
 if TYPE_CHECKING:
+    from gmem_jax.design.by_kernel import design_by_kernel
     from gmem_jax.design.drive import TunedDrive, design_drive
     from gmem_jax.design.waveforms import Design, design_waveforms
     from gmem_jax.reading import classify
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
 _LATER = {  # what loads flax or optax, by where it is
     "Design": "gmem_jax.design.waveforms",
+    "design_by_kernel": "gmem_jax.design.by_kernel",
     "design_waveforms": "gmem_jax.design.waveforms",
     "TunedDrive": "gmem_jax.design.drive",
     "design_drive": "gmem_jax.design.drive",
@@ -79,6 +81,7 @@ __all__ = [
     "TunedDrive",
     "classify",
     "clump",
+    "design_by_kernel",
     "design_drive",
     "design_waveforms",
     "experiment_from",

@@ -10,6 +10,7 @@ import typer
 from rich import progress
 
 from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, emit, log, say
+from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
@@ -71,7 +72,8 @@ def classify_command(
     from gmem_jax.reading.readers import confusion, stored_words
 
     try:
-        stored = stored_words(kept)
+        designed = configuration.get("target")
+        stored = stored_words(kept, signals_from(designed) if designed else None)
     except ValueError as error:
         raise InputError(f"{recall}: {error}; make one with gmem recall --signals words:L") from error
     claim(output, ".json", inputs=(recall,), force=force)

@@ -21,12 +21,12 @@ from gmem_jax.command.console import (
     reporting,
 )
 from gmem_jax.command.options import Chosen, with_experiment
-from gmem_jax.command.resuming import Restart, resumable
+from gmem_jax.command.resuming import Restart, batch_for, resumable
 from gmem_jax.derivatives.gradient import Gradient, value_and_grad
+from gmem_jax.design import by_kernel, waveforms
 from gmem_jax.design.drive import PARAMETERS, design_drive, start_within
 from gmem_jax.design.kernel import memory_kernel, relative_error
 from gmem_jax.design.stored import save_kernel
-from gmem_jax.design.waveforms import BUMPS, cost, design_waveforms
 from gmem_jax.experiment.experiment import Experiment, value_at
 from gmem_jax.experiment.host import CHUNK, Checkpoint, Keep, within
 from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run_bytes, simulate
@@ -40,6 +40,7 @@ from gmem_jax.show import figures
 from gmem_jax.show.kinds import kernel_facts
 
 GRADIENT = 11.0  # cost of a gradient in runs; see benchmarks
+MANY = 16  # signals above which one kernel serves all rather than a Jacobian each
 
 
 def _announce(experiment: Experiment, what: str, runs: float, side_by_side: int, memory: float = 1.0) -> None:
@@ -204,7 +205,16 @@ def design_command(
     chosen: Chosen,
     pack: PackName,
     output: Output = Path("designed.csv"),
-    iterations: Annotated[int, typer.Option(min=1, help="Corrections; each takes a Jacobian.")] = 3,
+    words: Annotated[int | None, typer.Option(help="Design all words of so many bits, as --signals words:L.")] = None,
+    by: Annotated[
+        str | None,
+        typer.Option(
+            help=f"jacobian: of each waveform; kernel: of the pack, default for words and above {MANY} signals."
+        ),
+    ] = None,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="Corrections; default 3 by Jacobians, 6 by the kernel.")
+    ] = None,
     gain: Annotated[float | None, typer.Option(help="Wanted gain; default half of the untouched waveforms'.")] = None,
     restart: Restart = False,
     picture: Picture = True,
@@ -212,16 +222,27 @@ def design_command(
     as_json: AsJson = False,
 ) -> None:
     """Pre-distort waveforms so that the recall follows their integrals; writes a CSV for `gmem recall` (minutes)."""
+    if by not in (None, "jacobian", "kernel"):
+        raise InputError(f"--by must be jacobian or kernel, got {by!r}")
+    chosen = chosen if words is None else chosen.with_signals(f"words:{words}")
     (experiment,), drawn = chosen.claim([pack], output, ".csv", picture=picture, force=force)
     _needs_sub0(experiment)
     history = output.with_name(f"{output.stem}-history.png")
     if picture:
         claim(history, ".png", force=force)
     began = time.perf_counter()
-    _announce(experiment, "design", cost(experiment, iterations), 2 * BUMPS * experiment.signals.count)
-    with resumable(output, key_of_run(experiment, iterations=iterations, gain=gain), restart=restart) as parts:
+    count = experiment.signals.count
+    by = by or ("kernel" if words is not None or count > MANY else "jacobian")
+    options: dict[str, Any] = {"gain": gain} | ({} if iterations is None else {"iterations": iterations})
+    if by == "kernel":
+        options["batch"] = batch_for(experiment, output, restart=restart)
+        _announce(experiment, "design", by_kernel.cost(experiment, iterations), min(count, options["batch"]))
+    else:
+        _announce(experiment, "design", waveforms.cost(experiment, iterations), 2 * waveforms.BUMPS * count)
+    with resumable(output, key_of_run(experiment, by=by, **options), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
-            found = design_waveforms(experiment, iterations=iterations, gain=gain, keep=parts, progress=progress)
+            design = by_kernel.design_by_kernel if by == "kernel" else waveforms.design_waveforms
+            found = design(experiment, keep=parts, progress=progress, **options)
         way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
         save_waveforms(output, found.signals, experiment.signals, design=way)
     if drawn:

@@ -67,6 +67,10 @@ class Chosen:
     def __init__(self, values: dict[str, Any]) -> None:
         self._values = values
 
+    def with_signals(self, name: str) -> "Chosen":
+        """The same, but for the signals."""
+        return Chosen({**self._values, "signals": name})
+
     def claim(
         self, packs: Sequence[str], output: Path, suffix: str, *, picture: bool, force: bool
     ) -> tuple[list[Experiment], Path | None]:

@@ -6,7 +6,6 @@ from typing import Annotated, Any
 
 import jax
 import numpy as np
-import psutil
 import typer
 
 from gmem_jax import native
@@ -25,14 +24,13 @@ from gmem_jax.command.console import (
     say,
 )
 from gmem_jax.command.options import Chosen, with_experiment
-from gmem_jax.command.resuming import Restart, folder_of, resumable
+from gmem_jax.command.resuming import Restart, batch_for, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.recall import default_batch, film_of, replica_bins, run, run_bytes
+from gmem_jax.experiment.recall import film_of, replica_bins, run, run_bytes
 from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.packs import list_packs, load_pack
-from gmem_jax.files.parts import Parts
 from gmem_jax.files.recalls import save_recall
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.show import figures, tables
@@ -51,9 +49,7 @@ def _run(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
     began = time.perf_counter()
-    kept = None if restart else Parts.key_of(folder_of(data)).get("batch")
-    batch = batch or (kept if isinstance(kept, int) and kept > 0 else None)
-    batch = batch or default_batch(experiment, psutil.virtual_memory().available)
+    batch = batch_for(experiment, data, batch, restart=restart)
     work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
     backend = native.name(experiment.backend, experiment.friction)
     side_by_side = min(batch, experiment.signals.count)

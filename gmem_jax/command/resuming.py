@@ -5,9 +5,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
+import psutil
 import typer
 
 from gmem_jax.command.console import say
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.recall import default_batch
 from gmem_jax.files.atomic import sweep
 from gmem_jax.files.parts import Parts, locked
 
@@ -17,6 +20,13 @@ Restart = Annotated[bool, typer.Option("--restart", help="Discard what an interr
 def folder_of(output: Path) -> Path:
     """Where the parts of an unfinished run are kept."""
     return output.with_name(f"{output.name}.parts")
+
+
+def batch_for(experiment: Experiment, output: Path, wanted: int | None = None, *, restart: bool = False) -> int:
+    """Signals to run together: as wanted, as in the parts of an unfinished run, or what fits the free memory."""
+    kept = None if restart else Parts.key_of(folder_of(output)).get("batch")
+    known = wanted or (kept if isinstance(kept, int) and kept > 0 else None)
+    return known or default_batch(experiment, psutil.virtual_memory().available)
 
 
 @contextmanager

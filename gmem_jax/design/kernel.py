@@ -118,7 +118,10 @@ class MemoryKernel:
             signals: waveforms that were never simulated.
             even: add the even parts, in proportion to the absolute amplitudes.
         """
-        amplitudes = self.coefficients(signals)
+        return self.recalled(self.coefficients(signals), even=even)
+
+    def recalled(self, amplitudes: np.ndarray, *, even: bool = True) -> np.ndarray:
+        """`predict` for amplitudes of the basis functions, [S, n]."""
         linear: np.ndarray = amplitudes @ self.odd
         return linear + np.abs(amplitudes) @ self.even if even else linear
 

@@ -23,6 +23,7 @@ from gmem_jax.experiment.signals import Signals, Spline, waveform
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)
 FRACTIONS = (1.0, 0.5, 0.25)  # of a step that are tried
+ITERATIONS = 3  # corrections of a design
 BUMPS = 17  # basis waveforms of a design
 TANGENT = 2.5  # cost of a tangent in runs; see benchmarks
 
@@ -91,15 +92,15 @@ class _Work:
         return lambda stage, moment, fraction: inner(f"{name}, {stage}" if name else stage, moment, fraction)
 
 
-def cost(experiment: Experiment, iterations: int) -> float:
+def cost(experiment: Experiment, iterations: int | None = None) -> float:
     """What a design takes, in runs of its signals."""
-    return _Work(experiment, BUMPS, iterations, silent).total
+    return _Work(experiment, BUMPS, iterations or ITERATIONS, silent).total
 
 
 def design_waveforms(
     experiment: Experiment,
     *,
-    iterations: int = 3,
+    iterations: int = ITERATIONS,
     n: int = BUMPS,
     width: float = 0.2,
     gain: float | None = None,

@@ -11,7 +11,7 @@ import numpy as np
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.signals import LONGEST_WORD, bin_average, word_bits, words
+from gmem_jax.experiment.signals import LONGEST_WORD, Signals, bin_average, word_bits, words
 
 FOLDS = 16  # parts that the words are split into for the linear decoder; fewer words are left out one by one
 PENALTIES = np.logspace(-6, 1, 15)  # tried for the ridge, in units of the largest singular value squared
@@ -34,13 +34,17 @@ class Stored:
     templates: np.ndarray
 
 
-def stored_words(recall: Recall) -> Stored:
+def stored_words(recall: Recall, target: Signals | None = None) -> Stored:
     """The words that a recall holds, by SUB2-BL if it has a second readout, else by SUB0.
+
+    Args:
+        recall: of the words themselves, or of waveforms designed to be recalled as they should be.
+        target: the words, if they were designed.
 
     Raises:
         ValueError: if its signals are not all the words of one length, in order.
     """
-    templates = np.asarray(recall.J)
+    templates = np.asarray(recall.J if target is None else bin_average(target))
     bits = len(templates).bit_length() - 1
     expected = np.asarray(bin_average(words(bits))) if 1 <= bits <= LONGEST_WORD else np.zeros(0)
     # J of a word is of order u_b / pi: a tenth of a thousandth of it is far above round-off, far below another word.

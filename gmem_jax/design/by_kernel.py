@@ -1,0 +1,127 @@
+"""Inverse design of many waveforms at once, as all words of a length: corrected by the memory kernel.
+
+A Jacobian of its own for every waveform (`waveforms`) costs some tens of runs of each. Here the one kernel of the pack,
+2 n + 1 replicas, serves them all: it says how each waveform should change for what its last recall missed. It is only
+nearly right, so the miss is simulated and corrected again; what gets worse is taken back and tried with half the step.
+"""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.design.kernel import MemoryKernel, bumps, memory_kernel, nearest
+from gmem_jax.design.waveforms import Design, bounded, sampled
+from gmem_jax.experiment.experiment import Experiment, replace
+from gmem_jax.experiment.host import Keep, Progress, forget, silent, within
+from gmem_jax.experiment.recall import run
+
+BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
+WIDTH = 0.08  # of them, in u
+DAMPING = 0.05  # of a correction, in parts of the kernel's largest singular value
+ITERATIONS = 6  # simulations of all waveforms
+PREDICTED = 6  # corrections of the first guess, by the kernel alone
+
+
+def correction(kernel: MemoryKernel, amplitudes: np.ndarray, miss: np.ndarray, damping: float = DAMPING) -> np.ndarray:
+    """Changes of amplitudes that make up for what recalls miss, by the kernel's slope on either side, [S, n].
+
+    Args:
+        kernel: with n basis waveforms.
+        amplitudes: of the present waveforms, [S, n].
+        miss: wanted p_sig less the present one, [S, 256], in E.
+        damping: of the least squares, in parts of the kernel's largest singular value.
+    """
+    slope = kernel.odd + np.sign(amplitudes)[:, :, None] * kernel.even  # [S, n, 256]
+    damped = (damping * np.linalg.norm(kernel.odd, 2)) ** 2 * np.eye(len(kernel.odd))
+    along = np.einsum("snu,su->sn", slope, miss)
+    step: np.ndarray = np.linalg.solve(slope @ slope.transpose(0, 2, 1) + damped, along[..., None])[..., 0]
+    return step
+
+
+def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS) -> float:
+    """What a design takes, in runs of its signals."""
+    return (iterations or ITERATIONS) + 2.0 + 2.0 * n / experiment.signals.count
+
+
+def design_by_kernel(
+    experiment: Experiment,
+    *,
+    iterations: int = ITERATIONS,
+    n: int = BUMPS,
+    width: float = WIDTH,
+    gain: float | None = None,
+    damping: float = DAMPING,
+    batch: int | None = None,
+    keep: Keep = forget,
+    progress: Progress = silent,
+) -> Design:
+    """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
+
+    Args:
+        experiment: the pack, the drive, and the signals whose J are the targets.
+        iterations: simulations of all waveforms, each but the last followed by a correction.
+        n: bumps of a designed waveform.
+        width: of the bumps.
+        gain: wanted common gain; default half of the untouched waveforms' own, so that the bound |I| <= 1 leaves room.
+        damping: of a correction; see `correction`.
+        batch: signals that run together; default all of them.
+        keep: asked for every part of every simulation, so that a design can be resumed (see `gmem_jax.files.parts`).
+        progress: told about every chunk.
+
+    Raises:
+        RunFailedError: if a simulation broke down.
+    """
+    if jnp.ndim(experiment.scale):
+        raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
+    total, done = cost(experiment, iterations, n), 0.0
+
+    def next_part(name: str, runs: float) -> tuple[Keep, Progress]:
+        nonlocal done
+        begun, done = done / total, done + runs
+        inner = within(progress, begun, done / total)
+
+        def own(part: str, play: Callable[..., object]) -> object:
+            return keep(f"{name}-{part}", play)
+
+        return own, lambda stage, moment, fraction: inner(f"{name}, {stage}", moment, fraction)
+
+    def recall(name: str, changed: Experiment) -> np.ndarray:
+        own, told = next_part(name, 1.0)
+        return np.asarray(run(changed, batch=batch, keep=own, progress=told).p_sig)
+
+    target = np.asarray(experiment.integral())
+    untouched = recall("untouched", experiment)
+    own, told = next_part("kernel", 2.0 * n / len(target))
+    kernel = memory_kernel(experiment, n, width, keep=own, progress=told)
+    original = experiment.compare(jnp.asarray(untouched))
+    gain = 0.5 * float(original.gain) if gain is None else gain
+    wanted = gain * float(experiment.scale) * target
+    # Where a unit of J is recalled with the kernel's gain, this much of each waveform is needed.
+    amplitudes = nearest(kernel.basis, experiment.signals) * gain / kernel.gain()
+    for _ in range(PREDICTED):
+        missed = wanted - kernel.recalled(amplitudes)
+        amplitudes = bounded(amplitudes + correction(kernel, amplitudes, missed, damping), width)
+    best, p_sig, step = amplitudes, np.full_like(wanted, np.inf), np.ones(len(target))
+    history = [float(original.fidelity)]
+    for iteration in range(iterations):
+        found = recall(f"iteration-{iteration}", replace(experiment, signals=bumps(amplitudes, width)))
+        better = np.linalg.norm(found - wanted, axis=1) < np.linalg.norm(p_sig - wanted, axis=1)
+        best, p_sig = (np.where(better[:, None], *pair) for pair in ((amplitudes, best), (found, p_sig)))
+        step = np.where(better, step, 0.5 * step)
+        history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
+        change = correction(kernel, best, wanted - p_sig, damping)
+        amplitudes = bounded(best + step[:, None] * change, width)
+    signals = sampled(bumps(best, width))
+    fresh = recall("verified", replace(experiment, signals=signals))
+    match = experiment.compare(jnp.asarray(fresh))
+    return Design(
+        signals=signals,
+        target=target,
+        p_sig=fresh,
+        fidelity=float(match.fidelity),
+        gain=float(match.gain),
+        untouched=untouched,
+        before=float(original.fidelity),
+        history=tuple(history),
+    )
