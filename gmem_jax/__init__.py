@@ -39,15 +39,17 @@ if TYPE_CHECKING:
     from gmem_jax.design.drive import TunedDrive, design_drive
     from gmem_jax.design.waveforms import Design, design_waveforms
     from gmem_jax.reading import classify
+    from gmem_jax.show.progress import ProgressBar
     from gmem_jax.sweeps.sweep import sweep
 
-_LATER = {  # what loads flax or optax, by where it is
+_LATER = {  # what loads flax or optax, or stands above what does, by where it is
     "Design": "gmem_jax.design.waveforms",
     "design_by_kernel": "gmem_jax.design.by_kernel",
     "design_waveforms": "gmem_jax.design.waveforms",
     "TunedDrive": "gmem_jax.design.drive",
     "design_drive": "gmem_jax.design.drive",
     "classify": "gmem_jax.reading.classify",
+    "ProgressBar": "gmem_jax.show.progress",
     "sweep": "gmem_jax.sweeps.sweep",
 }
 
@@ -72,6 +74,7 @@ __all__ = [
     "Mindlin",
     "MindlinRescaled",
     "Pack",
+    "ProgressBar",
     "Recall",
     "Recipe",
     "RunFailedError",

@@ -13,7 +13,7 @@ from gmem_jax.command.console import RunInterruptedError, say
 from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.files.programs import keep_programs
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None, help="Waveform memory in granular packs.")
+app = typer.Typer(rich_markup_mode=None, help="Waveform memory in granular packs.")
 for group in (packs, recalls, show, classify, derive, sweep, reproduce, benchmark):
     for name, command in group.COMMANDS.items():
         app.command(name)(command)

@@ -13,6 +13,7 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.drive import Drive
+from gmem_jax.experiment.html import brief, facts
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocol import Stage, memory_protocol, split
 from gmem_jax.experiment.signals import BINS, Signals, bin_average
@@ -255,6 +256,21 @@ class Experiment:
     def compare(self, p_sig: jax.Array) -> analysis.Match:
         """Gain and fidelity of recalled signals [S, 256]."""
         return analysis.compare(p_sig, self.integral(), self.scale)
+
+    def _repr_html_(self) -> str:
+        pack, dt = self.pack, self.timing.dt
+        rows = {
+            "pack": f"{pack.name}, {pack.grains} grains",
+            "signals": f"{self.signals.count}, {type(self.signals).__name__.lower()}",
+            "friction": f"{type(self.friction).__name__}, mu = {brief(getattr(self.friction, 'mu', 0.0))}",
+            "gamma0": self.gamma0,
+            "delta0": self.compression,
+            "t0 (t_c)": self.t0,
+            "dt (t_c)": dt,
+            "steps": self.steps_per_bin * sum(stage.bins for stage in self.stages),
+            **{name: getattr(self, name) for name in ("background", "backend", "precision")},
+        }
+        return facts("Experiment", rows)
 
 
 _OPEN = 1e-9  # of a waveform where it should vanish

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax import native
+from gmem_jax.experiment.html import brief, facts
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree
@@ -69,6 +70,18 @@ class Pack:
         """`record` as a dictionary."""
         info: dict[str, Any] = json.loads(self.record)
         return info
+
+    def _repr_html_(self) -> str:
+        rest = self.info.get("at_rest", {})
+        measured = {"filling phi": "filling", "coordination Z": "coordination", "pressure (E)": "pressure"}
+        rows = {
+            "grains": f"{self.grains} {self.clump.shape}",
+            "box (R)": brief(self.upper - self.lower),
+            "delta0": self.delta0,
+            "T1 (t_c)": self.ringing_period,
+            **{label: rest[name] for label, name in measured.items() if name in rest},
+        }
+        return facts(f"Pack {self.name}", rows)
 
 
 def smallest_box(lower: np.ndarray, upper: np.ndarray, delta0: float) -> np.ndarray:

@@ -1,6 +1,7 @@
 """What a pack gives back: an experiment run, its background subtracted, compared with the integrals (Secs. II, III)."""
 
 import dataclasses
+import importlib
 import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment import analysis
+from gmem_jax.experiment import analysis, html
 from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.doubts import doubts
 from gmem_jax.experiment.experiment import Experiment, replace
@@ -37,7 +38,7 @@ from gmem_jax.experiment.signals import BINS, part
 from gmem_jax.experiment.walk import walk
 from gmem_jax.physics.pytree import Scalar, pytree, traced
 from gmem_jax.physics.sample import Sample
-from gmem_jax.physics.state import DOUBTFUL, Status
+from gmem_jax.physics.state import DOUBTFUL, Status, explain
 
 REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than this part of the walls' speed
 COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
@@ -83,6 +84,27 @@ class Recall:
     stages: OrderedDict[str, Sample]
     dt: Scalar
     frames: Frames | None = None
+
+    def plot(self, what: str = "signals", experiment: Experiment | None = None, *, against: str = "time") -> Any:
+        """A picture of it, which a notebook shows: `.save(path)` writes it, `.figure` is matplotlib's.
+
+        Args:
+            what: "signals", "waveforms", "all"; or a quantity of the stages, like "pressure", "Z" or "phi".
+            experiment: that it is of, for the names of signals and the conditions in the title.
+            against: "time" or "u", for the stages.
+
+        Raises:
+            ValueError: if there is no such picture; it names those that there are.
+        """
+        from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
+        return from_above.plot(self, what, experiment, against)
+
+    def _repr_html_(self) -> str:
+        measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}
+        rows = {**measures, "F over T1": self.windowed_fidelity, "T1 (t_c)": self.window}
+        if not traced(self.status):
+            rows["status"] = explain(int(np.bitwise_or.reduce(np.asarray(self.status), axis=None)))
+        return html.facts(f"Recall of {self.J.shape[-2]} signals", rows)
 
 
 def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:

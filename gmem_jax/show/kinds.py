@@ -1,7 +1,7 @@
 """What any file that a command writes holds: facts, lines for a person, and the pictures that can be drawn of it."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,8 @@ from gmem_jax.files.results import load_result
 from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL
 from gmem_jax.files.waveforms import load_design, load_target, load_waveforms
 from gmem_jax.physics.material import Material
-from gmem_jax.show import figures, pictures, recalls, tables
+from gmem_jax.show import figures, pictures, tables
+from gmem_jax.show.recalls import PICTURES, recall_drawing
 from gmem_jax.show.stages import QUANTITIES, stages_drawing
 from gmem_jax.sweeps import table
 from gmem_jax.sweeps.store import Store
@@ -75,38 +76,30 @@ def shown(file: Path, against: str = "time") -> Shown:
     raise FileFormatError(f"{file}: schema is {kind[:40]!r}, expected one of {known}")
 
 
-def _of_stages(stages: Mapping[str, Any], title: str, against: str, t0: Any) -> dict[str, Draw]:
-    known = t0 if is_number(t0) else None
-
-    def draw(what: str, path: Path) -> None:
-        stages_drawing(stages, what, title, against=against, t0=known).save(path)
-
-    return {what: functools.partial(draw, what) for what in QUANTITIES} if stages else {}
-
-
 def _recall(file: Path, against: str) -> Shown:
     stored = load_recall(file)
     recall, configuration = stored
     row = tables.summary(recall, configuration)
-    title = f"{configuration['pack']}: {tables.conditions(configuration)}"
-    of_recall: dict[str, Draw] = {
-        "signals": lambda path: recalls.signals_drawing(
-            recall, stored.names, title, tables.relative_scale(configuration)
-        ).save(path),
-        "waveforms": lambda path: recalls.waveforms_drawing(recall, stored.names, title).save(path),
-        "all": lambda path: recalls.image_drawing(recall, stored.names, title).save(path),
-        **_of_stages(recall.stages, title, against, configuration["t0"]),
-    }
+
+    def draw(what: str, path: Path) -> None:
+        recall_drawing(recall, what, configuration, against=against).save(path)
+
+    drawn: dict[str, Draw] = {what: functools.partial(draw, what) for what in PICTURES}
     facts = {**row, "configuration": configuration}
-    return Shown(facts, tables.recall_lines(row, configuration), of_recall, stored.to_csv)
+    return Shown(facts, tables.recall_lines(row, configuration), drawn, stored.to_csv)
 
 
 def _pack(file: Path, against: str) -> Shown:
     pack = load_pack(file)
     facts = {"pack": pack.name, "grains": pack.grains, "ringing_period": float(pack.ringing_period), **pack.info}
+    stages, t0 = load_stages(file), pack.info.get("recipe", {}).get("t0")
+
+    def draw(what: str, path: Path) -> None:
+        known = t0 if is_number(t0) else None
+        stages_drawing(stages, what, f"{pack.name}: preparation", against=against, t0=known).save(path)
+
     drawn: dict[str, Draw] = {"grains": lambda path: pictures.grains_drawing(pack).save(path)}
-    t0 = pack.info.get("recipe", {}).get("t0")
-    drawn |= _of_stages(load_stages(file), f"{pack.name}: preparation", against, t0)
+    drawn |= {what: functools.partial(draw, what) for what in QUANTITIES if stages}
     return Shown(facts, [tables.pack_table(pack)], drawn)
 
 

@@ -1,17 +1,66 @@
 """Pictures of recalled signals."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.files.checked import is_number
+from gmem_jax.files.configuration import resolved
+from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.show.drawing import Drawing, blank
+from gmem_jax.show.stages import AGAINST, QUANTITIES, stages_drawing
+from gmem_jax.show.tables import conditions, relative_scale
 
 MOST = 64  # panels of one picture
+
+
+PICTURES = ("signals", "waveforms", "all", *QUANTITIES)
+"""What can be drawn of a recall."""
+
+
+def recall_drawing(
+    recall: Recall, what: str = "signals", configuration: Mapping[str, Any] | None = None, *, against: str = "time"
+) -> Drawing:
+    """A picture of a recall.
+
+    Args:
+        recall: the recall.
+        what: one of `PICTURES`: "signals", recalled; "waveforms", stored; "all", an image of all; or a quantity of the
+            stages: "pressure", "p_x", "p_y", "p_z", "p_xy", "Z", "contacts", "phi", "energy", "speed", "overlap",
+            "inertial".
+        configuration: the resolved one, for names, conditions and t0.
+        against: "time" or "u", for the stages.
+
+    Raises:
+        ValueError: if there is no such picture.
+    """
+    known = dict(configuration or {})
+    names = signal_names(recall, known)
+    title = f"{known['pack']}: {conditions(known)}" if known else "recall"
+    found = {name.lower(): name for name in PICTURES}.get(what.lower())
+    if found is None or against not in AGAINST:
+        raise ValueError(
+            f"{what!r} against {against!r}: pictures of a recall are {', '.join(PICTURES)}, against time or u"
+        )
+    if found == "signals":
+        return signals_drawing(recall, names, title, relative_scale(known) if known else None)
+    if found == "waveforms":
+        return waveforms_drawing(recall, names, title)
+    if found == "all":
+        return image_drawing(recall, names, title)
+    t0 = known.get("t0")
+    return stages_drawing(recall.stages, found, title, against=against, t0=t0 if is_number(t0) else None)
+
+
+def plot(recall: Recall, what: str, experiment: Experiment | None, against: str) -> Drawing:
+    """What `Recall.plot` calls."""
+    return recall_drawing(recall, what, None if experiment is None else resolved(experiment, 0.0), against=against)
 
 
 def signals_drawing(recall: Recall, names: Sequence[str], title: str, scale: Scalar | None = None) -> Drawing:

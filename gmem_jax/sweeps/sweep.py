@@ -13,12 +13,14 @@ import psutil
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.host import Progress, silent, within
+from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
 from gmem_jax.files.provenance import sources
+from gmem_jax.physics.state import explain
 from gmem_jax.preparation.preparation import Recipe, grain_steps
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.plan import ABREAST, Point, digest, groups, plan, point
@@ -40,13 +42,29 @@ class Result(NamedTuple):
     recall: Recall
 
 
+class Results(list[Result]):
+    """The points of a sweep, in order; a notebook shows them as a table."""
+
+    def _repr_html_(self) -> str:
+        names = list(self[0].values) if self else []
+        rows = [
+            [*(_label(one.values[name]) for name in names), one.recall.gain, one.recall.fidelity, _said(one.recall)]
+            for one in self
+        ]
+        return listing(f"Sweep of {len(self)} points", [*names, "G", "F", "status"], rows)
+
+
+def _said(recall: Recall) -> str:
+    return explain(int(np.bitwise_or.reduce(np.asarray(recall.status))))
+
+
 def sweep(
     experiment: Experiment,
     vary: Mapping[str, Sequence[Any]],
     folder: Path | str | None = None,
     *,
     progress: Progress = silent,
-) -> list[Result]:
+) -> Results:
     """Run every combination of some values, in this process; what may run side by side does.
 
     Args:
@@ -82,7 +100,7 @@ def sweep(
         keep = Parts(store.folder / "parts" / digest(keys), {"keys": keys}) if store else None
         found |= run_group(keys, experiments, store=store, keep=keep, progress=on)
         done += share
-    return [Result(one.values, found[one.key]) for one in points]
+    return Results(Result(one.values, found[one.key]) for one in points)
 
 
 def _labels(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,42 @@
+"""Short tables that a notebook shows in the place of an object."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from gmem_jax.physics.pytree import traced
+
+MOST = 20  # rows of a long table
+
+
+def brief(value: Any) -> str:
+    """A value in a few letters: a number, the range of several, words."""
+    if traced(value):
+        return "traced"
+    if isinstance(value, str | bool | None):
+        return str(value)
+    numbers = np.asarray(value)
+    if numbers.dtype.kind not in "fiu" or numbers.size == 0:
+        return str(value)
+    low, high = numbers.min(), numbers.max()
+    return f"{low:.4g}" if numbers.ndim == 0 or low == high else f"{low:.4g} to {high:.4g}"
+
+
+def facts(title: str, rows: Mapping[str, Any]) -> str:
+    """A table of names and values."""
+    return _table(title, [[name, brief(value)] for name, value in rows.items()])
+
+
+def listing(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A table with a line for each row, of which the first 20 are shown."""
+    more = [[f"... {len(rows) - MOST} more"]] if len(rows) > MOST else []
+    shown = [[brief(value) for value in row] for row in rows[:MOST]]
+    return _table(title, [*shown, *more], columns)
+
+
+def _table(title: str, rows: Sequence[Sequence[str]], columns: Sequence[str] = ()) -> str:
+    head = "".join(f"<th>{escape(name)}</th>" for name in columns)
+    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+    return f"<table><caption>{escape(title)}</caption>{f'<tr>{head}</tr>' if head else ''}{body}</table>"

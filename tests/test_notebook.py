@@ -1,0 +1,111 @@
+"""What a notebook shows: short tables in the place of objects, pictures, progress."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax.experiment.html import listing
+from gmem_jax.show import recalls
+from gmem_jax.sweeps.sweep import Result, Results
+
+PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+
+
+@pytest.fixture(scope="module")
+def recalled() -> tuple[gm.Experiment, gm.Recall]:
+    experiment = gm.Experiment(gm.load_pack(PACK), gm.words(1), t0=75.0, store=0.1, rest=0.1, hold=0.1)
+    return experiment, gm.run(experiment)
+
+
+def test_objects_are_shown_as_short_tables(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
+    experiment, recall = recalled
+    for shown, words in (
+        (experiment.pack, ("27 tetra(0.6)", "T1 (t_c)", "coordination Z")),
+        (experiment, ("2, bumps", "Hooke, mu = 1", "<td>75</td>")),
+        (recall, ("Recall of 2 signals", f"<td>{float(recall.gain):.4g}</td>", "F over T1")),
+        (
+            Results([Result({"friction.mu": 0.5}, recall)]),
+            ("Sweep of 1 points", "<th>friction.mu</th>", "<td>0.5</td>"),
+        ),
+    ):
+        table = shown._repr_html_()
+        assert table.startswith("<table>")
+        assert table.count("<tr>") < 15
+        assert all(word in table for word in words), table
+
+
+def test_objects_are_shown_inside_transformations_too(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
+    said: list[str] = []
+
+    def show(recall: gm.Recall) -> jax.Array:
+        said.append(recall._repr_html_())
+        return recall.gain
+
+    jax.eval_shape(show, recalled[1])
+    assert "traced" in said[0]
+
+
+def test_a_long_table_says_how_much_is_left_out_and_names_cannot_break_it() -> None:
+    table = listing("many", ["<b>"], [[f"row {number}"] for number in range(25)])
+    assert "... 5 more" in table
+    assert "row 19" in table
+    assert "row 20" not in table
+    assert "<b>" not in table
+
+
+def test_a_recall_draws_itself(recalled: tuple[gm.Experiment, gm.Recall], tmp_path: Path) -> None:
+    experiment, recall = recalled
+    drawn = recall.plot("signals", experiment)
+    assert drawn._repr_png_().startswith(b"\x89PNG")
+    title = drawn.figure._suptitle.get_text()
+    assert all(word in title for word in ("mu = 1", "gamma0 = 0.001", "t0 = 75 t_c", "all 2 words"))
+    stress, wave = drawn.figure.axes[0], drawn.figure.axes[2]
+    assert (stress.get_title(), wave.get_ylabel(), stress.get_ylabel()) == ("0", "", "stress (Pa)")
+    np.testing.assert_allclose(stress.lines[1].get_ydata() * 1e-10, 0.0, atol=1e-3)
+    (axis,) = recall.plot("z", experiment).figure.axes
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("time ($t_c$)", "coordination Z")
+    total = sum(len(line.get_xdata()) for line in axis.lines if len(line.get_xdata()) > 2)
+    assert total == sum(stage.bins for stage in experiment.stages)
+    (axis,) = recall.plot("p_x", against="u").figure.axes
+    assert axis.get_xlabel() == "compression variable u"
+    assert [label.get_text() for label in axis.figure.legends[0].get_texts()][-1].startswith("readout")
+    with pytest.raises(ValueError, match="pictures of a recall are signals, waveforms"):
+        recall.plot("colour")
+
+
+def test_the_scaled_integral_without_an_experiment_is_that_with_it(
+    recalled: tuple[gm.Experiment, gm.Recall],
+) -> None:
+    experiment, recall = recalled
+    one, other = (
+        recalls.signals_drawing(recall, ["0", "1"], "", scale).figure.axes[0].lines[2].get_ydata()
+        for scale in (None, experiment.scale)
+    )
+    np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_progress_is_shown_in_a_terminal_and_in_a_notebook(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.delitem(sys.modules, "IPython", raising=False)
+    bar = gm.ProgressBar()
+    for fraction in (0.1, 0.2, 1.0):
+        bar("encode", 7.0, fraction)
+    said = capsys.readouterr().err
+    assert "10% encode, t = 7 t_c" in said
+    assert "20%" not in said  # too soon after the first
+    assert said.endswith("100% encode, t = 7 t_c\n")
+    shown: list[Any] = []
+    handle = SimpleNamespace(update=lambda content, raw: shown.append(content))
+    shell = SimpleNamespace(get_ipython=lambda: SimpleNamespace(kernel=None))
+    monkeypatch.setitem(sys.modules, "IPython", shell)
+    monkeypatch.setitem(sys.modules, "IPython.display", SimpleNamespace(display=lambda *_, **__: handle))
+    gm.ProgressBar()("<rest>", 0.0, 0.25)
+    assert shown[0]["text/html"] == '<progress value="0.2500" max="1"></progress> 25% &lt;rest&gt;'
+    assert capsys.readouterr().err == ""
