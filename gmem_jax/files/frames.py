@@ -8,23 +8,11 @@ import h5py
 import numpy as np
 
 from gmem_jax.experiment.frames import Frames
-from gmem_jax.files.checked import Array, refusing, require, require_finite, title, whole
-from gmem_jax.files.hdf5 import Content, reading
+from gmem_jax.files.checked import refusing, require, require_finite, title, whole
+from gmem_jax.files.hdf5 import Content, reading, write_arrays
+from gmem_jax.files.schemas import FRAMES
 
 GROUP = "frames"
-_DECLARED = {  # kind, shape, unit, what it is
-    "time": (Array("real", ("F",)), "t_c", "since the beginning"),
-    "u": (Array("real", ("F",)), "1", "compression, from 0 to 1"),
-    "position": (Array("real", ("F", "N", 3)), "R", "grain centres"),
-    "quaternion": (Array("real", ("F", "N", 4)), "1", "body-to-lab rotations (w, x, y, z)"),
-    "lower": (Array("real", ("F", 3)), "R", "lower planes of the box"),
-    "upper": (Array("real", ("F", 3)), "R", "upper planes of the box"),
-    "start": (Array("whole", ("starts",)), "1", "contacts of frame f are rows start[f] to start[f + 1]"),
-    "spheres": (Array("whole", ("M", 2)), "1", "the two spheres i < j that touch; sphere k of grain n is n K + k"),
-    "normal_force": (Array("real", ("M",)), "E R^2", "by which they repel each other"),
-    "friction_force": (Array("real", ("M", 3)), "E R^2", "tangential force on sphere i, the opposite of that on j"),
-    "offsets": (Array("real", ("K", 3)), "R", "sphere centres of a grain in its own frame"),
-}
 
 
 def write_frames(file: h5py.File, frames: Frames) -> None:
@@ -32,9 +20,7 @@ def write_frames(file: h5py.File, frames: Frames) -> None:
     group = file.create_group(GROUP)
     group.attrs["stages"] = json.dumps(frames.stages)
     group.attrs["signal"] = frames.signal
-    for name, (_, unit, words) in _DECLARED.items():
-        array = group.create_dataset(name, data=np.asarray(getattr(frames, name)))
-        array.attrs["units"], array.attrs["description"] = unit, words
+    write_arrays(group, FRAMES, vars(frames))
 
 
 def read_frames(content: Content) -> Frames | None:
@@ -45,11 +31,11 @@ def read_frames(content: Content) -> Frames | None:
     """
     if GROUP not in content.attributes:
         return None
-    found = content.arrays({f"{GROUP}/{name}": array for name, (array, *_) in _DECLARED.items()})
+    found = content.arrays({f"{GROUP}/{name}": array for name, array in FRAMES.items()})
     stages, signal = json.loads(content.text("stages", GROUP)), content.attributes[GROUP].get("signal")
     require(isinstance(stages, list) and all(map(title, stages)), "the stages of its frames are no names")
     require(isinstance(signal, np.integer) and whole(int(signal)), "the signal of its frames is no number")
-    own = {name: found[f"{GROUP}/{name}"] for name in _DECLARED}
+    own = {name: found[f"{GROUP}/{name}"] for name in FRAMES}
     frames = Frames(**own, stages=tuple(stages), signal=int(signal))  # type: ignore[arg-type]
     _check(frames)
     return frames

@@ -18,6 +18,9 @@ DIMENSIONS = {  # names of lengths, and what the scales of those say that no arr
     "replica": "0 is the zero signal, k the k-th signal",
     "common": "the one run that all replicas have in common",
     "time": "end of the bin",
+    "frame": "number of the configuration",
+    "boundary": "number of the configuration, and one more",
+    "contact": "number of the contact, of all configurations",
     "bump": "number of the basis waveform",
 }
 
@@ -60,6 +63,20 @@ STAGE = {  # of a recall or a preparation, in stages/NAME; `common` is the last 
     "filling": Array("real", ("time", "replica"), "1", "phi, volume of the grains over that of the box"),
     "largest_overlap": Array("real", ("time", "replica"), "R", "deepest contact at the end of the bin"),
     "inertial_number": Array("real", ("time", "replica"), "1", "I of the compression; 0 without pressure"),
+}
+
+FRAMES = {  # configurations along the run that made a recall or a pack, in frames
+    "time": Array("real", ("frame",), "t_c", "since the beginning"),
+    "u": Array("real", ("frame",), "1", "compression variable"),
+    "position": Array("real", ("frame", "grain", "axis"), "R", "centres of the grains"),
+    "quaternion": Array("real", ("frame", "grain", "component"), "1", "orientations of the grains"),
+    "lower": Array("real", ("frame", "axis"), "R", "lower planes of the box"),
+    "upper": Array("real", ("frame", "axis"), "R", "upper planes of the box"),
+    "start": Array("whole", ("boundary",), "1", "contacts of frame f are rows start[f] to start[f + 1]"),
+    "spheres": Array("whole", ("contact", "side"), "1", "spheres i < j that touch; sphere k of grain n is n K + k"),
+    "normal_force": Array("real", ("contact",), "E R^2", "by which they repel each other"),
+    "friction_force": Array("real", ("contact", "axis"), "E R^2", "tangential force on i, the opposite of that on j"),
+    "offsets": Array("real", ("part", "axis"), "R", "centres of the spheres of a grain, in its own frame"),
 }
 
 PACK = Schema(
@@ -272,6 +289,8 @@ def _section(schema: Schema) -> str:
     if schema is RECALL or schema is PACK:
         lines += ["", "In `stages/NAME`, in the order of the attribute `order` (in packs where they were kept):", ""]
         lines += _table(STAGE)
+        lines += ["", "In `frames`, where they were asked for (`--frames`), whose attribute `stages` names theirs:", ""]
+        lines += _table(FRAMES)
     if schema.texts:
         lines += ["", "Attributes: " + "; ".join(f"`{name}`, {words}" for name, words in schema.texts.items()) + "."]
     if schema.before:
