@@ -79,11 +79,13 @@ import sys
 import gmem_jax
 from jax._src import xla_bridge
 heavy = [name for name in ("flax", "optax", "matplotlib", "rich", "jax_md") if name in sys.modules]
+import gmem_jax.command.app
+heavy += [name for name in ("scipy", "matplotlib", "jax_md") if name in sys.modules]
 print(xla_bridge.backends_are_initialized(), *heavy)
 """
 
 
-def test_importing_the_package_starts_no_backend_and_loads_nothing_heavy() -> None:
+def test_importing_the_package_or_its_command_starts_no_backend_and_loads_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", LOADING], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
 

@@ -113,7 +113,7 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
     needs = f"some {max(1, round(seconds / unit))} {name} on a free machine and {_bytes(memory)} of memory"
     if memory > free:
         raise InputError(f"{what} needs {needs}, and {_bytes(free)} are free")
-    say(f"{what}: {needs}")
+    say(f"{what}: {needs}{', in plain JAX' if backend == 'jax' else ''}")
 
 
 def _bytes(count: float) -> str:
