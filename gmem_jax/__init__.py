@@ -40,9 +40,10 @@ if TYPE_CHECKING:
     from gmem_jax.design.waveforms import Design, design_waveforms
     from gmem_jax.reading import classify
     from gmem_jax.show.progress import ProgressBar
+    from gmem_jax.show.view import view
     from gmem_jax.sweeps.sweep import sweep
 
-_LATER = {  # what loads flax or optax, or stands above what does, by where it is
+_LATER = {  # what loads flax or optax, or is seldom asked for, or stands above what does, by where it is
     "Design": "gmem_jax.design.waveforms",
     "design_by_kernel": "gmem_jax.design.by_kernel",
     "design_waveforms": "gmem_jax.design.waveforms",
@@ -51,6 +52,7 @@ _LATER = {  # what loads flax or optax, or stands above what does, by where it i
     "classify": "gmem_jax.reading.classify",
     "ProgressBar": "gmem_jax.show.progress",
     "sweep": "gmem_jax.sweeps.sweep",
+    "view": "gmem_jax.show.view",
 }
 
 
@@ -113,6 +115,7 @@ __all__ = [
     "sweep",
     "tetra",
     "value_and_grad",
+    "view",
     "waveform",
     "words",
     "written",

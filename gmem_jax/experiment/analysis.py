@@ -69,6 +69,29 @@ def compare(signal: jax.Array, integral: jax.Array, scale: Scalar) -> Match:
     return Match(gain, 1.0 - jnp.sqrt(miss / jnp.sum(signal * signal)))
 
 
+def errors_over_signals(signal: np.ndarray, integral: np.ndarray, scale: np.ndarray | float) -> tuple[float, float]:
+    """Standard errors of gain and fidelity from their spread over the S signals of a set (jackknife); NaN for one.
+
+    They say how much depends on which signals were stored in this pack, and nothing of other packs. Words are sums of
+    few bits, so that their errors are not independent.
+
+    Args:
+        signal: p_sig, [S, bins], in E.
+        integral: J, [S, bins].
+        scale: delta0 gamma0; scalar or [S, 1].
+    """
+    count, template = len(signal), scale * integral
+    if count < 2:
+        return math.nan, math.nan
+    overlap, power, own = (
+        np.sum(product) - np.sum(product, axis=1)
+        for product in (template * signal, template * template, signal * signal)
+    )
+    without = np.stack([overlap / power, 1.0 - np.sqrt(np.maximum(0.0, 1.0 - overlap**2 / (power * own)))])
+    gain, fidelity = np.sqrt((count - 1) * np.var(without, axis=1))
+    return float(gain), float(fidelity)
+
+
 def backgrounds(first: jax.Array, second: jax.Array, integral: jax.Array, scale: Scalar) -> dict[str, Match]:
     """Gain and fidelity of the set by each of `BACKGROUNDS`, from a run with a second readout.
 

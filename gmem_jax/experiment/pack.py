@@ -1,5 +1,6 @@
 """A prepared pack: what the memory experiment starts from."""
 
+import importlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -82,6 +83,10 @@ class Pack:
             **{label: rest[name] for label, name in measured.items() if name in rest},
         }
         return facts(f"Pack {self.name}", rows)
+
+    def view(self) -> Any:
+        """The pack in 3D, for notebooks; see `gmem_jax.show.view`, a floor above and not loaded before it is asked for."""
+        return importlib.import_module("gmem_jax.show.view").view(self)
 
 
 def smallest_box(lower: np.ndarray, upper: np.ndarray, delta0: float) -> np.ndarray:

@@ -1,0 +1,333 @@
+"""One page of everything that some files hold, which needs nothing else to be read: `gmem report`."""
+
+import html
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from gmem_jax.experiment import analysis
+from gmem_jax.experiment.frames import Frames
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.signals import BINS, Signals, bin_average, waveform
+from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.checked import json_of, refusing
+from gmem_jax.files.configuration import names_of, pack_fingerprint, signals_from
+from gmem_jax.files.frames import load_frames
+from gmem_jax.files.hdf5 import schema_of
+from gmem_jax.files.packs import list_packs, load_pack
+from gmem_jax.files.recalls import load_recall
+from gmem_jax.files.waveforms import load_target, load_waveforms
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.state import Status, explain
+from gmem_jax.reading.readers import confusion
+from gmem_jax.show import plots, tables, view
+from gmem_jax.show.scene import at_rest
+from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.table import rows as points_of
+
+LARGEST_CONFUSION = 256  # words
+_CELL = 300  # characters of a value in a configuration
+_ALIKE = ("signals", "friction", "mu", "delta0", "gamma0", "t0", "background", "grains")
+_NUMBER = re.compile(r"[-+]?\d[\d.,e±\s+-]*|nan|")
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> str:
+    """A table as HTML; columns of numbers stand to the right."""
+    cells = [[html.escape("" if cell is None else str(cell)) for cell in row] for row in rows]
+    right = [all(_NUMBER.fullmatch(cell) for cell in column) for column in zip(*cells, strict=True)]
+
+    def line(row: Sequence[str], tag: str) -> str:
+        kinds = (' class="number"' if number else "" for number in right)
+        each = (f"<{tag}{kind}>{cell}</{tag}>" for cell, kind in zip(row, kinds, strict=True))
+        return f"<tr>{''.join(each)}</tr>"
+
+    top = [line([html.escape(name) for name in head], "th")] if any(head) else []
+    body = "\n".join([*top, *(line(row, "td") for row in cells)])
+    said = f"<caption>{html.escape(caption)}</caption>" if caption else ""
+    return f'<div class="scroll"><table>{said}{body}</table></div>'
+
+
+def of_rich(drawn: Table) -> str:
+    """A table of the terminal as HTML."""
+    head = [str(column.header) for column in drawn.columns] if drawn.show_header else [""] * len(drawn.columns)
+    rows = list(zip(*(map(str, column.cells) for column in drawn.columns), strict=True))
+    title = f"<h3>{html.escape(str(drawn.title))}</h3>" if drawn.title else ""
+    return title + table(head, rows, str(drawn.caption or ""))
+
+
+def _configuration(values: Mapping[str, Any]) -> str:
+    """Every parameter, folded away; long lists are cut."""
+
+    def flat(part: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+        for name, value in part.items():
+            if isinstance(value, dict) and value:
+                yield from flat(value, f"{above}{name}.")
+            else:
+                text = value if isinstance(value, str) else json.dumps(value)
+                yield above + name, text if len(text) <= _CELL else f"{text[:_CELL]} ..."
+
+    rows = list(flat(values))
+    if not rows:
+        return ""
+    return f"<details><summary>configuration, {len(rows)} values</summary>{table(['', ''], rows)}</details>"
+
+
+def _note(words: str) -> str:
+    return f'<p class="note">{html.escape(words)}</p>'
+
+
+def _state(status: int) -> str:
+    kind = "" if not status else " fatal" if Status(status).fatal else " doubtful"
+    return f'<p><span class="status{kind}">{html.escape(explain(status))}</span></p>'
+
+
+class Report:
+    """A page in the making: sections of files, one after the other.
+
+    Attributes:
+        sections: title and HTML of each.
+    """
+
+    def __init__(self) -> None:
+        self.sections: list[tuple[str, str]] = []
+        self._recalls: list[tuple[dict[str, Any], dict[str, Any]]] = []
+        self._seen: set[str] = set()  # packs that are shown at rest
+        self._figures = self._views = 0
+
+    def add(self, source: str) -> None:
+        """Add what a file, the folder of a sweep or a shipped pack holds.
+
+        Raises:
+            FileNotFoundError: if there is none.
+            FileFormatError: if it is damaged, or of a kind that no report shows.
+        """
+        path = Path(source)
+        if path.is_dir():
+            self._sweep(path)
+        elif path.suffix.lower() == ".json":
+            with refusing(path, "result"):
+                self._json(path, json_of(path.read_text(), "content"))
+        elif path.suffix.lower() in (".csv", ".npy"):
+            self._waveforms(path)
+        elif source in list_packs():
+            self._pack(source)
+        else:
+            kinds = {"gmem-pack": self._pack, "gmem-recall": self._recall}
+            schema = schema_of(path)
+            if (kind := schema.partition("/")[0]) not in kinds:
+                raise FileFormatError(f"{source}: schema is {schema[:40]!r}, expected one of {', '.join(kinds)}")
+            kinds[kind](source)
+
+    def page(self, title: str) -> str:
+        """The whole page."""
+        parts = [*self._overview(), *self.sections]
+        links = "".join(f'<a href="#part-{number}">{html.escape(name)}</a>' for number, (name, _) in enumerate(parts))
+        made = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+        top = f"<header><h1>{html.escape(title)}</h1>{_note(f'gmem report, {made}')}<nav>{links}</nav></header>"
+        body = "\n".join(
+            f'<section id="part-{number}"><h2>{html.escape(name)}</h2>\n{content}</section>'
+            for number, (name, content) in enumerate(parts)
+        )
+        library = f"<script>{plots.script()}</script>\n" if self._figures else ""
+        return view.page(title, f"{library}{top}\n{body}", three=self._views > 0)
+
+    def _overview(self) -> list[tuple[str, str]]:
+        """Recalls of one experiment on several packs beside each other, with means and standard deviations."""
+        if len(self._recalls) < 2:
+            return []
+        alike = (
+            len({json.dumps([configuration.get(name) for name in _ALIKE]) for _, configuration in self._recalls}) == 1
+        )
+        rows, configuration = [row for row, _ in self._recalls], self._recalls[-1][1]
+        if not alike:
+            return []
+        return [("Packs", of_rich(tables.recall_table(rows, configuration)))]
+
+    def _figure(self, drawn: tuple[Any, int]) -> str:
+        self._figures += 1
+        return plots.written(drawn[0], f"figure-{self._figures}", drawn[1])
+
+    def _view(self, frames: Frames, material: Material) -> str:
+        self._views += 1
+        return view.figure(f"view-{self._views}", frames, material)
+
+    def _pack(self, source: str) -> None:
+        pack = load_pack(source)
+        made = None if source in list_packs() else load_frames(Path(source))
+        self._seen.add(pack_fingerprint(pack))
+        parts = [of_rich(tables.pack_table(pack)), self._view(at_rest(pack), Material())]
+        if made is not None:
+            parts += ["<h3>Its preparation</h3>", self._view(made, Material())]
+        parts.append(_configuration(pack.info))
+        self.sections.append((f"Pack {pack.name}", "\n".join(parts)))
+
+    def _recall(self, source: str) -> None:
+        recall, configuration = load_recall(Path(source))
+        row = tables.summary(recall, configuration)
+        self._recalls.append((row, configuration))
+        names, t0 = configuration["signals"], configuration["t0"]
+        scale = np.asarray(tables.relative_scale(configuration))
+        wanted = configuration.get("target")
+        target = None if wanted is None else np.asarray(bin_average(signals_from(wanted)))
+        about = "errors: standard errors over the signals stored in this pack (jackknife)"
+        parts = [_state(row["status"]), table(["", "G", "F"], _measures(recall, scale, t0), about)]
+        beside = tables.recall_table([row], configuration)
+        if beside.row_count > 1:  # a published point
+            parts.append(of_rich(beside))
+        if "backgrounds" in row:
+            parts += [of_rich(tables.backgrounds_table(row)), _note(tables.second_readout_lines(row))]
+        if target is not None:
+            parts.append(_note(tables.target_line(row)))
+        shown = f" (the first {plots.MOST} of {len(names)})" if len(names) > plots.MOST else ""
+        parts += [f"<h3>Recalled signals{shown}</h3>", self._figure(plots.recalls(recall, scale, names, target))]
+        times = t0 if isinstance(t0, float) else None
+        stages = f"Stages, white and grey in turn: {', '.join(recall.stages)}."
+        parts += ["<h3>Along the run</h3>", self._figure(plots.series(recall, names, times)), _note(stages)]
+        parts += ["<h3>Grains</h3>", self._grains(recall, configuration), _configuration(configuration)]
+        self.sections.append((f"Recall {Path(source).name}, pack {Path(configuration['pack']).stem}", "\n".join(parts)))
+
+    def _grains(self, recall: Recall, configuration: dict[str, Any]) -> str:
+        """The frames of a recall, or its pack at rest if it is there."""
+        written = configuration.get("experiment", {})
+        material = Material(**written.get("material", {}))
+        if recall.frames is not None:
+            return self._view(recall.frames, material)
+        without = "No frames in this file: gmem recall --frames 10 keeps some."
+        of_pack = written.get("pack", {})
+        if of_pack.get("sha256") in self._seen:
+            return _note(f"{without} Its pack at rest is shown above.")
+        try:
+            pack = load_pack(of_pack["source"])
+        except (OSError, ValueError, KeyError):
+            return _note(without)
+        if pack_fingerprint(pack) != of_pack["sha256"]:
+            return _note(without)
+        self._seen.add(of_pack["sha256"])
+        return _note(f"{without} This is its pack at rest, before the run.") + self._view(at_rest(pack), material)
+
+    def _json(self, path: Path, found: dict[str, Any]) -> None:
+        if "readers" in found:
+            title, parts = f"Reading of {Path(found['recall']).name}", self._reading(found)
+        elif "gradient" in found:
+            title, parts = f"Gradient {path.name}", self._gradient(found)
+        elif "history" in found:
+            title, parts = f"Tuned drive {path.name}", self._tuned(found)
+        else:
+            raise FileFormatError(f"{path}: not a result of gmem classify, gradient or tune")
+        self.sections.append((title, "\n".join([*parts, _configuration(found.get("configuration", {}))])))
+
+    def _reading(self, found: dict[str, Any]) -> list[str]:
+        parts = [of_rich(each) for each in tables.reading_tables(found)]
+        if found["words"] <= LARGEST_CONFUSION:
+            names = [f"{word:0{found['bits']}b}" for word in range(found["words"])]
+            counts = {name: confusion(row["read"], found["words"]) for name, row in found["readers"].items()}
+            parts.append(self._figure(plots.confusion(counts, names)))
+        return parts
+
+    def _gradient(self, found: dict[str, Any]) -> list[str]:
+        slopes = found["gradient"]
+        rows = [("F", f"{found['fidelity']:.4f}")]
+        rows += [(f"dF/d{name}", f"{slope:.5g}") for name, slope in slopes.items() if name != "waveform"]
+        lines = zip(found["places"], slopes["waveform"], strict=True)
+        curves = {f"signal {n}": (np.asarray(place), np.asarray(slope)) for n, (place, slope) in enumerate(lines, 1)}
+        drawn = plots.curves(curves, "compression variable u", "dF / d amplitude", mode="lines+markers")
+        return [table(["", ""], rows), self._figure(drawn)]
+
+    def _tuned(self, found: dict[str, Any]) -> list[str]:
+        names = list(found["values"])
+        head = ["iteration", *names, "mean F"]
+        rows = [
+            [number, *(f"{one[name]:.4g}" for name in names), f"{one['fidelity']:.4f}"]
+            for number, one in enumerate(found["history"])
+        ]
+        line = np.array([1.0 - one["fidelity"] for one in found["history"]])
+        drawn = plots.curves(
+            {"packs": (np.arange(line.size), line)}, "iteration", "1 - mean F", mode="lines+markers", log=True
+        )
+        return [table(head, rows), self._figure(drawn)]
+
+    def _waveforms(self, path: Path) -> None:
+        target = load_target(path) if path.suffix.lower() == ".csv" else None
+        signals = waveform(load_waveforms(path))
+        u = np.linspace(0.0, 1.0, 257)
+
+        def lines(some: Signals, word: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+            values = np.asarray(some.shear(jnp.asarray(u))).T[: plots.MOST]
+            return {f"{name}{word}": (u, value) for name, value in zip(names_of(some), values, strict=False)}
+
+        drawn = plots.curves(lines(signals, ""), "compression variable u", "I(u)")
+        parts = [self._figure(drawn)]
+        if target is not None:
+            told = "Designed so that their recall follows the integrals of these:"
+            parts += [_note(told), self._figure(plots.curves(lines(target, ""), "compression variable u", "I(u)"))]
+        self.sections.append((f"Waveforms {path.name}", "\n".join(parts)))
+
+    def _sweep(self, folder: Path) -> None:
+        if not (folder / "sweep.json").is_file():
+            raise FileFormatError(f"{folder}: no sweep here (no sweep.json)")
+        store = Store(folder)
+        card, rows = store.card(), points_of(store)
+        names = card["names"]
+        measured = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
+        cells = [
+            [
+                *(_short(row[name]) for name in names),
+                *("" if row[name] is None else f"{row[name]:.3f}" for name in measured),
+                row["why"] or ("ok" if row["state"] == "done" else row["state"]),
+            ]
+            for row in rows
+        ]
+        parts = [table([*names, "G", "F", "G over T1", "F over T1", "status"], cells)]
+        done = [row for row in rows if row["state"] == "done"]
+        parts += [self._figure(drawn) for name in names if (drawn := _against(name, done, names))]
+        parts.append(_configuration(card["shared"]))
+        self.sections.append((f"Sweep {folder.name}", "\n".join(parts)))
+
+
+def _against(x: str, done: Sequence[Mapping[str, Any]], names: Sequence[str]) -> tuple[Any, int] | None:
+    """F and G of a sweep against a number that varies, a line for each set of the other values; None if it is none."""
+    rows = sorted((row for row in done if isinstance(row[x], int | float)), key=lambda row: row[x])
+    if len({row[x] for row in rows}) < 2:
+        return None
+    others = [name for name in names if name != x and len({row[name] for row in rows}) > 1]
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(", ".join(f"{name} = {_short(row[name])}" for name in others), []).append(row)
+    lines = {
+        f"{letter} {name}": (np.array([row[x] for row in group]), np.array([row[measure] for row in group]))
+        for name, group in groups.items()
+        for letter, measure in (("F", "fidelity"), ("G", "gain"))
+    }
+    return plots.curves(lines, x, "F, G", mode="lines+markers")
+
+
+def _short(value: Any) -> str:
+    """A value as a table shows it; of a file, its name."""
+    text = f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+    return Path(text).stem if text.endswith(".h5") else text
+
+
+def _measures(recall: Recall, scale: np.ndarray, t0: float | list[float]) -> list[list[str]]:
+    """G and F with their standard errors over signals, as they are and averaged over the ringing period."""
+    p_sig, integral = jnp.asarray(recall.p_sig), jnp.asarray(recall.J)
+    window = float(recall.window) * BINS / float(np.max(t0))
+    rows = []
+    for name, (gain, fidelity), smooth in (
+        ("as recalled", (recall.gain, recall.fidelity), lambda curve: curve),
+        (
+            f"averaged over T1 = {float(recall.window):.0f} t_c",
+            (recall.windowed_gain, recall.windowed_fidelity),
+            lambda curve: analysis.running_mean(curve, window),
+        ),
+    ):
+        errors = analysis.errors_over_signals(np.asarray(smooth(p_sig)), np.asarray(smooth(integral)), scale)
+        pairs = zip((gain, fidelity), errors, strict=True)
+        rows.append([name, *(f"{float(value):.3f} ± {error:.3f}" for value, error in pairs)])
+    return rows

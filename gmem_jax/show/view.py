@@ -1,0 +1,92 @@
+"""A pack in three dimensions, in a page of its own: `pack.view()` in a notebook, and figures of a report."""
+
+import base64
+import html
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from string import Template
+
+from gmem_jax.experiment.frames import Frames
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.files.atomic import atomic
+from gmem_jax.physics.material import Material
+from gmem_jax.show.scene import at_rest, packed
+
+HEIGHT = 730  # pixels of a view in a notebook
+
+
+def web(name: str) -> str:
+    """A file that goes into pages."""
+    return (resources.files("gmem_jax") / "show" / "web" / name).read_text(encoding="utf-8")
+
+
+def page(title: str, body: str, *, three: bool, bare: bool = False) -> str:
+    """A whole page.
+
+    Args:
+        title: plain text.
+        body: HTML.
+        three: whether there are 3D views in it.
+        bare: whether nothing stands beside a view.
+    """
+    head = ""
+    if three:
+        modules = {"three": "three.module.min.js", "orbit": "OrbitControls.js"}
+        inlined = ",".join(f'"{name}":"{_address(web(file))}"' for name, file in modules.items())
+        head = f'<script type="importmap">{{"imports":{{{inlined}}}}}</script>'
+        body += f'\n<script type="module">{web("view.js")}</script>'
+    kind = " bare" if bare else ""
+    return Template(web("page.html")).substitute(
+        title=html.escape(title), style=web("style.css"), head=head, kind=kind, body=body
+    )
+
+
+def _address(script: str) -> str:
+    """A script as an address that can be imported."""
+    return f"data:text/javascript;base64,{base64.b64encode(script.encode()).decode()}"
+
+
+def figure(name: str, frames: Frames, material: Material = Material()) -> str:
+    """The HTML of one 3D view, for a `page` with three.
+
+    Args:
+        name: of the view in the page: letters, digits and dashes.
+        frames: what to show.
+        material: of the grains, for forces in mN.
+    """
+    captions = [
+        f"{stage}, u = {u:.3f}, t = {time:,.0f} t_c"
+        for stage, u, time in zip(frames.stages, frames.u, frames.time, strict=True)
+    ]
+    return Template(web("view.html")).substitute(name=name, data=packed(frames, captions, material))
+
+
+@dataclass(frozen=True)
+class View:
+    """A page with one 3D view; a notebook shows it.
+
+    Attributes:
+        html: the page.
+    """
+
+    html: str
+
+    def _repr_html_(self) -> str:
+        frame = f'width="100%" height="{HEIGHT}" style="border:0"'
+        return f'<iframe srcdoc="{html.escape(self.html)}" {frame}></iframe>'
+
+    def save(self, path: str | Path) -> None:
+        """Write the page.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        with atomic(Path(path)) as temporary:
+            temporary.write_text(self.html, encoding="utf-8")
+
+
+def view(pack: Pack | Frames) -> View:
+    """A pack at rest, or the frames of a recall, to be turned, cut and coloured."""
+    frames, name = (at_rest(pack), pack.name) if isinstance(pack, Pack) else (pack, "frames")
+    return View(page(name, figure("pack", frames), three=True, bare=True))
