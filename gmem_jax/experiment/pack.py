@@ -85,7 +85,7 @@ class Pack:
         return facts(f"Pack {self.name}", rows)
 
     def view(self) -> Any:
-        """The pack in 3D, for notebooks; see `gmem_jax.show.view`, a floor above and not loaded before it is asked for."""
+        """The pack in 3D, for notebooks; `gmem_jax.show.view` stands floors above, and is loaded when asked for."""
         return importlib.import_module("gmem_jax.show.view").view(self)
 
 
