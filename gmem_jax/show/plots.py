@@ -11,6 +11,7 @@ from gmem_jax.experiment.protocol import compression_at
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import BINS
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.sample import Sample
 
 MOST = 12  # panels of recalled signals
 LINES = 7  # replicas of a time series: the zero signal and six others
@@ -106,15 +107,14 @@ def recalls(
     return figure, 110 + 220 * rows
 
 
-def series(recall: Recall, names: Sequence[str], t0: float | None) -> tuple[Any, int]:
-    """Pressures, coordination and filling along the run, against time or u; the figure and its height.
+def series(stages: Mapping[str, Sample], names: Sequence[str], t0: float | None) -> tuple[Any, int]:
+    """Pressures, coordination and filling along a run, against time or u; the figure and its height.
 
     Args:
-        recall: whose stages are drawn: of the zero signal and the first six others.
-        names: of the signals.
+        stages: what was recorded, of which the zero signal and the first six others are drawn.
+        names: of the signals; none for a preparation.
         t0: duration of a compression in t_c; None where it differs between replicas.
     """
-    stages = recall.stages
     bins = np.array([len(sample.filling) for sample in stages.values()])
     ends = np.cumsum(bins)
     tick, unit = (1.0 / BINS, "t<sub>0</sub>") if t0 is None else (t0 / BINS, "t<sub>c</sub>")
@@ -137,7 +137,7 @@ def series(recall: Recall, names: Sequence[str], t0: float | None) -> tuple[Any,
             along("coordination", replica),
             along("filling", replica),
         ]
-        name = names[replica - 1] if replica else "zero signal"
+        name = names[replica - 1] if replica else "zero signal" if names else "preparation"
         colour = COLOURS[(replica - 1) % len(COLOURS)] if replica else "#444"
         for panel, values in enumerate(rows):
             more = {"legendgroup": name, "showlegend": panel == 0, "line": {"width": 1.2}}
@@ -233,7 +233,7 @@ def kernel(found: MemoryKernel, noise: float) -> tuple[Any, int]:
 def curves(
     rows: Mapping[str, tuple[np.ndarray, np.ndarray]], x: str, y: str, *, mode: str = "lines", log: bool = False
 ) -> tuple[Any, int]:
-    """Several curves by name in one panel; names that end in "target" are dashed like the one before."""
+    """Several curves by name in one panel."""
     figure = _plotly("graph_objects").Figure()
     for number, (name, (places, values)) in enumerate(rows.items()):
         colour = COLOURS[number % len(COLOURS)]

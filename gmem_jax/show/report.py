@@ -12,22 +12,27 @@ import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
 
+from gmem_jax.design.stored import load_kernel
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.frames import Frames
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import BINS, Signals, bin_average, waveform
 from gmem_jax.files.atomic import FileFormatError
-from gmem_jax.files.checked import json_of, refusing
+from gmem_jax.files.checked import is_number, refusing
 from gmem_jax.files.configuration import names_of, pack_fingerprint, signals_from
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
-from gmem_jax.files.packs import list_packs, load_pack
+from gmem_jax.files.packs import list_packs, load_pack, load_stages
 from gmem_jax.files.recalls import load_recall
-from gmem_jax.files.waveforms import load_target, load_waveforms
+from gmem_jax.files.results import load_result
+from gmem_jax.files.schemas import GRADIENT, READING, TUNED
+from gmem_jax.files.waveforms import load_design, load_target, load_waveforms
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import Status, explain
 from gmem_jax.reading.readers import confusion
 from gmem_jax.show import plots, tables, view
+from gmem_jax.show.kinds import NOISE, kernel_facts
 from gmem_jax.show.scene import at_rest
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.table import rows as points_of
@@ -112,14 +117,13 @@ class Report:
         if path.is_dir():
             self._sweep(path)
         elif path.suffix.lower() == ".json":
-            with refusing(path, "result"):
-                self._json(path, json_of(path.read_text(), "content"))
+            self._result(path)
         elif path.suffix.lower() in (".csv", ".npy"):
             self._waveforms(path)
         elif source in list_packs():
             self._pack(source)
         else:
-            kinds = {"gmem-pack": self._pack, "gmem-recall": self._recall}
+            kinds = {"gmem-pack": self._pack, "gmem-recall": self._recall, "gmem-kernel": self._kernel}
             schema = schema_of(path)
             if (kind := schema.partition("/")[0]) not in kinds:
                 raise FileFormatError(f"{source}: schema is {schema[:40]!r}, expected one of {', '.join(kinds)}")
@@ -163,21 +167,28 @@ class Report:
         made = None if source in list_packs() else load_frames(Path(source))
         self._seen.add(pack_fingerprint(pack))
         parts = [of_rich(tables.pack_table(pack)), self._view(at_rest(pack), Material())]
+        if stages := load_stages(source):
+            parts += ["<h3>Its preparation</h3>", *self._stages(stages, [], pack.info.get("recipe", {}).get("t0"))]
         if made is not None:
-            parts += ["<h3>Its preparation</h3>", self._view(made, Material())]
+            parts.append(self._view(made, Material()))
         parts.append(_configuration(pack.info))
         self.sections.append((f"Pack {pack.name}", "\n".join(parts)))
 
     def _recall(self, source: str) -> None:
-        recall, configuration = load_recall(Path(source))
+        stored = load_recall(Path(source))
+        recall, configuration = stored
         row = tables.summary(recall, configuration)
         self._recalls.append((row, configuration))
-        names, t0 = configuration["signals"], configuration["t0"]
+        names, t0 = stored.names, configuration["t0"]
         scale = np.asarray(tables.relative_scale(configuration))
         wanted = configuration.get("target")
         target = None if wanted is None else np.asarray(bin_average(signals_from(wanted)))
         about = "errors: standard errors over the signals stored in this pack (jackknife)"
-        parts = [_state(row["status"]), table(["", "G", "F"], _measures(recall, scale, t0), about)]
+        parts = [
+            _note(tables.conditions(configuration)),
+            _state(row["status"]),
+            table(["", "G", "F"], _measures(recall, scale, t0), about),
+        ]
         beside = tables.recall_table([row], configuration)
         if beside.row_count > 1:  # a published point
             parts.append(of_rich(beside))
@@ -187,9 +198,7 @@ class Report:
             parts.append(_note(tables.target_line(row)))
         shown = f" (the first {plots.MOST} of {len(names)})" if len(names) > plots.MOST else ""
         parts += [f"<h3>Recalled signals{shown}</h3>", self._figure(plots.recalls(recall, scale, names, target))]
-        times = t0 if isinstance(t0, float) else None
-        stages = f"Stages, white and grey in turn: {', '.join(recall.stages)}."
-        parts += ["<h3>Along the run</h3>", self._figure(plots.series(recall, names, times)), _note(stages)]
+        parts += self._stages(recall.stages, names, t0)
         parts += ["<h3>Grains</h3>", self._grains(recall, configuration), _configuration(configuration)]
         self.sections.append((f"Recall {Path(source).name}, pack {Path(configuration['pack']).stem}", "\n".join(parts)))
 
@@ -212,19 +221,36 @@ class Report:
         self._seen.add(of_pack["sha256"])
         return _note(f"{without} This is its pack at rest, before the run.") + self._view(at_rest(pack), material)
 
-    def _json(self, path: Path, found: dict[str, Any]) -> None:
-        if "readers" in found:
-            title, parts = f"Reading of {Path(found['recall']).name}", self._reading(found)
-        elif "gradient" in found:
-            title, parts = f"Gradient {path.name}", self._gradient(found)
-        elif "history" in found:
-            title, parts = f"Tuned drive {path.name}", self._tuned(found)
-        else:
-            raise FileFormatError(f"{path}: not a result of gmem classify, gradient or tune")
+    def _stages(self, stages: Mapping[str, Sample], names: Sequence[str], t0: Any) -> list[str]:
+        told = f"Stages, white and grey in turn: {', '.join(stages)}."
+        drawn = plots.series(stages, names, t0 if is_number(t0) else None)
+        return ["<h3>Along the run</h3>", self._figure(drawn), _note(told)]
+
+    def _kernel(self, source: str) -> None:
+        kernel, configuration = load_kernel(Path(source))
+        facts = kernel_facts(kernel, NOISE)
+        words = {
+            "gain": "gain of the nearest ideal kernel",
+            "distance": "distance from it",
+            "asymmetry": "asymmetry |even| / |odd|",
+            "resolution": f"resolution in v at {NOISE:g} Pa of noise",
+        }
+        rows = [(words[name], f"{facts[name]:.3f}") for name in words]
+        rows.append((f"singular values above {NOISE:g} Pa", f"{facts['capacity']} of {len(kernel.centres)}"))
+        drawn = self._figure(plots.kernel(kernel, NOISE / float(Material().modulus)))
+        parts = [table(["", ""], rows), drawn, _configuration(configuration)]
+        self.sections.append((f"Kernel {Path(source).name}", "\n".join(parts)))
+
+    def _result(self, path: Path) -> None:
+        schema, found = load_result(path)
+        with refusing(path, schema.title):
+            draw = {READING.name: self._reading, GRADIENT.name: self._gradient, TUNED.name: self._tuned}[schema.name]
+            parts = draw(found)
+        title = f"{schema.title.partition(' (')[0]} {path.name}"
         self.sections.append((title, "\n".join([*parts, _configuration(found.get("configuration", {}))])))
 
     def _reading(self, found: dict[str, Any]) -> list[str]:
-        parts = [of_rich(each) for each in tables.reading_tables(found)]
+        parts = [_note(f"of {found['recall']}, pack {found['pack']}"), *map(of_rich, tables.reading_tables(found))]
         if found["words"] <= LARGEST_CONFUSION:
             names = [f"{word:0{found['bits']}b}" for word in range(found["words"])]
             counts = {name: confusion(row["read"], found["words"]) for name, row in found["readers"].items()}
@@ -234,7 +260,7 @@ class Report:
     def _gradient(self, found: dict[str, Any]) -> list[str]:
         slopes = found["gradient"]
         rows = [("F", f"{found['fidelity']:.4f}")]
-        rows += [(f"dF/d{name}", f"{slope:.5g}") for name, slope in slopes.items() if name != "waveform"]
+        rows += [(f"dF/d{name}", f"{slopes[name]:.5g}") for name in slopes if is_number(slopes[name])]
         lines = zip(found["places"], slopes["waveform"], strict=True)
         curves = {f"signal {n}": (np.asarray(place), np.asarray(slope)) for n, (place, slope) in enumerate(lines, 1)}
         drawn = plots.curves(curves, "compression variable u", "dF / d amplitude", mode="lines+markers")
@@ -242,32 +268,35 @@ class Report:
 
     def _tuned(self, found: dict[str, Any]) -> list[str]:
         names = list(found["values"])
-        head = ["iteration", *names, "mean F"]
         rows = [
             [number, *(f"{one[name]:.4g}" for name in names), f"{one['fidelity']:.4f}"]
             for number, one in enumerate(found["history"])
         ]
-        line = np.array([1.0 - one["fidelity"] for one in found["history"]])
-        drawn = plots.curves(
-            {"packs": (np.arange(line.size), line)}, "iteration", "1 - mean F", mode="lines+markers", log=True
-        )
-        return [table(head, rows), self._figure(drawn)]
+        history = self._history(", ".join(found["packs"]), [one["fidelity"] for one in found["history"]])
+        return [table(["iteration", *names, "mean F"], rows), history]
+
+    def _history(self, name: str, fidelities: Sequence[float]) -> str:
+        line = (np.arange(len(fidelities)), 1.0 - np.asarray(fidelities))
+        return self._figure(plots.curves({name: line}, "iteration", "1 - F", mode="lines+markers", log=True))
 
     def _waveforms(self, path: Path) -> None:
-        target = load_target(path) if path.suffix.lower() == ".csv" else None
-        signals = waveform(load_waveforms(path))
-        u = np.linspace(0.0, 1.0, 257)
-
-        def lines(some: Signals, word: str) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-            values = np.asarray(some.shear(jnp.asarray(u))).T[: plots.MOST]
-            return {f"{name}{word}": (u, value) for name, value in zip(names_of(some), values, strict=False)}
-
-        drawn = plots.curves(lines(signals, ""), "compression variable u", "I(u)")
-        parts = [self._figure(drawn)]
+        commented = path.suffix.lower() == ".csv"
+        target, design = (load_target(path), load_design(path)) if commented else (None, {})
+        parts = [self._waves(waveform(load_waveforms(path)))]
         if target is not None:
             told = "Designed so that their recall follows the integrals of these:"
-            parts += [_note(told), self._figure(plots.curves(lines(target, ""), "compression variable u", "I(u)"))]
+            parts += [_note(told), self._waves(target)]
+        if design:
+            rows = [(name, f"{design[name]:.4f}") for name in ("before", "fidelity", "gain")]
+            parts += [table(["", ""], rows, f"F of the recall on {design['pack']} with respect to the target")]
+            parts.append(self._history(design["pack"], design["history"]))
         self.sections.append((f"Waveforms {path.name}", "\n".join(parts)))
+
+    def _waves(self, signals: Signals) -> str:
+        u = np.linspace(0.0, 1.0, 2 * BINS + 1)
+        values = np.asarray(signals.shear(jnp.asarray(u))).T
+        lines = {name: (u, value) for name, value, _ in zip(names_of(signals), values, range(plots.MOST), strict=False)}
+        return self._figure(plots.curves(lines, "compression variable u", "I(u)"))
 
     def _sweep(self, folder: Path) -> None:
         if not (folder / "sweep.json").is_file():
