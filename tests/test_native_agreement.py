@@ -22,7 +22,12 @@ BUILT, REASON = native.available()
 pytestmark = pytest.mark.skipif(not BUILT, reason=REASON)
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
-LAWS = [gm.Frictionless(), gm.Hooke(mu=0.5), gm.MindlinRescaled(mu=0.5), gm.Mindlin(mu=0.5, points=20)]
+LAWS = [
+    gm.Frictionless(),
+    gm.Hooke(mu=0.5),
+    gm.MindlinRescaled(mu=0.5, spinning=0.3),
+    gm.Mindlin(mu=0.5, points=20, spinning=0.0),
+]
 
 
 def compress(march: native.March, law: object, replicas: int) -> tuple[State, Sample]:
