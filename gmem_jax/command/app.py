@@ -8,13 +8,13 @@ import jax
 import typer
 from typer.exceptions import TyperException
 
-from gmem_jax.command import benchmark, classify, derive, packs, recalls, report, reproduce, show, sweep
+from gmem_jax.command import benchmark, classify, derive, exchange, packs, recalls, report, reproduce, show, sweep
 from gmem_jax.command.console import RunInterruptedError, say
 from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.files.programs import keep_programs
 
 app = typer.Typer(rich_markup_mode=None, help="Waveform memory in granular packs.")
-for group in (packs, recalls, show, classify, derive, sweep, report, reproduce, benchmark):
+for group in (packs, recalls, show, exchange, classify, derive, sweep, report, reproduce, benchmark):
     for name, command in group.COMMANDS.items():
         app.command(name)(command)
 

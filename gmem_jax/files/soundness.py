@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gmem_jax.experiment.frames import sphere_places
 from gmem_jax.files.checked import is_number, numbers, require, require_fields, require_finite, title, whole
 
 UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
@@ -36,7 +37,7 @@ def check(found: Found, *, isotropic: bool, record: dict[str, Any]) -> None:
     require_finite(found)
     _check_clump(found, isotropic)
     _check_box(found)
-    spheres = _spheres(found)
+    spheres = sphere_places(found["position"], found["quaternion"], found["clump/offsets"])
     lower, upper = found["lower"], found["upper"]
     require((spheres > lower) & (spheres < upper), "a grain lies outside the box")
     _check_list(found, spheres)
@@ -89,18 +90,6 @@ def _check_box(found: Found) -> None:
 
 def _filling(found: Found) -> float:
     return len(found["position"]) * float(found["clump/mass"]) / float(np.prod(found["upper"] - found["lower"]))
-
-
-def _spheres(found: Found) -> np.ndarray:
-    """Sphere centres, [N K, 3]; `pairs.sphere_centres` without JAX, which would compile it for every N."""
-    w, x, y, z = found["quaternion"].T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    turned = np.einsum("ijn,kj->nki", np.array(rows), found["clump/offsets"])
-    return np.asarray((found["position"][:, None] + turned).reshape(-1, 3))
 
 
 def _check_list(found: Found, spheres: np.ndarray) -> None:

@@ -1,0 +1,244 @@
+"""Configurations written in the formats of others: GSD, VTK, extended XYZ, LAMMPS. Lengths are in R, times in t_c.
+
+What is written is spheres, each with its grain's number; formats and fields are listed in docs/exchange.md.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TextIO
+
+import numpy as np
+
+from gmem_jax.experiment.frames import Frames
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.files.atomic import atomic
+
+RADIUS = 1.0
+
+
+def frames_of_pack(pack: Pack) -> Frames:
+    """A pack at rest as one configuration, without its contacts."""
+    of_pack = (pack.position, pack.quaternion, pack.lower, pack.upper)
+    position, quaternion, lower, upper = (np.asarray(array)[None] for array in of_pack)
+    return Frames(
+        time=np.zeros(1),
+        u=np.zeros(1),
+        position=position,
+        quaternion=quaternion,
+        lower=lower,
+        upper=upper,
+        start=np.zeros(2, int),
+        spheres=np.zeros((0, 2), np.int32),
+        normal_force=np.zeros(0),
+        friction_force=np.zeros((0, 3)),
+        offsets=np.asarray(pack.clump.offsets),
+        stages=("rest",),
+    )
+
+
+def _grain_numbers(frames: Frames) -> np.ndarray:
+    """The grain of every sphere, from 1, [N K]."""
+    return np.repeat(np.arange(1, frames.position.shape[1] + 1, dtype=np.int32), len(frames.offsets))
+
+
+def _optional(name: str, extra: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ValueError(f"this format needs {name}: pip install 'gmem_jax[{extra}]'") from None
+
+
+def write_gsd(path: Path, frames: Frames, mass: float) -> None:
+    """GSD, as HOOMD-blue and OVITO read it: particles are spheres, `body` is the grain's number from 0.
+
+    Raises:
+        ValueError: if the package gsd is not there.
+        OSError: if the path cannot be written.
+    """
+    hoomd, grain = _optional("gsd.hoomd", "export"), _grain_numbers(frames) - 1
+    each = len(frames.offsets)
+    with atomic(path) as temporary, hoomd.open(temporary, "w") as file:
+        for number in range(frames.count):
+            frame = hoomd.Frame()
+            lower, upper = frames.lower[number], frames.upper[number]
+            frame.configuration.step = number
+            frame.configuration.box = [*(upper - lower), 0.0, 0.0, 0.0]  # its origin is the centre
+            frame.particles.N, frame.particles.types = len(grain), ["sphere"]
+            frame.particles.position = frames.centres(number) - 0.5 * (lower + upper)
+            frame.particles.orientation = np.repeat(frames.quaternion[number], each, axis=0)
+            frame.particles.diameter = np.full(len(grain), 2.0 * RADIUS)
+            frame.particles.mass = np.full(len(grain), mass / each)
+            frame.particles.body = grain
+            frame.log = {"time": frames.time[[number]], "u": frames.u[[number]]}
+            file.append(frame)
+
+
+def write_xyz(path: Path, frames: Frames, mass: float) -> None:
+    """Extended XYZ, as OVITO and ASE read it: `molecule` is the grain's number from 1.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    grain = _grain_numbers(frames)
+    with atomic(path) as temporary, temporary.open("w") as file:
+        for number in range(frames.count):
+            lower, lengths = frames.lower[number], frames.upper[number] - frames.lower[number]
+            facts = {
+                "Lattice": " ".join(f"{edge:.17g}" for edge in np.diag(lengths).ravel()),
+                "Origin": " ".join(f"{plane:.17g}" for plane in lower),
+                "Properties": "species:S:1:pos:R:3:radius:R:1:molecule:I:1",
+                "pbc": "F F F",
+                "Time": f"{frames.time[number]:.17g}",
+                "u": f"{frames.u[number]:.17g}",
+                "stage": frames.stages[number],
+            }
+            file.write(f"{len(grain)}\n" + " ".join(f'{name}="{value}"' for name, value in facts.items()) + "\n")
+            _rows(file, "S %.17g %.17g %.17g 1 %d", frames.centres(number), grain)
+
+
+def write_lammps(path: Path, frames: Frames, mass: float) -> None:
+    """A LAMMPS data file for `atom_style hybrid sphere molecular`: molecules are grains, from 1.
+
+    The density is such that the spheres of a grain have its mass together.
+
+    Raises:
+        ValueError: for several configurations, which a data file does not hold.
+        OSError: if the path cannot be written.
+    """
+    grain, each = _grain_numbers(frames), len(frames.offsets)
+    density = mass / (each * 4.0 * np.pi / 3.0 * RADIUS**3)
+    with atomic(path) as temporary, temporary.open("w") as file:
+        file.write(f"gmem: {frames.position.shape[1]} grains of {each} spheres, lengths in R\n\n")
+        file.write(f"{len(grain)} atoms\n1 atom types\n\n")
+        for axis, lower, upper in zip("xyz", frames.lower[0], frames.upper[0], strict=True):
+            file.write(f"{lower:.17g} {upper:.17g} {axis}lo {axis}hi\n")
+        file.write("\nAtoms # hybrid sphere molecular\n\n")
+        row = f"%d 1 %.17g %.17g %.17g {2.0 * RADIUS:g} {density:.17g} %d"
+        _rows(file, row, np.arange(1, len(grain) + 1), frames.centres(0), grain)
+
+
+def write_dump(path: Path, frames: Frames, mass: float) -> None:
+    """A LAMMPS text dump of all configurations: id, mol, type, x, y, z, radius.
+
+    Raises:
+        OSError: if the path cannot be written.
+    """
+    grain = _grain_numbers(frames)
+    with atomic(path) as temporary, temporary.open("w") as file:
+        for number in range(frames.count):
+            file.write(f"ITEM: TIMESTEP\n{number}\nITEM: NUMBER OF ATOMS\n{len(grain)}\nITEM: BOX BOUNDS ff ff ff\n")
+            for lower, upper in zip(frames.lower[number], frames.upper[number], strict=True):
+                file.write(f"{lower:.17g} {upper:.17g}\n")
+            file.write("ITEM: ATOMS id mol type x y z radius\n")
+            _rows(file, "%d %d 1 %.17g %.17g %.17g 1", np.arange(1, len(grain) + 1), grain, frames.centres(number))
+
+
+def _rows(file: TextIO, form: str, *columns: np.ndarray) -> None:
+    """A line of this form for every row of the columns beside each other; whole numbers are exact as floats here."""
+    np.savetxt(file, np.column_stack(columns), fmt=form)
+
+
+def _series(path: Path) -> Path:
+    """The folder of a VTK series."""
+    return path.with_suffix("")
+
+
+def write_vtp(path: Path, frames: Frames, mass: float) -> None:
+    """VTK polygonal data, as ParaView reads it: a point for every sphere, with `radius` and `grain` (from 1).
+
+    Raises:
+        ValueError: if the package pyvista is not there.
+        OSError: if the path cannot be written.
+    """
+    _write_vtp(path, _points(frames, 0))
+
+
+def write_pvd(path: Path, frames: Frames, mass: float) -> None:
+    """A ParaView series: a .pvd file, and beside it a folder of its name with spheres and contacts of every frame.
+
+    A contact is a line between two centres with its `normal_force` and `friction_force`.
+
+    Raises:
+        ValueError: if the package pyvista is not there.
+        OSError: if the path cannot be written.
+    """
+    folder = _series(path)
+    folder.mkdir(exist_ok=True)
+    rows = []
+    for number in range(frames.count):
+        for part, (name, made) in enumerate((("spheres", _points), ("contacts", _lines))):
+            file = folder / f"{name}-{number:04d}.vtp"
+            _write_vtp(file, made(frames, number))
+            rows.append(
+                f'<DataSet timestep="{frames.time[number]:.17g}" part="{part}" file="{folder.name}/{file.name}"/>'
+            )
+    head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>\n'
+    with atomic(path) as temporary:
+        temporary.write_text(head + "\n".join(rows) + "\n</Collection></VTKFile>\n")
+
+
+def _points(frames: Frames, number: int) -> Any:
+    grain = _grain_numbers(frames)
+    mesh = _optional("pyvista", "vtk").PolyData(frames.centres(number))
+    mesh["radius"], mesh["grain"] = np.full(len(grain), RADIUS), grain
+    facts = {"lower": frames.lower[number], "upper": frames.upper[number], "u": frames.u[[number]]}
+    for name, values in {**facts, "time": frames.time[[number]]}.items():
+        mesh.field_data[name] = values
+    return mesh
+
+
+def _lines(frames: Frames, number: int) -> Any:
+    own = slice(*frames.start[number : number + 2])
+    pairs = frames.spheres[own]
+    lines = np.column_stack([np.full(len(pairs), 2), pairs]).ravel()
+    mesh = _optional("pyvista", "vtk").PolyData(frames.centres(number), lines=lines)
+    mesh.cell_data["normal_force"], mesh.cell_data["friction_force"] = (
+        frames.normal_force[own],
+        frames.friction_force[own],
+    )
+    return mesh
+
+
+def _write_vtp(path: Path, mesh: Any) -> None:
+    writer = _optional("vtkmodules.vtkIOXML", "vtk").vtkXMLPolyDataWriter()
+    with atomic(path) as temporary:
+        writer.SetFileName(str(temporary))
+        writer.SetInputData(mesh)
+        if not writer.Write():
+            raise OSError(f"{path}: cannot be written")
+
+
+class Format(NamedTuple):
+    """A format.
+
+    Attributes:
+        suffix: of its files.
+        write: writes frames, of grains of a mass.
+        series: likewise for several configurations, where that is another kind of file.
+    """
+
+    suffix: str
+    write: Callable[[Path, Frames, float], None]
+    series: "Format | None" = None
+
+
+FORMATS = {
+    "gsd": Format(".gsd", write_gsd),
+    "vtk": Format(".vtp", write_vtp, Format(".pvd", write_pvd)),
+    "xyz": Format(".xyz", write_xyz),
+    "lammps": Format(".data", write_lammps, Format(".lammpstrj", write_dump)),
+}
+
+
+def format_of(name: str, *, several: bool) -> Format:
+    """A format by its name.
+
+    Raises:
+        ValueError: if there is none of that name.
+    """
+    if name not in FORMATS:
+        raise ValueError(f"--to must be one of {', '.join(FORMATS)}; got {name!r}")
+    found = FORMATS[name]
+    return found.series if several and found.series else found
