@@ -1,9 +1,10 @@
 """All words of a length, pre-distorted by the kernel of their pack: how they are read before and after.
 
-python experiments/design_words.py [-o designed-words] [--packs tetra-325-a,...] [--bits 3,5,8] [--iterations 3] [--t0 1800]
+python experiments/design_words.py [-o designed-words] [--packs tetra-325-a,...] [--bits 3,5,8] [--iterations 3]
 
 The paper's net has seen inputs only. The designed words are read from a run of their own on the samples as they are
-written. Resumes; a row a pack and length goes to words.csv as it comes. L = 8 on 325 grains at t0 = 1,800: 6e9 grain-steps.
+written. Resumes; a row for each pack and length goes to words.csv as it comes. L = 8 on 325 grains at t0 = 1,800 takes
+some 1e10 grain-steps.
 """
 
 import argparse
