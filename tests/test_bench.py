@@ -136,6 +136,7 @@ def test_the_page_on_speed_holds_the_table_that_was_measured() -> None:
     assert page == table.into(page, table.short(stored))
 
 
+@pytest.mark.slow
 def test_a_gradient_is_timed_in_a_process_of_its_own() -> None:
     cost = bench.gradient_cost(gm.load_pack, str(PACK), "auto", values=2, t0=75.0)
     assert 0.0 < cost["forward_s"] < cost["gradient_s"]

@@ -234,6 +234,7 @@ def test_jit_changes_nothing(small: classify.Training) -> None:
         np.testing.assert_allclose(compiled, plain, rtol=1e-5)  # float32, other order of sums
 
 
+@pytest.mark.slow
 def test_training_can_be_mapped_over_seeds() -> None:
     def learn(seed: jax.Array) -> tuple[classify.Net, jax.Array, jax.Array]:
         data = classify.examples(SMALL, seed)

@@ -12,6 +12,7 @@ import gmem_jax as gm
 from gmem_jax.files.schemas import KERNEL
 
 
+@pytest.mark.slow
 def test_kernel_and_design_write_what_they_say(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:

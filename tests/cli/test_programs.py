@@ -23,6 +23,7 @@ def recall(output: Path, **environment: str) -> str:
     return done.stderr
 
 
+@pytest.mark.slow
 def test_programs_are_kept_used_again_in_silence_and_change_no_bit(tmp_path: Path) -> None:
     home = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     recall(tmp_path / "first.h5", **home)

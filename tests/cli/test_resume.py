@@ -28,6 +28,7 @@ def datasets(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
+@pytest.mark.slow
 def test_a_recall_killed_in_the_middle_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     target, parts = tmp_path / "killed.h5", tmp_path / "killed.h5.parts"
     run = recall(target)

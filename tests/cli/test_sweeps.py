@@ -53,6 +53,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "mu"
 
 
+@pytest.mark.slow
 def test_points_are_what_recalls_of_them_are(swept: Path) -> None:
     card = json.loads((swept / "sweep.json").read_text())
     pack = gm.load_pack(PACK)
@@ -156,6 +157,7 @@ def test_bad_commands_are_refused_in_one_line(
     assert told.out == ""
 
 
+@pytest.mark.slow
 def test_packs_are_made_once_for_all_points(tmp_path: Path) -> None:
     (tmp_path / "made.toml").write_text(
         "[prepare]\ngrains = 16\nt0 = 75\n[experiment]\nt0 = 75\n[vary]\nmu = [0.3, 1.0]\n"
