@@ -8,6 +8,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 
 PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
 ENTRY = "from gmem_jax.command.app import main; main()"
