@@ -13,7 +13,7 @@ demo: install
 
 test: install-dev
 	$(REBUILD)
-	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow"
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow" $(TESTS)
 
 # What takes minutes for one statement: sanitizers, plain JAX on several devices.
 test-slow: install-dev
