@@ -53,7 +53,7 @@ def emit(as_json: bool, result: Any, *tables: Any) -> None:
         sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
     else:
         for table in tables:
-            out.print(table)
+            out.print(table, soft_wrap=isinstance(table, str))
 
 
 def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool, option: str = "--output") -> Path:

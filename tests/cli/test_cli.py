@@ -34,6 +34,9 @@ def test_help_and_info_work(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     facts = json.loads(capsys.readouterr().out)
     assert facts["versions"]["jax"] == jax.__version__
     assert "tetra-325-a" in facts["packs"]
+    assert gmem(monkeypatch, "info") == 0
+    lines = capsys.readouterr().out.splitlines()  # however narrow the terminal is
+    assert {f"backend: {facts['backend']}", "shipped packs: " + ", ".join(facts["packs"])} <= set(lines)
 
 
 COMMANDS = ["prepare", "recall", "classify", "gradient", "kernel", "design", "demo", "show", "info", "bench"]
