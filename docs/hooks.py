@@ -9,7 +9,7 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
-FROM_ELSEWHERE = [f"benchmarks/{name}.md" for name in ("bench", "large_packs", "gpu")]
+FROM_ELSEWHERE = ["CHANGELOG.md", *(f"benchmarks/{name}.md" for name in ("bench", "large_packs", "gpu"))]
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
@@ -23,7 +23,7 @@ def on_files(files: Files, config: Any) -> Files:
 def on_page_markdown(text: str, page: Any, **_: Any) -> str:
     """Links between docs/ and benchmarks/, right in the repository, made right in the site."""
     if page.file.src_uri in FROM_ELSEWHERE:
-        return text.replace("](../docs/", "](../")
+        return text.replace("](../docs/", "](../").replace("](docs/", "](")
     up = "../" * page.file.src_uri.count("/")
     return text.replace(f"]({up}../benchmarks/", f"]({up}benchmarks/")
 

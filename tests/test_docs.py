@@ -16,7 +16,7 @@ from gmem_jax.command.app import app
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted([ROOT / "README.md", *DOCS.rglob("*.md"), *ROOT.glob("benchmarks/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("benchmarks/*.md")])
 HOW_TO = [DOCS / "tutorial.md", DOCS / "own_law.md", *sorted((DOCS / "howto").glob("*.md"))]
 SMALL = ROOT / "tests" / "data" / "tetra-27.h5"
 SHORT: dict[str, Any] = {"t0": 75.0, "store": 0.1, "rest": 0.1, "hold": 0.1}
