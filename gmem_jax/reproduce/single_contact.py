@@ -73,7 +73,7 @@ def laws_figure(path: Path, points: int = 200) -> dict[str, float]:
     unit = "$f_e / k$  (H: $R$;  M1, M2: $R^{3/2}$)"
     middle.set(xlabel="position on the path (corner number)", ylabel=unit, title="along the path")
     right.set(xlabel="overlap $p$ ($R$)", ylabel=unit, title="unloading, 4 to 5")
-    middle.legend(frameon=False, fontsize=8)
+    middle.legend(frameon=False, fontsize=7, loc="upper left")
     right.legend(frameon=False, fontsize=8)
     save(path, figure, also=(".svg",))
     names = [f"force_{name.replace(', ', '_').replace(' ', '_')}_k" for name in forces]
