@@ -237,6 +237,27 @@ MUTATIONS = (
         "test_hooke_follows_figure_10_to_the_last_digit",
     ),
     mutation(
+        "spinning-not-asked-for",
+        "contact/hooke.py",
+        "transport(history, kin, self.spinning)",
+        "transport(history, kin)",
+        "test_a_law_without_spinning_keeps_its_force_when_a_contact_turns",
+    ),
+    mutation(
+        "walls-always-rigid",
+        "physics/material.py",
+        "self.wall_rigidity * self.plane_stiffness",
+        "self.plane_stiffness",
+        "test_soft_walls_leave_the_contacts_of_grains_alone",
+    ),
+    mutation(
+        "walls-not-counted",
+        "physics/sample.py",
+        "0.5 * self.contacts + self.wall_contacts",
+        "0.5 * self.contacts",
+        "test_observables_are_those_counted_by_hand",
+    ),
+    mutation(
         "twist-of-both-spins",
         "contact/kinematics.py",
         "twist=0.5 * dot(",

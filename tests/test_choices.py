@@ -45,6 +45,19 @@ def test_soft_walls_leave_the_contacts_of_grains_alone() -> None:
     assert (soft.normal_stiffness, soft.mindlin_stiffness) == (rigid.normal_stiffness, rigid.mindlin_stiffness)
 
 
+@pytest.mark.parametrize("law", [gm.Hooke, gm.MindlinRescaled])
+def test_a_law_without_spinning_keeps_its_force_when_a_contact_turns(law: type) -> None:
+    still = led_contact(jnp.asarray([0.1]), jnp.asarray([0.0]), 0.3)
+    kin = type(still)(**{**vars(still), "twist": jnp.full_like(still.twist, 0.02)})
+    force = 1e-3 * jnp.asarray([1.0, 0.0, 0.0])[None, :, None]
+    limit = jnp.ones((1, 1, 1))
+    for spinning, across in ((0.0, 0.0), (1.0, 6e-6)):
+        made = law(spinning=spinning)
+        blank = made.init(1, 1, float)
+        history = force if law is gm.Hooke else type(blank)(force, jnp.full((1, 1, 1), 0.1))
+        np.testing.assert_allclose(np.asarray(made(kin, limit, history)[0])[0, 1, 0], across, atol=1e-9)
+
+
 def test_a_history_without_spinning_does_not_turn_about_the_normal() -> None:
     kin = led_contact(jnp.asarray([0.1]), jnp.asarray([0.0]), 0.3)
     twisting = type(kin)(**{**vars(kin), "twist": jnp.full_like(kin.twist, 0.02)})

@@ -313,6 +313,13 @@ def test_observables_are_those_counted_by_hand():
     assert (overlaps > 0.0).sum() > 1
     assert float(sample.coordination[0]) == pytest.approx(2.0 / 3.0, rel=1e-15)
     assert float(sample.contacts[0]) == pytest.approx(2.0 * (overlaps > 0.0).sum() / 3.0, rel=1e-15)
+    tight = still_box(jnp.full((3, 1), -1.3), jnp.asarray([[3.2], [9.3], [1.3]]))  # cuts off some spheres' caps
+    near = spheres.reshape(-1, 3)
+    on_walls = int((near < -1.3 + 1.0).sum() + (near > np.array([3.2, 9.3, 1.3]) - 1.0).sum())
+    assert on_walls > 3
+    once = (int((overlaps > 0.0).sum()) + on_walls) / 3.0
+    within = OBSERVE(system, state, tight, jnp.zeros((3, 1)))
+    assert float(within.contacts_per_grain[0]) == pytest.approx(once, rel=1e-15)
     assert float(sample.largest_overlap[0]) == pytest.approx(overlaps.max(), rel=1e-12)
     mass, inertia = float(grain.mass), float(grain.inertia[0])
     energy = 0.5 * mass * (velocity**2).sum() + 0.5 * inertia * (spin**2).sum()
