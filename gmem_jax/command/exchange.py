@@ -5,12 +5,14 @@ from typing import Annotated
 
 import typer
 
-from gmem_jax.command.console import AsJson, Force, InputError, Output, claim, emit, say
+from gmem_jax.command.console import AsJson, Force, InputError, Output, claim, emit, reporting, say
 from gmem_jax.files.exported import FORMATS, format_of, frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
-from gmem_jax.files.packs import PACK_SCHEMA, list_packs, load_pack
+from gmem_jax.files.packs import PACK_SCHEMA, list_packs, load_pack, save_pack
 from gmem_jax.files.recalls import load_recall
+from gmem_jax.preparation.imported import import_pack
+from gmem_jax.show import tables
 
 
 def export(
@@ -40,4 +42,23 @@ def export(
     emit(as_json, {**facts, "status": 0})
 
 
-COMMANDS = {"export": export}
+def import_command(
+    file: Annotated[Path, typer.Argument(help="A LAMMPS data file (molecules are grains) or a .gsd file of clumps.")],
+    output: Output,
+    radius: Annotated[float, typer.Option(help="Radius of the spheres in the file's unit of length.")] = 1.0,
+    delta0: Annotated[float, typer.Option(help="Areal compression that the pack is meant for.")] = 0.05,
+    name: Annotated[str, typer.Option(help="Name of the pack; default the file's.")] = "",
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a pack of equal clumps of equal spheres at rest in a box."""
+    claim(output, ".h5", inputs=(file,), force=force)
+    with reporting() as progress:
+        pack = import_pack(file, radius=radius, delta0=delta0, name=name, progress=progress)
+    save_pack(output, pack)
+    say(f"wrote {output}: {pack.grains} grains, {pack.clump.shape}")
+    facts = {"pack": pack.name, "output": str(output), "grains": pack.grains, "grain": pack.clump.shape}
+    emit(as_json, {**facts, "ringing_period": float(pack.ringing_period), "status": 0}, tables.pack_table(pack))
+
+
+COMMANDS = {"export": export, "import": import_command}

@@ -3,6 +3,7 @@
 One place for packs, recalls, parts, nets and waveforms.
 """
 
+import importlib
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -40,6 +41,18 @@ def refusing(path: Path, what: str) -> Iterator[None]:
     except Exception as error:  # a broken file may make a parser stumble in any way
         said = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())[:_SHOWN]
         raise FileFormatError(f"{path}: not a readable {what} ({said or type(error).__name__})") from error
+
+
+def optional(name: str, extra: str) -> Any:
+    """A module of a package that an extra of this one brings.
+
+    Raises:
+        ValueError: if it is not there.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise ValueError(f"this needs {name}: pip install 'gmem_jax[{extra}]'") from None
 
 
 class Array(NamedTuple):

@@ -12,6 +12,7 @@ import numpy as np
 from gmem_jax.experiment.frames import Frames
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
+from gmem_jax.files.checked import optional
 
 RADIUS = 1.0
 
@@ -41,15 +42,6 @@ def _grain_numbers(frames: Frames) -> np.ndarray:
     return np.repeat(np.arange(1, frames.position.shape[1] + 1, dtype=np.int32), len(frames.offsets))
 
 
-def _optional(name: str, extra: str) -> Any:
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ValueError(f"this format needs {name}: pip install 'gmem_jax[{extra}]'") from None
-
-
 def write_gsd(path: Path, frames: Frames, mass: float) -> None:
     """GSD, as HOOMD-blue and OVITO read it: particles are spheres, `body` is the grain's number from 0.
 
@@ -57,7 +49,7 @@ def write_gsd(path: Path, frames: Frames, mass: float) -> None:
         ValueError: if the package gsd is not there.
         OSError: if the path cannot be written.
     """
-    hoomd, grain = _optional("gsd.hoomd", "export"), _grain_numbers(frames) - 1
+    hoomd, grain = optional("gsd.hoomd", "export"), _grain_numbers(frames) - 1
     each = len(frames.offsets)
     with atomic(path) as temporary, hoomd.open(temporary, "w") as file:
         for number in range(frames.count):
@@ -99,12 +91,11 @@ def write_xyz(path: Path, frames: Frames, mass: float) -> None:
 
 
 def write_lammps(path: Path, frames: Frames, mass: float) -> None:
-    """A LAMMPS data file for `atom_style hybrid sphere molecular`: molecules are grains, from 1.
+    """A LAMMPS data file of the first configuration, for `atom_style hybrid sphere molecular`: molecules are grains, from 1.
 
     The density is such that the spheres of a grain have its mass together.
 
     Raises:
-        ValueError: for several configurations, which a data file does not hold.
         OSError: if the path cannot be written.
     """
     grain, each = _grain_numbers(frames), len(frames.offsets)
@@ -181,7 +172,7 @@ def write_pvd(path: Path, frames: Frames, mass: float) -> None:
 
 def _points(frames: Frames, number: int) -> Any:
     grain = _grain_numbers(frames)
-    mesh = _optional("pyvista", "vtk").PolyData(frames.centres(number))
+    mesh = optional("pyvista", "vtk").PolyData(frames.centres(number))
     mesh["radius"], mesh["grain"] = np.full(len(grain), RADIUS), grain
     facts = {"lower": frames.lower[number], "upper": frames.upper[number], "u": frames.u[[number]]}
     for name, values in {**facts, "time": frames.time[[number]]}.items():
@@ -193,7 +184,7 @@ def _lines(frames: Frames, number: int) -> Any:
     own = slice(*frames.start[number : number + 2])
     pairs = frames.spheres[own]
     lines = np.column_stack([np.full(len(pairs), 2), pairs]).ravel()
-    mesh = _optional("pyvista", "vtk").PolyData(frames.centres(number), lines=lines)
+    mesh = optional("pyvista", "vtk").PolyData(frames.centres(number), lines=lines)
     mesh.cell_data["normal_force"], mesh.cell_data["friction_force"] = (
         frames.normal_force[own],
         frames.friction_force[own],
@@ -202,7 +193,7 @@ def _lines(frames: Frames, number: int) -> Any:
 
 
 def _write_vtp(path: Path, mesh: Any) -> None:
-    writer = _optional("vtkmodules.vtkIOXML", "vtk").vtkXMLPolyDataWriter()
+    writer = optional("vtkmodules.vtkIOXML", "vtk").vtkXMLPolyDataWriter()
     with atomic(path) as temporary:
         writer.SetFileName(str(temporary))
         writer.SetInputData(mesh)

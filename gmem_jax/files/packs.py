@@ -47,6 +47,21 @@ def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None, f
             write_frames(file, frames)
 
 
+def check_pack(pack: Pack) -> None:
+    """Refuse a pack that its file would be refused for; see `soundness`.
+
+    Raises:
+        FileFormatError: saying what is wrong.
+    """
+    found: dict[str, Any] = {key: getattr(pack, key) for key in _OWN}
+    found |= {f"clump/{key}": getattr(pack.clump, key) for key in _CLUMP}
+    found |= {f"pairs/{key}": getattr(pack.pairs, key) for key in ("smallest", "reach")}
+    listed, reference = candidates(pack.pairs), np.asarray(pack.pairs.reference)[..., 0]
+    found |= {"pairs/candidates": listed, "pairs/reference": reference}
+    arrays = {path: np.asarray(array) for path, array in found.items()}
+    soundness.check(arrays, isotropic=pack.clump.isotropic, record=pack.info)
+
+
 def load_pack(source: str | Path) -> Pack:
     """Read a pack from a file, or a shipped one by name (see `list_packs`), neighbour list included.
 

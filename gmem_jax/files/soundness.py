@@ -115,12 +115,12 @@ def _check_list(found: Found, spheres: np.ndarray) -> None:
     require(apart < reach + GRAZING, "its list pairs spheres that are out of reach of each other")
     # Nothing listed is out of reach or listed twice: then it is complete if there are no more pairs than listed ones.
     require(
-        _pairs_within(mapped, reach - GRAZING, per_grain) <= len(keys),
+        pairs_within(mapped, reach - GRAZING, per_grain) <= len(keys),
         "its list misses spheres that are in reach of each other",
     )
 
 
-def _pairs_within(centres: np.ndarray, reach: float, per_grain: int) -> int:
+def pairs_within(centres: np.ndarray, reach: float, per_grain: int) -> int:
     """Number of pairs of spheres of different grains within reach, by cells of that edge; scipy takes longer to load.
 
     Raises:

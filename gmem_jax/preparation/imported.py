@@ -1,0 +1,142 @@
+"""Packs made of spheres that others have put somewhere: the shape of the grain, and how each of them lies."""
+
+import itertools
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.experiment.pack import SKIN, Pack, find_pairs
+from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.checked import require
+from gmem_jax.files.foreign import Spheres, load_spheres
+from gmem_jax.files.packs import check_pack
+from gmem_jax.files.provenance import provenance
+from gmem_jax.files.soundness import pairs_within
+from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.grain import Clump, clump, sphere, tetra
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.state import still_box
+from gmem_jax.physics.step import System
+from gmem_jax.preparation.ringing import ringing_period
+
+MISFIT = 1e-3  # R, by which spheres may lie elsewhere than in a rigid grain
+_NAMED = 1e-4  # R, by which the edges of a tetra grain may differ from those of a whole number of 1e-4 in overlap
+_ORDERS = 6  # spheres of a grain up to which they may be listed in another order in every grain
+DT = 0.3  # t_c, of the run that measures the ringing period
+
+
+def clump_of(centres: np.ndarray) -> Clump:
+    """The grain whose spheres lie so, [K, 3]; a sphere or tetra grain where it is one."""
+    if len(centres) == 1:
+        return sphere()
+    edges = np.linalg.norm(centres[:, None] - centres, axis=-1)[np.triu_indices(len(centres), 1)]
+    if len(centres) == 4 and np.ptp(edges) < _NAMED:
+        overlap = round(1.0 - 0.5 * float(edges.mean()), 4)
+        if 0.0 <= overlap < 1.0 and abs(1.0 - 0.5 * edges.mean() - overlap) < _NAMED:
+            return tetra(overlap)
+    return clump(centres, shape=f"clump-{len(centres)}")
+
+
+def lay(centres: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where grains of spheres at `offsets` [K, 3] lie, and how they are turned, if their spheres are at `centres`.
+
+    Args:
+        centres: [N, K, 3]; in any order within a grain of up to 6 spheres.
+        offsets: in the grain's frame.
+
+    Returns:
+        Grain centres [N, 3] and body-to-lab quaternions (w, x, y, z) [N, 4], of a rotation that the shape allows.
+
+    Raises:
+        FileFormatError: if a grain has another shape.
+    """
+    count, spheres, _ = centres.shape
+    turned, misfit = np.tile(np.eye(3), (count, 1, 1)), np.full(count, np.inf)
+    middle = centres.mean(axis=1)
+    orders = itertools.permutations(range(spheres)) if spheres <= _ORDERS else [tuple(range(spheres))]
+    for order in orders:
+        left = np.flatnonzero(misfit > MISFIT)
+        if not len(left):
+            break
+        body = offsets[list(order)] - offsets.mean(axis=0)
+        seen = centres[left] - middle[left, None]
+        first, _, second = np.linalg.svd(np.einsum("nki,kj->nij", seen, body))
+        first[:, :, 2] *= np.sign(np.linalg.det(first @ second))[:, None]
+        found = first @ second
+        far = np.linalg.norm(seen - np.einsum("nij,kj->nki", found, body), axis=2).max(axis=1)
+        better = far < misfit[left]
+        turned[left[better]], misfit[left[better]] = found[better], far[better]
+    worst = int(np.argmax(misfit))
+    require(
+        misfit <= MISFIT,
+        f"grain {worst + 1} has another shape than the first: a sphere is {misfit[worst]:.2g} R from its place",
+    )
+    quaternion = Rotation.from_matrix(turned).as_quat()[:, [3, 0, 1, 2]]
+    return middle - turned @ offsets.mean(axis=0), quaternion
+
+
+def import_pack(
+    path: Path,
+    *,
+    radius: float = 1.0,
+    delta0: float = 0.05,
+    name: str = "",
+    friction: FrictionLaw | None = None,
+    progress: Progress = silent,
+) -> Pack:
+    """A pack of the grains in a LAMMPS data file or a GSD file; see `gmem_jax.files.foreign`.
+
+    Args:
+        path: the file.
+        radius: of its spheres in its own unit of length, which becomes R.
+        delta0: compression that the pack is meant for.
+        name: of the pack; default the file's.
+        friction: law under which the ringing period is measured; default `Hooke()`.
+        progress: told about that run.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if it cannot be read, or is no pack at rest of equal grains of equal spheres in a box.
+        ValueError: for an impossible radius or delta0.
+        RunFailedError: if the grains cannot be simulated.
+    """
+    if not 0.0 < delta0 < 0.5:
+        raise ValueError(f"delta0 must be in (0, 0.5), got {delta0:g}")
+    read = load_spheres(path, radius)
+    try:
+        return _pack_of(read, Path(path), delta0, name or Path(path).stem, friction or Hooke(), radius, progress)
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+
+
+def _pack_of(
+    read: Spheres, path: Path, delta0: float, name: str, law: FrictionLaw, radius: float, progress: Progress
+) -> Pack:
+    require((read.centres > read.lower) & (read.centres < read.upper), "a grain lies outside the box")
+    pairs_within(read.centres.reshape(-1, 3), 2.0 + SKIN, read.centres.shape[1])  # refuses a heap
+    grain = clump_of(read.centres[0])
+    position, quaternion = lay(read.centres, np.asarray(grain.offsets))
+    box = still_box(jnp.asarray(read.lower)[:, None], jnp.asarray(read.upper)[:, None])
+    record = {"imported": {"file": path.name, "radius": radius}, "grain": grain.shape, **provenance()}
+    made = Pack(
+        clump=grain,
+        position=jnp.asarray(position),
+        quaternion=jnp.asarray(quaternion),
+        lower=jnp.asarray(read.lower),
+        upper=jnp.asarray(read.upper),
+        delta0=jnp.asarray(delta0),
+        ringing_period=jnp.asarray(1.0),
+        pairs=find_pairs(grain, position, quaternion, box, delta0),
+        name=name,
+        record=json.dumps(record),
+    )
+    check_pack(made)
+    system = System(grain, law, made.pairs, Material())
+    at = (made.position[..., None], made.quaternion[..., None], made.box)
+    return replace(made, ringing_period=jnp.asarray(ringing_period(system, *at, DT, progress)))

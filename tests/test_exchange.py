@@ -1,0 +1,244 @@
+"""Packs and frames in the formats of others: read back by their own programs, and made packs of again."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gmem_jax as gm
+from gmem_jax.bench import lammps
+from gmem_jax.command import app as cli
+from gmem_jax.experiment.frames import Frames, sphere_places
+from gmem_jax.files.exported import format_of, frames_of_pack
+from gmem_jax.files.foreign import load_spheres
+from gmem_jax.physics import grain
+from gmem_jax.physics.rotation import uniform
+from gmem_jax.preparation import imported
+
+SOURCE = Path(__file__).parent / "data" / "tetra-27.h5"
+PACK = gm.load_pack(SOURCE)
+MASS = float(PACK.clump.mass)
+SINGLE = 1e-6  # R, of positions in single precision in a box of some 7 R
+
+
+@pytest.fixture(scope="module")
+def pack_frames() -> Frames:
+    return frames_of_pack(PACK)
+
+
+@pytest.fixture(scope="module")
+def run_frames(pack_frames: Frames) -> Frames:
+    """Two configurations with a contact each, off the origin."""
+    one = pack_frames
+    twice = {name: np.repeat(getattr(one, name), 2, axis=0) for name in ("u", "quaternion")}
+    shift = np.array([0.1, -0.2, 3.0])
+    moved = {name: np.concatenate([getattr(one, name), getattr(one, name) + shift]) for name in ("lower", "upper")}
+    return replace(
+        one,
+        **twice,
+        **moved,
+        position=np.concatenate([one.position, one.position + shift]),
+        time=np.array([0.0, 41.5]),
+        start=np.array([0, 1, 3]),
+        spheres=np.array([[0, 7], [1, 9], [5, 20]]),
+        normal_force=np.array([1.0, 2.0, 3.0]),
+        friction_force=np.eye(3),
+        stages=("rest", "encode"),
+    )
+
+
+def written(folder: Path, name: str, frames: Frames) -> Path:
+    chosen = format_of(name, several=frames.count > 1)
+    path = folder / f"out{chosen.suffix}"
+    chosen.write(path, frames, MASS)
+    return path
+
+
+def grains(frames: Frames) -> np.ndarray:
+    return np.repeat(np.arange(frames.position.shape[1]), len(frames.offsets))
+
+
+def test_gsd_reads_what_was_written(run_frames: Frames, tmp_path: Path) -> None:
+    hoomd = pytest.importorskip("gsd.hoomd")
+    with hoomd.open(written(tmp_path, "gsd", run_frames), "r") as file:
+        assert len(file) == 2
+        for number, frame in enumerate(file):
+            middle = 0.5 * (run_frames.lower + run_frames.upper)[number]
+            np.testing.assert_allclose(frame.particles.position, run_frames.centres(number) - middle, atol=SINGLE)
+            np.testing.assert_array_equal(frame.particles.body, grains(run_frames))
+            np.testing.assert_array_equal(frame.particles.diameter, 2.0)
+            lengths = (run_frames.upper - run_frames.lower)[number]
+            np.testing.assert_allclose(frame.configuration.box, [*lengths, 0, 0, 0], rtol=1e-6)
+            np.testing.assert_array_equal(frame.log["time"], run_frames.time[number])
+
+
+def test_paraview_reads_what_was_written(run_frames: Frames, pack_frames: Frames, tmp_path: Path) -> None:
+    pyvista = pytest.importorskip("pyvista")
+    spheres = pyvista.read(written(tmp_path, "vtk", pack_frames).as_posix())
+    np.testing.assert_array_equal(spheres.points, pack_frames.centres(0))
+    np.testing.assert_array_equal(spheres["grain"], grains(pack_frames) + 1)
+    np.testing.assert_array_equal(spheres["radius"], 1.0)
+    reader = pyvista.get_reader(written(tmp_path, "vtk", run_frames).as_posix())
+    assert reader.time_values == [0.0, 41.5]
+    reader.set_active_time_value(41.5)
+    spheres, contacts = reader.read()
+    np.testing.assert_array_equal(spheres.points, run_frames.centres(1))
+    np.testing.assert_array_equal(contacts.lines.reshape(-1, 3)[:, 1:], [[1, 9], [5, 20]])
+    np.testing.assert_array_equal(contacts.cell_data["normal_force"], [2.0, 3.0])
+    np.testing.assert_array_equal(contacts.cell_data["friction_force"], np.eye(3)[1:])
+
+
+def test_extended_xyz_has_a_line_for_every_sphere(run_frames: Frames, tmp_path: Path) -> None:
+    lines = written(tmp_path, "xyz", run_frames).read_text().splitlines()
+    count = len(grains(run_frames))
+    assert lines[0] == lines[count + 2] == str(count)
+    assert 'Properties="species:S:1:pos:R:3:radius:R:1:molecule:I:1"' in lines[count + 3]
+    assert 'stage="encode"' in lines[count + 3]
+    table = np.loadtxt(lines[count + 4 :], usecols=range(1, 6))
+    np.testing.assert_array_equal(table[:, :3], run_frames.centres(1))
+    np.testing.assert_array_equal(table[:, 3], 1.0)
+    np.testing.assert_array_equal(table[:, 4], grains(run_frames) + 1)
+
+
+@pytest.mark.skipif(lammps.missing() is not None, reason="LAMMPS does not start")
+def test_lammps_reads_what_was_written(pack_frames: Frames, run_frames: Frames, tmp_path: Path) -> None:
+    data, dump = written(tmp_path, "lammps", pack_frames), written(tmp_path, "lammps", run_frames)
+    form = 'dump_modify d sort id format float "%20.15g"'
+    script = ["units lj", "atom_style hybrid sphere molecular", "boundary f f f", f"read_data {data.name}"]
+    script += ["variable total equal mass(all)", 'print "total ${total}"']
+    script += [
+        "dump d all custom 1 seen.txt id mol x y z radius",
+        form,
+        "pair_style zero 2.0",
+        "pair_coeff * *",
+        "run 0",
+    ]
+    script += [f"read_dump {dump.name} 1 x y z box yes", "run 0"]
+    told = lammps.execute(script, tmp_path)
+    total = float(next(line.split()[1] for line in told.splitlines() if line.startswith("total ")))
+    np.testing.assert_allclose(total, MASS * PACK.grains, rtol=1e-6)
+    seen = (tmp_path / "seen.txt").read_text().splitlines()
+    count = len(grains(pack_frames))
+    for rows, centres in ((seen[9 : 9 + count], pack_frames.centres(0)), (seen[-count:], run_frames.centres(1))):
+        table = np.loadtxt(rows)
+        np.testing.assert_allclose(table[:, 2:5], centres, atol=1e-13)
+        np.testing.assert_array_equal(table[:, 1], grains(pack_frames) + 1)
+        np.testing.assert_array_equal(table[:, 5], 1.0)
+
+
+# ---------------------------------------------------------------- import
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the run that measures the ringing period."""
+    monkeypatch.setattr(imported, "ringing_period", lambda *_: 20.0)
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(("name", "within"), [("lammps", 1e-13), ("gsd", SINGLE)])
+def test_a_pack_comes_back(pack_frames: Frames, tmp_path: Path, name: str, within: float) -> None:
+    if name == "gsd":
+        pytest.importorskip("gsd.hoomd")
+    back = imported.import_pack(written(tmp_path, name, pack_frames))
+    assert back.clump.shape == "tetra(0.6)"
+    np.testing.assert_allclose(back.position, PACK.position, atol=within)
+    np.testing.assert_allclose(np.abs(jnp.sum(back.quaternion * PACK.quaternion, axis=1)), 1.0, atol=within)
+    np.testing.assert_allclose(back.lower, PACK.lower, atol=within)
+    gm.save_pack(tmp_path / "back.h5", back)
+    assert gm.load_pack(tmp_path / "back.h5").grains == PACK.grains
+
+
+def test_grains_of_any_shape_are_found_in_any_order_of_their_spheres() -> None:
+    shape = grain.clump([[0.0, 0.0, 0.0], [1.0, 0.1, 0.0], [0.2, 1.3, 0.4]])
+    offsets = np.asarray(shape.offsets)
+    turned = np.asarray(uniform(jax.random.key(3), 5))
+    at = np.arange(15.0).reshape(5, 3)
+    centres = sphere_places(at, turned, offsets).reshape(5, 3, 3)
+    centres[2] = centres[2][[2, 0, 1]]
+    position, quaternion = imported.lay(centres, offsets)
+    np.testing.assert_allclose(position, at, atol=1e-13)
+    np.testing.assert_allclose(np.abs(np.sum(quaternion * turned, axis=1)), 1.0, atol=1e-13)
+    centres[3, 1] += 0.01
+    with pytest.raises(gm.FileFormatError, match="grain 4 has another shape"):
+        imported.lay(centres, offsets)
+
+
+def test_other_lengths_become_radii(pack_frames: Frames, tmp_path: Path) -> None:
+    lines = written(tmp_path, "lammps", pack_frames).read_text().splitlines()
+    start = lines.index("Atoms # hybrid sphere molecular") + 2
+    rows = [row.split() for row in lines[start:]]
+    scaled = [[*row[:2], *(repr(0.5 * float(x)) for x in row[2:5]), "1", row[6], row[7]] for row in rows]
+    box = [
+        " ".join([*(repr(0.5 * float(plane)) for plane in line.split()[:2]), *line.split()[2:]]) for line in lines[5:8]
+    ]
+    path = tmp_path / "half.data"
+    path.write_text("\n".join([*lines[:5], *box, *lines[8:start], *map(" ".join, scaled)]))
+    np.testing.assert_allclose(
+        load_spheres(path, 0.5).centres.reshape(-1, 3), pack_frames.centres(0), rtol=1e-12, atol=1e-13
+    )
+    with pytest.raises(gm.FileFormatError, match=r"must have radius 1, found 0.5.*--radius"):
+        load_spheres(path)
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(
+    ("old", "new", "refusal"),
+    [
+        (" 27\n", " 26\n", "grains have 4 to 8 spheres"),
+        ("# hybrid sphere molecular", "# atomic", "must be .* one of molecular"),
+        ("xlo xhi", "xlo", "no rectangular box"),
+        ("Atoms", "Velocities", "must be .* one of"),
+        ("\n1 1 ", "\n1 1 9", "outside the box"),
+        ("\n1 1 ", "\n1 1 x", "not a readable LAMMPS data file"),
+        ("108 atoms", "107 atoms", "declares 107 atoms"),
+    ],
+)
+def test_what_is_no_pack_is_refused(pack_frames: Frames, tmp_path: Path, old: str, new: str, refusal: str) -> None:
+    path = written(tmp_path, "lammps", pack_frames)
+    text = path.read_text() + "\n"
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(gm.FileFormatError, match=refusal) as refused:
+        imported.import_pack(path)
+    assert "\n" not in str(refused.value)
+    assert str(path) in str(refused.value)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_heap_is_refused(pack_frames: Frames, tmp_path: Path) -> None:
+    heap = replace(pack_frames, position=0.05 * pack_frames.position)
+    with pytest.raises(gm.FileFormatError, match="heap|no pack at rest"):
+        imported.import_pack(written(tmp_path, "lammps", heap))
+
+
+# ---------------------------------------------------------------- command line
+
+
+def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    return int(stop.value.code or 0)
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_commands_there_and_back(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    data, pack = tmp_path / "pack.data", tmp_path / "pack.h5"
+    assert gmem(monkeypatch, "export", SOURCE, "--to", "lammps", "-o", data, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["spheres"] == 108
+    assert gmem(monkeypatch, "import", data, "-o", pack, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["grain"] == "tetra(0.6)"
+    assert gmem(monkeypatch, "export", pack, "--to", "pdb", "-o", data) == 2
+    assert "must be one of gsd, vtk, xyz, lammps" in capsys.readouterr().err
+    assert gmem(monkeypatch, "export", pack, "--to", "xyz", "--frames", "-o", tmp_path / "a.xyz") == 2
+    assert "gmem prepare --frames" in capsys.readouterr().err
+    assert gmem(monkeypatch, "export", pack, "--to", "xyz", "-o", data) == 2
+    assert "this is a .xyz file" in capsys.readouterr().err
