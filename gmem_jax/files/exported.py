@@ -91,7 +91,7 @@ def write_xyz(path: Path, frames: Frames, mass: float) -> None:
 
 
 def write_lammps(path: Path, frames: Frames, mass: float) -> None:
-    """A LAMMPS data file of the first configuration, for `atom_style hybrid sphere molecular`: molecules are grains, from 1.
+    """A LAMMPS data file for `atom_style hybrid sphere molecular`, of the first configuration: molecules are grains.
 
     The density is such that the spheres of a grain have its mass together.
 
