@@ -14,14 +14,6 @@ from gmem_jax.experiment.html import listing
 from gmem_jax.show import recalls
 from gmem_jax.sweeps.sweep import Result, Results
 
-PACK = Path(__file__).parent / "data" / "tetra-27.h5"
-
-
-@pytest.fixture(scope="module")
-def recalled() -> tuple[gm.Experiment, gm.Recall]:
-    experiment = gm.Experiment(gm.load_pack(PACK), gm.words(1), t0=75.0, store=0.1, rest=0.1, hold=0.1)
-    return experiment, gm.run(experiment)
-
 
 def test_objects_are_shown_as_short_tables(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
     experiment, recall = recalled

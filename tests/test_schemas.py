@@ -20,11 +20,10 @@ PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 
 
 @pytest.fixture(scope="module")
-def recalled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, gm.Recall, gm.Experiment]:
-    experiment = gm.Experiment(gm.load_pack(PACK), gm.words(1), t0=75.0, store=0.1, rest=0.1, hold=0.1)
-    file, found = tmp_path_factory.mktemp("recall") / "recall.h5", gm.run(experiment)
-    gm.save_recall(file, found, gm.resolved(experiment, 1.0))
-    return file, found, experiment
+def stored(recalled: tuple[gm.Experiment, gm.Recall], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("recall") / "recall.h5"
+    gm.save_recall(file, recalled[1], gm.resolved(recalled[0], 1.0))
+    return file
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +36,11 @@ def kernel(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MemoryKernel
 
 
 @pytest.fixture(scope="module")
-def files(recalled: tuple[Path, gm.Recall, gm.Experiment], kernel: tuple[Path, MemoryKernel]) -> list[Path]:
+def files(stored: Path, recalled: tuple[gm.Experiment, gm.Recall], kernel: tuple[Path, MemoryKernel]) -> list[Path]:
     stages = {"cycle 1: compress": recalled[1].stages["compress"], "rest": recalled[1].stages["rest"]}
     pack = kernel[0].with_name("pack.h5")
     gm.save_pack(pack, gm.load_pack(PACK), stages)
-    return [recalled[0], kernel[0], pack]
+    return [stored, kernel[0], pack]
 
 
 def test_every_array_has_units_a_description_and_a_scale_for_each_dimension(files: list[Path]) -> None:
@@ -56,18 +55,18 @@ def test_every_array_has_units_a_description_and_a_scale_for_each_dimension(file
                     assert array.is_scale or dimension[0].shape == (length,), array.name
 
 
-def test_xarray_opens_the_files_without_us(files: list[Path], recalled: tuple[Path, gm.Recall, gm.Experiment]) -> None:
+def test_xarray_opens_the_files_without_us(files: list[Path], recalled: tuple[gm.Experiment, gm.Recall]) -> None:
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("h5netcdf")
     for path in files:
         xarray.open_datatree(path, engine="h5netcdf").close()
-    with xarray.open_dataset(recalled[0], engine="h5netcdf") as data:
+    with xarray.open_dataset(files[0], engine="h5netcdf") as data:
         np.testing.assert_array_equal(data.p_sig.sel(signal="1"), recalled[1].p_sig[1])
         np.testing.assert_array_equal(data.shear.sel(u=0.4, method="nearest"), recalled[1].shear[:, 102])
         assert data.p_sig.attrs["units"] == "E"
-    with xarray.open_dataset(recalled[0], engine="h5netcdf", group="stages/readout") as data:
+    with xarray.open_dataset(files[0], engine="h5netcdf", group="stages/readout") as data:
         assert data.pressure.dims == ("time", "axis", "replica")
-        assert float(data.time[-1]) == sum(stage.bins for stage in recalled[2].stages) / 256
+        assert float(data.time[-1]) == sum(stage.bins for stage in recalled[0].stages) / 256
         assert float(data.u[-1]) == 0.0
 
 
@@ -80,10 +79,12 @@ def test_the_u_of_a_stage_is_that_of_its_protocol() -> None:
             np.testing.assert_array_equal(compression_at(name, passed), expected)
 
 
-def test_a_recall_is_an_xarray_with_all_stages_in_a_row(recalled: tuple[Path, gm.Recall, gm.Experiment]) -> None:
+def test_a_recall_is_an_xarray_with_all_stages_in_a_row(
+    stored: Path, recalled: tuple[gm.Experiment, gm.Recall]
+) -> None:
     pytest.importorskip("xarray")
-    path, found, experiment = recalled
-    data = gm.load_recall(path).to_xarray()
+    experiment, found = recalled
+    data = gm.load_recall(stored).to_xarray()
     assert list(data.signal.values) == ["0", "1"]
     readout = data.sel(time=data.stage == "readout")
     np.testing.assert_array_equal(readout.pressure, found.stages["readout"].pressure)
@@ -95,17 +96,19 @@ def test_a_recall_is_an_xarray_with_all_stages_in_a_row(recalled: tuple[Path, gm
     assert all(array.attrs["units"] and array.attrs["description"] for array in data.data_vars.values())
 
 
-def test_the_csv_of_a_recall_has_a_column_for_each_signal(recalled: tuple[Path, gm.Recall, gm.Experiment]) -> None:
-    head, *rows = gm.load_recall(recalled[0]).to_csv().splitlines()
+def test_the_csv_of_a_recall_has_a_column_for_each_signal(
+    stored: Path, recalled: tuple[gm.Experiment, gm.Recall]
+) -> None:
+    head, *rows = gm.load_recall(stored).to_csv().splitlines()
     assert head == "u,p_sig of 0 (E),p_sig of 1 (E)"
     np.testing.assert_array_equal(np.loadtxt(rows, delimiter=",")[:, 1:].T, recalled[1].p_sig)
 
 
 def test_a_recall_from_before_there_were_axes_is_read(
-    tmp_path: Path, recalled: tuple[Path, gm.Recall, gm.Experiment]
+    tmp_path: Path, stored: Path, recalled: tuple[gm.Experiment, gm.Recall]
 ) -> None:
     old = tmp_path / "old.h5"
-    old.write_bytes(recalled[0].read_bytes())
+    old.write_bytes(stored.read_bytes())
     with h5py.File(old, "r+") as file:
         file.attrs["schema"] = "gmem-recall/2"
         for name in ("signal", "replica", "axis", "common", *(f"stages/{name}/time" for name in file["stages"])):

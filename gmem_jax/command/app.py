@@ -29,7 +29,7 @@ def main() -> None:
     keep_programs()
     warnings.showwarning = _one_line
     try:
-        code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        code = app(args=sys.argv[1:] or ["--help"], prog_name="gmem", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except TyperException as error:
         problem = error.format_message()

@@ -270,7 +270,9 @@ HDF5 files open without this package. Every dataset has the attributes `units` a
 for each of its dimensions (those that are no dataset of the tables below count from 0):
 
 ```python
-import h5py, xarray
+import h5py
+import xarray
+
 h5py.File("recall.h5")["p_sig"].attrs["units"]
 xarray.open_dataset("recall.h5", engine="h5netcdf").p_sig.sel(signal="signal 1").plot()
 xarray.open_dataset("recall.h5", engine="h5netcdf", group="stages/readout").pressure

@@ -51,6 +51,7 @@ QUANTITIES = {
         lambda sample: {"": 1e3 * _KPA * (np.asarray(sample.pressure)[:, 0] - np.asarray(sample.pressure)[:, 1])},
     ),
     "Z": Quantity("coordination Z", _field("coordination")),
+    "per_grain": Quantity("contacts per grain, those with walls too", _field("contacts_per_grain")),
     "contacts": Quantity("touching spheres per grain, times two", _field("contacts")),
     "phi": Quantity(r"filling $\phi$", _field("filling")),
     "energy": Quantity("kinetic energy ($E R^3$)", _field("kinetic_energy"), log=True),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import PACK, gmem
+from test_cli import gmem
 
 import gmem_jax as gm
 from gmem_jax.design.kernel import MemoryKernel
@@ -13,6 +13,7 @@ from gmem_jax.design.stored import save_kernel
 from gmem_jax.files import schemas
 from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
+from gmem_jax.show import recalls
 from gmem_jax.sweeps.plan import point
 from gmem_jax.sweeps.store import Store
 
@@ -20,11 +21,10 @@ RUN = {"seconds": 1.0, "status": 0, "configuration": {}}
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(recalled: tuple[gm.Experiment, gm.Recall], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file of every kind."""
-    folder = tmp_path_factory.mktemp("files")
-    experiment = gm.Experiment(gm.load_pack(PACK), gm.words(1), t0=75.0, store=0.1, rest=0.1, hold=0.1)
-    found, configuration = gm.run(experiment), gm.resolved(experiment, 1.0)
+    folder, (experiment, found) = tmp_path_factory.mktemp("files"), recalled
+    configuration = gm.resolved(experiment, 1.0)
     gm.save_recall(folder / "recall.h5", found, configuration)
     gm.save_pack(folder / "pack.h5", experiment.pack, {"cycle 1: compress": found.stages["compress"]})
     bumps = np.random.default_rng(0).normal(size=(2, 5, 256))
@@ -156,12 +156,19 @@ def test_pictures_that_are_there_are_kept(
     assert (tmp_path / "x.png").read_text() == "precious"
 
 
-def test_more_signals_than_fit_are_said_to_be_more(folder: Path) -> None:
-    from gmem_jax.show.recalls import MOST, signals_drawing
-
-    stored = gm.load_recall(folder / "recall.h5")
-    many = {name: np.tile(getattr(stored.recall, name), (40, 1)) for name in ("J", "shear", "p_sig")}
-    recall = type(stored.recall)(**{**vars(stored.recall), **many})
-    figure = signals_drawing(recall, [f"{number:07b}" for number in range(80)], "a pack").figure
-    assert f"the first {MOST} of 80 signals are shown" in figure._suptitle.get_text()
+def test_more_signals_than_fit_are_said_to_be_more(
+    monkeypatch: pytest.MonkeyPatch, recalled: tuple[gm.Experiment, gm.Recall]
+) -> None:
+    monkeypatch.setattr(recalls, "MOST", 4)
+    many = {name: np.tile(getattr(recalled[1], name), (40, 1)) for name in ("J", "shear", "p_sig")}
+    recall = type(recalled[1])(**{**vars(recalled[1]), **many})
+    figure = recalls.signals_drawing(recall, [f"{number:07b}" for number in range(80)], "a pack").figure
+    assert "the first 4 of 80 signals are shown" in figure._suptitle.get_text()
     assert [axis.get_title() for axis in figure.axes[:3]] == ["0000000", "0000001", "0000010"]
+
+
+def test_commands_are_completed_in_a_shell(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    for name, value in (("_GMEM_COMPLETE", "complete_bash"), ("COMP_WORDS", "gmem sh"), ("COMP_CWORD", "1")):
+        monkeypatch.setenv(name, value)
+    assert gmem(monkeypatch) == 0
+    assert capsys.readouterr().out.split() == ["show"]
