@@ -14,7 +14,7 @@ from gmem_jax.experiment.frames import Frames, joined, places, take
 from gmem_jax.experiment.recall import film_of
 from gmem_jax.files.frames import load_frames, write_frames
 from gmem_jax.files.hdf5 import writing
-from gmem_jax.files.recalls import RECALL_SCHEMA
+from gmem_jax.files.schemas import RECALL
 from gmem_jax.physics.state import Grains, State
 from gmem_jax.physics.step import System, contact_forces, sphere_table
 from gmem_jax.preparation.preparation import film_of as film_of_preparation
@@ -160,7 +160,7 @@ def test_frames_that_cannot_be_are_refused(
 ) -> None:
     frames = frames_of(filmed)
     changed = replace(frames, **{name: how(getattr(frames, name)) for name, how in change.items()})
-    with writing(tmp_path / "recall.h5", RECALL_SCHEMA) as file:
+    with writing(tmp_path / "recall.h5", RECALL.name) as file:
         write_frames(file, changed)
     with pytest.raises(gm.FileFormatError, match=refusal):
         load_frames(tmp_path / "recall.h5")

@@ -9,8 +9,9 @@ from gmem_jax.command.console import AsJson, Force, InputError, Output, claim, e
 from gmem_jax.files.exported import FORMATS, format_of, frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
-from gmem_jax.files.packs import PACK_SCHEMA, list_packs, load_pack, save_pack
+from gmem_jax.files.packs import list_packs, load_pack, save_pack
 from gmem_jax.files.recalls import load_recall
+from gmem_jax.files.schemas import PACK
 from gmem_jax.preparation.imported import import_pack
 from gmem_jax.show import tables
 
@@ -24,7 +25,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a pack, or the configurations along a recall, for other programs (docs/exchange.md)."""
-    if str(file) in list_packs() or schema_of(file) == PACK_SCHEMA:
+    if str(file) in list_packs() or schema_of(file) == PACK.name:
         pack = load_pack(file)
         mass, found = float(pack.clump.mass), load_frames(file) if frames else frames_of_pack(pack)
         command = "prepare"
