@@ -24,17 +24,22 @@ _PAIRS = [path.removeprefix("pairs/") for path in PACK.arrays if path.startswith
 _OWN = [path for path in PACK.arrays if "/" not in path]
 
 
+def _arrays(pack: Pack) -> dict[str, Any]:
+    """What `PACK` declares, by path."""
+    values: dict[str, Any] = {name: getattr(pack, name) for name in _OWN}
+    values |= {f"clump/{name}": getattr(pack.clump, name) for name in _CLUMP}
+    values |= {f"pairs/{name}": getattr(pack.pairs, name) for name in ("smallest", "reach")}
+    reference = np.asarray(pack.pairs.reference)[..., 0]
+    return {**values, "pairs/candidates": candidates(pack.pairs), "pairs/reference": reference}
+
+
 def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None, frames: Frames | None = None) -> None:
     """Write a pack, and the time series of its preparation and configurations along it if given.
 
     Raises:
         OSError: if the path cannot be written.
     """
-    clump, pairs = pack.clump, pack.pairs
-    values = {name: getattr(pack, name) for name in _OWN}
-    values |= {f"clump/{name}": getattr(clump, name) for name in _CLUMP}
-    values |= {f"pairs/{name}": getattr(pairs, name) for name in ("smallest", "reach")}
-    values |= {"pairs/candidates": candidates(pairs), "pairs/reference": np.asarray(pairs.reference)[..., 0]}
+    clump, values = pack.clump, _arrays(pack)
     with writing(path, PACK.name) as file:
         file.attrs["name"] = pack.name
         file.attrs["record"] = pack.record
@@ -53,12 +58,7 @@ def check_pack(pack: Pack) -> None:
     Raises:
         FileFormatError: saying what is wrong.
     """
-    found: dict[str, Any] = {key: getattr(pack, key) for key in _OWN}
-    found |= {f"clump/{key}": getattr(pack.clump, key) for key in _CLUMP}
-    found |= {f"pairs/{key}": getattr(pack.pairs, key) for key in ("smallest", "reach")}
-    listed, reference = candidates(pack.pairs), np.asarray(pack.pairs.reference)[..., 0]
-    found |= {"pairs/candidates": listed, "pairs/reference": reference}
-    arrays = {path: np.asarray(array) for path, array in found.items()}
+    arrays = {path: np.asarray(array) for path, array in _arrays(pack).items()}
     soundness.check(arrays, isotropic=pack.clump.isotropic, record=pack.info)
 
 

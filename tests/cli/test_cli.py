@@ -39,7 +39,20 @@ def test_help_and_info_work(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     assert {f"backend: {facts['backend']}", "shipped packs: " + ", ".join(facts["packs"])} <= set(lines)
 
 
-COMMANDS = ["prepare", "recall", "classify", "gradient", "kernel", "design", "demo", "show", "info", "bench", "export", "import"]
+COMMANDS = [
+    "prepare",
+    "recall",
+    "classify",
+    "gradient",
+    "kernel",
+    "design",
+    "demo",
+    "show",
+    "info",
+    "bench",
+    "export",
+    "import",
+]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
