@@ -55,7 +55,7 @@ def test_a_recall_draws_itself(recalled: tuple[gm.Experiment, gm.Recall], tmp_pa
     experiment, recall = recalled
     drawn = recall.plot("signals", experiment)
     assert drawn._repr_png_().startswith(b"\x89PNG")
-    title = drawn.figure._suptitle.get_text()
+    title = " ".join(drawn.figure._suptitle.get_text().split())
     assert all(word in title for word in ("mu = 1", "gamma0 = 0.001", "t0 = 75 t_c", "all 2 words"))
     stress, wave = drawn.figure.axes[0], drawn.figure.axes[2]
     assert (stress.get_title(), wave.get_ylabel(), stress.get_ylabel()) == ("0", "", "stress (Pa)")

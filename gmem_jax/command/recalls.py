@@ -64,7 +64,7 @@ def _run(
             configuration["target"] = written_signals(target)
         save_recall(data, recall, configuration)
     if picture is not None:
-        title = f"{configuration['pack']}: {tables.conditions(configuration)}"
+        title = tables.heading(configuration)
         figures.recall_figure(picture, recall, experiment.scale, title, configuration["signals"])
     say(f"wrote {data}" + (f" and {picture}" if picture else ""))
     row = {**tables.summary(recall, configuration), "seconds": configuration["seconds"], "output": str(data)}

@@ -1,6 +1,7 @@
 """Pictures that are files, or shown by a notebook. Matplotlib is imported on first use, and no display is asked for."""
 
 import io
+import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,11 @@ class Drawing:
         path = Path(path)
         with atomic(path) as temporary:
             self.figure.savefig(temporary, format=path.suffix.removeprefix("."), dpi=DPI)
+
+    def title(self, *lines: str) -> None:
+        """Put lines over it, broken where the picture ends."""
+        width = int(12 * self.figure.get_figwidth())  # letters of this size in an inch
+        self.figure.suptitle("\n".join(textwrap.fill(line, width) for line in lines if line), fontsize=9)
 
     def _repr_png_(self) -> bytes:
         content = io.BytesIO()

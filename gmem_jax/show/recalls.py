@@ -13,9 +13,9 @@ from gmem_jax.files.configuration import resolved
 from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
+from gmem_jax.show import tables
 from gmem_jax.show.drawing import Drawing, blank
 from gmem_jax.show.stages import AGAINST, QUANTITIES, stages_drawing
-from gmem_jax.show.tables import conditions, relative_scale
 
 MOST = 64  # panels of one picture
 
@@ -42,14 +42,14 @@ def recall_drawing(
     """
     known = dict(configuration or {})
     names = signal_names(recall, known)
-    title = f"{known['pack']}: {conditions(known)}" if known else "recall"
+    title = tables.heading(known) if known else "recall"
     found = {name.lower(): name for name in PICTURES}.get(what.lower())
     if found is None or against not in AGAINST:
         raise ValueError(
             f"{what!r} against {against!r}: pictures of a recall are {', '.join(PICTURES)}, against time or u"
         )
     if found == "signals":
-        return signals_drawing(recall, names, title, relative_scale(known) if known else None)
+        return signals_drawing(recall, names, title, tables.relative_scale(known) if known else None)
     if found == "waveforms":
         return waveforms_drawing(recall, names, title)
     if found == "all":
@@ -107,7 +107,7 @@ def signals_drawing(recall: Recall, names: Sequence[str], title: str, scale: Sca
     handles = [recalled, scaled, wave]
     labels = ["recalled $p_{sig}$", r"$G E \delta_0 \gamma_0 J$", "waveform $I(u)$"]
     drawing.figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
-    drawing.figure.suptitle(_heading(recall, title, shown, len(signals)), fontsize=10)
+    drawing.title(title, _measures(recall, shown, len(signals)))
     return drawing
 
 
@@ -122,7 +122,7 @@ def waveforms_drawing(recall: Recall, names: Sequence[str], title: str) -> Drawi
         axis.set_title(names[number], fontsize=9 if shown <= 16 else 7, pad=3)
     _u_below(axes, shown)
     axes[0, 0].legend(fontsize=7, frameon=False)
-    drawing.figure.suptitle(f"{title}{_part(shown, len(recall.J))}", fontsize=10)
+    drawing.title(f"{title}{_part(shown, len(recall.J))}")
     return drawing
 
 
@@ -149,7 +149,7 @@ def image_drawing(recall: Recall, names: Sequence[str], title: str) -> Drawing:
         axis.set_xlabel("compression variable u")
     step = -(-count // 64)
     left.set_yticks(range(0, count, step), list(names)[::step], fontsize=8 if count <= 16 else 6)
-    drawing.figure.suptitle(_heading(recall, title, count, count), fontsize=10)
+    drawing.title(title, _measures(recall, count, count))
     return drawing
 
 
@@ -173,8 +173,8 @@ def _u_below(axes: Any, shown: int) -> None:
         axis.set_xlabel("compression variable u" if columns <= 3 else "u", fontsize=9)
 
 
-def _heading(recall: Recall, title: str, shown: int, count: int) -> str:
-    return f"{title}\nG = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}{_part(shown, count)}"
+def _measures(recall: Recall, shown: int, count: int) -> str:
+    return f"G = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}{_part(shown, count)}"
 
 
 def _part(shown: int, count: int) -> str:

@@ -80,8 +80,7 @@ def stages_drawing(
     else:
         _against_time(axis, stages, quantity, t0)
     many = any(np.shape(sample.filling)[-1] > 1 for sample in stages.values())
-    band = "\nline: zero signal, band: lowest to highest of all replicas" if many else ""
-    axis.set_title(f"{title}{band}", fontsize=9)
+    drawing.title(title, "line: zero signal, band: lowest to highest of all replicas" if many else "")
     axis.set_ylabel(quantity.label)
     if quantity.log:
         axis.set_yscale("log", nonpositive="mask")

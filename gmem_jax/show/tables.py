@@ -3,6 +3,7 @@
 import csv
 import math
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -164,6 +165,11 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
         fidelity = f"{point['fidelity_mean']:.3f}\n± {point['fidelity_sd']:.3f}"
         table.add_row(f"published ({point['n_packs']:.0f})", gain, fidelity)
     return table
+
+
+def heading(configuration: dict[str, Any]) -> str:
+    """What stands over a picture of a recall: its pack, and its conditions."""
+    return f"{Path(configuration['pack']).stem}: {conditions(configuration)}"
 
 
 def conditions(configuration: dict[str, Any]) -> str:
