@@ -78,7 +78,7 @@ LOADING = """
 import sys
 import gmem_jax
 from jax._src import xla_bridge
-heavy = [name for name in ("flax", "optax", "matplotlib", "rich", "jax_md") if name in sys.modules]
+heavy = [name for name in ("flax", "optax", "matplotlib", "plotly", "rich", "jax_md") if name in sys.modules]
 import gmem_jax.command.app
 heavy += [name for name in ("scipy", "matplotlib", "jax_md") if name in sys.modules]
 print(xla_bridge.backends_are_initialized(), *heavy)

@@ -63,7 +63,7 @@ def _line(x: np.ndarray, y: np.ndarray, name: str, colour: str, **more: Any) -> 
 
 def _panels(count: int, columns: int, titles: Sequence[str], **more: Any) -> Any:
     rows = -(-count // columns)
-    gaps = {"vertical_spacing": 0.11 if rows < 4 else 0.07, "horizontal_spacing": 0.075}
+    gaps = {"vertical_spacing": 0.11 if rows < 4 else 0.07, "horizontal_spacing": 0.09}
     figure = _plotly("subplots").make_subplots(rows, columns, subplot_titles=titles, **gaps, **more)
     figure.update_annotations(font_size=13)
     return figure

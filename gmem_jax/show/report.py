@@ -199,15 +199,17 @@ class Report:
         shown = f" (the first {plots.MOST} of {len(names)})" if len(names) > plots.MOST else ""
         parts += [f"<h3>Recalled signals{shown}</h3>", self._figure(plots.recalls(recall, scale, names, target))]
         parts += self._stages(recall.stages, names, t0)
-        parts += ["<h3>Grains</h3>", self._grains(recall, configuration), _configuration(configuration)]
+        parts += ["<h3>Grains</h3>", self._grains(recall, names, configuration), _configuration(configuration)]
         self.sections.append((f"Recall {Path(source).name}, pack {Path(configuration['pack']).stem}", "\n".join(parts)))
 
-    def _grains(self, recall: Recall, configuration: dict[str, Any]) -> str:
+    def _grains(self, recall: Recall, names: Sequence[str], configuration: dict[str, Any]) -> str:
         """The frames of a recall, or its pack at rest if it is there."""
         written = configuration.get("experiment", {})
         material = Material(**written.get("material", {}))
-        if recall.frames is not None:
-            return self._view(recall.frames, material)
+        if (frames := recall.frames) is not None:
+            whose = f"the run of {names[frames.signal - 1]}" if frames.signal else "the run without shear"
+            told = f"{frames.count} moments of {whose}; displacements are since the first."
+            return _note(told) + self._view(frames, material)
         without = "No frames in this file: gmem recall --frames 10 keeps some."
         of_pack = written.get("pack", {})
         if of_pack.get("sha256") in self._seen:

@@ -48,6 +48,7 @@ COMMANDS = [
     "design",
     "demo",
     "show",
+    "report",
     "info",
     "bench",
     "export",
