@@ -87,6 +87,13 @@ class View:
 
 
 def view(pack: Pack | Frames) -> View:
-    """A pack at rest, or the frames of a recall, to be turned, cut and coloured."""
+    """A pack at rest, or the frames of a recall, in 3D: to be turned, cut and coloured.
+
+    Args:
+        pack: a pack, or `recall.frames`.
+
+    Returns:
+        What a notebook shows, and `save` writes as a page.
+    """
     frames, name = (at_rest(pack), pack.name) if isinstance(pack, Pack) else (pack, "frames")
     return View(page(name, figure("pack", frames), three=True, bare=True))
