@@ -178,7 +178,7 @@ def test_a_recall_keeps_its_waveforms_and_their_names_and_is_refused_when_its_pa
     np.testing.assert_array_equal(again.shear, np.asarray(experiment.signals.shear(found.u)).T)
     np.testing.assert_array_equal(again.p_sig, found.p_sig)
     assert configuration["signals"] == ["0", "1"]
-    assert configuration["experiment"]["signals"].items() >= {"kind": "words", "bits": 1}.items()
+    assert configuration["experiment"]["signals"] == {"kind": "words", "bits": 1, "pad": 2.0, "width": 1.0}
     for change, words in (
         (lambda file: put(file, "p_sig", file["p_sig"][:1]), r"'p_sig' has shape \[1, 256\]"),
         (lambda file: put(file, "fidelity", np.asarray(np.nan)), "fidelity holds numbers that are not finite"),

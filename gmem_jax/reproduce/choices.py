@@ -167,7 +167,7 @@ def draw(path: Path, found: Sequence[Effect], title: str) -> None:
         (axes[1], "change of F", [effect.of_fidelity for effect in shown], 1.0),
     ):
         means = [unit * one.mean for one in numbers]
-        errors = [unit * one.error if one.packs > 1 else 0.0 for one in numbers]
+        errors = [unit * one.error for one in numbers] if numbers and numbers[0].packs > 1 else None
         names = list(dict.fromkeys(effect.choice.name for effect in shown))
         colours = [f"C{names.index(effect.choice.name) % 10}" for effect in shown]
         axis.barh(places, means, xerr=errors, color=colours, height=0.6, capsize=2)

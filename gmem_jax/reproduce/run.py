@@ -133,8 +133,8 @@ def weigh(
     if not found:
         return Weighed([], [], _failed(store))
     choices.write_csv(target.with_suffix(".csv"), found)
-    what = f"{size.grains:,} grains, t$_0$ = {size.t0:g} t$_c$, {found[0].gain.packs} packs"
-    choices.draw(target, found, f"What the paper leaves open ({scale}: {what})")
+    what = f"{scale}: {size.grains:,} grains, t$_0$ = {size.t0:g} t$_c$, packs: {found[0].gain.packs}"
+    choices.draw(target, found, f"What the paper leaves open ({what})")
     return Weighed(found, [target, target.with_suffix(".svg"), target.with_suffix(".csv")], _failed(store))
 
 
