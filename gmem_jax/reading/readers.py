@@ -42,7 +42,7 @@ def stored_words(recall: Recall, target: Signals | None = None) -> Stored:
         target: the words, if they were designed.
 
     Raises:
-        ValueError: if its signals are not all the words of one length, in order.
+        ValueError: if its signals are not all the words of one length, in order, of the default pad and width.
     """
     templates = np.asarray(recall.J if target is None else bin_average(target))
     bits = len(templates).bit_length() - 1
