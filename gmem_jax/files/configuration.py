@@ -83,7 +83,11 @@ def _as_words(signals: Signals) -> dict[str, Any]:
     if np.ndim(signals.width) != 0 or not 0.0 < first < 0.5:
         return {}
     pad = round(bits * first / (1.0 - 2.0 * first), DIGITS)
-    form = {"bits": bits, "pad": pad, "width": round(float(signals.width) / bit_width(bits, pad), DIGITS)}
+    form: dict[str, Any] = {
+        "bits": bits,
+        "pad": pad,
+        "width": round(float(signals.width) / bit_width(bits, pad), DIGITS),
+    }
     try:
         return form if _equal(signals, words(**form)) else {}
     except ValueError:

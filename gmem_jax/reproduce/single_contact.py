@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.files.atomic import atomic
+from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
@@ -16,10 +18,14 @@ from gmem_jax.physics.pytree import pytree
 from gmem_jax.show.figures import pyplot, save
 
 CORNERS = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0)])  # (p, sigma), in R
-FREE = {"mu": 1e6, "stiffness": 1.0, "damping_time": 0.0}  # never slides; forces in units of the stiffness
+FREE: dict[str, Any] = {
+    "mu": 1e6,
+    "stiffness": 1.0,
+    "damping_time": 0.0,
+}  # never slides; forces in units of the stiffness
 P_MAX = 1.5
 M2, M2_PAPER = "M2", "M2, paper's weights"
-LAWS = {
+LAWS: dict[str, FrictionLaw] = {
     "H": Hooke(**FREE),
     "M1": MindlinRescaled(**FREE),
     M2: Mindlin(**FREE, p_max=P_MAX),
@@ -31,12 +37,17 @@ SHOWN = (("paper, without h", 20), ("paper, with h", 20), ("paper, with h", 100)
 
 def closed_form(law: str, overlap: np.ndarray) -> np.ndarray:
     """The elastic force on the last segment of the path, in units of the stiffness."""
-    root = np.sqrt(overlap)
+    root: np.ndarray = np.sqrt(overlap)
     if law == "H":
         return np.ones_like(root)
     if law == "M1":
-        return (0.8 * np.sqrt(0.5) + 0.2) * root
-    return 0.8 * np.minimum(root, np.sqrt(0.5)) + 0.2 * root
+        return float(0.8 * np.sqrt(0.5) + 0.2) * root
+    force: np.ndarray = 0.8 * np.minimum(root, np.sqrt(0.5)) + 0.2 * root
+    return force
+
+
+def _force(law: FrictionLaw, overlap: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    return np.asarray(contact_path(law, jnp.asarray(overlap), jnp.asarray(displacement)))
 
 
 def led(points: int) -> tuple[np.ndarray, np.ndarray, slice]:
@@ -55,7 +66,7 @@ def laws_figure(path: Path, points: int = 200) -> dict[str, float]:
         OSError: if they cannot be written.
     """
     overlap, displacement, last = led(points)
-    forces = {name: np.asarray(contact_path(law, overlap, displacement)) for name, law in LAWS.items()}
+    forces = {name: _force(law, overlap, displacement) for name, law in LAWS.items()}
     figure, (left, middle, right) = pyplot().subplots(1, 3, figsize=(11.5, 3.7))
     left.plot(*CORNERS.T, "o-", color="0.3", markersize=4)
     for number, (p, sigma) in enumerate(CORNERS):
@@ -118,9 +129,7 @@ def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]
     overlap = led_overlap[last]
     exact = closed_form(M2, overlap)
     forces = {
-        (form, count): np.asarray(contact_path(_form(form, count), led_overlap, displacement))[last]
-        for form in FORMS
-        for count in COUNTS
+        (form, count): _force(_form(form, count), led_overlap, displacement)[last] for form in FORMS for count in COUNTS
     }
     figure, (left, middle, right) = pyplot().subplots(1, 3, figsize=(12.5, 3.9))
     left.plot(overlap, exact, color="0.6", linewidth=4, label="exact")
