@@ -53,7 +53,8 @@ def test_pages_that_the_code_names_are_there(source: str) -> None:
     assert not [page for page in named if not (ROOT / page).is_file()]
 
 
-COMMANDS: Any = typer.main.get_command(app).commands
+ROOT_COMMAND: Any = typer.main.get_command(app)
+COMMANDS = ROOT_COMMAND.commands
 
 
 def parsed(words: list[str]) -> None:
@@ -77,7 +78,13 @@ def test_commands_are_there_with_the_options_that_pages_give_them(page: Path) ->
             parsed(words)
     for told in re.findall(r"`gmem ([^`]+)`", page.read_text()):  # in a sentence, where arguments may be missing
         command, *words = shlex.split(told)
-        options = {option for one in COMMANDS.get(command).params for option in [*one.opts, *one.secondary_opts]}
+        if command.startswith("-"):
+            command, words = "", [command, *words]
+        options = {
+            option
+            for one in (COMMANDS[command] if command else ROOT_COMMAND).params
+            for option in [*one.opts, *one.secondary_opts]
+        }
         assert {word for word in words if word.startswith("-")} <= {*options, "--help"}, told
 
 

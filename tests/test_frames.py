@@ -160,7 +160,7 @@ def test_frames_that_cannot_be_are_refused(
 ) -> None:
     frames = frames_of(filmed)
     changed = replace(frames, **{name: how(getattr(frames, name)) for name, how in change.items()})
-    with writing(tmp_path / "recall.h5", RECALL.name) as file:
-        write_frames(file, changed)
-    with pytest.raises(gm.FileFormatError, match=refusal):
+    with pytest.raises(gm.FileFormatError, match=refusal):  # in writing already, if they do not fit each other
+        with writing(tmp_path / "recall.h5", RECALL.name) as file:
+            write_frames(file, changed)
         load_frames(tmp_path / "recall.h5")

@@ -12,7 +12,6 @@ from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.schemas import PACK
-from gmem_jax.preparation.imported import import_pack
 from gmem_jax.show import tables
 
 
@@ -53,6 +52,9 @@ def import_command(
     as_json: AsJson = False,
 ) -> None:
     """Make a pack of equal clumps of equal spheres at rest in a box."""
+    # Here, not above: scipy takes half a second to load, and no other command needs it.
+    from gmem_jax.preparation.imported import import_pack
+
     claim(output, ".h5", inputs=(file,), force=force)
     with reporting() as progress:
         pack = import_pack(file, radius=radius, delta0=delta0, name=name, progress=progress)
