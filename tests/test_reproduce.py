@@ -156,7 +156,7 @@ def test_claims_are_judged_by_their_runs(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert [row["claim"] for row in json.loads((tmp_path / "claims-tiny.json").read_text())] == [v.claim for v in found]
     assert len(found) == 8
     by_claim = {verdict.claim: verdict for verdict in found}
-    order = by_claim["shear before the compression leaves nothing"]
+    order = by_claim["shear before the compression leaves no waveform"]
     before = gm.run(gm.Experiment(gm.load_pack(PACK), gm.six_signals(), t0=150.0, shear="before"))
     assert order.values["G"] == float(before.windowed_gain)
     moved = by_claim["tetra grains rearrange less than spheres, and less than without friction"].values

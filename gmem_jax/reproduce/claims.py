@@ -105,7 +105,7 @@ def order_matters(standard: Recall, before: Recall, scale: float) -> Verdict:
     waved, wave = (float(compare(_less_mean(one.p_sig), _less_mean(one.J), scale).gain) for one in (before, standard))
     gain, fidelity = float(before.windowed_gain), float(before.windowed_fidelity)
     return Verdict(
-        "shear before the compression leaves nothing",
+        "shear before the compression leaves no waveform",
         abs(waved) < LITTLE * abs(wave),
         f"less its mean over u, what is left has G = {waved:.3f} beside {wave:.3f}; with it G = {gain:.3f}, "
         f"F = {fidelity:.3f} beside {float(standard.windowed_gain):.3f} and {float(standard.windowed_fidelity):.3f}; "
