@@ -288,7 +288,7 @@ def browser(page: Path) -> Iterator[Any]:
         chrome.execute_script("document.querySelector('.view').scrollIntoView()")
         begun = time.monotonic()
         while not chrome.execute_script("return !!document.querySelector('.view').view"):
-            assert time.monotonic() - begun < 60.0, chrome.get_log("browser")
+            assert time.monotonic() - begun < 120.0, chrome.get_log("browser")
             time.sleep(0.05)
         yield chrome
 
