@@ -196,8 +196,8 @@ MUTATIONS = (
     mutation(
         "cutoff-a-little-short",
         "physics/search.py",
-        "r_cutoff=cutoff + 1e-4",
-        "r_cutoff=cutoff - 1e-4",
+        "r_cutoff=self._cutoff + 1e-4",
+        "r_cutoff=self._cutoff - 1e-4",
         "test_pairs_are_listed_up_to_the_last_digit_of_the_skin",
     ),
     mutation(
@@ -373,7 +373,7 @@ MUTATIONS = (
     mutation(
         "replicas-guest-torque-lost",
         "replicas.h",
-        "torque = torque + load_vec(guest + 6 * static_cast<std::size_t>(n) + 3);",
+        "torque = torque + convert<V>(load_vec(guest + 6 * static_cast<std::size_t>(n) + 3));",
         "",
         f"{DOMAINS}[9-H]",
     ),
@@ -496,7 +496,7 @@ MUTATIONS = (
         "team.cc",
         "if (any(taken)) return true;",
         "return true;",
-        "test_native_sources.py::test_unit_tests_in_cpp[threads]",
+        "test_unit_tests_in_cpp[threads]",
     ),
     mutation(
         "native-walls-and-spheres",
@@ -1138,7 +1138,7 @@ MUTATIONS = (
     mutation(
         "a-list-with-gaps",
         "files/soundness.py",
-        "_pairs_within(mapped, reach - GRAZING, per_grain) <= len(keys),",
+        "pairs_within(mapped, reach - GRAZING, per_grain) <= len(keys),",
         "True,",
         "test_an_impossible_pack_is_refused_whoever_sealed_it",
     ),
