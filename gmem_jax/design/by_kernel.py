@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.design.kernel import MemoryKernel, bumps, memory_kernel, nearest
-from gmem_jax.design.waveforms import Design, bounded, sampled
+from gmem_jax.design.waveforms import Design, bounded, sampled, verified
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Keep, Progress, forget, silent, within
 from gmem_jax.experiment.recall import run
@@ -114,14 +114,4 @@ def design_by_kernel(
         amplitudes = bounded(best + step[:, None] * change, width)
     signals = sampled(bumps(best, width))
     fresh = recall("verified", replace(experiment, signals=signals))
-    match = experiment.compare(jnp.asarray(fresh))
-    return Design(
-        signals=signals,
-        target=target,
-        p_sig=fresh,
-        fidelity=float(match.fidelity),
-        gain=float(match.gain),
-        untouched=untouched,
-        before=float(original.fidelity),
-        history=tuple(history),
-    )
+    return verified(experiment, signals, fresh, untouched, history)

@@ -75,6 +75,23 @@ def sampled(signals: Signals, nodes: int = NODES) -> Spline:
     return waveform(values)
 
 
+def verified(
+    experiment: Experiment, signals: Spline, p_sig: np.ndarray, untouched: np.ndarray, history: Sequence[float]
+) -> Design:
+    """What came of a design, by the recalls of the designed and of the untouched waveforms, both [S, 256] in E."""
+    match = experiment.compare(jnp.asarray(p_sig))
+    return Design(
+        signals=signals,
+        target=np.asarray(experiment.integral()),
+        p_sig=p_sig,
+        fidelity=float(match.fidelity),
+        gain=float(match.gain),
+        untouched=untouched,
+        before=float(experiment.compare(jnp.asarray(untouched)).fidelity),
+        history=tuple(history),
+    )
+
+
 class _Work:
     """What a design takes, in runs of its signals, and how much of that is done."""
 
@@ -174,14 +191,4 @@ def design_waveforms(
     signals = sampled(bumps(amplitudes, width))
     last = work.next(1.0 + work.prefix, "verified")
     fresh = np.asarray(keep("verified", lambda _: run(replace(experiment, signals=signals), progress=last).p_sig))
-    match = experiment.compare(jnp.asarray(fresh))
-    return Design(
-        signals=signals,
-        target=target,
-        p_sig=fresh,
-        fidelity=float(match.fidelity),
-        gain=float(match.gain),
-        untouched=np.asarray(untouched),
-        before=before,
-        history=tuple(history),
-    )
+    return verified(experiment, signals, fresh, np.asarray(untouched), history)
