@@ -1,21 +1,39 @@
-"""Double precision everywhere, and no programs compiled before or left for later."""
+"""Double precision everywhere, no programs compiled before or left for later, and which cases run apart."""
 
 import os
-from pathlib import Path
 
 import jax
 import pytest
-
-import gmem_jax as gm
 
 os.environ["GMEM_COMPILE_CACHE"] = "off"
 
 jax.config.update("jax_enable_x64", True)
 
+# Cases of ten seconds and more, nearly all of it compiling, that repeat for a law what their siblings say of others:
+# `make test-slow`.
+SLOW = (
+    "test_both_modes_agree_with_plain_jax[M2-exact-True]",
+    "test_both_modes_agree_with_plain_jax[M2-paper-True]",
+    "test_both_modes_agree_with_plain_jax[frictionless-True]",
+    "test_both_modes_agree_with_plain_jax[H-False]",
+    "test_both_modes_of_derivatives_cross_the_domains_as_defined[narrow rings]",
+    "test_spinning_sliding_grains_of_several_domains_move_as_defined[1-narrow rings]",
+    "test_spinning_sliding_grains_of_several_domains_move_as_defined[9-narrow rings]",
+    "test_every_law_and_the_places_of_bumps_and_delta0_have_derivatives[M1]",
+    "test_derivatives_are_finite_at_the_corners_of_the_laws[overlap zero-M2]",
+    "test_derivatives_are_finite_at_the_corners_of_the_laws[apart-M2]",
+    "test_derivatives_are_finite_at_the_corners_of_the_laws[separating so fast that the dashpot would pull-M2]",
+    "test_the_kernels_give_the_values_and_tangents_of_the_definition[M1]",
+    "test_the_kernels_give_the_values_and_tangents_of_the_definition[frictionless]",
+    "test_every_instruction_set_has_the_same_derivatives[avx2]",
+    "test_eight_threads_at_once_give_the_bits_of_one_after_the_other[traced-20]",
+    "test_a_run_goes_on_with_the_lists_it_had[M2]",
+    "test_a_replica_does_not_depend_on_its_neighbours_in_the_batch[chosen1]",
+)
 
-@pytest.fixture(scope="session")
-def recalled() -> tuple[gm.Experiment, gm.Recall]:
-    """Two words recalled by 27 grains, far too fast: what tests of files and pictures share."""
-    pack = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
-    experiment = gm.Experiment(pack, gm.words(1), t0=75.0, store=0.1, rest=0.1, hold=0.1)
-    return experiment, gm.run(experiment)
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark them."""
+    for item in items:
+        if item.name in SLOW:
+            item.add_marker(pytest.mark.slow)

@@ -113,6 +113,7 @@ def test_rivals_take_turns_and_the_best_counts() -> None:
     assert [(row.us, row.median, row.worst) for row in rows] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
 
 
+@pytest.mark.slow
 def test_what_was_measured_is_kept_at_once(pack: gm.Pack) -> None:
     kept: list[int] = []
     result = bench.run(

@@ -369,6 +369,7 @@ def final_pressure(mu, stiffness, gamma0):
     return 1e3 * (sample.pressure[-1, 0, 1] - sample.pressure[-1, 1, 1])
 
 
+@pytest.mark.slow
 def test_reverse_mode_gradients_agree_with_central_differences():
     point = (0.2, 0.145, 0.02)  # mu small enough for many contacts to slide
     cluster27()  # built outside of tracing

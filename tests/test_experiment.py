@@ -214,6 +214,7 @@ def test_packs_of_one_size_share_a_structure() -> None:
     assert len(shapes) == 1
 
 
+@pytest.mark.slow
 def test_grad_and_vmap_work_outside_jit() -> None:
     experiment = make()
 

@@ -84,6 +84,7 @@ def test_the_exact_jacobian_agrees_with_central_differences(
     assert miss["all"] < 1e-2
 
 
+@pytest.mark.slow
 def test_the_jacobian_by_gamma0_follows_from_that_by_the_amplitudes(exact: jacobian.Jacobian) -> None:
     # Only the product gamma0 a_k enters: gamma0 dp/dgamma0 = sum_k a_k dp/da_k, to round-off.
     euler = exact.values[:2] @ exact.p_sig[:2]
@@ -201,6 +202,7 @@ def test_every_law_and_the_places_of_bumps_and_delta0_have_derivatives(experimen
         np.testing.assert_allclose(jnp.vdot(found.slope[name], step), difference, rtol=tolerance)
 
 
+@pytest.mark.slow
 def test_grad_of_the_traced_recall_agrees_with_the_walk_on_the_host(experiment: gm.Experiment) -> None:
     short = gm.replace(experiment, rest=0.02, hold=0.02, store=0.02)
 

@@ -146,6 +146,7 @@ def test_the_definition_of_a_call_is_what_the_library_computes(law: Any, isotrop
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-18)
 
 
+@pytest.mark.slow
 @needs_library
 def test_other_platforms_have_the_derivatives_of_a_sweep() -> None:
     """Their rules, run here: on shared arguments, with leading axes of size one."""
@@ -180,6 +181,7 @@ def test_other_platforms_have_the_derivatives_of_a_sweep() -> None:
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-9 * float(jnp.abs(other).max()))
 
 
+@pytest.mark.slow
 @needs_library
 def test_points_of_a_sweep_may_share_their_state() -> None:
     value, (by_mu, by_rates) = jax.jit(derivatives(native.march))(MUS, RATES)

@@ -147,6 +147,7 @@ def test_derivatives_through_200_steps_are_those_of_the_definition() -> None:
         np.testing.assert_allclose(fast, plain, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_vmap_and_grad_in_either_order() -> None:
     system, state = squeezed(LAWS["H"])
     theta = arguments(system, state)
@@ -201,6 +202,7 @@ def test_every_instruction_set_has_the_same_derivatives(monkeypatch: pytest.Monk
     assert_close(pull(), best)
 
 
+@pytest.mark.slow
 def test_bins_counted_only_at_run_time_are_differentiated_forwards() -> None:
     system, state = squeezed(LAWS["H"])
     walls = motion()

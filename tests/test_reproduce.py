@@ -148,6 +148,7 @@ def test_the_physics_gives_the_stored_numbers() -> None:
     np.testing.assert_allclose([float(number) for number in found], stored, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_claims_are_judged_by_their_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(reproducing, "packs", lambda *_, **__: [{"pack": PACK}])

@@ -84,6 +84,7 @@ def test_odd_and_even_parts_add_up_to_the_recall_of_each_bump(
     np.testing.assert_allclose(kernel.predict(signals), p_sig, atol=1e-6 * np.abs(np.asarray(p_sig)).max())
 
 
+@pytest.mark.slow
 def test_designed_waveforms_improve_stay_within_the_bound_and_survive_a_csv(
     experiment: gm.Experiment, tmp_path: Path
 ) -> None:

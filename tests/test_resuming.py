@@ -86,6 +86,7 @@ def test_a_preparation_goes_on(tmp_path: Path) -> None:
     _same(run, tmp_path / "parts", [2, 5, 40])
 
 
+@pytest.mark.slow
 def test_the_way_back_goes_on(tmp_path: Path) -> None:
     experiment = gm.Experiment(with_skin(gm.load_pack(PACK), 0.02), ONE, **SHORT)
 

@@ -99,6 +99,7 @@ def test_status_show_and_export_tell_the_same(
     assert "--force" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_longer_sweep_computes_only_what_is_new_and_retries_what_failed(swept: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in (swept / "points").iterdir()}
     (swept.parent / "more.toml").write_text(SWEEP.replace("1.0]", "0.6, 1.0]") + BROKEN)

@@ -125,7 +125,7 @@ inline void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> lever
 }
 
 // Finds the spheres of a grain, handed to `put(k, centre)`, and what the walls do to them; whether they are near them.
-// gmem_jax/physics/step.py: _sphere_table
+// gmem_jax/physics/step.py: sphere_table
 template <class V, class Put>
 GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const Midway<V>& m, const double* offsets, int spheres,
                             double arm, const WallState<V>& box, WallForces<V>& on, const Put& put) {
