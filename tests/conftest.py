@@ -1,9 +1,12 @@
-"""Double precision everywhere, no programs compiled before or left for later, and which cases run apart."""
+"""Double precision everywhere, no programs compiled before or left for later, which cases run apart, and what many tests read."""
 
 import os
+from pathlib import Path
 
 import jax
 import pytest
+
+import gmem_jax as gm
 
 os.environ["GMEM_COMPILE_CACHE"] = "off"
 
@@ -37,3 +40,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.name in SLOW:
             item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="session")
+def recalled() -> tuple[gm.Experiment, gm.Recall]:
+    """Two words recalled by 27 grains, far too fast: what tests of files and pictures share."""
+    pack = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
+    experiment = gm.Experiment(pack, gm.words(1), t0=75.0, store=0.1, rest=0.1, hold=0.1)
+    return experiment, gm.run(experiment)

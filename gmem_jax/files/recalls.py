@@ -150,6 +150,8 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
     require_fields(configuration.get("grain"), "configuration's grain", shape=title, mass=is_number, diameter=is_number)
     experiment = configuration.get("experiment", {})
     require(isinstance(experiment, dict), "its configuration has an impossible 'experiment'")
+    signals, form = configuration.get("signals", []), experiment.get("signals", {})
+    require(isinstance(signals, list) and isinstance(form, dict), "its configuration has impossible 'signals'")
     if "target" in configuration:
         require_fields(configuration["target"], "target", kind=title)
         signals_from(configuration["target"])

@@ -147,8 +147,8 @@ def pairs_within(centres: np.ndarray, reach: float, per_grain: int) -> int:
 
 def _check_record(found: Found, record: dict[str, Any], overlap: np.ndarray) -> None:
     """What was measured of the pack when it was made is what its numbers still say."""
-    if recipe := record.get("recipe"):
-        require_fields(recipe, "recipe", seed=whole)
+    if "recipe" in record:
+        require_fields(record["recipe"], "recipe", seed=whole, t0=is_number)
     if "at_rest" not in record:
         return
     triple = {"pressure": numbers, "lengths": numbers}

@@ -178,9 +178,8 @@ def conditions(configuration: dict[str, Any]) -> str:
     known = ", ".join(f"{name} = {_amount(configuration[name])}" for name in amounts)
     form = configuration.get("experiment", {}).get("signals", {})
     count = len(configuration.get("signals", ()))
-    kind = form.get("kind") if isinstance(form, dict) else None
     named = {"six": "the six signals", "words": f"all {count} words of {form.get('bits')} bits"}
-    stored = named.get(str(kind), f"{count} signals" if count else "")
+    stored = named.get(str(form.get("kind")), f"{count} signals" if count else "")
     return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", stored)))
 
 
