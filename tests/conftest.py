@@ -1,4 +1,4 @@
-"""Double precision everywhere, no programs compiled before or left for later, which cases run apart, and what many tests read."""
+"""Double precision everywhere, no programs kept or delayed, which cases run apart, and what many tests read."""
 
 import os
 from pathlib import Path
