@@ -215,6 +215,13 @@ def design_command(
     iterations: Annotated[
         int | None, typer.Option(min=1, help="Corrections; default 3 by Jacobians, 6 by the kernel.")
     ] = None,
+    bumps: Annotated[
+        int | None, typer.Option(min=2, help="Of a waveform; default 17 by Jacobians, 31 by the kernel.")
+    ] = None,
+    width: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=1.0, help="Of bumps, in u; default 0.2 by Jacobians, 0.08 by the kernel."),
+    ] = None,
     gain: Annotated[float | None, typer.Option(help="Wanted gain; default half of the untouched waveforms'.")] = None,
     restart: Restart = False,
     picture: Picture = True,
@@ -233,12 +240,15 @@ def design_command(
     began = time.perf_counter()
     count = experiment.signals.count
     by = by or ("kernel" if words is not None or count > MANY else "jacobian")
-    options: dict[str, Any] = {"gain": gain} | ({} if iterations is None else {"iterations": iterations})
+    asked = {"iterations": iterations, "n": bumps, "width": width}
+    options: dict[str, Any] = {"gain": gain} | {name: value for name, value in asked.items() if value is not None}
     if by == "kernel":
         options["batch"] = batch_for(experiment, output, restart=restart)
-        _announce(experiment, "design", by_kernel.cost(experiment, iterations), min(count, options["batch"]))
+        effort = by_kernel.cost(experiment, iterations, bumps or by_kernel.BUMPS)
+        _announce(experiment, "design", effort, min(count, options["batch"]))
     else:
-        _announce(experiment, "design", waveforms.cost(experiment, iterations), 2 * waveforms.BUMPS * count)
+        n = bumps or waveforms.BUMPS
+        _announce(experiment, "design", waveforms.cost(experiment, iterations, n), 2 * n * count)
     with resumable(output, key_of_run(experiment, by=by, **options), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             design = by_kernel.design_by_kernel if by == "kernel" else waveforms.design_waveforms

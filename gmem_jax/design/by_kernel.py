@@ -2,11 +2,14 @@
 
 A Jacobian of its own for every waveform (`waveforms`) costs some tens of runs of each. Here the one kernel of the pack,
 2 n + 1 replicas, serves them all: it says how each waveform should change for what its last recall missed. It is only
-nearly right, so the miss is simulated and corrected again; what gets worse is taken back and tried with half the step.
+nearly right, so the miss is simulated and corrected again, and what each simulation shows of a waveform's own slopes is
+added to the kernel (Broyden's update). What gets worse is taken back, and the next step is damped more (Levenberg and
+Marquardt).
 """
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,22 +21,28 @@ from gmem_jax.experiment.recall import run
 
 BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
 WIDTH = 0.08  # of them, in u
-DAMPING = 0.05  # of a correction, in parts of the kernel's largest singular value
+DAMPING = 0.05  # of the first correction, in parts of the kernel's largest singular value
+EASED, FIRMED = 0.6, 1.8  # times the damping after a step that was better, and one that was worse
 ITERATIONS = 6  # simulations of all waveforms
+SHORTEST = 1e-6  # step from which slopes are learned; a waveform of nothing takes none
 PREDICTED = 6  # corrections of the first guess, by the kernel alone
 
 
-def correction(kernel: MemoryKernel, amplitudes: np.ndarray, miss: np.ndarray, damping: float = DAMPING) -> np.ndarray:
-    """Changes of amplitudes that make up for what recalls miss, by the kernel's slope on either side, [S, n].
+def slopes(kernel: MemoryKernel, amplitudes: np.ndarray) -> np.ndarray:
+    """dp_sig / da of waveforms by the kernel, on the side of nought where each amplitude is, [S, n, 256]."""
+    slope: np.ndarray = kernel.odd + np.sign(amplitudes)[:, :, None] * kernel.even
+    return slope
+
+
+def correction(slope: np.ndarray, miss: np.ndarray, damping: jax.typing.ArrayLike) -> np.ndarray:
+    """Changes of amplitudes that make up for what recalls miss, by damped least squares, [S, n].
 
     Args:
-        kernel: with n basis waveforms.
-        amplitudes: of the present waveforms, [S, n].
+        slope: dp_sig / da of the present waveforms, [S, n, 256].
         miss: wanted p_sig less the present one, [S, 256], in E.
-        damping: of the least squares, in parts of the kernel's largest singular value.
+        damping: in the unit of singular values of the slope, a number or [S].
     """
-    slope = kernel.odd + np.sign(amplitudes)[:, :, None] * kernel.even  # [S, n, 256]
-    damped = (damping * np.linalg.norm(kernel.odd, 2)) ** 2 * np.eye(len(kernel.odd))
+    damped = np.square(np.asarray(damping))[..., None, None] * np.eye(slope.shape[1])
     along = np.einsum("snu,su->sn", slope, miss)
     step: np.ndarray = np.linalg.solve(slope @ slope.transpose(0, 2, 1) + damped, along[..., None])[..., 0]
     return step
@@ -60,11 +69,11 @@ def design_by_kernel(
 
     Args:
         experiment: the pack, the drive, and the signals whose J are the targets.
-        iterations: simulations of all waveforms, each but the last followed by a correction.
+        iterations: simulations of all waveforms, each but the first after a correction.
         n: bumps of a designed waveform.
         width: of the bumps.
         gain: wanted common gain; default half of the untouched waveforms' own, so that the bound |I| <= 1 leaves room.
-        damping: of a correction; see `correction`.
+        damping: of the first correction, in parts of the kernel's largest singular value.
         batch: signals that run together; default all of them.
         keep: asked for every part of every simulation, so that a design can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
@@ -99,19 +108,25 @@ def design_by_kernel(
     wanted = gain * float(experiment.scale) * target
     # Where a unit of J is recalled with the kernel's gain, this much of each waveform is needed.
     amplitudes = nearest(kernel.basis, experiment.signals) * gain / kernel.gain()
+    damped = np.full(len(target), damping * np.linalg.norm(kernel.odd, 2))
     for _ in range(PREDICTED):
         missed = wanted - kernel.recalled(amplitudes)
-        amplitudes = bounded(amplitudes + correction(kernel, amplitudes, missed, damping), width)
-    best, p_sig, step = amplitudes, np.full_like(wanted, np.inf), np.ones(len(target))
-    history = [float(original.fidelity)]
-    for iteration in range(iterations):
-        found = recall(f"iteration-{iteration}", replace(experiment, signals=bumps(amplitudes, width)))
+        amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, damped), width)
+    best, p_sig = amplitudes, recall("iteration-0", replace(experiment, signals=bumps(amplitudes, width)))
+    history = [float(original.fidelity), float(experiment.compare(jnp.asarray(p_sig)).fidelity)]
+    learned = np.zeros((len(best), *kernel.odd.shape))  # of each waveform's slopes, beyond the kernel
+    for iteration in range(1, iterations):
+        slope = slopes(kernel, best) + learned
+        tried = bounded(best + correction(slope, wanted - p_sig, damped), width)
+        found = recall(f"iteration-{iteration}", replace(experiment, signals=bumps(tried, width)))
+        step = tried - best
+        unforeseen = found - p_sig - np.einsum("sn,snu->su", step, slope)
+        length = np.maximum(np.sum(step**2, axis=1), SHORTEST**2)
+        learned += (step / length[:, None])[:, :, None] * unforeseen[:, None, :]
         better = np.linalg.norm(found - wanted, axis=1) < np.linalg.norm(p_sig - wanted, axis=1)
-        best, p_sig = (np.where(better[:, None], *pair) for pair in ((amplitudes, best), (found, p_sig)))
-        step = np.where(better, step, 0.5 * step)
+        best, p_sig = (np.where(better[:, None], *pair) for pair in ((tried, best), (found, p_sig)))
+        damped *= np.where(better, EASED, FIRMED)
         history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
-        change = correction(kernel, best, wanted - p_sig, damping)
-        amplitudes = bounded(best + step[:, None] * change, width)
     signals = sampled(bumps(best, width))
     fresh = recall("verified", replace(experiment, signals=signals))
     return verified(experiment, signals, fresh, untouched, history)

@@ -109,9 +109,9 @@ class _Work:
         return lambda stage, moment, fraction: inner(f"{name}, {stage}" if name else stage, moment, fraction)
 
 
-def cost(experiment: Experiment, iterations: int | None = None) -> float:
+def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS) -> float:
     """What a design takes, in runs of its signals."""
-    return _Work(experiment, BUMPS, iterations or ITERATIONS, silent).total
+    return _Work(experiment, n, iterations or ITERATIONS, silent).total
 
 
 def design_waveforms(
