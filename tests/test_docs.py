@@ -13,11 +13,12 @@ import typer
 
 import gmem_jax as gm
 from gmem_jax.command.app import app
+from gmem_jax.command.sweep import planned
+from gmem_jax.sweeps.spec import read_spec
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *ROOT.glob("benchmarks/*.md")])
-HOW_TO = [DOCS / "tutorial.md", DOCS / "own_law.md", *sorted((DOCS / "howto").glob("*.md"))]
 SMALL = ROOT / "tests" / "data" / "tetra-27.h5"
 SHORT: dict[str, Any] = {"t0": 75.0, "store": 0.1, "rest": 0.1, "hold": 0.1}
 
@@ -137,11 +138,23 @@ def test_the_tutorial_needs_no_setting_but_double_precision() -> None:
     assert jax.config.jax_enable_x64
 
 
+def test_sweeps_that_pages_write_down_could_be_begun(tmp_path: Path) -> None:
+    path, written = tmp_path / "sweep.toml", [block for page in PAGES for block in blocks(page, "toml")]
+    assert len(written) > 1
+    for block in written:
+        path.write_text(block)
+        planned(path, read_spec(path), tmp_path / "sweep")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("page", HOW_TO, ids=name)
-def test_examples_run(page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name)
+def test_examples_run(
+    page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, recalled: tuple[gm.Experiment, gm.Recall]
+) -> None:
     """All blocks of a page, one after the other, on a pack of 27 grains and a short experiment."""
+    pytest.importorskip("xarray")
     monkeypatch.chdir(tmp_path)
+    gm.save_recall(Path("recall.h5"), recalled[1], {})  # a page on files reads what `gmem recall` wrote
     small, experiment, train = gm.load_pack(SMALL), gm.Experiment, gm.classify.train
     monkeypatch.setattr(gm, "load_pack", lambda _: small)
     monkeypatch.setattr(gm, "prepare", lambda **_: small)

@@ -148,7 +148,7 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
         configuration: resolved, of any of them.
     """
     table = Table(title="Recall of the waveforms", caption=conditions(configuration))
-    for column in ("pack", "G", "F", "G over T1", "F over T1", "T1", "status"):
+    for column in ("pack", "G", "F", "G over T1", "F over T1", "T1 (t_c)", "status"):
         words = column in ("pack", "status")  # may wrap in a narrow terminal; numbers are never cut
         table.add_column(column, justify="left" if words else "right", no_wrap=not words, overflow="fold")
     keys = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
