@@ -110,7 +110,8 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
         raise InputError(f"{what} would take {years:.0e} years; choose a larger dt, a smaller t0 or fewer grains")
     units = (("days", 86400.0), ("hours", 3600.0), ("min", 60.0), ("s", 1.0))
     name, unit = next(pair for pair in units if seconds >= 2.0 * pair[1] or pair[1] == 1.0)
-    needs = f"some {max(1, round(seconds / unit))} {name} on a free machine once compiled, and {_bytes(memory)} of memory"
+    takes = f"some {max(1, round(seconds / unit))} {name} on a free machine once compiled"
+    needs = f"{takes}, and {_bytes(memory)} of memory"
     if memory > free:
         raise InputError(f"{what} needs {needs}, and {_bytes(free)} are free")
     say(f"{what}: {needs}{', in plain JAX' if backend == 'jax' else ''}")

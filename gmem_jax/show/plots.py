@@ -17,6 +17,7 @@ MOST = 12  # panels of recalled signals
 LINES = 7  # replicas of a time series: the zero signal and six others
 COLOURS = ("#1f5fa8", "#c8501e", "#2a8c57", "#8250b4", "#b8860b", "#0f8b8d", "#b03060")
 TOLD = {"displaylogo": False, "responsive": True, "toImageButtonOptions": {"format": "svg"}}
+U = "compression variable u"
 MARGIN = {"t": 80, "b": 50}  # pixels above and below the panels
 _AXIS = {"showline": True, "linecolor": "#999", "ticks": "outside", "gridcolor": "#eceff3", "zerolinecolor": "#c8cdd4"}
 
@@ -50,7 +51,7 @@ def written(figure: Any, name: str, height: int) -> str:
         height=height,
         hoverlabel={"bgcolor": "#fff"},
     )
-    figure.update_xaxes(**_AXIS)
+    figure.update_xaxes(**_AXIS, zeroline=False)
     figure.update_yaxes(**_AXIS)
     return str(figure.to_html(full_html=False, include_plotlyjs=False, config=TOLD, div_id=name))
 
@@ -100,9 +101,14 @@ def recalls(
             figure.add_trace(_line(np.asarray(recall.u), unit * values[number], name, colour, **more), **at)
     rows = -(-shown // columns)
     for column in range(1, columns + 1):
-        figure.update_xaxes(title_text="compression variable u", row=rows, col=column)
+        figure.update_xaxes(title_text=U, row=rows, col=column)
     for row in range(1, rows + 1):
         figure.update_yaxes(title_text="stress (Pa)", row=row, col=1)
+    drawn = unit * np.stack([values[:shown] for _, values, *_ in curves])
+    lowest, highest = np.nanmin(drawn), np.nanmax(drawn)
+    margin = 0.05 * (highest - lowest)
+    figure.update_xaxes(range=[0.0, 1.0])
+    figure.update_yaxes(range=[lowest - margin, highest + margin])  # plotly finds none for axes that are shared
     figure.update_layout(legend=_above(40, 110 + 220 * rows), hovermode="x unified")
     return figure, 110 + 220 * rows
 
@@ -144,7 +150,7 @@ def series(stages: Mapping[str, Sample], names: Sequence[str], t0: float | None)
             figure.add_trace(_line(time, values, name, colour, **more), row=panel // 2 + 1, col=panel % 2 + 1)
     for panel, unit_of in enumerate(("kPa", "kPa", "kPa", "Pa", "", "")):
         figure.update_yaxes(title_text=unit_of, row=panel // 2 + 1, col=panel % 2 + 1)
-    words = {"time": f"time t ({unit})", "u": "compression variable u"}
+    words = {"time": f"time t ({unit})", "u": U}
     figure.update_xaxes(title_text=words["time"], row=3)
     starts = tick * (ends - bins)
     bands = [_band(start, tick * end) for start, end in list(zip(starts, ends, strict=True))[1::2]]
@@ -238,6 +244,6 @@ def curves(
     for number, (name, (places, values)) in enumerate(rows.items()):
         colour = COLOURS[number % len(COLOURS)]
         figure.add_trace(_line(places, values, name, colour).update(mode=mode))
-    figure.update_xaxes(title_text=x)
+    figure.update_xaxes(title_text=x, range=[0.0, 1.0] if x == U else None)
     figure.update_yaxes(title_text=y, type="log" if log else "linear")
     return figure, 380

@@ -102,7 +102,7 @@ def signals_drawing(recall: Recall, names: Sequence[str], title: str, scale: Sca
     for axis in axes[:, 0]:
         axis.set_ylabel("stress (Pa)", fontsize=9)
     _u_below(axes, shown)
-    for right in rights[axes.shape[1] - 1 :: axes.shape[1]] or rights[-1:]:
+    for right in {*rights[axes.shape[1] - 1 :: axes.shape[1]], rights[-1]}:
         right.set_ylabel(r"$I(u) = \gamma / \gamma_0$", fontsize=8, color="0.5")
     handles = [recalled, scaled, wave]
     labels = ["recalled $p_{sig}$", r"$G E \delta_0 \gamma_0 J$", "waveform $I(u)$"]

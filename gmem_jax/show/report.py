@@ -55,8 +55,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "")
 
     top = [line([html.escape(name) for name in head], "th")] if any(head) else []
     body = "\n".join([*top, *(line(row, "td") for row in cells)])
-    said = f"<caption>{html.escape(caption)}</caption>" if caption else ""
-    return f'<div class="scroll"><table>{said}{body}</table></div>'
+    return f'<div class="scroll"><table>{body}</table></div>' + (_note(caption) if caption else "")
 
 
 def of_rich(drawn: Table) -> str:
@@ -168,7 +167,7 @@ class Report:
         self._seen.add(pack_fingerprint(pack))
         parts = [of_rich(tables.pack_table(pack)), self._view(at_rest(pack), Material())]
         if stages := load_stages(source):
-            parts += ["<h3>Its preparation</h3>", *self._stages(stages, [], pack.info.get("recipe", {}).get("t0"))]
+            parts += self._stages(stages, [], pack.info.get("recipe", {}).get("t0"), "Its preparation")
         if made is not None:
             parts.append(self._view(made, Material()))
         parts.append(_configuration(pack.info))
@@ -223,10 +222,12 @@ class Report:
         self._seen.add(of_pack["sha256"])
         return _note(f"{without} This is its pack at rest, before the run.") + self._view(at_rest(pack), material)
 
-    def _stages(self, stages: Mapping[str, Sample], names: Sequence[str], t0: Any) -> list[str]:
+    def _stages(
+        self, stages: Mapping[str, Sample], names: Sequence[str], t0: Any, title: str = "Along the run"
+    ) -> list[str]:
         told = f"Stages, white and grey in turn: {', '.join(stages)}."
         drawn = plots.series(stages, names, t0 if is_number(t0) else None)
-        return ["<h3>Along the run</h3>", self._figure(drawn), _note(told)]
+        return [f"<h3>{title}</h3>", self._figure(drawn), _note(told)]
 
     def _kernel(self, source: str) -> None:
         kernel, configuration = load_kernel(Path(source))
@@ -240,7 +241,9 @@ class Report:
         rows = [(words[name], f"{facts[name]:.3f}") for name in words]
         rows.append((f"singular values above {NOISE:g} Pa", f"{facts['capacity']} of {len(kernel.centres)}"))
         drawn = self._figure(plots.kernel(kernel, NOISE / float(Material().modulus)))
-        parts = [table(["", ""], rows), drawn, _configuration(configuration)]
+        bumps = {**configuration, "signals": (), "experiment": {}}  # no signals were stored
+        about = f"{tables.heading(bumps)}, {len(kernel.centres)} bumps of width {kernel.width:g}"
+        parts = [_note(about), table(["", ""], rows), drawn, _configuration(configuration)]
         self.sections.append((f"Kernel {Path(source).name}", "\n".join(parts)))
 
     def _result(self, path: Path) -> None:
@@ -252,7 +255,10 @@ class Report:
         self.sections.append((title, "\n".join([*parts, _configuration(found.get("configuration", {}))])))
 
     def _reading(self, found: dict[str, Any]) -> list[str]:
-        parts = [_note(f"of {found['recall']}, pack {found['pack']}"), *map(of_rich, tables.reading_tables(found))]
+        parts = [
+            _note(f"of {found['recall']}, pack {Path(found['pack']).stem}"),
+            *map(of_rich, tables.reading_tables(found)),
+        ]
         if found["words"] <= LARGEST_CONFUSION:
             names = [f"{word:0{found['bits']}b}" for word in range(found["words"])]
             counts = {name: confusion(row["read"], found["words"]) for name, row in found["readers"].items()}
@@ -260,13 +266,18 @@ class Report:
         return parts
 
     def _gradient(self, found: dict[str, Any]) -> list[str]:
-        slopes = found["gradient"]
+        slopes, configuration = found["gradient"], found.get("configuration", {})
         rows = [("F", f"{found['fidelity']:.4f}")]
-        rows += [(f"dF/d{name}", f"{slopes[name]:.5g}") for name in slopes if is_number(slopes[name])]
+        stiffness = "per E R" if configuration.get("friction") == "hooke" else "per E R^0.5"
+        units = {"stiffness": f" ({stiffness})"}
+        rows += [
+            (f"dF/d{name}{units.get(name, '')}", f"{slopes[name]:.5g}") for name in slopes if is_number(slopes[name])
+        ]
         lines = zip(found["places"], slopes["waveform"], strict=True)
         curves = {f"signal {n}": (np.asarray(place), np.asarray(slope)) for n, (place, slope) in enumerate(lines, 1)}
-        drawn = plots.curves(curves, "compression variable u", "dF / d amplitude", mode="lines+markers")
-        return [table(["", ""], rows), self._figure(drawn)]
+        drawn = plots.curves(curves, plots.U, "dF / d amplitude", mode="lines+markers")
+        about = tables.heading(configuration) if configuration else Path(found["pack"]).stem
+        return [_note(about), table(["", ""], rows), self._figure(drawn)]
 
     def _tuned(self, found: dict[str, Any]) -> list[str]:
         names = list(found["values"])
@@ -274,12 +285,16 @@ class Report:
             [number, *(f"{one[name]:.4g}" for name in names), f"{one['fidelity']:.4f}"]
             for number, one in enumerate(found["history"])
         ]
-        history = self._history(", ".join(found["packs"]), [one["fidelity"] for one in found["history"]])
-        return [table(["iteration", *names, "mean F"], rows), history]
+        packs = ", ".join(Path(pack).stem for pack in found["packs"])
+        history = self._history(packs, [one["fidelity"] for one in found["history"]])
+        about = f"mean over {packs}; stiffness in E R (k_M in E R^0.5)"
+        return [_note(about), table(["iteration", *names, "mean F"], rows), history]
 
     def _history(self, name: str, fidelities: Sequence[float]) -> str:
         line = (np.arange(len(fidelities)), 1.0 - np.asarray(fidelities))
-        return self._figure(plots.curves({name: line}, "iteration", "1 - F", mode="lines+markers", log=True))
+        figure, height = plots.curves({name: line}, "iteration", "1 - F", mode="lines+markers", log=True)
+        figure.update_xaxes(dtick=1 + len(fidelities) // 20)
+        return self._figure((figure, height))
 
     def _waveforms(self, path: Path) -> None:
         commented = path.suffix.lower() == ".csv"
@@ -289,16 +304,18 @@ class Report:
             told = "Designed so that their recall follows the integrals of these:"
             parts += [_note(told), self._waves(target)]
         if design:
-            rows = [(name, f"{design[name]:.4f}") for name in ("before", "fidelity", "gain")]
-            parts += [table(["", ""], rows, f"F of the recall on {design['pack']} with respect to the target")]
-            parts.append(self._history(design["pack"], design["history"]))
+            words = {"before": "F before", "fidelity": "F", "gain": "G"}
+            rows = [(words[name], f"{design[name]:.4f}") for name in words]
+            pack = Path(design["pack"]).stem
+            parts += [table(["", ""], rows, f"of the recall on {pack} with respect to the target")]
+            parts.append(self._history(pack, design["history"]))
         self.sections.append((f"Waveforms {path.name}", "\n".join(parts)))
 
     def _waves(self, signals: Signals) -> str:
         u = np.linspace(0.0, 1.0, 2 * BINS + 1)
         values = np.asarray(signals.shear(jnp.asarray(u))).T
         lines = {name: (u, value) for name, value, _ in zip(names_of(signals), values, range(plots.MOST), strict=False)}
-        return self._figure(plots.curves(lines, "compression variable u", "I(u)"))
+        return self._figure(plots.curves(lines, plots.U, "I(u)"))
 
     def _sweep(self, folder: Path) -> None:
         if not (folder / "sweep.json").is_file():

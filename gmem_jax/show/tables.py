@@ -173,14 +173,16 @@ def heading(configuration: dict[str, Any]) -> str:
 
 
 def conditions(configuration: dict[str, Any]) -> str:
-    """What a recall depends on first of all: law, mu, gamma0, delta0, t0, signals."""
+    """What a recall depends on first of all: law, mu, gamma0, delta0, t0, signals; its background if not SUB0."""
     amounts = ("mu", "gamma0", "delta0", "t0")
     known = ", ".join(f"{name} = {_amount(configuration[name])}" for name in amounts)
     form = configuration.get("experiment", {}).get("signals", {})
     count = len(configuration.get("signals", ()))
     named = {"six": "the six signals", "words": f"all {count} words of {form.get('bits')} bits"}
     stored = named.get(str(form.get("kind")), f"{count} signals" if count else "")
-    return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", stored)))
+    background = configuration.get("background", "sub0")
+    subtracted = "" if background == "sub0" else background.upper()
+    return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", stored, subtracted)))
 
 
 def _amount(value: Any) -> str:
