@@ -12,6 +12,7 @@ from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.files.atomic import FileFormatError, probe
 from gmem_jax.files.parts import locked
 from gmem_jax.physics.state import SENTENCES, Status
+from gmem_jax.show.tables import cell
 from gmem_jax.sweeps.executors import executor as executor_named
 from gmem_jax.sweeps.spec import Spec, read_spec
 from gmem_jax.sweeps.store import Store
@@ -159,12 +160,6 @@ def _export(store: Store, output: Path | None, force: bool, as_json: bool) -> No
     emit(as_json, {"output": str(output), "status": 0})
 
 
-def _number(value: Any) -> str:
-    """A value as a table shows it; of a file, its name."""
-    text = f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
-    return Path(text).stem if text.endswith(".h5") else text
-
-
 def _table(table: list[dict[str, Any]], names: list[str]) -> Table:
     drawn = Table()
     for name in (*names, "G", "F", "F(T1)", "status"):
@@ -173,7 +168,7 @@ def _table(table: list[dict[str, Any]], names: list[str]) -> Table:
         state = ", ".join(_bits(row["status"])) if row["state"] == "done" else row["state"]
         numbers = [row[name] for name in ("gain", "fidelity", "windowed_fidelity")]
         measured = ("" if number is None else f"{number:.3f}" for number in numbers)
-        drawn.add_row(*(_number(row[name]) for name in names), *measured, state or "ok")
+        drawn.add_row(*(cell(row[name]) for name in names), *measured, state or "ok")
     reasons = {bit for row in table if row["state"] == "done" for bit in Status if row["status"] & bit}
     drawn.caption = "; ".join([ABOUT, *(f"{_word(bit)}: {SENTENCES[bit]}" for bit in sorted(reasons))])
     return drawn
@@ -193,7 +188,7 @@ def _means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
         drawn.add_column(name, no_wrap=name not in names, min_width=14 if name in ("G", "F", "F(T1)") else None)
     for row in table:
         shown = [_with_error(row, name) for name in ("gain", "fidelity", "windowed_fidelity")]
-        drawn.add_row(*(_number(row[name]) for name in names), str(row["done"]), *shown)
+        drawn.add_row(*(cell(row[name]) for name in names), str(row["done"]), *shown)
     drawn.caption = f"mean and standard error; {ABOUT}"
     return drawn
 

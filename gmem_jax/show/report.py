@@ -199,7 +199,9 @@ class Report:
         parts += [f"<h3>Recalled signals{shown}</h3>", self._figure(plots.recalls(recall, scale, names, target))]
         parts += self._stages(recall.stages, names, t0)
         parts += ["<h3>Grains</h3>", self._grains(recall, names, configuration), _configuration(configuration)]
-        self.sections.append((f"Recall {Path(source).name}, pack {Path(configuration['pack']).stem}", "\n".join(parts)))
+        self.sections.append(
+            (f"Recall {Path(source).name}, pack {tables.cell(configuration['pack'])}", "\n".join(parts))
+        )
 
     def _grains(self, recall: Recall, names: Sequence[str], configuration: dict[str, Any]) -> str:
         """The frames of a recall, or its pack at rest if it is there."""
@@ -256,7 +258,7 @@ class Report:
 
     def _reading(self, found: dict[str, Any]) -> list[str]:
         parts = [
-            _note(f"of {found['recall']}, pack {Path(found['pack']).stem}"),
+            _note(f"of {found['recall']}, pack {tables.cell(found['pack'])}"),
             *map(of_rich, tables.reading_tables(found)),
         ]
         if found["words"] <= LARGEST_CONFUSION:
@@ -276,7 +278,7 @@ class Report:
         lines = zip(found["places"], slopes["waveform"], strict=True)
         curves = {f"signal {n}": (np.asarray(place), np.asarray(slope)) for n, (place, slope) in enumerate(lines, 1)}
         drawn = plots.curves(curves, plots.U, "dF / d amplitude", mode="lines+markers")
-        about = tables.heading(configuration) if configuration else Path(found["pack"]).stem
+        about = tables.heading(configuration) if configuration else tables.cell(found["pack"])
         return [_note(about), table(["", ""], rows), self._figure(drawn)]
 
     def _tuned(self, found: dict[str, Any]) -> list[str]:
@@ -285,7 +287,7 @@ class Report:
             [number, *(f"{one[name]:.4g}" for name in names), f"{one['fidelity']:.4f}"]
             for number, one in enumerate(found["history"])
         ]
-        packs = ", ".join(Path(pack).stem for pack in found["packs"])
+        packs = ", ".join(tables.cell(pack) for pack in found["packs"])
         history = self._history(packs, [one["fidelity"] for one in found["history"]])
         about = f"mean over {packs}; stiffness in E R (k_M in E R^0.5)"
         return [_note(about), table(["iteration", *names, "mean F"], rows), history]
@@ -306,7 +308,7 @@ class Report:
         if design:
             words = {"before": "F before", "fidelity": "F", "gain": "G"}
             rows = [(words[name], f"{design[name]:.4f}") for name in words]
-            pack = Path(design["pack"]).stem
+            pack = tables.cell(design["pack"])
             parts += [table(["", ""], rows, f"of the recall on {pack} with respect to the target")]
             parts.append(self._history(pack, design["history"]))
         self.sections.append((f"Waveforms {path.name}", "\n".join(parts)))
@@ -326,7 +328,7 @@ class Report:
         measured = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
         cells = [
             [
-                *(_short(row[name]) for name in names),
+                *(tables.cell(row[name]) for name in names),
                 *("" if row[name] is None else f"{row[name]:.3f}" for name in measured),
                 row["why"] or ("ok" if row["state"] == "done" else row["state"]),
             ]
@@ -347,19 +349,13 @@ def _against(x: str, done: Sequence[Mapping[str, Any]], names: Sequence[str]) ->
     others = [name for name in names if name != x and len({row[name] for row in rows}) > 1]
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
-        groups.setdefault(", ".join(f"{name} = {_short(row[name])}" for name in others), []).append(row)
+        groups.setdefault(", ".join(f"{name} = {tables.cell(row[name])}" for name in others), []).append(row)
     lines = {
         f"{letter} {name}": (np.array([row[x] for row in group]), np.array([row[measure] for row in group]))
         for name, group in groups.items()
         for letter, measure in (("F", "fidelity"), ("G", "gain"))
     }
     return plots.curves(lines, x, "F, G", mode="lines+markers")
-
-
-def _short(value: Any) -> str:
-    """A value as a table shows it; of a file, its name."""
-    text = f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
-    return Path(text).stem if text.endswith(".h5") else text
 
 
 def _measures(recall: Recall, scale: np.ndarray, t0: float | list[float]) -> list[list[str]]:

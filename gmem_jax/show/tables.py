@@ -154,7 +154,7 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
     keys = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
     for row in rows:
         numbers = [f"{row[key]:.3f}" for key in keys]
-        table.add_row(row["pack"], *numbers, f"{row['ringing_period']:.0f}", row["status_names"])
+        table.add_row(cell(row["pack"]), *numbers, f"{row['ringing_period']:.0f}", row["status_names"])
     if len(rows) > 1:
         means = [spread([row[key] for row in rows]) for key in keys]
         table.add_section()
@@ -169,7 +169,13 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
 
 def heading(configuration: dict[str, Any]) -> str:
     """What stands over a picture of a recall: its pack, and its conditions."""
-    return f"{Path(configuration['pack']).stem}: {conditions(configuration)}"
+    return f"{cell(configuration['pack'])}: {conditions(configuration)}"
+
+
+def cell(value: Any) -> str:
+    """A value as a table shows it; of a file, its name."""
+    text = f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
+    return Path(text).stem if text.endswith(".h5") else text
 
 
 def conditions(configuration: dict[str, Any]) -> str:
