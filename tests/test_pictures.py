@@ -11,7 +11,9 @@ from gmem_jax.experiment.analysis import compare
 from gmem_jax.experiment.signals import bin_average, part
 from gmem_jax.reproduce import run as reproducing
 from gmem_jax.reproduce.two_grains import tell
+from gmem_jax.show.pictures import sweep_drawing
 from gmem_jax.show.render import camera, rendered
+from gmem_jax.show.tables import cell
 
 
 def test_a_contact_keeps_the_shear_at_which_it_formed_until_it_breaks() -> None:
@@ -51,3 +53,14 @@ def test_a_picture_is_written(tmp_path: Path) -> None:
     assert [path.name for path in files] == ["fig05.png", "fig05.svg"]
     assert all(path.stat().st_size > 200 for path in files)
     assert said[0].startswith("fig05")
+
+
+def test_packs_are_called_by_their_files_and_else_by_their_whole_names() -> None:
+    assert [cell(name) for name in ("here/pack.b.h5", "tetra(0.6)-64-seed1")] == ["pack.b", "tetra(0.6)-64-seed1"]
+
+
+def test_a_sweep_is_drawn_over_what_can_be_counted() -> None:
+    rows = [{"pack": pack, "mu": mu, "gain": mu, "state": "done"} for pack in ("a.h5", "b.h5") for mu in (0.2, 1.0)]
+    (axis,) = sweep_drawing(rows, ["pack", "mu"], "gain", "mu").figure.axes
+    assert axis.get_xlabel() == "mu"
+    np.testing.assert_allclose(axis.lines[1].get_xydata(), [[0.2, 0.2], [1.0, 1.0]])

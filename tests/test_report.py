@@ -22,6 +22,7 @@ from gmem_jax.command import app
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.frames import Frames
 from gmem_jax.physics.sample import Sample
+from gmem_jax.show import plots
 from gmem_jax.show.report import Report, table
 from gmem_jax.show.scene import at_rest, links, packed, quantities
 
@@ -187,6 +188,14 @@ def test_errors_over_signals_are_those_of_leaving_each_out() -> None:
     expected = np.sqrt(4 / 5 * np.sum((each - np.mean(each, axis=0)) ** 2, axis=0))
     np.testing.assert_allclose(analysis.errors_over_signals(signal, integral, scale), expected, rtol=1e-9)
     assert np.isnan(analysis.errors_over_signals(signal[:1], integral[:1], scale)).all()
+
+
+def test_no_curve_of_the_recalled_signals_is_cut_off() -> None:
+    pytest.importorskip("plotly")
+    figure, _ = plots.recalls(made_up(), EXPERIMENT.scale, ["one", "two"])
+    lowest, highest = min(line.y.min() for line in figure.data), max(line.y.max() for line in figure.data)
+    for axis in figure.select_yaxes():
+        assert axis.range[0] < lowest < highest < axis.range[1]
 
 
 class References(HTMLParser):

@@ -99,7 +99,9 @@ def classify_command(
     save_result(output, READING, result)
     if drawn:
         net = result["readers"]["net"]
-        title = f"{configuration['pack']}, {stored.bits} bits: accuracy {net['accuracy']:.3f} ({seeds} nets)"
+        title = (
+            f"{tables.cell(configuration['pack'])}, {stored.bits} bits: accuracy {net['accuracy']:.3f} ({seeds} nets)"
+        )
         figures.confusion_figure(drawn, confusion(net["read"], len(stored.signals)), title)
     say(f"wrote {output}" + (f" and {drawn}" if drawn else ""))
     emit(as_json, result, *tables.reading_tables(result))

@@ -134,6 +134,7 @@ def history_figure(path: Path, histories: dict[str, Sequence[float]]) -> None:
     for name, history in histories.items():
         axis.semilogy(range(len(history)), 1.0 - np.asarray(history), "o-", markersize=4, label=name)
     axis.set(xlabel="iteration", ylabel="1 - F")
+    axis.xaxis.get_major_locator().set_params(integer=True)
     axis.legend(frameon=False, fontsize=8)
     save(path, figure)
 

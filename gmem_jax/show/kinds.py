@@ -118,7 +118,7 @@ def kernel_facts(kernel: MemoryKernel, noise: float) -> dict[str, Any]:
 
 def _kernel(file: Path) -> Shown:
     kernel, configuration = load_kernel(file)
-    pack = str(configuration.get("pack", file.stem))
+    pack = tables.cell(configuration.get("pack", file.stem))
     about = {"pack": pack, "n": len(kernel.centres), "width": kernel.width, "gamma0": kernel.gamma0}
     facts = kernel_facts(kernel, NOISE)
     lines = [f"memory kernel of {pack}: {about['n']} bumps of width {kernel.width:g}, gamma0 = {kernel.gamma0:g}"]
@@ -144,7 +144,7 @@ def _result(file: Path) -> Shown:
 
 def _reading(facts: dict[str, Any]) -> Shown:
     lines = tables.reading_tables(facts)
-    title = f"{facts['pack']}, {facts['bits']} bits"
+    title = f"{tables.cell(facts['pack'])}, {facts['bits']} bits"
     net = facts["readers"]["net"]
     reads = np.asarray(net["read"]).reshape(-1, facts["words"])
     right = f"{title}: accuracy {net['accuracy']:.3f} ({len(reads)} nets)"
@@ -157,7 +157,7 @@ def _reading(facts: dict[str, Any]) -> Shown:
 
 
 def _gradient(facts: dict[str, Any]) -> Shown:
-    slopes, title = facts["gradient"], f"{facts['pack']}: F = {facts['fidelity']:.4f}"
+    slopes, title = facts["gradient"], f"{tables.cell(facts['pack'])}: F = {facts['fidelity']:.4f}"
     lines = [title, *(f"dF/d{name} = {slopes[name]:.5g}" for name in slopes if is_number(slopes[name]))]
     for number, row in enumerate(slopes["waveform"]):
         lines.append(f"dF/da of signal {number + 1}: " + " ".join(f"{value:.4g}" for value in row))
@@ -167,7 +167,7 @@ def _gradient(facts: dict[str, Any]) -> Shown:
 
 
 def _tuned(facts: dict[str, Any]) -> Shown:
-    packs, history = " ".join(facts["packs"]), facts["history"]
+    packs, history = " ".join(map(tables.cell, facts["packs"])), facts["history"]
     values = ", ".join(f"{name} = {value:.4g}" for name, value in facts["values"].items())
     line = f"{packs}: mean F {facts['before']:.4f} -> {facts['fidelity']:.4f} with {values}"
     fidelities = [float(one["fidelity"]) for one in history]
@@ -210,7 +210,7 @@ def _waveforms(file: Path) -> Shown:
         lines.append(
             f"{design['pack']}: F {design['before']:.4f} -> {design['fidelity']:.4f}, gain {design['gain']:.3f}"
         )
-        drawn["history"] = lambda path: figures.history_figure(path, {design["pack"]: design["history"]})
+        drawn["history"] = lambda path: figures.history_figure(path, {tables.cell(design["pack"]): design["history"]})
     return Shown(facts, ["\n".join(lines)], drawn)
 
 

@@ -13,6 +13,7 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.state import Grains
 from gmem_jax.show.drawing import Drawing, blank
+from gmem_jax.show.tables import cell
 
 _LABELS = {
     "gain": "gain G",
@@ -81,6 +82,7 @@ def values_drawing(history: Sequence[Mapping[str, float]], title: str) -> Drawin
             way = [one[name] / first for one in history]
             axis.plot(way, "o-", markersize=4, label=f"{name}: {first:.3g} to {history[-1][name]:.3g}")
     axis.set(xlabel="iteration", ylabel="over the first value", title=title)
+    axis.xaxis.get_major_locator().set_params(integer=True)
     axis.legend(fontsize=8, frameon=False)
     return drawing
 
@@ -123,10 +125,11 @@ def waves_drawing(signals: Signals, target: Signals | None, title: str) -> Drawi
 
 
 def sweep_drawing(rows: Sequence[Mapping[str, Any]], names: Sequence[str], measure: str, title: str) -> Drawing:
-    """A measure of every point against the first name that varies, and the mean where several points share a value."""
+    """A measure of every point against the first number that varies, else the first name that does; means at each."""
     done = [row for row in rows if row["state"] == "done"]
-    along = next((name for name in names if len({row[name] for row in done}) > 1), names[0])
-    numbers = all(isinstance(row[along], int | float) for row in done)
+    varying = [name for name in names if len({row[name] for row in done}) > 1] or list(names[:1])
+    counted = [name for name in varying if all(isinstance(row[name], int | float) for row in done)]
+    along, numbers = (counted or varying)[0], bool(counted)
     values = sorted({row[along] for row in done}, key=lambda value: value if numbers else str(value))
     place = {value: value if numbers else number for number, value in enumerate(values)}
     drawing, ((axis,),) = blank(size=(6.4, 4.0))
@@ -134,7 +137,7 @@ def sweep_drawing(rows: Sequence[Mapping[str, Any]], names: Sequence[str], measu
     means = [np.mean([row[measure] for row in done if row[along] == value]) for value in values]
     axis.plot([place[value] for value in values], means, "-", color="C0", label="mean of the points there")
     if not numbers:
-        axis.set_xticks(range(len(values)), [str(value)[:24] for value in values], rotation=30, ha="right")
+        axis.set_xticks(range(len(values)), [cell(value)[:24] for value in values], rotation=30, ha="right")
     axis.set(xlabel=along, ylabel=_LABELS[measure])
     axis.set_title(f"{title}: {len(done)} of {len(rows)} points", fontsize=10)
     axis.legend(fontsize=7, frameon=False)
