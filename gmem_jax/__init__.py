@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from gmem_jax.design.by_kernel import design_by_kernel
     from gmem_jax.design.drive import TunedDrive, design_drive
     from gmem_jax.design.waveforms import Design, design_waveforms
-    from gmem_jax.reading import classify
+    from gmem_jax.reading import capacity, classify
     from gmem_jax.show.progress import ProgressBar
     from gmem_jax.show.view import view
     from gmem_jax.sweeps.sweep import sweep
@@ -49,6 +49,7 @@ _LATER = {  # what loads flax or optax, or is seldom asked for, or stands above 
     "design_waveforms": "gmem_jax.design.waveforms",
     "TunedDrive": "gmem_jax.design.drive",
     "design_drive": "gmem_jax.design.drive",
+    "capacity": "gmem_jax.reading.capacity",
     "classify": "gmem_jax.reading.classify",
     "ProgressBar": "gmem_jax.show.progress",
     "sweep": "gmem_jax.sweeps.sweep",
@@ -60,7 +61,7 @@ def __getattr__(name: str) -> Any:
     if name not in _LATER:
         raise AttributeError(f"module 'gmem_jax' has no attribute {name!r}")
     module = importlib.import_module(_LATER[name])
-    return module if name == "classify" else getattr(module, name)
+    return module if name in ("capacity", "classify") else getattr(module, name)
 
 
 __all__ = [
@@ -84,6 +85,7 @@ __all__ = [
     "Spline",
     "Status",
     "TunedDrive",
+    "capacity",
     "classify",
     "clump",
     "design_by_kernel",

@@ -1,0 +1,286 @@
+"""How many bits a pack holds, against N and gamma0, and alphabets of waveforms beside words.
+
+python experiments/capacity.py [-o capacity] [--packs tetra-325-a,...] [--large tetra-1024-a,tetra-3267-a]
+
+For each pack and gamma0: six signals on the pack as it is and on the same pack one experiment older (what does not
+repeat is a noise), and a kernel of 31 bumps; on --simulated packs all words of 8 bits and an alphabet of 256 too. The
+rest follows from the kernel. Simulations are kept, and studies in capacity.csv are done, so that it goes on where it
+was killed; some 2e10 grain-steps in all. What stands in the table is drawn to capacity.png.
+"""
+
+import argparse
+import csv
+import math
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import jax
+import matplotlib
+import numpy as np
+from console import say
+
+import gmem_jax as gm
+from gmem_jax.design.by_kernel import BUMPS, WIDTH
+from gmem_jax.design.kernel import bumps
+from gmem_jax.experiment.recall import LARGEST_BATCH, simulate
+from gmem_jax.experiment.signals import part
+from gmem_jax.files.configuration import key_of_run
+from gmem_jax.files.parts import Parts
+from gmem_jax.physics.material import Material
+from gmem_jax.reading.capacity import candidates, channels, decoded_bits, greedy_alphabet, smallest_distance
+
+ROUND_OFF = 1e-9  # of p_sig: what another order of grains, skin or instruction set changes (docs/trust.md)
+TIME_STEP = 2e-3  # of p_sig: what a time step four times shorter changes (docs/trust.md)
+FIXED = 1.0  # Pa
+PASCAL = Material().modulus
+SHORT = 8  # bits of the words that are simulated, and of whose recall relative noises are parts
+LONGER = {10: 2, 12: 1}  # bits of words that are only predicted, and draws of noise
+USUAL = 1e-3  # gamma0 of the large packs, of longer words and of alphabets
+SIZES = tuple(2**bits for bits in range(3, 11))
+TRIED = 20000  # candidates for an alphabet
+COLUMNS = ("pack", "N", "gamma0", "study", "quantity", "S", "noise", "sd_Pa", "value", "error")
+
+Row = dict[str, str]
+Found = dict[str, str | int | float]
+Noises = dict[str, float]
+
+
+class Case:
+    """A pack at one gamma0; what is simulated on it is kept in a folder."""
+
+    def __init__(self, name: str, gamma0: float, t0: float, folder: Path) -> None:
+        self.name, self.gamma0 = name, gamma0
+        self.experiment = gm.Experiment(gm.load_pack(name), gm.six_signals(), gamma0=gamma0, t0=t0)
+        self.parts = Parts(folder / f"{name}-{gamma0:g}.parts", key_of_run(self.experiment))
+
+    def repeated(self) -> np.ndarray:
+        """Recalls of the six signals, on the pack and on the same one an experiment without signal older, [2, 6, 256].
+
+        The older one has its grains where they came to rest; springs of friction begin anew, as in any pack.
+        """
+
+        def play(_: object) -> np.ndarray:
+            first = gm.run(self.experiment, frames=2, frames_of=0, progress=say)
+            assert first.frames is not None
+            position, quaternion = first.frames.position[-1], first.frames.quaternion[-1]
+            older = gm.pack_from(self.experiment.pack, position=position, quaternion=quaternion)
+            again = gm.run(gm.replace(self.experiment, pack=older), progress=say)
+            return np.stack([first.p_sig, again.p_sig])
+
+        return np.asarray(self.parts("repeated", play))
+
+    def kernel(self) -> gm.MemoryKernel:
+        """The memory kernel on narrow bumps."""
+        return gm.memory_kernel(self.experiment, BUMPS, WIDTH, keep=self.parts, progress=say)
+
+    def recalled(self, name: str, signals: gm.Signals) -> np.ndarray:
+        """Recalls of any signals, [S, 256], a batch at a time."""
+        found = []
+        for first in range(0, signals.count, LARGEST_BATCH):
+            few = part(signals, first, min(first + LARGEST_BATCH, signals.count))
+            wanted = gm.replace(self.experiment, signals=few)
+            batch = self.parts(
+                f"{name}-{first}", lambda at, wanted=wanted: simulate(wanted, checkpoint=at, progress=say).p_sig
+            )
+            found.append(batch)
+        return np.concatenate(found)
+
+
+class Table:
+    """The rows there are. A study of a case is done once."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.rows: list[Row] = list(csv.DictReader(path.open())) if path.exists() else []
+
+    def note(self, case: Case, study: str, found: Iterable[Found]) -> None:
+        """Add what a study finds, unless it is there already."""
+        key = {"pack": case.name, "gamma0": f"{case.gamma0:g}", "study": study}
+        if self.pick(**key):
+            return
+        key |= {"N": str(case.experiment.pack.grains)}
+        rows = [key | {name: _text(value) for name, value in each.items()} for each in found]
+        new = not self.path.exists()
+        with self.path.open("a") as file:
+            writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
+            if new:
+                writer.writeheader()
+            writer.writerows(rows)
+        self.rows += [dict.fromkeys(COLUMNS, "") | row for row in rows]
+        for row in rows:
+            print(*row.values(), flush=True)
+
+    def pick(self, **wanted: str) -> list[Row]:
+        """Rows with these values."""
+        return [row for row in self.rows if all(row[name] == value for name, value in wanted.items())]
+
+
+def _text(value: str | int | float) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def relative(change: np.ndarray, signals: np.ndarray) -> float:
+    """|change| / |signals|."""
+    return float(np.linalg.norm(change) / np.linalg.norm(signals))
+
+
+def noise(name: str, part_of_signal: float) -> Iterator[Found]:
+    """A measured noise."""
+    yield {"quantity": "noise over signal", "noise": name, "value": part_of_signal}
+
+
+def carried(kernel: gm.MemoryKernel, deviations: Noises) -> Iterator[Found]:
+    """The upper bound at each noise."""
+    for name, sd in deviations.items():
+        bits, own = channels(kernel, sd), {"noise": name, "sd_Pa": sd * PASCAL}
+        yield {"quantity": "bits", "value": float(bits.sum()), **own}
+        yield {"quantity": "channels in use", "value": int(np.sum(bits > 0.0)), **own}
+
+
+def decoded(signals: np.ndarray, deviations: Noises, draws: int = 4) -> Iterator[Found]:
+    """The lower bound at each noise."""
+    for name, sd in deviations.items():
+        bits, error = decoded_bits(signals, sd, draws=draws)
+        own = {"S": len(signals), "noise": name, "sd_Pa": sd * PASCAL}
+        yield {"quantity": "bits", "value": bits, "error": error, **own}
+
+
+def checked(predicted: np.ndarray, simulated: np.ndarray) -> Iterator[Found]:
+    """How far apart the two nearest simulated recalls are, how good predictions were, and as templates."""
+    yield {"quantity": "nearest two (Pa)", "S": len(simulated), "value": smallest_distance(simulated) * PASCAL}
+    yield {"quantity": "error of prediction", "value": relative(predicted - simulated, simulated)}
+    away = np.linalg.norm(simulated[:, None] - predicted[None], axis=2)
+    right = float(np.mean(away.argmin(axis=1) == np.arange(len(away))))
+    yield {"quantity": "read by nearest prediction", "S": len(simulated), "value": right}
+
+
+def distances(kernel: gm.MemoryKernel, alphabet: np.ndarray) -> Iterator[Found]:
+    """The two nearest of an alphabet's first recalls and of as many words', as the kernel predicts them."""
+    for size in SIZES:
+        words = kernel.predict(gm.words(size.bit_length() - 1))
+        yield {"quantity": "nearest two (Pa)", "S": size, "value": float(alphabet[size - 1]) * PASCAL}
+        yield {"quantity": "nearest two words (Pa)", "S": size, "value": smallest_distance(words) * PASCAL}
+
+
+def study(table: Table, case: Case, noises: Noises, *, simulated: bool) -> None:
+    """All of a case, at noises given as parts of the words' recall."""
+    kernel, words = case.kernel(), gm.words(SHORT)
+    predicted = kernel.predict(words)
+    rms = math.sqrt(np.mean(predicted**2))
+    deviations = {name: share * rms for name, share in noises.items()} | {f"{FIXED:g} Pa": FIXED / PASCAL}
+    table.note(case, "channels", carried(kernel, deviations))
+    table.note(case, f"words {SHORT} predicted", decoded(predicted, deviations))
+    if simulated:
+        found = case.recalled(f"words-{SHORT}", words)
+        table.note(case, f"words {SHORT} simulated", decoded(found, deviations))
+        table.note(case, f"words {SHORT} checked", checked(predicted, found))
+    if case.gamma0 != USUAL or not case.name.endswith("-a"):
+        return
+    amplitudes = candidates(kernel, TRIED)
+    recalls = kernel.recalled(amplitudes)
+    alphabet = greedy_alphabet(recalls, max(SIZES))
+    table.note(case, "alphabets", distances(kernel, alphabet.distance))
+    if simulated:
+        few = alphabet.chosen[: 2**SHORT]
+        found = case.recalled(f"alphabet-{2**SHORT}", bumps(amplitudes[few], WIDTH))
+        table.note(case, "alphabet checked", checked(recalls[few], found))
+    for bits, draws in LONGER.items():
+        table.note(case, f"words {bits} predicted", decoded(kernel.predict(gm.words(bits)), deviations, draws))
+
+
+def over_packs(rows: list[Row], by: str) -> tuple[list[float], list[float], list[float]]:
+    """Mean and SD (0 of one pack) of the values of rows at each value of a column."""
+    places = sorted({float(row[by]) for row in rows})
+    values = [[float(row["value"]) for row in rows if float(row[by]) == place] for place in places]
+    deviation = [float(np.std(some, ddof=1)) if len(some) > 1 else 0.0 for some in values]
+    return places, [float(np.mean(some)) for some in values], deviation
+
+
+STYLES = {
+    "channels": ("^--", "channels: at most, were it linear"),
+    f"words {SHORT} predicted": ("o-", f"decoded, words of {SHORT} bits, predicted"),
+    f"words {SHORT} simulated": ("x", f"decoded, words of {SHORT} bits, simulated"),
+    "words 12 predicted": ("s", "decoded, words of 12 bits, predicted"),
+}
+
+
+def draw(table: Table, path: Path) -> None:
+    """Bounds against N and against gamma0, and distances against the size of an alphabet."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 3, figsize=(15, 4.8))
+    usual, small = f"{USUAL:g}", min((row["N"] for row in table.rows), key=int)
+    names = list(dict.fromkeys(row["noise"] for row in table.pick(study="channels")))
+    for axis, by, kept in ((axes[0], "N", {"gamma0": usual}), (axes[1], "gamma0", {"N": small})):
+        for colour, name in enumerate(names):
+            for study, (style, _) in STYLES.items():
+                rows = table.pick(study=study, quantity="bits", noise=name, **kept)
+                if rows:
+                    axis.errorbar(*over_packs(rows, by), fmt=style, color=f"C{colour}", capsize=2, mfc="none", ms=5)
+        axis.set(xscale="log", yscale="log", xlabel={"N": "N", "gamma0": r"$\gamma_0$"}[by], ylabel="bits")
+    for colour, name in enumerate(names):
+        axes[0].plot([], [], color=f"C{colour}", label=name)
+    for style, label in STYLES.values():
+        axes[1].plot([], [], style, color="0.4", mfc="none", label=label)
+    axes[0].set_title(rf"$\gamma_0$ = {usual}", fontsize=9)
+    axes[1].set_title(f"N = {small}, mean and SD over packs", fontsize=9)
+    axes[0].legend(title="noise", fontsize=7, title_fontsize=7, frameon=False)
+    axes[1].legend(fontsize=7, frameon=False)
+    for colour, pack in enumerate(dict.fromkeys(row["pack"] for row in table.pick(study="alphabets"))):
+        for kind, style, label in (("nearest two", "o-", "greedy"), ("nearest two words", "s--", "words")):
+            rows = table.pick(study="alphabets", quantity=f"{kind} (Pa)", pack=pack)
+            axes[2].plot(*points(rows), style, color=f"C{colour}", ms=4, mfc="none", label=f"{pack}, {label}")
+        for study, marker in (("alphabet checked", "o"), (f"words {SHORT} checked", "s")):
+            axes[2].plot(*points(table.pick(study=study, quantity="nearest two (Pa)", pack=pack, gamma0=usual)),
+                         marker, color=f"C{colour}", ms=6)  # fmt: skip
+    axes[2].set(xscale="log", yscale="log", xlabel="waveforms S", ylabel="nearest two recalls apart (Pa, rms)")
+    axes[2].set_title("predicted; full: simulated", fontsize=9)
+    axes[2].legend(fontsize=7, frameon=False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def points(rows: list[Row]) -> tuple[list[int], list[float]]:
+    """Sizes and values of rows."""
+    return [int(row["S"]) for row in rows], [float(row["value"]) for row in rows]
+
+
+def main() -> None:
+    """Noises first, since that between packs needs them all; then kernels and what follows from them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("capacity"), help="folder to write to")
+    parser.add_argument("--packs", default="tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e")
+    parser.add_argument("--large", default="tetra-1024-a,tetra-3267-a", help=f"packs at gamma0 = {USUAL:g} only")
+    parser.add_argument("--simulated", default="tetra-325-a", help="packs whose words of 8 bits are simulated")
+    parser.add_argument("--gammas", default="1e-3,3e-4,3e-3")
+    parser.add_argument("--t0", type=float, default=1.8e3)
+    arguments = parser.parse_args()
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_enable_x64", True)
+    table = Table(arguments.output / "capacity.csv")
+    small, large, simulated = (
+        [name for name in names.split(",") if name] for names in (arguments.packs, arguments.large, arguments.simulated)
+    )
+
+    for gamma0 in map(float, arguments.gammas.split(",")):
+        cases = [Case(name, gamma0, arguments.t0, arguments.output) for name in small]
+        recalls = np.stack([case.repeated() for case in cases])  # packs, now and older, signals, bins
+        # How far one pack's recall is from the mean of all, by SD.
+        between = math.sqrt(recalls[:, 0].var(axis=0, ddof=min(1, len(cases) - 1)).mean() / np.mean(recalls[:, 0] ** 2))
+        table.note(cases[0], "between packs", noise("other pack", between))
+        cases += [Case(name, gamma0, arguments.t0, arguments.output) for name in large if gamma0 == USUAL]
+        for case in cases:
+            now, later = case.repeated()
+            older = relative(later - now, now)
+            table.note(case, "repeated", noise("older pack", older))
+            noises = {"round-off": ROUND_OFF, "time step": TIME_STEP, "older pack": older}
+            if case.name in small:
+                noises["other pack"] = between
+            study(table, case, noises, simulated=case.name in simulated)
+            draw(table, arguments.output / "capacity.png")
+
+
+if __name__ == "__main__":
+    main()
