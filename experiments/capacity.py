@@ -162,30 +162,48 @@ def distances(kernel: gm.MemoryKernel, alphabet: np.ndarray) -> Iterator[Found]:
         yield {"quantity": "nearest two words (Pa)", "S": size, "value": smallest_distance(words) * PASCAL}
 
 
-def study(table: Table, case: Case, noises: Noises, *, simulated: bool) -> None:
-    """All of a case, at noises given as parts of the words' recall."""
-    kernel, words = case.kernel(), gm.words(SHORT)
-    predicted = kernel.predict(words)
-    rms = math.sqrt(np.mean(predicted**2))
-    deviations = {name: share * rms for name, share in noises.items()} | {f"{FIXED:g} Pa": FIXED / PASCAL}
-    table.note(case, "channels", carried(kernel, deviations))
-    table.note(case, f"words {SHORT} predicted", decoded(predicted, deviations))
-    if simulated:
-        found = case.recalled(f"words-{SHORT}", words)
-        table.note(case, f"words {SHORT} simulated", decoded(found, deviations))
-        table.note(case, f"words {SHORT} checked", checked(predicted, found))
-    if case.gamma0 != USUAL or not case.name.endswith("-a"):
-        return
+def deviations(kernel: gm.MemoryKernel, noises: Noises) -> Noises:
+    """Standard deviations in E, of noises given as parts of the words' recall."""
+    rms = math.sqrt(np.mean(kernel.predict(gm.words(SHORT)) ** 2))
+    return {name: share * rms for name, share in noises.items()} | {f"{FIXED:g} Pa": FIXED / PASCAL}
+
+
+def alphabet_of(kernel: gm.MemoryKernel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The largest alphabet: amplitudes [S, n], their predicted recalls [S, 256], and the smallest distances [S]."""
     amplitudes = candidates(kernel, TRIED)
     recalls = kernel.recalled(amplitudes)
-    alphabet = greedy_alphabet(recalls, max(SIZES))
-    table.note(case, "alphabets", distances(kernel, alphabet.distance))
-    if simulated:
-        few = alphabet.chosen[: 2**SHORT]
-        found = case.recalled(f"alphabet-{2**SHORT}", bumps(amplitudes[few], WIDTH))
-        table.note(case, "alphabet checked", checked(recalls[few], found))
+    chosen, distance = greedy_alphabet(recalls, max(SIZES))
+    return amplitudes[chosen], recalls[chosen], distance
+
+
+def predict(table: Table, case: Case, noises: Noises) -> None:
+    """What follows from the kernel in a moment."""
+    kernel = case.kernel()
+    sd = deviations(kernel, noises)
+    table.note(case, "channels", carried(kernel, sd))
+    table.note(case, f"words {SHORT} predicted", decoded(kernel.predict(gm.words(SHORT)), sd))
+    if case.gamma0 == USUAL and case.name.endswith("-a"):
+        table.note(case, "alphabets", distances(kernel, alphabet_of(kernel)[2]))
+
+
+def check(table: Table, case: Case, noises: Noises) -> None:
+    """What is to be simulated."""
+    kernel, words = case.kernel(), gm.words(SHORT)
+    found = case.recalled(f"words-{SHORT}", words)
+    table.note(case, f"words {SHORT} simulated", decoded(found, deviations(kernel, noises)))
+    table.note(case, f"words {SHORT} checked", checked(kernel.predict(words), found))
+    if case.gamma0 == USUAL:
+        amplitudes, recalls, _ = alphabet_of(kernel)
+        found = case.recalled(f"alphabet-{2**SHORT}", bumps(amplitudes[: 2**SHORT], WIDTH))
+        table.note(case, "alphabet checked", checked(recalls[: 2**SHORT], found))
+
+
+def lengthen(table: Table, case: Case, noises: Noises) -> None:
+    """Longer words, by the kernel: minutes of fitting."""
+    kernel = case.kernel()
     for bits, draws in LONGER.items():
-        table.note(case, f"words {bits} predicted", decoded(kernel.predict(gm.words(bits)), deviations, draws))
+        predicted = kernel.predict(gm.words(bits))
+        table.note(case, f"words {bits} predicted", decoded(predicted, deviations(kernel, noises), draws))
 
 
 def over_packs(rows: list[Row], by: str) -> tuple[list[float], list[float], list[float]]:
@@ -264,11 +282,11 @@ def main() -> None:
         [name for name in names.split(",") if name] for names in (arguments.packs, arguments.large, arguments.simulated)
     )
 
+    known: list[tuple[Case, Noises]] = []
     for gamma0 in map(float, arguments.gammas.split(",")):
         cases = [Case(name, gamma0, arguments.t0, arguments.output) for name in small]
-        recalls = np.stack([case.repeated() for case in cases])  # packs, now and older, signals, bins
-        # How far one pack's recall is from the mean of all, by SD.
-        between = math.sqrt(recalls[:, 0].var(axis=0, ddof=min(1, len(cases) - 1)).mean() / np.mean(recalls[:, 0] ** 2))
+        recalls = np.stack([case.repeated()[0] for case in cases])  # packs, signals, bins
+        between = math.sqrt(recalls.var(axis=0, ddof=min(1, len(cases) - 1)).mean() / np.mean(recalls**2))
         table.note(cases[0], "between packs", noise("other pack", between))
         cases += [Case(name, gamma0, arguments.t0, arguments.output) for name in large if gamma0 == USUAL]
         for case in cases:
@@ -276,10 +294,15 @@ def main() -> None:
             older = relative(later - now, now)
             table.note(case, "repeated", noise("older pack", older))
             noises = {"round-off": ROUND_OFF, "time step": TIME_STEP, "older pack": older}
-            if case.name in small:
-                noises["other pack"] = between
-            study(table, case, noises, simulated=case.name in simulated)
+            known.append((case, noises | ({"other pack": between} if case.name in small else {})))
+            predict(table, *known[-1])
             draw(table, arguments.output / "capacity.png")
+    for case, noises in known:
+        if case.name in simulated:
+            check(table, case, noises)
+        if case.gamma0 == USUAL and case.name.endswith("-a"):
+            lengthen(table, case, noises)
+        draw(table, arguments.output / "capacity.png")
 
 
 if __name__ == "__main__":

@@ -152,20 +152,19 @@ def greedy_alphabet(recalls: jax.typing.ArrayLike, size: int) -> Alphabet:
     values = np.asarray(recalls, dtype=float)
     if not 1 <= size <= len(values):
         raise ValueError(f"an alphabet of {len(values)} candidates has 1 to {len(values)} waveforms, got {size}")
-    chosen, distance = [int(np.argmax(np.linalg.norm(values, axis=1)))], [np.inf]
-    nearest = np.full(len(values), np.inf)
+    power = np.mean(values**2, axis=1)
+    chosen, distance = [int(np.argmax(power))], [np.inf]
+    nearest = np.full(len(values), np.inf)  # mean square to the nearest that is chosen
     while len(chosen) < size:
-        nearest = np.minimum(nearest, _rms(values - values[chosen[-1]]))
+        last = chosen[-1]
+        nearest = np.minimum(nearest, power + power[last] - 2.0 * values @ values[last] / values.shape[1])
         chosen.append(int(np.argmax(nearest)))
-        distance.append(float(nearest[chosen[-1]]))
+        distance.append(float(np.sqrt(max(0.0, nearest[chosen[-1]]))))
     return Alphabet(np.asarray(chosen), np.asarray(distance))
 
 
 def smallest_distance(recalls: jax.typing.ArrayLike) -> float:
     """Distance of the two nearest recalls [S, 256], as in `Alphabet`."""
     values = np.asarray(recalls, dtype=float)
-    return float(min(_rms(values[row + 1 :] - values[row]).min() for row in range(len(values) - 1)))
-
-
-def _rms(rows: np.ndarray) -> np.ndarray:
-    return np.asarray(np.sqrt(np.mean(rows**2, axis=-1)))
+    pairs = (np.mean((values[row + 1 :] - values[row]) ** 2, axis=1).min() for row in range(len(values) - 1))
+    return float(np.sqrt(min(pairs)))
