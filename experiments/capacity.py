@@ -176,13 +176,13 @@ def alphabet_of(kernel: gm.MemoryKernel) -> tuple[np.ndarray, np.ndarray, np.nda
     return amplitudes[chosen], recalls[chosen], distance
 
 
-def predict(table: Table, case: Case, noises: Noises) -> None:
-    """What follows from the kernel in a moment."""
+def predict(table: Table, case: Case, noises: Noises, *, close: bool) -> None:
+    """What follows from the kernel in a moment; of a pack that is looked at closely, alphabets too."""
     kernel = case.kernel()
     sd = deviations(kernel, noises)
     table.note(case, "channels", carried(kernel, sd))
     table.note(case, f"words {SHORT} predicted", decoded(kernel.predict(gm.words(SHORT)), sd))
-    if case.gamma0 == USUAL and case.name.endswith("-a"):
+    if close:
         table.note(case, "alphabets", distances(kernel, alphabet_of(kernel)[2]))
 
 
@@ -295,12 +295,12 @@ def main() -> None:
             table.note(case, "repeated", noise("older pack", older))
             noises = {"round-off": ROUND_OFF, "time step": TIME_STEP, "older pack": older}
             known.append((case, noises | ({"other pack": between} if case.name in small else {})))
-            predict(table, *known[-1])
+            predict(table, *known[-1], close=gamma0 == USUAL and case.name in large + simulated)
             draw(table, arguments.output / "capacity.png")
     for case, noises in known:
         if case.name in simulated:
             check(table, case, noises)
-        if case.gamma0 == USUAL and case.name.endswith("-a"):
+        if case.gamma0 == USUAL and case.name in large + simulated:
             lengthen(table, case, noises)
         draw(table, arguments.output / "capacity.png")
 
