@@ -124,9 +124,10 @@ def relative(change: np.ndarray, signals: np.ndarray) -> float:
     return float(np.linalg.norm(change) / np.linalg.norm(signals))
 
 
-def noise(name: str, part_of_signal: float) -> Iterator[Found]:
-    """A measured noise."""
-    yield {"quantity": "noise over signal", "noise": name, "value": part_of_signal}
+def noise(parts_of_signal: Noises) -> Iterator[Found]:
+    """Measured noises."""
+    for name, share in parts_of_signal.items():
+        yield {"quantity": "noise over signal", "noise": name, "value": share}
 
 
 def carried(kernel: gm.MemoryKernel, deviations: Noises) -> Iterator[Found]:
@@ -285,16 +286,18 @@ def main() -> None:
     known: list[tuple[Case, Noises]] = []
     for gamma0 in map(float, arguments.gammas.split(",")):
         cases = [Case(name, gamma0, arguments.t0, arguments.output) for name in small]
-        recalls = np.stack([case.repeated()[0] for case in cases])  # packs, signals, bins
-        between = math.sqrt(recalls.var(axis=0, ddof=min(1, len(cases) - 1)).mean() / np.mean(recalls**2))
-        table.note(cases[0], "between packs", noise("other pack", between))
+        between: Noises = {}
+        if len(cases) > 1:
+            recalls = np.stack([case.repeated()[0] for case in cases])  # packs, signals, bins
+            between = {"other pack": math.sqrt(recalls.var(axis=0, ddof=1).mean() / np.mean(recalls**2))}
+            table.note(cases[0], "between packs", noise(between))
         cases += [Case(name, gamma0, arguments.t0, arguments.output) for name in large if gamma0 == USUAL]
         for case in cases:
             now, later = case.repeated()
             older = relative(later - now, now)
-            table.note(case, "repeated", noise("older pack", older))
+            table.note(case, "repeated", noise({"older pack": older}))
             noises = {"round-off": ROUND_OFF, "time step": TIME_STEP, "older pack": older}
-            known.append((case, noises | ({"other pack": between} if case.name in small else {})))
+            known.append((case, noises | (between if case.name in small else {})))
             predict(table, *known[-1], close=gamma0 == USUAL and case.name in large + simulated)
             draw(table, arguments.output / "capacity.png")
     for case, noises in known:
