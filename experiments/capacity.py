@@ -124,10 +124,9 @@ def relative(change: np.ndarray, signals: np.ndarray) -> float:
     return float(np.linalg.norm(change) / np.linalg.norm(signals))
 
 
-def noise(parts_of_signal: Noises) -> Iterator[Found]:
-    """Measured noises."""
-    for name, share in parts_of_signal.items():
-        yield {"quantity": "noise over signal", "noise": name, "value": share}
+def noise(name: str, part_of_signal: float) -> Iterator[Found]:
+    """A measured noise."""
+    yield {"quantity": "noise over signal", "noise": name, "value": part_of_signal}
 
 
 def carried(kernel: gm.MemoryKernel, deviations: Noises) -> Iterator[Found]:
@@ -267,10 +266,11 @@ def points(rows: list[Row]) -> tuple[list[int], list[float]]:
 
 
 def main() -> None:
-    """Noises first, since that between packs needs them all; then kernels and what follows from them."""
+    """The noise between packs first, then each case, and last what takes longest."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("capacity"), help="folder to write to")
-    parser.add_argument("--packs", default="tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e")
+    packs = "tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e"
+    parser.add_argument("--packs", default=packs, help="two or more of one size")
     parser.add_argument("--large", default="tetra-1024-a,tetra-3267-a", help=f"packs at gamma0 = {USUAL:g} only")
     parser.add_argument("--simulated", default="tetra-325-a", help="packs whose words of 8 bits are simulated")
     parser.add_argument("--gammas", default="1e-3,3e-4,3e-3")
@@ -283,22 +283,20 @@ def main() -> None:
         [name for name in names.split(",") if name] for names in (arguments.packs, arguments.large, arguments.simulated)
     )
 
+    usual = [Case(name, USUAL, arguments.t0, arguments.output) for name in small]
+    recalls = np.stack([case.repeated()[0] for case in usual])  # packs, signals, bins
+    between = math.sqrt(recalls.var(axis=0, ddof=1).mean() / np.mean(recalls**2))
+    table.note(usual[0], "between packs", noise("other pack", between))
     known: list[tuple[Case, Noises]] = []
     for gamma0 in map(float, arguments.gammas.split(",")):
-        cases = [Case(name, gamma0, arguments.t0, arguments.output) for name in small]
-        between: Noises = {}
-        if len(cases) > 1:
-            recalls = np.stack([case.repeated()[0] for case in cases])  # packs, signals, bins
-            between = {"other pack": math.sqrt(recalls.var(axis=0, ddof=1).mean() / np.mean(recalls**2))}
-            table.note(cases[0], "between packs", noise(between))
-        cases += [Case(name, gamma0, arguments.t0, arguments.output) for name in large if gamma0 == USUAL]
-        for case in cases:
+        for name in small + (large if gamma0 == USUAL else []):
+            case = Case(name, gamma0, arguments.t0, arguments.output)
             now, later = case.repeated()
             older = relative(later - now, now)
-            table.note(case, "repeated", noise({"older pack": older}))
-            noises = {"round-off": ROUND_OFF, "time step": TIME_STEP, "older pack": older}
-            known.append((case, noises | (between if case.name in small else {})))
-            predict(table, *known[-1], close=gamma0 == USUAL and case.name in large + simulated)
+            table.note(case, "repeated", noise("older pack", older))
+            noises = {"round-off": ROUND_OFF, "time step": TIME_STEP, "older pack": older, "other pack": between}
+            known.append((case, noises))
+            predict(table, case, noises, close=gamma0 == USUAL and name in large + simulated)
             draw(table, arguments.output / "capacity.png")
     for case, noises in known:
         if case.name in simulated:
