@@ -31,7 +31,7 @@ from gmem_jax.reading.capacity import candidates, channels, decoded_bits, greedy
 
 ROUND_OFF = 1e-9  # of p_sig: what another order of grains, skin or instruction set changes (docs/trust.md)
 TIME_STEP = 2e-3  # of p_sig: what a time step four times shorter changes (docs/trust.md)
-FIXED = 1.0  # Pa
+FIXED = (1.0, 5.0)  # Pa
 PASCAL = Material().modulus
 SHORT = 8  # bits of the words that are simulated, and of whose recall relative noises are parts
 LONGER = {10: 2, 12: 1}  # bits of words that are only predicted, and draws of noise
@@ -108,7 +108,7 @@ class Table:
             writer.writerows(rows)
         self.rows += [dict.fromkeys(COLUMNS, "") | row for row in rows]
         for row in rows:
-            print(*row.values(), flush=True)
+            print(*(row[name] for name in COLUMNS if name in row), flush=True)
 
     def pick(self, **wanted: str) -> list[Row]:
         """Rows with these values."""
@@ -165,7 +165,8 @@ def distances(kernel: gm.MemoryKernel, alphabet: np.ndarray) -> Iterator[Found]:
 def deviations(kernel: gm.MemoryKernel, noises: Noises) -> Noises:
     """Standard deviations in E, of noises given as parts of the words' recall."""
     rms = math.sqrt(np.mean(kernel.predict(gm.words(SHORT)) ** 2))
-    return {name: share * rms for name, share in noises.items()} | {f"{FIXED:g} Pa": FIXED / PASCAL}
+    fixed = {f"{pascals:g} Pa": pascals / PASCAL for pascals in FIXED}
+    return {name: share * rms for name, share in noises.items()} | fixed
 
 
 def alphabet_of(kernel: gm.MemoryKernel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
