@@ -3,9 +3,9 @@
 python experiments/capacity.py [-o capacity] [--packs tetra-325-a,...] [--large tetra-1024-a,tetra-3267-a]
 
 For each pack and gamma0: six signals on the pack as it is and on the same pack one experiment older (what does not
-repeat is a noise), and a kernel of 31 bumps; on --simulated packs all words of 8 bits and an alphabet of 256 too. The
+repeat is a noise), and a kernel of 31 bumps; on --simulated packs all words of 8 bits and an alphabet of 63 too. The
 rest follows from the kernel. Simulations are kept, and studies in capacity.csv are done, so that it goes on where it
-was killed; some 2e10 grain-steps in all. What stands in the table is drawn to capacity.png.
+was killed; some 2.5e10 grain-steps in all. What stands in the table is drawn to capacity.png.
 """
 
 import argparse
@@ -195,8 +195,8 @@ def check(table: Table, case: Case, noises: Noises) -> None:
     table.note(case, f"words {SHORT} checked", checked(kernel.predict(words), found))
     if case.gamma0 == USUAL:
         amplitudes, recalls, _ = alphabet_of(kernel)
-        found = case.recalled(f"alphabet-{2**SHORT}", bumps(amplitudes[: 2**SHORT], WIDTH))
-        table.note(case, "alphabet checked", checked(recalls[: 2**SHORT], found))
+        found = case.recalled("alphabet", bumps(amplitudes[:LARGEST_BATCH], WIDTH))
+        table.note(case, "alphabet checked", checked(recalls[:LARGEST_BATCH], found))
 
 
 def lengthen(table: Table, case: Case, noises: Noises) -> None:
@@ -238,14 +238,15 @@ def draw(table: Table, path: Path) -> None:
                 if rows:
                     axis.errorbar(*over_packs(rows, by), fmt=style, color=f"C{colour}", capsize=2, mfc="none", ms=5)
         axis.set(xscale="log", yscale="log", xlabel={"N": "N", "gamma0": r"$\gamma_0$"}[by], ylabel="bits")
+        axis.set_ylim(1.0, 5e4)  # room for the legends
     for colour, name in enumerate(names):
         axes[0].plot([], [], color=f"C{colour}", label=name)
     for style, label in STYLES.values():
         axes[1].plot([], [], style, color="0.4", mfc="none", label=label)
     axes[0].set_title(rf"$\gamma_0$ = {usual}", fontsize=9)
     axes[1].set_title(f"N = {small}, mean and SD over packs", fontsize=9)
-    axes[0].legend(title="noise", fontsize=7, title_fontsize=7, frameon=False)
-    axes[1].legend(fontsize=7, frameon=False)
+    axes[0].legend(title="noise", loc="upper left", ncols=2, fontsize=7, title_fontsize=7, frameon=False)
+    axes[1].legend(loc="upper left", fontsize=7, frameon=False)
     for colour, pack in enumerate(dict.fromkeys(row["pack"] for row in table.pick(study="alphabets"))):
         for kind, style, label in (("nearest two", "o-", "greedy"), ("nearest two words", "s--", "words")):
             rows = table.pick(study="alphabets", quantity=f"{kind} (Pa)", pack=pack)
