@@ -18,6 +18,7 @@ from gmem_jax.design.waveforms import Design, bounded, sampled, verified
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Keep, Progress, forget, silent, within
 from gmem_jax.experiment.recall import run
+from gmem_jax.experiment.signals import Spline
 
 BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
 WIDTH = 0.08  # of them, in u
@@ -112,13 +113,18 @@ def design_by_kernel(
     for _ in range(PREDICTED):
         missed = wanted - kernel.recalled(amplitudes)
         amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, damped), width)
-    best, p_sig = amplitudes, recall("iteration-0", replace(experiment, signals=bumps(amplitudes, width)))
+
+    def made(rows: np.ndarray) -> Spline:
+        """As they are written in the end: at slow rates even the cubics between samples are seen in F."""
+        return sampled(bumps(rows, width))
+
+    best, p_sig = amplitudes, recall("trial-0", replace(experiment, signals=made(amplitudes)))
     history = [float(original.fidelity), float(experiment.compare(jnp.asarray(p_sig)).fidelity)]
     learned = np.zeros((len(best), *kernel.odd.shape))  # of each waveform's slopes, beyond the kernel
     for iteration in range(1, iterations):
         slope = slopes(kernel, best) + learned
         tried = bounded(best + correction(slope, wanted - p_sig, damped), width)
-        found = recall(f"iteration-{iteration}", replace(experiment, signals=bumps(tried, width)))
+        found = recall(f"trial-{iteration}", replace(experiment, signals=made(tried)))
         step = tried - best
         unforeseen = found - p_sig - np.einsum("sn,snu->su", step, slope)
         length = np.maximum(np.sum(step**2, axis=1), SHORTEST**2)
@@ -127,6 +133,6 @@ def design_by_kernel(
         best, p_sig = (np.where(better[:, None], *pair) for pair in ((tried, best), (found, p_sig)))
         damped *= np.where(better, EASED, FIRMED)
         history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
-    signals = sampled(bumps(best, width))
+    signals = made(best)
     fresh = recall("verified", replace(experiment, signals=signals))
     return verified(experiment, signals, fresh, untouched, history)
