@@ -1,6 +1,7 @@
 """Double precision everywhere, no programs kept or delayed, which cases run apart, and what many tests read."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -40,6 +41,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.name in SLOW:
             item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs() -> Iterator[None]:
+    """Programs are forgotten before they fill the memory maps of a process (65,530 on Linux): XLA crashes there."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_text().count("\n") > 30_000:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")
