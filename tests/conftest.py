@@ -33,6 +33,16 @@ SLOW = (
     "test_eight_threads_at_once_give_the_bits_of_one_after_the_other[traced-20]",
     "test_a_run_goes_on_with_the_lists_it_had[M2]",
     "test_a_replica_does_not_depend_on_its_neighbours_in_the_batch[chosen1]",
+    "test_devices_share_out_replicas_and_sweeps[native-sweep]",
+    "test_both_modes_agree_with_plain_jax[M1-True]",
+    "test_both_modes_agree_with_plain_jax[M2-averaged-True]",
+    "test_every_law_and_the_places_of_bumps_and_delta0_have_derivatives[M2]",
+    "test_derivatives_are_finite_at_the_corners_of_the_laws[no sliding-M2]",
+    "test_derivatives_are_finite_at_the_corners_of_the_laws[overlap zero-M1]",
+    "test_both_modes_of_derivatives_cross_the_domains_as_defined[M2]",
+    "test_the_kernels_give_the_values_and_tangents_of_the_definition[M2-averaged]",
+    "test_pictures_of_recalls_and_words[fig14]",
+    "test_a_run_as_in_the_paper_is_not_doubted[friction2]",
 )
 
 
