@@ -22,8 +22,8 @@ from console import say
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import BUMPS, WIDTH
 from gmem_jax.design.kernel import bumps
-from gmem_jax.experiment.recall import LARGEST_BATCH, simulate
-from gmem_jax.experiment.signals import part
+from gmem_jax.experiment.host import under
+from gmem_jax.experiment.recall import LARGEST_BATCH
 from gmem_jax.files.configuration import key_of_run
 from gmem_jax.files.parts import Parts
 from gmem_jax.physics.material import Material
@@ -75,15 +75,8 @@ class Case:
 
     def recalled(self, name: str, signals: gm.Signals) -> np.ndarray:
         """Recalls of any signals, [S, 256], a batch at a time."""
-        found = []
-        for first in range(0, signals.count, LARGEST_BATCH):
-            few = part(signals, first, min(first + LARGEST_BATCH, signals.count))
-            wanted = gm.replace(self.experiment, signals=few)
-            batch = self.parts(
-                f"{name}-{first}", lambda at, wanted=wanted: simulate(wanted, checkpoint=at, progress=say).p_sig
-            )
-            found.append(batch)
-        return np.concatenate(found)
+        wanted = gm.replace(self.experiment, signals=signals)
+        return np.asarray(gm.run(wanted, batch=LARGEST_BATCH, keep=under(name, self.parts), progress=say).p_sig)
 
 
 class Table:

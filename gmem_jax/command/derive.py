@@ -213,14 +213,25 @@ def design_command(
         ),
     ] = None,
     iterations: Annotated[
-        int | None, typer.Option(min=1, help="Corrections; default 3 by Jacobians, 6 by the kernel.")
+        int | None,
+        typer.Option(
+            min=1,
+            help=f"Corrections; default {waveforms.ITERATIONS} by Jacobians, {by_kernel.ITERATIONS} by the kernel.",
+        ),
     ] = None,
     bumps: Annotated[
-        int | None, typer.Option(min=2, help="Of a waveform; default 17 by Jacobians, 31 by the kernel.")
+        int | None,
+        typer.Option(
+            min=2, help=f"Of a waveform; default {waveforms.BUMPS} by Jacobians, {by_kernel.BUMPS} by the kernel."
+        ),
     ] = None,
     width: Annotated[
         float | None,
-        typer.Option(min=0.01, max=1.0, help="Of bumps, in u; default 0.2 by Jacobians, 0.08 by the kernel."),
+        typer.Option(
+            min=0.01,
+            max=1.0,
+            help=f"Of bumps, in u; default {waveforms.WIDTH} by Jacobians, {by_kernel.WIDTH} by the kernel.",
+        ),
     ] = None,
     gain: Annotated[float | None, typer.Option(help="Wanted gain; default half of the untouched waveforms'.")] = None,
     restart: Restart = False,

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
-import numpy as np
 import typer
 
 from gmem_jax import native
@@ -33,6 +32,7 @@ from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
 from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.state import together
 from gmem_jax.show import figures, tables
 
 
@@ -127,7 +127,7 @@ def demo(
         row, configuration = _run(experiment, data, data.with_suffix(".png"))
         rows.append(row)
     means = {key: spread([row[key] for row in rows])[0] for key in ("gain", "fidelity")}
-    bits = int(np.bitwise_or.reduce([row["status"] for row in rows]))
+    bits = together([row["status"] for row in rows])
     total = {"status": bits, "seconds": sum(row["seconds"] for row in rows)}
     emit(as_json, {**means, **total, "packs": rows}, tables.recall_table(rows, configuration))
 

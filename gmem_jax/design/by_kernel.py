@@ -7,16 +7,13 @@ added to the kernel (Broyden's update). What gets worse is taken back, and the n
 Marquardt).
 """
 
-from collections.abc import Callable
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.design.kernel import MemoryKernel, bumps, memory_kernel, nearest
-from gmem_jax.design.waveforms import Design, bounded, sampled, verified
+from gmem_jax.design.waveforms import Design, Work, bounded, correction, refuse_several_scales, sampled, verified
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Keep, Progress, forget, silent, within
+from gmem_jax.experiment.host import Keep, Progress, forget, silent, under
 from gmem_jax.experiment.recall import run
 from gmem_jax.experiment.signals import Spline
 
@@ -33,20 +30,6 @@ def slopes(kernel: MemoryKernel, amplitudes: np.ndarray) -> np.ndarray:
     """dp_sig / da of waveforms by the kernel, on the side of nought where each amplitude is, [S, n, 256]."""
     slope: np.ndarray = kernel.odd + np.sign(amplitudes)[:, :, None] * kernel.even
     return slope
-
-
-def correction(slope: np.ndarray, miss: np.ndarray, damping: jax.typing.ArrayLike) -> np.ndarray:
-    """Changes of amplitudes that make up for what recalls miss, by damped least squares, [S, n].
-
-    Args:
-        slope: dp_sig / da of the present waveforms, [S, n, 256].
-        miss: wanted p_sig less the present one, [S, 256], in E.
-        damping: in the unit of singular values of the slope, a number or [S].
-    """
-    damped = np.square(np.asarray(damping))[..., None, None] * np.eye(slope.shape[1])
-    along = np.einsum("snu,su->sn", slope, miss)
-    step: np.ndarray = np.linalg.solve(slope @ slope.transpose(0, 2, 1) + damped, along[..., None])[..., 0]
-    return step
 
 
 def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS) -> float:
@@ -82,34 +65,22 @@ def design_by_kernel(
     Raises:
         RunFailedError: if a simulation broke down.
     """
-    if jnp.ndim(experiment.scale):
-        raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
-    total, done = cost(experiment, iterations, n), 0.0
-
-    def next_part(name: str, runs: float) -> tuple[Keep, Progress]:
-        nonlocal done
-        begun, done = done / total, done + runs
-        inner = within(progress, begun, done / total)
-
-        def own(part: str, play: Callable[..., object]) -> object:
-            return keep(f"{name}-{part}", play)
-
-        return own, lambda stage, moment, fraction: inner(f"{name}, {stage}", moment, fraction)
+    refuse_several_scales(experiment)
+    work = Work(cost(experiment, iterations, n), progress)
 
     def recall(name: str, changed: Experiment) -> np.ndarray:
-        own, told = next_part(name, 1.0)
-        return np.asarray(run(changed, batch=batch, keep=own, progress=told).p_sig)
+        return np.asarray(run(changed, batch=batch, keep=under(name, keep), progress=work.next(1.0, name)).p_sig)
 
     target = np.asarray(experiment.integral())
     untouched = recall("untouched", experiment)
-    own, told = next_part("kernel", 2.0 * n / len(target))
-    kernel = memory_kernel(experiment, n, width, keep=own, progress=told)
+    told = work.next(2.0 * n / len(target), "kernel")
+    kernel = memory_kernel(experiment, n, width, keep=under("kernel", keep), progress=told)
     original = experiment.compare(jnp.asarray(untouched))
     gain = 0.5 * float(original.gain) if gain is None else gain
     wanted = gain * float(experiment.scale) * target
     # Where a unit of J is recalled with the kernel's gain, this much of each waveform is needed.
     amplitudes = nearest(kernel.basis, experiment.signals) * gain / kernel.gain()
-    damped = np.full(len(target), damping * np.linalg.norm(kernel.odd, 2))
+    damped = np.full((len(target), 1), damping * np.linalg.norm(kernel.odd, 2))
     for _ in range(PREDICTED):
         missed = wanted - kernel.recalled(amplitudes)
         amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, damped), width)
@@ -131,7 +102,7 @@ def design_by_kernel(
         learned += (step / length[:, None])[:, :, None] * unforeseen[:, None, :]
         better = np.linalg.norm(found - wanted, axis=1) < np.linalg.norm(p_sig - wanted, axis=1)
         best, p_sig = (np.where(better[:, None], *pair) for pair in ((tried, best), (found, p_sig)))
-        damped *= np.where(better, EASED, FIRMED)
+        damped *= np.where(better, EASED, FIRMED)[:, None]
         history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
     signals = made(best)
     fresh = recall("verified", replace(experiment, signals=signals))

@@ -25,6 +25,7 @@ DAMPING = (0.01, 0.005)
 FRACTIONS = (1.0, 0.5, 0.25)  # of a step that are tried
 ITERATIONS = 3  # corrections of a design
 BUMPS = 17  # basis waveforms of a design
+WIDTH = 0.2  # of them, in u
 TANGENT = 2.5  # cost of a tangent in runs; see benchmarks
 
 
@@ -61,11 +62,17 @@ def bounded(amplitudes: np.ndarray, width: float) -> np.ndarray:
     return result
 
 
-def _step(jacobian: np.ndarray, miss: np.ndarray, damping: float) -> np.ndarray:
-    """The change of amplitudes [n] whose recall comes nearest to `miss` [256] by a Jacobian [n, 256], damped."""
-    left, values, right = np.linalg.svd(jacobian, full_matrices=False)
-    filtered = values / (values**2 + (damping * values[0]) ** 2)
-    result: np.ndarray = ((miss @ right.T) * filtered) @ left.T
+def correction(slope: np.ndarray, miss: np.ndarray, damping: np.ndarray | float) -> np.ndarray:
+    """Changes of amplitudes whose recalls come nearest to what is missed, by damped least squares, [S, n].
+
+    Args:
+        slope: dp_sig / da of every waveform, [S, n, 256].
+        miss: wanted p_sig less the present one, [S, 256], in E.
+        damping: in the unit of singular values of the slope, a number or [S, 1].
+    """
+    left, values, right = np.linalg.svd(slope, full_matrices=False)
+    filtered = values / (values**2 + np.square(damping))
+    result: np.ndarray = np.einsum("snk,sk,sku,su->sn", left, filtered, right, miss, optimize=True)
     return result
 
 
@@ -92,14 +99,11 @@ def verified(
     )
 
 
-class _Work:
-    """What a design takes, in runs of its signals, and how much of that is done."""
+class Work:
+    """What a design takes in all, in runs of its signals, and how much of that is done."""
 
-    def __init__(self, experiment: Experiment, n: int, iterations: int, progress: Progress) -> None:
-        common, own = (sum(stage.bins for stage in some) for some in experiment.phases)
-        self.prefix = common / (own * experiment.replicas)
-        self.jacobian = TANGENT * n
-        self.total = 3.0 + 2.0 * self.prefix + iterations * (self.jacobian + len(FRACTIONS))
+    def __init__(self, total: float, progress: Progress) -> None:
+        self.total = total
         self._done, self._progress = 0.0, progress
 
     def next(self, runs: float, name: str = "") -> Progress:
@@ -111,7 +115,22 @@ class _Work:
 
 def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS) -> float:
     """What a design takes, in runs of its signals."""
-    return _Work(experiment, n, iterations or ITERATIONS, silent).total
+    return 3.0 + 2.0 * _prefix(experiment) + (iterations or ITERATIONS) * (TANGENT * n + len(FRACTIONS))
+
+
+def _prefix(experiment: Experiment) -> float:
+    common, own = (sum(stage.bins for stage in some) for some in experiment.phases)
+    return common / (own * experiment.replicas)
+
+
+def refuse_several_scales(experiment: Experiment) -> None:
+    """Refuse what has no one gain.
+
+    Raises:
+        ValueError: if gamma0 or delta0 differs between replicas.
+    """
+    if jnp.ndim(experiment.scale):
+        raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
 
 
 def design_waveforms(
@@ -119,7 +138,7 @@ def design_waveforms(
     *,
     iterations: int = ITERATIONS,
     n: int = BUMPS,
-    width: float = 0.2,
+    width: float = WIDTH,
     gain: float | None = None,
     damping: Sequence[float] = DAMPING,
     optimiser: optax.GradientTransformation | None = None,
@@ -144,10 +163,9 @@ def design_waveforms(
     Raises:
         RunFailedError: if a simulation broke down.
     """
-    if jnp.ndim(experiment.scale):
-        raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
-    work = _Work(experiment, n, iterations, progress)
-    begun = prefix_of(experiment, keep=keep, progress=work.next(work.prefix))
+    refuse_several_scales(experiment)
+    work, prefix = Work(cost(experiment, iterations, n), progress), _prefix(experiment)
+    begun = prefix_of(experiment, keep=keep, progress=work.next(prefix))
     target = np.asarray(experiment.integral())
     untouched = keep("untouched", lambda at: simulate(experiment, begun, checkpoint=at, progress=work.next(1.0)).p_sig)
     original = experiment.compare(jnp.asarray(untouched))
@@ -171,7 +189,7 @@ def design_waveforms(
         """dp_sig / da of every signal, [S, n, 256]."""
         rows, directions = np.repeat(at, n, axis=0), np.tile(np.eye(n), (count, 1))
         direction = {"signals.amplitudes": jnp.asarray(directions)}
-        on = work.next(work.jacobian, f"F = {history[-1]:.4f}")
+        on = work.next(TANGENT * n, f"F = {history[-1]:.4f}")
         slope = keep(name, lambda _: push(make(rows), direction, progress=on).p_sig_slope)
         return np.asarray(slope).reshape(count, n, -1)
 
@@ -180,7 +198,7 @@ def design_waveforms(
     for iteration in range(iterations):
         local = jacobians(f"jacobian-{iteration}", amplitudes)
         damped = damping[min(iteration, len(damping) - 1)]
-        steps = np.stack([_step(*pair, damped) for pair in zip(local, wanted - p_sig, strict=True)])
+        steps = correction(local, wanted - p_sig, damped * np.linalg.norm(local, 2, axis=(1, 2))[:, None])
         updates, memory = optimiser.update(jnp.asarray(-steps), memory, jnp.asarray(amplitudes))
         tried = [bounded(amplitudes + fraction * np.asarray(updates), width) for fraction in FRACTIONS]
         candidates = np.stack([amplitudes, *tried])
@@ -189,6 +207,6 @@ def design_waveforms(
         amplitudes, p_sig = candidates[chosen], recalls[chosen]
         history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
     signals = sampled(bumps(amplitudes, width))
-    last = work.next(1.0 + work.prefix, "verified")
+    last = work.next(1.0 + prefix, "verified")
     fresh = np.asarray(keep("verified", lambda _: run(replace(experiment, signals=signals), progress=last).p_sig))
     return verified(experiment, signals, fresh, np.asarray(untouched), history)

@@ -22,7 +22,7 @@ from gmem_jax.experiment.walk import Course, walk_some
 from gmem_jax.physics.pairs import carry_history
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.search import PairFinder
-from gmem_jax.physics.state import Box, State, Status, explain
+from gmem_jax.physics.state import Box, State, Status, explain, together
 
 Progress = Callable[[str, float, float], None]
 """Called with the stage's name, the simulated time so far (t_c) and the fraction of the whole work done (0 to 1)."""
@@ -51,6 +51,11 @@ Keep = Callable[[str, Callable[[Checkpoint], Any]], Any]
 def forget(name: str, run: Callable[[Checkpoint], Any]) -> Any:
     """Run every part, keep none: a `Keep`."""
     return run(NOWHERE)
+
+
+def under(name: str, keep: Keep) -> Keep:
+    """The same `Keep` for one of several runs, whose parts have this name before their own."""
+    return lambda part, play: keep(f"{name}-{part}", play)
 
 
 class RunFailedError(RuntimeError):
@@ -113,7 +118,7 @@ def require_x64() -> None:
 
 def worst(state: State) -> int:
     """All status bits of all replicas."""
-    return int(np.bitwise_or.reduce(local(state.status)))
+    return together(local(state.status))
 
 
 def refuse(status: int, where: str) -> None:

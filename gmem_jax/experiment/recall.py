@@ -38,7 +38,7 @@ from gmem_jax.experiment.signals import BINS, part
 from gmem_jax.experiment.walk import walk
 from gmem_jax.physics.pytree import Scalar, pytree, traced
 from gmem_jax.physics.sample import Sample
-from gmem_jax.physics.state import DOUBTFUL, Status, explain
+from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
 
 REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than this part of the walls' speed
 COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
@@ -103,7 +103,7 @@ class Recall:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}
         rows = {**measures, "F over T1": self.windowed_fidelity, "T1 (t_c)": self.window}
         if not traced(self.status):
-            rows["status"] = explain(int(np.bitwise_or.reduce(np.asarray(self.status), axis=None)))
+            rows["status"] = explain(together(self.status))
         return html.facts(f"Recall of {self.J.shape[-2]} signals", rows)
 
 

@@ -1,7 +1,6 @@
 """Results with names on their axes: xarray (an extra of the package), and CSV."""
 
 import csv
-import importlib
 import io
 import json
 from collections.abc import Mapping
@@ -12,19 +11,8 @@ import numpy as np
 from gmem_jax.experiment.protocol import compression_at
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import BINS
+from gmem_jax.files.checked import optional
 from gmem_jax.files.schemas import RECALL, STAGE
-
-
-def library(name: str) -> Any:
-    """A library of the extra "export".
-
-    Raises:
-        ValueError: if it is not installed, and how it would be.
-    """
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise ValueError(f'{name.split(".")[0]} is not installed: pip install "gmem_jax[export]"') from error
 
 
 def described(name: str) -> dict[str, str]:
@@ -44,7 +32,7 @@ def recall_dataset(recall: Recall, names: list[str], configuration: Mapping[str,
     Raises:
         ValueError: if xarray is not installed.
     """
-    xarray = library("xarray")
+    xarray = optional("xarray", "export")
     stages, replicas = recall.stages, len(recall.status)
     bins = {name: len(sample.filling) for name, sample in stages.items()}
     ends = [compression_at(name, np.arange(1, count + 1) / count) for name, count in bins.items()]

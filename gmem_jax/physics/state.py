@@ -9,6 +9,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
 
 from gmem_jax.physics.pytree import pytree
 
@@ -68,6 +70,11 @@ SENTENCES = {
     Status.LARGE_FRICTION: "mu exceeds 10, as no material does, so that contacts hardly slide; use a smaller mu",
     Status.LARGE_STIFFNESS: "tangential springs are stiffer than a Hertz contact is; use a stiffness below 1.5 k_n",
 }
+
+
+def together(status: npt.ArrayLike) -> int:
+    """The bits that any of several replicas or packs has set."""
+    return int(np.bitwise_or.reduce(np.asarray(status), axis=None))
 
 
 def explain(status: int) -> str:

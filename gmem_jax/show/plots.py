@@ -1,6 +1,5 @@
 """Figures of a report, to be zoomed and pointed at. Plotly is imported on first use."""
 
-import importlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ from gmem_jax.design.kernel import MemoryKernel
 from gmem_jax.experiment.protocol import compression_at
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import BINS
+from gmem_jax.files.checked import optional
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.sample import Sample
 
@@ -22,22 +22,15 @@ MARGIN = {"t": 80, "b": 50}  # pixels above and below the panels
 _AXIS = {"showline": True, "linecolor": "#999", "ticks": "outside", "gridcolor": "#eceff3", "zerolinecolor": "#c8cdd4"}
 
 
-class MissingPlotlyError(ValueError):
-    """There is no plotly; the message says how to get it."""
-
-
 def _plotly(module: str) -> Any:
-    try:
-        return importlib.import_module(f"plotly.{module}")
-    except ImportError as error:
-        raise MissingPlotlyError("a report needs plotly: pip install 'gmem_jax[report]'") from error
+    return optional(f"plotly.{module}", "report")
 
 
 def script() -> str:
     """plotly.js itself.
 
     Raises:
-        MissingPlotlyError: if it is not installed.
+        ValueError: if it is not installed.
     """
     return str(_plotly("offline").get_plotlyjs())
 

@@ -18,7 +18,7 @@ from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.configuration import signals_from
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.state import Status, explain
+from gmem_jax.physics.state import Status, explain, together
 
 SLOW_ENOUGH = 1.8e3  # t0, in t_c: G and F agree with those at ten times slower drives where nothing rings
 
@@ -42,7 +42,7 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
     readout = recall.stages["readout"]
     pressure = np.asarray(readout.pressure)
     unit = Material().modulus
-    status = int(np.bitwise_or.reduce(np.asarray(recall.status)))
+    status = together(recall.status)
     return {
         "pack": configuration["pack"],
         "grains": configuration["grains"],

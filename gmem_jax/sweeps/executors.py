@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from gmem_jax.experiment.host import RunFailedError
+from gmem_jax.files.checked import optional
 from gmem_jax.sweeps import work
 from gmem_jax.sweeps.store import Store
 
@@ -146,13 +147,9 @@ class Submitted(Executor):
     """
 
     def __init__(self, cluster: str, workers: int | None = None, options: dict[str, Any] | None = None) -> None:
-        try:
-            import submitit
-        except ImportError as error:
-            raise ValueError('executor "slurm" needs submitit: pip install "gmem_jax[slurm]"') from error
+        self._submitit = optional("submitit", "slurm")
         self.workers, self._cluster = workers or 1, cluster
         self._options = {"timeout_min": 60, "cpus_per_task": 1, **(options or {})}
-        self._submitit: Any = submitit
         self._jobs: dict[str, Any] = {}
         self._executor: Any = None
         if cluster == "slurm":

@@ -20,7 +20,7 @@ from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
 from gmem_jax.files.provenance import sources
-from gmem_jax.physics.state import explain
+from gmem_jax.physics.state import explain, together
 from gmem_jax.preparation.preparation import Recipe, grain_steps
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.plan import ABREAST, Point, digest, groups, plan, point
@@ -48,14 +48,15 @@ class Results(list[Result]):
     def _repr_html_(self) -> str:
         names = list(self[0].values) if self else []
         rows = [
-            [*(_label(one.values[name]) for name in names), one.recall.gain, one.recall.fidelity, _said(one.recall)]
+            [
+                *(_label(one.values[name]) for name in names),
+                one.recall.gain,
+                one.recall.fidelity,
+                explain(together(one.recall.status)),
+            ]
             for one in self
         ]
         return listing(f"Sweep of {len(self)} points", [*names, "G", "F", "status"], rows)
-
-
-def _said(recall: Recall) -> str:
-    return explain(int(np.bitwise_or.reduce(np.asarray(recall.status))))
 
 
 def sweep(

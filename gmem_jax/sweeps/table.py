@@ -10,8 +10,9 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.labelled import described, library
-from gmem_jax.physics.state import explain
+from gmem_jax.files.checked import optional
+from gmem_jax.files.labelled import described
+from gmem_jax.physics.state import explain, together
 from gmem_jax.sweeps.store import Store
 
 MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
@@ -33,7 +34,7 @@ def rows(store: Store) -> list[dict[str, Any]]:
         row: dict[str, Any] = {name: _cell(point["values"].get(name)) for name in card["names"]}
         if store.at(key).is_file():
             recall, configuration = store.load(key)
-            status = int(np.bitwise_or.reduce(np.asarray(recall.status)))
+            status = together(recall.status)
             row |= {"state": "done", **{name: float(getattr(recall, name)) for name in MEASURES}}
             row |= {"status": status, "why": explain(status) if status else "", "seconds": configuration["seconds"]}
         else:
@@ -79,7 +80,7 @@ def export(store: Store, path: Path) -> None:
             writer.writeheader()
             writer.writerows(table)
     elif suffix == ".parquet":
-        pyarrow, parquet = library("pyarrow"), library("pyarrow.parquet")
+        pyarrow, parquet = optional("pyarrow", "export"), optional("pyarrow.parquet", "export")
         with atomic(path) as temporary:
             parquet.write_table(pyarrow.Table.from_pylist(table), temporary)
     elif suffix in (".h5", ".nc"):
@@ -91,8 +92,8 @@ def export(store: Store, path: Path) -> None:
 
 def _dataset(store: Store, table: Sequence[dict[str, Any]]) -> Any:
     """The table as an xarray.Dataset over points; signals where all points have as many."""
-    xarray = library("xarray")
-    library("h5netcdf")
+    xarray = optional("xarray", "export")
+    optional("h5netcdf", "export")
     card = store.card()
     columns = {name: ("point", _column([row[name] for row in table])) for name in table[0]}
     data = xarray.Dataset(columns, attrs={"schema": "gmem-sweep-table/1", "shared": json.dumps(card["shared"])})
