@@ -16,7 +16,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw, largest_overlap
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.kinematics import kinematics, transport
-from gmem_jax.physics.contact.mindlin import Mindlin, transport_layers
+from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.contact.path import contact_path, lead_contact, led_contact, polyline
@@ -303,20 +303,6 @@ def test_a_stuck_contact_carries_its_force_through_tumbling_and_spinning(law):
     largest = 0.25 * angle**2 * (np.pi**2 / 8.0) / steps
     assert float(jnp.linalg.norm(after - expected)) < largest * float(before[0])
     assert float(jnp.linalg.norm(after)) == pytest.approx(float(before[0]), rel=1e-9)
-
-
-def test_the_layers_of_m2_are_transported_like_any_other_vector():
-    random = np.random.default_rng(0)
-    layers = random.normal(size=(5, 7, 3, 2))
-    layers[:, 2] = 0.0
-
-    @jax.jit
-    def both(separation, velocity, spin, layers):
-        kin = kinematics(separation, velocity, spin, jnp.ones(5, bool), 0.3)
-        return transport_layers(layers, kin), jax.vmap(transport, in_axes=(1, None), out_axes=1)(layers, kin)
-
-    together, one_by_one = both(*random.normal(size=(3, 5, 3, 2)), layers)
-    np.testing.assert_allclose(together, one_by_one, rtol=1e-11, atol=1e-14)
 
 
 # ---------------------------------------------------------------- time step

@@ -70,7 +70,7 @@ HOSTILE = {
     "half a centre": (changed("reference", lambda a: a[:, :2]), "reference centres .* with 3 = 3"),
     "a sphere less": (changed("reference", lambda a: a[:-1]), "as many spheres"),
     "no sphere in a grain": (changed("offsets", lambda a: a[:0]), "no grain"),
-    "a short history": (changed("history", lambda a: [a[0][:-1], *a[1:]]), "should be .P.*3B. with P"),
+    "a short history": (changed("history", lambda a: [a[0][:-1], *a[1:]]), "should be .P.*[23]B. with P"),
     "no history": (lambda g: {**called(leaves=0)(g), "history": []}, "not that of the friction law"),
     "an unknown law": (called(law=4), "no friction law has number 4"),
     "an unknown variant": (called(variant=-1), "no variant of the Mindlin law has number -1"),
@@ -112,7 +112,7 @@ def test_want_of_memory_is_an_error_and_leaves_the_library_working() -> None:
         "fields": [leaf[..., :1] for leaf in given["fields"]],
         "parameters": given["parameters"][:, :1],
         "walls": jnp.zeros((steps, 12, 1)),
-        "history": [jnp.zeros((1, points, 3, 1)), jnp.zeros((1, 1, 1))],
+        "history": [jnp.zeros((1, points, 2, 1)), jnp.zeros((1, 3, 1)), jnp.zeros((1, 1, 1))],
     }
     call, fixed, arrays = parts({**called(points=points)(given), **alone})
     bars = calls.Results(arrays.fields, jnp.zeros((3, 1)), arrays.history)

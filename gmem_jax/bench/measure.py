@@ -48,7 +48,7 @@ from gmem_jax.physics.step import System
 LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
 T0 = 1.8e3  # duration of the compression that is timed, t_c
 ENCODE = Stage("encode", 0.0, 1.0, 1.0, sheared=True)
-BINS = 4  # bins per timed call, so that checks and samples weigh as in a run
+BINS = 8  # bins per timed call, so that checks and samples weigh as in a run; which does 32 at once
 AGREEMENT = 1e-8  # of the pressure, between backends: round-off grown over a few hundred steps
 LAMMPS_LISTS = ((0.1, 20), (0.2, 50), (0.2, 1000), (0.3, 1000))  # (skin in R, steps between checks) tried for LAMMPS
 Say = Callable[[str, float], None]

@@ -22,8 +22,8 @@ V* touch(Law law, V apart, V* to) {
   const auto vec = [](double x, double y, double z) { return Vec<V>{splat<V>(x), splat<V>(y), splat<V>(z)}; };
   const Meeting<V> meeting{apart * vec(0.6, 0.8, 0.0),   vec(0.5, 0.7, 0.1),   vec(-0.4, -0.6, 0.1),
                          vec(2e-3, -1e-3, 3e-3),       vec(1e-3, 4e-3, 0.0), vec(0.0, -2e-3, 1e-3)};
-  V history[4] = {splat<V>(2e-4), splat<V>(-1e-4), splat<V>(5e-4), splat<V>(0.03)};
-  if (Law::kLayered) history[0] = splat<V>(0.01);
+  V history[10] = {splat<V>(2e-4), splat<V>(-1e-4), splat<V>(5e-4), splat<V>(0.03)};
+  if (Law::kLayered) store_vec(history, vec(0.8, -0.6, 0.0)), history[kLastOverlap] = splat<V>(0.01);
   Contact<V> contact;
   meet(meeting, dot(meeting.separation, meeting.separation), contact);
   contact.history = history;
@@ -33,9 +33,10 @@ V* touch(Law law, V apart, V* to) {
   int stored;
   StoredRuns<V> runs{run, 1, &stored, kPoints};
   if constexpr (Law::kLayered) {
-    const auto ring = [&](int j) { return splat<V>(1e-4) * vec(j / 2, 1 - j / 3, 2 - j / 4); };
-    runs.load(Reach<V, Law::variant>(history[0], parameters, kPoints).outer, false, ring);
-    friction(law, contact, parameters, runs);
+    const auto ring = [&](int j) { return splat<V>(1e-4) * Flat<V>{splat<V>(j / 2), splat<V>(1 - j / 3)}; };
+    const V outer = Reach<V, Law::variant>(history[kLastOverlap], parameters, kPoints).outer;
+    store_layers(history + kLayers, runs.load(outer, kLacking<Law::variant>, false, ring));
+    friction(law, &contact, 1, parameters, [&](int) { return runs; });
   } else {
     friction(law, &contact, 1, parameters);
   }
@@ -43,8 +44,8 @@ V* touch(Law law, V apart, V* to) {
   for (const Vec<V>& part : {found.force, found.torque_one, found.torque_other}) store_vec(to, part), to += 3;
   for (int q = 0; q < Law::kHistory; ++q) *to++ = history[q];
   if constexpr (Law::kLayered) {
-    const V outer = Reach<V, Law::variant>(history[0], parameters, kPoints).outer;
-    runs.unload(outer, kPoints, [&](int, Vec<V> f) { store_vec(to, f), to += 3; });
+    const V outer = Reach<V, Law::variant>(history[kLastOverlap], parameters, kPoints).outer;
+    runs.unload(load_layers(history + kLayers), outer, kPoints, [&](int, Flat<V> f) { *to++ = f.along, *to++ = f.across; });
   }
   return to;
 }

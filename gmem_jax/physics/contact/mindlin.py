@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from gmem_jax.physics.contact.friction import coulomb
-from gmem_jax.physics.contact.kinematics import Kinematics
+from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle, static
 from gmem_jax.physics.rotation import cross, dot
@@ -19,33 +19,20 @@ class LayeredHistory:
     """What M2 remembers of a contact; zero for an untouched one.
 
     Attributes:
-        layers: f_j with half of the next step's increment, [P, Q, 3, B], in E R^1.5.
+        layers: f_j with half of the next step's increment, along the frame and across it, [P, Q, 2, B], in E R^1.5.
+        frame: a unit vector of the tangent plane that is carried along like a force, [P, 3, B]; n x frame is the other.
         overlap: overlap of the last step, [P, 1, B], in R.
     """
 
     layers: jax.Array
+    frame: jax.Array
     overlap: jax.Array
 
 
-def transport_layers(layers: jax.Array, kin: Kinematics, spinning: Scalar = 1.0) -> jax.Array:
-    """`kinematics.transport` of every layer [P, Q, 3, B], to round-off.
-
-    Projection and turn are one matrix per contact here: three times faster than going through the layers one by one.
-    """
-    half = 0.5 * spinning * kin.twist * kin.dt
-    shrink = 1.0 / (1.0 + half * half)
-    cosine, sine = (1.0 - half * half) * shrink, 2.0 * half * shrink
-    moved, along, before = (jnp.zeros((), layers.dtype),) * 3
-    for axis in range(3):
-        unit = jnp.zeros_like(kin.normal).at[:, axis].set(1.0)
-        column = cosine * (unit - dot(unit, kin.normal) * kin.normal) + sine * cross(kin.normal, unit)
-        component = layers[:, :, axis : axis + 1]
-        moved += component * column[:, None]
-        along += component * kin.normal[:, None, axis : axis + 1]
-        before += component * component
-    after = before - along * along
-    alive = after > 0.0
-    return moved * jnp.where(alive, jnp.sqrt(jnp.where(alive, before, 1.0) / jnp.where(alive, after, 1.0)), 1.0)
+def any_tangent(normal: jax.Array) -> jax.Array:
+    """Unit vectors that are not along unit vectors `normal`, both [P, 3, B]: projected, where a frame begins."""
+    near_x = jnp.abs(normal[:, :1]) > 0.6
+    return jnp.concatenate([jnp.where(near_x, 0.0, 1.0), jnp.where(near_x, 1.0, 0.0), jnp.zeros_like(normal[:, :1])], 1)
 
 
 @pytree
@@ -56,7 +43,8 @@ class Mindlin:
     f(q) is the elastic force per unit of q in the ring of contact area that was attached when sqrt(p) passed q. It is
     kept on Q points a spacing dq = sqrt(p_max) / (Q - 1) apart: with x = sqrt(p) / dq and the outermost ring
     jp = floor(x), f_e = dq sum_j w_j f_j over j <= jp. The dashpot is f_d = damping_time k p^0.5 dsigma/dt, and
-    |f_e + f_d| <= mu f_n; a sliding contact gives up the same f in all its rings.
+    |f_e + f_d| <= mu f_n; a sliding contact gives up the same f in all its rings. All rings turn with the contact alike:
+    what is kept of f_j are its components in a frame that does.
 
     The variants differ in the outermost ring, which the contact fills in part only:
 
@@ -110,7 +98,9 @@ class Mindlin:
     def init(self, contacts: int, replicas: int, dtype: Any) -> LayeredHistory:
         """Nothing attached yet."""
         return LayeredHistory(
-            jnp.zeros((contacts, self.points, 3, replicas), dtype), jnp.zeros((contacts, 1, replicas), dtype)
+            jnp.zeros((contacts, self.points, 2, replicas), dtype),
+            jnp.zeros((contacts, 3, replicas), dtype),
+            jnp.zeros((contacts, 1, replicas), dtype),
         )
 
     def outermost(self, x: jax.Array) -> jax.Array:
@@ -135,7 +125,7 @@ class Mindlin:
         inside &= x[:, None] > 0.5
         return inside, jnp.where(inside, weight - 0.5 * (points == 0), 0.0), jnp.where(x > 0.5, x - 0.5, 1.0)
 
-    def _diluted(self, history: LayeredHistory, layers: jax.Array, x: jax.Array) -> jax.Array:
+    def _diluted(self, history: LayeredHistory, x: jax.Array) -> jax.Array:
         """The layers after the contact grew to x: the force w f of the ring that was partly filled stays."""
         known = history.overlap > 0.0
         reached = jnp.where(known, jnp.sqrt(jnp.where(known, history.overlap, 1.0)) / self.spacing, 0.0)
@@ -144,7 +134,7 @@ class Mindlin:
         grows = filled < weight
         dilution = jnp.where(grows, filled / jnp.where(grows, weight, 1.0), 1.0)
         points = jnp.arange(self.points)[:, None, None]
-        return layers * jnp.where(points == ring[:, None], dilution[:, None], 1.0)
+        return history.layers * jnp.where(points == ring[:, None], dilution[:, None], 1.0)
 
     def __call__(
         self, kin: Kinematics, normal_force: jax.Array, history: LayeredHistory
@@ -154,16 +144,21 @@ class Mindlin:
         x = root / self.spacing
         inside, weight, total = self.weights(x)
         inside &= kin.touching[:, None]
-        half_step = (0.5 * self.stiffness * kin.dt) * kin.sliding
-        dashpot = (self.stiffness * self.damping_time) * root * kin.sliding
 
-        layers = transport_layers(history.layers, kin, self.spinning)
-        if self.variant == "averaged":
-            layers = self._diluted(history, layers, x)
+        before = jnp.where(history.overlap > 0.0, history.frame, any_tangent(kin.normal).astype(history.frame.dtype))
+        frame = transport(before, kin, self.spinning)
+        across = cross(kin.normal, frame)
+        sliding = jnp.concatenate([dot(kin.sliding, frame), dot(kin.sliding, across)], axis=1)
+        half_step = (0.5 * self.stiffness * kin.dt) * sliding
+        dashpot = (self.stiffness * self.damping_time) * root * sliding
+
+        layers = self._diluted(history, x) if self.variant == "averaged" else history.layers
         layers = jnp.where(inside, layers + half_step[:, None], 0.0)
         trial = self.spacing * jnp.sum(weight * layers, axis=1) + dashpot
         force, _ = coulomb(trial, self.mu * normal_force)
         correction = (force - trial) / (self.spacing * total) + half_step
         layers = jnp.where(inside, layers + correction[:, None], 0.0)
-        force = jnp.where(kin.touching, force, 0.0)
-        return force, LayeredHistory(layers, jnp.where(kin.touching, kin.overlap, 0.0))
+        force = jnp.where(kin.touching, force[:, :1] * frame + force[:, 1:] * across, 0.0)
+        return force, LayeredHistory(
+            layers, jnp.where(kin.touching, frame, 0.0), jnp.where(kin.touching, kin.overlap, 0.0)
+        )

@@ -28,7 +28,7 @@ inline Wants histories(Law law) {
   switch (law) {
     case Law::hooke: return {{"forces", "P3B"}};
     case Law::mindlin_rescaled: return {{"forces", "P3B"}, {"overlaps", "P1B"}};
-    case Law::mindlin: return {{"layers", "PQ3B"}, {"overlaps", "P1B"}};
+    case Law::mindlin: return {{"layers", "PQ2B"}, {"frames", "P3B"}, {"overlaps", "P1B"}};
     default: return {};
   }
 }

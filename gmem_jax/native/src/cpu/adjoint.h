@@ -80,7 +80,7 @@ struct Adjoint {
   V* mid_bar;      // [N, kMid]
   V* sphere_bar;   // [S, 3]
   V* guest_bar;    // [guests, kGuest]
-  V* history_bar;  // [candidates, kHistory and the forces of Mindlin's runs, 3 Q]
+  V* history_bar;  // [candidates, kHistory and the forces of Mindlin's runs, 2 Q]
   V* domain_bar;   // [domains, kParameters]
   V* chunk_bar;    // [chunks, kParameters]
   V* wall_bar;     // [chunks, kWalls], of one step
@@ -128,7 +128,7 @@ struct Adjoint {
   }
 
   // Numbers in the history of a contact.
-  static int remembered(const Problem& p) { return Law::kHistory + (Law::kLayered ? 3 * p.points : 0); }
+  static int remembered(const Problem& p) { return Law::kHistory + (Law::kLayered ? 2 * p.points : 0); }
   V* history_of(std::size_t c) const { return history_bar + c * remembered(problem); }
 
   int chunks() const { return forward.chunks(problem); }
@@ -207,12 +207,12 @@ struct Adjoint {
   // Calls `each(leaf, row in the arrays of the call, number)` for the history in `row` of the list.
   template <class Each>
   void for_history(std::ptrdiff_t row, const Each& each) const {
-    for (int q = 0; q < Law::kHistory; ++q) {
+    for (int q = 0; q < Law::kGiven; ++q) {
       const Place place = place_of<Law>(row, q);
       each(place.leaf, place.row, q);
     }
     for (int q = Law::kHistory; q < remembered(problem); ++q)
-      each(0, row * problem.points * 3 + q - Law::kHistory, q);
+      each(0, row * problem.points * 2 + q - Law::kHistory, q);
   }
 
   void load_bars() {
@@ -227,7 +227,7 @@ struct Adjoint {
         history_of(c)[q] = forward.mode.gather(block.slopes, [leaf](const Lane& lane) { return lane.history_in[leaf]; }, row);
       });
     if constexpr (Law::kLayered)
-      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c) add_up_runs(c);
+      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c) to_layers(c);
     if (rank == 0) {
       std::memset(domain_bar, 0, sizeof(V) * plan.domains * kParameters);
       std::memset(chunk_bar, 0, sizeof(V) * chunks() * kParameters);
@@ -235,21 +235,40 @@ struct Adjoint {
     team.barrier();
   }
 
-  // From the bars of rings to those of the runs that they are in at the end.
-  void add_up_runs(std::size_t c) {
+  // From the bars of rings to those of the layers and runs that they are in at the end.
+  void to_layers(std::size_t c) {
     const StoredRuns<V> runs = forward.mode.runs_of(c);
     const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
-    const V outer = Reach<V, Law::variant>(forward.mode.history[c], law, problem.points).outer;
-    V* bar = history_of(c) + Law::kHistory;
+    const V outer = forward.mode.outermost(c, law);
+    V *layers = history_of(c) + kLayers, *ring = history_of(c) + Law::kHistory;
+    for (int q = kLayers; q < Law::kHistory; ++q) history_of(c)[q] = V{};
     for (int l = 0; l < W; ++l)
       for (int k = 0, j = 0; j < problem.points; ++j) {
         if (k + 1 < runs.count() && runs.get(k + 1).start[l] <= j) ++k;
-        for (int axis = 0; axis < 3; ++axis) {
-          const double of_ring = bar[3 * j + axis][l];
-          bar[3 * j + axis][l] = 0.0;
-          if (j <= outer[l]) bar[3 * k + axis][l] += of_ring;
+        for (int axis = 0; axis < 2; ++axis) {
+          const double bar = ring[2 * j + axis][l];
+          ring[2 * j + axis][l] = 0.0;
+          if (j < outer[l]) ring[2 * k + axis][l] += bar, layers[axis][l] += bar;
+          if (j == outer[l]) layers[4 + axis][l] = bar;
         }
       }
+  }
+
+  // From the bars of layers and runs at the beginning, when each ring is a run, to those of the rings.
+  void to_rings(std::size_t c) {
+    const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
+    const Place place = place_of<Law>(plan.candidate[c].row, kLastOverlap);
+    const V overlap = forward.mode.read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row);
+    const V outer = Reach<V, Law::variant>(overlap, law, problem.points).outer;
+    const V *layers = history_of(c) + kLayers;
+    V* ring = history_of(c) + Law::kHistory;
+    for (int j = 0; j < problem.points; ++j) {
+      const V at = splat<V>(j), weight = splat<V>(j == 0 ? 1.0 - kLacking<Law::variant> : 1.0);
+      for (int axis = 0; axis < 2; ++axis) {
+        V& bar = ring[2 * j + axis];
+        bar = zero_unless(at <= outer, select(at < outer, fma(weight, layers[2 + axis], bar), layers[4 + axis]));
+      }
+    }
   }
 
   void unload_bars() {
@@ -258,6 +277,8 @@ struct Adjoint {
         write([f](const Lane& lane) { return lane.grains_out[f]; }, row, of_grain(state_bar, u, kState)[number]);
       });
     });
+    if constexpr (Law::kLayered)
+      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c) to_rings(c);
     for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
       for_history(plan.candidate[c].row, [&](int leaf, std::ptrdiff_t row, int q) {
         write([leaf](const Lane& lane) { return lane.history_out[leaf]; }, row, history_of(c)[q]);
@@ -322,6 +343,7 @@ struct Adjoint {
       (*now)[k] = run;
     }
     void keep(Taped counts) { now->resize(static_cast<std::size_t>(largest(counts))); }
+    void remember() const {}
   };
 
   // The contacts of one domain.
@@ -358,20 +380,20 @@ struct Adjoint {
                                            load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.other)));
     const Meeting<Taped> meeting{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
                                  leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
-    Taped memory[4];
+    Taped memory[Law::kHistory + 1];
     for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(seen.history[c * Law::kHistory + q]);
     Contact<Taped> contact;
     contact.history = memory;
     meet(meeting, dot(meeting.separation, meeting.separation), contact);
     close(&contact, 1, parameter);
     std::vector<Run<Taped>> now;
-    const int leaves = recorded.mark().slots, before = Law::kLayered ? seen.runs[c] : 0;
+    const int leaves = recorded.mark().slots, before = Law::kLayered ? seen.runs[c] : -1;
     for (int k = 0; k < before; ++k) {
       const Run<V>& run = seen.run[c * problem.points + k];
-      now.push_back({leaf(run.force), constant(run.start)});
+      now.push_back({{leaf(run.force.along), leaf(run.force.across)}, constant(run.start)});
     }
     if constexpr (Law::kLayered) {
-      friction(Law{}, contact, law, Runs{problem.points, &now});
+      friction(Law{}, &contact, 1, law, [&](int) { return Runs{problem.points, &now}; });
     } else {
       friction(Law{}, &contact, 1, law);
     }
@@ -384,12 +406,13 @@ struct Adjoint {
     seed(found.torque_one, load_vec(one + kMidTorque));
     seed(found.torque_other, load_vec(other + kMidTorque));
     for (int q = 0; q < Law::kHistory; ++q) seed(memory[q], bar[q]);
-    for (std::size_t k = 0; k < now.size(); ++k) seed(now[k].force, load_vec(bar + Law::kHistory + 3 * k));
+    V* of_runs = bar + Law::kHistory;
+    for (std::size_t k = 0; k < now.size(); ++k)
+      seed(now[k].force.along, of_runs[2 * k]), seed(now[k].force.across, of_runs[2 * k + 1]);
     recorded.reverse(mark);
 
     for (int q = 0; q < Law::kHistory; ++q) bar[q] = recorded.bar(mark.slots + kMeeting + q);
-    for (int q = Law::kHistory; q < remembered(problem); ++q) bar[q] = V{};
-    for (int k = 0; k < before; ++k) store_vec(bar + Law::kHistory + 3 * k, bars(leaves + 3 * k));
+    for (int q = 0; before >= 0 && q < 2 * problem.points; ++q) of_runs[q] = q < 2 * before ? recorded.bar(leaves + q) : V{};
     share_out(pair, mark.slots);
   }
 

@@ -47,10 +47,11 @@ struct Place {
   std::ptrdiff_t row;
 };
 
-// Where number `q` of the history in `row` of the list lies: leaf 0 is the force (or the layers), leaf 1 the overlap.
+// Where number `q` of the history in `row` of the list lies: leaf 0 is the force, leaf 1 the overlap; Mindlin's layers
+// come before them.
 template <class Law>
 Place place_of(std::ptrdiff_t row, int q) {
-  return q < Law::kVectors ? Place{0, row * Law::kVectors + q} : Place{1, row};
+  return q < Law::kVectors ? Place{Law::kLayered, row * Law::kVectors + q} : Place{Law::kLayered + 1, row};
 }
 
 }  // namespace GMEM_ISA

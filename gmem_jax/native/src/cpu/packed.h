@@ -16,12 +16,15 @@ struct GrainRows {
   Row position, velocity, spin, force, torque;
 };
 
+struct alignas(Row) RowOfRun : Run<double> {};
+
 template <class Law>
 struct Packed {
   using Number = Real;
   using V = Real;
   using OfContacts = Real;
   static constexpr bool kLooks = false;
+  static constexpr int kHistoryRows = (Law::kHistory + 3) / 4;
 
   const Problem& problem;
   const Block& block;
@@ -31,8 +34,8 @@ struct Packed {
   Row* sphere;       // [S + 2]: centres; the last two are far apart and fill up vectors
   GrainRows* grain;  // [N + 1]
   Row* guest;        // [guests, 2]: force and torque
-  Row* history;      // [candidates + 1]
-  Row* run;          // [Q, candidates + 1] of the Mindlin law: those that are few lie together
+  Row* history;      // [candidates + 1, kHistoryRows]
+  RowOfRun* run;     // [Q, candidates + 1] of the Mindlin law: those that are few lie together
   Marks marks;
 
   Packed(const Problem& problem, const Block& block)
@@ -47,10 +50,10 @@ struct Packed {
     Row* sphere = carver.take<Row>(grains * p.spheres_per_grain + 2);
     GrainRows* grain = carver.take<GrainRows>(grains + 1);
     Row* guest = carver.take<Row>(static_cast<std::size_t>(plan.guests) * 2);
-    Row* history = carver.take<Row>(Law::kHistory ? candidates : 0);
+    Row* history = carver.take<Row>(candidates * kHistoryRows);
     if (mode) mode->sphere = sphere, mode->grain = grain, mode->guest = guest, mode->history = history;
     carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
-    Row* run = carver.take<Row>(Law::kLayered ? candidates * p.points : 0);
+    RowOfRun* run = carver.take<RowOfRun>(Law::kLayered ? candidates * p.points : 0);
     if (mode) mode->run = run;
     return carver.used;
   }
@@ -86,43 +89,44 @@ struct Packed {
   }
 
   std::ptrdiff_t run_stride() const { return plan.candidates + 1; }
-  // A run's four numbers are a row.
-  StoredRuns<double> runs_of(std::size_t c) const {
-    return {reinterpret_cast<Run<double>*>(run + c), run_stride(), marks.runs + c, problem.points};
-  }
+  StoredRuns<double, RowOfRun> runs_of(std::size_t c) const { return {run + c, run_stride(), marks.runs + c, problem.points}; }
+  // Number q of the history of a contact.
+  double& remembered(std::size_t c, int q) const { return reinterpret_cast<double*>(history + c * kHistoryRows)[q]; }
   double outermost(std::size_t c, const LawParameters<V>& law) const {
-    return Reach<V, Law::variant>(splat<V>(history[c][0]), law, problem.points).outer[0];
+    return Reach<V, Law::variant>(splat<V>(remembered(c, kLastOverlap)), law, problem.points).outer[0];
   }
 
   void load_history(std::ptrdiff_t c, const LawParameters<V>& law) {
     const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = false;
     marks.wake[c] = -1.0;  // not looked at yet
-    for (int q = 0; q < Law::kHistory; ++q) {
+    for (int q = 0; q < Law::kGiven; ++q) {
       const Place place = place_of<Law>(row, q);
-      history[c][q] = lane.history_in[place.leaf][place.row * problem.stride];
+      remembered(c, q) = lane.history_in[place.leaf][place.row * problem.stride];
     }
     if constexpr (Law::kLayered) {
       const double outer = outermost(c, law);
       marks.rings[c] = rings_of(problem, outer);
-      runs_of(c).load(outer, false, [&](int j) {
-        const double* from = lane.history_in[0] + (row * problem.points + j) * 3 * problem.stride;
-        return Vec<double>{from[0], from[problem.stride], from[2 * problem.stride]};
-      });
+      const auto ring = [&](int j) {
+        const double* from = lane.history_in[0] + (row * problem.points + j) * 2 * problem.stride;
+        return Flat<double>{from[0], from[problem.stride]};
+      };
+      store_layers(&remembered(c, kLayers), runs_of(c).load(outer, kLacking<Law::variant>, false, ring));
     }
   }
 
   void unload_history(std::ptrdiff_t c, const LawParameters<V>& law, int) const {
     const std::ptrdiff_t row = plan.candidate[c].row;
-    for (int q = 0; q < Law::kHistory; ++q) {
+    for (int q = 0; q < Law::kGiven; ++q) {
       const Place place = place_of<Law>(row, q);
-      lane.history_out[place.leaf][place.row * problem.stride] = history[c][q];
+      lane.history_out[place.leaf][place.row * problem.stride] = remembered(c, q);
     }
     if constexpr (Law::kLayered) {
       const double outer = outermost(c, law);
-      runs_of(c).unload(outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Vec<double> f) {
-        double* to = lane.history_out[0] + (row * problem.points + j) * 3 * problem.stride;
-        to[0] = f.x, to[problem.stride] = f.y, to[2 * problem.stride] = f.z;
+      const Layers<double> layers = load_layers(&remembered(c, kLayers));
+      runs_of(c).unload(layers, outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Flat<double> f) {
+        double* to = lane.history_out[0] + (row * problem.points + j) * 2 * problem.stride;
+        to[0] = f.along, to[problem.stride] = f.across;
       });
     }
   }
@@ -134,13 +138,13 @@ struct Packed {
 
   void unload_padding(int n, int) const {
     const std::ptrdiff_t row = plan.padding_row[n];
-    for (int q = 0; q < Law::kHistory; ++q) {
+    for (int q = 0; q < Law::kGiven; ++q) {
       const Place place = place_of<Law>(row, q);
       lane.history_out[place.leaf][place.row * problem.stride] = 0.0;
     }
     if (Law::kLayered && !problem.history_aliased)
-      for (int q = 0; q < 3 * problem.points; ++q)
-        lane.history_out[0][(row * problem.points * 3 + q) * problem.stride] = 0.0;
+      for (int q = 0; q < 2 * problem.points; ++q)
+        lane.history_out[0][(row * problem.points * 2 + q) * problem.stride] = 0.0;
   }
 
   int dummy_sphere() const { return units(problem) * W * problem.spheres_per_grain; }
@@ -150,8 +154,7 @@ struct Packed {
     sphere[dummy_sphere()] = Row{};
     sphere[dummy_sphere() + 1] = Row{4.0};
     grain[dummy_grain()] = GrainRows{};
-    if constexpr (Law::kHistory > 0) history[plan.candidates] = Row{};
-    if constexpr (Law::kLayered) marks.runs[plan.candidates] = 0;
+    forget(plan.candidates);
   }
 
   // --- what the grains tell the contacts, and the contacts the grains
@@ -204,7 +207,7 @@ struct Packed {
 
   // Of W contacts.
   struct Runs {
-    Row* first[W];
+    RowOfRun* first[W];
     int* stored[W];
     std::ptrdiff_t stride;
     int rings, most;
@@ -212,18 +215,22 @@ struct Packed {
     int points() const { return rings; }
     int count() const { return most; }
     Run<V> get(int k) const {
-      const Row none{0.0, 0.0, 0.0, kNowhere};
-      const Rows rows = load_rows([&](int l) { return k < *stored[l] ? first[l] + k * stride : &none; });
-      return {columns(rows), spare_column(rows)};
+      const Row none{0.0, 0.0, kNowhere};
+      const Rows rows = load_rows([&](int l) {
+        return k < *stored[l] ? reinterpret_cast<const Row*>(first[l] + k * stride) : &none;
+      });
+      const Vec<V> run = columns(rows);
+      return {{run.x, run.y}, run.z};
     }
     void set(int k, const Run<V>& run) {
-      const Rows rows = rows_of(run.force, run.start);
-      for (int l = 0; l < W; ++l) first[l][k * stride] = row_of(rows, l);
+      const Rows rows = rows_of({run.force.along, run.force.across, run.start});
+      for (int l = 0; l < W; ++l) *reinterpret_cast<Row*>(first[l] + k * stride) = row_of(rows, l);
     }
     void keep(V counts) {
       for (int l = 0; l < W; ++l) *stored[l] = static_cast<int>(counts[l]);
       most = static_cast<int>(largest(counts));
     }
+    void remember() const {}
   };
 
   // W contacts; where there are fewer, the rest are dummies far apart.
@@ -251,7 +258,7 @@ struct Packed {
           const std::size_t later = awake[n + kAhead];
           const GrainRows* other = grain + plan.candidate[later].grain_other;
           __builtin_prefetch(sphere + plan.candidate[later].other);
-          __builtin_prefetch(history + later);
+          if constexpr (kHistoryRows > 0) __builtin_prefetch(history + later * kHistoryRows);
           if (marks.touched[later]) __builtin_prefetch(other), __builtin_prefetch(&other->spin), __builtin_prefetch(&other->torque);
         }
         if (!marks.touched[c] && !touches(c, travel)) continue;
@@ -274,9 +281,13 @@ struct Packed {
     return false;
   }
 
-  void blank(std::size_t c) {
-    if constexpr (Law::kHistory > 0) history[c] = Row{};
+  void forget(std::size_t c) {
+    for (int r = 0; r < kHistoryRows; ++r) history[c * kHistoryRows + r] = Row{};
     if constexpr (Law::kLayered) marks.runs[c] = 0;
+  }
+
+  void blank(std::size_t c) {
+    forget(c);
     const int n = plan.candidate[c].guest;
     if (n >= 0) guest[2 * static_cast<std::size_t>(n)] = guest[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
@@ -285,7 +296,7 @@ struct Packed {
     constexpr int kGroups = 8;
     Group group[kGroups];
     Contact<V> contact[kGroups];
-    V memory[kGroups][4];
+    V memory[kGroups][kHistoryRows ? 4 * kHistoryRows : 1];
     const int groups = (count + W - 1) / W;
     for (int n = 0; n < groups; ++n) {
       group[n] = group_of(touching + n * W, count - n * W);
@@ -297,7 +308,7 @@ struct Packed {
     close(contact, groups, parameter);
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
     if constexpr (Law::kLayered) {
-      for (int n = 0; n < groups; ++n) friction(Law{}, contact[n], law, runs_of(group[n]));
+      friction(Law{}, contact, groups, law, [&](int n) { return runs_of(group[n]); });
     } else {
       friction(Law{}, contact, groups, law);
     }
@@ -340,19 +351,17 @@ struct Packed {
   }
 
   void read_history(const Group& g, V* memory) const {
-    if constexpr (Law::kHistory > 0) store_vec(memory, columns(load_rows([&](int l) { return history + g.c[l]; })));
-    if constexpr (Law::kHistory > 3)
-      for (int l = 0; l < W; ++l) memory[3][l] = history[g.c[l]][3];
+    for (int r = 0; r < kHistoryRows; ++r) {
+      const Rows rows = load_rows([&](int l) { return history + static_cast<std::size_t>(g.c[l]) * kHistoryRows + r; });
+      store_vec(memory + 4 * r, columns(rows));
+      if (Law::kHistory > 4 * r + 3) memory[4 * r + 3] = spare_column(rows);
+    }
   }
 
   void write_history(const Group& g, const V* memory) {
-    if constexpr (Law::kHistory > 0) {
-      const Rows kept = rows_of(load_vec(memory));
-      for (int l = 0; l < W; ++l) {
-        Row row = row_of(kept, l);
-        if constexpr (Law::kHistory > 3) row[3] = memory[3][l];
-        history[g.c[l]] = row;
-      }
+    for (int r = 0; r < kHistoryRows; ++r) {
+      const Rows kept = rows_of(load_vec(memory + 4 * r), Law::kHistory > 4 * r + 3 ? memory[4 * r + 3] : V{});
+      for (int l = 0; l < W; ++l) history[static_cast<std::size_t>(g.c[l]) * kHistoryRows + r] = row_of(kept, l);
     }
   }
 

@@ -19,8 +19,8 @@ template <class V>
 struct Trace {
   bool* touched = nullptr;  // [candidates]
   V* history;               // [candidates, kHistory] of the law
-  Run<V>* run;              // [candidates, Q]
-  int* runs;                // [candidates]
+  Run<V>* run;              // [candidates, Q], where a contact came to another ring
+  int* runs;                // [candidates]; -1 where it did not
 };
 
 template <class V>
@@ -65,7 +65,7 @@ struct Replicas {
   const Problem& problem;
   const Block& block;
   const Plan& plan;
-  bool adjacent;  // the lanes are W neighbours in every array of the call
+  bool adjacent;  // the lanes are neighbours in every array of the call
   bool together;  // they all have the same number of steps
   V* hot;         // the engine's
   V* sphere;      // [S, 3]: centres
@@ -78,7 +78,7 @@ struct Replicas {
   bool apart = false;  // Mindlin's rings each by itself, for their derivatives
 
   Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
-    adjacent = block.count == kReplicas<V>;
+    adjacent = true;
     together = true;
     const Lane& a = block.lanes[0];
     for (int l = 1; l < block.count; ++l) {
@@ -130,7 +130,10 @@ struct Replicas {
   template <class Pointer>
   V read(const Pointer& pointer, std::ptrdiff_t row) const {
     return of_lanes<V>(block, [&](const Lane* lanes, int first) {
-      return adjacent ? load(pointer(lanes[first]) + row * problem.stride) : gather(lanes, pointer, row, first);
+      const int count = block.count - first;
+      if (!adjacent || count < 1) return gather(lanes, pointer, row, first);
+      const double* from = pointer(lanes[first]) + row * problem.stride;
+      return count < W ? load(from, count) : load(from);
     });
   }
 
@@ -139,7 +142,10 @@ struct Replicas {
   void write(const Pointer& pointer, std::ptrdiff_t row, V number, int steps_done) const {
     const auto a = result(number);
     const Lane* lanes = results();
-    if (adjacent && together) return store(pointer(lanes[0]) + row * problem.stride, a);
+    if (adjacent && together) {
+      double* to = pointer(lanes[0]) + row * problem.stride;
+      return block.count < kReplicas<V> ? store(to, a, block.count) : store(to, a);
+    }
     for (int l = 0; l < block.count; ++l)
       if (block.lanes[l].steps == steps_done) pointer(lanes[l])[row * problem.stride] = a[l];
   }
@@ -172,56 +178,63 @@ struct Replicas {
     }
   }
 
-  StoredRuns<V> runs_of(std::size_t c) const { return {run + c, plan.candidates, marks.runs + c, problem.points}; }
+  StoredRuns<V> runs_of(std::size_t c) const {
+    if (!trace.touched) return {run + c, plan.candidates, marks.runs + c, problem.points};
+    return {run + c, plan.candidates, marks.runs + c, problem.points, trace.run + c * problem.points, trace.runs + c};
+  }
+  V outermost(std::size_t c, const LawParameters<V>& law) const {
+    return Reach<V, Law::variant>(history[c * Law::kHistory + kLastOverlap], law, problem.points).outer;
+  }
 
   void load_history(std::ptrdiff_t c, const LawParameters<V>& law) {
     const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = true;
     marks.wake[c] = 0.0;
-    for (int q = 0; q < Law::kHistory; ++q) {
+    for (int q = 0; q < Law::kGiven; ++q) {
       const Place place = place_of<Law>(row, q);
       history[c * Law::kHistory + q] =
           convert<C>(read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row));
     }
     if constexpr (Law::kLayered) {
-      const V outer = Reach<V, Law::variant>(history[c], law, problem.points).outer;
+      const V outer = outermost(c, law);
       marks.rings[c] = rings_of(problem, outer);
-      runs_of(c).load(outer, apart, [&](int j) {
+      const auto ring = [&](int j) {
         const auto in = [](const Lane& lane) { return lane.history_in[0]; };
-        const std::ptrdiff_t from = (row * problem.points + j) * 3;
-        return Vec<V>{read(in, from), read(in, from + 1), read(in, from + 2)};
-      });
+        const std::ptrdiff_t from = (row * problem.points + j) * 2;
+        return Flat<V>{read(in, from), read(in, from + 1)};
+      };
+      store_layers(history + c * Law::kHistory + kLayers, runs_of(c).load(outer, kLacking<Law::variant>, apart, ring));
     }
   }
 
   void unload_history(std::ptrdiff_t c, const LawParameters<V>& law, int steps_done) const {
     const std::ptrdiff_t row = plan.candidate[c].row;
-    for (int q = 0; q < Law::kHistory; ++q) {
+    for (int q = 0; q < Law::kGiven; ++q) {
       const Place place = place_of<Law>(row, q);
       write([place](const Lane& lane) { return lane.history_out[place.leaf]; }, place.row,
             convert<V>(history[c * Law::kHistory + q]), steps_done);
     }
     if constexpr (Law::kLayered) {
-      const V outer = Reach<V, Law::variant>(history[c], law, problem.points).outer;
-      runs_of(c).unload(outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Vec<V> f) {
+      const V outer = outermost(c, law);
+      const Layers<V> layers = load_layers(history + c * Law::kHistory + kLayers);
+      runs_of(c).unload(layers, outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Flat<V> f) {
         const auto out = [](const Lane& lane) { return lane.history_out[0]; };
-        const std::ptrdiff_t to = (row * problem.points + j) * 3;
-        write(out, to, f.x, steps_done);
-        write(out, to + 1, f.y, steps_done);
-        write(out, to + 2, f.z, steps_done);
+        const std::ptrdiff_t to = (row * problem.points + j) * 2;
+        write(out, to, f.along, steps_done);
+        write(out, to + 1, f.across, steps_done);
       });
     }
   }
 
   void unload_padding(int n, int steps_done) const {
     const std::ptrdiff_t row = plan.padding_row[n];
-    for (int q = 0; q < Law::kHistory; ++q) {
+    for (int q = 0; q < Law::kGiven; ++q) {
       const Place place = place_of<Law>(row, q);
       write([place](const Lane& lane) { return lane.history_out[place.leaf]; }, place.row, V{}, steps_done);
     }
     if (Law::kLayered && !problem.history_aliased)
-      for (int q = 0; q < 3 * problem.points; ++q)
-        write([](const Lane& lane) { return lane.history_out[0]; }, row * problem.points * 3 + q, V{}, steps_done);
+      for (int q = 0; q < 2 * problem.points; ++q)
+        write([](const Lane& lane) { return lane.history_out[0]; }, row * problem.points * 2 + q, V{}, steps_done);
   }
 
   void load_dummies() {}
@@ -278,10 +291,7 @@ struct Replicas {
   void remember(std::size_t c) {
     trace.touched[c] = true;
     for (int q = 0; q < Law::kHistory; ++q) trace.history[c * Law::kHistory + q] = history[c * Law::kHistory + q];
-    if constexpr (Law::kLayered) {
-      trace.runs[c] = marks.runs[c];
-      for (int k = 0; k < marks.runs[c]; ++k) trace.run[c * problem.points + k] = runs_of(c).get(k);
-    }
+    if constexpr (Law::kLayered) trace.runs[c] = -1;
   }
 
   void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel) {
@@ -332,23 +342,10 @@ struct Replicas {
     compute(touching, count, contact, parameter, law);
   }
 
-  // Has the runs of a contact brought near: they lie too far apart for the processor to see what comes next.
-  void fetch(std::size_t c) const {
-    for (int k = 0; k < marks.runs[c]; ++k) {
-      const char* at = reinterpret_cast<const char*>(&runs_of(c).get(k));
-      for (std::size_t line = 0; line < sizeof(Run<C>); line += 64) __builtin_prefetch(at + line, 1);
-    }
-  }
-
   void compute(const int* touching, int count, Contact<C>* contact, const C* parameter, const LawParameters<C>& law) {
-    if constexpr (Law::kLayered)
-      if (count) fetch(touching[0]);
     close(contact, count, parameter);
     if constexpr (Law::kLayered) {
-      for (int n = 0; n < count; ++n) {
-        if (n + 1 < count) fetch(touching[n + 1]);
-        friction(Law{}, contact[n], law, runs_of(touching[n]));
-      }
+      friction(Law{}, contact, count, law, [&](int n) { return runs_of(touching[n]); });
     } else {
       friction(Law{}, contact, count, law);
     }

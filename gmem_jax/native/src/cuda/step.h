@@ -69,14 +69,15 @@ struct Lane {
   }
 };
 
-// Where number `q` of a contact's history lies in the call: leaf 0 is the force (or the rings), leaf 1 the overlap.
+// Where number `q` of a contact's history lies in the call: leaf 0 is the force, leaf 1 the overlap; Mindlin's rings come
+// before them.
 template <class Law>
 struct Place {
   int leaf;
   long long row;
 
   Place(long long row, int q)
-      : leaf(q < Law::kVectors ? 0 : 1), row(q < Law::kVectors ? row * Law::kVectors + q : row) {}
+      : leaf((q < Law::kVectors ? 0 : 1) + Law::kLayered), row(q < Law::kVectors ? row * Law::kVectors + q : row) {}
 };
 
 // The runs of one side, in one lane; see physics/runs.h.
@@ -88,41 +89,55 @@ struct Runs {
 
   int points() const { return rings; }
   int count() const { return *stored; }
-  Run<V> get(int k) const { return {at.vec(4 * k), at[4 * k + 3]}; }
-  void set(int k, const Run<V>& run) const { at.put(4 * k, run.force), at.put(4 * k + 3, run.start); }
+  Run<V> get(int k) const { return {{at[3 * k], at[3 * k + 1]}, at[3 * k + 2]}; }
+  void set(int k, const Run<V>& run) const {
+    at.put(3 * k, run.force.along), at.put(3 * k + 1, run.force.across), at.put(3 * k + 2, run.start);
+  }
   void keep(V counts) const { *stored = static_cast<int>(largest(counts)); }
+  void remember() const {}
 
   // From rings up to `outer`, of which `ring(j)` reads one.
   template <class Ring>
-  void load(int outer, const Ring& ring) const {
-    Vec<V> previous{};
+  Layers<V> load(int outer, double lacking, const Ring& ring) const {
+    Flat<V> previous{};
+    Layers<V> layers{};
     int found = 0;
-    for (int j = 0; j <= outer; ++j) {
-      const Vec<V> force = ring(j);
-      if (j == 0 || j == outer || differ(force, previous)) set(found++, {force, splat<V>(j)});
+    for (int j = 0; j < outer; ++j) {
+      const Flat<V> force = ring(j);
+      layers.inside = fma(splat<V>(j == 0 ? 1.0 - lacking : 1.0), force, layers.inside);
+      if (j == 0 || differ(force, previous)) set(found++, {force, splat<V>(j)});
       previous = force;
     }
+    if (outer >= 0) layers.rim = ring(outer);
     *stored = found;
+    return layers;
   }
 
   // All rings of a contact that reaches to `outer`, to `put(j, f)`.
   template <class Put>
-  void unload(int outer, const Put& put) const {
+  void unload(const Layers<V>& layers, int outer, const Put& put) const {
     int next = 0;
-    Vec<V> force{};
+    Flat<V> force{};
     for (int j = 0; j < rings; ++j) {
-      if (next < *stored && !bits_less(splat<V>(j), get(next).start)) force = get(next++).force;
-      put(j, j <= outer ? force : Vec<V>{});
+      if (next < *stored && !bits_less(splat<V>(j), get(next).start)) force = get(next++).force + layers.common;
+      put(j, j < outer ? force : j == outer ? layers.rim : Flat<V>{});
     }
   }
 };
+
+// The outermost ring that a side has reached.
+template <class V, class Law>
+int outermost(const Lane<V>& on, long long side, const LawParameters<V>& law) {
+  const V overlap = on.in(on.a.history)[side * Law::kHistory + kLastOverlap];
+  return static_cast<int>(largest(Reach<V, Law::variant>(overlap, law, on.a.points).outer));
+}
 
 template <class V>
 Runs<V> runs_of(const Lane<V>& on, long long side) {
   const Arguments& a = on.a;
   Column<V> at = on.in(a.runs);
-  at.value += side * a.points * 4 * at.stride;
-  if (__is_class(V)) at.slope += side * a.points * 4 * at.stride;
+  at.value += side * a.points * 3 * at.stride;
+  if (__is_class(V)) at.slope += side * a.points * 3 * at.stride;
   return {at, a.stored + side * a.lanes + on.lane, a.points};
 }
 
@@ -181,15 +196,19 @@ void enter(const Arguments& a, int thread) {
   for (int side = a.start.of(on.entry)[grain]; side < a.start.of(on.entry)[grain + 1]; ++side) {
     const int row = a.side.of(on.entry)[side].row;
     const Column<V> history = on.in(a.history);
-    for (int n = 0; n < Law::kHistory; ++n) {
+    for (int n = 0; n < Law::kGiven; ++n) {
       const Place<Law> place(row, n);
       history.put(side * static_cast<long long>(Law::kHistory) + n, on.in(a.history_in[place.leaf])[place.row]);
     }
     if constexpr (Law::kLayered) {
-      const V outer = Reach<V, Law::variant>(history[side], law, a.points).outer;
-      runs_of(on, side).load(static_cast<int>(largest(outer)), [&](int j) {
-        return on.in(a.history_in[0]).vec(3 * (static_cast<long long>(row) * a.points + j));
-      });
+      const Column<V> rings = on.in(a.history_in[0]);
+      const long long first = 2ll * row * a.points;
+      V layers[Law::kHistory - kLayers];
+      store_layers(layers, runs_of(on, side).load(outermost<V, Law>(on, side, law), kLacking<Law::variant>, [&](int j) {
+        return Flat<V>{rings[first + 2 * j], rings[first + 2 * j + 1]};
+      }));
+      for (int n = kLayers; n < Law::kHistory; ++n)
+        history.put(side * static_cast<long long>(Law::kHistory) + n, layers[n - kLayers]);
     }
   }
   on.in(a.pressure).put(grain * 3ll, Vec<V>{});
@@ -231,7 +250,7 @@ GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side&
   contact.history = history;
   close(&contact, 1, parameter);
   if constexpr (Law::kLayered) {
-    friction(Law{}, contact, law, runs_of(on, number));
+    friction(Law{}, &contact, 1, law, [&](int) { return runs_of(on, number); });
   } else {
     friction(Law{}, &contact, 1, law);
   }
@@ -245,6 +264,7 @@ GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side&
 template <class V, class Law>
 inline void forget(const Lane<V>& on, long long number) {
   const Column<V> stored = on.in(on.a.history);
+  if (Law::kHistory > kLastOverlap && is_zero(stored[number * Law::kHistory + kLastOverlap])) return;
   for (int n = 0; n < Law::kHistory; ++n)
     if (!is_zero(stored[number * Law::kHistory + n])) stored.put(number * Law::kHistory + n, V{});
   if constexpr (Law::kLayered) runs_of(on, number).keep(V{});
@@ -313,24 +333,27 @@ void leave(const Arguments& a, int thread) {
   }
   if (row >= a.rows) return;
   const long long side = a.place.of(on.entry)[row];
-  for (int n = 0; n < Law::kHistory; ++n) {
+  for (int n = 0; n < Law::kGiven; ++n) {
     const Place<Law> place(row, n);
     const V number = side < 0 ? V{} : on.in(a.history)[side * Law::kHistory + n];
     on.out(a.history_out[place.leaf]).put(place.row, result(number));
   }
   if constexpr (Law::kLayered) {
     const Column<double> out = on.out(a.history_out[0]);
-    const auto put = [&](int j, Vec<V> f) {
-      out.put(3 * (static_cast<long long>(row) * a.points + j), Vec<double>{result(f.x), result(f.y), result(f.z)});
+    const auto put = [&](int j, Flat<V> f) {
+      const long long to = 2 * (static_cast<long long>(row) * a.points + j);
+      out.put(to, result(f.along)), out.put(to + 1, result(f.across));
     };
     if (side < 0) {
-      for (int j = 0; j < a.points; ++j) put(j, Vec<V>{});
+      for (int j = 0; j < a.points; ++j) put(j, Flat<V>{});
     } else {
       V parameter[kParameters];
       read_parameters(on, parameter);
       const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
-      const V outer = Reach<V, Law::variant>(on.in(a.history)[side], law, a.points).outer;
-      runs_of(on, side).unload(static_cast<int>(largest(outer)), put);
+      const Column<V> history = on.in(a.history);
+      V layers[Law::kHistory - kLayers];
+      for (int n = kLayers; n < Law::kHistory; ++n) layers[n - kLayers] = history[side * Law::kHistory + n];
+      runs_of(on, side).unload(load_layers(layers), outermost<V, Law>(on, side, law), put);
     }
   }
 }

@@ -28,6 +28,24 @@ typedef Mask<Real> Bits;  // all bits of a lane set or clear
 
 inline Real load(const double* p) { return *reinterpret_cast<const Unaligned*>(p); }
 inline void store(double* p, Real a) { *reinterpret_cast<Unaligned*>(p) = a; }
+// Of fewer than W numbers; the last one is repeated.
+inline Real load(const double* p, int count) {
+  Real a;
+#if defined(__AVX512F__)
+  const __m512i lane = _mm512_min_epi64(_mm512_set_epi64(7, 6, 5, 4, 3, 2, 1, 0), _mm512_set1_epi64(count - 1));
+  a = (Real)_mm512_permutexvar_pd(lane, _mm512_maskz_loadu_pd(static_cast<__mmask8>((1u << count) - 1), p));
+#else
+  for (int l = 0; l < W; ++l) a[l] = p[l < count ? l : count - 1];
+#endif
+  return a;
+}
+inline void store(double* p, Real a, int count) {
+#if defined(__AVX512F__)
+  _mm512_mask_storeu_pd(p, static_cast<__mmask8>((1u << count) - 1), (__m512d)a);
+#else
+  for (int l = 0; l < count; ++l) p[l] = a[l];
+#endif
+}
 inline Real select(Bits m, Real a, Real b) { return m ? a : b; }
 inline Real zero_unless(Bits m, Real a) { return m ? a : Real{}; }
 

@@ -146,6 +146,10 @@ struct Pair {
   friend double largest(Pair x) { return __builtin_fmax(largest(x.a), largest(x.b)); }
   friend double smallest(Pair x) { return __builtin_fmin(smallest(x.a), smallest(x.b)); }
   friend void store(double* p, Pair x) { store(p, x.a), store(p + W, x.b); }
+  friend void store(double* p, Pair x, int count) {
+    store(p, x.a, count < W ? count : W);
+    if (count > W) store(p + W, x.b, count - W);
+  }
 };
 
 using Halves = Floats<W>::Lanes;

@@ -1,4 +1,4 @@
-// Three-vectors whose components are numbers of any kind.
+// Vectors whose components are numbers of any kind: of space, and of a plane.
 
 #pragma once
 
@@ -47,6 +47,29 @@ template <class V>
 inline Vec<V> add_cross(Vec<V> c, Vec<V> a, Vec<V> b) {
   return {fma(a.y, b.z, fnma(a.z, b.y, c.x)), fma(a.z, b.x, fnma(a.x, b.z, c.y)), fma(a.x, b.y, fnma(a.y, b.x, c.z))};
 }
+
+// A vector of a plane in which some direction is marked.
+template <class V>
+struct Flat {
+  V along, across;
+};
+
+template <class V>
+inline Flat<V> operator+(Flat<V> a, Flat<V> b) { return {a.along + b.along, a.across + b.across}; }
+template <class V>
+inline Flat<V> operator*(V s, Flat<V> a) { return {s * a.along, s * a.across}; }
+template <class V>
+inline Flat<V> zero_unless(Mask<V> m, Flat<V> a) { return {zero_unless(m, a.along), zero_unless(m, a.across)}; }
+template <class V>
+inline Flat<V> select(Mask<V> m, Flat<V> a, Flat<V> b) {
+  return {select(m, a.along, b.along), select(m, a.across, b.across)};
+}
+template <class V>
+inline Mask<V> differ(Flat<V> a, Flat<V> b) { return differ(a.along, b.along) | differ(a.across, b.across); }
+template <class V>
+inline Flat<V> fma(V s, Flat<V> a, Flat<V> b) { return {fma(s, a.along, b.along), fma(s, a.across, b.across)}; }
+template <class V>
+inline V dot(Flat<V> a, Flat<V> b) { return fma(a.across, b.across, a.along * b.along); }
 
 template <class V>
 inline Vec<V> load_vec(const V* p) { return {p[0], p[1], p[2]}; }

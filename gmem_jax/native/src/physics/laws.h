@@ -89,31 +89,37 @@ struct Transport {
   }
 };
 
-// Carry the force in the histories of a batch along, times `factor(contact)`, and add `push(contact)` times sliding.
-template <class V, class Factor, class Pushed>
-inline void carry(Contact<V>* c, int count, const Factor& factor, const Pushed& push) {
+// Carry vectors of a batch, `from(contact)`, along with their contacts; their forces become `then(contact, carried)`.
+template <class V, class From, class Then>
+inline void carry(Contact<V>* c, int count, const From& from, const Then& then) {
   for (int n = 0; n < count; ++n) {
-    c[n].force = load_vec(c[n].history);
+    c[n].force = from(c[n]);
     c[n].square = Transport<V>(c[n]).flatten(c[n].force, c[n].before);
   }
   invert_roots(c, count);
-  for (int n = 0; n < count; ++n) {
-    const Vec<V> carried = Transport<V>(c[n]).restore(c[n].force, c[n].before, c[n].square, c[n].inverse);
-    c[n].force = fma(push(c[n]), c[n].sliding, factor(c[n], carried));
-  }
+  for (int n = 0; n < count; ++n)
+    c[n].force = then(c[n], Transport<V>(c[n]).restore(c[n].force, c[n].before, c[n].square, c[n].inverse));
+}
+
+struct Remembered {
+  template <class V>
+  GMEM_INLINE Vec<V> operator()(const Contact<V>& c) const { return load_vec(c.history); }
+};
+
+// By what a trial force is to be multiplied, of which `square` and `inverse` are the square and its inverse root.
+// gmem_jax/physics/contact/friction.py: coulomb
+template <class V>
+GMEM_INLINE V limited(const Contact<V>& c, V mu) {
+  const V limit = mu * c.normal_force;
+  return select(c.square > limit * limit, limit * c.inverse, splat<V>(1.0));
 }
 
 // Take the trial forces of a batch back to the friction limit.
-// gmem_jax/physics/contact/friction.py: coulomb
 template <class V>
 inline void coulomb(Contact<V>* c, int count, V mu) {
   for (int n = 0; n < count; ++n) c[n].square = dot(c[n].force, c[n].force);
   invert_roots(c, count);
-  for (int n = 0; n < count; ++n) {
-    const V limit = mu * c[n].normal_force;
-    const V scale = select(c[n].square > limit * limit, limit * c[n].inverse, splat<V>(1.0));
-    c[n].force = zero_unless(c[n].touching(), scale * c[n].force);
-  }
+  for (int n = 0; n < count; ++n) c[n].force = zero_unless(c[n].touching(), limited(c[n], mu) * c[n].force);
 }
 
 // gmem_jax/physics/contact/frictionless.py: Frictionless.__call__
@@ -126,7 +132,7 @@ GMEM_INLINE void friction(Frictionless, Contact<V>* c, int count, const LawParam
 template <class V>
 GMEM_INLINE void friction(Hooke, Contact<V>* c, int count, const LawParameters<V>& law) {
   const V push = law.half_step + law.dashpot, rest = law.half_step - law.dashpot;
-  carry(c, count, [](const Contact<V>&, Vec<V> carried) { return carried; }, [&](const Contact<V>&) { return push; });
+  carry(c, count, Remembered{}, [&](const Contact<V>& now, Vec<V> carried) { return fma(push, now.sliding, carried); });
   coulomb(c, count, law.mu);
   for (int n = 0; n < count; ++n)
     store_vec(c[n].history, zero_unless(c[n].touching(), fma(rest, c[n].sliding, c[n].force)));
@@ -138,16 +144,16 @@ GMEM_INLINE void friction(Rescaled, Contact<V>* c, int count, const LawParameter
   const V one = splat<V>(1.0);
   const V push = law.stiffness * (law.half_dt + law.damping_time), rest = law.stiffness * (law.half_dt - law.damping_time);
   // sqrt(p / p_old) on unloading; sqrt(p) has been left in `root_overlap`.
-  const auto rescaled = [&](const Contact<V>& now, Vec<V> carried) {
-    const Mask<V> unloads = now.touching() & (now.overlap < now.history[3]);
-    const V ratio = root(select(unloads, now.safe_overlap(), one) / select(unloads, now.history[3], one));
-    return ratio * carried;
-  };
-  carry(c, count, rescaled, [&](const Contact<V>& now) { return push * now.root_overlap; });
+  carry(c, count, Remembered{}, [&](const Contact<V>& now, Vec<V> carried) {
+    const V last = now.history[kLastOverlap];
+    const Mask<V> unloads = now.touching() & (now.overlap < last);
+    const V ratio = root(select(unloads, now.safe_overlap(), one) / select(unloads, last, one));
+    return fma(push * now.root_overlap, now.sliding, ratio * carried);
+  });
   coulomb(c, count, law.mu);
   for (int n = 0; n < count; ++n) {
     store_vec(c[n].history, zero_unless(c[n].touching(), fma(rest * c[n].root_overlap, c[n].sliding, c[n].force)));
-    c[n].history[3] = zero_unless(c[n].touching(), c[n].overlap);
+    c[n].history[kLastOverlap] = zero_unless(c[n].touching(), c[n].overlap);
   }
 }
 
@@ -166,89 +172,74 @@ struct Reach {
   }
 };
 
-// `Transport` of many forces of one contact: a matrix.
-// gmem_jax/physics/contact/mindlin.py: transport_layers
+// By how much ring 0 weighs less than one.
+template <Variant variant>
+constexpr double kLacking = variant == Variant::paper ? 0.5 : 0.0;
+
+// A vector that is not along the unit vector `normal`.
+// gmem_jax/physics/contact/mindlin.py: any_tangent
 template <class V>
-struct TransportOfMany {
-  Vec<V> normal, column[3];
-  V denominator2;
+GMEM_INLINE Vec<V> any_tangent(Vec<V> normal) {
+  const V one = splat<V>(1.0), near = splat<V>(0.6);
+  const Mask<V> near_x = (near < normal.x) | (near < -normal.x);
+  return {select(near_x, V{}, one), zero_unless(near_x, one), V{}};
+}
 
-  GMEM_INLINE explicit TransportOfMany(const Contact<V>& c) : normal(c.normal) {
-    const Transport<V> single(c);
-    const Vec<V> turned = single.sine * normal, scaled = single.cosine * normal;
-    column[0] = fnma(normal.x, scaled, Vec<V>{single.cosine, turned.z, -turned.y});
-    column[1] = fnma(normal.y, scaled, Vec<V>{-turned.z, single.cosine, turned.x});
-    column[2] = fnma(normal.z, scaled, Vec<V>{turned.y, -turned.x, single.cosine});
-    denominator2 = single.denominator2;
-  }
-
-  // First part: moves `force`; returns the square whose inverse root the second part wants.
-  GMEM_INLINE V move(Vec<V>& force, V& before) const {
-    const V along_normal = dot(force, normal);
-    before = dot(force, force);
-    force = fma(force.x, column[0], fma(force.y, column[1], force.z * column[2]));
-    return (before * denominator2) * fnma(along_normal, along_normal, before);
-  }
-
-  // By what it is to be multiplied then; see `Transport.restore`.
-  GMEM_INLINE V restoring(V square, V before, V inverse) const {
-    return select(square > splat<V>(1e-280), before * inverse, splat<V>(1.0));
-  }
-};
-
-// One contact. `runs` has `points()`; `count()`, of the lane that has most; `get(k)` and `set(k, run)`; and
-// `keep(counts)`, of each lane.
+// `runs_of(n)` are those of contact n: with `points()`; `count()`, of the lane that has most; `get(k)` and `set(k, run)`;
+// `keep(counts)`, of each lane; and `remember()`, called before they change.
 // gmem_jax/physics/contact/mindlin.py: Mindlin.__call__
-template <class V, Variant variant, class Runs>
-void friction(Layered<variant>, Contact<V>& c, const LawParameters<V>& law, Runs runs) {
-  const V one = splat<V>(1.0), half = splat<V>(0.5);
-  const Reach<V, variant> before(c.history[0], law, runs.points()), now(c.overlap, law, runs.points());
-  if (bits_less(before.outer, now.outer) | bits_less(now.outer, before.outer)) reattach(runs, before.outer, now.outer);
+template <class V, Variant variant, class RunsOf>
+GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, const LawParameters<V>& law, const RunsOf& runs_of) {
+  const V one = splat<V>(1.0), lacking = splat<V>(kLacking<variant>);
+  const auto frame = [](const Contact<V>& now) {
+    return select(now.history[kLastOverlap] > V{}, load_vec(now.history), any_tangent(now.normal));
+  };
+  carry(c, count, frame, [](const Contact<V>&, Vec<V> carried) { return carried; });
 
-  // The force in a ring that fills stays: Mindlin._diluted.
-  const V filled = before.x - before.outer;
-  const V fills = select(before.outer < now.outer, one, now.x - before.outer);
-  const Mask<V> grows = filled < fills;
-  const V dilution = select(grows, filled / select(grows, fills, one), one);
+  Flat<V> sliding[kTogether], trial[kTogether];
+  V weight[kTogether], total[kTogether];  // of the rings inside the outermost; of all
+  Mask<V> attached[kTogether];
+  for (int n = 0; n < count; ++n) {
+    auto runs = runs_of(n);
+    const int points = runs.points();
+    const Reach<V, variant> before(c[n].history[kLastOverlap], law, points), now(c[n].overlap, law, points);
+    Layers<V> layers = load_layers(c[n].history + kLayers);
+    if (variant == Variant::averaged) {  // the force in a ring that fills stays: Mindlin._diluted
+      const V filled = before.x - before.outer, fills = select(before.outer < now.outer, one, now.x - before.outer);
+      const Mask<V> grows = filled < fills;
+      layers.rim = select(grows, filled / select(grows, fills, one), one) * layers.rim;
+    }
+    if (bits_less(before.outer, now.outer) | bits_less(now.outer, before.outer))
+      reattach(runs, layers, before.outer, now.outer, kLacking<variant>);
+    store_layers(c[n].history + kLayers, layers);
 
-  const TransportOfMany<V> transport(c);
-  const Vec<V> half_step = law.half_step * c.sliding;
-  constexpr int kRuns = kTogether;
-  Run<V> run[kRuns];
-  V squared[kRuns], product[kRuns], inverse[kRuns];
-  Vec<V> sum{};
-  const int stored = runs.count();
-  for (int first = 0; first < stored; first += kRuns) {
-    const int count = stored - first < kRuns ? stored - first : kRuns;
-    for (int n = 0; n < count; ++n) {
-      run[n] = runs.get(first + n);
-      product[n] = transport.move(run[n].force, squared[n]);
-    }
-    for (int n = 0; n < count; ++n) inverse[n] = inverse_root(product[n]);
-    const V next = first + count < stored ? runs.get(first + count).start : splat<V>(kNowhere);
-    for (int n = 0; n < count; ++n) {
-      const V start = run[n].start, end = n + 1 < count ? run[n + 1].start : next;
-      V scale = transport.restoring(product[n], squared[n], inverse[n]);
-      if (variant == Variant::averaged) scale = select(start < before.outer, one, dilution) * scale;
-      V weight = select(end < now.x, end, now.x) - start;
-      if (variant == Variant::paper && first + n == 0) weight = weight - half;
-      run[n].force = fma(scale, run[n].force, half_step);
-      sum = fma(zero_unless(start <= now.x, weight), run[n].force, sum);
-      runs.set(first + n, run[n]);
-    }
+    const Mask<V> beyond = V{} < now.outer;
+    attached[n] = V{} <= now.outer;
+    weight[n] = zero_unless(beyond, now.outer - lacking);
+    const V rim = zero_unless(attached[n], now.x - now.outer - select(beyond, V{}, lacking));
+    const V whole = weight[n] + rim;
+    total[n] = select(attached[n], whole, one);
+    sliding[n] = {dot(c[n].sliding, c[n].force), dot(c[n].sliding, cross(c[n].normal, c[n].force))};
+    const V pushed = fma(law.spacing, whole * law.half_step, law.dashpot * c[n].root_overlap);
+    trial[n] = fma(pushed, sliding[n], law.spacing * fma(rim, layers.rim, layers.inside));
+    c[n].square = dot(trial[n], trial[n]);
   }
-  const Mask<V> attached = now.outer > V{} - half;
-  const V total = select(attached, variant == Variant::paper ? now.x - half : now.x, one);
-  const Vec<V> trial = fma(law.spacing, sum, (law.dashpot * c.root_overlap) * c.sliding);
-  c.force = trial;
-  coulomb(&c, 1, law.mu);
-  const Vec<V> correction = fma(one / (law.spacing * total), c.force - trial, half_step);
-  for (int k = 0; k < stored; ++k) {
-    Run<V> last = runs.get(k);
-    last.force = zero_unless(last.start <= now.x, last.force + correction);
-    runs.set(k, last);
+  invert_roots(c, count);
+  for (int n = 0; n < count; ++n) {
+    const V scale = limited(c[n], law.mu);
+    const Mask<V> touching = c[n].touching();
+    const Flat<V> push = fma((scale - one) / (law.spacing * total[n]), trial[n], (law.half_step + law.half_step) * sliding[n]);
+    Layers<V> layers = load_layers(c[n].history + kLayers);
+    layers.common = zero_unless(attached[n], layers.common + push);
+    layers.inside = fma(weight[n], push, layers.inside);
+    layers.rim = zero_unless(attached[n], layers.rim + push);
+    store_layers(c[n].history + kLayers, layers);
+    const Vec<V> along = zero_unless(touching, c[n].force);
+    store_vec(c[n].history, along);
+    c[n].history[kLastOverlap] = zero_unless(touching, c[n].overlap);
+    const Flat<V> force = scale * trial[n];
+    c[n].force = fma(force.along, along, force.across * cross(c[n].normal, along));
   }
-  c.history[0] = zero_unless(c.touching(), c.overlap);
 }
 
 }  // namespace GMEM_ISA

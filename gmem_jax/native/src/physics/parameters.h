@@ -6,7 +6,7 @@ namespace gmem {
 
 constexpr int kFields = 6;  // position, quaternion, velocity, spin, acceleration, spin rate
 constexpr int kWalls = 12;  // lower, upper, lower velocity, upper velocity
-constexpr int kMaxHistory = 2;
+constexpr int kMaxHistory = 3;
 
 // What is wanted: all steps; their derivative along a direction; or, back from derivatives by all results, those by all
 // arguments.
@@ -24,29 +24,36 @@ constexpr int kLawParameters = 5;  // mu, stiffness, damping time, spinning, spa
 constexpr int kParameters = kLaw + kLawParameters;
 constexpr int kSpinning = kLaw + 3;
 
+// Where a history has the overlap of the last step, if it has it; and Mindlin's `Layers`.
+constexpr int kLastOverlap = 3, kLayers = 4;
+
 // The laws as types.
 struct Frictionless {
-  static constexpr int kHistory = 0;  // numbers remembered of a contact, beside Mindlin's layers
-  static constexpr int kVectors = 0;  // those of them that are components of forces
+  static constexpr int kHistory = 0;  // numbers remembered of a contact from step to step, beside Mindlin's layers
+  static constexpr int kGiven = 0;    // those of them, the first, that come and go in the arrays of a call
+  static constexpr int kVectors = 0;  // those of these that are components of a vector
   static constexpr bool kLayered = false;
 };
 
 struct Hooke {
   static constexpr int kHistory = 3;
+  static constexpr int kGiven = 3;
   static constexpr int kVectors = 3;
   static constexpr bool kLayered = false;
 };
 
 struct Rescaled {
   static constexpr int kHistory = 4;  // force, overlap
+  static constexpr int kGiven = 4;
   static constexpr int kVectors = 3;
   static constexpr bool kLayered = false;
 };
 
 template <Variant variant_>
 struct Layered {
-  static constexpr int kHistory = 1;  // overlap; the layers are kept apart
-  static constexpr int kVectors = 0;
+  static constexpr int kHistory = 10;  // frame, overlap, `Layers`; the rings inside are kept apart
+  static constexpr int kGiven = 4;
+  static constexpr int kVectors = 3;
   static constexpr bool kLayered = true;
   static constexpr Variant variant = variant_;
 };

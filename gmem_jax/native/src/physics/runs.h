@@ -1,6 +1,7 @@
-// What is stored of Mindlin's f. All attached rings are changed alike in every step, so that rings which were attached
-// in the same step share their f for ever: kept are runs of equal rings. (A contact of the shipped packs has 37 rings
-// in 2 runs at rest, and 52 in 22 where it is compressed.)
+// What is stored of Mindlin's f. All attached rings are changed alike in every step: what all have got is kept once, and
+// only the outermost ring, which is filling, by itself. The rings inside are looked at when a contact reaches a ring more
+// or less. Those that were attached together share their f for ever: kept are runs of equal rings. (A contact of the
+// shipped packs has 37 rings in 2 runs at rest, and 52 in 22 where it is compressed.)
 
 #pragma once
 
@@ -12,84 +13,123 @@ namespace GMEM_ISA {
 // Every lane has its own runs: number k of one may begin elsewhere than number k of another.
 template <class V>
 struct Run {
-  Vec<V> force;  // f
-  V start;       // its first ring; it ends where the next one begins
+  Flat<V> force;  // f without what is common to all
+  V start;        // its first ring; it ends where the next one begins, the last at the outermost ring
 };
 
 // Where a run begins that a lane does not have: beyond all rings.
 constexpr double kNowhere = 1e9;
 
 template <class V>
-inline Run<V> no_run() { return {Vec<V>{}, splat<V>(kNowhere)}; }
+inline Run<V> no_run() { return {Flat<V>{}, splat<V>(kNowhere)}; }
 
 template <class V>
 inline void copy_lane(Run<V>& to, int l, const Run<V>& from) {
-  copy_lane(to.force.x, l, from.force.x);
-  copy_lane(to.force.y, l, from.force.y);
-  copy_lane(to.force.z, l, from.force.z);
+  copy_lane(to.force.along, l, from.force.along);
+  copy_lane(to.force.across, l, from.force.across);
   copy_lane(to.start, l, from.start);
 }
 
-// The runs of a contact that reaches to ring `outer` where it reached to `before` (-1: to none): rings that it left are
-// forgotten, new ones begin with nothing. The outermost ring, whose f may change while it fills, is a run of its own.
+// Of all rings of a contact.
+template <class V>
+struct Layers {
+  Flat<V> common;  // what is to be added to the f of every run
+  Flat<V> inside;  // the sum of w f over the rings inside the outermost
+  Flat<V> rim;     // f of the outermost
+};
+
+template <class V>
+inline Layers<V> load_layers(const V* p) { return {{p[0], p[1]}, {p[2], p[3]}, {p[4], p[5]}}; }
+template <class V>
+inline void store_layers(V* p, const Layers<V>& a) {
+  p[0] = a.common.along, p[1] = a.common.across;
+  p[2] = a.inside.along, p[3] = a.inside.across;
+  p[4] = a.rim.along, p[5] = a.rim.across;
+}
+
+// The layers of a contact whose outermost ring was `before` (-1: none is attached) and is `outer` now, in the lanes where
+// that differs: rings that it left are forgotten, new ones begin with nothing. Ring 0 weighs less than one by `lacking`.
 template <class V, class Runs>
-void reattach(Runs& runs, V before, V outer) {
+void reattach(Runs& runs, Layers<V>& layers, V before, V outer, double lacking) {
+  runs.remember();
   const V one = splat<V>(1.0), nowhere = splat<V>(kNowhere);
-  const Mask<V> left = outer < before;
-  V previous = -one, count{};
-  Vec<V> force{};
+  const Mask<V> grows = before < outer, shrinks = outer < before, differs = grows | shrinks;
+  const Flat<V> common = zero_unless(differs, layers.common);
+  V last = -one, count{};
+  Flat<V> force{}, inside{}, rim{};
   const int stored = runs.count();
   for (int k = 0; k < stored + 2; ++k) {
-    const Run<V> run = k < stored ? runs.get(k) : no_run<V>();
-    const Mask<V> stays = run.start <= outer, begins = (outer < run.start) & (previous < outer);
-    if (!bits(stays | begins)) break;
-    // First the new rings that are full, then the outermost.
-    const V start = select((previous <= before) & (before + one < outer), before + one, outer);
-    force = zero_unless(stays | (begins & left), select(stays, run.force, force));
-    previous = select(stays, run.start, select(begins, start, nowhere));
-    count = count + zero_unless(stays | begins, one);
-    runs.set(k, {force, previous});
+    Run<V> run = k < stored ? runs.get(k) : no_run<V>();
+    run.force = run.force + common;
+    const Mask<V> stays = run.start < outer, reaches = run.start <= outer, begins = grows & (outer <= run.start);
+    rim = select(shrinks & reaches, run.force, rim);
+    // First the ring that was the outermost, then those that were passed in this step.
+    const Mask<V> former = begins & (last < before);
+    const Mask<V> passed = begins & (before <= last) & (last <= before) & (before + one < outer);
+    const Mask<V> there = stays | former | passed;
+    if (!bits(there | reaches)) break;
+    const V start = select(stays, run.start, select(former, before, before + one));
+    inside = fma(zero_unless(there, start - last), force, inside);
+    force = select(there, zero_unless(stays | former, select(stays, run.force, layers.rim)), force);
+    if (lacking != 0.0 && k == 0) inside = fma(splat<V>(-lacking), force, inside);
+    last = select(there, start, last);
+    count = count + zero_unless(there, one);
+    runs.set(k, {force, select(there, start, nowhere)});
   }
   runs.keep(count);
+  inside = fma(outer - last, force, inside);
+  layers = {select(differs, Flat<V>{}, layers.common), select(differs, inside, layers.inside),
+            select(differs, rim, layers.rim)};
 }
 
 // Runs that lie `stride` apart.
-template <class V>
+template <class V, class Stored = Run<V>>
 struct StoredRuns {
-  Run<V>* first;
+  Stored* first;
   long long stride;
   int* stored;  // in the lane that has most
   int rings;
+  Run<V>* seen = nullptr;  // where `remember` copies them, one after the other, and how many they are
+  int* seen_count = nullptr;
 
   int points() const { return rings; }
   int count() const { return *stored; }
   const Run<V>& get(int k) const { return first[k * stride]; }
-  void set(int k, const Run<V>& run) { first[k * stride] = run; }
+  void set(int k, const Run<V>& run) { static_cast<Run<V>&>(first[k * stride]) = run; }
   void keep(V counts) { *stored = static_cast<int>(largest(counts)); }
+  void remember() const {
+    if (!seen) return;
+    *seen_count = count();
+    for (int k = 0; k < count(); ++k) seen[k] = get(k);
+  }
 
   // From rings, of which `ring(j)` reads one. With `apart` each is a run of its own, whatever it holds.
   template <class Ring>
-  void load(V outer, bool apart, const Ring& ring) {
+  Layers<V> load(V outer, double lacking, bool apart, const Ring& ring) {
     const int end = static_cast<int>(largest(outer)) + 1;
     int found[kLanes<V>] = {};
     *stored = 0;
-    Vec<V> previous{};
+    Flat<V> previous{};
+    Layers<V> layers{};
     for (int j = 0; j < end; ++j) {
       const Run<V> run{ring(j), splat<V>(j)};
-      const bool all = apart || j == 0;
-      const unsigned begins = bits(run.start <= outer) & (all ? ~0u : bits(differ(run.force, previous) | (outer <= run.start)));
+      const Mask<V> within = run.start < outer;
+      layers.inside = fma(zero_unless(within, splat<V>(j == 0 ? 1.0 - lacking : 1.0)), run.force, layers.inside);
+      layers.rim = select(run.start <= outer, run.force, layers.rim);
+      const unsigned begins = bits(within) & (apart || j == 0 ? ~0u : bits(differ(run.force, previous)));
       previous = run.force;
       for (int l = 0; begins && l < kLanes<V>; ++l) {
         if (!(begins >> l & 1)) continue;
         if (found[l] == *stored) set((*stored)++, no_run<V>());
-        copy_lane(first[found[l]++ * stride], l, run);
+        copy_lane(static_cast<Run<V>&>(first[found[l]++ * stride]), l, run);
       }
     }
+    return layers;
   }
 
   // The first `end` rings of a contact that reaches to `outer`, to `put(j, f)`.
   template <class Put>
-  void unload(V outer, int end, const Put& put) const {
+  void unload(const Layers<V>& layers, V outer, int end, const Put& put) const {
     int next[kLanes<V>] = {};  // run of each lane
     Run<V> now = no_run<V>();
     V until{};  // where they begin
@@ -102,7 +142,7 @@ struct StoredRuns {
         const int after = ++next[l];
         copy_lane(until, l, after < *stored ? get(after).start : splat<V>(kNowhere));
       }
-      put(j, zero_unless(at <= outer, now.force));
+      put(j, zero_unless(at <= outer, select(at < outer, now.force + layers.common, layers.rim)));
     }
   }
 };
