@@ -15,7 +15,7 @@ import scenes
 from gmem_jax.physics.contact.friction import FrictionLaw, largest_overlap
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
-from gmem_jax.physics.contact.kinematics import kinematics, transport
+from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.contact.normal import hertz

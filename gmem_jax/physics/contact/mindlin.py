@@ -43,7 +43,7 @@ class Mindlin:
     f(q) is the elastic force per unit of q in the ring of contact area that was attached when sqrt(p) passed q. It is
     kept on Q points a spacing dq = sqrt(p_max) / (Q - 1) apart: with x = sqrt(p) / dq and the outermost ring
     jp = floor(x), f_e = dq sum_j w_j f_j over j <= jp. The dashpot is f_d = damping_time k p^0.5 dsigma/dt, and
-    |f_e + f_d| <= mu f_n; a sliding contact gives up the same f in all its rings. All rings turn with the contact alike:
+    |f_e + f_d| <= mu f_n; a sliding contact gives up the same f in all its rings. These turn with the contact alike:
     what is kept of f_j are its components in a frame that does.
 
     The variants differ in the outermost ring, which the contact fills in part only:
