@@ -56,6 +56,7 @@ def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
     rows = [replace(row, median=row.us, worst=1.2 * row.us) for row in rows]
     facts = {
         "repeats": 5,
+        "t0": 1.8e3,
         "commit": "0123456789ab",
         "versions": {"jax": "0"},
         "processor": "P",
@@ -65,6 +66,7 @@ def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
     result = {
         **facts,
         "repeats": 5,
+        "t0": 1.8e3,
         "lammps": "L",
         "rows": [asdict(row) for row in rows],
         "growth": growth,

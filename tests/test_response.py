@@ -122,12 +122,11 @@ def test_design_inverts_a_linear_memory(monkeypatch: pytest.MonkeyPatch, experim
     assert found.fidelity > 0.999  # the sampled waveform is a cubic through 127 nodes
 
 
-# Memories that are what their kernel says, three times as loud, and quite another one.
-@pytest.mark.parametrize(("louder", "otherwise", "reached"), [(1.0, 0.0, 0.998), (3.0, 0.0, 0.95), (1.0, 0.6, 0.97)])
-def test_many_designs_share_a_kernel_learn_where_it_is_wrong_and_take_back_what_makes_them_worse(
-    monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment, louder: float, otherwise: float, reached: float
-) -> None:
-    kernel = ideal(0.3)
+def memory_of_another_kernel(
+    monkeypatch: pytest.MonkeyPatch, louder: float, otherwise: float, known_gain: float = 0.3
+) -> gm.MemoryKernel:
+    """Puts a memory into the place of simulations; what is taken for its kernel, and is it but for `otherwise`."""
+    kernel = ideal(known_gain)
     mixing, other = (np.linalg.qr(np.random.default_rng(seed).standard_normal((17, 17)))[0] for seed in (1, 2))
     odd = (np.eye(17) + 0.3 * mixing) @ kernel.odd  # linear, but no integral
     even = 0.1 * np.roll(odd, 1, axis=0)
@@ -140,6 +139,15 @@ def test_many_designs_share_a_kernel_learn_where_it_is_wrong_and_take_back_what_
 
     monkeypatch.setattr(by_kernel, "run", memory)
     monkeypatch.setattr(by_kernel, "memory_kernel", lambda *_, **__: known)
+    return known
+
+
+# Memories that are what their kernel says, three times as loud, and quite another one.
+@pytest.mark.parametrize(("louder", "otherwise", "reached"), [(1.0, 0.0, 0.998), (3.0, 0.0, 0.95), (1.0, 0.6, 0.97)])
+def test_many_designs_share_a_kernel_learn_where_it_is_wrong_and_take_back_what_makes_them_worse(
+    monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment, louder: float, otherwise: float, reached: float
+) -> None:
+    memory_of_another_kernel(monkeypatch, louder, otherwise)
     damping = 1e-3 if otherwise else 1e-2
     found = gm.design_by_kernel(experiment, iterations=8, n=17, width=0.2, gain=0.1, damping=damping)
     assert found.before < 0.95
@@ -147,6 +155,30 @@ def test_many_designs_share_a_kernel_learn_where_it_is_wrong_and_take_back_what_
     # A whole step in a memory three times as loud overshoots by twice the miss.
     assert (found.history[2] == found.history[1]) == (louder == 3.0)
     np.testing.assert_allclose(found.fidelity, found.history[-1], atol=2e-3)  # samples of bumps, joined by cubics
+
+
+def test_slopes_that_are_measured_need_not_be_learned(
+    monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment
+) -> None:
+    memory_of_another_kernel(monkeypatch, 1.0, 1.2)
+    asked = {"iterations": 8, "n": 17, "width": 0.2, "gain": 0.1, "damping": 1e-3}
+    told: list[float] = []
+    learned = gm.design_by_kernel(experiment, **asked)
+    measured = gm.design_by_kernel(experiment, measured=17, progress=lambda *at: told.append(at[-1]), **asked)
+    assert measured.history[:4] == learned.history[:4]  # half of the iterations go by
+    assert 1.0 - measured.fidelity < 0.3 * (1.0 - learned.fidelity)
+
+
+def test_a_gain_that_is_not_asked_for_leaves_room_below_the_bound(
+    monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment
+) -> None:
+    known = memory_of_another_kernel(monkeypatch, 1.0, 0.0)
+    asked = {"iterations": 1, "n": 17, "width": 0.2, "damping": 1e-2}
+    found = gm.design_by_kernel(experiment, **asked)
+    own = float(experiment.compare(jnp.asarray(known.predict(experiment.signals))).gain)
+    assert found.gain < 0.5 * own
+    v = jnp.linspace(0.0, 1.0, 999)
+    assert float(jnp.max(jnp.abs(found.signals.shear(v)))) == pytest.approx(by_kernel.ROOM, rel=0.05)
 
 
 def test_a_drive_climbs_to_the_best_value_within_bounds(

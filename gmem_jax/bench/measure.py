@@ -46,7 +46,7 @@ from gmem_jax.physics.state import Grains, State, Status, explain, replicate, st
 from gmem_jax.physics.step import System
 
 LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
-T0 = 1.8e3  # duration of the compression that is timed, t_c
+T0 = 1.8e3  # duration of the compression that is timed, t_c, if not chosen
 ENCODE = Stage("encode", 0.0, 1.0, 1.0, sheared=True)
 BINS = 8  # bins per timed call, so that checks and samples weigh as in a run; which does 32 at once
 AGREEMENT = 1e-8  # of the pressure, between backends: round-off grown over a few hundred steps
@@ -68,22 +68,22 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str) -> tuple[Course, State]:
+def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str, t0: float = T0) -> tuple[Course, State]:
     """The start of an encode stage: what a walk needs."""
     heights = jnp.linspace(-1.0, 1.0, max(1, replicas - 1))[:, None]
     signals = Bumps(heights, jnp.full_like(heights, 0.1), 0.2)
-    experiment = Experiment(pack, signals, law, t0=T0, backend=backend)
+    experiment = Experiment(pack, signals, law, t0=t0, backend=backend)
     course = experiment.course(sheared=replicas > 1)
     return course, replicate(experiment.begin(), replicas)
 
 
-def rival(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 0.5) -> Rival:
+def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, seconds: float = 0.5) -> Rival:
     """A walk of some bins on a backend, compiled; timed for about `seconds` each time.
 
     Raises:
         RuntimeError: if the simulation breaks down.
     """
-    course, state = encode(pack, LAWS[law], replicas, backend)
+    course, state = encode(pack, LAWS[law], replicas, backend, t0)
     call = (course, state, ENCODE.bin(0), BINS)
     began = time.perf_counter()
     binary = forward.program.lower(*call, most=BINS).compile()
@@ -270,6 +270,7 @@ def run(
     *,
     laws: Sequence[str] = ("H", "M1", "M2"),
     replicas: Sequence[int] = (1, 8, 32, 64),
+    t0: float = T0,
     with_lammps: bool = True,
     with_jax: bool = True,
     scaling: bool = True,
@@ -284,6 +285,7 @@ def run(
         packs: their names; the first is also tiled to larger ones, and carries the plain-JAX comparison of M1 and M2.
         laws: friction laws.
         replicas: numbers of replicas.
+        t0: duration of the compression whose first bins are timed, in t_c; the cost against N is for `T0`.
         with_lammps: measure LAMMPS too, if it can run here.
         with_jax: measure plain JAX too, where the native backend is there.
         scaling: measure also the cost against N, memory and the cost of a gradient.
@@ -308,6 +310,7 @@ def run(
         "lammps": absent or "2025.7.22",
         "instruction_set": native.available()[1],
         "repeats": REPEATS,
+        "t0": t0,
         "rows": [],
         "growth": [],
         "bytes_per_grain_replica": {},
@@ -324,10 +327,10 @@ def run(
         counts = [count for count in replicas if fits(pack, law, count)]
         ours = [(backend, count) for backend in backends if _worth(pack, first, backend, law) for count in counts]
         if law == "M2":  # its histories are large, and it has no rival
-            found = [row for backend, count in ours for row in race([rival(pack, backend, law, count)])]
+            found = [row for backend, count in ours for row in race([rival(pack, backend, law, count, t0=t0)])]
         else:
             theirs = lammps_rivals(pack, law) if absent is None else []
-            found = race([*(rival(pack, backend, law, count) for backend, count in ours), *theirs])
+            found = race([*(rival(pack, backend, law, count, t0=t0) for backend, count in ours), *theirs])
         rows += found
         add("rows", found)
     if wrong := disagreements(rows):
@@ -356,7 +359,7 @@ def fits(pack: Pack, law: str, replicas: int, share: float = 0.25) -> bool:
     friction = LAWS[law]
     points = friction.points if isinstance(friction, Mindlin) else 1
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return 3 * 8 * points * pack.pairs.capacity * replicas * 3 < share * total
+    return 2 * 8 * points * pack.pairs.capacity * replicas * 3 < share * total
 
 
 def _worth(pack: Pack, first: Pack, backend: str, law: str) -> bool:

@@ -36,7 +36,7 @@ def markdown(result: dict[str, Any], baseline: dict[str, Any] | None = None) -> 
         f"LAMMPS {result['lammps']}, commit {commit}",
         "",
         f"Microseconds of wall time per grain-step, all cores of the machine: best - worst of {result['repeats']} "
-        "repeats, rivals in turn. Ratios are of the best.",
+        f"repeats, rivals in turn, t0 = {result['t0']:g}. Ratios are of the best.",
         "",
         "| law | N | engine | replicas | us | LAMMPS' best / this | compile, s | baseline / this |",
         "|---|---|---|---|---|---|---|---|",
@@ -98,7 +98,7 @@ def short(result: dict[str, Any], law: str = "H") -> str:
         ]
         lines.append(f"| {' | '.join(cells)} |")
     where = f"{result['processor']} ({result['instruction_set']}), commit {(result['commit'] or 'unknown')[:9]}"
-    return "\n".join([*lines, "", f"{where}; best - worst of {result['repeats']} repeats in turn.", ""])
+    return "\n".join([*lines, "", f"{where}; t0 = {result['t0']:g}; best - worst of {result['repeats']} repeats in turn.", ""])
 
 
 def into(text: str, table: str) -> str:

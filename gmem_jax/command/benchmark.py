@@ -17,6 +17,9 @@ def bench_command(
     packs: Annotated[str, typer.Option(help="Packs, separated by commas; default one of each shipped size.")] = "",
     laws: Annotated[str, typer.Option(help="Friction laws among H, M1, M2, separated by commas.")] = "H,M1,M2",
     replicas: Annotated[str, typer.Option(help="Numbers of replicas, separated by commas.")] = "1,8,32,64",
+    t0: Annotated[
+        float, typer.Option(help="Duration of the compression whose first bins are timed, in t_c.", metavar="<float>")
+    ] = measure.T0,
     with_lammps: Annotated[bool, typer.Option("--lammps/--no-lammps", help="Measure LAMMPS beside us.")] = True,
     with_jax: Annotated[bool, typer.Option("--jax/--no-jax", help="Measure plain JAX beside us.")] = True,
     scaling: Annotated[bool, typer.Option("--scaling/--no-scaling", help="Cost against N, memory, gradient.")] = True,
@@ -40,6 +43,8 @@ def bench_command(
     counts = replicas.split(",")
     if not all(count.isdigit() and int(count) > 0 for count in counts):
         raise InputError(f"--replicas {replicas}: must be positive whole numbers, separated by commas")
+    if not t0 > 0.0:
+        raise InputError(f"--t0 {t0}: must be positive")
     before = None
     if baseline:
         with refusing(baseline, "bench.json"):
@@ -51,6 +56,7 @@ def bench_command(
             names,
             laws=chosen,
             replicas=[int(count) for count in counts],
+            t0=t0,
             with_lammps=with_lammps,
             with_jax=with_jax,
             scaling=scaling,

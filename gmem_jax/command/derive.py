@@ -233,7 +233,12 @@ def design_command(
             help=f"Of bumps, in u; default {waveforms.WIDTH} by Jacobians, {by_kernel.WIDTH} by the kernel.",
         ),
     ] = None,
-    gain: Annotated[float | None, typer.Option(help="Wanted gain; default half of the untouched waveforms'.")] = None,
+    gain: Annotated[
+        float | None, typer.Option(help="Wanted gain; default at most half of the untouched waveforms'.")
+    ] = None,
+    measured: Annotated[
+        int, typer.Option(min=0, help="Directions along which slopes are measured twice; by the kernel only.")
+    ] = 0,
     restart: Restart = False,
     picture: Picture = True,
     force: Force = False,
@@ -255,8 +260,11 @@ def design_command(
     options: dict[str, Any] = {"gain": gain} | {name: value for name, value in asked.items() if value is not None}
     if by == "kernel":
         options["batch"] = batch_for(experiment, output, restart=restart)
-        effort = by_kernel.cost(experiment, iterations, bumps or by_kernel.BUMPS)
-        _announce(experiment, "design", effort, min(count, options["batch"]))
+        options["measured"] = measured
+        effort = by_kernel.cost(experiment, iterations, bumps or by_kernel.BUMPS, measured)
+        _announce(experiment, "design", effort, min(count * max(1, measured), options["batch"]))
+    elif measured:
+        raise InputError("--measured: only designs by the kernel measure slopes; use --by kernel")
     else:
         n = bumps or waveforms.BUMPS
         _announce(experiment, "design", waveforms.cost(experiment, iterations, n), 2 * n * count)

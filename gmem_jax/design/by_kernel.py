@@ -3,15 +3,24 @@
 A Jacobian of its own for every waveform (`waveforms`) costs some tens of runs of each. Here the one kernel of the pack,
 2 n + 1 replicas, serves them all: it says how each waveform should change for what its last recall missed. It is only
 nearly right, so the miss is simulated and corrected again, and what each simulation shows of a waveform's own slopes is
-added to the kernel (Broyden's update). What gets worse is taken back, and the next step is damped more (Levenberg and
-Marquardt).
+added to the kernel (Broyden's update); along its strongest directions they can be measured too, all at once. What
+gets worse is taken back, and the next step is damped more (Levenberg and Marquardt).
 """
 
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.design.kernel import MemoryKernel, bumps, memory_kernel, nearest
-from gmem_jax.design.waveforms import Design, Work, bounded, correction, refuse_several_scales, sampled, verified
+from gmem_jax.design.waveforms import (
+    Design,
+    Work,
+    bounded,
+    correction,
+    largest,
+    refuse_several_scales,
+    sampled,
+    verified,
+)
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Keep, Progress, forget, silent, under
 from gmem_jax.experiment.recall import run
@@ -22,6 +31,9 @@ WIDTH = 0.08  # of them, in u
 DAMPING = 0.05  # of the first correction, in parts of the kernel's largest singular value
 EASED, FIRMED = 0.6, 1.8  # times the damping after a step that was better, and one that was worse
 ITERATIONS = 6  # simulations of all waveforms
+MEASURED = (1 / 2, 3 / 4)  # parts of the iterations after which slopes are measured
+PROBE = (0.01, 0.05)  # shortest and longest step along a direction that is measured
+ROOM = 0.6  # of the bound |I| <= 1, that the first guess may take where no gain is asked for
 SHORTEST = 1e-6  # step from which slopes are learned; a waveform of nothing takes none
 PREDICTED = 6  # corrections of the first guess, by the kernel alone
 
@@ -32,9 +44,9 @@ def slopes(kernel: MemoryKernel, amplitudes: np.ndarray) -> np.ndarray:
     return slope
 
 
-def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS) -> float:
+def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS, measured: int = 0) -> float:
     """What a design takes, in runs of its signals."""
-    return (iterations or ITERATIONS) + 2.0 + 2.0 * n / experiment.signals.count
+    return (iterations or ITERATIONS) + 2.0 + 2.0 * n / experiment.signals.count + len(MEASURED) * measured
 
 
 def design_by_kernel(
@@ -45,6 +57,7 @@ def design_by_kernel(
     width: float = WIDTH,
     gain: float | None = None,
     damping: float = DAMPING,
+    measured: int = 0,
     batch: int | None = None,
     keep: Keep = forget,
     progress: Progress = silent,
@@ -56,8 +69,11 @@ def design_by_kernel(
         iterations: simulations of all waveforms, each but the first after a correction.
         n: bumps of a designed waveform.
         width: of the bumps.
-        gain: wanted common gain; default half of the untouched waveforms' own, so that the bound |I| <= 1 leaves room.
+        gain: wanted common gain; default half of the untouched waveforms' own, or less, so that the bound |I| <= 1
+            leaves room for what the kernel says is needed.
         damping: of the first correction, in parts of the kernel's largest singular value.
+        measured: directions, the kernel's strongest, along which the slopes of every waveform are measured twice on the
+            way, by as many runs of all waveforms side by side.
         batch: signals that run together; default all of them.
         keep: asked for every part of every simulation, so that a design can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
@@ -66,24 +82,32 @@ def design_by_kernel(
         RunFailedError: if a simulation broke down.
     """
     refuse_several_scales(experiment)
-    work = Work(cost(experiment, iterations, n), progress)
+    work = Work(cost(experiment, iterations, n, measured), progress)
 
-    def recall(name: str, changed: Experiment) -> np.ndarray:
-        return np.asarray(run(changed, batch=batch, keep=under(name, keep), progress=work.next(1.0, name)).p_sig)
+    def recall(name: str, changed: Experiment, runs: float = 1.0) -> np.ndarray:
+        return np.asarray(run(changed, batch=batch, keep=under(name, keep), progress=work.next(runs, name)).p_sig)
 
     target = np.asarray(experiment.integral())
     untouched = recall("untouched", experiment)
     told = work.next(2.0 * n / len(target), "kernel")
     kernel = memory_kernel(experiment, n, width, keep=under("kernel", keep), progress=told)
     original = experiment.compare(jnp.asarray(untouched))
-    gain = 0.5 * float(original.gain) if gain is None else gain
-    wanted = gain * float(experiment.scale) * target
-    # Where a unit of J is recalled with the kernel's gain, this much of each waveform is needed.
-    amplitudes = nearest(kernel.basis, experiment.signals) * gain / kernel.gain()
     damped = np.full((len(target), 1), damping * np.linalg.norm(kernel.odd, 2))
-    for _ in range(PREDICTED):
-        missed = wanted - kernel.recalled(amplitudes)
-        amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, damped), width)
+
+    def guess(gain: float) -> np.ndarray:
+        """What the kernel alone says."""
+        # Where a unit of J is recalled with the kernel's gain, this much of each waveform is needed.
+        amplitudes = nearest(kernel.basis, experiment.signals) * gain / kernel.gain()
+        for _ in range(PREDICTED):
+            missed = gain * float(experiment.scale) * target - kernel.recalled(amplitudes)
+            amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, damped), width)
+        return amplitudes
+
+    if gain is None:
+        gain = 0.5 * float(original.gain)
+        for _ in range(PREDICTED):  # a guess that is cut off at the bound does not say how much too large it is
+            gain *= min(1.0, ROOM / float(np.max(largest(guess(gain), width))))
+    wanted, amplitudes = gain * float(experiment.scale) * target, guess(gain)
 
     def made(rows: np.ndarray) -> Spline:
         """As they are written in the end: at slow rates even the cubics between samples are seen in F."""
@@ -92,7 +116,17 @@ def design_by_kernel(
     best, p_sig = amplitudes, recall("trial-0", replace(experiment, signals=made(amplitudes)))
     history = [float(original.fidelity), float(experiment.compare(jnp.asarray(p_sig)).fidelity)]
     learned = np.zeros((len(best), *kernel.odd.shape))  # of each waveform's slopes, beyond the kernel
+    strongest = np.linalg.svd(kernel.odd, full_matrices=False)[0].T[:measured]  # [m, n]
     for iteration in range(1, iterations):
+        if measured and iteration in [int(part * iterations) for part in MEASURED]:
+            # Where the next step would go, and about as far.
+            ahead = correction(slopes(kernel, best) + learned, wanted - p_sig, damped) @ strongest.T
+            far = np.where(ahead < 0.0, -1.0, 1.0) * np.clip(np.abs(ahead), *PROBE)
+            probes = bounded((best[:, None] + far[:, :, None] * strongest).reshape(-1, n), width)
+            changes = recall(f"slopes-{iteration}", replace(experiment, signals=made(probes)), measured)
+            steps = probes.reshape(len(best), -1, n) - best[:, None]
+            unforeseen = changes.reshape(len(best), -1, p_sig.shape[1]) - p_sig[:, None] - steps @ slopes(kernel, best)
+            learned = np.linalg.pinv(steps) @ unforeseen
         slope = slopes(kernel, best) + learned
         tried = bounded(best + correction(slope, wanted - p_sig, damped), width)
         found = recall(f"trial-{iteration}", replace(experiment, signals=made(tried)))

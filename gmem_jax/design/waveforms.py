@@ -54,11 +54,16 @@ class Design:
     history: tuple[float, ...]
 
 
+def largest(amplitudes: np.ndarray, width: float) -> np.ndarray:
+    """Largest |I| of waveforms [S, n], [S]."""
+    v = (jnp.arange(FINE) + 0.5) / FINE
+    found: np.ndarray = np.max(np.abs(np.asarray(bumps(amplitudes, width).shear(v))), axis=0)
+    return found
+
+
 def bounded(amplitudes: np.ndarray, width: float) -> np.ndarray:
     """Amplitudes [S, n] with every waveform that exceeds |I| = 1 scaled back to it."""
-    v = (jnp.arange(FINE) + 0.5) / FINE
-    largest = np.max(np.abs(np.asarray(bumps(amplitudes, width).shear(v))), axis=0)
-    result: np.ndarray = amplitudes / np.maximum(1.0, largest)[:, None]
+    result: np.ndarray = amplitudes / np.maximum(1.0, largest(amplitudes, width))[:, None]
     return result
 
 

@@ -24,7 +24,10 @@ SLOW_ENOUGH = 1.8e3  # t0, in t_c: G and F agree with those at ten times slower 
 
 
 def published(file: str = "six_signals.csv", **conditions: str | float) -> list[dict[str, Any]]:
-    """Rows of a published table (numbers converted) in which every named column has the given value."""
+    """Rows of a published table (numbers converted) in which every named column has the given value.
+
+    The tables are of arXiv:2603.14595 and its authors' public table of the data, `gmem-data`.
+    """
     text = (resources.files("gmem_jax") / "reference" / file).read_text()
     rows = [{key: _number(cell) for key, cell in row.items()} for row in csv.DictReader(text.splitlines())]
     return [row for row in rows if all(row[key] == value for key, value in conditions.items())]
