@@ -9,7 +9,8 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
-FROM_ELSEWHERE = ["CHANGELOG.md", *(f"benchmarks/{name}.md" for name in ("bench", "large_packs", "gpu"))]
+MEASURED = ("bench", "paper_rate/bench", "large_packs", "gpu")
+FROM_ELSEWHERE = ["CHANGELOG.md", *(f"benchmarks/{name}.md" for name in MEASURED)]
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 

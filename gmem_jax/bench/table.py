@@ -98,7 +98,9 @@ def short(result: dict[str, Any], law: str = "H") -> str:
         ]
         lines.append(f"| {' | '.join(cells)} |")
     where = f"{result['processor']} ({result['instruction_set']}), commit {(result['commit'] or 'unknown')[:9]}"
-    return "\n".join([*lines, "", f"{where}; t0 = {result['t0']:g}; best - worst of {result['repeats']} repeats in turn.", ""])
+    return "\n".join(
+        [*lines, "", f"{where}; t0 = {result['t0']:g}; best - worst of {result['repeats']} repeats in turn.", ""]
+    )
 
 
 def into(text: str, table: str) -> str:
