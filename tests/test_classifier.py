@@ -56,10 +56,20 @@ def test_an_example_is_a_shifted_scaled_word_plus_noise_of_its_rung(data: classi
         clean = np.asarray(bin_average(moved))[word] / mean * (1.0 + 0.3 * (factor / 16.0 - 1.0))
         made = np.asarray(MAKE(data, jnp.asarray(word), jnp.asarray((shift * 33 + factor) * 25 + draw)))
         assert made.dtype == np.float32
+        made = made * float(data.level[shift, factor, draw])
         deviation = 0.3 * draw / 24.0
         # The SD of 256 draws is known to 1 / sqrt(512) of itself; four of these. Float32 leaves 1e-6 where it is 0.
         assert np.std(made - clean) == pytest.approx(deviation, rel=4.0 / np.sqrt(512.0), abs=1e-6)
         assert abs(np.mean(made - clean)) < 4.0 * deviation / 16.0 + 1e-6
+
+
+def test_every_set_is_as_large_as_every_other() -> None:
+    bits = 7  # 128 words: |J| of a set with its noise is known to 1 / sqrt(128 * 256)
+    data = classify.examples(classify.Lessons(bits), 3)
+    for shift, factor, draw in ((0, 0, 0), (20, 32, 24), (10, 0, 24), (3, 30, 6)):
+        made = np.asarray(MAKE(data, jnp.arange(1 << bits), jnp.asarray((shift * 33 + factor) * 25 + draw)))
+        assert np.mean(np.abs(made)) == pytest.approx(1.0, rel=1e-4 if draw == 0 else 4.0 / np.sqrt(128 * 256))
+    assert float(data.level[10, 0, 24]) > 1.1 * 0.7  # noise of 0.43 of what it is added to
 
 
 def test_examples_follow_from_their_numbers_and_the_seed_alone(data: classify.Examples) -> None:
@@ -67,7 +77,8 @@ def test_examples_follow_from_their_numbers_and_the_seed_alone(data: classify.Ex
     together = np.asarray(MAKE(data, word, combination))
     alone = np.asarray(MAKE(data, word[2:], combination[2:]))
     np.testing.assert_array_equal(together[2:], alone)
-    noise = together - np.asarray(data.table[word, 0]) * np.array([0.7, 0.7 + 0.6 / 32.0, 0.7])[:, None]
+    level = np.asarray(data.level[0, [0, 1, 0], 24])[:, None]
+    noise = together - np.asarray(data.table[word, 0]) * np.array([0.7, 0.7 + 0.6 / 32.0, 0.7])[:, None] / level
     assert np.abs(np.corrcoef(noise)[np.triu_indices(3, 1)]).max() < 0.3  # independent: SD 1 / 16
     other = MAKE(classify.examples(PAPER, 1), word, combination)
     assert np.abs(np.asarray(other) - together).max() > 0.1
@@ -84,7 +95,7 @@ def test_held_out_combinations_are_never_trained_on(data: classify.Examples) -> 
         def make(self, word: jax.Array, combination: jax.Array) -> jax.Array:
             return combination
 
-    spy = Spy(data.table, data.order, data.noise, data.lessons)
+    spy = Spy(data.table, data.level, data.order, data.noise, data.lessons)
     for key in range(50):
         asked, word = spy.training(jax.random.key(key))
         assert set(np.asarray(asked).tolist()) <= trained
@@ -103,7 +114,8 @@ def test_no_two_examples_have_the_same_noise() -> None:
     data = classify.examples(recipe, 0)
     word, combination = (part.ravel() for part in jnp.meshgrid(jnp.arange(4), jnp.arange(18), indexing="ij"))
     shift, factor, draw = combination // 9, combination // 3 % 3, combination % 3
-    clean = np.asarray(data.table[word, shift]) * (0.7 + 0.3 * np.asarray(factor))[:, None]
+    level = np.asarray(data.level[shift, factor, draw])[:, None]
+    clean = np.asarray(data.table[word, shift]) * (0.7 + 0.3 * np.asarray(factor))[:, None] / level
     noise = (np.asarray(MAKE(data, word, combination)) - clean)[np.asarray(draw) > 0]  # the first draw has none
     correlation = np.corrcoef(noise)[np.triu_indices(len(noise), 1)]
     assert len(noise) == 48
@@ -115,7 +127,7 @@ def test_a_quick_check_takes_other_combinations_for_every_word(data: classify.Ex
         def make(self, word: jax.Array, combination: jax.Array) -> jax.Array:
             return combination
 
-    asked, word = Spy(data.table, data.order, data.noise, data.lessons).held_out(jnp.arange(QUICK_CHECK))
+    asked, word = Spy(data.table, data.level, data.order, data.noise, data.lessons).held_out(jnp.arange(QUICK_CHECK))
     assert np.bincount(np.asarray(word)).tolist() == [QUICK_CHECK // 8] * 8
     assert len(set(np.asarray(asked[:8]).tolist())) == 8
     # 512 for every word; each word begins 7 further than the one before.

@@ -1,16 +1,22 @@
 """What the paper's reader learns from: the inputs J_s alone, shifted, scaled, with noise (paper, Sec. III).
 
+All words under one transformation are a set, and each set is divided by its own <|J|>, as what is recalled is when it
+is read: of a factor there remains how much smaller or larger the noise is.
+
 Nothing of the training set is stored but the shifted J_s, [S, shifts, 256]: an example follows from the numbers of its
 word, shift, amplitude and draw, and from the seed. All functions are pure.
 """
 
 import functools
+import math
 from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 
 from gmem_jax.experiment.signals import BINS, bin_average, bit_width, words
+
+RATIOS = 64  # of noise to signal at which the size of a set is calculated, and joined by straight lines: right to 1e-5
 
 
 @dataclass(frozen=True)
@@ -59,13 +65,16 @@ class Lessons:
         return max(1, round(self.held_out * self.combinations))
 
 
-@functools.partial(jax.tree_util.register_dataclass, data_fields=["table", "order", "noise"], meta_fields=["lessons"])
+@functools.partial(
+    jax.tree_util.register_dataclass, data_fields=["table", "level", "order", "noise"], meta_fields=["lessons"]
+)
 @dataclass(frozen=True)
 class Examples:
     """Everything an example is made from.
 
     Attributes:
         table: J_s(u - shift) / <|J|>, [S, shifts, 256], float32.
+        level: mean of |J| of each set by shift, amplitude and draw, in that of the words as they are; float32.
         order: numbers of the (shift, amplitude, draw) combinations, shuffled by the seed; the first `lessons.kept` are
             held out.
         noise: random key.
@@ -73,6 +82,7 @@ class Examples:
     """
 
     table: jax.Array
+    level: jax.Array
     order: jax.Array
     noise: jax.Array
     lessons: Lessons
@@ -82,16 +92,16 @@ class Examples:
         lessons = self.lessons
         shift, rest = jnp.divmod(combination, lessons.amplitudes * lessons.draws)
         factor, draw = jnp.divmod(rest, lessons.draws)
-        scale = 1.0 + lessons.amplitude * _ladder(factor, lessons.amplitudes)
-        deviation = lessons.noise * (draw / max(lessons.draws - 1, 1))
+        scale, deviation = _scale(lessons, factor), _deviation(lessons, draw)
         number = word * lessons.combinations + combination
 
         def normal(one: jax.Array) -> jax.Array:
             return jax.random.normal(jax.random.fold_in(self.noise, one), (BINS,), jnp.float32)
 
         noise = jax.vmap(normal)(number.ravel()).reshape(*number.shape, BINS)
-        clean = self.table[word, shift]
-        return scale.astype(jnp.float32)[..., None] * clean + deviation.astype(jnp.float32)[..., None] * noise
+        level = self.level[shift, factor, draw]
+        clean = (scale.astype(jnp.float32) / level)[..., None] * self.table[word, shift]
+        return clean + (deviation.astype(jnp.float32) / level)[..., None] * noise
 
     def training(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """A batch of training inputs [batch, 256] and their words [batch], drawn with replacement."""
@@ -114,11 +124,22 @@ def _ladder(place: jax.Array, rungs: int) -> jax.Array:
     return 2.0 * place / (rungs - 1) - 1.0 if rungs > 1 else 0.0 * place
 
 
+def _scale(lessons: Lessons, factor: jax.Array) -> jax.Array:
+    """By what a set is multiplied."""
+    return 1.0 + lessons.amplitude * _ladder(factor, lessons.amplitudes)
+
+
+def _deviation(lessons: Lessons, draw: jax.Array) -> jax.Array:
+    """SD of the noise of a set, in <|J|>."""
+    return lessons.noise * (draw / max(lessons.draws - 1, 1))
+
+
 def examples(lessons: Lessons, seed: jax.typing.ArrayLike) -> Examples:
     """The training and validation set of a seed."""
     shuffle, noise = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
     order = jax.random.permutation(shuffle, lessons.combinations)
-    return Examples(table=_table(lessons), order=order, noise=noise, lessons=lessons)
+    table = _table(lessons)
+    return Examples(table=table, level=_level(lessons, table), order=order, noise=noise, lessons=lessons)
 
 
 def _table(lessons: Lessons) -> jax.Array:
@@ -132,3 +153,22 @@ def _table(lessons: Lessons) -> jax.Array:
 
     # One shift after another: side by side they would need `shifts` times the memory of `bin_average`.
     return jnp.moveaxis(jax.lax.map(moved, steps), 0, 1)
+
+
+def _level(lessons: Lessons, table: jax.Array) -> jax.Array:
+    """Mean of |scale J + deviation n| over words, u and Gaussian n, [shifts, amplitudes, draws]."""
+    scale = _scale(lessons, jnp.arange(lessons.amplitudes))[:, None]
+    noise = _deviation(lessons, jnp.arange(lessons.draws)) / scale  # of a set that is not scaled
+    known = jnp.linspace(0.0, jnp.max(noise), RATIOS)
+
+    def mean(signal: jax.Array, deviation: jax.Array) -> jax.Array:
+        """Of the absolute value of Gaussian numbers, a folded normal distribution."""
+        x = signal / (math.sqrt(2.0) * jnp.maximum(deviation, 1e-6))
+        return jnp.mean(deviation * math.sqrt(2.0 / math.pi) * jnp.exp(-(x**2)) + signal * jax.lax.erf(x))
+
+    def of_shift(moved: jax.Array) -> jax.Array:
+        means = jax.lax.map(lambda deviation: mean(moved, deviation), known.astype(table.dtype))
+        return (scale * jnp.interp(noise, known, means)).astype(jnp.float32)
+
+    level: jax.Array = jax.lax.map(of_shift, jnp.moveaxis(table, 1, 0))
+    return level
