@@ -241,7 +241,7 @@ struct Packed {
   };
 
   void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel) {
-    constexpr int kLook = 256, kBatch = 8 * W, kAhead = 8;
+    constexpr int kLook = 256, kBatch = kTogether * W, kAhead = 8;
     int awake[kLook + 1], touching[kBatch];
     int count = 0;
     for (int look = first; look < end; look += kLook) {
@@ -293,7 +293,7 @@ struct Packed {
   }
 
   void compute(const int* touching, int count, const V* parameter, const LawParameters<V>& law) {
-    constexpr int kGroups = 8;
+    constexpr int kGroups = kTogether;
     Group group[kGroups];
     Contact<V> contact[kGroups];
     V memory[kGroups][kHistoryRows ? 4 * kHistoryRows : 1];

@@ -295,7 +295,7 @@ struct Replicas {
   }
 
   void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel) {
-    constexpr int kLook = 256, kBatch = 8, kAhead = 6;
+    constexpr int kLook = 256, kBatch = kTogether, kAhead = 6;
     const V contact_square = splat<V>(4.0);
     int awake[kLook + 1], touching[kBatch];
     Contact<C> contact[kBatch];
