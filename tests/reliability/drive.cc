@@ -91,8 +91,11 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
       return f == 1 && row % 4 == 0 ? 1.0 : f == 1 ? 0.0 : 0.01 * noise(row, l, 4 + f);
     };
   };
-  const int leaves = c.law == Law::frictionless ? 0 : c.law == Law::hooke ? 1 : 2;
-  const int rows[kMaxHistory] = {3 * (c.law == Law::mindlin ? points : 1) * candidates, candidates};
+  // Numbers of a contact in each array of the histories, the last of them its overlap but for Hooke's law.
+  const std::vector<int> sizes = c.law == Law::frictionless ? std::vector<int>{}
+                                 : c.law == Law::hooke      ? std::vector<int>{3}
+                                 : c.law == Law::mindlin    ? std::vector<int>{2 * points, 3, 1}
+                                                            : std::vector<int>{3, 1};
   const bool forward = c.task == Task::forward, back = c.task == Task::adjoint;
 
   Lane lane{}, slope{};
@@ -103,10 +106,12 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     lane.grains_out[f] = slope.grains_out[f] = array(n * kSizes[f], true, small);
   }
   if (plant == "alignment") lane.grains_in[4] = reinterpret_cast<double*>(reinterpret_cast<char*>(array(n * 3 + 1, false, small)) + 1);
-  for (int leaf = 0; leaf < leaves; ++leaf) {
-    lane.history_in[leaf] = array(rows[leaf], false, leaf ? positive : small);
-    slope.history_in[leaf] = array(rows[leaf], false, small);
-    lane.history_out[leaf] = slope.history_out[leaf] = array(rows[leaf], true, small);
+  for (std::size_t leaf = 0; leaf < sizes.size(); ++leaf) {
+    const int rows = sizes[leaf] * candidates;
+    const bool overlap = sizes[leaf] == 1;
+    lane.history_in[leaf] = array(rows, false, [&](int row, int l) { return overlap ? positive(row, l) : small(row, l); });
+    slope.history_in[leaf] = array(rows, false, small);
+    lane.history_out[leaf] = slope.history_out[leaf] = array(rows, true, small);
   }
   lane.parameters = array(kParameters, false, parameter);
   lane.walls = array(kSteps * kWalls, false, wall);
