@@ -103,11 +103,14 @@ def design_by_kernel(
             amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, damped), width)
         return amplitudes
 
-    if gain is None:
-        gain = 0.5 * float(original.gain)
-        for _ in range(PREDICTED):  # a guess that is cut off at the bound does not say how much too large it is
-            gain *= min(1.0, ROOM / float(np.max(largest(guess(gain), width))))
-    wanted, amplitudes = gain * float(experiment.scale) * target, guess(gain)
+    chosen, gain = gain is not None, 0.5 * float(original.gain) if gain is None else gain
+    amplitudes = guess(gain)
+    for _ in range(PREDICTED):  # a guess that is cut off at the bound does not say how much too large it is
+        if chosen or (peak := float(np.max(largest(amplitudes, width)))) <= ROOM:
+            break
+        gain *= ROOM / peak
+        amplitudes = guess(gain)
+    wanted = gain * float(experiment.scale) * target
 
     def made(rows: np.ndarray) -> Spline:
         """As they are written in the end: at slow rates even the cubics between samples are seen in F."""

@@ -1,5 +1,4 @@
-// What both modes keep of each candidate beside forces and histories, and where a law's history lies in the arrays of
-// a call.
+// What both modes keep of each candidate beside forces and histories.
 
 #pragma once
 
@@ -40,18 +39,6 @@ template <class V>
 int rings_to_write(const Problem& p, int before, V outer) {
   const int now = static_cast<int>(largest(outer)) + 1;
   return !p.history_aliased ? p.points : now > before ? now : before;
-}
-
-struct Place {
-  int leaf;
-  std::ptrdiff_t row;
-};
-
-// Where number `q` of the history in `row` of the list lies: leaf 0 is the force, leaf 1 the overlap; Mindlin's layers
-// come before them.
-template <class Law>
-Place place_of(std::ptrdiff_t row, int q) {
-  return q < Law::kVectors ? Place{Law::kLayered, row * Law::kVectors + q} : Place{Law::kLayered + 1, row};
 }
 
 }  // namespace GMEM_ISA

@@ -69,17 +69,6 @@ struct Lane {
   }
 };
 
-// Where number `q` of a contact's history lies in the call: leaf 0 is the force, leaf 1 the overlap; Mindlin's rings come
-// before them.
-template <class Law>
-struct Place {
-  int leaf;
-  long long row;
-
-  Place(long long row, int q)
-      : leaf((q < Law::kVectors ? 0 : 1) + Law::kLayered), row(q < Law::kVectors ? row * Law::kVectors + q : row) {}
-};
-
 // The runs of one side, in one lane; see physics/runs.h.
 template <class V>
 struct Runs {
@@ -197,7 +186,7 @@ void enter(const Arguments& a, int thread) {
     const int row = a.side.of(on.entry)[side].row;
     const Column<V> history = on.in(a.history);
     for (int n = 0; n < Law::kGiven; ++n) {
-      const Place<Law> place(row, n);
+      const Place place = place_of<Law>(row, n);
       history.put(side * static_cast<long long>(Law::kHistory) + n, on.in(a.history_in[place.leaf])[place.row]);
     }
     if constexpr (Law::kLayered) {
@@ -334,7 +323,7 @@ void leave(const Arguments& a, int thread) {
   if (row >= a.rows) return;
   const long long side = a.place.of(on.entry)[row];
   for (int n = 0; n < Law::kGiven; ++n) {
-    const Place<Law> place(row, n);
+    const Place place = place_of<Law>(row, n);
     const V number = side < 0 ? V{} : on.in(a.history)[side * Law::kHistory + n];
     on.out(a.history_out[place.leaf]).put(place.row, result(number));
   }

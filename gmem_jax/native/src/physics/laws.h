@@ -38,6 +38,18 @@ inline void invert_roots(Contact<V>* c, int count) {
   for (int n = 0; n < count; ++n) c[n].inverse = inverse_root(c[n].square);
 }
 
+// Where number `q` of the history in `row` of the list lies in the arrays of a call: leaf 0 is the force, leaf 1 the
+// overlap; Mindlin's layers come before them.
+struct Place {
+  int leaf;
+  long long row;
+};
+
+template <class Law>
+inline Place place_of(long long row, int q) {
+  return q < Law::kVectors ? Place{Law::kLayered, row * Law::kVectors + q} : Place{Law::kLayered + 1, row};
+}
+
 // A law's parameters, and products of them that every contact needs.
 template <class V>
 struct LawParameters {
@@ -101,6 +113,7 @@ inline void carry(Contact<V>* c, int count, const From& from, const Then& then) 
     c[n].force = then(c[n], Transport<V>(c[n]).restore(c[n].force, c[n].before, c[n].square, c[n].inverse));
 }
 
+// The vector that a history begins with.
 struct Remembered {
   template <class V>
   GMEM_INLINE Vec<V> operator()(const Contact<V>& c) const { return load_vec(c.history); }
