@@ -764,8 +764,8 @@ MUTATIONS = (
     mutation(
         "progress-of-bins",
         "experiment/host.py",
-        "self.report(stage.name, samples[-1].pressure.shape[-1] * count,",
-        "self.report(stage.name, count,",
+        "self.work += bins * (self.state.replicas + STEP)",
+        "self.work += bins",
         "test_the_samples_of_a_run_follow_the_table",
     ),
     mutation(

@@ -9,7 +9,7 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.host import Walker
+from gmem_jax.experiment.host import Walker, work_of
 from gmem_jax.experiment.protocol import Stage
 from gmem_jax.experiment.recall import finish
 from gmem_jax.experiment.walk import Course
@@ -66,7 +66,7 @@ def test_a_broken_run_stops_and_names_the_stage() -> None:
 
 def test_progress_rises_to_one_and_names_the_stage() -> None:
     calls: list[tuple[str, float, float]] = []
-    compress(0.8, progress=lambda *told: calls.append(told), total_work=64.0, chunk=16)
+    compress(0.8, progress=lambda *told: calls.append(told), total_work=work_of([COMPRESS], 1), chunk=16)
     assert [name for name, _, _ in calls] == ["compress"] * 4
     np.testing.assert_allclose([fraction for _, _, fraction in calls], [0.25, 0.5, 0.75, 1.0])
     np.testing.assert_allclose(calls[-1][1], 64 * 2 * 0.3)

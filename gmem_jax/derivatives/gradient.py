@@ -15,7 +15,18 @@ import numpy as np
 
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, value_at
 from gmem_jax.experiment.experiment import replace as with_values
-from gmem_jax.experiment.host import NOWHERE, Action, Checkpoint, Compiled, Move, Progress, Walker, silent, within
+from gmem_jax.experiment.host import (
+    NOWHERE,
+    Action,
+    Checkpoint,
+    Compiled,
+    Move,
+    Progress,
+    Walker,
+    silent,
+    within,
+    work_of,
+)
 from gmem_jax.experiment.protocol import Bin, Stage
 from gmem_jax.experiment.recall import shear, walker
 from gmem_jax.experiment.walk import Course, walk, walk_some
@@ -249,8 +260,7 @@ def _number_slope(experiment: Experiment, theta: Any, tangent: Any, *, sheared: 
 
 def _work(experiment: Experiment, on: Walker) -> float:
     common, own = experiment.phases
-    before, after = (sum(stage.bins for stage in some) for some in (common, own))
-    return float(before * on.state.replicas + after * experiment.replicas)
+    return work_of(common, on.state.replicas) + work_of(own, experiment.replicas)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from gmem_jax.experiment.host import (
     require_x64,
     silent,
     within,
+    work_of,
     worst,
 )
 from gmem_jax.experiment.pack import smallest_box
@@ -247,11 +248,10 @@ def run(
     if size < count and (begun.state.replicas > 1 or jnp.ndim(experiment.gamma0)):
         raise ValueError("parameters with a value for each replica need all signals in one batch")
     common, own = experiment.phases
-    before, after = (sum(stage.bins for stage in some) for some in (common, own))
     firsts = range(0, count, size)
-    begun.total_work = float(replica_bins(experiment, size, begun.state.replicas))
+    done = work_of(common, begun.state.replicas)
+    begun.total_work = done + sum(work_of(own, 1 + min(size, count - first)) for first in firsts)
     samples = begun.play_part("prefix", keep, *common)
-    done = before * begun.state.replicas
     parts: list[tuple[dict[str, Sample], jax.Array]] = []
     taken: Taken = {}
     for number, first in enumerate(firsts):
@@ -259,7 +259,7 @@ def run(
         few = experiment if size >= count else replace(experiment, signals=part(experiment.signals, first, last))
         filmed = first < frames_of <= last or frames_of == first == 0
         own_film = Film(film.wanted, max(0, frames_of - first)) if filmed else Film()
-        on = begun.afresh(work=float(done), film=own_film)
+        on = begun.afresh(work=done, film=own_film)
 
         def run_batch(checkpoint: Checkpoint, few: Experiment = few, on: Walker = on) -> Any:
             shear(on, few)
@@ -270,7 +270,7 @@ def run(
         found_part, all_taken = keep(f"batch-{number:04d}", run_batch)
         parts.append(found_part)
         taken = all_taken if filmed else taken
-        done += after * (last - first + 1)
+        done += work_of(own, 1 + last - first)
     after_prefix, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
     found: Recall = finished(experiment, samples | after_prefix, jnp.asarray(status))
     return (
@@ -291,11 +291,11 @@ def film_of(experiment: Experiment, frames: int, of: int) -> Film:
     return Film(places(experiment.stages, frames, CHUNK), of) if frames else Film()
 
 
-def replica_bins(experiment: Experiment, batch: int, wide: int = 1) -> int:
-    """The work of a run: bins times replicas, of which the prefix has `wide` and each batch one for no signal."""
+def replica_bins(experiment: Experiment, batch: int) -> int:
+    """Bins times replicas of a run, of which the prefix has one and each batch one for no signal."""
     before, after = (sum(stage.bins for stage in some) for some in experiment.phases)
     count = experiment.signals.count
-    return before * wide + after * (count + -(-count // batch))
+    return before + after * (count + -(-count // batch))
 
 
 def _join(first: Any, *others: Any) -> np.ndarray:
@@ -345,7 +345,7 @@ def prefix_of(experiment: Experiment, *, keep: Keep = forget, progress: Progress
     """
     common, _ = experiment.phases
     begun = walker(experiment, progress=progress)
-    begun.total_work = float(begun.state.replicas * sum(stage.bins for stage in common))
+    begun.total_work = work_of(common, begun.state.replicas)
     begun.play_part("prefix", keep, *common)
     return begun
 
@@ -371,8 +371,8 @@ def simulate(
     share = 0.1 if begun is None else 0.0
     begun = prefix_of(experiment, progress=within(progress, 0.0, share)) if begun is None else begun
     _, own = experiment.phases
-    work = float(experiment.replicas * sum(stage.bins for stage in own))
-    on = begun.afresh(progress=within(progress, share, 1.0), work=0.0, total_work=work)
+    all_work = work_of(own, experiment.replicas)
+    on = begun.afresh(progress=within(progress, share, 1.0), work=0.0, total_work=all_work)
     shear(on, experiment)
     found: Recall = finished(experiment, on.play(*own, checkpoint=checkpoint), on.state.status)
     return found

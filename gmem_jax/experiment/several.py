@@ -16,7 +16,7 @@ import numpy as np
 
 from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, replace, replica_parameters, value_at
-from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent
+from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent, work_of
 from gmem_jax.experiment.recall import Recall, finished, walker, warn_of_another_compression
 from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics.pytree import pytree
@@ -138,8 +138,7 @@ def run_several(
     silence = Chosen(side.signals().sets, jnp.ones(max(1, len(one_each) - 1), int))
     everything = side.wide(owners, side.signals())
     on = walker(side.wide(one_each, silence), progress=progress)
-    bins = [sum(stage.bins for stage in stages) for stages in (common, own)]
-    on.total_work = float(bins[0] * on.state.replicas + bins[1] * len(owners))
+    on.total_work = work_of(common, on.state.replicas) + work_of(own, len(owners))
 
     def rest(checkpoint: Checkpoint) -> Any:
         # One replica if nothing that acts on the prefix differs.

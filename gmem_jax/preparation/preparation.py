@@ -13,6 +13,7 @@ from gmem_jax import native
 from gmem_jax.experiment.drive import Drive
 from gmem_jax.experiment.frames import Film, Frames, joined, places
 from gmem_jax.experiment.host import (
+    STEP,
     Checkpoint,
     Compiled,
     Keep,
@@ -224,7 +225,7 @@ class _Preparation:
         system = System(clump, Frictionless(), finder(grains, clump, self.box), material)
         state = start(system, at, grains.quaternion, self.box)
         state = accelerate(system, replace(state, grains=grains), self.box)
-        expected = expected_time(recipe, float(lengths[2])) / (self.dt * steps)
+        expected = expected_time(recipe, float(lengths[2])) / (self.dt * steps) * (1.0 + STEP)
         self.march = native.marcher(native.name(backend, system.friction))
         course = Course(system, self._drive(), self.dt, recipe.drag, steps=steps, backend=backend)
         self.walker = Walker(course, state, finder=finder, progress=progress, total_work=expected, film=film)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.host import Progress, Walker, silent
+from gmem_jax.experiment.host import Progress, Walker, silent, work_of
 from gmem_jax.experiment.protocol import Stage
 from gmem_jax.experiment.signals import BINS
 from gmem_jax.experiment.walk import Course
@@ -52,7 +52,8 @@ def ringing_period(
     velocity = rate * (position - 0.5 * (box.lower + box.upper))
     state = accelerate(system, replace(state, grains=replace(state.grains, velocity=velocity)), box)
     still = Course(system, Drive(box.lower, box.upper, 0.0), dt, steps=STEPS)
-    walker = Walker(still, state, progress=progress, total_work=float(bins))
-    sample = walker.play(Stage("ringing", 0.0, 0.0, bins / BINS))["ringing"]
+    ringing = Stage("ringing", 0.0, 0.0, bins / BINS)
+    walker = Walker(still, state, progress=progress, total_work=work_of([ringing], 1))
+    sample = walker.play(ringing)["ringing"]
     pressure = np.asarray(sample.pressure)[:, :, 0]
     return spectrum_peak(pressure[:, 0] - pressure[:, 1], STEPS * float(dt))
