@@ -35,7 +35,7 @@ Force = Annotated[bool, typer.Option("--force", help="Replace outputs that exist
 KeptFrames = Annotated[
     int, typer.Option("--frames", min=0, help="Configurations along the run to keep, the first and last among them.")
 ]
-PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a shipped pack.")]
+PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a pack that is shipped or made.")]
 
 
 class InputError(ValueError):

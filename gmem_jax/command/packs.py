@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Any
 
 import jax
@@ -13,7 +14,6 @@ from gmem_jax.command.console import (
     Force,
     InputError,
     KeptFrames,
-    Output,
     announce,
     claim,
     emit,
@@ -23,7 +23,8 @@ from gmem_jax.command.console import (
 from gmem_jax.command.resuming import Restart, resumable
 from gmem_jax.experiment.frames import Frames
 from gmem_jax.files.configuration import fingerprint
-from gmem_jax.files.packs import list_packs, save_pack
+from gmem_jax.files.home import kept_pack
+from gmem_jax.files.packs import STANDARD, list_packs, save_pack
 from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics import grain
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -52,8 +53,32 @@ PREPARATION_BYTES = 2e4  # of memory a grain: lists while grains fly, at N = 10,
 _DEFAULT = Recipe()
 
 
+SLOW = 1.8e4  # t_c: a compression of standard packs, at the paper's rate
+
+
+def standard_recipe(name: str) -> Recipe:
+    """The recipe of a pack that is made by its name.
+
+    Raises:
+        InputError: if it is no such name.
+    """
+    if not (found := STANDARD.fullmatch(name)):
+        raise InputError(
+            f"{name}: a standard pack is called tetra-N-x, N grains and a letter for the seed: tetra-31680-a"
+        )
+    if name in list_packs():
+        raise InputError(f"{name}: is shipped, and need not be made")
+    return Recipe(grains=int(found[1]), seed=ord(found[2]) - ord("a") + 1, t0=SLOW)
+
+
 def prepare_command(
-    output: Output,
+    standard: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[NAME]", help="A standard pack, tetra-N-x, to be made at the paper's rate and kept by that name."
+        ),
+    ] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write.")] = None,
     grains: Annotated[int, typer.Option(help="Number of grains N.")] = _DEFAULT.grains,
     shape: Annotated[str, typer.Option(help="tetra or sphere.")] = "tetra",
     overlap: Annotated[float, typer.Option(help="Overlap O of a tetra grain, in [0, 1).")] = 0.6,
@@ -70,15 +95,25 @@ def prepare_command(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Prepare a pack: gas, pressure, frictionless cycles, rest."""
+    """Prepare a pack: gas, pressure, frictionless cycles, rest.
+
+    A standard pack (tetra-31680-a, or another N or letter) is made once and found by its name from then on.
+    """
     if shape not in ("tetra", "sphere"):
         raise InputError(f"--shape must be tetra or sphere, got {shape!r}")
     clump = grain.tetra(overlap) if shape == "tetra" else grain.sphere()
     recipe = Recipe(grains=grains, seed=seed, delta0=delta0, t0=t0, dt=dt)
+    if standard is not None:
+        if output is not None or name or recipe != _DEFAULT or (shape, overlap) != ("tetra", 0.6):
+            raise InputError(f"{standard}: the name of a standard pack says all about it; leave other options away")
+        recipe, name, output = standard_recipe(standard), standard, kept_pack(standard)
+        output.parent.mkdir(parents=True, exist_ok=True)
+    elif output is None:
+        raise InputError("--output is missing: name a file, or a standard pack like tetra-31680-a")
     film_of(recipe, frames)  # refuses what cannot be before anything is begun
     claim(output, ".h5", force=force)
     backend = native.name(backend, Frictionless())
-    announce(f"{grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * grains, backend)
+    announce(f"{recipe.grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * recipe.grains, backend)
     began = time.perf_counter()
     stages: dict[str, Sample] = {}
     film: list[Frames] = []

@@ -1,5 +1,6 @@
-"""Pack files, and the packs that ship with the package."""
+"""Pack files, the packs that ship with the package, and those that were made by name."""
 
+import re
 from collections import OrderedDict
 from importlib import resources
 from pathlib import Path
@@ -14,10 +15,14 @@ from gmem_jax.files import soundness
 from gmem_jax.files.checked import json_of, refusing, require, title
 from gmem_jax.files.frames import write_frames
 from gmem_jax.files.hdf5 import reading, write_arrays, write_samples, writing
+from gmem_jax.files.home import kept_pack
 from gmem_jax.files.schemas import PACK
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import candidates, tabulate
 from gmem_jax.physics.sample import Sample
+
+STANDARD = re.compile(r"tetra-([1-9][0-9]{1,6})-([a-z])")
+"""Names of standard packs: the number of tetra grains, and a letter for the seed, a for 1."""
 
 _CLUMP = [path.removeprefix("clump/") for path in PACK.arrays if path.startswith("clump/")]
 _PAIRS = [path.removeprefix("pairs/") for path in PACK.arrays if path.startswith("pairs/")]
@@ -63,10 +68,13 @@ def check_pack(pack: Pack) -> None:
 
 
 def load_pack(source: str | Path) -> Pack:
-    """Read a pack from a file, or a shipped one by name (see `list_packs`), neighbour list included.
+    """Read a pack from a file, or by name, neighbour list included.
+
+    Args:
+        source: a file, a shipped pack (see `list_packs`), or one that `gmem prepare NAME` has made.
 
     Raises:
-        FileNotFoundError: if there is neither such a file nor such a shipped pack.
+        FileNotFoundError: if there is no such file or pack.
         FileFormatError: if the file is damaged, not a complete pack of this schema, or its numbers are not those of
             grains at rest in their box (see `soundness`).
     """
@@ -94,7 +102,7 @@ def load_stages(source: str | Path) -> OrderedDict[str, Sample]:
     """The samples of a pack's preparation, where its file keeps them; else empty.
 
     Raises:
-        FileNotFoundError: if there is neither such a file nor such a shipped pack.
+        FileNotFoundError: if there is no such file or pack; see `load_pack`.
         FileFormatError: if they are incomplete.
     """
     path = _path_of(source)
@@ -108,7 +116,11 @@ def _path_of(source: str | Path) -> Path:
         return Path(str(resources.files("gmem_jax") / "packs" / f"{name}.h5"))
     path = Path(source)
     if not path.is_file() and path.suffix == "":
-        raise FileNotFoundError(f"{name}: neither a file nor a shipped pack ({', '.join(list_packs())})")
+        made = kept_pack(name)
+        if STANDARD.fullmatch(name) and made.is_file():
+            return made
+        how = f"; `gmem prepare {name}` makes it" if STANDARD.fullmatch(name) else ""
+        raise FileNotFoundError(f"{name}: neither a file nor a shipped pack ({', '.join(list_packs())}){how}")
     return path
 
 

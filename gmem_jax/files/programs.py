@@ -8,6 +8,8 @@ from pathlib import Path
 
 import jax
 
+from gmem_jax.files.home import kept
+
 SWITCH = "GMEM_COMPILE_CACHE"  # another folder, or "off"
 
 
@@ -29,8 +31,7 @@ def keep_programs() -> None:
     chosen = os.environ.get(SWITCH, "")
     if chosen == "off" or getattr(jax.config, "jax_compilation_cache_dir", None):
         return
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = Path(chosen) if chosen else home / "gmem_jax" / f"jax-{jax.__version__}-{_processor()}"
+    folder = Path(chosen) if chosen else kept() / f"jax-{jax.__version__}-{_processor()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

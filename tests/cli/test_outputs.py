@@ -8,6 +8,7 @@ import pytest
 from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
+from gmem_jax.command import packs
 from gmem_jax.files.results import finite
 from gmem_jax.show import tables
 
@@ -123,6 +124,21 @@ def test_published_points_stand_only_beside_what_they_were_measured_on() -> None
 def test_json_has_null_where_there_is_no_number() -> None:
     odd = {"a": float("nan"), "b": [float("inf"), 1.0], "c": {"d": (-float("inf"), "x")}}
     assert json.dumps(finite(odd), allow_nan=False) == '{"a": null, "b": [null, 1.0], "c": {"d": [null, "x"]}}'
+
+
+def test_a_standard_pack_is_made_once_and_found_by_its_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert packs.standard_recipe("tetra-31680-c") == packs.Recipe(grains=31680, seed=3, t0=1.8e4)
+    monkeypatch.setattr(packs, "SLOW", 75.0)
+    assert gmem(monkeypatch, "prepare", "tetra-16-b", "--json") == 0
+    made = json.loads(capsys.readouterr().out)
+    assert made["output"] == str(tmp_path / "gmem_jax" / "packs" / "tetra-16-b.h5")
+    pack = gm.load_pack("tetra-16-b")
+    assert (pack.name, pack.grains, pack.info["recipe"]["seed"]) == ("tetra-16-b", 16, 2)
+    assert gmem(monkeypatch, "prepare", "tetra-16-b") == 2
+    assert "exists" in capsys.readouterr().err
 
 
 def test_what_cannot_fit_is_refused_before_it_begins(
