@@ -9,14 +9,14 @@ from gmem_jax.command.console import AsJson, Force, InputError, Output, claim, e
 from gmem_jax.files.exported import FORMATS, format_of, frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
-from gmem_jax.files.packs import list_packs, load_pack, save_pack
+from gmem_jax.files.packs import load_pack, pack_called, save_pack
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.schemas import PACK
 from gmem_jax.show import tables
 
 
 def export(
-    file: Annotated[Path, typer.Argument(help="A pack or a recall file, or the name of a shipped pack.")],
+    file: Annotated[Path, typer.Argument(help="A pack or a recall file, or the name of a pack.")],
     to: Annotated[str, typer.Option(help=f"{', '.join(FORMATS)}.")],
     output: Output,
     frames: Annotated[bool, typer.Option("--frames", help="Of a pack: the configurations of its preparation.")] = False,
@@ -24,7 +24,8 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a pack, or the configurations along a recall, for other programs (docs/exchange.md)."""
-    if str(file) in list_packs() or schema_of(file) == PACK.name:
+    file = pack_called(str(file)) or file
+    if schema_of(file) == PACK.name:
         pack = load_pack(file)
         mass, found = float(pack.clump.mass), load_frames(file) if frames else frames_of_pack(pack)
         command = "prepare"

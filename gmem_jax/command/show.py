@@ -15,7 +15,7 @@ from gmem_jax.show.stages import AGAINST
 
 def show(
     file: Annotated[
-        Path, typer.Argument(help="Any file that a command wrote, the folder of a sweep, or a shipped pack.")
+        Path, typer.Argument(help="Any file that a command wrote, the folder of a sweep, or a pack by its name.")
     ],
     as_json: AsJson = False,
     plot: Annotated[str, typer.Option(metavar="WHAT", help="Draw this into --output; list says what there is.")] = "",

@@ -111,17 +111,21 @@ def load_stages(source: str | Path) -> OrderedDict[str, Sample]:
 
 
 def _path_of(source: str | Path) -> Path:
-    name = str(source)
-    if name in list_packs():
-        return Path(str(resources.files("gmem_jax") / "packs" / f"{name}.h5"))
-    path = Path(source)
+    name, path = str(source), Path(source)
+    if known := pack_called(name):
+        return known
     if not path.is_file() and path.suffix == "":
-        made = kept_pack(name)
-        if STANDARD.fullmatch(name) and made.is_file():
-            return made
         how = f"; `gmem prepare {name}` makes it" if STANDARD.fullmatch(name) else ""
         raise FileNotFoundError(f"{name}: neither a file nor a shipped pack ({', '.join(list_packs())}){how}")
     return path
+
+
+def pack_called(name: str) -> Path | None:
+    """The file of a pack that ships with the package or was made by its name; None if there is no such pack."""
+    if name in list_packs():
+        return Path(str(resources.files("gmem_jax") / "packs" / f"{name}.h5"))
+    made = kept_pack(name)
+    return made if STANDARD.fullmatch(name) and made.is_file() else None
 
 
 def list_packs() -> list[str]:

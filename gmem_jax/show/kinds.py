@@ -13,7 +13,7 @@ from gmem_jax.experiment.signals import waveform
 from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.checked import is_number, refusing
 from gmem_jax.files.hdf5 import schema_of
-from gmem_jax.files.packs import list_packs, load_pack, load_stages
+from gmem_jax.files.packs import load_pack, load_stages, pack_called
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import load_result
 from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL
@@ -46,17 +46,17 @@ class Shown(NamedTuple):
 
 
 def shown(file: Path, against: str = "time") -> Shown:
-    """What a file, a shipped pack or the folder of a sweep holds.
+    """What a file, a pack or the folder of a sweep holds.
 
     Args:
-        file: its path, or the name of a shipped pack.
+        file: its path, or the name of a pack.
         against: "time" or "u": what pictures of stages are drawn over.
 
     Raises:
         FileNotFoundError: if it is not there.
         FileFormatError: if it is of no kind that commands write, or damaged.
     """
-    if str(file) in list_packs():
+    if pack_called(str(file)):
         return _pack(file, against)
     suffix = file.suffix.lower()
     if suffix == ".json":

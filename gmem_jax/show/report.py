@@ -22,7 +22,7 @@ from gmem_jax.files.checked import is_number, refusing
 from gmem_jax.files.configuration import names_of, pack_fingerprint, signals_from
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
-from gmem_jax.files.packs import list_packs, load_pack, load_stages
+from gmem_jax.files.packs import load_pack, load_stages, pack_called
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import load_result
 from gmem_jax.files.schemas import GRADIENT, READING, TUNED
@@ -119,7 +119,7 @@ class Report:
             self._result(path)
         elif path.suffix.lower() in (".csv", ".npy"):
             self._waveforms(path)
-        elif source in list_packs():
+        elif pack_called(source):
             self._pack(source)
         else:
             kinds = {"gmem-pack": self._pack, "gmem-recall": self._recall, "gmem-kernel": self._kernel}
@@ -163,7 +163,7 @@ class Report:
 
     def _pack(self, source: str) -> None:
         pack = load_pack(source)
-        made = None if source in list_packs() else load_frames(Path(source))
+        made = load_frames(pack_called(source) or Path(source))
         self._seen.add(pack_fingerprint(pack))
         parts = [of_rich(tables.pack_table(pack)), self._view(at_rest(pack), Material())]
         if stages := load_stages(source):

@@ -137,6 +137,10 @@ def test_a_standard_pack_is_made_once_and_found_by_its_name(
     assert made["output"] == str(tmp_path / "gmem_jax" / "packs" / "tetra-16-b.h5")
     pack = gm.load_pack("tetra-16-b")
     assert (pack.name, pack.grains, pack.info["recipe"]["seed"]) == ("tetra-16-b", 16, 2)
+    assert gmem(monkeypatch, "show", "tetra-16-b") == 0
+    assert gmem(monkeypatch, "export", "tetra-16-b", "--to", "xyz", "-o", tmp_path / "pack.xyz") == 0
+    assert gmem(monkeypatch, "report", "tetra-16-b", "-o", tmp_path / "pack.html") == 0
+    capsys.readouterr()
     assert gmem(monkeypatch, "prepare", "tetra-16-b") == 2
     assert "exists" in capsys.readouterr().err
 
