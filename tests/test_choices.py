@@ -122,7 +122,7 @@ def test_effects_are_differences_on_the_same_pack(tmp_path: Path) -> None:
     stiff = found["stiffness", 0.18]
     assert (stiff.of_gain.mean, stiff.of_fidelity.mean) == (pytest.approx(0.15), pytest.approx(-0.1))
     assert (stiff.of_gain.sd, stiff.of_gain.packs) == (pytest.approx(0.1 / math.sqrt(2.0)), 2)
-    assert found["stiffness", 0.135].default
+    assert found["stiffness", 0.13].default
     assert ("stiffness", 0.10) not in found  # not run
     choices.write_csv(tmp_path / "choices.csv", list(found.values()))
     assert (tmp_path / "choices.csv").read_text().count("\n") == 1 + len(found)

@@ -34,7 +34,7 @@ class Choice(NamedTuple):
 _WORDS: Values = {"signals": "words:3", "background": "sub2-bl"}
 CHOICES = (
     Choice("shear_share", "part of gamma on each axis", (0.5, 0.25, 1.0)),
-    Choice("stiffness", "k_H (E R)", (0.135, 0.10, 0.12, 0.145, 0.18)),
+    Choice("stiffness", "k_H (E R)", (0.13, 0.10, 0.12, 0.145, 0.18)),
     Choice("wall_rigidity", "stiffness of walls over rigid ones", (1.0, 0.5, 2.0)),
     Choice("spinning", "history turns about the normal", (1.0, 0.0)),
     Choice("rest", "rests (t0)", (0.2, 0.05, 0.8)),

@@ -20,14 +20,14 @@ class Hooke:
         mu: friction coefficient; scalar or [B].
         stiffness: k_H in E R; scalar or [B]. The paper gives "a typical inverse transverse compliance" of the
             Mindlin law: k_M <sqrt(p)> is 0.10 to 0.145 over the compression. The default is calibrated within
-            these, on one pack of 10,240 (docs/decisions/physics.md).
+            these, on packs of 10,240 (docs/decisions/physics.md).
         damping_time: gamma_H / k_H in t_c; scalar or [B].
         spinning: 1 where the history turns with a contact about its normal, 0 where it does not (as in LAMMPS, which
             only tumbles it); scalar or [B].
     """
 
     mu: Scalar = parameter(1.0, "[0, inf)")
-    stiffness: Scalar = parameter(0.135, "(0, inf)")
+    stiffness: Scalar = parameter(0.13, "(0, inf)")
     damping_time: Scalar = parameter(0.069, "[0, inf)")
     spinning: Scalar = parameter(1.0, "[0, 1]")
 
