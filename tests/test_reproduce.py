@@ -95,9 +95,10 @@ def test_every_figure_has_points_and_no_point_twice(name: str, scale: str) -> No
 def test_shipped_packs_come_first_and_only_where_they_fit() -> None:
     laptop = SCALES["laptop"]
     assert [row["pack"] for row in packs(laptop, 325, 5)] == [f"tetra-325-{letter}" for letter in "abcde"]
-    more = packs(laptop, 1024, 3)
-    assert more[0] == {"pack": "tetra-1024-a"}
-    assert {row["prepare.seed"] for row in more[1:]} == {101, 102}
+    more = packs(laptop, 3267, 5)
+    assert more[2] == {"pack": "tetra-3267-c"}
+    assert {row["prepare.seed"] for row in more[3:]} == {101, 102}
+    assert "pack" not in packs(laptop, 10240, 1)[0]  # k_H was calibrated on the shipped ones
     assert "pack" not in packs(laptop, 325, 1, delta0=0.02)[0]
     assert packs(laptop, 325, 1, shape="sphere")[0]["prepare.shape"] == "sphere"
 
