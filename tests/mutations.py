@@ -764,7 +764,7 @@ MUTATIONS = (
     mutation(
         "progress-of-bins",
         "experiment/host.py",
-        "self.work += bins * (self.state.replicas + STEP)",
+        "self.work += bins * work_of_bin(self.state.replicas)",
         "self.work += bins",
         "test_the_samples_of_a_run_follow_the_table",
     ),

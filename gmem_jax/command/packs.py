@@ -21,6 +21,7 @@ from gmem_jax.command.console import (
     say,
 )
 from gmem_jax.command.resuming import Restart, resumable
+from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.experiment.frames import Frames
 from gmem_jax.files.configuration import fingerprint
 from gmem_jax.files.home import kept_pack
@@ -53,9 +54,6 @@ PREPARATION_BYTES = 2e4  # of memory a grain: lists while grains fly, at N = 10,
 _DEFAULT = Recipe()
 
 
-SLOW = 1.8e4  # t_c: a compression of standard packs, at the paper's rate
-
-
 def standard_recipe(name: str) -> Recipe:
     """The recipe of a pack that is made by its name.
 
@@ -68,7 +66,7 @@ def standard_recipe(name: str) -> Recipe:
         )
     if name in list_packs():
         raise InputError(f"{name}: is shipped, and need not be made")
-    return Recipe(grains=int(found[1]), seed=ord(found[2]) - ord("a") + 1, t0=SLOW)
+    return Recipe(grains=int(found[1]), seed=ord(found[2]) - ord("a") + 1, t0=PAPER_T0)
 
 
 def prepare_command(
@@ -107,7 +105,12 @@ def prepare_command(
         if output is not None or name or recipe != _DEFAULT or (shape, overlap) != ("tetra", 0.6):
             raise InputError(f"{standard}: the name of a standard pack says all about it; leave other options away")
         recipe, name, output = standard_recipe(standard), standard, kept_pack(standard)
-        output.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            output.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{output.parent}: cannot make this folder ({error.strerror}); set XDG_CACHE_HOME"
+            ) from error
     elif output is None:
         raise InputError("--output is missing: name a file, or a standard pack like tetra-31680-a")
     film_of(recipe, frames)  # refuses what cannot be before anything is begun

@@ -67,9 +67,14 @@ def silent(stage: str, time: float, fraction: float) -> None:
     """Report nothing."""
 
 
+def work_of_bin(replicas: int) -> float:
+    """What a bin costs, in replica-bins: it takes as long as `STEP` replicas more than there are."""
+    return replicas + STEP
+
+
 def work_of(stages: Iterable[Stage], replicas: int) -> float:
-    """What some stages cost, in replica-bins: a bin takes as long as `STEP` replicas more than there are."""
-    return sum(stage.bins for stage in stages) * (replicas + STEP)
+    """What some stages cost, in replica-bins."""
+    return sum(stage.bins for stage in stages) * work_of_bin(replicas)
 
 
 def within(progress: Progress, begun: float, ended: float) -> Progress:
@@ -352,7 +357,7 @@ class Walker:
 
     def report(self, name: str, bins: float, time: float) -> None:
         """Count finished bins and tell the progress callback."""
-        self.work += bins * (self.state.replicas + STEP)
+        self.work += bins * work_of_bin(self.state.replicas)
         self.time += time
         self.progress(name, self.time, min(1.0, self.work / self.total_work))
 

@@ -13,7 +13,6 @@ from gmem_jax import native
 from gmem_jax.experiment.drive import Drive
 from gmem_jax.experiment.frames import Film, Frames, joined, places
 from gmem_jax.experiment.host import (
-    STEP,
     Checkpoint,
     Compiled,
     Keep,
@@ -24,6 +23,7 @@ from gmem_jax.experiment.host import (
     refuse,
     require_x64,
     silent,
+    work_of_bin,
     worst,
 )
 from gmem_jax.experiment.pack import Pack, find_pairs, pair_finder, smallest_box
@@ -225,7 +225,7 @@ class _Preparation:
         system = System(clump, Frictionless(), finder(grains, clump, self.box), material)
         state = start(system, at, grains.quaternion, self.box)
         state = accelerate(system, replace(state, grains=grains), self.box)
-        expected = expected_time(recipe, float(lengths[2])) / (self.dt * steps) * (1.0 + STEP)
+        expected = expected_time(recipe, float(lengths[2])) / (self.dt * steps) * work_of_bin(1)
         self.march = native.marcher(native.name(backend, system.friction))
         course = Course(system, self._drive(), self.dt, recipe.drag, steps=steps, backend=backend)
         self.walker = Walker(course, state, finder=finder, progress=progress, total_work=expected, film=film)

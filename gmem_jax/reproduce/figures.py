@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.files.packs import list_packs
 from gmem_jax.sweeps.spec import PREPARE, Spec
 
 Values = dict[str, Any]
 """Names of a sweep file with the values of one point."""
 
-PAPER_T0 = 1.8e4  # t_c
 DELTA0 = 0.05  # the paper's compression, and that of every shipped pack
 CALIBRATED = 10240  # grains of the shipped packs by whose recalls k_H was chosen: no comparison may use them
 MADE = 101  # seed of the first pack that is made: the shipped ones have small seeds

@@ -131,7 +131,7 @@ def test_a_standard_pack_is_made_once_and_found_by_its_name(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert packs.standard_recipe("tetra-31680-c") == packs.Recipe(grains=31680, seed=3, t0=1.8e4)
-    monkeypatch.setattr(packs, "SLOW", 75.0)
+    monkeypatch.setattr(packs, "PAPER_T0", 75.0)
     assert gmem(monkeypatch, "prepare", "tetra-16-b", "--json") == 0
     made = json.loads(capsys.readouterr().out)
     assert made["output"] == str(tmp_path / "gmem_jax" / "packs" / "tetra-16-b.h5")
@@ -143,6 +143,9 @@ def test_a_standard_pack_is_made_once_and_found_by_its_name(
     capsys.readouterr()
     assert gmem(monkeypatch, "prepare", "tetra-16-b") == 2
     assert "exists" in capsys.readouterr().err
+    monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
+    assert gmem(monkeypatch, "prepare", "tetra-16-b") == 2
+    assert "cannot make this folder" in capsys.readouterr().err
 
 
 def test_what_cannot_fit_is_refused_before_it_begins(

@@ -32,7 +32,9 @@ REASON = lammps.missing()
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
 
 MATERIAL = gm.Material()
-HOOKE = gm.Hooke(damping_time=0.0)  # LAMMPS' dashpots all vary with the contact radius, ours of H does not
+# LAMMPS' dashpots all vary with the contact radius, ours of H does not. With this k_H no sample of the oblique path is
+# where sliding begins; at 0.13 the one at t = 526 is: ours slides from 526.25 on, LAMMPS before, then 3e-4 apart.
+HOOKE = gm.Hooke(stiffness=0.145, damping_time=0.0)
 BOTH_LAWS = pytest.mark.parametrize("law", [HOOKE, MindlinRescaled()], ids=["H", "M1"])
 
 
@@ -118,12 +120,9 @@ def test_an_oblique_load_and_unload_agrees_once_lammps_is_extrapolated_to_dt_0(l
         theirs[steps] = run.force[1:, 0]
     ours = forces_on_a_path(law, path, lambda t: jnp.zeros(3), duration, 4000)[7::8]
     scale = np.abs(ours).max()
-    # Measured: 1e-3 apart at 4,000 steps, 2e-6 after one Richardson step; 3e-4 where sliding begins in the step before
-    # the sample, and nothing is smooth. There may be one such sample.
+    # Measured: 1e-3 apart at 4,000 steps, 2e-6 after one Richardson step.
     assert np.abs(theirs[4000] - ours).max() < 2e-3 * scale
-    *apart, farthest = np.sort(np.abs(2.0 * theirs[4000] - theirs[2000] - ours).max(axis=1))
-    assert apart[-1] < 1e-5 * scale
-    assert farthest < (1e-5 if mu > 1.0 else 1e-3) * scale
+    assert np.abs(2.0 * theirs[4000] - theirs[2000] - ours).max() < 1e-5 * scale
 
 
 @BOTH_LAWS
