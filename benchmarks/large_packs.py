@@ -23,7 +23,7 @@ from gmem_jax.experiment.host import forward  # noqa: E402
 from gmem_jax.files.provenance import provenance  # noqa: E402
 
 PRECISIONS = ("double", "mixed")
-SIZES = ("tetra-325-a", "tetra-3267-a", "tetra-10240-a")
+SIZES = ("tetra-325-a", "tetra-3267-a", "tetra-10240-b")
 
 
 def costs(pack: gm.Pack, replicas: int, seconds: float, t0: float) -> dict[str, np.ndarray]:

@@ -98,7 +98,9 @@ def test_shipped_packs_come_first_and_only_where_they_fit() -> None:
     more = packs(laptop, 3267, 5)
     assert more[2] == {"pack": "tetra-3267-c"}
     assert {row["prepare.seed"] for row in more[3:]} == {101, 102}
-    assert "pack" not in packs(laptop, 10240, 1)[0]  # k_H was calibrated on the shipped ones
+    large = packs(laptop, 10240, 3)
+    assert large[:2] == [{"pack": "tetra-10240-d"}, {"pack": "tetra-10240-e"}]  # k_H was calibrated on a, b and c
+    assert "pack" not in large[2]
     assert "pack" not in packs(laptop, 325, 1, delta0=0.02)[0]
     assert packs(laptop, 325, 1, shape="sphere")[0]["prepare.shape"] == "sphere"
 

@@ -19,7 +19,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.sample import observe
 
-PACKS = ("tetra-1024-a", "tetra-10240-a")
+PACKS = ("tetra-1024-a", "tetra-10240-b")
 REPLICAS = (1, 8, 32, 128)
 ARCHITECTURES = {"sm_80": "A100", "sm_90": "H100, H200", "sm_100": "B200", "sm_120": "RTX 50"}
 LAWS = {"frictionless": Frictionless(), **measure.LAWS}

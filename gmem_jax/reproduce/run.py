@@ -30,10 +30,9 @@ from gmem_jax.show.tables import summary
 from gmem_jax.sweeps.executors import Executor, Processes
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.sweep import Conductor
+from gmem_jax.sweeps.sweep import SIDE_BY_SIDE, Conductor
 
 RUNS = "runs"  # the folder of the sweep that all figures share
-SIDE_BY_SIDE = 8  # replicas of the quick measurement: a block
 MOST_SHOWN = 8  # words of a length in Fig. 13
 Tell = Callable[[str], None]
 
@@ -181,7 +180,10 @@ class Outcome(NamedTuple):
 
 
 def quick_cost(points: Sequence[Values]) -> float:
-    """Seconds a grain-step here, over some points: a second's measurement for each law, on the pack nearest in size."""
+    """Seconds a grain-step here with `SIDE_BY_SIDE` replicas, over some points.
+
+    A second's measurement for each law, on the pack nearest in size.
+    """
     work: dict[tuple[str, str], float] = {}
     for values in points:
         law = entry_of(law_named(str(values.get("friction", "H"))))

@@ -1,5 +1,6 @@
 """A sweep from its beginning to its end: points, packs, jobs, results."""
 
+import contextlib
 import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -12,10 +13,10 @@ import psutil
 
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
-from gmem_jax.experiment.host import Progress, silent, within
+from gmem_jax.experiment.host import Progress, silent, within, work_of_bin
 from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.recall import Recall, replica_bins
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
@@ -28,7 +29,8 @@ from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import clump_of, run_group
 
-COST = 8e-8  # s a grain-step on two cores; see docs/scaling.md
+COST = 8e-8  # s a grain-step on two cores, of SIDE_BY_SIDE replicas; see docs/scaling.md
+SIDE_BY_SIDE = 8  # replicas: a block
 CHECKED = 50  # values of a name that are tried before a sweep begins
 ANY_PACK = "tetra-325-a"
 GRAIN = {"shape": "tetra", "overlap": 0.6}  # of packs to be made, where nothing else is said
@@ -122,7 +124,7 @@ class Conductor:
         spec: what is asked for.
         folder: of its store.
         say: told in a line what is planned, and what happened.
-        cost: seconds a grain-step, for that.
+        cost: seconds a grain-step with `SIDE_BY_SIDE` replicas, for that.
 
     Raises:
         FileFormatError: if the folder holds something else.
@@ -229,6 +231,8 @@ class Conductor:
         """
         if makes := self.pack_jobs():
             self._announce(f"{len(makes)} packs to be made", makes, executor)
+            if later := self.points_to_come():
+                self._announce(f"then {len(later)} points on them", later, executor)
             self._finish(executor, makes, progress, "packs")
         points = self.points()
         failed = [(digest([self.spec.shared, values]), values, reason) for values, reason in self.impossible]
@@ -249,11 +253,25 @@ class Conductor:
         else:
             self.say(f"all {kept} points are there")
 
+    def points_to_come(self) -> list[dict[str, Any]]:
+        """What will be run on packs that do not exist yet: work and replicas of each point by itself."""
+        found = []
+        for values in self.spec.combinations():
+            all_ = {**self.spec.shared, **values}
+            if "pack" in all_ or self.store.pack_at(self._pack_job(all_)["name"]).is_file():
+                continue
+            with contextlib.suppress(ValueError, FileNotFoundError):  # an impossible point is told of in its turn
+                like = self._experiment(all_, self._packs(ANY_PACK))
+                work = self._recipe(all_)[0].grains * like.timing.steps * replica_bins(like, like.signals.count)
+                found.append({"work": work, "replicas": like.replicas})
+        return found
+
     def _announce(self, what: str, jobs: list[dict[str, Any]], executor: Executor) -> None:
         work = sum(job["work"] for job in jobs)
         widest = max(job["replicas"] for job in jobs)
         workers = min(executor.workers, len(jobs))
-        minutes = max(1, round(self.cost * work / 60.0))
+        blocks = sum(job["work"] * work_of_bin(job["replicas"]) / job["replicas"] for job in jobs)
+        minutes = max(1, round(self.cost * blocks * SIDE_BY_SIDE / work_of_bin(SIDE_BY_SIDE) / 60.0))
         where = "here" if self.cost != COST else "of two free cores (native, law H)"
         cost = f"{work:.2g} grain-steps, some {minutes} min {where}"
         self.say(f"{what}, {widest} replicas side by side at most, workers: {workers}; {cost}")

@@ -168,6 +168,7 @@ def test_packs_are_made_once_for_all_points(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "2 packs to be made" in done.stderr
+    assert "then 4 points on them, 7 replicas side by side" in done.stderr
     assert "4 of 4 points in 2 runs" in done.stderr
     assert len(list((tmp_path / "made" / "packs").iterdir())) == 2
     again = subprocess.run(command, capture_output=True, text=True)
