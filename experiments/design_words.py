@@ -4,9 +4,9 @@ python experiments/design_words.py [-o designed-words] [--packs tetra-325-a,...]
     [--drawn 256]
 
 The paper's net has seen inputs only, those of all words. The designed words are read from a run of their own on the
-samples as they are written. Of longer words some are drawn, so that an accuracy p of N of them has a standard error of
-sqrt(p (1 - p) / N); the net and the templates choose among all. Resumes; a row for each pack and length goes to
-words.csv as it comes. L = 8 on 325 grains at t0 = 1,800 takes some 1e10 grain-steps.
+samples as they are written. A pack's kernel is measured once. Of longer words some are drawn, so that an accuracy p
+of N of them has a standard error of sqrt(p (1 - p) / N); the net and the templates choose among all. Resumes; a row
+for each pack and length goes to words.csv as it comes. L = 8 on 325 grains at t0 = 1,800 takes some 1e10 grain-steps.
 """
 
 import argparse
@@ -20,14 +20,18 @@ import numpy as np
 from console import say
 
 import gmem_jax as gm
+from gmem_jax.design.by_kernel import BUMPS, WIDTH
 from gmem_jax.experiment.recall import LARGEST_BATCH
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.configuration import key_of_run
 from gmem_jax.files.parts import Parts
 from gmem_jax.reading import training
 from gmem_jax.reading.lessons import Lessons
-from gmem_jax.reading.net import accuracy
+from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import linear_decoder, nearest_template
+
+TABLE = "words.csv"
+Row = dict[str, str | int | float]
 
 
 def main() -> None:
@@ -45,49 +49,76 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
 
-    for bits in map(int, arguments.bits.split(",")):
-        kept = folder / f"words-{bits}-seed-0.msgpack"
-        every = gm.words(bits)
-        number = np.arange(every.count)
-        if every.count > arguments.drawn:
-            number = np.sort(np.random.default_rng(bits).choice(number, arguments.drawn, replace=False))
-        learns = len(number) == every.count  # the linear decoder, from all the words
-        words = replace(every, amplitudes=every.amplitudes[number], centres=every.centres[number])
-        templates = bin_average(every)
-        net = training.train(Lessons(bits), 0, budget=arguments.budget, checkpoint=kept).net
-        for name in arguments.packs.split(","):
-            began = time.perf_counter()
-            experiment = gm.Experiment(gm.load_pack(name), words, t0=arguments.t0)
-            options = {"iterations": arguments.iterations, "batch": LARGEST_BATCH}
-            stem = f"{name}-{bits}-t0-{arguments.t0:g}"
-            parts = Parts(folder / f"{stem}.parts", key_of_run(experiment, **options))
-            design = gm.design_by_kernel(experiment, **options, keep=parts, progress=say)
-            gm.save_waveforms(folder / f"{stem}.csv", design.signals, words)
-            row: dict[str, object] = {
-                "pack": name,
-                "bits": bits,
-                "words": len(number),
-                "t0": arguments.t0,
-                "iterations": arguments.iterations,
-            }
-            for when, p_sig in (("untouched", design.untouched), ("designed", design.p_sig)):
-                match = experiment.compare(p_sig)
-                row |= {
-                    f"F {when}": round(float(match.fidelity), 4),
-                    f"G {when}": round(float(match.gain), 4),
-                    f"net {when}": float(accuracy(net, p_sig, number)),
-                    f"template {when}": float(np.mean(nearest_template(p_sig, templates) == number)),
-                    f"linear {when}": float(np.mean(linear_decoder(p_sig) == number)) if learns else "",
-                }
-            row["seconds"] = round(time.perf_counter() - began)
-            table, new = folder / "words.csv", not (folder / "words.csv").exists()
-            with table.open("a") as file:
-                writer = csv.DictWriter(file, row)
-                if new:
-                    writer.writeheader()
-                writer.writerow(row)
+    for name in arguments.packs.split(","):
+        any_words = gm.Experiment(gm.load_pack(name), gm.words(3), t0=arguments.t0)
+        measured = Parts(folder / f"{name}-t0-{arguments.t0:g}.kernel", key_of_run(any_words))
+        kernel = gm.memory_kernel(any_words, BUMPS, WIDTH, keep=measured, progress=say)
+        for bits in map(int, arguments.bits.split(",")):
+            if there(folder / TABLE, name, bits):
+                continue
+            kept = folder / f"words-{bits}-seed-0.msgpack"
+            net = training.train(Lessons(bits), 0, budget=arguments.budget, checkpoint=kept).net
+            number = drawn(2**bits, arguments.drawn)
+            row = design(folder, any_words, kernel, bits, number, net, arguments.iterations)
             print(row, flush=True)
-            parts.discard()
+            append(folder / TABLE, row)
+
+
+def drawn(count: int, most: int) -> np.ndarray:
+    """Numbers of the words that are designed, of so many."""
+    every = np.arange(count)
+    return every if count <= most else np.sort(np.random.default_rng(count).choice(every, most, replace=False))
+
+
+def design(
+    folder: Path,
+    any_words: gm.Experiment,
+    kernel: gm.MemoryKernel,
+    bits: int,
+    number: np.ndarray,
+    net: Net,
+    iterations: int,
+) -> Row:
+    """Design these words of a length, and read them as they come and designed."""
+    began = time.perf_counter()
+    every = gm.words(bits)
+    words = replace(every, amplitudes=every.amplitudes[number], centres=every.centres[number])
+    experiment = gm.replace(any_words, signals=words)
+    options = {"iterations": iterations, "batch": LARGEST_BATCH}
+    pack, t0 = experiment.pack.name, float(experiment.t0)
+    stem = f"{pack}-{bits}-t0-{t0:g}"
+    parts = Parts(folder / f"{stem}.parts", key_of_run(experiment, **options))
+    found = gm.design_by_kernel(experiment, **options, kernel=kernel, keep=parts, progress=say)
+    gm.save_waveforms(folder / f"{stem}.csv", found.signals, words)
+    templates = bin_average(every)
+    row: Row = {"pack": pack, "bits": bits, "words": len(number), "t0": t0, "iterations": iterations}
+    for when, p_sig in (("untouched", found.untouched), ("designed", found.p_sig)):
+        match = experiment.compare(p_sig)
+        row |= {
+            f"F {when}": round(float(match.fidelity), 4),
+            f"G {when}": round(float(match.gain), 4),
+            f"net {when}": float(accuracy(net, p_sig, number)),
+            f"template {when}": float(np.mean(nearest_template(p_sig, templates) == number)),
+            f"linear {when}": float(np.mean(linear_decoder(p_sig) == number)) if len(number) == every.count else "",
+        }
+    parts.discard()
+    return row | {"seconds": round(time.perf_counter() - began)}
+
+
+def there(table: Path, pack: str, bits: int) -> bool:
+    """Whether the table has these words."""
+    rows = csv.DictReader(table.open()) if table.exists() else []
+    return any((row["pack"], row["bits"]) == (pack, str(bits)) for row in rows)
+
+
+def append(table: Path, row: Row) -> None:
+    """A row more."""
+    new = not table.exists()
+    with table.open("a") as file:
+        writer = csv.DictWriter(file, row)
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
 
 
 if __name__ == "__main__":

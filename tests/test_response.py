@@ -169,6 +169,19 @@ def test_slopes_that_are_measured_need_not_be_learned(
     assert 1.0 - measured.fidelity < 0.3 * (1.0 - learned.fidelity)
 
 
+def test_a_kernel_that_is_there_is_not_measured_again(
+    monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment
+) -> None:
+    known = memory_of_another_kernel(monkeypatch, 1.0, 0.6)
+    asked = {"iterations": 3, "gain": 0.1, "damping": 1e-2}
+    measured = gm.design_by_kernel(experiment, n=17, width=0.2, **asked)
+    monkeypatch.delattr(by_kernel, "memory_kernel")
+    given = gm.design_by_kernel(experiment, kernel=known, **asked)
+    assert given.history == measured.history
+    with pytest.raises(ValueError, match=r"the kernel is of gamma0 = 0\.001, the experiment's is 0\.003"):
+        gm.design_by_kernel(gm.replace(experiment, gamma0=3e-3), kernel=known)
+
+
 def test_a_gain_that_is_not_asked_for_leaves_room_below_the_bound(
     monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment
 ) -> None:

@@ -49,12 +49,24 @@ def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS, 
     return (iterations or ITERATIONS) + 2.0 + 2.0 * n / experiment.signals.count + len(MEASURED) * measured
 
 
+def refuse_another_drive(kernel: MemoryKernel, experiment: Experiment) -> None:
+    """Refuse a kernel that is not of this drive.
+
+    Raises:
+        ValueError: saying what differs.
+    """
+    for name, own in (("gamma0", experiment.gamma0), ("delta0", experiment.compression)):
+        if getattr(kernel, name) != float(own):
+            raise ValueError(f"the kernel is of {name} = {getattr(kernel, name):g}, the experiment's is {float(own):g}")
+
+
 def design_by_kernel(
     experiment: Experiment,
     *,
     iterations: int = ITERATIONS,
     n: int = BUMPS,
     width: float = WIDTH,
+    kernel: MemoryKernel | None = None,
     gain: float | None = None,
     damping: float = DAMPING,
     measured: int = 0,
@@ -69,6 +81,7 @@ def design_by_kernel(
         iterations: simulations of all waveforms, each but the first after a correction.
         n: bumps of a designed waveform.
         width: of the bumps.
+        kernel: of this pack and drive, if it has been measured before: its bumps are taken.
         gain: wanted common gain; default half of the untouched waveforms' own, or less, so that the bound |I| <= 1
             leaves room for what the kernel says is needed.
         damping: of the first correction, in parts of the kernel's largest singular value.
@@ -79,18 +92,23 @@ def design_by_kernel(
         progress: told about every chunk.
 
     Raises:
+        ValueError: if the kernel was measured at another gamma0 or delta0, or either differs between replicas.
         RunFailedError: if a simulation broke down.
     """
     refuse_several_scales(experiment)
-    work = Work(cost(experiment, iterations, n, measured), progress)
+    if kernel is not None:
+        refuse_another_drive(kernel, experiment)
+        n, width = len(kernel.centres), kernel.width
+    work = Work(cost(experiment, iterations, 0 if kernel else n, measured), progress)
 
     def recall(name: str, changed: Experiment, runs: float = 1.0) -> np.ndarray:
         return np.asarray(run(changed, batch=batch, keep=under(name, keep), progress=work.next(runs, name)).p_sig)
 
     target = np.asarray(experiment.integral())
     untouched = recall("untouched", experiment)
-    told = work.next(2.0 * n / len(target), "kernel")
-    kernel = memory_kernel(experiment, n, width, keep=under("kernel", keep), progress=told)
+    if kernel is None:
+        told = work.next(2.0 * n / len(target), "kernel")
+        kernel = memory_kernel(experiment, n, width, keep=under("kernel", keep), progress=told)
     original = experiment.compare(jnp.asarray(untouched))
     damped = np.full((len(target), 1), damping * np.linalg.norm(kernel.odd, 2))
 
