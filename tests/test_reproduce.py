@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -103,6 +104,12 @@ def test_shipped_packs_come_first_and_only_where_they_fit() -> None:
     assert "pack" not in large[2]
     assert "pack" not in packs(laptop, 325, 1, delta0=0.02)[0]
     assert packs(laptop, 325, 1, shape="sphere")[0]["prepare.shape"] == "sphere"
+
+
+def test_single_precision_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with jax.enable_x64(False), pytest.raises(ValueError, match="float64 is needed"):
+        reproducing.reproduce("fig06", tmp_path / "out")
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

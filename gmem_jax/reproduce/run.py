@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from gmem_jax import native
 from gmem_jax.bench.measure import rival
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.host import Progress, silent
+from gmem_jax.experiment.host import Progress, require_x64, silent
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.physics.contact.laws import entry_of, law_named
@@ -215,10 +215,11 @@ def reproduce(
         say: told in a line what is planned, and what happened.
 
     Raises:
-        ValueError: if there is no such figure or scale.
+        ValueError: if there is no such figure or scale, or JAX runs in 32 bits.
         RunFailedError: if workers die again and again.
         OSError: if something cannot be written, or no worker started.
     """
+    require_x64()
     if name not in FIGURES or scale not in SCALES:
         raise ValueError(f"no figure {name!r} at scale {scale!r}; there are {', '.join((*FIGURES, *SCALES))}")
     size, folder = SCALES[scale], Path(folder)
