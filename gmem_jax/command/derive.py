@@ -237,7 +237,11 @@ def design_command(
         float | None, typer.Option(help="Wanted gain; default at most half of the untouched waveforms'.")
     ] = None,
     measured: Annotated[
-        int, typer.Option(min=0, help="Directions along which slopes are measured twice; by the kernel only.")
+        int,
+        typer.Option(
+            min=0,
+            help="Directions, on average, along which a waveform's slopes are measured twice; by the kernel only.",
+        ),
     ] = 0,
     restart: Restart = False,
     picture: Picture = True,

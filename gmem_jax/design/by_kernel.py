@@ -3,8 +3,9 @@
 A Jacobian of its own for every waveform (`waveforms`) costs some tens of runs of each. Here the one kernel of the pack,
 2 n + 1 replicas, serves them all: it says how each waveform should change for what its last recall missed. It is only
 nearly right, so the miss is simulated and corrected again, and what each simulation shows of a waveform's own slopes is
-added to the kernel (Broyden's update); along its strongest directions they can be measured too, all at once. What
-gets worse is taken back, and the next step is damped more (Levenberg and Marquardt).
+added to the kernel (Broyden's update). They can be measured too, all at once, and most of those waveforms that miss
+most: what is left then lies along directions in which the kernel is small. What gets worse is taken back, and the next
+step is damped more (Levenberg and Marquardt).
 """
 
 import jax.numpy as jnp
@@ -31,7 +32,7 @@ WIDTH = 0.08  # of them, in u
 DAMPING = 0.05  # of the first correction, in parts of the kernel's largest singular value
 EASED, FIRMED = 0.6, 1.8  # times the damping after a step that was better, and one that was worse
 ITERATIONS = 6  # simulations of all waveforms
-MEASURED = (1 / 2, 3 / 4)  # parts of the iterations after which slopes are measured
+MEASURED = (1 / 3, 2 / 3)  # parts of the iterations after which slopes are measured
 PROBE = (0.01, 0.05)  # shortest and longest step along a direction that is measured
 ROOM = 0.6  # of the bound |I| <= 1, that the first guess may take where no gain is asked for
 SHORTEST = 1e-6  # step from which slopes are learned; a waveform of nothing takes none
@@ -47,6 +48,15 @@ def slopes(kernel: MemoryKernel, amplitudes: np.ndarray) -> np.ndarray:
 def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS, measured: int = 0) -> float:
     """What a design takes, in runs of its signals."""
     return (iterations or ITERATIONS) + 2.0 + 2.0 * n / experiment.signals.count + len(MEASURED) * measured
+
+
+def shares(runs: int, needs: np.ndarray, most: int) -> np.ndarray:
+    """So many runs shared out in proportion to needs [S], none taking more than `most`, [S]."""
+    share, order = np.zeros(len(needs), int), np.argsort(-needs)
+    for place, neediest in enumerate(order):
+        fair = (runs - share.sum()) * needs[neediest] / max(needs[order[place:]].sum(), np.finfo(float).tiny)
+        share[neediest] = min(most, round(fair))
+    return share
 
 
 def refuse_another_drive(kernel: MemoryKernel, experiment: Experiment) -> None:
@@ -85,8 +95,8 @@ def design_by_kernel(
         gain: wanted common gain; default half of the untouched waveforms' own, or less, so that the bound |I| <= 1
             leaves room for what the kernel says is needed.
         damping: of the first correction, in parts of the kernel's largest singular value.
-        measured: directions, the kernel's strongest, along which the slopes of every waveform are measured twice on the
-            way, by as many runs of all waveforms side by side.
+        measured: directions along which the slopes of a waveform are measured twice on the way, on average: those that
+            miss most have most of the runs, up to all n directions, the kernel's strongest first.
         batch: signals that run together; default all of them.
         keep: asked for every part of every simulation, so that a design can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
@@ -110,7 +120,7 @@ def design_by_kernel(
         told = work.next(2.0 * n / len(target), "kernel")
         kernel = memory_kernel(experiment, n, width, keep=under("kernel", keep), progress=told)
     original = experiment.compare(jnp.asarray(untouched))
-    damped = np.full((len(target), 1), damping * np.linalg.norm(kernel.odd, 2))
+    firm = np.full((len(target), 1), damping * np.linalg.norm(kernel.odd, 2))
 
     def guess(gain: float) -> np.ndarray:
         """What the kernel alone says."""
@@ -118,7 +128,7 @@ def design_by_kernel(
         amplitudes = nearest(kernel.basis, experiment.signals) * gain / kernel.gain()
         for _ in range(PREDICTED):
             missed = gain * float(experiment.scale) * target - kernel.recalled(amplitudes)
-            amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, damped), width)
+            amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, firm), width)
         return amplitudes
 
     chosen, gain = gain is not None, 0.5 * float(original.gain) if gain is None else gain
@@ -137,17 +147,24 @@ def design_by_kernel(
     best, p_sig = amplitudes, recall("trial-0", replace(experiment, signals=made(amplitudes)))
     history = [float(original.fidelity), float(experiment.compare(jnp.asarray(p_sig)).fidelity)]
     learned = np.zeros((len(best), *kernel.odd.shape))  # of each waveform's slopes, beyond the kernel
-    strongest = np.linalg.svd(kernel.odd, full_matrices=False)[0].T[:measured]  # [m, n]
+    strongest = np.linalg.svd(kernel.odd)[0].T  # [n, n]
+    damped = firm
     for iteration in range(1, iterations):
         if measured and iteration in [int(part * iterations) for part in MEASURED]:
+            missed = wanted - p_sig
             # Where the next step would go, and about as far.
-            ahead = correction(slopes(kernel, best) + learned, wanted - p_sig, damped) @ strongest.T
+            ahead = correction(slopes(kernel, best) + learned, missed, damped) @ strongest.T
             far = np.where(ahead < 0.0, -1.0, 1.0) * np.clip(np.abs(ahead), *PROBE)
-            probes = bounded((best[:, None] + far[:, :, None] * strongest).reshape(-1, n), width)
-            changes = recall(f"slopes-{iteration}", replace(experiment, signals=made(probes)), measured)
-            steps = probes.reshape(len(best), -1, n) - best[:, None]
-            unforeseen = changes.reshape(len(best), -1, p_sig.shape[1]) - p_sig[:, None] - steps @ slopes(kernel, best)
-            learned = np.linalg.pinv(steps) @ unforeseen
+            share = shares(measured * len(best), np.sum(missed**2, axis=1), n)
+            whose = np.repeat(np.arange(len(best)), share)
+            steps = np.concatenate([far[one, :count, None] * strongest[:count] for one, count in enumerate(share)])
+            probes = bounded(best[whose] + steps, width)
+            changes = recall(f"slopes-{iteration}", replace(experiment, signals=made(probes)), measured) - p_sig[whose]
+            steps = probes - best[whose]
+            for one in np.unique(whose):
+                mine, foreseen = whose == one, slopes(kernel, best)[one]
+                learned[one] = np.linalg.pinv(steps[mine]) @ (changes[mine] - steps[mine] @ foreseen)
+            damped = np.minimum(damped, firm)
         slope = slopes(kernel, best) + learned
         tried = bounded(best + correction(slope, wanted - p_sig, damped), width)
         found = recall(f"trial-{iteration}", replace(experiment, signals=made(tried)))
@@ -157,7 +174,7 @@ def design_by_kernel(
         learned += (step / length[:, None])[:, :, None] * unforeseen[:, None, :]
         better = np.linalg.norm(found - wanted, axis=1) < np.linalg.norm(p_sig - wanted, axis=1)
         best, p_sig = (np.where(better[:, None], *pair) for pair in ((tried, best), (found, p_sig)))
-        damped *= np.where(better, EASED, FIRMED)[:, None]
+        damped = damped * np.where(better, EASED, FIRMED)[:, None]
         history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
     signals = made(best)
     fresh = recall("verified", replace(experiment, signals=signals))
