@@ -1,7 +1,9 @@
 """The memory kernel and designs, on made-up kernels and on a shortened run of 27 grains."""
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.design import by_kernel, drive, waveforms
 from gmem_jax.design import kernel as response
+from gmem_jax.experiment.host import Checkpoint, forget
 from gmem_jax.experiment.recall import prefix_of, simulate
 from gmem_jax.experiment.signals import BINS, bin_average
 
@@ -139,6 +142,7 @@ def memory_of_another_kernel(
 
     monkeypatch.setattr(by_kernel, "run", memory)
     monkeypatch.setattr(by_kernel, "memory_kernel", lambda *_, **__: known)
+    monkeypatch.setattr(by_kernel, "prefix_of", lambda *_, **__: None)
     return known
 
 
@@ -188,6 +192,20 @@ def test_a_kernel_that_is_there_is_not_measured_again(
     assert given.history == measured.history
     with pytest.raises(ValueError, match=r"the kernel is of gamma0 = 0\.001, the experiment's is 0\.003"):
         gm.design_by_kernel(gm.replace(experiment, gamma0=3e-3), kernel=known)
+
+
+def test_all_recalls_of_a_design_begin_where_one_prefix_ended(experiment: gm.Experiment) -> None:
+    parts: list[str] = []
+
+    def keep(name: str, play: Callable[[Checkpoint], Any]) -> Any:
+        parts.append(name)
+        return forget(name, play)
+
+    found = gm.design_by_kernel(experiment, iterations=3, n=3, width=0.5, measured=1, keep=keep)
+    recalls = ["untouched", "trial-0", "slopes-1", "trial-1", "slopes-2", "trial-2", "verified"]
+    assert sorted(parts) == sorted(["prefix", "kernel-basis", *(f"{name}-batch-0000" for name in recalls)])
+    fresh = gm.run(gm.replace(experiment, signals=found.signals))
+    np.testing.assert_array_equal(found.p_sig, np.asarray(fresh.p_sig))
 
 
 def test_a_gain_that_is_not_asked_for_leaves_room_below_the_bound(

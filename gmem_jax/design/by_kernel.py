@@ -23,8 +23,8 @@ from gmem_jax.design.waveforms import (
     verified,
 )
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Keep, Progress, forget, silent, under
-from gmem_jax.experiment.recall import run
+from gmem_jax.experiment.host import Keep, Progress, forget, remembering, sharing, silent, under
+from gmem_jax.experiment.recall import PREFIX, prefix_of, run
 from gmem_jax.experiment.signals import Spline
 
 BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
@@ -111,14 +111,18 @@ def design_by_kernel(
         n, width = len(kernel.centres), kernel.width
     work = Work(cost(experiment, iterations, 0 if kernel else n, measured), progress)
 
+    once = remembering(keep)
+
     def recall(name: str, changed: Experiment, runs: float = 1.0) -> np.ndarray:
-        return np.asarray(run(changed, batch=batch, keep=under(name, keep), progress=work.next(runs, name)).p_sig)
+        kept = sharing(PREFIX, once, under(name, keep))
+        return np.asarray(run(changed, batch=batch, keep=kept, progress=work.next(runs, name)).p_sig)
 
     target = np.asarray(experiment.integral())
     untouched = recall("untouched", experiment)
     if kernel is None:
         told = work.next(2.0 * n / len(target), "kernel")
-        kernel = memory_kernel(experiment, n, width, keep=under("kernel", keep), progress=told)
+        begun = prefix_of(experiment, keep=once)
+        kernel = memory_kernel(experiment, n, width, begun=begun, keep=under("kernel", keep), progress=told)
     original = experiment.compare(jnp.asarray(untouched))
     firm = np.full((len(target), 1), damping * np.linalg.norm(kernel.odd, 2))
 

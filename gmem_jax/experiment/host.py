@@ -59,6 +59,23 @@ def under(name: str, keep: Keep) -> Keep:
     return lambda part, play: keep(f"{name}-{part}", play)
 
 
+def remembering(keep: Keep) -> Keep:
+    """The same `Keep`, by which a part is run or loaded once, however often it is asked for."""
+    found: dict[str, Any] = {}
+
+    def kept(name: str, play: Callable[[Checkpoint], Any]) -> Any:
+        if name not in found:
+            found[name] = keep(name, play)
+        return found[name]
+
+    return kept
+
+
+def sharing(part: str, once: Keep, own: Keep) -> Keep:
+    """`own`, but for one part, which is asked of `once`."""
+    return lambda name, play: (once if name == part else own)(name, play)
+
+
 class RunFailedError(RuntimeError):
     """A run whose numbers are meaningless: a grain escaped, a number overflowed, an overlap left the law's range."""
 

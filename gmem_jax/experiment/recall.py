@@ -44,6 +44,7 @@ from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
 REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than this part of the walls' speed
 COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
 GRAIN_BYTES = 800  # of a grain's own numbers and its spheres'
+PREFIX = "prefix"  # name of the part of a run that is common to all waveforms
 LARGEST_BATCH = 63  # signals; with the zero signal they fill whole vectors of every CPU
 
 
@@ -251,7 +252,7 @@ def run(
     firsts = range(0, count, size)
     done = work_of(common, begun.state.replicas)
     begun.total_work = done + sum(work_of(own, 1 + min(size, count - first)) for first in firsts)
-    samples = begun.play_part("prefix", keep, *common)
+    samples = begun.play_part(PREFIX, keep, *common)
     parts: list[tuple[dict[str, Sample], jax.Array]] = []
     taken: Taken = {}
     for number, first in enumerate(firsts):
@@ -346,7 +347,7 @@ def prefix_of(experiment: Experiment, *, keep: Keep = forget, progress: Progress
     common, _ = experiment.phases
     begun = walker(experiment, progress=progress)
     begun.total_work = work_of(common, begun.state.replicas)
-    begun.play_part("prefix", keep, *common)
+    begun.play_part(PREFIX, keep, *common)
     return begun
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, replace, replica_parameters, value_at
 from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent, work_of
-from gmem_jax.experiment.recall import Recall, finished, walker, warn_of_another_compression
+from gmem_jax.experiment.recall import PREFIX, Recall, finished, walker, warn_of_another_compression
 from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics.pytree import pytree
 
@@ -152,7 +152,7 @@ def run_several(
         samples = on.play(*own, checkpoint=checkpoint)
         return samples, on.status()
 
-    before = on.play_part("prefix", keep, *common)
+    before = on.play_part(PREFIX, keep, *common)
     on = on.afresh()
     after, status = keep("after", rest)
     found = []
