@@ -18,6 +18,7 @@ import jax
 import matplotlib
 import numpy as np
 from console import say
+from packs import over_packs
 
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import BUMPS, WIDTH
@@ -200,14 +201,6 @@ def lengthen(table: Table, case: Case, noises: Noises) -> None:
         table.note(case, f"words {bits} predicted", decoded(predicted, deviations(kernel, noises), draws))
 
 
-def over_packs(rows: list[Row], by: str) -> tuple[list[float], list[float], list[float]]:
-    """Mean and SD (0 of one pack) of the values of rows at each value of a column."""
-    places = sorted({float(row[by]) for row in rows})
-    values = [[float(row["value"]) for row in rows if float(row[by]) == place] for place in places]
-    deviation = [float(np.std(some, ddof=1)) if len(some) > 1 else 0.0 for some in values]
-    return places, [float(np.mean(some)) for some in values], deviation
-
-
 STYLES = {
     "channels": ("^--", "channels: at most, were it linear"),
     f"words {SHORT} predicted": ("o-", f"decoded, words of {SHORT} bits, predicted"),
@@ -229,7 +222,9 @@ def draw(table: Table, path: Path) -> None:
             for study, (style, _) in STYLES.items():
                 rows = table.pick(study=study, quantity="bits", noise=name, **kept)
                 if rows:
-                    axis.errorbar(*over_packs(rows, by), fmt=style, color=f"C{colour}", capsize=2, mfc="none", ms=5)
+                    axis.errorbar(
+                        *over_packs(rows, by, "value"), fmt=style, color=f"C{colour}", capsize=2, mfc="none", ms=5
+                    )
         axis.set(xscale="log", yscale="log", xlabel={"N": "N", "gamma0": r"$\gamma_0$"}[by], ylabel="bits")
         axis.set_ylim(1.0, 5e4)  # room for the legends
     for colour, name in enumerate(names):

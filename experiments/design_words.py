@@ -6,7 +6,8 @@ python experiments/design_words.py [-o designed-words] [--packs tetra-325-a,...]
 The paper's net has seen inputs only, those of all words. The designed words are read from a run of their own on the
 samples as they are written. A pack's kernel is measured once. Of longer words some are drawn, so that an accuracy p
 of N of them has a standard error of sqrt(p (1 - p) / N); the net and the templates choose among all. Resumes; a row
-for each pack and length goes to words.csv as it comes. L = 8 on 325 grains at t0 = 1,800 takes some 1e10 grain-steps.
+for each pack and length goes to words.csv as it comes, and what stands there is drawn to words.png. L = 8 on 325 grains
+at t0 = 1,800 takes some 1e10 grain-steps.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from console import say
+from packs import over_packs
 
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import BUMPS, WIDTH
@@ -29,6 +31,8 @@ from gmem_jax.reading import training
 from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import linear_decoder, nearest_template
+from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.tables import published
 
 TABLE = "words.csv"
 Row = dict[str, str | int | float]
@@ -62,6 +66,7 @@ def main() -> None:
             row = design(folder, any_words, kernel, bits, number, net, arguments.iterations)
             print(row, flush=True)
             append(folder / TABLE, row)
+            draw(folder / TABLE, folder / "words.png")
 
 
 def drawn(count: int, most: int) -> np.ndarray:
@@ -119,6 +124,29 @@ def append(table: Path, row: Row) -> None:
         if new:
             writer.writeheader()
         writer.writerow(row)
+
+
+def draw(table: Path, path: Path) -> None:
+    """F and what the net reads against L: as they come and designed, mean and SD over packs; and the published."""
+    figure, axes = pyplot().subplots(1, 2, figsize=(10, 4.2))
+    rows = list(csv.DictReader(table.open()))
+    sizes = sorted({gm.load_pack(row["pack"]).grains for row in rows})
+    for axis, column, theirs in ((axes[0], "F", "fidelity_sub0"), (axes[1], "net", "classifier_accuracy")):
+        for colour, grains in enumerate(sizes):
+            own = [row for row in rows if gm.load_pack(row["pack"]).grains == grains]
+            for when, style in (("untouched", "o--"), ("designed", "s-")):
+                lengths, means, deviations = over_packs(own, "bits", f"{column} {when}")
+                label = f"{when}, N = {grains:,}"
+                axis.errorbar(
+                    lengths, means, deviations, fmt=style, color=f"C{colour}", mfc="none", capsize=2, label=label
+                )
+        stars = [(row["word_bits"], row[theirs]) for row in published("binary_words.csv")]
+        axis.plot(*zip(*stars, strict=True), "k*", ms=9, label="published, untouched, N = 10,240")
+        axis.set(xlabel="bits of a word, L", ylim=(0.0, 1.05))
+    axes[0].set_ylabel("F (SUB0)")
+    axes[1].set_ylabel("words read right by the net")
+    axes[0].legend(fontsize=8, frameon=False)
+    save(path, figure)
 
 
 if __name__ == "__main__":
