@@ -16,7 +16,7 @@ from gmem_jax.reproduce import claims, figures
 from gmem_jax.reproduce import run as reproducing
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, Point, compare, compared
 from gmem_jax.reproduce.draw import power
-from gmem_jax.reproduce.figures import FIGURES, SCALES, Figure, packs, spec_of
+from gmem_jax.reproduce.figures import FIGURES, SCALES, Figure, packs, scale_of, spec_of
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import work
@@ -57,6 +57,23 @@ def test_published_points_are_found_by_their_conditions() -> None:
     assert compared(word, "F", [0.6], 0).theirs.mean == 0.606
     assert compared(word, "accuracy net", [0.8], 0).theirs.mean == 0.829
     assert compared(word, "G", [0.6], 0).theirs is None
+
+
+def test_a_scale_with_changes() -> None:
+    assert scale_of("paper") == SCALES["paper"]
+    changed = scale_of("paper,t0=5.4e3,packs=1,lengths=3+4")
+    assert changed == replace(SCALES["paper"], t0=5400.0, packs=1, lengths=(3, 4))
+    for text, wrong in {
+        "poster": "no scale 'poster'; there are laptop, workstation, paper",
+        "laptop,t=5": "'t=5' changes nothing of a scale",
+        "laptop,packs=1.5": "must be like packs=5",
+        "laptop,lengths=3,4": "'4' changes nothing",
+        "laptop,lengths=": r"must be like lengths=3\+4\+5",
+        "laptop,t0=-1": "must be positive",
+        "laptop,t0=nan": "must be positive",
+    }.items():
+        with pytest.raises(ValueError, match=wrong):
+            scale_of(text)
 
 
 def test_differences_are_in_units_of_the_combined_error() -> None:

@@ -14,7 +14,7 @@ from gmem_jax.files.atomic import probe
 from gmem_jax.files.parts import locked
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import Effect
-from gmem_jax.reproduce.figures import FIGURES, SCALES
+from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import (
     GALLERY,
     PICTURES,
@@ -33,7 +33,10 @@ NAMES = sorted((*FIGURES, *PICTURES, GALLERY, "claims", "choices"))
 
 def reproduce_command(
     what: Annotated[str, typer.Argument(help=f"{', '.join(NAMES)}, or all.")],
-    scale: Annotated[str, typer.Option(help=f"How large and slow: {', '.join(SCALES)}.")] = "laptop",
+    scale: Annotated[
+        str,
+        typer.Option(help=f"How large and slow: {', '.join(SCALES)}; or changed, as in paper,t0=5400,packs=1."),
+    ] = "laptop",
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for pictures, tables and runs.")] = Path(
         "reproduce"
     ),
@@ -48,8 +51,10 @@ def reproduce_command(
     """
     if what not in (*NAMES, "all"):
         raise InputError(f"reproduce {what}: no such figure; there are {', '.join(NAMES)} and all")
-    if scale not in SCALES:
-        raise InputError(f"--scale {scale}: must be one of {', '.join(SCALES)}")
+    try:
+        scale_of(scale)
+    except ValueError as error:
+        raise InputError(f"--scale {scale}: {error}") from None
     if not output.parent.is_dir():
         raise InputError(f"--output {output}: folder {output.parent} does not exist")
     probe(output.parent)

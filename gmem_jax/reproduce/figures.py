@@ -3,8 +3,9 @@
 A figure is a sweep: all figures share one store, so that a point that two of them need is computed once.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from gmem_jax.experiment.experiment import PAPER_T0
@@ -51,6 +52,40 @@ SCALES = {
     "workstation": Scale(5.4e3, 3267, 3, 2, (325, 1024, 3267, 10240), (3, 5, 7), 2, 600.0),
     "paper": Scale(PAPER_T0, 10240, 5, 2, (325, 1024, 3267, 10240, 31680, 100450), (3, 5, 7, 9, 10), 3, 3600.0),
 }
+
+
+def scale_of(text: str, scales: Mapping[str, Scale] = SCALES) -> Scale:
+    """A scale by its name, or with changes: "paper,t0=5400,packs=1,lengths=3+4".
+
+    Args:
+        text: the name, and after commas any of the fields of `Scale` with other numbers; + joins several.
+        scales: that have a name.
+
+    Raises:
+        ValueError: saying what cannot be, and what could.
+    """
+    name, *changes = text.split(",")
+    if name not in scales:
+        raise ValueError(f"no scale {name!r}; there are {', '.join(scales)}")
+    found, known = scales[name], [field.name for field in fields(Scale)]
+    for change in changes:
+        field, _, value = change.partition("=")
+        if field not in known:
+            raise ValueError(f"{change!r} changes nothing of a scale; {', '.join(known)} could, as in {name},packs=1")
+        was = getattr(found, field)
+        wanted: Any
+        try:
+            wanted = tuple(map(int, value.split("+"))) if isinstance(was, tuple) else type(was)(value)
+        except ValueError:
+            raise ValueError(f"{change!r}: must be like {field}={_written(was)}") from None
+        if not all(0.0 < each < math.inf for each in (wanted if isinstance(wanted, tuple) else (wanted,))):
+            raise ValueError(f"{change!r}: must be positive")
+        found = replace(found, **{field: wanted})
+    return found
+
+
+def _written(value: float | tuple[int, ...]) -> str:
+    return "+".join(map(str, value)) if isinstance(value, tuple) else f"{value:g}"
 
 
 class Figure(NamedTuple):

@@ -21,7 +21,7 @@ from gmem_jax.reproduce import choices, claims, draw
 from gmem_jax.reproduce.choices import Effect
 from gmem_jax.reproduce.claims import Verdict
 from gmem_jax.reproduce.compare import Compared, Conditions, Point, compare, compared, points_of, write_csv
-from gmem_jax.reproduce.figures import FIGURES, SCALES, SHOWN_WORD, Figure, Scale, Values, packs, shown_packs, spec_of
+from gmem_jax.reproduce.figures import FIGURES, SHOWN_WORD, Figure, Scale, Values, packs, scale_of, shown_packs, spec_of
 from gmem_jax.reproduce.single_contact import convergence_figure, laws_figure
 from gmem_jax.reproduce.two_grains import two_grains_figure
 from gmem_jax.show.figures import recall_figure
@@ -65,6 +65,11 @@ def _run(spec: Spec, folder: Path, executor: Executor | None, progress: Progress
     return conductor.store
 
 
+def _target(folder: Path, name: str, scale: str, suffix: str = ".png") -> Path:
+    """Where a figure of a scale is written: changes of the scale are in its name."""
+    return folder / f"{name}-{scale.replace(',', '-')}{suffix}"
+
+
 def _failed(store: Store) -> list[str]:
     """Why points of the last sweep failed, in a list as long as they are many."""
     return sorted(reason for row in store.card()["points"] if (reason := store.failed().get(row["key"])))
@@ -88,10 +93,10 @@ def picture(
         target = folder / f"{name}.png"
         say(f"{name}: {PICTURES[name].draw(target) or 'drawn'}")
         return [path for suffix in (".png", ".svg", ".csv") if (path := target.with_suffix(suffix)).is_file()]
-    size = SCALES[scale]
+    size = scale_of(scale)
     spec = Spec(shared={"t0": size.t0}, extra=tuple(shown_packs(size)))
     shown = Conductor(spec, folder / RUNS, say).packs(executor or Processes(), progress)
-    target = folder / f"{name}-{scale}.png"
+    target = _target(folder, name, scale)
     packs_figure(target, shown, "Packs at rest, by size and by shape")
     return [target]
 
@@ -121,14 +126,14 @@ def weigh(
 
     Args and errors are those of `reproduce`.
     """
-    size, folder = choices.SIZES[scale], Path(folder)
+    size, folder = scale_of(scale, choices.SIZES), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     named = packs(size, size.grains, size.few)
     store = _run(Spec(shared={"t0": size.t0}, extra=tuple(choices.points(named))), folder, executor, progress, say)
     done = store.done()
     rows = [row for row in store.card()["points"] if row["key"] in done]
     runs = [(row["values"], summary(*store.load(row["key"]))) for row in rows]
-    found, target = choices.effects(named, runs, size.t0), folder / f"choices-{scale}.png"
+    found, target = choices.effects(named, runs, size.t0), _target(folder, "choices", scale)
     if not found:
         return Weighed([], [], _failed(store))
     choices.write_csv(target.with_suffix(".csv"), found)
@@ -148,7 +153,7 @@ def judge(
 
     Args and errors are those of `reproduce`.
     """
-    size, folder = SCALES[scale], Path(folder)
+    size, folder = scale_of(scale), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (named,) = packs(size, size.grains, 1)
     (spheres,) = packs(size, size.grains, 1, shape="sphere")
@@ -158,7 +163,7 @@ def judge(
     tetra, sphere = (load_pack(runs[place][2]["pack"]) for place in (0, -1))
     own = [(values, recall) for values, recall, _ in runs[:-1]]
     found = claims.verdicts(tetra, size.t0, own, {"sphere": sphere})
-    with atomic(folder / f"claims-{scale}.json") as path:
+    with atomic(_target(folder, "claims", scale, ".json")) as path:
         path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n")
     return found
 
@@ -209,7 +214,7 @@ def reproduce(
     Args:
         name: one of `FIGURES`.
         folder: for them, and for the runs that all figures share.
-        scale: one of `SCALES`.
+        scale: a name of `SCALES`, or one with changes: see `scale_of`.
         executor: does the runs; default processes of this machine.
         progress: told about them.
         say: told in a line what is planned, and what happened.
@@ -220,13 +225,13 @@ def reproduce(
         OSError: if something cannot be written, or no worker started.
     """
     require_x64()
-    if name not in FIGURES or scale not in SCALES:
-        raise ValueError(f"no figure {name!r} at scale {scale!r}; there are {', '.join((*FIGURES, *SCALES))}")
-    size, folder = SCALES[scale], Path(folder)
+    if name not in FIGURES:
+        raise ValueError(f"no figure {name!r}; there are {', '.join(FIGURES)}")
+    size, folder = scale_of(scale), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     store = _run(spec_of(FIGURES[name], size), folder, executor, progress, say)
     points = points_of(store)
-    target = folder / f"{name}-{scale}.png"
+    target = _target(folder, name, scale)
     failed = _failed(store)
     if not points:
         return Outcome(name, [], [], failed)
