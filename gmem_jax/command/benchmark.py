@@ -35,8 +35,8 @@ def bench_command(
     """
     if device == "gpu":
         return _on_gpu(as_json)
-    shipped = [f"tetra-{size}-a" for size in (325, 1024, 3267, 10240)]
-    names = packs.split(",") if packs else [name for name in shipped if name in list_packs()]
+    shipped = {int(name.split("-")[1]): name for name in reversed(list_packs())}
+    names = packs.split(",") if packs else [shipped[size] for size in sorted(shipped)]
     chosen = laws.split(",")
     if unknown := [law for law in chosen if law not in measure.LAWS]:
         raise InputError(f"--laws {unknown[0]}: no such law; there are {', '.join(measure.LAWS)}")

@@ -16,6 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import gmem_jax as gm
+
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 PAGE = ROOT / "docs" / "reliability.md"
@@ -104,7 +106,8 @@ def _trust(found: list[dict[str, Any]]) -> list[str]:
     for row in found:
         away = f"{row['away']:.1e}" if row["away"] else "0"
         lines.append(f"| {row['study']} | {row['value']} | {row['pack']} | {row['G']:.5f} | {row['F']:.5f} | {away} |")
-    return ["Relative to the first row of the same study and pack. More in [trust.md](trust.md).", "", *lines]
+    law = f"with $k_H$ = {gm.Hooke().stiffness:g}"
+    return [f"Relative to the first row of the same study and pack, {law}. More in [trust.md](trust.md).", "", *lines]
 
 
 def page(found: dict[str, dict[str, Any]], minutes: float) -> str:
