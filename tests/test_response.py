@@ -194,6 +194,19 @@ def test_a_kernel_that_is_there_is_not_measured_again(
         gm.design_by_kernel(gm.replace(experiment, gamma0=3e-3), kernel=known)
 
 
+def test_a_design_goes_on_from_an_earlier_one(monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment) -> None:
+    memory_of_another_kernel(monkeypatch, 1.0, 0.6)
+    asked = {"n": 17, "width": 0.2, "damping": 1e-2}
+    first = gm.design_by_kernel(experiment, iterations=3, gain=0.1, **asked)
+    further = gm.design_by_kernel(experiment, iterations=3, start=first.signals, **asked)
+    np.testing.assert_allclose(further.history[1], first.fidelity, rtol=1e-9)  # its samples are met
+    assert further.fidelity > first.fidelity
+    louder = gm.design_by_kernel(experiment, iterations=1, start=first.signals, gain=0.15, **asked)
+    assert louder.history[1] == further.history[1]
+    with pytest.raises(ValueError, match="8 waveforms to start from, for 6 signals"):
+        gm.design_by_kernel(experiment, start=gm.words(3), **asked)
+
+
 def test_all_recalls_of_a_design_begin_where_one_prefix_ended(experiment: gm.Experiment) -> None:
     parts: list[str] = []
 

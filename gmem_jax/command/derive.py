@@ -32,7 +32,8 @@ from gmem_jax.experiment.host import CHUNK, Checkpoint, Keep, within
 from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run_bytes, simulate
 from gmem_jax.experiment.signals import Bumps, Spline
 from gmem_jax.files import schemas
-from gmem_jax.files.configuration import key_of_run, pack_fingerprint, resolved
+from gmem_jax.files.configuration import fingerprint, key_of_run, pack_fingerprint, resolved
+from gmem_jax.files.named import named_signals
 from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
@@ -236,6 +237,10 @@ def design_command(
     gain: Annotated[
         float | None, typer.Option(help="Wanted gain; default at most half of the untouched waveforms'.")
     ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(help="Designed waveforms to make better, as --output wrote them; by the kernel only."),
+    ] = None,
     measured: Annotated[
         int,
         typer.Option(
@@ -267,12 +272,16 @@ def design_command(
         options["measured"] = measured
         effort = by_kernel.cost(experiment, iterations, bumps or by_kernel.BUMPS, measured)
         _announce(experiment, "design", effort, min(count * max(1, measured), options["batch"]))
-    elif measured:
-        raise InputError("--measured: only designs by the kernel measure slopes; use --by kernel")
+        if start is not None:
+            options["start"] = named_signals(str(start))
+    elif measured or start is not None:
+        option = "--measured" if measured else "--start"
+        raise InputError(f"{option}: designs by Jacobians have no use for it; add --by kernel")
     else:
         n = bumps or waveforms.BUMPS
         _announce(experiment, "design", waveforms.cost(experiment, iterations, n), 2 * n * count)
-    with resumable(output, key_of_run(experiment, by=by, **options), restart=restart) as parts:
+    begun = {"start": fingerprint(options["start"])} if start is not None else {}
+    with resumable(output, key_of_run(experiment, by=by, **{**options, **begun}), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             design = by_kernel.design_by_kernel if by == "kernel" else waveforms.design_waveforms
             found = design(experiment, keep=parts, progress=progress, **options)

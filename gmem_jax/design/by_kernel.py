@@ -25,7 +25,7 @@ from gmem_jax.design.waveforms import (
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Keep, Progress, forget, remembering, sharing, silent, under
 from gmem_jax.experiment.recall import PREFIX, prefix_of, run
-from gmem_jax.experiment.signals import Spline
+from gmem_jax.experiment.signals import Signals, Spline
 
 BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
 WIDTH = 0.08  # of them, in u
@@ -78,6 +78,7 @@ def design_by_kernel(
     width: float = WIDTH,
     kernel: MemoryKernel | None = None,
     gain: float | None = None,
+    start: Signals | None = None,
     damping: float = DAMPING,
     measured: int = 0,
     batch: int | None = None,
@@ -92,8 +93,9 @@ def design_by_kernel(
         n: bumps of a designed waveform.
         width: of the bumps.
         kernel: of this pack and drive, if it has been measured before: its bumps are taken.
-        gain: wanted common gain; default half of the untouched waveforms' own, or less, so that the bound |I| <= 1
-            leaves room for what the kernel says is needed.
+        gain: wanted common gain; default that of `start`, or half of the untouched waveforms' own, or less, so that the
+            bound |I| <= 1 leaves room for what the kernel says is needed.
+        start: waveforms that were designed before for the same J, to be made better; default what the kernel says.
         damping: of the first correction, in parts of the kernel's largest singular value.
         measured: directions along which the slopes of a waveform are measured twice on the way, on average: those that
             miss most have most of the runs, up to all n directions, the kernel's strongest first.
@@ -102,10 +104,15 @@ def design_by_kernel(
         progress: told about every chunk.
 
     Raises:
-        ValueError: if the kernel was measured at another gamma0 or delta0, or either differs between replicas.
+        ValueError: if the kernel was measured at another gamma0 or delta0, or either differs between replicas, or there
+            are not as many waveforms to start from as signals.
         RunFailedError: if a simulation broke down.
     """
     refuse_several_scales(experiment)
+    if start is not None and start.count != experiment.signals.count:
+        raise ValueError(
+            f"{start.count} waveforms to start from, for {experiment.signals.count} signals; give one for each"
+        )
     if kernel is not None:
         refuse_another_drive(kernel, experiment)
         n, width = len(kernel.centres), kernel.width
@@ -135,26 +142,34 @@ def design_by_kernel(
             amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, firm), width)
         return amplitudes
 
-    chosen, gain = gain is not None, 0.5 * float(original.gain) if gain is None else gain
-    amplitudes = guess(gain)
-    for _ in range(PREDICTED):  # a guess that is cut off at the bound does not say how much too large it is
-        if chosen or (peak := float(np.max(largest(amplitudes, width)))) <= ROOM:
-            break
-        gain *= ROOM / peak
+    if start is not None:
+        amplitudes = bounded(nearest(sampled(kernel.basis), start), width)  # as they were written
+    elif gain is not None:
         amplitudes = guess(gain)
-    wanted = gain * float(experiment.scale) * target
+    else:
+        gain = 0.5 * float(original.gain)
+        amplitudes = guess(gain)
+        for _ in range(PREDICTED):  # a guess that is cut off at the bound does not say how much too large it is
+            if (peak := float(np.max(largest(amplitudes, width)))) <= ROOM:
+                break
+            gain *= ROOM / peak
+            amplitudes = guess(gain)
 
     def made(rows: np.ndarray) -> Spline:
         """As they are written in the end: at slow rates even the cubics between samples are seen in F."""
         return sampled(bumps(rows, width))
 
     best, p_sig = amplitudes, recall("trial-0", replace(experiment, signals=made(amplitudes)))
-    history = [float(original.fidelity), float(experiment.compare(jnp.asarray(p_sig)).fidelity)]
+    first = experiment.compare(jnp.asarray(p_sig))
+    history = [float(original.fidelity), float(first.fidelity)]
+    wanted = (float(first.gain) if gain is None else gain) * float(experiment.scale) * target
     learned = np.zeros((len(best), *kernel.odd.shape))  # of each waveform's slopes, beyond the kernel
     strongest = np.linalg.svd(kernel.odd)[0].T  # [n, n]
     damped = firm
+    passed = 0.0 if start is None else MEASURED[0]  # what an earlier design has learned already
+    moments = [max(1, int((part - passed) * iterations)) for part in MEASURED]
     for iteration in range(1, iterations):
-        if measured and iteration in [int(part * iterations) for part in MEASURED]:
+        if measured and iteration in moments:
             missed = wanted - p_sig
             # Where the next step would go, and about as far.
             ahead = correction(slopes(kernel, best) + learned, missed, damped) @ strongest.T

@@ -32,6 +32,24 @@ def test_kernel_and_design_write_what_they_say(
     assert {path.name for path in tmp_path.iterdir()} == names
 
 
+def test_a_design_goes_on_from_a_file(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    waves, few, samples = tmp_path / "earlier.csv", tmp_path / "few.csv", 0.3 * np.sin(np.linspace(0.2, 3.0, 8))
+    gm.save_waveforms(few, gm.waveform(samples))
+    gm.save_waveforms(waves, gm.waveform(np.outer(np.ones(6), samples)))
+    assert gmem(monkeypatch, "design", PACK, "--start", waves, *SHORT) == 2
+    assert "--start: designs by Jacobians have no use for it" in capsys.readouterr().err
+    on = ["design", PACK, "--by", "kernel", "--bumps", 5, "--width", 0.4, "--iterations", 1, "--no-picture", *SHORT]
+    assert gmem(monkeypatch, *on, "--start", few) == 2
+    assert "1 waveforms to start from, for 6 signals; give one for each" in capsys.readouterr().err
+    assert gmem(monkeypatch, *on, "--start", waves, "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)["history"]) == 2
+    # Five bumps come near the earlier waveforms, all alike, and nothing was corrected.
+    np.testing.assert_allclose(gm.load_waveforms(tmp_path / "designed.csv")[0].max(), samples.max(), rtol=0.1)
+
+
 def test_gradient_prints_finite_slopes_of_everything(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
