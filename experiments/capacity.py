@@ -33,7 +33,7 @@ from gmem_jax.reading.capacity import candidates, channels, decoded_bits, greedy
 ROUND_OFF = 1e-9  # of p_sig: what another order of grains, skin or instruction set changes (docs/trust.md)
 TIME_STEP = 2e-3  # of p_sig: what a time step four times shorter changes (docs/trust.md)
 FIXED = (1.0, 5.0)  # Pa
-PASCAL = Material().modulus
+PASCAL = float(Material().modulus)
 SHORT = 8  # bits of the words that are simulated, and of whose recall relative noises are parts
 LONGER = {10: 2, 12: 1}  # bits of words that are only predicted, and draws of noise
 USUAL = 1e-3  # gamma0 of the large packs, of longer words and of alphabets
@@ -126,7 +126,8 @@ def noise(name: str, part_of_signal: float) -> Iterator[Found]:
 def carried(kernel: gm.MemoryKernel, deviations: Noises) -> Iterator[Found]:
     """The upper bound at each noise."""
     for name, sd in deviations.items():
-        bits, own = channels(kernel, sd), {"noise": name, "sd_Pa": sd * PASCAL}
+        bits = channels(kernel, sd)
+        own: Found = {"noise": name, "sd_Pa": sd * PASCAL}
         yield {"quantity": "bits", "value": float(bits.sum()), **own}
         yield {"quantity": "channels in use", "value": int(np.sum(bits > 0.0)), **own}
 
@@ -135,7 +136,7 @@ def decoded(signals: np.ndarray, deviations: Noises, draws: int = 4) -> Iterator
     """The lower bound at each noise."""
     for name, sd in deviations.items():
         bits, error = decoded_bits(signals, sd, draws=draws)
-        own = {"S": len(signals), "noise": name, "sd_Pa": sd * PASCAL}
+        own: Found = {"S": len(signals), "noise": name, "sd_Pa": sd * PASCAL}
         yield {"quantity": "bits", "value": bits, "error": error, **own}
 
 
@@ -227,6 +228,9 @@ def draw(table: Table, path: Path) -> None:
                     )
         axis.set(xscale="log", yscale="log", xlabel={"N": "N", "gamma0": r"$\gamma_0$"}[by], ylabel="bits")
         axis.set_ylim(1.0, 5e4)  # room for the legends
+        places = sorted({float(row[by]) for row in table.pick(study="channels", **kept)})
+        axis.set_xticks(places, [f"{place:g}" for place in places])
+        axis.set_xticks([], minor=True)
     for colour, name in enumerate(names):
         axes[0].plot([], [], color=f"C{colour}", label=name)
     for style, label in STYLES.values():

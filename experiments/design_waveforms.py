@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from console import say
 
@@ -27,7 +28,7 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
 
-    histories = {}
+    histories: dict[str, tuple[float, ...]] = {}
     for name in arguments.packs.split(","):
         began = time.perf_counter()
         experiment = gm.Experiment(gm.load_pack(name), gm.six_signals())
@@ -35,8 +36,8 @@ def main() -> None:
         seconds = time.perf_counter() - began
         gm.save_waveforms(arguments.output / f"{name}.csv", design.signals)
         again = gm.waveform(gm.load_waveforms(arguments.output / f"{name}.csv"))
-        p_sig = np.asarray(gm.run(gm.replace(experiment, signals=again)).p_sig)
-        verified, unit = experiment.compare(p_sig).fidelity, float(experiment.scale)
+        p_sig = gm.run(gm.replace(experiment, signals=again)).p_sig
+        verified, unit = experiment.compare(jnp.asarray(p_sig)).fidelity, float(experiment.scale)
         miss = np.linalg.norm(p_sig - design.gain * unit * design.target, axis=1)
         each = 1.0 - miss / np.linalg.norm(p_sig, axis=1)
         print(

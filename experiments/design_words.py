@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from console import say
 from packs import over_packs
@@ -89,16 +90,17 @@ def design(
     every = gm.words(bits)
     words = replace(every, amplitudes=every.amplitudes[number], centres=every.centres[number])
     experiment = gm.replace(any_words, signals=words)
-    options = {"iterations": iterations, "batch": LARGEST_BATCH}
     pack, t0 = experiment.pack.name, float(experiment.t0)
     stem = f"{pack}-{bits}-t0-{t0:g}"
-    parts = Parts(folder / f"{stem}.parts", key_of_run(experiment, **options))
-    found = gm.design_by_kernel(experiment, **options, kernel=kernel, keep=parts, progress=say)
+    parts = Parts(folder / f"{stem}.parts", key_of_run(experiment, iterations=iterations, batch=LARGEST_BATCH))
+    found = gm.design_by_kernel(
+        experiment, iterations=iterations, batch=LARGEST_BATCH, kernel=kernel, keep=parts, progress=say
+    )
     gm.save_waveforms(folder / f"{stem}.csv", found.signals, words)
     templates = bin_average(every)
     row: Row = {"pack": pack, "bits": bits, "words": len(number), "t0": t0, "iterations": iterations}
     for when, p_sig in (("untouched", found.untouched), ("designed", found.p_sig)):
-        match = experiment.compare(p_sig)
+        match = experiment.compare(jnp.asarray(p_sig))
         row |= {
             f"F {when}": round(float(match.fidelity), 4),
             f"G {when}": round(float(match.gain), 4),

@@ -1,4 +1,4 @@
-"""The tables of docs/results/README.md from the files beside it, as `gmem reproduce` wrote them.
+"""The tables of docs/results/README.md, as `gmem reproduce` wrote them, and of docs/remember_more.md, of words.
 
 python experiments/results_page.py
 """
@@ -7,9 +7,12 @@ import csv
 import json
 from pathlib import Path
 
+from packs import over_packs
+
+from gmem_jax.show.tables import published
+
 HERE = Path(__file__).parent.parent / "docs" / "results"
 BEGIN, END = "<!-- made by experiments/results_page.py -->", "<!-- end -->"
-ALWAYS = ("measure", "mean", "sd", "packs")
 
 
 def table(path: Path) -> list[str]:
@@ -49,12 +52,46 @@ def choices(path: Path) -> list[str]:
     return lines
 
 
+def designed_words(path: Path) -> list[str]:
+    """What `design_words.py` wrote as Markdown, mean and SD over packs of a size."""
+    columns = ("net untouched", "net designed", "template designed", "F untouched", "F designed")
+    head = ["N", "L", "packs x words", "read by the net as they come", "designed", "nearest template, designed"]
+    head += ["F as they come", "designed", "published: net, F"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    theirs = {
+        row["word_bits"]: f"{row['classifier_accuracy']:g}, {row['fidelity_sub0']}"
+        for row in published("binary_words.csv")
+    }
+    theirs[9] = "0.91"  # in the paper's text
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    for grains, bits in sorted({(_grains(row), int(row["bits"])) for row in rows}):
+        own = [row for row in rows if (_grains(row), int(row["bits"])) == (grains, bits)]
+        counts = [f"{grains:,}", str(bits), f"{len(own)} x {own[0]['words']}"]
+        shown = []
+        for column in columns:
+            _, (mean,), (deviation,) = over_packs(own, "bits", column)
+            shown.append(f"{mean:.2f}" + (f" ± {deviation:.2f}" if len(own) > 1 else ""))
+        lines.append(f"| {' | '.join([*counts, *shown, theirs.get(bits, '')])} |")
+    return lines
+
+
+def _grains(row: dict[str, str]) -> int:
+    return int(row["pack"].split("-")[1])
+
+
 def _with(mean: str, deviation: str) -> str:
     return f"{float(mean):.3f}" + (f" ± {float(deviation):.3f}" if deviation else "")
 
 
+def put(lines: list[str], page: Path) -> None:
+    """Write lines between the marks of a page."""
+    before, _, rest = page.read_text().partition(BEGIN)
+    page.write_text(f"{before}{BEGIN}\n\n" + "\n".join(lines) + f"{END}{rest.partition(END)[2]}")
+
+
 def main() -> None:
-    """Put all of them between the marks of the page."""
+    """Put all of them between the marks of their pages."""
     lines = []
     for folder in sorted(path for path in HERE.iterdir() if path.is_dir()):
         for path in sorted(folder.glob("claims-*.json")):
@@ -70,9 +107,8 @@ def main() -> None:
                 lines += [*choices(numbers), ""]
             elif numbers.is_file():
                 lines += [*table(numbers), ""]
-    page = HERE / "README.md"
-    before, _, rest = page.read_text().partition(BEGIN)
-    page.write_text(f"{before}{BEGIN}\n\n" + "\n".join(lines) + f"{END}{rest.partition(END)[2]}")
+    put(lines, HERE / "README.md")
+    put([*designed_words(HERE / "designed_words.csv"), "", ""], HERE.parent / "remember_more.md")
 
 
 if __name__ == "__main__":

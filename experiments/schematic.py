@@ -33,13 +33,13 @@ def waveform(u: np.ndarray) -> np.ndarray:
     """I(u): two bumps."""
     places = [(u - centre) / WIDTH for centre in CENTRES]
     bumps = [np.where(np.abs(x) < 0.5, np.cos(np.pi * x), 0.0) for x in places]
-    return sum(height * bump for height, bump in zip(HEIGHTS, bumps, strict=True))
+    return np.asarray(HEIGHTS) @ bumps
 
 
 def integral(u: np.ndarray) -> np.ndarray:
     """J(u)."""
     fine = np.linspace(0.0, 1.0, 4001)
-    return np.interp(u, fine, np.cumsum(waveform(fine)) * (fine[1] - fine[0]))
+    return np.asarray(np.interp(u, fine, np.cumsum(waveform(fine)) * (fine[1] - fine[0])))
 
 
 def grains(axis: Axes, half: Sequence[float]) -> None:

@@ -1,6 +1,6 @@
 """Pictures. Matplotlib is imported on first use, and without a display."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +124,7 @@ def kernel_figure(path: Path, kernel: MemoryKernel, noise: float, title: str) ->
     save(path, figure)
 
 
-def history_figure(path: Path, histories: dict[str, Sequence[float]]) -> None:
+def history_figure(path: Path, histories: Mapping[str, Sequence[float]]) -> None:
     """1 - F against iterations.
 
     Raises:
