@@ -247,6 +247,7 @@ def draw(table: Table, path: Path) -> None:
             axes[2].plot(*points(table.pick(study=study, quantity="nearest two (Pa)", pack=pack, gamma0=usual)),
                          marker, color=f"C{colour}", ms=6)  # fmt: skip
     axes[2].set(xscale="log", yscale="log", xlabel="waveforms S", ylabel="nearest two recalls apart (Pa, rms)")
+    axes[2].set_ylim(top=3.0 * axes[2].get_ylim()[1])  # room for the legend
     axes[2].set_title("predicted; full: simulated", fontsize=9)
     axes[2].legend(fontsize=7, frameon=False)
     figure.tight_layout()
