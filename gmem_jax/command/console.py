@@ -144,11 +144,14 @@ def _reporting() -> Iterator[Progress]:
     if not log.is_terminal:
         told, at = "", -math.inf
         first: tuple[float, float] | None = None  # when the first chunk was done: what came before is compiling
+        last = 0.0
 
         def line(stage: str, moment: float, fraction: float) -> None:
-            nonlocal told, at, first
+            nonlocal told, at, first, last
             now = time.perf_counter()
-            first = first or (now, fraction)
+            if first is None or fraction < last:  # less than before: another pass has begun, as points after packs
+                first = now, fraction
+            last = fraction
             if stage == told and now - at < EVERY:
                 return
             told, at = stage, now
@@ -162,6 +165,10 @@ def _reporting() -> Iterator[Progress]:
     times = (progress.TimeElapsedColumn(), progress.TextColumn("ETA"), progress.TimeRemainingColumn())
     with progress.Progress(*columns, *times, console=log) as bar:
         task = bar.add_task("compiling", total=1.0)
-        yield lambda stage, moment, fraction: bar.update(
-            task, completed=fraction, description=f"{stage}, t = {moment:.0f} t_c" if moment else stage
-        )
+
+        def move(stage: str, moment: float, fraction: float) -> None:
+            if fraction < bar.tasks[task].completed:
+                bar.reset(task)
+            bar.update(task, completed=fraction, description=f"{stage}, t = {moment:.0f} t_c" if moment else stage)
+
+        yield move
