@@ -14,7 +14,7 @@ import gmem_jax as gm
 from gmem_jax.experiment.host import silent
 from gmem_jax.reproduce import claims, figures
 from gmem_jax.reproduce import run as reproducing
-from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, Point, compare, compared
+from gmem_jax.reproduce.compare import Conditions, Estimate, Point, compare, compared
 from gmem_jax.reproduce.draw import power
 from gmem_jax.reproduce.figures import FIGURES, SCALES, Figure, packs, scale_of, spec_of
 from gmem_jax.sweeps.executors import Executor
@@ -94,11 +94,20 @@ def test_fast_drives_count_after_averaging_over_the_ringing() -> None:
 
 
 def test_the_exponent_of_a_power_law() -> None:
-    def row(grains: int, gain: float) -> Compared:
-        return Compared(replace(STANDARD, grains=grains), "G", Estimate(gain, 0.0, 2), None, 0, 0)
-
-    assert power([row(n, 0.2 * n**0.08) for n in (325, 1024, 3267)]) == pytest.approx(0.08)
-    assert math.isnan(power([row(325, 0.2)]))
+    exact = {n: Estimate(0.2 * n**0.08, math.nan, 1) for n in (325, 1024, 3267)}
+    exponent, error = power(exact)
+    assert exponent == pytest.approx(0.08)
+    assert math.isnan(error)
+    assert all(map(math.isnan, power({325: Estimate(0.2, 0.1, 4)})))
+    # Two sizes: the difference of two logarithms, with their relative errors 0.03 and 0.04 in quadrature.
+    exponent, error = power({100: Estimate(0.2, 0.012, 4), 10000: Estimate(0.3, 0.024, 4)})
+    assert exponent == pytest.approx(math.log(1.5) / math.log(100.0))
+    assert error == pytest.approx(0.05 / math.log(100.0))
+    # What is known badly hardly counts.
+    exponent, _ = power(
+        {**exact, 10240: Estimate(0.8, 8.0, 4)} | {n: e._replace(sd=1e-4, packs=4) for n, e in exact.items()}
+    )
+    assert exponent == pytest.approx(0.08, abs=1e-6)
 
 
 @pytest.mark.parametrize("scale", SCALES)

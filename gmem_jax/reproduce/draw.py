@@ -1,7 +1,7 @@
 """The figures as pictures: ours with error bars, the published points as stars."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from gmem_jax.experiment.signals import words as all_words
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.sample import Sample
 from gmem_jax.reading.readers import stored_words
-from gmem_jax.reproduce.compare import Compared, Conditions
+from gmem_jax.reproduce.compare import Compared, Conditions, Estimate
 from gmem_jax.show.figures import pyplot, save
 
 LABELS = {
@@ -87,11 +87,10 @@ def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str
     axis.errorbar(
         x, y, error, color=colour, marker=symbol, markersize=4, capsize=3, linewidth=1, ls=joined, label=label
     )
-    for grains in sorted({row.grains for row in rows if row.theirs}):
-        theirs = [(row, row.theirs) for row in rows if row.theirs and row.grains == grains]
-        same = all(row.conditions.grains == grains for row, _ in theirs)
+    for grains, theirs in _published(rows, across).items():
+        same = across == "grains" or all(row.conditions.grains == grains for row, _ in theirs)
         axis.errorbar(
-            [_place(row, across, words) for row, _ in theirs],
+            [row.grains if across == "grains" else _place(row, across, words) for row, _ in theirs],
             [estimate.mean for _, estimate in theirs],
             [np.nan_to_num(estimate.error) for _, estimate in theirs],
             color=colour,
@@ -100,8 +99,17 @@ def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str
             markerfacecolor=colour if same else "none",
             capsize=2,
             ls="none",
-            label=f"published, N = {grains:,} (mean ± SE)",
+            label=f"published, N = {grains:,} (mean ± SE)" if grains else "published (mean ± SE)",
         )
+
+
+def _published(rows: Sequence[Compared], across: str) -> dict[int, list[tuple[Compared, Estimate]]]:
+    """The published points of a curve by their N; where N is the axis, each once, under 0."""
+    known = [(row, row.theirs) for row in rows if row.theirs]
+    if across == "grains":
+        return {0: list({row.grains: (row, theirs) for row, theirs in known}.values())} if known else {}
+    sizes = sorted({row.grains for row, _ in known})
+    return {grains: [pair for pair in known if pair[0].grains == grains] for grains in sizes}
 
 
 def _axis(axis: Any, across: str, words: Sequence[str], label: str) -> None:
@@ -116,22 +124,46 @@ def _axis(axis: Any, across: str, words: Sequence[str], label: str) -> None:
         axis.xaxis.get_major_locator().set_params(integer=True)
     if across in LOGARITHMIC:
         axis.set_xscale("log")
+        # Few places, less than decades apart: each is named, where matplotlib would write 3 x 10^2 over 4 x 10^2.
+        places = sorted({float(x) for line in axis.get_lines() for x in np.atleast_1d(line.get_xdata())})
+        axis.set_xticks(places, [f"{x:,.0f}" if x >= 1.0 else f"{x:g}" for x in places])
+        axis.set_xticks([], minor=True)
 
 
-def power(rows: Sequence[Compared], published: bool = False) -> float:
-    """The exponent of G ~ N^k by least squares over sizes; NaN for fewer than two."""
-    both = [(row.conditions.grains, row.theirs if published else row.ours, row) for row in rows if row.measure == "G"]
-    known = [(n, e.mean) for n, e, row in both if e is not None and (not published or row.grains == n) and e.mean > 0.0]
-    if len({n for n, _ in known}) < 2:
-        return math.nan
-    size, gain = np.log(np.array(known, float)).T
-    return float(np.polyfit(size, gain, 1)[0])
+def power(sizes: Mapping[int, Estimate]) -> tuple[float, float]:
+    """The exponent k of G ~ N^k by least squares, and its standard error.
+
+    Args:
+        sizes: G by N. If all have a standard error they count by it; else alike, and the exponent has none (NaN).
+
+    Returns:
+        Exponent and error; NaN for fewer than two sizes.
+    """
+    if len(sizes) < 2:
+        return math.nan, math.nan
+    size, mean = np.log(list(sizes)), np.array([estimate.mean for estimate in sizes.values()])
+    relative = np.array([estimate.error for estimate in sizes.values()]) / mean
+    weighed = bool(np.all(relative > 0.0))
+    weights = 1.0 / relative if weighed else np.ones_like(mean)
+    centred = size - np.average(size, weights=weights**2)
+    spread = np.sum((weights * centred) ** 2)
+    slope = np.sum(weights**2 * centred * np.log(mean)) / spread
+    return float(slope), float(1.0 / np.sqrt(spread)) if weighed else math.nan
 
 
 def _power_law(axis: Any, rows: Sequence[Compared]) -> None:
-    ours, theirs = power(rows), power(rows, published=True)
+    from matplotlib.ticker import MaxNLocator
+
+    of_both = {"ours": {row.conditions.grains: row.ours for row in rows}}
+    of_both["published"] = {row.grains: row.theirs for row in rows if row.theirs}
+    said = []
+    for whose, sizes in of_both.items():
+        exponent, error = power(sizes)
+        said.append(f"{whose} $N^{{{exponent:.3f}}}$" + ("" if math.isnan(error) else f" (± {error:.3f})"))
     axis.set_yscale("log")
-    axis.set_title(f"ours $N^{{{ours:.3f}}}$, published points here $N^{{{theirs:.3f}}}$", fontsize=8)
+    axis.set_yticks(ticks := MaxNLocator(5).tick_values(*axis.get_ylim()), [f"{tick:g}" for tick in ticks])
+    axis.set_yticks([], minor=True)
+    axis.set_title(", ".join(said), fontsize=8)
 
 
 def through_time(path: Path, recall: Recall, signal: int, title: str) -> None:
