@@ -90,23 +90,42 @@ def put(lines: list[str], page: Path) -> None:
     page.write_text(f"{before}{BEGIN}\n\n" + "\n".join(lines) + f"{END}{rest.partition(END)[2]}")
 
 
+def heading(name: str, scale: str) -> list[str]:
+    """Over a figure: which, at which scale, and by what command."""
+    what = f"Fig. {name.removeprefix('fig').lstrip('0')}" if name.startswith("fig") else name.capitalize()
+    named, *changes = scale.split("-")
+    command = f"`gmem reproduce {name}" + (f" --scale {','.join([named, *changes])}`" if named else "`")
+    return [f"## {', '.join(filter(None, [what, named, *changes]))}", "", command, ""]
+
+
+def verdicts(path: Path) -> list[str]:
+    """What was found of the claims as Markdown."""
+    lines = ["| claim | holds | numbers |", "|---|---|---|"]
+    for verdict in json.loads(path.read_text()):
+        lines.append(f"| {verdict['claim']} | {'yes' if verdict['holds'] else 'no'} | {verdict['numbers']} |")
+    return lines
+
+
+def figure(picture: Path) -> list[str]:
+    """A picture and its numbers, if it has any."""
+    numbers = picture.with_suffix(".csv")
+    lines = [f"![{picture.stem}]({picture.relative_to(HERE)})", ""]
+    if not numbers.is_file():
+        return lines
+    return [*lines, *(choices if picture.stem.startswith("choices") else table)(numbers), ""]
+
+
 def main() -> None:
-    """Put all of them between the marks of their pages."""
+    """Put all of them between the marks of their pages: figure by figure, the largest scale first."""
+    shown = []
+    for place, folder in enumerate(("paper", "workstation", "laptop")):
+        for path in (HERE / folder).iterdir():
+            name, _, scale = path.stem.partition("-")
+            if path.suffix == ".png" or name == "claims":
+                shown.append(((not name.startswith("fig"), name, place, scale), path))
     lines = []
-    for folder in sorted(path for path in HERE.iterdir() if path.is_dir()):
-        for path in sorted(folder.glob("claims-*.json")):
-            lines += [f"## Claims, {folder.name}", "", "| claim | holds | numbers |", "|---|---|---|"]
-            for verdict in json.loads(path.read_text()):
-                said = "yes" if verdict["holds"] else "no"
-                lines.append(f"| {verdict['claim']} | {said} | {verdict['numbers']} |")
-            lines.append("")
-        for picture in sorted((*folder.glob("choices-*.png"), *folder.glob("fig*.png"))):
-            name, numbers = picture.stem, picture.with_suffix(".csv")
-            lines += [f"## {name}", "", f"![{name}]({picture.relative_to(HERE)})", ""]
-            if name.startswith("choices"):
-                lines += [*choices(numbers), ""]
-            elif numbers.is_file():
-                lines += [*table(numbers), ""]
+    for (_, name, _, scale), path in sorted(shown):
+        lines += [*heading(name, scale), *([*verdicts(path), ""] if name == "claims" else figure(path))]
     put(lines, HERE / "README.md")
     put([*designed_words(HERE / "designed_words.csv"), "", ""], HERE.parent / "remember_more.md")
 

@@ -109,6 +109,20 @@ def test_every_background_is_reported_with_its_own_gain_and_fidelity() -> None:
     np.testing.assert_allclose(rows["sub2-bl"].fidelity, analysis.compare(alone, J, SCALE).fidelity, rtol=1e-6)
 
 
+def test_averaging_over_a_window_removes_what_rings_in_it_from_every_background() -> None:
+    integral, period = J[3:], 8.5  # both are zero at the ends, so that the line of SUB2-BL takes nothing of them
+    signal = 0.3 * SCALE * integral
+    ringing = 0.2 * jnp.max(signal) * jnp.sin(2.0 * jnp.pi * jnp.arange(256) / period)
+    first = -jnp.concatenate([jnp.zeros((1, 256)), signal + ringing])
+    second = jnp.zeros_like(first)
+    raw = analysis.backgrounds(first, second, integral, SCALE)
+    smooth = analysis.backgrounds(first, second, integral, SCALE, period / 256.0)
+    for name in analysis.BACKGROUNDS:
+        assert float(raw[name].fidelity) < 0.8 < 0.97 < float(smooth[name].fidelity)
+        p_sig, wanted = (RUNNING_MEAN(series, period) for series in (analysis.subtract(name, first, second), integral))
+        np.testing.assert_allclose(smooth[name], analysis.compare(p_sig, wanted, SCALE), rtol=1e-9)
+
+
 def test_correlation_is_the_cosine_between_signal_and_integral() -> None:
     np.testing.assert_allclose(analysis.correlation(-3.0 * J, J), -np.ones(6), rtol=1e-14)
     angle = 0.3

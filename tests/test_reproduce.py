@@ -93,6 +93,15 @@ def test_fast_drives_count_after_averaging_over_the_ringing() -> None:
     assert found[0]["F"].status == 4
 
 
+def test_so_do_words_by_every_background() -> None:
+    of = {"gain": 0.3, "fidelity": 0.72, "windowed_gain": 0.31, "windowed_fidelity": 0.78}
+    numbers = {**of, "status": 0, "backgrounds": {"sub0": {**of, "windowed_fidelity": 0.77}, "sub2-bl": of}}
+    words = replace(STANDARD, bits=3, background="sub2-bl")
+    for t0, expected in ((5.4e3, {"sub0": 0.77, "sub2-bl": 0.78}), (1.8e4, {"sub0": 0.72, "sub2-bl": 0.72})):
+        rows = [row for row in compare([Point(words, numbers, "k")], t0) if row.measure == "F"]
+        assert {row.conditions.background: row.ours.mean for row in rows} == expected
+
+
 def test_the_exponent_of_a_power_law() -> None:
     exact = {n: Estimate(0.2 * n**0.08, math.nan, 1) for n in (325, 1024, 3267)}
     exponent, error = power(exact)

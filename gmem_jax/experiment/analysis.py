@@ -10,6 +10,8 @@ import numpy as np
 
 from gmem_jax.physics.pytree import Scalar
 
+MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
+"""What is said of every recall: G and F of the set, and both averaged over the ringing period (`compare`)."""
 BACKGROUNDS = ("sub0", "sub2", "sub2-bl")
 """Ways to remove the background: the zero signal's run; the same run's second readout; that without its line."""
 
@@ -55,14 +57,17 @@ class Match(NamedTuple):
     fidelity: jax.Array
 
 
-def compare(signal: jax.Array, integral: jax.Array, scale: Scalar) -> Match:
+def compare(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None) -> Match:
     """Gain and fidelity of a set of signals (paper, Sec. II).
 
     Args:
         signal: p_sig, [S, bins], in E.
         integral: J, bin-averaged like p_sig, [S, bins].
         scale: delta0 gamma0; scalar or [S, 1].
+        window: part of u over which both are averaged before; the ringing period over t0 removes what rings.
     """
+    if window is not None:
+        signal, integral = (running_mean(series, window * series.shape[-1]) for series in (signal, integral))
     template = scale * integral
     gain = jnp.sum(template * signal) / jnp.sum(template * template)
     miss = jnp.sum((signal - gain * template) ** 2)
@@ -92,7 +97,9 @@ def errors_over_signals(signal: np.ndarray, integral: np.ndarray, scale: np.ndar
     return float(gain), float(fidelity)
 
 
-def backgrounds(first: jax.Array, second: jax.Array, integral: jax.Array, scale: Scalar) -> dict[str, Match]:
+def backgrounds(
+    first: jax.Array, second: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None
+) -> dict[str, Match]:
     """Gain and fidelity of the set by each of `BACKGROUNDS`, from a run with a second readout.
 
     Args:
@@ -100,8 +107,9 @@ def backgrounds(first: jax.Array, second: jax.Array, integral: jax.Array, scale:
         second: p_xy of the second readout, alike.
         integral: J, [S, bins].
         scale: delta0 gamma0; scalar or [S, 1].
+        window: of `compare`.
     """
-    return {name: compare(subtract(name, first, second), integral, scale) for name in BACKGROUNDS}
+    return {name: compare(subtract(name, first, second), integral, scale, window) for name in BACKGROUNDS}
 
 
 def correlation(signal: jax.Array, integral: jax.Array) -> jax.Array:

@@ -120,11 +120,8 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
     sound = jnp.where(jnp.any(status & ~int(DOUBTFUL)), jnp.nan, 1.0)
     p_sig = sound * experiment.recalled({name: stages[name].pressure for name in stages if "readout" in name})
     integral = experiment.integral()
-    window = pack.ringing_period * BINS / jnp.max(jnp.asarray(t0))
     match = experiment.compare(p_sig)
-    smooth = analysis.compare(
-        analysis.running_mean(p_sig, window), analysis.running_mean(integral, window), experiment.scale
-    )
+    smooth = analysis.compare(p_sig, integral, experiment.scale, pack.ringing_period / jnp.max(jnp.asarray(t0)))
     u = (jnp.arange(BINS) + 0.5) / BINS
     return Recall(
         u=u,

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import BINS
 from gmem_jax.files.atomic import FileFormatError
@@ -33,7 +34,6 @@ from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Status
 
 _OLDEST = "gmem-recall/1"
-_MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity", "window")
 _EVERY_BIT = int(sum(Status))
 
 
@@ -168,7 +168,7 @@ def _check(recall: Recall) -> None:
         (recall.window > 0.0) & np.all(np.asarray(recall.dt) > 0.0), "its time step or ringing period is not positive"
     )
     if not np.any(status & ~int(DOUBTFUL)):
-        measured = {name: getattr(recall, name) for name in ("p_sig", *_MEASURES, "residual_speed")}
+        measured = {name: getattr(recall, name) for name in ("p_sig", *MEASURES, "window", "residual_speed")}
         require_finite(measured)
     if "readout" not in recall.stages:
         raise FileFormatError("incomplete file, the stage 'readout' is missing")

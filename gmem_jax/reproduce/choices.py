@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.files.atomic import atomic
-from gmem_jax.reproduce.compare import RINGS, Estimate
+from gmem_jax.reproduce.compare import Estimate, counted
 from gmem_jax.reproduce.figures import SCALES, Scale, Values, crossed
 from gmem_jax.show.figures import pyplot, save
 
@@ -93,7 +93,6 @@ def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]
         runs: values of points and summaries of their recalls (`show.tables.summary`); points that failed are missing.
         t0: at which they were run: below the paper's, G and F are those after averaging over the ringing period.
     """
-    windowed = "windowed_" if t0 < RINGS else ""
     known = list(runs)
 
     def at(pack: Values, values: Values) -> dict[str, Any] | None:
@@ -105,12 +104,12 @@ def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]
             both = [(at(pack, choice.shared), at(pack, _values(choice, value))) for pack in packs]
             pairs = [(default, tried) for default, tried in both if default and tried]
             if pairs:
-                found.append(_effect(choice, value, pairs, windowed))
+                found.append(_effect(choice, value, pairs, t0))
     return found
 
 
-def _effect(choice: Choice, value: Any, pairs: Sequence[tuple[Any, Any]], windowed: str) -> Effect:
-    gain, fidelity = f"{windowed}gain", f"{windowed}fidelity"
+def _effect(choice: Choice, value: Any, pairs: Sequence[tuple[Any, Any]], t0: float) -> Effect:
+    gain, fidelity = counted(t0)
     of_gain = [tried[gain] / default[gain] - 1.0 for default, tried in pairs]
     of_fidelity = [tried[fidelity] - default[fidelity] for default, tried in pairs]
     own = [_estimate([tried[name] for _, tried in pairs]) for name in (gain, fidelity)]

@@ -128,14 +128,17 @@ def points_of(store: Store) -> list[Point]:
     return found
 
 
+def counted(t0: float) -> tuple[str, str]:
+    """The names of the gain and the fidelity that count at a rate: where it rings, those averaged over the ringing."""
+    return ("windowed_gain", "windowed_fidelity") if t0 < RINGS else ("gain", "fidelity")
+
+
 def _measures(point: Point, t0: float) -> dict[Conditions, tuple[float, float]]:
     """G and F of a point by its conditions: one for every background that it has."""
     at = asdict(point.conditions)
-    if "backgrounds" in point.numbers:
-        rows = point.numbers["backgrounds"].items()
-        return {Conditions(**{**at, "background": name}): (row["gain"], row["fidelity"]) for name, row in rows}
-    windowed = "windowed_" if t0 < RINGS else ""
-    return {point.conditions: (point.numbers[f"{windowed}gain"], point.numbers[f"{windowed}fidelity"])}
+    rows = point.numbers.get("backgrounds", {point.conditions.background: point.numbers})
+    gain, fidelity = counted(t0)
+    return {Conditions(**{**at, "background": name}): (row[gain], row[fidelity]) for name, row in rows.items()}
 
 
 def compare(points: Iterable[Point], t0: float) -> list[Compared]:

@@ -9,13 +9,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.analysis import BACKGROUNDS
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import Bumps, six_signals
 from gmem_jax.experiment.signals import words as all_words
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.sample import Sample
 from gmem_jax.reading.readers import stored_words
-from gmem_jax.reproduce.compare import Compared, Conditions, Estimate
+from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, counted
 from gmem_jax.show.figures import pyplot, save
 
 LABELS = {
@@ -30,16 +31,21 @@ PANELS = {"F": "fidelity F", "G": "gain G", "accuracy": "part of the words read 
 LOGARITHMIC = ("gamma0", "grains")
 SYMBOLS = "osD^v<>pPX"
 VECTOR = (".svg",)
+TINT = 0.3  # of the stars of the same N; those of another are empty
 
 
 def _panel(measure: str) -> str:
     return PANELS[measure.split()[0]]
 
 
+def _written(value: str) -> str:
+    return value.upper() if value in BACKGROUNDS else value
+
+
 def _series(row: Compared, across: str, varied: Sequence[str]) -> str:
     """What tells a row's curve from the others."""
     at = asdict(row.conditions)
-    shown = [f"{name} = {at[name]:g}" if isinstance(at[name], float | int) else str(at[name]) for name in varied]
+    shown = [f"{name} = {at[name]:g}" if isinstance(at[name], float | int) else _written(at[name]) for name in varied]
     reader = [" ".join(row.measure.split()[1:])]
     return ", ".join(filter(None, [*shown, *reader])) or "gmem_jax"
 
@@ -65,6 +71,7 @@ def against(path: Path, rows: Sequence[Compared], across: str, title: str) -> No
             curves.setdefault(_series(row, across, varied), []).append(row)
         for place, (label, members) in enumerate(curves.items()):
             _curve(axis, members, across, words, label, place)
+        _say_published(axis, inside, across)
         _axis(axis, across, words, panel)
         if across == "grains" and panel == PANELS["G"]:
             _power_law(axis, [row for members in curves.values() for row in members])
@@ -88,7 +95,6 @@ def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str
         x, y, error, color=colour, marker=symbol, markersize=4, capsize=3, linewidth=1, ls=joined, label=label
     )
     for grains, theirs in _published(rows, across).items():
-        same = across == "grains" or all(row.conditions.grains == grains for row, _ in theirs)
         axis.errorbar(
             [row.grains if across == "grains" else _place(row, across, words) for row, _ in theirs],
             [estimate.mean for _, estimate in theirs],
@@ -96,11 +102,24 @@ def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str
             color=colour,
             marker="*",
             markersize=10,
-            markerfacecolor=colour if same else "none",
+            markeredgecolor=colour,
+            markerfacecolor=(colour, TINT) if _same_size(grains, theirs) else "none",
             capsize=2,
             ls="none",
-            label=f"published, N = {grains:,} (mean ± SE)" if grains else "published (mean ± SE)",
+            zorder=1.9,  # ours over it
         )
+
+
+def _say_published(axis: Any, rows: Sequence[Compared], across: str) -> None:
+    """One line of the legend for the stars of all curves, whatever their colour."""
+    for grains, theirs in _published(rows, across).items():
+        face = ("0.4", TINT) if _same_size(grains, theirs) else "none"
+        said = f"published, N = {grains:,} (mean ± SE)" if grains else "published (mean ± SE)"
+        axis.plot([], [], "*", color="0.4", markersize=10, markeredgecolor="0.4", markerfacecolor=face, label=said)
+
+
+def _same_size(grains: int, theirs: Sequence[tuple[Compared, Estimate]]) -> bool:
+    return not grains or all(row.conditions.grains == grains for row, _ in theirs)
 
 
 def _published(rows: Sequence[Compared], across: str) -> dict[int, list[tuple[Compared, Estimate]]]:
@@ -257,7 +276,8 @@ def words(
     unit = Material().modulus
     for line, (recall, configuration), chosen in zip(axes, recalls, shown, strict=True):
         stored = stored_words(recall)
-        scale = unit * float(recall.gain) * configuration["delta0"] * configuration["gamma0"]
+        gain, fidelity = (float(getattr(recall, name)) for name in counted(configuration["t0"]))
+        scale = unit * gain * configuration["delta0"] * configuration["gamma0"]
         for axis, word in zip(line, chosen, strict=False):
             axis.axhline(0.0, color="0.8", linewidth=0.8)
             axis.plot(recall.u, unit * stored.signals[word], linewidth=1.0, label="recalled, SUB2-BL")
@@ -267,7 +287,7 @@ def words(
             axis.set_title(f"{word:0{stored.bits}b}", fontsize=8)
         for axis in line[len(chosen) :]:
             axis.set_visible(False)
-        line[0].set_ylabel(f"L = {stored.bits}\nF = {float(recall.fidelity):.2f}\nstress (Pa)", fontsize=8)
+        line[0].set_ylabel(f"L = {stored.bits}\nF = {fidelity:.2f}\nstress (Pa)", fontsize=8)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=7, frameon=False, loc="upper right", ncols=2)
     for axis in axes[-1]:
         axis.set_xlabel("u")

@@ -9,6 +9,7 @@ import numpy as np
 
 from gmem_jax.design.kernel import MemoryKernel
 from gmem_jax.design.stored import load_kernel
+from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.experiment.signals import waveform
 from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.checked import is_number, refusing
@@ -224,4 +225,4 @@ def sweep_pictures(store: Store) -> dict[str, Draw]:
     def draw(measure: str, path: Path) -> None:
         pictures.sweep_drawing(table.rows(store), store.card()["names"], measure, store.folder.name).save(path)
 
-    return {measure: functools.partial(draw, measure) for measure in sorted(table.MEASURES)}
+    return {measure: functools.partial(draw, measure) for measure in sorted(MEASURES)}

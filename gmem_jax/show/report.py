@@ -325,11 +325,10 @@ class Report:
         store = Store(folder)
         card, rows = store.card(), points_of(store)
         names = card["names"]
-        measured = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
         cells = [
             [
                 *(tables.cell(row[name]) for name in names),
-                *("" if row[name] is None else f"{row[name]:.3f}" for name in measured),
+                *("" if row[name] is None else f"{row[name]:.3f}" for name in analysis.MEASURES),
                 row["why"] or ("ok" if row["state"] == "done" else row["state"]),
             ]
             for row in rows

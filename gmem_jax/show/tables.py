@@ -107,8 +107,10 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
         return {}
     first, second = (analysis.recalled(recall.stages[name].pressure) for name in ("readout", "readout-2"))
     scale = relative_scale(configuration)
-    matches = analysis.backgrounds(first, second, recall.J, scale)
-    rows = {name: {"gain": float(match.gain), "fidelity": float(match.fidelity)} for name, match in matches.items()}
+    rows: dict[str, dict[str, float]] = {name: {} for name in analysis.BACKGROUNDS}
+    for prefix, window in (("", None), ("windowed_", recall.window / np.max(configuration["t0"]))):
+        for name, match in analysis.backgrounds(first, second, recall.J, scale, window).items():
+            rows[name] |= {f"{prefix}gain": float(match.gain), f"{prefix}fidelity": float(match.fidelity)}
     correlation, left = (spread(values) for values in analysis.remembered_after(second, recall.J, scale))
     rest = {"correlation": correlation[0], "correlation_se": correlation[2], "gain": left[0], "gain_se": left[2]}
     return {"backgrounds": rows, "second_readout": rest}
@@ -127,10 +129,10 @@ def recall_lines(row: dict[str, Any], configuration: dict[str, Any]) -> list[Any
 def backgrounds_table(row: dict[str, Any]) -> Table:
     """Gain and fidelity by each background, from the `summary` of a recall with a second readout."""
     table = Table(title="By background")
-    for column in ("background", "G", "F"):
+    for column in ("background", "G", "F", "G over T1", "F over T1"):
         table.add_column(column, justify="left" if column == "background" else "right")
     for name, values in row["backgrounds"].items():
-        table.add_row(name.upper(), f"{values['gain']:.3f}", f"{values['fidelity']:.3f}")
+        table.add_row(name.upper(), *(f"{values[key]:.3f}" for key in analysis.MEASURES))
     return table
 
 
@@ -154,12 +156,11 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
     for column in ("pack", "G", "F", "G over T1", "F over T1", "T1 (t_c)", "status"):
         words = column in ("pack", "status")  # may wrap in a narrow terminal; numbers are never cut
         table.add_column(column, justify="left" if words else "right", no_wrap=not words, overflow="fold")
-    keys = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
     for row in rows:
-        numbers = [f"{row[key]:.3f}" for key in keys]
+        numbers = [f"{row[key]:.3f}" for key in analysis.MEASURES]
         table.add_row(cell(row["pack"]), *numbers, f"{row['ringing_period']:.0f}", row["status_names"])
     if len(rows) > 1:
-        means = [spread([row[key] for row in rows]) for key in keys]
+        means = [spread([row[key] for row in rows]) for key in analysis.MEASURES]
         table.add_section()
         table.add_row(f"mean ± SD ({len(rows)})", *(f"{mean:.3f}\n± {sd:.3f}" for mean, sd, _ in means))
     for point in _comparable(configuration):

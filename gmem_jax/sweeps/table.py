@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.experiment.analysis import spread
+from gmem_jax.experiment.analysis import MEASURES, spread
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import optional
 from gmem_jax.files.labelled import described
 from gmem_jax.physics.state import explain, together
 from gmem_jax.sweeps.store import Store
 
-MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
 FORMATS = (".csv", ".parquet", ".h5", ".nc")
 
 
