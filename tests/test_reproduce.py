@@ -5,6 +5,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.experiment.host import silent
-from gmem_jax.reproduce import claims, figures
+from gmem_jax.reproduce import claims, draw, figures
 from gmem_jax.reproduce import run as reproducing
 from gmem_jax.reproduce.compare import Conditions, Estimate, Point, compare, compared
 from gmem_jax.reproduce.draw import power
@@ -151,7 +152,7 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     def points(scale: figures.Scale) -> list[figures.Values]:
         return [{"pack": PACK, "mu": mu} for mu in (0.5, 1.0)]
 
-    monkeypatch.setitem(FIGURES, "fig08", Figure("friction", points, "mu"))
+    monkeypatch.setitem(FIGURES, "fig08", Figure("friction", points, ("mu",)))
     monkeypatch.setitem(FIGURES, "fig06", Figure("one", lambda scale: points(scale)[1:]))
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(reproducing, "quick_cost", lambda points: 1e-7)
@@ -169,6 +170,22 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     reproducing.reproduce("fig06", tmp_path, "tiny", Here(), silent, said.append)
     assert said[1:] == ["all 1 points are there"]
     assert (tmp_path / "fig06-tiny.svg").is_file()
+
+
+def test_each_condition_that_is_varied_has_its_line_of_panels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    at = [replace(STANDARD, delta0=delta0, gamma0=gamma0) for delta0 in (0.02, 0.05) for gamma0 in (3e-4, 1e-3)]
+    at += [replace(STANDARD, overlap=0.8), replace(STANDARD, shape="sphere", overlap=1.0)]
+    rows = [compared(each, measure, [0.3, 0.4], 0) for each in at for measure in "FG"]
+    drawn: list[Any] = []
+    monkeypatch.setattr(draw, "save", lambda path, figure, also: drawn.append(figure))
+    draw.against(tmp_path / "fig11.png", rows, ("gamma0", "overlap"), "title")
+    panels = [
+        {tuple(line.get_xdata()) for line in axis.get_lines() if line.get_linestyle() == "-"} for axis in drawn[0].axes
+    ]
+    assert panels == [{(3e-4, 1e-3)}, {(3e-4, 1e-3)}, {(0.6, 0.8, 1.0)}, {(0.6, 0.8, 1.0)}]
+    assert [len(axis.get_legend().get_texts()) for axis in drawn[0].axes] == [3, 3, 2, 2]  # and the published points
+    draw.against(tmp_path / "fig08.png", rows[:2], ("mu",), "one point")
+    assert len(drawn[1].axes) == 2
 
 
 @pytest.mark.parametrize("name", ["fig04", "fig13", "fig14"])

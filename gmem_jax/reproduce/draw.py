@@ -26,6 +26,7 @@ LABELS = {
     "gamma0": "shear amplitude $\\gamma_0$",
     "grains": "number of grains N",
     "bits": "length of words L (bits)",
+    "overlap": "overlap of the spheres of a grain $O$ (1: a sphere)",
 }
 PANELS = {"F": "fidelity F", "G": "gain G", "accuracy": "part of the words read right"}
 LOGARITHMIC = ("gamma0", "grains")
@@ -42,7 +43,7 @@ def _written(value: str) -> str:
     return value.upper() if value in BACKGROUNDS else value
 
 
-def _series(row: Compared, across: str, varied: Sequence[str]) -> str:
+def _series(row: Compared, varied: Sequence[str]) -> str:
     """What tells a row's curve from the others."""
     at = asdict(row.conditions)
     shown = [f"{name} = {at[name]:g}" if isinstance(at[name], float | int) else _written(at[name]) for name in varied]
@@ -50,34 +51,58 @@ def _series(row: Compared, across: str, varied: Sequence[str]) -> str:
     return ", ".join(filter(None, [*shown, *reader])) or "gmem_jax"
 
 
-def against(path: Path, rows: Sequence[Compared], across: str, title: str) -> None:
-    """G and F against one condition, with the published points; a curve for each combination of the others that vary.
+def against(path: Path, rows: Sequence[Compared], across: Sequence[str], title: str) -> None:
+    """G and F against a condition, with the published points; a curve for each combination of the others that vary.
+
+    Args:
+        path: file to write.
+        rows: what to show.
+        across: the condition; or several, each with a line of panels for the rows that only it varies.
+        title: over the picture.
 
     Raises:
         OSError: if it cannot be written.
     """
-    plt = pyplot()
-    all_ = [asdict(row.conditions) for row in rows]
-    fields = [name for name in Conditions.__dataclass_fields__ if name != across]
-    varied = [name for name in fields if len({at[name] for at in all_}) > 1]
-    panels: dict[str, list[Compared]] = {}
-    for row in rows:
-        panels.setdefault(_panel(row.measure), []).append(row)
-    figure, axes = plt.subplots(1, len(panels), figsize=(5.2 * len(panels), 4.0), squeeze=False)
-    words = sorted({at[across] for at in all_}) if across == "law" else []
-    for axis, (panel, inside) in zip(axes[0], panels.items(), strict=True):
-        curves: dict[str, list[Compared]] = {}
-        for row in inside:
-            curves.setdefault(_series(row, across, varied), []).append(row)
-        for place, (label, members) in enumerate(curves.items()):
-            _curve(axis, members, across, words, label, place)
-        _say_published(axis, inside, across)
-        _axis(axis, across, words, panel)
-        if across == "grains" and panel == PANELS["G"]:
-            _power_law(axis, [row for members in curves.values() for row in members])
-        axis.legend(fontsize=7, frameon=False)
+    lines = {name: rows if len(across) == 1 else _varying(rows, name) for name in across}
+    lines = {name: found for name, found in lines.items() if found} or {across[0]: rows}
+    panels = list(dict.fromkeys(_panel(row.measure) for row in rows))
+    shape = len(lines), len(panels)
+    figure, axes = pyplot().subplots(*shape, figsize=(5.2 * shape[1], 4.0 * shape[0]), squeeze=False)
+    for line, (name, shown) in zip(axes, lines.items(), strict=True):
+        for axis, panel in zip(line, panels, strict=True):
+            _curves(axis, [row for row in shown if _panel(row.measure) == panel], name, panel)
     figure.suptitle(title, fontsize=10)
     save(path, figure, also=VECTOR)
+
+
+def _others(across: str) -> list[str]:
+    """The conditions that tell curves against one from each other. With an overlap of 1 a grain is a sphere."""
+    same = {across, "shape"} if across == "overlap" else {across}
+    return [name for name in Conditions.__dataclass_fields__ if name not in same]
+
+
+def _varying(rows: Sequence[Compared], across: str) -> list[Compared]:
+    """The rows of curves that have more than one place along a condition."""
+    curves: dict[tuple[Any, ...], list[Compared]] = {}
+    for row in rows:
+        curves.setdefault((row.measure, *(getattr(row.conditions, name) for name in _others(across))), []).append(row)
+    return [row for members in curves.values() if len(members) > 1 for row in members]
+
+
+def _curves(axis: Any, rows: Sequence[Compared], across: str, panel: str) -> None:
+    at = [asdict(row.conditions) for row in rows]
+    varied = [name for name in _others(across) if len({one[name] for one in at}) > 1]
+    words = sorted({one[across] for one in at}) if across == "law" else []
+    curves: dict[str, list[Compared]] = {}
+    for row in rows:
+        curves.setdefault(_series(row, varied), []).append(row)
+    for place, (label, members) in enumerate(curves.items()):
+        _curve(axis, members, across, words, label, place)
+    _say_published(axis, rows, across)
+    _axis(axis, across, words, panel)
+    if across == "grains" and panel == PANELS["G"]:
+        _power_law(axis, rows)
+    axis.legend(fontsize=7, frameon=False)
 
 
 def _place(row: Compared, across: str, words: Sequence[str]) -> float:

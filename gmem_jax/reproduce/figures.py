@@ -94,12 +94,12 @@ class Figure(NamedTuple):
     Attributes:
         title: what it shows.
         points: the values of every point at a scale.
-        across: the condition on the horizontal axis, where there is one; see `compare.Conditions`.
+        across: the condition on the horizontal axis, where there is one, or several; see `compare.Conditions`.
     """
 
     title: str
     points: Callable[[Scale], list[Values]]
-    across: str = ""
+    across: tuple[str, ...] = ()
 
 
 def packs(scale: Scale, grains: int, count: int, delta0: float = DELTA0, **grain: Any) -> list[Values]:
@@ -177,13 +177,15 @@ def _words(scale: Scale) -> list[Values]:
 FIGURES = {
     "fig04": Figure("phi, Z and pressures through the experiment, with signal 5 and with none", _one),
     "fig06": Figure("six recalled waveforms beside their integrals", _standard),
-    "fig08": Figure("G and F against friction", _friction, "mu"),
-    "fig09": Figure("G and F under the three friction laws", _laws, "law"),
-    "fig11": Figure("G and F against compression and amplitude, and the shape of the grains", _amplitudes, "gamma0"),
-    "fig12a": Figure("G and F against compression", _compression, "delta0"),
-    "fig12b": Figure("G and F against the number of grains", _sizes, "grains"),
+    "fig08": Figure("G and F against friction", _friction, ("mu",)),
+    "fig09": Figure("G and F under the three friction laws", _laws, ("law",)),
+    "fig11": Figure(
+        "G and F against compression and amplitude, and the shape of the grains", _amplitudes, ("gamma0", "overlap")
+    ),
+    "fig12a": Figure("G and F against compression", _compression, ("delta0",)),
+    "fig12b": Figure("G and F against the number of grains", _sizes, ("grains",)),
     "fig13": Figure("recalled words", _words),
-    "fig14": Figure("F by three backgrounds, and accuracy, against the length of words", _words, "bits"),
+    "fig14": Figure("F by three backgrounds, and accuracy, against the length of words", _words, ("bits",)),
 }
 
 
