@@ -184,7 +184,7 @@ FIGURES = {
     ),
     "fig12a": Figure("G and F against compression", _compression, ("delta0",)),
     "fig12b": Figure("G and F against the number of grains", _sizes, ("grains",)),
-    "fig13": Figure("recalled words", _words),
+    "fig13": Figure("Recalled words", _words),
     "fig14": Figure("F by three backgrounds, and accuracy, against the length of words", _words, ("bits",)),
 }
 
