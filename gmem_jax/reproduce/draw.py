@@ -161,11 +161,15 @@ def _axis(axis: Any, across: str, words: Sequence[str], label: str) -> None:
     axis.set_ylabel(label)
     if label != PANELS["G"]:
         axis.set_ylim(0.0, 1.03)
+    elif across != "grains" and axis.get_ylim()[0] > 0.0:  # a gain without friction has either sign
+        axis.set_ylim(0.0, 1.08 * axis.get_ylim()[1])
     if words:
         axis.set_xticks(range(len(words)), words)
         axis.margins(x=0.2)
     if across == "bits":
-        axis.xaxis.get_major_locator().set_params(integer=True)
+        low, high = axis.dataLim.intervalx
+        axis.set_xticks(np.arange(low, high + 1.0))
+        axis.set_xlim(low - 0.5, high + 0.5)
     if across in LOGARITHMIC:
         axis.set_xscale("log")
         # Few places, less than decades apart: each is named, where matplotlib would write 3 x 10^2 over 4 x 10^2.
