@@ -614,6 +614,20 @@ MUTATIONS = (
         "test_backgrounds_subtract_what_they_say",
     ),
     mutation(
+        "backgrounds-not-averaged",
+        "experiment/analysis.py",
+        "integral, scale, window) for name",
+        "integral, scale, None) for name",
+        "test_averaging_over_a_window_removes_what_rings_in_it_from_every_background",
+    ),
+    mutation(
+        "words-count-with-their-ringing",
+        "reproduce/compare.py",
+        "(row[gain], row[fidelity]) for name",
+        '(row["gain"], row["fidelity"]) for name',
+        "test_so_do_words_by_every_background",
+    ),
+    mutation(
         "running-mean-window",
         "experiment/analysis.py",
         "low = jnp.clip(centre - 0.5 * width",
