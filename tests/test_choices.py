@@ -95,6 +95,7 @@ def test_files_from_before_the_choices_read_as_the_defaults() -> None:
     older = written(experiment)
     del older["shear_share"], older["friction"]["spinning"], older["material"]["wall_rigidity"]
     older["signals"] = {"kind": "words", "bits": 2}
+    older["material"]["tangential_damping"] = 0.069
     assert written(experiment_from(older, PACK)) == written(experiment)
 
 

@@ -37,16 +37,18 @@ def exact(experiment: gm.Experiment) -> jacobian.Jacobian:
 EVERYTHING = ("signals.amplitudes", "gamma0", "friction.mu", "friction.stiffness", "pack.position")
 
 
-def test_nested_checkpoints_change_neither_values_nor_derivatives() -> None:
+@pytest.mark.parametrize("length", [20, 48, 53])  # plain, in blocks, in blocks with some left over
+def test_nested_checkpoints_change_neither_values_nor_derivatives(length: int) -> None:
     def run(start: jax.Array, scan: Any) -> jax.Array:
         def body(x: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
             return jnp.sin(x) + 0.1 * k, x * k
 
-        end, seen = scan(body, start, jnp.arange(48))
-        return end + jnp.sum(seen)
+        end, seen = scan(body, start, jnp.arange(length))
+        return end + jnp.sum(seen * jnp.arange(length))
 
     assert checkpoint.inner_length(12) == 3
     assert checkpoint.inner_length(256) == 16
+    assert checkpoint.inner_length(668) == 25  # 4 x 167 would keep 171 states
     nested = jax.value_and_grad(lambda x: run(x, checkpoint.scan))(0.3)
     plain = jax.value_and_grad(lambda x: run(x, jax.lax.scan))(0.3)
     np.testing.assert_allclose(nested, plain, rtol=1e-14)
@@ -107,6 +109,12 @@ def test_a_jacobian_of_several_signals_is_refused(experiment: gm.Experiment) -> 
     several = gm.replace(experiment, signals=gm.six_signals())
     with pytest.raises(ValueError, match="one signal made of bumps"):
         jacobian.exact(several)
+
+
+@pytest.mark.parametrize("way", [jacobian.exact, lambda experiment: jacobian.differences(experiment, 1e-6)])
+def test_a_jacobian_of_another_background_is_refused(experiment: gm.Experiment, way: Any) -> None:
+    with pytest.raises(ValueError, match="with the background sub0, got sub2"):
+        way(gm.replace(experiment, background="sub2"))
 
 
 CORNERS = {

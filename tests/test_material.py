@@ -48,8 +48,7 @@ def test_poissons_ratio_must_be_physical(value):
         Material(poisson=value)
 
 
-@pytest.mark.parametrize("name", ["normal_damping", "tangential_damping"])
 @pytest.mark.parametrize("value", [-0.1, float("nan")])
-def test_damping_times_must_not_be_negative_or_nan(name, value):
-    with pytest.raises(ValueError, match=rf"^{name} must be in \[0, inf\), got "):
-        Material(**{name: value})
+def test_damping_times_must_not_be_negative_or_nan(value):
+    with pytest.raises(ValueError, match=r"^normal_damping must be in \[0, inf\), got "):
+        Material(normal_damping=value)

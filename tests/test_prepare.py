@@ -153,7 +153,12 @@ def test_the_same_seed_gives_the_same_pack_bit_for_bit_and_another_another(prepa
         ({"delta0": 0.0}, "delta0 must be in"),
         ({"filling": 0.9}, "filling of the gas must be in"),
         ({"t0": -1.0}, "t0 must be positive"),
-        ({"cycles": -1}, "must not be negative"),
+        ({"cycles": -1}, "cycles must not be negative"),
+        ({"rest": -1.0}, "rest must not be negative"),
+        ({"hold": float("nan")}, "hold must not be negative"),
+        ({"pressure_error": 0.0}, "pressure_error must be positive"),
+        ({"patience": -1.0}, "patience must be positive"),
+        ({"seed": -1}, "seed must be a whole number from 0"),
     ],
 )
 def test_impossible_recipes_are_refused(bad: dict, words: str) -> None:

@@ -87,3 +87,23 @@ def test_a_sweep_in_the_library_keeps_its_results_and_grows(base: gm.Experiment,
     # Without a folder nothing is kept, and the numbers are the same.
     (other,) = gm.sweep(base, {"pack": [str(PACK)]})
     np.testing.assert_array_equal(other.recall.p_sig, gm.run(base).p_sig)
+
+
+def test_a_part_of_a_set_may_be_silent(base: gm.Experiment) -> None:
+    signals = gm.waveform(np.array([[0.0] * 4, [0.0, 1.0, 1.0, 0.0]]))
+    experiment = gm.replace(base, signals=signals)
+    whole, split = gm.run(experiment), gm.run(experiment, batch=1)
+    scale = float(jnp.abs(whole.p_sig).max())
+    np.testing.assert_allclose(split.p_sig, whole.p_sig, atol=1e-6 * scale)  # see above
+    together = run_several([experiment, gm.replace(experiment, {"friction.mu": 0.5})])
+    np.testing.assert_allclose(together[0].p_sig, whole.p_sig, atol=1e-6 * scale)
+
+
+def test_every_replica_may_have_its_share_of_the_shear(base: gm.Experiment) -> None:
+    shares = jnp.linspace(0.4, 0.6, 7)
+    found = gm.run(gm.replace(base, shear_share=shares))
+    alone = gm.run(gm.replace(base, shear_share=float(shares[3])))
+    scale = float(jnp.abs(alone.p_sig).max())
+    np.testing.assert_allclose(found.p_sig[2], alone.p_sig[2], atol=1e-6 * scale)  # see above
+    with pytest.raises(ValueError, match="need all signals in one batch"):
+        gm.run(gm.replace(base, shear_share=shares), batch=3)

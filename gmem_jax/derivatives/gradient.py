@@ -322,7 +322,8 @@ def value_and_grad(
         return loss(changed, p_sig), p_sig
 
     readouts = {name: jnp.asarray(samples[name].pressure) for name in samples if "readout" in name}
-    last = jax.jit(jax.value_and_grad(final, argnums=(0, 1), has_aux=True))
+    # Not compiled: it is another function in every call, and compiling it takes longer than doing it.
+    last = jax.value_and_grad(final, argnums=(0, 1), has_aux=True)
     (value, p_sig), (slope, by_readouts) = last(theta, readouts)
     rest.readouts = {name: np.asarray(by) for name, by in by_readouts.items()}
 

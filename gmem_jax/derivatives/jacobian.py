@@ -45,6 +45,8 @@ def _one_signal(experiment: Experiment) -> tuple[Bumps, np.ndarray]:
     bumps = experiment.signals
     if not isinstance(bumps, Bumps) or bumps.count != 1:
         raise ValueError("a Jacobian is taken of one signal made of bumps")
+    if experiment.background != "sub0":
+        raise ValueError(f"a Jacobian is taken with the background sub0, got {experiment.background}")
     return bumps, np.asarray(bumps.amplitudes)
 
 
@@ -72,7 +74,7 @@ def exact(experiment: Experiment, *, law: bool = True, progress: Progress = sile
         progress: told about every chunk.
 
     Raises:
-        ValueError: if there is another number of signals, or they are not bumps.
+        ValueError: if there is another number of signals, they are not bumps, or the background is not sub0.
         RunFailedError: if the simulation broke down.
     """
     bumps, row = _one_signal(experiment)
@@ -110,7 +112,7 @@ def differences(experiment: Experiment, relative: float, *, law: bool = True, pr
     """Central differences with steps of `relative` times each parameter (amplitudes: times 1), as replicas.
 
     Raises:
-        ValueError: if there is another number of signals, or they are not bumps.
+        ValueError: if there is another number of signals, they are not bumps, or the background is not sub0.
         RunFailedError: if the simulation broke down.
     """
     bumps, row = _one_signal(experiment)

@@ -5,21 +5,23 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import lax
 
 SHORT = 32  # carries that one level may keep
 
 
 def inner_length(length: int) -> int:
-    """The largest divisor of `length` that is not above its square root (1 for a prime)."""
-    return next(part for part in range(math.isqrt(max(1, length)), 0, -1) if length % part == 0)
+    """A length of blocks near the square root of `length`: a divisor if there is one, for the body is compiled once."""
+    root = math.isqrt(max(1, length))
+    return next((part for part in range(root, root // 2, -1) if length % part == 0), root)
 
 
 def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any) -> tuple[Any, Any]:
     """`jax.lax.scan` over xs, leaves [n, ...], in blocks of blocks: reverse mode keeps about 2 sqrt(n) carries, not n.
 
     The price is one more evaluation of the body, which short scans are spared. Forward evaluation and forward mode are
-    those of one scan.
+    those of one scan. What the blocks leave over is a block by itself.
 
     Args:
         body: as for `jax.lax.scan`.
@@ -35,7 +37,11 @@ def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any) -> tu
     def block(carry: Any, some: Any) -> tuple[Any, Any]:
         return lax.scan(one, carry, some)
 
-    carry, ys = lax.scan(
-        jax.checkpoint(block), carry, jax.tree.map(lambda leaf: leaf.reshape(-1, inner, *leaf.shape[1:]), xs)
-    )
-    return carry, jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ys)
+    whole = length - length % inner
+    blocks = jax.tree.map(lambda leaf: leaf[:whole].reshape(-1, inner, *leaf.shape[1:]), xs)
+    carry, ys = lax.scan(jax.checkpoint(block), carry, blocks)
+    ys = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), ys)
+    if whole == length:
+        return carry, ys
+    carry, last = jax.checkpoint(block)(carry, jax.tree.map(lambda leaf: leaf[whole:], xs))
+    return carry, jax.tree.map(lambda one, other: jnp.concatenate([one, other]), ys, last)

@@ -1,5 +1,6 @@
 """The one description of a memory experiment: every field, default and check (paper, Secs. II and III)."""
 
+import copy
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ from gmem_jax.experiment.drive import Drive
 from gmem_jax.experiment.html import brief, facts
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocol import Stage, memory_protocol, split
-from gmem_jax.experiment.signals import BINS, Signals, bin_average
+from gmem_jax.experiment.signals import BINS, Signals, bin_average, part
 from gmem_jax.experiment.walk import Course
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
@@ -29,7 +30,6 @@ PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
 MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
 LARGEST_STEP = 0.5  # t_c; the stiffest mode has a period near 10 t_c
-BACKENDS = ("auto", "jax", "native")
 AFTER_PREFIX = ("signals", "gamma0", "shear_share")  # fields that the shear-free prefix does not depend on
 
 
@@ -104,8 +104,8 @@ class Experiment:
             raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {self.background!r}")
         if self.shear not in ("during", "before"):
             raise ValueError(f"shear must be during or before, got {self.shear!r}")
-        if self.backend not in BACKENDS:
-            raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
+        if self.backend not in native.BACKENDS:
+            raise ValueError(f"backend must be one of {', '.join(native.BACKENDS)}; got {self.backend!r}")
         native.require_precision(self.precision, self.backend, self.friction)
         if not 0.0 < self.dt <= LARGEST_STEP:
             raise ValueError(f"dt must be in (0, {LARGEST_STEP}], got {self.dt:g}")
@@ -205,11 +205,11 @@ class Experiment:
     def course(self, *, sheared: bool) -> Course:
         """What a walk is told, in the prefix or after it."""
         lower, upper = self.pack.box.lower, self.pack.box.upper
-        gamma0, signals = (self.gamma0, self.signals) if sheared else (0.0, None)
+        gamma0, signals, share = (self.gamma0, self.signals, self.shear_share) if sheared else (0.0, None, 1.0)
         dt, steps = self.timing
         return Course(
             System(self.pack.clump, self.friction, self.pack.pairs, self.material),
-            Drive(lower, upper, self.compression, gamma0, signals, self.shear_share),
+            Drive(lower, upper, self.compression, gamma0, signals, share),
             dt,
             self.drag,
             steps=steps,
@@ -354,6 +354,13 @@ def replace(
     if traced(found.get("t0")):
         found.setdefault("steps", experiment.steps_per_bin)
     return dataclasses.replace(experiment, **found)
+
+
+def with_part(experiment: Experiment, first: int, last: int) -> Experiment:
+    """The same experiment with waveforms number `first` to `last` - 1 alone, be they silent: the whole set is not."""
+    few = copy.copy(experiment)
+    object.__setattr__(few, "signals", part(experiment.signals, first, last))
+    return few
 
 
 def _with(tree: Any, path: list[str], value: Any) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 from gmem_jax.experiment import analysis, html
 from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.doubts import doubts
-from gmem_jax.experiment.experiment import Experiment, replace
+from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
 from gmem_jax.experiment.frames import Film, Frames, Taken, joined, places
 from gmem_jax.experiment.host import (
     CHUNK,
@@ -35,7 +35,7 @@ from gmem_jax.experiment.host import (
 )
 from gmem_jax.experiment.pack import smallest_box
 from gmem_jax.experiment.protocol import Stage, table
-from gmem_jax.experiment.signals import BINS, part
+from gmem_jax.experiment.signals import BINS
 from gmem_jax.experiment.walk import walk
 from gmem_jax.physics.pytree import Scalar, pytree, traced
 from gmem_jax.physics.sample import Sample
@@ -243,7 +243,7 @@ def run(
     film = film_of(experiment, frames, frames_of)
     begun = walker(experiment, progress=progress, film=film)
     warn_of_another_compression(experiment)
-    if size < count and (begun.state.replicas > 1 or jnp.ndim(experiment.gamma0)):
+    if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
         raise ValueError("parameters with a value for each replica need all signals in one batch")
     common, own = experiment.phases
     firsts = range(0, count, size)
@@ -254,7 +254,7 @@ def run(
     taken: Taken = {}
     for number, first in enumerate(firsts):
         last = min(first + size, count)
-        few = experiment if size >= count else replace(experiment, signals=part(experiment.signals, first, last))
+        few = experiment if size >= count else with_part(experiment, first, last)
         filmed = first < frames_of <= last or frames_of == first == 0
         own_film = Film(film.wanted, max(0, frames_of - first)) if filmed else Film()
         on = begun.afresh(work=done, film=own_film)

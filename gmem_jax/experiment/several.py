@@ -18,7 +18,7 @@ from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, replace, replica_parameters, value_at
 from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent, work_of
 from gmem_jax.experiment.recall import PREFIX, Recall, finished, walker, warn_of_another_compression
-from gmem_jax.experiment.signals import Signals
+from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import pytree
 
 
@@ -135,7 +135,9 @@ def run_several(
         warn_of_another_compression(each)
     one_each = np.unique(side.prefix, return_index=True)[1]
     owners = np.repeat(np.arange(len(experiments)), np.diff(side.first))
-    silence = Chosen(side.signals().sets, jnp.ones(max(1, len(one_each) - 1), int))
+    sets = side.signals().sets
+    loud = 1 + int(np.argmax(np.any(np.asarray(bin_average(sets[0])), axis=1)))  # the prefix applies none of them
+    silence = Chosen(sets, jnp.full(max(1, len(one_each) - 1), loud))
     everything = side.wide(owners, side.signals())
     on = walker(side.wide(one_each, silence), progress=progress)
     on.total_work = work_of(common, on.state.replicas) + work_of(own, len(owners))

@@ -34,6 +34,7 @@ from gmem_jax.physics.material import Material
 _SIGNALS = {"bumps": Bumps, "spline": Spline}
 # What files from before there was such a field did; laws, material and words: their defaults of today.
 _OLDER = {"precision": "double", "shear": "during", "shear_share": 0.5}
+_GONE = ("tangential_damping",)  # of the material, once; nothing followed it
 DIGITS = 9  # of the pad and width of words
 _PARTS = ("pack", "signals", "friction", "material")
 
@@ -176,7 +177,7 @@ def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) 
     if pack_fingerprint(pack) != of_pack["sha256"]:
         raise FileFormatError(f"{of_pack['source']}: not the pack that this was made with (its content has changed)")
     own = {name: _number(value) for name, value in configuration.items() if name not in _PARTS}
-    material = {name: _number(value) for name, value in configuration["material"].items()}
+    material = {name: _number(value) for name, value in configuration["material"].items() if name not in _GONE}
     return Experiment(
         pack, signals_from(configuration["signals"]), _law_from(configuration["friction"]), Material(**material), **own
     )

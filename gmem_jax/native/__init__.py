@@ -109,7 +109,13 @@ def needs(law: FrictionLaw, architecture: str, *, tangent: bool = False) -> dict
 
 
 def name(backend: str, law: FrictionLaw) -> str:
-    """What "auto" means for this friction law on JAX's default device, "jax" or "native"; others are themselves."""
+    """What "auto" means for this friction law on JAX's default device, "jax" or "native"; others are themselves.
+
+    Raises:
+        ValueError: if there is no such backend.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
     if backend != "auto":
         return backend
     if not available()[0] or not supports(law):

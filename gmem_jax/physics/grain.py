@@ -25,7 +25,7 @@ class Clump:
         offsets: sphere centres, [K, 3], in R.
         mass: mass, equal to the volume of the union, in rho R^3.
         inertia: principal moments, [3], in rho R^5.
-        diameter: largest extent of the grain through its centre (outer diameter), in R.
+        diameter: outer diameter, of the sphere about its centre of mass that holds it, in R.
         isotropic: whether the three moments are equal, so that no gyroscopic term is needed.
         shape: a name for logs and files.
     """

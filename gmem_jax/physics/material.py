@@ -14,7 +14,7 @@ from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle
 class Material:
     """An elastic solid: what the spheres of all grains and their contacts are made of.
 
-    The defaults are the paper's (Sec. II).
+    The defaults are the paper's (Sec. II). Friction laws have stiffness and damping of their own, which do not follow.
 
     Attributes:
         radius: sphere radius R, in m.
@@ -22,7 +22,6 @@ class Material:
         density: mass density rho, in kg/m^3.
         poisson: Poisson's ratio nu.
         normal_damping: ratio gamma_n / k_n of the Hertz contact, in t_c.
-        tangential_damping: ratio gamma / k of a tangential spring, in t_c.
         wall_rigidity: stiffness of a wall contact over that with a rigid plane; 1/2 for walls as soft as the grains.
 
     Raises:
@@ -34,7 +33,6 @@ class Material:
     density: Scalar = parameter(1200.0, "(0, inf)")
     poisson: Scalar = parameter(0.49, "(-1, 0.5]")
     normal_damping: Scalar = parameter(0.23, "[0, inf)")
-    tangential_damping: Scalar = parameter(0.069, "[0, inf)")
     wall_rigidity: Scalar = parameter(1.0, "(0, inf)")
 
     def __post_init__(self) -> None:

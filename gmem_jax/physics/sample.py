@@ -49,7 +49,7 @@ class Sample:
         """Sphere contacts per grain, each counted once, those with walls too, [B].
 
         What the paper's "average number of contacts on a grain" compares with: it grows alike in a compression, the
-        `coordination` half as much (docs/decisions.md).
+        `coordination` half as much (docs/physics.md).
         """
         return 0.5 * self.contacts + self.wall_contacts
 

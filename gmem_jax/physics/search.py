@@ -126,7 +126,8 @@ class PairFinder:
             smallest: edge lengths of the smallest box of the coming motion, [3]; default the present box.
         """
         lengths = np.asarray(box.lengths)
-        smallest = lengths[:, 0] if smallest is None else np.minimum(smallest, lengths[:, 0])
+        now = lengths.min(axis=1)  # shear makes the boxes of replicas differ
+        smallest = now if smallest is None else np.minimum(smallest, now)
         reference = (np.asarray(sphere_centres(grains, clump)) - np.asarray(box.lower)) / lengths
         if np.all(reference == reference[..., :1]):
             reference = reference[..., :1]

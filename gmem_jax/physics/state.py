@@ -24,7 +24,6 @@ class Status(enum.IntFlag):
     NOT_AT_REST = 8
     OVERLAP_RANGE = 16
     STEP_TOO_LARGE = 32
-    CAPACITY = 64
     IMPOSSIBLE = 128
     DEEP_OVERLAP = 256
     NOT_QUASI_STATIC = 512
@@ -60,7 +59,6 @@ SENTENCES = {
     Status.NOT_AT_REST: "a hold ended before the pack was at rest; use a longer hold or a hold drag",
     Status.OVERLAP_RANGE: "an overlap exceeded the p_max of the friction law; use a larger p_max",
     Status.STEP_TOO_LARGE: "the time step exceeds 0.5 t_c; use a smaller dt",
-    Status.CAPACITY: "the neighbour list overflowed its capacity; allocate it anew",
     Status.IMPOSSIBLE: "a parameter or a waveform is impossible; use numbers that `Experiment` accepts outside a trace",
     Status.DEEP_OVERLAP: "an overlap exceeded 0.2 R, and Hertz's law is for small ones; use less compression or shear",
     Status.NOT_QUASI_STATIC: "the walls move too fast (an inertial number beyond 5e-3); use a larger t0 or less shear",

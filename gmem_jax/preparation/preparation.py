@@ -53,7 +53,7 @@ FEWEST = 12  # grains of the smallest pack that was prepared
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
 DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with it all six are the paper's
 
-_press = Compiled(press, static_argnames=("blocks", "march"))
+_press = Compiled(press, static_argnames=("march",))
 
 
 @dataclass(frozen=True)
@@ -106,14 +106,17 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.grains < FEWEST:
             raise ValueError(f"grains must be at least {FEWEST} to jam between six walls, got {self.grains}")
+        if self.seed < 0:
+            raise ValueError(f"seed must be a whole number from 0, got {self.seed}")
         if not 0.0 < self.delta0 < 0.5:
             raise ValueError(f"delta0 must be in (0, 0.5), got {self.delta0}")
         if not 0.0 < self.filling < 0.6:
             raise ValueError(f"filling of the gas must be in (0, 0.6), got {self.filling}")
         if not 0.0 < self.dt <= 0.5:
             raise ValueError(f"dt must be in (0, 0.5] t_c, got {self.dt}")
-        if self.cycles < 0 or self.drag < 0.0:
-            raise ValueError("cycles and drag must not be negative")
+        for name in ("cycles", "drag", "rest", "hold"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         for name in (
             "t0",
             "pressure",
@@ -123,6 +126,8 @@ class Recipe:
             "piston_gain",
             "settled_speed",
             "quiet",
+            "pressure_error",
+            "patience",
         ):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -379,7 +384,9 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
     position = position - centre[:, 0]
     pairs = find_pairs(clump, position, quaternion, box, recipe.delta0)
     system = System(clump, friction, pairs, material)
-    period = ringing_period(system, jnp.asarray(position)[..., None], grains.quaternion, box, preparation.dt)
+    backend = "jax" if walker.course.backend == "jax" else "auto"  # the experiment's law may be one of the user's own
+    at_rest = jnp.asarray(position)[..., None], grains.quaternion, box
+    period = ringing_period(system, *at_rest, preparation.dt, backend=backend)
     last = jax.tree.map(lambda leaf: leaf[-1, ..., 0].tolist(), preparation.log["rest"])
     record = {
         "recipe": asdict(recipe),
@@ -389,7 +396,7 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
         "simulated_time": walker.time,
         "at_rest": asdict(last),
         **provenance(),
-        "backend": native.name(walker.course.backend, friction),
+        "backend": native.name(walker.course.backend, Frictionless()),
     }
     return Pack(
         clump=clump,

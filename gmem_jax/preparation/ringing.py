@@ -32,7 +32,14 @@ def spectrum_peak(series: np.ndarray, spacing: float) -> float:
 
 
 def ringing_period(
-    system: System, position: jax.Array, quaternion: jax.Array, box: Box, dt: Scalar, progress: Progress = silent
+    system: System,
+    position: jax.Array,
+    quaternion: jax.Array,
+    box: Box,
+    dt: Scalar,
+    progress: Progress = silent,
+    *,
+    backend: str = "auto",
 ) -> float:
     """T_1 in t_c: kick the resting pack with a uniform shear rate, and take the strongest period of p_xy.
 
@@ -43,6 +50,7 @@ def ringing_period(
         box: walls, one replica.
         dt: time step, in t_c.
         progress: told about the run.
+        backend: who does the steps.
     """
     lengths = box.lengths
     duration = 40.0 * float(jnp.max(lengths))  # some 15 periods: the mode's speed is about 0.4 R / t_c
@@ -51,7 +59,7 @@ def ringing_period(
     rate = KICK * jnp.asarray([-1.0, 1.0, 0.0])[:, None]
     velocity = rate * (position - 0.5 * (box.lower + box.upper))
     state = accelerate(system, replace(state, grains=replace(state.grains, velocity=velocity)), box)
-    still = Course(system, Drive(box.lower, box.upper, 0.0), dt, steps=STEPS)
+    still = Course(system, Drive(box.lower, box.upper, 0.0), dt, steps=STEPS, backend=backend)
     ringing = Stage("ringing", 0.0, 0.0, bins / BINS)
     walker = Walker(still, state, progress=progress, total_work=work_of([ringing], 1))
     sample = walker.play(ringing)["ringing"]

@@ -1,8 +1,12 @@
 // Numbers: lanes against doubles, derivatives forwards against differences, backwards against forwards.
 
+#include <initializer_list>
+#include <limits>
+
 #include "check.h"
 #include "numbers/dual.h"
 #include "numbers/rows.h"
+#include "numbers/single.h"
 #include "numbers/tape.h"
 #include "physics/rotation.h"
 
@@ -129,8 +133,18 @@ void a_turn_is_a_rotation() {
   CHECK(close_to(back.x, 1.0, 1e-15) && close_to(back.y, 0.0, 1e-15));
 }
 
+void what_is_no_number_comes_through_a_bound() {
+  const double nothing = std::numeric_limits<double>::quiet_NaN();
+  for (const double fine : {-3.0, 7.0})
+    for (const Pair& x : {Pair{splat<Real>(nothing), splat<Real>(fine)}, Pair{splat<Real>(fine), splat<Real>(nothing)}})
+      CHECK(std::isnan(largest(x)) && std::isnan(smallest(x)));
+  const Pair x{lanes(1.0), lanes(2.0)};
+  CHECK(largest(x) == lanes(2.0)[W - 1] && smallest(x) == 1.0);
+}
+
 void test() {
   lanes_are_doubles();
+  what_is_no_number_comes_through_a_bound();
   elementary_functions();
   rows_are_columns_transposed();
   slopes_are_those_of_differences();

@@ -17,6 +17,8 @@ from gmem_jax.physics.contact.kinematics import Kinematics
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.rotation import dot
 
+TANGENTIAL_DAMPING = 0.069  # gamma / k of a tangential spring, in t_c; the paper's, of every law
+
 
 @runtime_checkable
 class FrictionLaw(Protocol):
@@ -55,7 +57,7 @@ class RangedLaw(Protocol):
 
 
 def largest_overlap(law: FrictionLaw) -> Scalar:
-    """Overlap beyond which a run with `law` is to be flagged (`Status.OVERLAP_RANGE`); infinite for most laws."""
+    """Overlap beyond which a run with `law` has failed (`Status.OVERLAP_RANGE`); infinite for most laws."""
     return law.largest_overlap if isinstance(law, RangedLaw) else float("inf")
 
 

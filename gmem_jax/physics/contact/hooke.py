@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.physics.contact.friction import coulomb
+from gmem_jax.physics.contact.friction import TANGENTIAL_DAMPING, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle
 
@@ -28,7 +28,7 @@ class Hooke:
 
     mu: Scalar = parameter(1.0, "[0, inf)")
     stiffness: Scalar = parameter(0.13, "(0, inf)")
-    damping_time: Scalar = parameter(0.069, "[0, inf)")
+    damping_time: Scalar = parameter(TANGENTIAL_DAMPING, "[0, inf)")
     spinning: Scalar = parameter(1.0, "[0, 1]")
 
     def __post_init__(self) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.physics.contact.friction import coulomb
+from gmem_jax.physics.contact.friction import TANGENTIAL_DAMPING, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle
@@ -38,14 +38,14 @@ class MindlinRescaled:
 
     Attributes:
         mu: friction coefficient; scalar or [B].
-        stiffness: k_M in E R^0.5; scalar or [B].
+        stiffness: k_M in E R^0.5, by default that of the default material; scalar or [B].
         damping_time: gamma_M / k_M in t_c; scalar or [B].
         spinning: see `gmem_jax.physics.contact.hooke.Hooke`.
     """
 
     mu: Scalar = parameter(1.0, "[0, inf)")
     stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)")
-    damping_time: Scalar = parameter(Material().tangential_damping, "[0, inf)")
+    damping_time: Scalar = parameter(TANGENTIAL_DAMPING, "[0, inf)")
     spinning: Scalar = parameter(1.0, "[0, 1]")
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-// All steps of one block: velocity Verlet as in gmem_jax/dynamics.py, in two phases per step that the threads of a
+// All steps of one block: velocity Verlet as in gmem_jax/physics/step.py, in two phases per step that the threads of a
 // team share - contacts, then grains (the end of one step and the beginning of the next).
 //
 // Forces are summed in the order that the plan fixes, wall forces in chunks of grains of fixed size. So neither the

@@ -178,8 +178,10 @@ struct Packed {
     Row f[W], t[W];
     for (int l = 0; l < W; ++l) {
       const int g = u * W + l;
-      f[l] = grain[g].force;
-      t[l] = grain[g].torque;
+      // The lanes beyond the last grain are its copies without its contacts: the walls alone would throw them out, and
+      // their speed would make all candidates be looked at.
+      f[l] = g < problem.grains ? grain[g].force : Row{};
+      t[l] = g < problem.grains ? grain[g].torque : Row{};
       if (g >= problem.grains) continue;
       for (int n = plan.guest_start[g]; n < plan.guest_start[g + 1]; ++n) {
         f[l] += guest[2 * static_cast<std::size_t>(n)];
@@ -210,7 +212,7 @@ struct Packed {
     RowOfRun* first[W];
     int* stored[W];
     std::ptrdiff_t stride;
-    int rings, most;
+    int rings, most, lanes;
 
     int points() const { return rings; }
     int count() const { return most; }
@@ -224,16 +226,16 @@ struct Packed {
     }
     void set(int k, const Run<V>& run) {
       const Rows rows = rows_of({run.force.along, run.force.across, run.start});
-      for (int l = 0; l < W; ++l) *reinterpret_cast<Row*>(first[l] + k * stride) = row_of(rows, l);
+      for (int l = 0; l < lanes; ++l) *reinterpret_cast<Row*>(first[l] + k * stride) = row_of(rows, l);
     }
     void keep(V counts) {
-      for (int l = 0; l < W; ++l) *stored[l] = static_cast<int>(counts[l]);
+      for (int l = 0; l < lanes; ++l) *stored[l] = static_cast<int>(counts[l]);
       most = static_cast<int>(largest(counts));
     }
     void remember() const {}
   };
 
-  // W contacts; where there are fewer, the rest are dummies far apart.
+  // W contacts; where there are fewer, the rest are dummies far apart, which all threads read and none writes.
   struct Group {
     int count;
     int c[W];
@@ -361,7 +363,7 @@ struct Packed {
   void write_history(const Group& g, const V* memory) {
     for (int r = 0; r < kHistoryRows; ++r) {
       const Rows kept = rows_of(load_vec(memory + 4 * r), Law::kHistory > 4 * r + 3 ? memory[4 * r + 3] : V{});
-      for (int l = 0; l < W; ++l) history[static_cast<std::size_t>(g.c[l]) * kHistoryRows + r] = row_of(kept, l);
+      for (int l = 0; l < g.count; ++l) history[static_cast<std::size_t>(g.c[l]) * kHistoryRows + r] = row_of(kept, l);
     }
   }
 
@@ -370,6 +372,7 @@ struct Packed {
     runs.stride = run_stride();
     runs.rings = problem.points;
     runs.most = 0;
+    runs.lanes = g.count;
     for (int l = 0; l < W; ++l) {
       runs.first[l] = run + g.c[l];
       runs.stored[l] = marks.runs + g.c[l];

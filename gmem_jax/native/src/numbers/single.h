@@ -143,8 +143,15 @@ struct Pair {
   friend Pair max(Pair x, Pair y) { return {max(x.a, y.a), max(x.b, y.b)}; }
   friend Pair root(Pair x) { return {root(x.a), root(x.b)}; }
   friend unsigned bits_less(Pair x, Pair y) { return bits_less(x.a, y.a) | bits_less(x.b, y.b) << W; }
-  friend double largest(Pair x) { return __builtin_fmax(largest(x.a), largest(x.b)); }
-  friend double smallest(Pair x) { return __builtin_fmin(smallest(x.a), smallest(x.b)); }
+  // What is no number comes through, as it does from one half: a bound that left out its neighbours would be too low.
+  friend double largest(Pair x) {
+    const double a = largest(x.a), b = largest(x.b);
+    return a != a || a > b ? a : b;
+  }
+  friend double smallest(Pair x) {
+    const double a = smallest(x.a), b = smallest(x.b);
+    return a != a || a < b ? a : b;
+  }
   friend void store(double* p, Pair x) { store(p, x.a), store(p + W, x.b); }
   friend void store(double* p, Pair x, int count) {
     store(p, x.a, count < W ? count : W);
