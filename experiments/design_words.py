@@ -12,6 +12,7 @@ at t0 = 1,800 takes some 1e10 grain-steps.
 
 import argparse
 import csv
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +60,7 @@ def main() -> None:
         measured = Parts(folder / f"{name}-t0-{arguments.t0:g}.kernel", key_of_run(any_words))
         kernel = gm.memory_kernel(any_words, BUMPS, WIDTH, keep=measured, progress=say)
         for bits in map(int, arguments.bits.split(",")):
-            if there(folder / TABLE, name, bits):
+            if there(folder / TABLE, name, bits, arguments.t0, arguments.iterations):
                 continue
             kept = folder / f"words-{bits}-seed-0.msgpack"
             net = training.train(Lessons(bits), 0, budget=arguments.budget, checkpoint=kept).net
@@ -112,9 +113,12 @@ def design(
     return row | {"seconds": round(time.perf_counter() - began)}
 
 
-def there(table: Path, pack: str, bits: int) -> bool:
-    """Whether the table has these words."""
-    rows = csv.DictReader(table.open()) if table.exists() else []
+def there(table: Path, pack: str, bits: int, t0: float, iterations: int) -> bool:
+    """Whether the table has these words; what is drawn of it is of one rate and one effort."""
+    rows = list(csv.DictReader(table.open())) if table.exists() else []
+    for row in rows:
+        if (float(row["t0"]), int(row["iterations"])) != (t0, iterations):
+            sys.exit(f"{table}: has words of t0 = {row['t0']}, {row['iterations']} iterations; name another folder")
     return any((row["pack"], row["bits"]) == (pack, str(bits)) for row in rows)
 
 

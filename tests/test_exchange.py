@@ -216,6 +216,20 @@ def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
     return int(stop.value.code or 0)
 
 
+def test_a_folder_beside_a_series_is_filled_by_force_only(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, run_frames: Frames, tmp_path: Path
+) -> None:
+    pytest.importorskip("pyvista")
+    monkeypatch.setattr("gmem_jax.command.exchange.load_frames", lambda _: run_frames)
+    (tmp_path / "run").mkdir()
+    command = ["export", SOURCE, "--frames", "--to", "vtk", "-o", tmp_path / "run.pvd"]
+    assert gmem(monkeypatch, *command) == 2
+    assert "run beside it exists" in capsys.readouterr().err
+    assert not list((tmp_path / "run").iterdir())
+    assert gmem(monkeypatch, *command, "--force") == 0
+    assert len(list((tmp_path / "run").iterdir())) == 4
+
+
 @pytest.mark.usefixtures("quick")
 def test_the_commands_there_and_back(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path

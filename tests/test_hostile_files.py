@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
+from gmem_jax.command.exchange import export
 from gmem_jax.files import tree
 from gmem_jax.files.parts import load_part, save_part
 from gmem_jax.files.seal import BLOCK, seal
@@ -161,6 +162,9 @@ def test_a_pack_from_before_there_were_seals_is_read_with_a_warning(tmp_path: Pa
     with pytest.warns(UserWarning, match="written before files had checksums"):
         again = gm.load_pack(old)
     np.testing.assert_array_equal(again.position, gm.load_pack(PACK).position)
+    with pytest.warns(UserWarning, match="checksums"):
+        export(old, "xyz", tmp_path / "old.xyz", frames=False)
+    assert (tmp_path / "old.xyz").is_file()
     with h5py.File(old, "r+") as file:
         negative(file)
     with warnings.catch_warnings():

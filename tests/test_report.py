@@ -24,7 +24,7 @@ from gmem_jax.experiment.frames import Frames
 from gmem_jax.physics.sample import Sample
 from gmem_jax.show import plots
 from gmem_jax.show.report import Report, table
-from gmem_jax.show.scene import at_rest, links, packed, quantities
+from gmem_jax.show.scene import Quantity, at_rest, links, packed, quantities
 
 PACK_FILE = Path(__file__).parent / "data" / "tetra-27.h5"
 PACK = gm.load_pack(PACK_FILE)
@@ -115,6 +115,28 @@ def made_up() -> gm.Recall:
     per_replica = {"residual_speed": np.full(3, 1e-4), "status": np.array([0, 0, int(gm.Status.RINGING)])}
     curves = {"u": u, "shear": integral, "J": integral, "p_sig": p_sig}
     return gm.Recall(**numbers, **per_replica, **curves, stages=stages, frames=squeezed())
+
+
+def test_packs_stand_in_one_table_only_if_nothing_else_differs(folder: Path, tmp_path: Path) -> None:
+    recall, other = replace(made_up(), frames=None), replace(PACK, position=PACK.position + 1e-6)
+    for name, changes in {"pack": {}, "law": {"friction.stiffness": 0.2}, "rests": {"rest": 0.1}}.items():
+        experiment = gm.replace(EXPERIMENT, {"pack": other, **changes})
+        gm.save_recall(tmp_path / f"{name}.h5", recall, gm.resolved(experiment, 1.0))
+
+    def together(*paths: Path) -> bool:
+        report = Report()
+        for path in paths:
+            report.add(str(path))
+        return "mean ± SD (2)" in report.page("two")
+
+    assert together(folder / "without.h5", tmp_path / "pack.h5")
+    assert not together(folder / "without.h5", folder / "without.h5")  # once is enough
+    assert not together(folder / "without.h5", tmp_path / "law.h5")
+    assert not together(folder / "without.h5", tmp_path / "rests.h5")
+
+
+def test_colours_end_somewhere_though_nothing_touches() -> None:
+    assert Quantity("force on a grain", "N", np.zeros((1, 0))).top == 1.0
 
 
 def unpacked(text: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

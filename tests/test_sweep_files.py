@@ -1,15 +1,22 @@
 """What a sweep file may say, how its points become runs, and what is refused in one line."""
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.sweeps.executors import executor
+from gmem_jax.experiment.host import silent
+from gmem_jax.files.atomic import atomic
+from gmem_jax.sweeps.executors import Executor, Submitted, executor
 from gmem_jax.sweeps.plan import plan, point
 from gmem_jax.sweeps.spec import read_spec, spec_of
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.sweep import Conductor
+from gmem_jax.sweeps.sweep import Conductor, _labels
+from gmem_jax.sweeps.table import rows
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 MEMORY = 1 << 33
@@ -145,3 +152,121 @@ def test_executors_that_cannot_be_had_say_so(monkeypatch: pytest.MonkeyPatch) ->
         executor("processes", 10_000, {})
     with pytest.raises(ValueError, match="no option 'queue'"):
         executor("processes", 1, {"queue": "long"})
+    with pytest.raises(ValueError, match=r"options of submitit: .*'queue'"):
+        executor("local", 1, {"queue": "long"})
+    with pytest.raises(ValueError, match=r"options of submitit: .*timeout_min"):
+        executor("local", 1, {"timeout_min": "long"})
+
+
+def test_the_last_words_of_a_scheduler_s_workers_are_found(tmp_path: Path) -> None:
+    chosen = executor("local", 1, {})
+    assert isinstance(chosen, Submitted)
+    job = SimpleNamespace(stdout=lambda: None, stderr=lambda: "slurmstepd: error: out of memory\n")
+    chosen._jobs = {"worker-0": job}
+    assert chosen.said(Store(tmp_path)).strip() == "slurmstepd: error: out of memory"
+
+
+class Mortal(Executor):
+    """Its workers get as far as they are told, one after the other, and die; the last finishes."""
+
+    workers = 1
+
+    def __init__(self, reach: list[float]) -> None:
+        self.reach, self.started = reach, 0
+
+    def start(self, store: Store, name: str) -> None:
+        if self.started == len(self.reach):
+            store.fail("key", "finished, as far as an executor can tell")
+        else:
+            store.tell(name, "job", self.reach[self.started], "points")
+        self.started += 1
+
+    def alive(self) -> set[str]:
+        return set()
+
+    def stop(self) -> None:
+        pass
+
+
+def test_workers_may_die_as_often_as_each_gets_farther(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gmem_jax.sweeps.executors.POLL", 0.0)
+    job = {"kind": "points", "name": "job", "points": ["key"], "work": 1.0}
+    steps = Mortal([0.1 * number for number in range(9)])
+    steps.finish(Store(tmp_path / "steps"), [job], lambda _: None)
+    assert steps.started == 10
+    stuck = Mortal([0.3, 0.2, 0.3, 0.1, 0.3, 0.3])
+    with pytest.raises(gm.RunFailedError, match="end without doing their jobs"):
+        stuck.finish(Store(tmp_path / "stuck"), [job], lambda _: None)
+    assert stuck.started <= 5
+
+
+class Killed(Executor):
+    """Two workers: the first job is done, of the second there are parts, and there it ends."""
+
+    workers = 2
+
+    def __init__(self) -> None:
+        self.jobs: list[dict[str, Any]] = []
+
+    def start(self, store: Store, name: str) -> None:
+        pass
+
+    def alive(self) -> set[str]:
+        return set()
+
+    def stop(self) -> None:
+        pass
+
+    def finish(self, store: Store, jobs: list[dict[str, Any]], told: Callable[[float], None]) -> None:
+        self.jobs = jobs
+        for key in jobs[0]["points"]:
+            store.fail(key, "done, as far as a plan can tell")
+        store.parts(jobs[-1]).mkdir(exist_ok=True)
+
+
+def test_runs_that_were_begun_go_on_as_they_were(tmp_path: Path) -> None:
+    values = {"experiment": {"pack": str(PACK), "t0": 150.0}, "vary": {"mu": [0.1 * n for n in range(1, 9)]}}
+    first, again = Killed(), Killed()
+    conductor(tmp_path, **values).run(first, silent)
+    assert [len(job["points"]) for job in first.jobs] == [4, 4]
+    conductor(tmp_path, **values).run(again, silent)
+    assert [job["name"] for job in again.jobs] == [
+        first.jobs[1]["name"]
+    ]  # not two runs of two, which two workers would be given anew
+
+
+def test_why_a_pack_could_not_be_made_is_said_of_its_points(tmp_path: Path) -> None:
+    made = conductor(tmp_path, prepare={"grains": 16}, vary={"mu": [0.1, 0.2]})
+    (job,) = made.pack_jobs()
+    made.store.fail(job["name"], "settle: not at rest")
+    made.run(Killed(), silent)
+    assert {row["why"] for row in rows(made.store)} == {"its pack could not be made: settle: not at rest"}
+    with pytest.raises(gm.RunFailedError, match="settle: not at rest"):
+        made.packs(Killed(), silent)
+
+
+def test_jobs_say_where_a_pack_is_whoever_reads_them_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(PACK.parent)
+    near = gm.Experiment(gm.load_pack(PACK.name), gm.six_signals(), t0=150.0)
+    (one,) = plan([point({}, near)], set(), MEMORY)
+    assert one.configurations[0]["pack"]["source"] == str(PACK)
+    shipped = gm.replace(near, pack=gm.load_pack("tetra-325-a"))
+    assert plan([point({}, shipped)], set(), MEMORY)[0].configurations[0]["pack"]["source"] == "tetra-325-a"
+
+
+def test_values_of_any_kind_have_a_label() -> None:
+    values = {"friction": gm.Mindlin(), "mu": 0.5, "t0": np.float64(2.0), "steps": None, "pack": "tetra-325-a"}
+    assert _labels(values) == {"friction": "Mindlin", "mu": 0.5, "t0": 2.0, "steps": None, "pack": "tetra-325-a"}
+
+
+def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
+    store, job = Store(tmp_path), {"kind": "run", "name": "abc", "points": ["key"], "work": 1.0}
+    store.order([job])
+    for name in ("abc-0", "old"):
+        (tmp_path / "parts" / name).mkdir()
+    with store.mine(job), atomic(store.at("key")) as temporary:
+        Store(tmp_path).order([])  # another sweep is asked for meanwhile, or somebody looks
+        assert temporary.is_file()
+        assert [path.name for path in (tmp_path / "parts").iterdir()] == ["abc-0"]
+    store.order([])
+    assert not list((tmp_path / "parts").iterdir())

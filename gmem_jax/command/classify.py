@@ -14,6 +14,7 @@ from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
+from gmem_jax.physics.state import together
 from gmem_jax.show import figures, tables
 
 if TYPE_CHECKING:
@@ -95,7 +96,13 @@ def classify_command(
         say(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}")
     result = report.reading(stored, trained)
     seconds = time.perf_counter() - began
-    result = {"recall": str(recall), "pack": configuration["pack"], "status": 0, "seconds": seconds, **result}
+    result = {
+        "recall": str(recall),
+        "pack": configuration["pack"],
+        "status": together(kept.status),
+        "seconds": seconds,
+        **result,
+    }
     save_result(output, READING, result)
     if drawn:
         net = result["readers"]["net"]

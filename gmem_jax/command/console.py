@@ -16,6 +16,7 @@ from rich.console import Console
 
 from gmem_jax.experiment.host import Progress
 from gmem_jax.files.atomic import probe
+from gmem_jax.files.checked import NAME, title
 from gmem_jax.files.results import finite
 
 log = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
@@ -54,6 +55,16 @@ def emit(as_json: bool, result: Any, *tables: Any) -> None:
     else:
         for table in tables:
             out.print(table, soft_wrap=isinstance(table, str))
+
+
+def require_name(name: str) -> None:
+    """Refuse a name that no file of ours may have.
+
+    Raises:
+        InputError: saying so.
+    """
+    if not title(name):
+        raise InputError(f"--name: must be a line of at most {NAME} printable characters")
 
 
 def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool, option: str = "--output") -> Path:

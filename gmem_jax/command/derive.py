@@ -259,6 +259,8 @@ def design_command(
     chosen = chosen if words is None else chosen.with_signals(f"words:{words}")
     (experiment,), drawn = chosen.claim([pack], output, ".csv", picture=picture, force=force)
     _needs_sub0(experiment)
+    if start is not None:
+        claim(output, ".csv", inputs=(start,), force=force)
     history = output.with_name(f"{output.stem}-history.png")
     if picture:
         claim(history, ".png", force=force)
@@ -345,7 +347,7 @@ def tune_command(
     began = time.perf_counter()
     first = experiments[0]
     _announce(first, "tune", len(names) * ((2 * len(limits) + 1) * iterations + 1), first.signals.count)
-    key = key_of_run(first, packs=[pack_fingerprint(each.pack) for each in experiments], bounds=limits)
+    key = key_of_run(first, packs=[pack_fingerprint(each.pack) for each in experiments], bounds=list(limits.items()))
     with resumable(output, key, restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             found = design_drive(experiments, limits, iterations=iterations, keep=parts, progress=progress)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from gmem_jax.command.console import AsJson, Force, InputError, Output, claim, emit, reporting, say
+from gmem_jax.command.console import AsJson, Force, InputError, Output, claim, emit, reporting, require_name, say
 from gmem_jax.files.exported import FORMATS, format_of, frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
@@ -25,7 +25,7 @@ def export(
 ) -> None:
     """Write a pack, or the configurations along a recall, for other programs (docs/exchange.md)."""
     file = pack_called(str(file)) or file
-    if schema_of(file) == PACK.name:
+    if schema_of(file) in (PACK.name, *PACK.before):
         pack = load_pack(file)
         mass, found = float(pack.clump.mass), load_frames(file) if frames else frames_of_pack(pack)
         command = "prepare"
@@ -36,6 +36,11 @@ def export(
         raise InputError(f"{file}: holds no configurations; keep some with gmem {command} --frames 16")
     chosen = format_of(to, several=frames)
     claim(output, chosen.suffix, inputs=(file,), force=force)
+    beside = output.with_suffix("")
+    if chosen.folder and beside.exists() and not (force and beside.is_dir()):
+        raise InputError(
+            f"--output {output}: {beside} beside it exists; name another file, or allow --force to fill it"
+        )
     chosen.write(output, found, mass)
     _, grains, _ = found.position.shape
     facts = {"output": str(output), "frames": found.count, "grains": grains, "spheres": grains * len(found.offsets)}
@@ -56,6 +61,7 @@ def import_command(
     # Here, not above: scipy takes half a second to load, and no other command needs it.
     from gmem_jax.preparation.imported import import_pack
 
+    require_name(name)
     claim(output, ".h5", inputs=(file,), force=force)
     with reporting() as progress:
         pack = import_pack(file, radius=radius, delta0=delta0, name=name, progress=progress)

@@ -18,6 +18,7 @@ from gmem_jax.command.console import (
     claim,
     emit,
     reporting,
+    require_name,
     say,
 )
 from gmem_jax.command.resuming import Restart, resumable
@@ -113,6 +114,7 @@ def prepare_command(
             ) from error
     elif output is None:
         raise InputError("--output is missing: name a file, or a standard pack like tetra-31680-a")
+    require_name(name)
     film_of(recipe, frames)  # refuses what cannot be before anything is begun
     claim(output, ".h5", force=force)
     backend = native.name(backend, Frictionless())

@@ -1,7 +1,8 @@
 """`gmem reproduce`."""
 
+import contextlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +19,7 @@ from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import (
     GALLERY,
     PICTURES,
+    RUNS,
     Outcome,
     Weighed,
     judge,
@@ -27,6 +29,7 @@ from gmem_jax.reproduce.run import (
     weigh,
 )
 from gmem_jax.sweeps.executors import executor as executor_named
+from gmem_jax.sweeps.store import Store
 
 NAMES = sorted((*FIGURES, *PICTURES, GALLERY, "claims", "choices"))
 
@@ -41,7 +44,11 @@ def reproduce_command(
         "reproduce"
     ),
     executor: Annotated[str, typer.Option(help="processes, slurm or local.")] = "processes",
-    workers: Annotated[int | None, typer.Option(min=1, help="Workers; default 1 for 8 CPUs.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Workers; default 1, of processes 1 for 8 CPUs.")] = None,
+    option: Annotated[
+        list[str] | None, typer.Option(help="Of submitit, NAME=VALUE, again for each: timeout_min=240.")
+    ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Try points and packs that failed again.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Run a figure of the paper again, beside the published points.
@@ -55,25 +62,30 @@ def reproduce_command(
         scale_of(scale)
     except ValueError as error:
         raise InputError(f"--scale {scale}: {error}") from None
+    options = _options(option or [])
+    executor_named(executor, workers, options)  # what cannot be had is refused before anything is written
     if not output.parent.is_dir():
         raise InputError(f"--output {output}: folder {output.parent} does not exist")
     probe(output.parent)
     output.mkdir(exist_ok=True)
     outcomes, verdicts, weighed, drawn = [], [], Weighed([], [], []), []
+    broken: list[str] = []
 
     def wanted(names: Iterable[str]) -> list[str]:
         return [name for name in names if what in (name, "all")]
 
     def how(progress: Progress) -> tuple[Any, ...]:
-        return output, scale, executor_named(executor, workers, {}), progress, say
+        return output, scale, executor_named(executor, workers, options), progress, say
 
     with locked(output / "figures"):
+        if retry and (count := Store(output / RUNS).forgive()):
+            say(f"{count} points and packs that failed are tried again")
         for name in wanted((GALLERY, *PICTURES)):
-            with reporting(goes_on=True) as progress:
+            with _going_on(broken), reporting(goes_on=True) as progress:
                 drawn += picture(name, *how(progress))
-            say(f"wrote {drawn[-1]}")
+                say(f"wrote {drawn[-1]}")
         if wanted(["claims"]):
-            with reporting(goes_on=True) as progress:
+            with _going_on(broken), reporting(goes_on=True) as progress:
                 verdicts = judge(*how(progress))
         if wanted(["choices"]):
             with reporting(goes_on=True) as progress:
@@ -98,8 +110,37 @@ def reproduce_command(
     lines = [f"{'yes' if verdict.holds else 'NO ':4}{verdict.claim}\n    {verdict.numbers}" for verdict in verdicts]
     more = [_choices_table(weighed.effects)] if weighed.effects else []
     emit(as_json, result, *lines, *more, *map(_table, outcomes))
-    if broken := len(weighed.failed) + sum(len(outcome.failed) for outcome in outcomes):
-        raise RunFailedError(f"{broken} points")
+    broken += weighed.failed + [reason for outcome in outcomes for reason in outcome.failed]
+    if broken:
+        raise RunFailedError(f"{len(broken)} points or packs; --retry tries them again")
+
+
+@contextlib.contextmanager
+def _going_on(broken: list[str]) -> Iterator[None]:
+    """What cannot be shown because a run failed is said, and the next thing done."""
+    try:
+        yield
+    except RunFailedError as error:
+        broken.append(str(error))
+        say(f"failed: {error}", style="yellow")
+
+
+def _options(texts: Sequence[str]) -> dict[str, Any]:
+    """Options of an executor by name; numbers where they read as such.
+
+    Raises:
+        InputError: if one does not read like timeout_min=240.
+    """
+    options: dict[str, Any] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if not (name and value):
+            raise InputError(f"--option {text}: should read like timeout_min=240")
+        options[name] = value
+        for kind in (float, int):
+            with contextlib.suppress(ValueError):
+                options[name] = kind(value)
+    return options
 
 
 def _say_written(done: Outcome | Weighed) -> None:

@@ -31,7 +31,9 @@ def sweep_command(
         Path | None, typer.Option("-o", "--output", help="Folder of the sweep, default the file's name; or of export.")
     ] = None,
     executor: Annotated[str, typer.Option(help="processes, slurm or local; default the file's, or processes.")] = "",
-    workers: Annotated[int | None, typer.Option(min=1, help="Workers; default the file's, or 1 for 8 CPUs.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Workers; default the file's, or 1, of processes 1 for 8 CPUs.")
+    ] = None,
     over: Annotated[str, typer.Option(help="show: names to average over, separated by commas.")] = "",
     retry: Annotated[bool, typer.Option("--retry", help="Try points that failed again.")] = False,
     force: Force = False,
@@ -128,7 +130,8 @@ def _status(store: Store, as_json: bool) -> None:
     table = rows(store)
     summary = _summary(store, table)
     lines = [f"{summary[state]} {state}" for state in ("done", "failed", "open")]
-    at_work = [one for one in store.told() if any(job["name"] == one["job"] for job in store.jobs())]
+    taken = {job["name"] for job in store.jobs() if store.taken(job)}
+    at_work = [one for one in store.told() if one["job"].partition("-")[0] in taken]
     busy = [f"{one['what']}, {one['fraction']:.0%}" for one in at_work if one["fraction"] < 1.0]
     reasons = sorted({row["why"] for row in table if row["state"] == "failed"})
     emit(as_json, summary, ", ".join(lines), *busy, *(f"failed: {reason}" for reason in reasons))

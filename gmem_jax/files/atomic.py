@@ -5,6 +5,7 @@ import errno
 import os
 import re
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -58,8 +59,15 @@ def probe(folder: Path) -> None:
     Path(name).unlink()
 
 
-def sweep(folder: Path, name: str = "") -> None:
-    """Remove what killed writers left behind: temporary files of the files in a folder (or of one of them)."""
+def sweep(folder: Path, name: str = "", *, age: float = 0.0) -> None:
+    """Remove what killed writers left behind: temporary files of the files in a folder (or of one of them).
+
+    Args:
+        folder: where they are.
+        name: of the one file; default all.
+        age: in s: younger ones may be those of living writers.
+    """
     for left in Path(folder).glob(f".{name}.*.tmp" if name else ".*.tmp"):
         with contextlib.suppress(OSError):
-            left.unlink()
+            if time.time() - left.stat().st_mtime >= age:
+                left.unlink()

@@ -20,6 +20,7 @@ KINDS = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no
 FIXED = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that have one length in every file
 LONGEST = 18  # digits of a whole number: no count or seed has more
 NAME = 200  # characters of what is printed
+PATH = 4096  # of a path
 _SHOWN = 160  # characters of an error of some library
 
 
@@ -155,6 +156,11 @@ def numbers(value: Any) -> bool:
 def title(value: Any) -> bool:
     """Whether it is a short text that can be printed in a line."""
     return isinstance(value, str) and len(value) <= NAME and value.isprintable()
+
+
+def source(value: Any) -> bool:
+    """Whether it can be the path of a file, or the name of a pack."""
+    return isinstance(value, str) and len(value) <= PATH and value.isprintable()
 
 
 def whole(value: Any) -> bool:

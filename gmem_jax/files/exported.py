@@ -131,11 +131,6 @@ def _rows(file: TextIO, form: str, *columns: np.ndarray) -> None:
     np.savetxt(file, np.column_stack(columns), fmt=form)
 
 
-def _series(path: Path) -> Path:
-    """The folder of a VTK series."""
-    return path.with_suffix("")
-
-
 def write_vtp(path: Path, frames: Frames, mass: float) -> None:
     """VTK polygonal data, as ParaView reads it: a point for every sphere, with `radius` and `grain` (from 1).
 
@@ -155,7 +150,7 @@ def write_pvd(path: Path, frames: Frames, mass: float) -> None:
         ValueError: if the package pyvista is not there.
         OSError: if the path cannot be written.
     """
-    folder = _series(path)
+    folder = path.with_suffix("")
     folder.mkdir(exist_ok=True)
     rows = []
     for number in range(frames.count):
@@ -208,16 +203,18 @@ class Format(NamedTuple):
         suffix: of its files.
         write: writes frames, of grains of a mass.
         series: likewise for several configurations, where that is another kind of file.
+        folder: whether it writes a folder, too, of the file's name without its suffix.
     """
 
     suffix: str
     write: Callable[[Path, Frames, float], None]
     series: "Format | None" = None
+    folder: bool = False
 
 
 FORMATS = {
     "gsd": Format(".gsd", write_gsd),
-    "vtk": Format(".vtp", write_vtp, Format(".pvd", write_pvd)),
+    "vtk": Format(".vtp", write_vtp, Format(".pvd", write_pvd, folder=True)),
     "xyz": Format(".xyz", write_xyz),
     "lammps": Format(".data", write_lammps, Format(".lammpstrj", write_dump)),
 }

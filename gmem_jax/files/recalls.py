@@ -22,6 +22,7 @@ from gmem_jax.files.checked import (
     require,
     require_fields,
     require_finite,
+    source,
     title,
     whole,
 )
@@ -144,7 +145,7 @@ def _waveforms(configuration: dict[str, Any], u: np.ndarray, integral: np.ndarra
 
 def _check_configuration(configuration: dict[str, Any]) -> None:
     """What tables and figures rely on."""
-    kinds = {"pack": title, "friction": title, "background": title, "grains": whole, "steps": whole}
+    kinds = {"pack": source, "friction": title, "background": title, "grains": whole, "steps": whole}
     amounts = dict.fromkeys(("mu", "delta0", "gamma0", "t0", "hold_drag", "dt"), numbers)
     require_fields(configuration, "configuration", **kinds, **amounts, seconds=is_number)
     require_fields(configuration.get("grain"), "configuration's grain", shape=title, mass=is_number, diameter=is_number)

@@ -93,7 +93,7 @@ PACK = Schema(
         "clump/offsets": Array("real", ("part", "axis"), "R", "centres of the spheres of a grain, in its own frame"),
         "clump/mass": Array("real", (), "rho R^3", "mass of a grain"),
         "clump/inertia": Array("real", ("axis",), "rho R^5", "principal moments of inertia of a grain"),
-        "clump/diameter": Array("real", (), "R", "largest extent of a grain"),
+        "clump/diameter": Array("real", (), "R", "of the sphere about a grain's centre that holds it"),
         "pairs/candidates": Array("whole", ("side", "candidate"), "1", "numbers of the spheres that may touch"),
         "pairs/reference": Array("real", ("sphere", "axis"), "1", "where the list was made, in parts of the box"),
         "pairs/smallest": Array("real", ("axis",), "R", "edges of the box at u = 1, for which the list was made"),
@@ -150,7 +150,7 @@ KERNEL = Schema(
 
 _RUN = {
     "seconds": Array("real", (), "s", "wall time of the run"),
-    "status": Array("whole", (), "1", "bits of gm.Status; 0 is sound"),
+    "status": Array("whole", (), "1", "0: nothing broke; what is doubtful a recall says"),
 }
 _MADE = {**_RUN, "configuration": Array("object", (), "", _CONFIGURATION["configuration"])}
 
@@ -208,6 +208,7 @@ READING = Schema(
             "list", ("net",), "", "seed, accuracy, cross-entropy (nats), validation accuracy, steps, seconds"
         ),
         **_RUN,
+        "status": Array("whole", (), "1", "bits of gm.Status of the recall; 0 is sound"),
     },
     before={"": "without `schema` and `about`"},
 )

@@ -1,5 +1,6 @@
 """Waveforms as tables of samples: CSV and NPY."""
 
+import codecs
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -71,7 +72,7 @@ def _comment(path: Path, mark: str) -> dict[str, Any]:
     """The JSON of a comment in one of the first two lines; {} if there is none."""
     with path.open("rb") as file:
         lines = [file.readline(_LARGEST) for _ in range(2)]
-    for line in lines:
+    for line in (line.removeprefix(codecs.BOM_UTF8) for line in lines):
         if line.startswith(mark.encode()):
             return json_of(line.decode().removeprefix(mark), mark.strip("# :"))
     return {}
@@ -83,7 +84,7 @@ def _npy(path: Path) -> np.ndarray:
 
 
 def _csv(path: Path) -> np.ndarray:
-    lines = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    lines = [line for line in path.read_text("utf-8-sig").splitlines() if line.strip() and not line.startswith("#")]
     if not lines:
         return np.zeros((0, 0))
     first = lines[0].split(",")

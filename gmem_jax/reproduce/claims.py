@@ -98,8 +98,8 @@ def order_matters(standard: Recall, before: Recall, scale: float) -> Verdict:
     """A shear pulse before the compression leaves nothing to be read: no waveform, that is.
 
     What it moved for good leaves an offset, about as large at every u, and the same for one bump early, one late or
-    two (docs/decisions.md). J has a sign for most of the signals, so that an offset alone has a gain. The verdict is on
-    p_sig and J less their means over u.
+    two (docs/decisions/experiment.md). J has a sign for most of the signals, so that an offset alone has a gain. The
+    verdict is on p_sig and J less their means over u.
     """
     ratio = float(np.sqrt(np.sum(np.asarray(before.p_sig) ** 2) / np.sum(np.asarray(standard.p_sig) ** 2)))
     waved, wave = (float(compare(_less_mean(one.p_sig), _less_mean(one.J), scale).gain) for one in (before, standard))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from gmem_jax import native
 from gmem_jax.bench.measure import rival
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.host import Progress, require_x64, silent
+from gmem_jax.experiment.host import Progress, RunFailedError, require_x64, silent
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.physics.contact.laws import entry_of, law_named
@@ -58,11 +58,11 @@ PICTURES = {
 GALLERY = "fig03"  # pictures of packs, which may have to be made
 
 
-def _run(spec: Spec, folder: Path, executor: Executor | None, progress: Progress, say: Tell) -> Store:
-    """Do what is missing of a sweep."""
+def _run(spec: Spec, folder: Path, executor: Executor | None, progress: Progress, say: Tell) -> Conductor:
+    """Do what is missing of a sweep, whose conductor has done it."""
     conductor = Conductor(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
     conductor.run(executor or Processes(), progress)
-    return conductor.store
+    return conductor
 
 
 def _target(folder: Path, name: str, scale: str, suffix: str = ".png") -> Path:
@@ -129,7 +129,8 @@ def weigh(
     size, folder = scale_of(scale, choices.SIZES), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     named = packs(size, size.grains, size.few)
-    store = _run(Spec(shared={"t0": size.t0}, extra=tuple(choices.points(named))), folder, executor, progress, say)
+    spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.points(named)))
+    store = _run(spec, folder, executor, progress, say).store
     done = store.done()
     rows = [row for row in store.card()["points"] if row["key"] in done]
     runs = [(row["values"], summary(*store.load(row["key"]))) for row in rows]
@@ -151,18 +152,20 @@ def judge(
 ) -> list[Verdict]:
     """Run what the claims of the paper need, on one pack, and judge them; writes claims-SCALE.json.
 
-    Args and errors are those of `reproduce`.
+    Args and errors are those of `reproduce`; a claim cannot be judged where a point of it failed (RunFailedError).
     """
     size, folder = scale_of(scale), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     (named,) = packs(size, size.grains, 1)
     (spheres,) = packs(size, size.grains, 1, shape="sphere")
     spec = Spec(shared={"t0": size.t0}, extra=(*claims.points([named]), spheres))
-    store = _run(spec, folder, executor, progress, say)
-    runs = [(row["values"], *store.load(row["key"])) for row in store.card()["points"]]
-    tetra, sphere = (load_pack(runs[place][2]["pack"]) for place in (0, -1))
-    own = [(values, recall) for values, recall, _ in runs[:-1]]
-    found = claims.verdicts(tetra, size.t0, own, {"sphere": sphere})
+    conductor = _run(spec, folder, executor, progress, say)
+    store = conductor.store
+    if failed := _failed(store):
+        raise RunFailedError(failed[0])
+    runs = [(row["values"], store.load(row["key"])[0]) for row in store.card()["points"]]
+    tetra, sphere = (conductor.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
+    found = claims.verdicts(tetra, size.t0, runs[:-1], {"sphere": sphere})
     with atomic(_target(folder, "claims", scale, ".json")) as path:
         path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n")
     return found
@@ -229,7 +232,7 @@ def reproduce(
         raise ValueError(f"no figure {name!r}; there are {', '.join(FIGURES)}")
     size, folder = scale_of(scale), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    store = _run(spec_of(FIGURES[name], size), folder, executor, progress, say)
+    store = _run(spec_of(FIGURES[name], size), folder, executor, progress, say).store
     points = points_of(store)
     target = _target(folder, name, scale)
     failed = _failed(store)

@@ -39,8 +39,13 @@ from gmem_jax.sweeps.table import rows as points_of
 
 LARGEST_CONFUSION = 256  # words
 _CELL = 300  # characters of a value in a configuration
-_ALIKE = ("signals", "friction", "mu", "delta0", "gamma0", "t0", "background", "grains")
 _NUMBER = re.compile(r"[-+]?\d[\d.,e±\s+-]*|nan|")
+
+
+def _but_for_its_pack(configuration: dict[str, Any]) -> str:
+    """All that makes the experiment of a recall, and size and shape of the grains, so that packs can be compared."""
+    own = {**configuration["experiment"], "pack": [configuration["grains"], configuration["grain"]["shape"]]}
+    return json.dumps(own, sort_keys=True)
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> str:
@@ -145,11 +150,10 @@ class Report:
         """Recalls of one experiment on several packs beside each other, with means and standard deviations."""
         if len(self._recalls) < 2:
             return []
-        alike = (
-            len({json.dumps([configuration.get(name) for name in _ALIKE]) for _, configuration in self._recalls}) == 1
-        )
+        own = [configuration.get("experiment", {}) for _, configuration in self._recalls]
+        packs = {each.get("pack", {}).get("sha256") for each in own}
         rows, configuration = [row for row, _ in self._recalls], self._recalls[-1][1]
-        if not alike:
+        if len(packs) < len(own) or len({_but_for_its_pack(each) for _, each in self._recalls}) > 1:
             return []
         return [("Packs", of_rich(tables.recall_table(rows, configuration)))]
 

@@ -38,7 +38,9 @@ class Quantity:
 
     @property
     def top(self) -> float:
-        """Where the colours end; 1 where all is zero."""
+        """Where the colours end; 1 where all is zero, or nothing is there."""
+        if not self.values.size:
+            return 1.0
         return float(np.quantile(self.values, SHOWN)) or float(self.values.max()) or 1.0
 
 

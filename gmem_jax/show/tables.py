@@ -13,6 +13,7 @@ from rich.table import Table
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import spread
+from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average
@@ -61,7 +62,7 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "contacts_per_grain": [_known(np.asarray(readout.contacts_per_grain)[k, 0]) for k in (-1, 0)],
         "pressure_pa": [float(pressure[k, :2, 0].mean() * unit) for k in (-1, 0)],
         "largest_signal_pa": float(np.max(np.abs(np.asarray(recall.p_sig))) * unit),
-        "dt": float(recall.dt),
+        "dt": float(np.max(np.asarray(recall.dt))),
         "status": status,
         "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
         "status_text": explain(status),
@@ -201,13 +202,17 @@ def _amount(value: Any) -> str:
 
 
 def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:
-    """Published points of the same experiment: signals, background, law, grain, size, drive, and a rate not faster
-    than that at which fast drives were found to agree with the paper's.
+    """Published points of the same experiment: signals, background, law, grain, size, drive, stages, and a rate not
+    faster than that at which fast drives were found to agree with the paper's.
+
+    What the paper leaves open may be chosen otherwise: to see what it does to the agreement is why one would.
     """
     written = configuration.get("experiment", {})
     if written.get("signals") != {"kind": "six"} or configuration.get("background") != "sub0":
         return []
     if configuration["friction"] != "hooke" or not np.min(configuration["t0"]) >= SLOW_ENOUGH:
+        return []
+    if any(written.get(name) != getattr(Experiment, name) for name in ("shear", "store", "hold")):
         return []
     same = {key: configuration[key] for key in ("mu", "delta0", "gamma0")}
     shape = configuration["grain"]["shape"]

@@ -11,6 +11,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from gmem_jax.experiment.host import RunFailedError
@@ -19,7 +20,7 @@ from gmem_jax.sweeps import work
 from gmem_jax.sweeps.store import Store
 
 POLL = 0.5  # s
-DEATHS = 3  # of workers one after the other, without a job finished between, that end a sweep
+DEATHS = 3  # of workers one after the other, none of which got farther than those before, that end a sweep
 CORES = 8  # of a worker: more gain little at N = 325
 PATIENCE = 30.0  # s for a controller to answer
 
@@ -54,7 +55,7 @@ class Executor(ABC):
         """
         names = [f"worker-{number}" for number in range(min(self.workers, max(1, len(jobs))))]
         total = sum(job["work"] for job in jobs) or 1.0
-        deaths, left, open_ = 0, len(jobs), jobs
+        deaths, furthest, open_ = 0, -1.0, jobs
         try:
             while True:
                 open_ = [job for job in open_ if not store.finished(job)]
@@ -64,13 +65,13 @@ class Executor(ABC):
                 told(now / total)
                 if not open_:
                     return
-                deaths = deaths if len(open_) == left else 0
-                left = len(open_)
+                if now > furthest:  # a worker whose time is over, say, has not died in vain
+                    deaths, furthest = 0, now
                 alive = self.alive()
                 if not alive and not any(store.taken(job) for job in open_):
                     if deaths == DEATHS:
                         store.require_room()
-                        raise RunFailedError(f"workers end without doing their jobs: {self.last_words(store, names)}")
+                        raise RunFailedError(f"workers end without doing their jobs: {self._last_words(store)}")
                     deaths += 1
                 for name in names[: len(open_)]:
                     if name not in alive and (deaths <= DEATHS):
@@ -79,11 +80,13 @@ class Executor(ABC):
         finally:
             self.stop()
 
-    @staticmethod
-    def last_words(store: Store, names: list[str]) -> str:
-        """The last line of what the workers said."""
-        lines = [line for name in names if store.log_of(name).is_file() for line in store.log_of(name).open()]
-        return lines[-1].strip() if lines else "they said nothing"
+    def said(self, store: Store) -> str:
+        """What the workers said."""
+        return store.said()
+
+    def _last_words(self, store: Store) -> str:
+        lines = [line.strip() for line in self.said(store).splitlines() if line.strip()]
+        return lines[-1] if lines else "they said nothing"
 
 
 def cores() -> list[int]:
@@ -139,8 +142,8 @@ class Submitted(Executor):
 
     Args:
         cluster: "slurm", or "local" for submitit's own processes.
-        workers: how many.
-        options: of submitit's executor, like slurm_partition, timeout_min, cpus_per_task, mem_gb.
+        workers: how many; default 1.
+        options: of submitit's executor, like slurm_partition, timeout_min (60), cpus_per_task (1), mem_gb.
 
     Raises:
         ValueError: if submitit is not installed, the scheduler cannot be reached, or an option is none of its.
@@ -154,17 +157,29 @@ class Submitted(Executor):
         self._executor: Any = None
         if cluster == "slurm":
             _require_slurm()
+        try:
+            self._submitting(Path())
+        except (NameError, AssertionError) as error:
+            raise ValueError(f"options of submitit: {str(error).splitlines()[0]}") from None
+
+    def _submitting(self, logs: Path) -> Any:
+        """Submitit's executor; NameError or AssertionError if an option is none of its, or cannot be."""
+        made = self._submitit.AutoExecutor(logs, cluster=self._cluster)
+        made.update_parameters(**self._options)
+        return made
 
     def start(self, store: Store, name: str) -> None:
         """Submit a job."""
         try:
             if self._executor is None:
-                logs = store.folder / "workers" / "submitit"
-                self._executor = self._submitit.AutoExecutor(logs, cluster=self._cluster)
-                self._executor.update_parameters(**self._options)
+                self._executor = self._submitting(store.folder / "workers" / "submitit")
             self._jobs[name] = self._executor.submit(work.main, [str(store.folder), name])
         except (self._submitit.core.utils.FailedJobError, subprocess.SubprocessError, FileNotFoundError) as error:
             raise OSError(f"the scheduler takes no job: {' '.join(str(error).split())[-300:]}") from error
+
+    def said(self, store: Store) -> str:
+        """What the workers said, as far as submitit finds it."""
+        return "\n".join(text for job in self._jobs.values() for text in (job.stdout(), job.stderr()) if text)
 
     def alive(self) -> set[str]:
         """The names of those that have not ended."""

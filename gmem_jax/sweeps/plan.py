@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from gmem_jax.experiment.experiment import Experiment
@@ -84,10 +85,18 @@ def job(group: Sequence[Point], memory: int) -> Job:
     """The job of a group of points."""
     keys = tuple(one.key for one in group)
     experiments = [one.experiment for one in group]
+    configurations = tuple(_found_anywhere(written(each)) for each in experiments)
     batch = min(default_batch(experiments[0], memory), experiments[0].signals.count)
     work = sum(each.pack.grains * each.timing.steps * replica_bins(each, batch) for each in experiments)
     replicas = sum(each.replicas for each in experiments) if len(group) > 1 else batch + 1
-    return Job(digest(keys), keys, tuple(written(each) for each in experiments), batch, replicas, float(work))
+    return Job(digest(keys), keys, configurations, batch, replicas, float(work))
+
+
+def _found_anywhere(configuration: dict[str, Any]) -> dict[str, Any]:
+    """A written experiment whose pack a worker finds in whichever folder it runs."""
+    of_pack = configuration["pack"]
+    path = Path(of_pack["source"])
+    return {**configuration, "pack": {**of_pack, "source": str(path.absolute())}} if path.is_file() else configuration
 
 
 def plan(points: Sequence[Point], done: set[str], memory: int, *, workers: int = 1) -> list[Job]:

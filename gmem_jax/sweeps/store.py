@@ -27,6 +27,7 @@ from gmem_jax.sweeps.plan import Point
 
 SWEEP_SCHEMA = "gmem-sweep/1"
 ROOM = 1 << 20  # bytes that must be left on the disk: some points of a small pack
+WRITTEN = 3600.0  # s in which a file is surely written: workers write while others look
 FOLDERS = ("jobs", "points", "failed", "packs", "parts", "workers")
 
 
@@ -51,7 +52,7 @@ class Store:
                 raise FileFormatError(f"{folder}: holds {others[0]} and no sweep; name a folder of its own")
         for name in FOLDERS:
             (self.folder / name).mkdir(parents=True, exist_ok=True)
-            sweep(self.folder / name)
+            sweep(self.folder / name, age=WRITTEN)
 
     @property
     def _card(self) -> Path:
@@ -167,7 +168,7 @@ class Store:
         return len(failed)
 
     def order(self, jobs: Sequence[dict[str, Any]]) -> None:
-        """Put up jobs in the place of those that were there; parts of others are removed."""
+        """Put up jobs in the place of those that were there; parts of others are removed, where nobody is at them."""
         wanted = {f"{number:05d}-{job['name']}.json": job for number, job in enumerate(jobs)}
         for path in (self.folder / "jobs").glob("*.json"):
             if path.name not in wanted:
@@ -176,12 +177,18 @@ class Store:
             self._write(self.folder / "jobs" / name, job)
         names = {job["name"] for job in jobs}
         for path in (self.folder / "parts").iterdir():
-            if path.is_dir() and path.name not in names:
+            name = path.name.partition("-")[0]  # points of a job that broke are run by themselves, numbered
+            if path.is_dir() and name not in names and not self.taken({"name": name}):
                 shutil.rmtree(path, ignore_errors=True)
 
     def jobs(self) -> list[dict[str, Any]]:
         """The jobs that were put up, in order."""
         return [json.loads(path.read_text()) for path in sorted((self.folder / "jobs").glob("*.json"))]
+
+    def begun(self, keys: set[str]) -> list[dict[str, Any]]:
+        """Unfinished runs of some points that a worker is at, or was: they go on as they were begun."""
+        runs = [job for job in self.jobs() if job["kind"] == "run" and keys.issuperset(job["points"])]
+        return [job for job in runs if not self.finished(job) and (self.parts(job).is_dir() or self.taken(job))]
 
     def finished(self, job: dict[str, Any]) -> bool:
         """Whether nothing is left to do of a job."""
@@ -231,3 +238,10 @@ class Store:
     def log_of(self, worker: str) -> Path:
         """The file of what a worker says."""
         return self.folder / "workers" / f"{worker}.log"
+
+    def said(self) -> str:
+        """What the workers with such files said, who said something last at the end."""
+        logs = (self.folder / "workers").glob("*.log")
+        return "\n".join(
+            path.read_text(errors="replace") for path in sorted(logs, key=lambda path: path.stat().st_mtime)
+        )

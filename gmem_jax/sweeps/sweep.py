@@ -3,17 +3,19 @@
 import contextlib
 import functools
 import itertools
+import numbers
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import psutil
 
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
-from gmem_jax.experiment.host import Progress, silent, within, work_of_bin
+from gmem_jax.experiment.host import Progress, RunFailedError, silent, within, work_of_bin
 from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall, replica_bins
@@ -112,9 +114,12 @@ def _labels(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _label(value: Any) -> Any:
-    if isinstance(value, str):
+    if value is None or isinstance(value, str):
         return value
-    return value.name if isinstance(value, Pack) else float(value) if np.ndim(value) == 0 else type(value).__name__
+    if isinstance(value, Pack):
+        return value.name
+    scalar = isinstance(value, np.ndarray | jax.Array) and value.ndim == 0
+    return float(value) if scalar or isinstance(value, numbers.Real) else type(value).__name__
 
 
 class Conductor:
@@ -165,7 +170,8 @@ class Conductor:
             if "pack" not in all_:
                 job = self._pack_job(all_)
                 wanted[job["name"]] = job
-        return [job for job in wanted.values() if not self.store.pack_at(job["name"]).is_file()]
+        failed = self.store.failed()
+        return [job for name, job in wanted.items() if name not in failed and not self.store.pack_at(name).is_file()]
 
     def check(self) -> None:
         """Refuse a sweep before anything is computed: some points with every value are made, on some pack if need be.
@@ -194,21 +200,35 @@ class Conductor:
             raise ValueError(f"a point has a pack and {odd[0]!r} of one to be made; give one of them")
         return named_experiment(pack, own, self._signals(*waveforms_of(own)))
 
-    def _pack(self, values: Mapping[str, Any]) -> Pack:
-        return self._packs(str(values.get("pack") or self.store.pack_at(self._pack_job(values)["name"])))
+    def pack_of(self, values: Mapping[str, Any]) -> Pack:
+        """The pack of a point, if it is made.
+
+        Args:
+            values: of the point, the shared ones too.
+
+        Raises:
+            RunFailedError: if it could not be made.
+            FileNotFoundError: if there is no such pack.
+        """
+        if "pack" in values:
+            return self._packs(str(values["pack"]))
+        name = self._pack_job(values)["name"]
+        if not self.store.pack_at(name).is_file() and (reason := self.store.failed().get(name)):
+            raise RunFailedError(f"its pack could not be made: {reason}")
+        return self._packs(str(self.store.pack_at(name)))
 
     def packs(self, executor: Executor, progress: Progress) -> list[Pack]:
         """The packs of all points, in order; those that do not exist yet are made.
 
         Raises:
-            RunFailedError: if workers die again and again.
+            RunFailedError: if one could not be made, or workers die again and again.
             OSError: if none can be started.
-            FileNotFoundError: if there is no such pack, or it could not be made.
+            FileNotFoundError: if there is no such pack.
         """
         if makes := self.pack_jobs():
             self._announce(f"{len(makes)} packs to be made", makes, executor)
             self._finish(executor, makes, progress, "packs")
-        return [self._pack({**self.spec.shared, **values}) for values in self.spec.combinations()]
+        return [self.pack_of({**self.spec.shared, **values}) for values in self.spec.combinations()]
 
     def points(self) -> list[Point]:
         """All points that are possible, once their packs are there."""
@@ -217,8 +237,8 @@ class Conductor:
         for values in self.spec.combinations():
             all_ = {**self.spec.shared, **values}
             try:
-                found.append(point(values, self._experiment(all_, self._pack(all_))))
-            except (ValueError, FileNotFoundError) as error:
+                found.append(point(values, self._experiment(all_, self.pack_of(all_))))
+            except (ValueError, FileNotFoundError, RunFailedError) as error:
                 self.impossible.append((values, " ".join(str(error).split())))
         return found
 
@@ -244,7 +264,9 @@ class Conductor:
             self.store.at(key).unlink()
         known = self.store.done() | set(self.store.failed())
         memory = psutil.virtual_memory().available // executor.workers
-        jobs = [job.asdict() for job in plan(points, known, memory, workers=executor.workers)]
+        begun = self.store.begun({one.key for one in points} - set(self.store.failed()))
+        under_way = {key for job in begun for key in job["points"]}
+        jobs = begun + [job.asdict() for job in plan(points, known | under_way, memory, workers=executor.workers)]
         kept = len({one.key for one in points} & known)
         if jobs:
             count = sum(len(job["points"]) for job in jobs)

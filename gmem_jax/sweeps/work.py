@@ -114,9 +114,8 @@ class _Worker:
         return [experiment_from(one, self.packs(one["pack"]["source"])) for one in written]
 
     def _run(self, job: dict[str, Any]) -> None:
-        experiments = [experiment_from(one, self.packs(one["pack"]["source"])) for one in job["configurations"]]
-        say = self.progress(job["name"])
-        run_group(job["points"], experiments, store=self.store, batch=job["batch"], keep=self._parts(job), progress=say)
+        say, keep = self.progress(job["name"]), self._parts(job)
+        run_group(job["points"], self._experiments(job), store=self.store, batch=job["batch"], keep=keep, progress=say)
 
     def _one_by_one(self, job: dict[str, Any]) -> None:
         for number, key in enumerate(job["points"]):

@@ -44,6 +44,8 @@ def test_a_design_goes_on_from_a_file(
     on = ["design", PACK, "--by", "kernel", "--bumps", 5, "--width", 0.4, "--iterations", 1, "--no-picture", *SHORT]
     assert gmem(monkeypatch, *on, "--start", few) == 2
     assert "1 waveforms to start from, for 6 signals; give one for each" in capsys.readouterr().err
+    assert gmem(monkeypatch, *on, "--start", waves, "-o", waves, "--force") == 2
+    assert "is an input of this command" in capsys.readouterr().err
     assert gmem(monkeypatch, *on, "--start", waves, "--json") == 0
     assert len(json.loads(capsys.readouterr().out)["history"]) == 2
     # Five bumps come near the earlier waveforms, all alike, and nothing was corrected.

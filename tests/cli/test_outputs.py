@@ -10,6 +10,7 @@ from test_cli import PACK, SHORT, gmem
 import gmem_jax as gm
 from gmem_jax.command import packs
 from gmem_jax.files.results import finite
+from gmem_jax.files.waveforms import load_target
 from gmem_jax.show import tables
 
 
@@ -84,6 +85,17 @@ def test_waveforms_that_are_not_what_they_seem_are_refused(
     assert len(said.strip().splitlines()) == 1
 
 
+def test_a_byte_order_mark_is_no_part_of_the_numbers(tmp_path: Path) -> None:
+    (tmp_path / "plain.csv").write_text("0.1\n0.5\n0.9\n")
+    (tmp_path / "marked.csv").write_text("0.1\n0.5\n0.9\n", encoding="utf-8-sig")
+    gm.save_waveforms(tmp_path / "designed.csv", gm.waveform(np.array([0.1, 0.5])), gm.waveform(np.array([0.2, 0.4])))
+    text = (tmp_path / "designed.csv").read_text()
+    (tmp_path / "again.csv").write_text(text, encoding="utf-8-sig")
+    for plain, marked in (("plain.csv", "marked.csv"), ("designed.csv", "again.csv")):
+        np.testing.assert_array_equal(*(gm.load_waveforms(tmp_path / name) for name in (plain, marked)))
+    assert load_target(tmp_path / "again.csv") is not None
+
+
 def test_complex_samples_are_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
@@ -119,6 +131,9 @@ def test_published_points_stand_only_beside_what_they_were_measured_on() -> None
     assert points(background="sub2") == 0
     assert points(friction=gm.Mindlin()) == 0
     assert points(**{"friction.mu": 0.5}) == 0
+    assert points(shear="before") == 0
+    assert points(store=8.0) == 0
+    assert points(**{"friction.stiffness": 0.2}) == 1  # the paper leaves it open
 
 
 def test_json_has_null_where_there_is_no_number() -> None:

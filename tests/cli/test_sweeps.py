@@ -138,11 +138,15 @@ def test_workers_that_are_killed_are_replaced_and_change_no_bit(swept: Path, tmp
 
 
 REFUSED = {
-    "no such file": ["nowhere.toml"],
-    "no sweep": ["status", "."],
-    "no such folder": ["show", "nowhere"],
-    "name the folder": ["status"],
-    "neither a sweep file": ["recall.h5"],
+    "no such file": ["sweep", "nowhere.toml"],
+    "no sweep": ["sweep", "status", "."],
+    "no such folder": ["sweep", "show", "nowhere"],
+    "name the folder": ["sweep", "status"],
+    "neither a sweep file": ["sweep", "recall.h5"],
+    "no such figure": ["reproduce", "fig99"],
+    "changes nothing of a scale": ["reproduce", "fig06", "--scale", "paper,size=3"],
+    "should read like timeout_min=240": ["reproduce", "fig06", "--option", "timeout_min"],
+    "no option 'mem_gb'": ["reproduce", "fig06", "--option", "mem_gb=1.5"],
 }
 
 
@@ -151,11 +155,12 @@ def test_bad_commands_are_refused_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, problem: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert gmem(monkeypatch, "sweep", *REFUSED[problem]) == 2
+    assert gmem(monkeypatch, *REFUSED[problem]) == 2
     told = capsys.readouterr()
     assert problem in told.err
     assert told.err.count("\n") == 1
     assert told.out == ""
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
