@@ -14,7 +14,7 @@ from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
-from gmem_jax.physics.state import together
+from gmem_jax.physics.state import explain, together
 from gmem_jax.show import figures, tables
 
 if TYPE_CHECKING:
@@ -85,6 +85,8 @@ def classify_command(
     except OSError as error:
         raise InputError(f"--nets {folder}: cannot make this folder ({error.strerror})") from error
     say(f"{stored.bits}-bit words of pack {configuration['pack']}, background {stored.background.upper()}")
+    if status := together(kept.status):
+        say(f"{recall}: {explain(status)}", style="yellow")
     began = time.perf_counter()
     trained = []
     for seed in range(seeds):
@@ -99,7 +101,7 @@ def classify_command(
     result = {
         "recall": str(recall),
         "pack": configuration["pack"],
-        "status": together(kept.status),
+        "status": status,
         "seconds": seconds,
         **result,
     }

@@ -151,7 +151,10 @@ def test_recalled_words_are_classified_and_the_nets_are_used_again(
     assert stored.pop("schema") == "gmem-reading/1"
     assert set(stored.pop("about")) == set(said)
     assert stored == said
-    assert (said["bits"], said["background"], said["status"]) == (1, "sub2-bl", 0)
+    assert (said["bits"], said["background"]) == (1, "sub2-bl")
+    # A drive as fast as this is doubtful, and so is what is read from it.
+    assert said["status"] == np.bitwise_or.reduce(gm.load_recall(one_bit)[0].status) != 0
+    assert gm.explain(said["status"]) in " ".join(spoken.err.split())
     assert [net["finished"] for net in said["nets"]] == [True, True]
     assert set(said["readers"]) == {"net", "nearest template", "linear decoder"}
     mean = np.mean([net["accuracy"] for net in said["nets"]])
