@@ -235,6 +235,22 @@ def test_runs_that_were_begun_go_on_as_they_were(tmp_path: Path) -> None:
     ]  # not two runs of two, which two workers would be given anew
 
 
+def test_what_was_begun_outlives_another_figure_s_jobs(tmp_path: Path) -> None:
+    first = {"kind": "run", "name": "abc", "points": ["one", "two"], "work": 1.0}
+    other = {"kind": "pack", "name": "def", "work": 1.0}
+    store = Store(tmp_path)
+    store.order([first])
+    store.parts(first).mkdir()
+    store.order([other])
+    assert store.jobs() == [other]
+    assert store.begun({"one", "two", "three"}) == [first]
+    assert store.begun({"one"}) == []
+    for key in first["points"]:
+        store.fail(key, "done otherwise")
+    store.order([])
+    assert not list((tmp_path / "parts").iterdir())
+
+
 def test_why_a_pack_could_not_be_made_is_said_of_its_points(tmp_path: Path) -> None:
     made = conductor(tmp_path, prepare={"grains": 16}, vary={"mu": [0.1, 0.2]})
     (job,) = made.pack_jobs()

@@ -5,7 +5,7 @@
     points/<key>.h5    recalls, as `gmem recall` writes them
     failed/<key>.json  reasons
     packs/<key>.h5     packs made for this sweep
-    parts/<job>/       unfinished jobs
+    parts/<job>/       unfinished jobs; those that are not put up now with their file
     workers/           what each worker is doing, and what it said
 
 A point's key stands for everything that its numbers depend on; what is there need not be computed again.
@@ -28,6 +28,7 @@ from gmem_jax.sweeps.plan import Point
 SWEEP_SCHEMA = "gmem-sweep/1"
 ROOM = 1 << 20  # bytes that must be left on the disk: some points of a small pack
 WRITTEN = 3600.0  # s in which a file is surely written: workers write while others look
+JOB = "job.json"  # beside the parts of one that was put aside for others
 FOLDERS = ("jobs", "points", "failed", "packs", "parts", "workers")
 
 
@@ -168,18 +169,27 @@ class Store:
         return len(failed)
 
     def order(self, jobs: Sequence[dict[str, Any]]) -> None:
-        """Put up jobs in the place of those that were there; parts of others are removed, where nobody is at them."""
+        """Put up jobs in the place of those that were there. Of others what was begun stays, to be gone on with."""
         wanted = {f"{number:05d}-{job['name']}.json": job for number, job in enumerate(jobs)}
         for path in (self.folder / "jobs").glob("*.json"):
             if path.name not in wanted:
-                path.unlink()
+                begun = self.folder / "parts" / path.stem.partition("-")[2]
+                path.replace(begun / JOB) if begun.is_dir() else path.unlink()
         for name, job in wanted.items():
             self._write(self.folder / "jobs" / name, job)
-        names = {job["name"] for job in jobs}
+        names = {job["name"] for job in (*jobs, *self._interrupted()) if not self.finished(job)}
         for path in (self.folder / "parts").iterdir():
             name = path.name.partition("-")[0]  # points of a job that broke are run by themselves, numbered
             if path.is_dir() and name not in names and not self.taken({"name": name}):
                 shutil.rmtree(path, ignore_errors=True)
+
+    def _interrupted(self) -> list[dict[str, Any]]:
+        """Jobs of which there are parts, and which are not put up."""
+        found = []
+        for path in (self.folder / "parts").glob(f"*/{JOB}"):
+            with contextlib.suppress(OSError, ValueError):
+                found.append(json.loads(path.read_text()))
+        return found
 
     def jobs(self) -> list[dict[str, Any]]:
         """The jobs that were put up, in order."""
@@ -187,7 +197,8 @@ class Store:
 
     def begun(self, keys: set[str]) -> list[dict[str, Any]]:
         """Unfinished runs of some points that a worker is at, or was: they go on as they were begun."""
-        runs = [job for job in self.jobs() if job["kind"] == "run" and keys.issuperset(job["points"])]
+        jobs = {job["name"]: job for job in (*self.jobs(), *self._interrupted())}.values()
+        runs = [job for job in jobs if job["kind"] == "run" and keys.issuperset(job["points"])]
         return [job for job in runs if not self.finished(job) and (self.parts(job).is_dir() or self.taken(job))]
 
     def finished(self, job: dict[str, Any]) -> bool:
