@@ -98,13 +98,7 @@ def classify_command(
         say(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}")
     result = report.reading(stored, trained)
     seconds = time.perf_counter() - began
-    result = {
-        "recall": str(recall),
-        "pack": configuration["pack"],
-        "status": status,
-        "seconds": seconds,
-        **result,
-    }
+    result = {"recall": str(recall), "pack": configuration["pack"], "status": status, "seconds": seconds, **result}
     save_result(output, READING, result)
     if drawn:
         net = result["readers"]["net"]

@@ -153,14 +153,14 @@ def numbers(value: Any) -> bool:
     return is_number(value) or (isinstance(value, list) and len(value) > 0 and all(map(is_number, value)))
 
 
-def title(value: Any) -> bool:
-    """Whether it is a short text that can be printed in a line."""
-    return isinstance(value, str) and len(value) <= NAME and value.isprintable()
+def title(value: Any, most: int = NAME) -> bool:
+    """Whether it is a text of at most so many characters that can be printed in a line."""
+    return isinstance(value, str) and len(value) <= most and value.isprintable()
 
 
 def source(value: Any) -> bool:
     """Whether it can be the path of a file, or the name of a pack."""
-    return isinstance(value, str) and len(value) <= PATH and value.isprintable()
+    return title(value, PATH)
 
 
 def whole(value: Any) -> bool:
