@@ -46,7 +46,7 @@ from gmem_jax.preparation.ringing import ringing_period
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
 FREE_CANDIDATES = 68  # a grain of a pressed pack with that skin: one program for all lists
 FREE_CONTACTS = 48  # a sphere
-SETTLING = 6.0e3  # t_c that coming to rest under the piston took at N = 325 to 3,267, for the progress bar
+SETTLING = 500.0  # t_c that coming to rest took per R of a dense pack's height (170 to 880, N = 325 to 10,240)
 CYCLE_SKIN = 0.5  # in R; frictionless grains turn freely, so a list lasts only some 50 t_c
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles
 FEWEST = 12  # grains of the smallest pack that was prepared
@@ -158,9 +158,10 @@ def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array
 
 def expected_time(recipe: Recipe, height: float) -> float:
     """How long a preparation will take about, in t_c; `height` is that of the gas, in R."""
-    fall = height * (1.0 - recipe.filling / DENSE) / min(recipe.piston_speed, recipe.piston_gain)
+    dense = height * recipe.filling / DENSE
+    fall = (height - dense) / min(recipe.piston_speed, recipe.piston_gain)
     cycles = recipe.cycles * (2.0 + recipe.rest + recipe.hold) + recipe.rest
-    return recipe.gas_time + fall + SETTLING + cycles * recipe.t0
+    return recipe.gas_time + fall + SETTLING * dense + cycles * recipe.t0
 
 
 def grain_steps(recipe: Recipe, clump: Clump) -> float:
