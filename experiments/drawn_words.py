@@ -1,0 +1,141 @@
+"""A few words of each length on a pack too large for all of them: how well they come back, and are read.
+
+python experiments/drawn_words.py [-o drawn-words] [--pack tetra-10240-d] [--bits 7,9,10] [--drawn 15] [--t0 5400]
+
+All 1,024 words of ten bits on 10,240 grains would take 70 hours of a core; fifteen and the zero signal fill two vectors
+of a CPU and take one. Words are drawn without looking; of ten bits the one that the paper shows is put in the place of
+the last. F of those drawn stands for F of all within its standard error over words; of an accuracy p the standard error
+is sqrt(p (1 - p) / drawn). The paper's net, which has seen inputs of all words, and the templates choose among all.
+Resumes; recalls are kept, rows go to words.csv and are drawn to words.png.
+"""
+
+import argparse
+import csv
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from console import say
+from design_words import drawn
+
+import gmem_jax as gm
+from gmem_jax.experiment import analysis
+from gmem_jax.experiment.signals import bin_average
+from gmem_jax.files.configuration import key_of_run
+from gmem_jax.files.parts import Parts
+from gmem_jax.reading import training
+from gmem_jax.reading.lessons import Lessons
+from gmem_jax.reading.net import Net, accuracy
+from gmem_jax.reading.readers import nearest_template
+from gmem_jax.reproduce.figures import SHOWN_WORD
+from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.tables import published
+
+SHOWN_OF = 10  # bits of the word that the paper shows
+Row = dict[str, str | int | float]
+
+
+def main() -> None:
+    """Run and read, length by length."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("drawn-words"), help="folder to write to")
+    parser.add_argument("--pack", default="tetra-10240-d")
+    parser.add_argument("--bits", default="7,9,10")
+    parser.add_argument("--drawn", type=int, default=15, help="words of a length")
+    parser.add_argument("--t0", type=float, default=5.4e3)
+    parser.add_argument("--budget", type=float, default=600.0, help="seconds for training a net")
+    arguments = parser.parse_args()
+    folder = arguments.output
+    folder.mkdir(parents=True, exist_ok=True)
+    jax.config.update("jax_enable_x64", True)
+
+    pack, rows = gm.load_pack(arguments.pack), []
+    for bits in map(int, arguments.bits.split(",")):
+        every, number = gm.words(bits), chosen(bits, arguments.drawn)
+        some = replace(every, amplitudes=every.amplitudes[number], centres=every.centres[number])
+        experiment = gm.Experiment(pack, some, t0=arguments.t0, background="sub2-bl")
+        file = folder / f"{pack.name}-{bits}-t0-{arguments.t0:g}.h5"
+        if not file.exists():
+            run(experiment, file)
+        recall, _ = gm.load_recall(file)
+        net = training.train(
+            Lessons(bits), 0, budget=arguments.budget, checkpoint=folder / f"words-{bits}-seed-0.msgpack"
+        ).net
+        row = {"pack": pack.name, "t0": arguments.t0, **read(experiment, recall, bits, number, net)}
+        print(row, flush=True)
+        rows.append(row)
+        write(folder / "words.csv", rows)
+        draw(rows, folder / "words.png")
+
+
+def chosen(bits: int, most: int) -> np.ndarray:
+    """Numbers of the words, the one that the paper shows among them."""
+    number = drawn(2**bits, most)
+    shown = SHOWN_WORD - 1
+    return np.sort([*number[:-1], shown]) if bits == SHOWN_OF and shown not in number else number
+
+
+def run(experiment: gm.Experiment, file: Path) -> None:
+    """Run what is not there yet, and keep it."""
+    parts = Parts(file.with_suffix(".parts"), key_of_run(experiment))
+    began = time.perf_counter()
+    recall = gm.run(experiment, keep=parts, progress=say)
+    gm.save_recall(file, recall, gm.resolved(experiment, time.perf_counter() - began))
+    parts.discard()
+
+
+def read(experiment: gm.Experiment, recall: gm.Recall, bits: int, number: np.ndarray, net: Net) -> Row:
+    """F by every background, over the ringing period, and what is read of SUB2-BL."""
+    scale, window = float(experiment.scale), float(recall.window) / float(experiment.t0)
+    first, second = (analysis.recalled(jnp.asarray(recall.stages[name].pressure)) for name in ("readout", "readout-2"))
+    row: Row = {"bits": bits, "words": len(number)}
+    width = window * recall.J.shape[-1]
+    integral = np.asarray(analysis.running_mean(recall.J, width))
+    for name in analysis.BACKGROUNDS:
+        signal = analysis.running_mean(analysis.subtract(name, first, second), width)
+        match = analysis.compare(signal, jnp.asarray(integral), scale)
+        errors = analysis.errors_over_signals(np.asarray(signal), integral, scale)
+        for measure, value, error in zip("GF", match, errors, strict=True):
+            row |= {f"{measure} {name}": round(float(value), 4), f"{measure} {name} error": round(error, 4)}
+    templates = bin_average(gm.words(bits))
+    row["net"] = float(accuracy(net, recall.p_sig, number))
+    row["template"] = float(np.mean(nearest_template(recall.p_sig, templates) == number))
+    return row
+
+
+def write(path: Path, rows: list[Row]) -> None:
+    """A table of rows."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def draw(rows: list[Row], path: Path) -> None:
+    """F by three backgrounds, and accuracies, against L, beside the published."""
+    lengths = [int(row["bits"]) for row in rows]
+    theirs = published("binary_words.csv")
+    figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 4.2))
+    for colour, name in enumerate(analysis.BACKGROUNDS):
+        values, errors = ([float(row[f"F {name}{kind}"]) for row in rows] for kind in ("", " error"))
+        left.errorbar(lengths, values, errors, fmt="o", color=f"C{colour}", mfc="none", capsize=2, label=name.upper())
+        stars = [(row["word_bits"], row[f"fidelity_{name.replace('-', '_')}"]) for row in theirs]
+        left.plot(*zip(*stars, strict=True), "*:", color=f"C{colour}", ms=8, label=f"{name.upper()}, published")
+    for reader, style in (("net", "C0o"), ("template", "C1s")):
+        share = np.array([float(row[reader]) for row in rows])
+        error = np.sqrt(share * (1.0 - share) / [int(row["words"]) for row in rows])
+        right.errorbar(lengths, share, error, fmt=style, mfc="none", capsize=2, label=reader)
+    stars = [(row["word_bits"], row["classifier_accuracy"]) for row in theirs]
+    right.plot(*zip(*stars, strict=True), "k*:", ms=8, label="net, published")
+    for axis, words in ((left, "F"), (right, "words read right")):
+        axis.set(xlabel="length of words L (bits)", ylabel=words, ylim=(0.0, 1.05))
+        axis.legend(fontsize=8, frameon=False)
+    figure.suptitle(f"{rows[0]['words']} drawn words a length, {rows[0]['pack']}, t0 = {float(rows[0]['t0']):,.0f} t_c")
+    save(path, figure)
+
+
+if __name__ == "__main__":
+    main()
