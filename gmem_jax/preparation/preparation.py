@@ -80,7 +80,7 @@ class Recipe:
         settled_speed: largest grain speed at which the piston is fixed, in R / t_c.
         quiet: largest grain speed of the finished pack, in R / t_c.
         pressure_error: relative error of p_z at which the piston is fixed.
-        patience: longest time spent on coming to rest, in t_c.
+        patience: longest time spent on coming to rest, in t_c; four times what 100,450 grains should need (`SETTLING`).
     """
 
     grains: int = 325
@@ -101,7 +101,7 @@ class Recipe:
     settled_speed: float = 1.0e-5
     quiet: float = 1.0e-6
     pressure_error: float = 0.01
-    patience: float = 6.0e4
+    patience: float = 2.0e5
 
     def __post_init__(self) -> None:
         if self.grains < FEWEST:
