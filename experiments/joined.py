@@ -1,0 +1,60 @@
+"""Parts of one figure that were run at different times or places, as the whole that one run would have given.
+
+python experiments/joined.py fig14 part.csv part.csv ... -o fig14-paper-t0=5400-packs=1-lengths=3+4-nets=1
+
+Parts are tables that `gmem reproduce` wrote; the whole is a table and a picture by the name of its scale. Of conditions
+that come twice the first are taken.
+"""
+
+import argparse
+import csv
+import math
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from gmem_jax.reproduce import draw
+from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, write_csv
+from gmem_jax.reproduce.figures import FIGURES, scale_of
+
+
+def main() -> None:
+    """Read the parts, write and draw the whole."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("figure", choices=[name for name, figure in FIGURES.items() if figure.across])
+    parser.add_argument("parts", type=Path, nargs="+")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="without a suffix")
+    arguments = parser.parse_args()
+    named, *changes = arguments.output.name.removeprefix(f"{arguments.figure}-").split("-")
+    scale = ",".join([named, *changes])
+    figure, t0 = FIGURES[arguments.figure], scale_of(scale).t0
+    rows: dict[tuple[Conditions, str], Compared] = {}
+    for part in arguments.parts:
+        with part.open() as file:
+            for row in map(compared, csv.DictReader(file)):
+                rows.setdefault((row.conditions, row.measure), row)
+    ordered = sorted(rows.values(), key=lambda row: [getattr(row.conditions, name) for name in figure.across])
+    target = arguments.output.parent / f"{arguments.output.name}.png"
+    write_csv(target.with_name(f"{arguments.output.name}.csv"), ordered)
+    draw.against(target, ordered, figure.across, f"{figure.title} ({scale}: t$_0$ = {t0:g} t$_c$)")
+
+
+def compared(line: dict[str, str]) -> Compared:
+    """A line of a table that `write_csv` wrote."""
+
+    def number(name: str) -> float:
+        return float(line[name] or math.nan)
+
+    conditions: dict[str, Any] = {name: kind(line[name]) for name, kind in get_type_hints(Conditions).items()}
+    theirs = Estimate(number("published_mean"), number("published_sd"), int(line["published_packs"]))
+    return Compared(
+        Conditions(**conditions),
+        line["measure"],
+        Estimate(number("mean"), number("sd"), int(line["packs"])),
+        theirs if theirs.packs else None,
+        int(line["published_grains"]),
+        int(line["status"]),
+    )
+
+
+if __name__ == "__main__":
+    main()
