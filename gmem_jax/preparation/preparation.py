@@ -47,7 +47,8 @@ FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds fo
 FREE_CANDIDATES = 68  # a grain of a pressed pack with that skin: one program for all lists
 FREE_CONTACTS = 48  # a sphere
 SETTLING = 500.0  # t_c that coming to rest took per R of a dense pack's height (170 to 880, N = 325 to 10,240)
-CYCLE_SKIN = 0.5  # in R; frictionless grains turn freely, so a list lasts only some 50 t_c
+DENSE_SKIN = 0.5  # of a pressed pack: half of the candidates, half of the time; yet frictionless grains turn freely, so
+# that a list lasts only some 50 t_c of a cycle
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles
 FEWEST = 12  # grains of the smallest pack that was prepared
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
@@ -217,7 +218,7 @@ class _Preparation:
         progress: Progress,
     ) -> None:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
-        self.recipe, self.keep, self.filmed = recipe, keep, frames > 0
+        self.recipe, self.keep, self.filmed, self.lengths = recipe, keep, frames > 0, lengths
         film = film_of(recipe, frames)
         self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
         steps = max(1, math.ceil(recipe.t0 / (BINS * recipe.dt) * (1.0 - 1e-12)))
@@ -294,6 +295,8 @@ class _Preparation:
         approach = Servo(recipe.pressure, recipe.piston_speed, recipe.piston_gain, 0.1, math.inf)
         self.press("press", approach, 4.0 * height / recipe.piston_speed, 0.0)
         settle = replace(approach, error=recipe.pressure_error, quiet=recipe.settled_speed)
+        self.walker.finder = pair_finder(self.walker.course.system.clump, self.lengths, DENSE_SKIN)
+        self.walker.renew(self.box)
         pressed = self.press("settle", settle, recipe.patience, recipe.drag)
         if not bool(pressed.settled):
             raise RunFailedError(
@@ -307,7 +310,7 @@ class _Preparation:
         """Frictionless compress/decompress cycles of the x and y walls, then rest until quiet."""
         recipe, walker = self.recipe, self.walker
         walker.course = replace(walker.course, drive=self._drive())
-        walker.finder, walker.skin, walker.chunk = None, CYCLE_SKIN, CYCLE_CHUNK
+        walker.finder, walker.skin, walker.chunk = None, DENSE_SKIN, CYCLE_CHUNK
         walker.smallest = smallest_box(
             np.asarray(self.box.lower)[:, 0], np.asarray(self.box.upper)[:, 0], recipe.delta0
         )
