@@ -156,6 +156,13 @@ def test_grain_pairs_number_the_pairs_of_grains_consistently(crowd):
     assert not set(numbers[~real]) & set(together)
 
 
+def test_a_full_list_numbers_its_pairs_of_grains_below_its_capacity():
+    found = np.array([(i, j) for i in range(5) for j in range(i + 1, 5)])[:8].T
+    pairs = tabulate(found, np.zeros((5, 3, 1)), np.ones(3), 2.4, 1)
+    assert pairs.capacity == 8
+    np.testing.assert_array_equal(pairs.grain_pair, np.arange(8))
+
+
 def test_capacities_grow_when_needed_never_shrink_and_lose_nothing():
     lengths = np.array([14.0, 11.0, 16.0])
     finder = PairFinder(TETRA, lengths, skin=0.4, capacity=40, per_sphere=2)

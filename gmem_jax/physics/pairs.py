@@ -33,7 +33,7 @@ class Pairs:
         second: sphere j, int32 [P].
         valid: False for padding, [P].
         incidence: for each sphere the rows of its contacts in the stack (as i: c; as j: P + c; padding: 2 P), [S, C].
-        grain_pair: number of the grain pair each candidate belongs to, [P].
+        grain_pair: number of the grain pair each candidate belongs to, below P; padding has one of its own, [P].
         reference: sphere centres in box coordinates (0 to 1) when the list was built, [S, 3, B], or [S, 3, 1] for
             replicas that had not parted yet.
         smallest: edge lengths of the box the distances were measured in, [3].
@@ -114,14 +114,18 @@ def tabulate(
         incidence[owners, place] = number + order
     padded = np.zeros((2, capacity), dtype=np.int32)
     padded[:, :pairs] = found
-    grains = padded // spheres_per_grain
-    _, grain_pair = np.unique(grains[0].astype(np.int64) * count + grains[1], return_inverse=True)
+    # What is listed is all but sorted, of which a stable sort makes use. With the padding it took most of the time.
+    one, other = found // spheres_per_grain
+    keys = one.astype(np.int64) * count + other
+    order = np.argsort(keys, kind="stable")
+    grain_pair = np.zeros(capacity, dtype=np.int32)
+    grain_pair[order] = int(pairs < capacity) + np.cumsum(np.diff(keys[order], prepend=keys[order[:1]]) != 0)
     return Pairs(
         first=jnp.asarray(padded[0]),
         second=jnp.asarray(padded[1]),
         valid=jnp.asarray(np.arange(capacity) < pairs),
         incidence=jnp.asarray(incidence),
-        grain_pair=jnp.asarray(grain_pair.astype(np.int32)),
+        grain_pair=jnp.asarray(grain_pair),
         reference=jnp.asarray(reference),
         smallest=jnp.asarray(smallest),
         reach=jnp.asarray(float(reach)),
