@@ -19,10 +19,11 @@ from gmem_jax.experiment.frames import Film, Frame, Taken, take
 from gmem_jax.experiment.pack import SKIN, pair_finder
 from gmem_jax.experiment.protocol import Bin, Stage
 from gmem_jax.experiment.walk import Course, walk_some
-from gmem_jax.physics.pairs import carry_history
+from gmem_jax.physics.pairs import carry_history, slack, sphere_centres
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, State, Status, explain, together
+from gmem_jax.physics.step import System
 
 Progress = Callable[[str, float, float], None]
 """Called with the stage's name, the simulated time so far (t_c) and the fraction of the whole work done (0 to 1)."""
@@ -163,6 +164,12 @@ forward = Compiled(walk_some, static_argnames="most")
 """`walk_some`, compiled once for all chunks and stages of one structure."""
 
 
+@Compiled
+def _room(system: System, state: State, box: Box) -> jax.Array:
+    """What the list still allows for, [B], in R: its skin at first; see `pairs.slack`."""
+    return slack(system.pairs, sphere_centres(state.grains, system.clump), box)
+
+
 Move = Callable[[Any, Any], Any]
 """From a history of an old list and a blank one of the new, to the history of the new: linear in both."""
 
@@ -210,6 +217,8 @@ class Walker:
         spread: where the replicas are put, if on several devices.
         film: which configurations are kept.
         taken: those that were, so far.
+        foresees: whether lists are made anew before they go stale rather than after, for walks on which none lasts:
+            every second or third chunk would be thrown away.
     """
 
     course: Course
@@ -227,7 +236,9 @@ class Walker:
     spread: Spread | None = None
     film: Film = field(default_factory=Film)
     taken: Taken = field(default_factory=dict)
+    foresees: bool = False
     _renewed_at: tuple[str, float] | None = None
+    _lasted: int = 0  # bins since the list was made
 
     def afresh(self, **changes: Any) -> "Walker":
         """A walk that begins where this one is, whatever lists were made on the way here."""
@@ -245,7 +256,7 @@ class Walker:
 
     def kept(self) -> dict[str, Any]:
         """All that `restore` needs to go on from here to the same bits, as a tree of arrays."""
-        counters = np.asarray([self.time, self.work, self.rebuilds, self.skin, self.chunk], float)
+        counters = np.asarray([self.time, self.work, self.rebuilds, self.skin, self.chunk, self._lasted], float)
         finder = {} if self.finder is None else self.finder.kept()
         pairs = self.course.system.pairs
         if self.spread and pairs.reference.shape[-1] > 1:
@@ -262,8 +273,8 @@ class Walker:
         """Stand where a walk on the same course stood when it gave `kept`."""
         self.state, self.course = kept["state"], self.course.with_pairs(kept["pairs"])
         self.put_on(self.spread)
-        self.time, self.work, rebuilds, self.skin, chunk = kept["counters"].tolist()
-        self.rebuilds, self.chunk, self.taken = int(rebuilds), int(chunk), kept["taken"]
+        self.time, self.work, rebuilds, self.skin, chunk, lasted = kept["counters"].tolist()
+        self.rebuilds, self.chunk, self._lasted, self.taken = int(rebuilds), int(chunk), int(lasted), kept["taken"]
         if not _same(kept["finder"], self.finder.kept() if self.finder else {}):
             self.finder = pair_finder(self.course.system.clump, **kept["finder"]) if kept["finder"] else None
 
@@ -330,8 +341,11 @@ class Walker:
                 self._take_after(stage, done, bins - done, count, state, sample)
             self.state = state
             done += count
+            self._lasted += count
             samples.append(jax.tree.map(lambda leaf, count=count: leaf[:count], self._here(sample)))
             self.report(stage.name, count, self._moment(count))
+            if self.foresees and done < stage.bins:
+                self._foresee(stage, done)
             yield done == stage.bins
 
     def _take_after(self, stage: Stage, done: int, bins: int, count: int, state: State, sample: Sample) -> None:
@@ -395,7 +409,21 @@ class Walker:
         self.state = replace(self.state, history=move(self.state.history, blank))
         self.course = self.course.with_pairs(pairs)
         self.rebuilds += 1
+        self._lasted = 0
         self.put_on(spread)
+
+    def _box_before(self, bin_: Bin) -> Box:
+        """The walls at the beginning of a bin; lengths alone count here: time and duration are in bins."""
+        return self.course.drive.box_at(bin_, jnp.asarray(float(bin_.number)), float(bin_.bins))
+
+    def _foresee(self, stage: Stage, done: int) -> None:
+        """Renew a list that would not last for another chunk, if grains went on using it up as they have."""
+        first, count = stage.bin(done), min(self.chunk, stage.bins - done)
+        box = self._box_before(first)
+        room = float(jnp.min(_room(self.course.system, self.state, box)))
+        if (self.skin - room) * (1.0 + count / self._lasted) > self.skin:
+            self._renewed_at = (stage.name, self.time)
+            self.renew(box)
 
     def _renew_again(self, stage: Stage, first: Bin) -> None:
         """Renew a stale list before its chunk is redone; if that was just done, shorten the chunk or widen the skin.
@@ -411,5 +439,4 @@ class Walker:
             if self.skin > WIDEST:
                 raise RunFailedError(f"{stage.name}: {explain(int(Status.STALE_PAIRS))}")
         self._renewed_at = (stage.name, self.time)
-        # Lengths alone count here: time and duration in bins.
-        self.renew(self.course.drive.box_at(first, jnp.asarray(float(first.number)), float(first.bins)))
+        self.renew(self._box_before(first))

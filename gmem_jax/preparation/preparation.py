@@ -310,7 +310,7 @@ class _Preparation:
         """Frictionless compress/decompress cycles of the x and y walls, then rest until quiet."""
         recipe, walker = self.recipe, self.walker
         walker.course = replace(walker.course, drive=self._drive())
-        walker.finder, walker.skin, walker.chunk = None, DENSE_SKIN, CYCLE_CHUNK
+        walker.finder, walker.skin, walker.chunk, walker.foresees = None, DENSE_SKIN, CYCLE_CHUNK, True
         walker.smallest = smallest_box(
             np.asarray(self.box.lower)[:, 0], np.asarray(self.box.upper)[:, 0], recipe.delta0
         )
