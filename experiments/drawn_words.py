@@ -6,7 +6,7 @@ All 1,024 words of ten bits on 10,240 grains would take 70 hours of a core; fift
 of a CPU and take one. Words are drawn without looking; of ten bits the one that the paper shows is put in the place of
 the last. F of those drawn stands for F of all within its standard error over words; of an accuracy p the standard error
 is sqrt(p (1 - p) / drawn). The paper's net, which has seen inputs of all words, and the templates choose among all.
-Resumes; recalls are kept, rows go to words.csv and are drawn to words.png.
+Resumes; recalls are kept, rows go to words.csv, to those of other lengths that are there, and are drawn to words.png.
 """
 
 import argparse
@@ -52,12 +52,13 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
 
-    pack, rows = gm.load_pack(arguments.pack), []
+    pack, table = gm.load_pack(arguments.pack), folder / "words.csv"
+    rows = read_rows(table) if table.exists() else []
     for bits in map(int, arguments.bits.split(",")):
         every, number = gm.words(bits), chosen(bits, arguments.drawn)
         some = replace(every, amplitudes=every.amplitudes[number], centres=every.centres[number])
         experiment = gm.Experiment(pack, some, t0=arguments.t0, background="sub2-bl")
-        file = folder / f"{pack.name}-{bits}-t0-{arguments.t0:g}.h5"
+        file = folder / f"{pack.name}-{bits}-{len(number)}-t0-{arguments.t0:g}.h5"
         if not file.exists():
             run(experiment, file)
         recall, _ = gm.load_recall(file)
@@ -66,8 +67,8 @@ def main() -> None:
         ).net
         row = {"pack": pack.name, "t0": arguments.t0, **read(experiment, recall, bits, number, net)}
         print(row, flush=True)
-        rows.append(row)
-        write(folder / "words.csv", rows)
+        rows = sorted([row, *(other for other in rows if other["bits"] != bits)], key=lambda one: int(one["bits"]))
+        write(table, rows)
         draw(rows, folder / "words.png")
 
 
@@ -106,6 +107,12 @@ def read(experiment: gm.Experiment, recall: gm.Recall, bits: int, number: np.nda
     return row
 
 
+def read_rows(path: Path) -> list[Row]:
+    """The rows that `write` wrote."""
+    with path.open() as file:
+        return [{**row, "bits": int(row["bits"])} for row in csv.DictReader(file)]
+
+
 def write(path: Path, rows: list[Row]) -> None:
     """A table of rows."""
     with path.open("w", newline="") as file:
@@ -133,7 +140,8 @@ def draw(rows: list[Row], path: Path) -> None:
     for axis, words in ((left, "F"), (right, "words read right")):
         axis.set(xlabel="length of words L (bits)", ylabel=words, ylim=(0.0, 1.05))
         axis.legend(fontsize=8, frameon=False)
-    figure.suptitle(f"{rows[0]['words']} drawn words a length, {rows[0]['pack']}, t0 = {float(rows[0]['t0']):,.0f} t_c")
+    counts = ", ".join(f"{row['words']} of {row['bits']} bits" for row in rows)
+    figure.suptitle(f"Drawn words ({counts}), {rows[0]['pack']}, t$_0$ = {float(rows[0]['t0']):,.0f} t$_c$")
     save(path, figure)
 
 

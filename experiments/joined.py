@@ -3,7 +3,8 @@
 python experiments/joined.py fig14 part.csv part.csv ... -o fig14-paper-t0=5400-packs=1-lengths=3+4-nets=1
 
 Parts are tables that `gmem reproduce` wrote; the whole is a table and a picture by the name of its scale. Of conditions
-that come twice the first are taken.
+that come twice the first are taken. Parts of another figure give what it has in common with this one (`--only mu=1`),
+and what was run at several rates says so (`--rates "1,800 to 18,000"`).
 """
 
 import argparse
@@ -23,19 +24,22 @@ def main() -> None:
     parser.add_argument("figure", choices=[name for name, figure in FIGURES.items() if figure.across])
     parser.add_argument("parts", type=Path, nargs="+")
     parser.add_argument("-o", "--output", type=Path, required=True, help="without a suffix")
+    parser.add_argument("--only", metavar="NAME=VALUE", default="", help="rows of the parts that have this condition")
+    parser.add_argument("--rates", default="", help="t0 of the parts, where it is not that of the scale")
     arguments = parser.parse_args()
     named, *changes = arguments.output.name.removeprefix(f"{arguments.figure}-").split("-")
     scale = ",".join([named, *changes])
-    figure, t0 = FIGURES[arguments.figure], scale_of(scale).t0
+    figure, t0 = FIGURES[arguments.figure], arguments.rates or f"{scale_of(scale).t0:g}"
+    name, _, value = arguments.only.partition("=")
     rows: dict[tuple[Conditions, str], Compared] = {}
     for part in arguments.parts:
         with part.open() as file:
-            for row in map(compared, csv.DictReader(file)):
+            for row in (compared(line) for line in csv.DictReader(file) if not name or line[name] == value):
                 rows.setdefault((row.conditions, row.measure), row)
     ordered = sorted(rows.values(), key=lambda row: [getattr(row.conditions, name) for name in figure.across])
     target = arguments.output.parent / f"{arguments.output.name}.png"
     write_csv(target.with_name(f"{arguments.output.name}.csv"), ordered)
-    draw.against(target, ordered, figure.across, f"{figure.title} ({scale}: t$_0$ = {t0:g} t$_c$)")
+    draw.against(target, ordered, figure.across, f"{figure.title} ({scale}: t$_0$ = {t0} t$_c$)")
 
 
 def compared(line: dict[str, str]) -> Compared:
