@@ -6,7 +6,7 @@ All 1,024 words of ten bits on 10,240 grains would take 70 hours of a core; fift
 of a CPU and take one. Words are drawn without looking; of ten bits the one that the paper shows is put in the place of
 the last. F of those drawn stands for F of all within its standard error over words; of an accuracy p the standard error
 is sqrt(p (1 - p) / drawn). The paper's net, which has seen inputs of all words, and the templates choose among all.
-Resumes; recalls are kept, rows go to words.csv, to those of other lengths that are there, and are drawn to words.png.
+Resumes; recalls are kept. A pack and rate have one table, to which lengths may be added later, and its picture.
 """
 
 import argparse
@@ -52,7 +52,8 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
 
-    pack, table = gm.load_pack(arguments.pack), folder / "words.csv"
+    pack = gm.load_pack(arguments.pack)
+    table = folder / f"{pack.name}-t0-{arguments.t0:g}.csv"
     rows = read_rows(table) if table.exists() else []
     for bits in map(int, arguments.bits.split(",")):
         every, number = gm.words(bits), chosen(bits, arguments.drawn)
@@ -69,7 +70,7 @@ def main() -> None:
         print(row, flush=True)
         rows = sorted([row, *(other for other in rows if other["bits"] != bits)], key=lambda one: int(one["bits"]))
         write(table, rows)
-        draw(rows, folder / "words.png")
+        draw(rows, table.with_suffix(".png"))
 
 
 def chosen(bits: int, most: int) -> np.ndarray:

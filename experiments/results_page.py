@@ -12,6 +12,10 @@ from packs import over_packs
 from gmem_jax.show.tables import published
 
 HERE = Path(__file__).parent.parent / "docs" / "results"
+JOINED = {  # figures that no one command makes
+    "fig12b-paper": "Fig. 6 of this scale, figs. 8 and 12b of smaller ones and "
+    "`--scale workstation,sizes=31680,few=1`, put together by `experiments/joined.py`",
+}
 BEGIN, END = "<!-- made by experiments/results_page.py -->", "<!-- end -->"
 
 
@@ -95,6 +99,7 @@ def heading(name: str, scale: str) -> list[str]:
     what = f"Fig. {name.removeprefix('fig').lstrip('0')}" if name.startswith("fig") else name.capitalize()
     named, *changes = scale.split("-")
     command = f"`gmem reproduce {name}" + (f" --scale {','.join([named, *changes])}`" if named else "`")
+    command = JOINED.get(f"{name}-{scale}", command)
     return [f"## {', '.join(filter(None, [what, named, *changes]))}", "", command, ""]
 
 

@@ -757,9 +757,16 @@ MUTATIONS = (
     mutation(
         "chunk-redone-on-the-stale-list",
         "experiment/host.py",
-        "self.renew(self.course.drive.box_at(first, jnp.asarray(float(first.number)), float(first.bins)))",
+        "self.renew(self._box_before(first))",
         "pass",
         "test_a_list_that_goes_stale_is_rebuilt_and_its_chunk_redone_with_the_same_result",
+    ),
+    mutation(
+        "list-foreseen-too-late",
+        "experiment/host.py",
+        "(1.0 + count / self._lasted) > self.skin",
+        "1.0 > self.skin",
+        "test_a_walk_that_foresees_throws_no_chunk_away",
     ),
     mutation(
         "stale-chunk-stands",

@@ -9,14 +9,14 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.host import Walker, work_of
+from gmem_jax.experiment.host import Action, Walker, work_of
 from gmem_jax.experiment.protocol import Stage
 from gmem_jax.experiment.recall import finish
 from gmem_jax.experiment.walk import Course
 from gmem_jax.physics.pairs import sphere_centres
-from gmem_jax.physics.sample import end_bin
+from gmem_jax.physics.sample import Sample, end_bin
 from gmem_jax.physics.search import PairFinder
-from gmem_jax.physics.state import Status, replicate
+from gmem_jax.physics.state import State, Status, replicate
 from gmem_jax.physics.step import System, start
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
@@ -46,6 +46,32 @@ def test_a_list_that_goes_stale_is_rebuilt_and_its_chunk_redone_with_the_same_re
     assert wide.rebuilds == 0
     assert narrow.rebuilds >= 1
     # The same contacts in the same order; only sums over a wider padded table may round differently.
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+class Counted(Action):
+    """Going forwards, counting the chunks that were done and those that stand."""
+
+    def __init__(self) -> None:
+        self.done = self.stand = 0
+
+    def chunk(self, *given: object) -> tuple[State, Sample, object]:
+        self.done += 1
+        return super().chunk(*given)
+
+    def accept(self, *given: object) -> None:
+        self.stand += 1
+
+
+# The affine strain uses up 0.12 R steadily, so that what the last chunk took foretells the next one.
+def test_a_walk_that_foresees_throws_no_chunk_away() -> None:
+    _, expected = compress(0.8)
+    late, early = Counted(), Counted()
+    compress(0.12, chunk=2, action=late)
+    walker, found = compress(0.12, chunk=2, action=early, foresees=True)
+    assert late.done > late.stand == 32
+    assert early.done == early.stand == 32
+    assert 1 <= walker.rebuilds <= 8
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
