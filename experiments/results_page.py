@@ -13,8 +13,8 @@ from gmem_jax.show.tables import published
 
 HERE = Path(__file__).parent.parent / "docs" / "results"
 JOINED = {  # figures that no one command makes
-    "fig12b-paper": "Fig. 6 of this scale, figs. 8 and 12b of smaller ones and "
-    "`--scale workstation,sizes=31680,few=1`, put together by `experiments/joined.py`",
+    "fig12b-paper": "Fig. 6 of this scale, figs. 8 and 12b of smaller ones, "
+    "`--scale workstation,sizes=31680,few=1` and `experiments/large_pack.py`, put together by `experiments/joined.py`",
 }
 BEGIN, END = "<!-- made by experiments/results_page.py -->", "<!-- end -->"
 

@@ -317,15 +317,30 @@ class _Preparation:
         walker.renew(self.box)
         self.log |= walker.play_part("cycles", self.keep, *_cycles(recipe))
         rest = Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1))
-        waited = 0.0
-        while waited == 0.0 or float(largest_speed(walker.state)) > recipe.quiet:
-            if waited > recipe.patience:
-                raise RunFailedError(
-                    f"rest: largest speed {float(largest_speed(walker.state)):.1e} R/t_c after {waited:g} t_c"
-                )
-            self.log |= walker.play_part(f"rest-{waited:g}", self.keep, rest)
-            waited += rest.length * recipe.t0
+        last, kept = self.keep(rest.name, lambda checkpoint: self._until_quiet(checkpoint, rest))
+        walker.restore(kept)
+        self.log |= last
         self.take(rest.name)
+
+    def _until_quiet(self, checkpoint: Checkpoint, rest: Stage) -> tuple[Any, Any]:
+        """Rest as often as needed: the samples of the last time, and where the walker stands."""
+        recipe, walker, waited = self.recipe, self.walker, 0.0
+        if begun := checkpoint.begun():
+            walker.restore(begun["walker"])
+            waited = float(begun["waited"])
+
+        def standing() -> dict[str, Any]:
+            return {"walker": walker.kept(), "waited": np.asarray(waited)}
+
+        while True:
+            last = walker.play(rest)
+            waited += rest.length * recipe.t0
+            speed = float(largest_speed(walker.state))
+            if speed <= recipe.quiet:
+                return last, walker.kept()
+            if waited > recipe.patience:
+                raise RunFailedError(f"rest: largest speed {speed:.1e} R/t_c after {waited:g} t_c")
+            checkpoint.reached(standing)
 
 
 def prepare(

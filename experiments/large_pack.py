@@ -1,0 +1,117 @@
+"""One waveform in a pack too large to wait for: how far a shorter preparation, and one waveform of six, can be trusted.
+
+python experiments/large_pack.py --grains 100450 --seeds 101 --waveforms 3 --dt 0.425 --store 0.5
+python experiments/large_pack.py --grains 1024 --seeds 1,2,3,4,5 [--prepared standard]
+
+A large pack presses for long at the standard speed and never comes to rest everywhere at once, so that a largest speed
+says little of it. `SHORT` presses twice as fast, fixes the piston as soon as the pressure is right within 1 %, and ends
+the last rest at a largest speed of 2e-4 R / t_c. Of a run with six waveforms each is evaluated by itself too. Rows are
+added to a table; what is in it is not run again, and what was interrupted goes on.
+"""
+
+import argparse
+import csv
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+from console import say
+
+import gmem_jax as gm
+from gmem_jax.experiment import analysis
+from gmem_jax.files.configuration import key_of_run
+from gmem_jax.files.parts import Parts
+from gmem_jax.files.provenance import sources
+from gmem_jax.physics.state import together
+from gmem_jax.preparation.preparation import Recipe
+
+STANDARD = Recipe()
+SHORT = Recipe(piston_gain=0.01, settled_speed=3e-3, quiet=2e-4)
+RECIPES = {"standard": STANDARD, "short": SHORT}
+CONDITIONS = ("grains", "seed", "prepared", "t0", "dt", "store", "run_with", "waveforms")
+MEASURES = ("G", "F", "G_over_T1", "F_over_T1")
+
+
+def main() -> None:
+    """Prepare, run and evaluate what is not in the table yet."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("large-pack"), help="folder to write to")
+    parser.add_argument("--grains", type=int, default=1024)
+    parser.add_argument("--seeds", default="101")
+    parser.add_argument("--prepared", choices=RECIPES, default="short")
+    parser.add_argument("--waveforms", default="1,2,3,4,5,6", help="of the six, those to run")
+    parser.add_argument("--t0", type=float, default=5.4e3)
+    parser.add_argument("--dt", type=float, default=0.3)
+    parser.add_argument("--store", type=float, default=2.0, help="in t0")
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    folder: Path = arguments.output
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = [int(number) for number in arguments.waveforms.split(",")]
+    for seed in map(int, arguments.seeds.split(",")):
+        recipe = replace(RECIPES[arguments.prepared], grains=arguments.grains, seed=seed)
+        pack = prepared(folder / f"tetra-{recipe.grains}-{seed}-{arguments.prepared}.h5", recipe)
+        six, rows = gm.six_signals(), np.asarray(wanted) - 1
+        some = replace(six, amplitudes=six.amplitudes[rows], centres=six.centres[rows])
+        experiment = gm.Experiment(pack, some, t0=arguments.t0, dt=arguments.dt, store=arguments.store)
+        row = {"grains": recipe.grains, "seed": seed, "prepared": arguments.prepared, "t0": arguments.t0}
+        row |= {"dt": arguments.dt, "store": arguments.store, "run_with": len(wanted)}
+        recall = run(experiment, folder / f"{'-'.join(str(value) for value in row.values())}.h5")
+        found = [
+            {**row, "waveforms": " ".join(map(str, those)), **measured(experiment, recall, wanted, those)}
+            for those in dict.fromkeys((tuple(wanted), *((one,) for one in wanted)))
+        ]
+        add(folder / "large_pack.csv", found)
+
+
+def prepared(file: Path, recipe: Recipe) -> gm.Pack:
+    """The pack of that file; it is made if there is none."""
+    if not file.exists():
+        parts = Parts(file.with_suffix(".parts"), {"recipe": asdict(recipe), **sources()})
+        gm.save_pack(file, gm.prepare(recipe, keep=parts, progress=say))
+        parts.discard()
+    return gm.load_pack(str(file))
+
+
+def run(experiment: gm.Experiment, file: Path) -> gm.Recall:
+    """The recall of that file; it is run if there is none."""
+    if not file.exists():
+        parts = Parts(file.with_suffix(".parts"), key_of_run(experiment))
+        began = time.perf_counter()
+        recall = gm.run(experiment, keep=parts, progress=say)
+        gm.save_recall(file, recall, gm.resolved(experiment, time.perf_counter() - began))
+        parts.discard()
+    return gm.load_recall(file)[0]
+
+
+def measured(
+    experiment: gm.Experiment, recall: gm.Recall, ran: list[int], those: tuple[int, ...]
+) -> dict[str, float | int]:
+    """G and F of some of the waveforms that ran, as they are and over the ringing period."""
+    rows = np.asarray([ran.index(number) for number in those])
+    pair = recall.p_sig[rows], recall.J[rows], experiment.scale
+    plain, smooth = analysis.compare(*pair), analysis.compare(*pair, float(recall.window) / float(experiment.t0))
+    status = together(np.asarray(recall.status)[[0, *(rows + 1)]])
+    values = (float(value) for match in (plain, smooth) for value in match)
+    return {**dict(zip(MEASURES, (round(value, 6) for value in values), strict=True)), "status": status}
+
+
+def add(path: Path, rows: list[dict[str, object]]) -> None:
+    """Put rows into a table, in the place of older ones of the same conditions."""
+    old: list[dict[str, object]] = []
+    if path.exists():
+        with path.open() as file:
+            old = list(csv.DictReader(file))
+    new = {tuple(str(row[name]) for name in CONDITIONS): row for row in [*old, *rows]}
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(new.values())
+    for row in rows[:1]:
+        print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()
