@@ -6,22 +6,21 @@ python experiments/large_pack.py --grains 1024 --seeds 1,2,3,4,5 [--prepared sta
 A large pack presses for long at the standard speed and never comes to rest everywhere at once, so that a largest speed
 says little of it. `SHORT` presses twice as fast, fixes the piston as soon as the pressure is right within 1 %, and ends
 the last rest at a largest speed of 2e-4 R / t_c. Of a run with six waveforms each is evaluated by itself too. Rows are
-added to a table; what is in it is not run again, and what was interrupted goes on.
+added to a table; packs and recalls are kept and not made again, and what was interrupted goes on.
 """
 
 import argparse
 import csv
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import jax
 import numpy as np
 from console import say
+from drawn_words import run
 
 import gmem_jax as gm
 from gmem_jax.experiment import analysis
-from gmem_jax.files.configuration import key_of_run
 from gmem_jax.files.parts import Parts
 from gmem_jax.files.provenance import sources
 from gmem_jax.physics.state import together
@@ -35,7 +34,7 @@ MEASURES = ("G", "F", "G_over_T1", "F_over_T1")
 
 
 def main() -> None:
-    """Prepare, run and evaluate what is not in the table yet."""
+    """Prepare, run and evaluate, seed by seed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("large-pack"), help="folder to write to")
     parser.add_argument("--grains", type=int, default=1024)
@@ -58,7 +57,11 @@ def main() -> None:
         experiment = gm.Experiment(pack, some, t0=arguments.t0, dt=arguments.dt, store=arguments.store)
         row = {"grains": recipe.grains, "seed": seed, "prepared": arguments.prepared, "t0": arguments.t0}
         row |= {"dt": arguments.dt, "store": arguments.store, "run_with": len(wanted)}
-        recall = run(experiment, folder / f"{'-'.join(str(value) for value in row.values())}.h5")
+        ran = "+".join(map(str, wanted))
+        file = folder / f"{'-'.join(map(str, [*row.values(), ran]))}.h5"
+        if not file.exists():
+            run(experiment, file)
+        recall, _ = gm.load_recall(file)
         found = [
             {**row, "waveforms": " ".join(map(str, those)), **measured(experiment, recall, wanted, those)}
             for those in dict.fromkeys((tuple(wanted), *((one,) for one in wanted)))
@@ -73,17 +76,6 @@ def prepared(file: Path, recipe: Recipe) -> gm.Pack:
         gm.save_pack(file, gm.prepare(recipe, keep=parts, progress=say))
         parts.discard()
     return gm.load_pack(str(file))
-
-
-def run(experiment: gm.Experiment, file: Path) -> gm.Recall:
-    """The recall of that file; it is run if there is none."""
-    if not file.exists():
-        parts = Parts(file.with_suffix(".parts"), key_of_run(experiment))
-        began = time.perf_counter()
-        recall = gm.run(experiment, keep=parts, progress=say)
-        gm.save_recall(file, recall, gm.resolved(experiment, time.perf_counter() - began))
-        parts.discard()
-    return gm.load_recall(file)[0]
 
 
 def measured(
