@@ -19,8 +19,8 @@ jax.config.update("jax_enable_x64", True)
 
 import gmem_jax as gm  # noqa: E402
 from gmem_jax.bench.measure import ENCODE, LAWS, encode, processor  # noqa: E402
-from gmem_jax.experiment.host import forward  # noqa: E402
 from gmem_jax.files.provenance import provenance  # noqa: E402
+from gmem_jax.simulation.observers import forward  # noqa: E402
 
 PRECISIONS = ("double", "mixed")
 SIZES = ("tetra-325-a", "tetra-3267-a", "tetra-10240-b")
@@ -28,8 +28,8 @@ SIZES = ("tetra-325-a", "tetra-3267-a", "tetra-10240-b")
 
 def costs(pack: gm.Pack, replicas: int, seconds: float, t0: float) -> dict[str, np.ndarray]:
     """Microseconds per grain-step of every call, by precision."""
-    course, state = encode(pack, LAWS["H"], replicas, "native", t0)
-    calls = {name: (replace(course, precision=name), state, ENCODE.bin(0), 1) for name in PRECISIONS}
+    simulation, state = encode(pack, LAWS["H"], replicas, "native", t0)
+    calls = {name: (replace(simulation, precision=name), state, ENCODE.bin(0), 1) for name in PRECISIONS}
     taken: dict[str, list[float]] = {name: [] for name in PRECISIONS}
     for call in calls.values():
         jax.block_until_ready(forward(*call, most=4))
@@ -39,7 +39,7 @@ def costs(pack: gm.Pack, replicas: int, seconds: float, t0: float) -> dict[str, 
             start = time.perf_counter()
             jax.block_until_ready(forward(*call, most=4))
             taken[name].append(time.perf_counter() - start)
-    unit = 1e6 / (course.steps * pack.grains * replicas)
+    unit = 1e6 / (simulation.steps * pack.grains * replicas)
     return {name: unit * np.asarray(times) for name, times in taken.items()}
 
 

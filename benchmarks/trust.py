@@ -78,9 +78,9 @@ def run_piece(piece: Piece, file: Path) -> None:
     import numpy as np
 
     import gmem_jax as gm
-    from gmem_jax.experiment.pack import smallest_box
     from gmem_jax.physics.search import PairFinder
     from gmem_jax.physics.state import Grains
+    from gmem_jax.simulation.strain import smallest_box
 
     changes = dict(piece.changes)
     pack = gm.load_pack(piece.pack)

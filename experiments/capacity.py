@@ -23,10 +23,9 @@ from packs import over_packs
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import BUMPS, WIDTH
 from gmem_jax.design.kernel import bumps
-from gmem_jax.experiment.host import under
 from gmem_jax.experiment.recall import LARGEST_BATCH
+from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.configuration import key_of_run
-from gmem_jax.files.parts import Parts
 from gmem_jax.physics.material import Material
 from gmem_jax.reading.capacity import candidates, channels, decoded_bits, greedy_alphabet, smallest_distance
 
@@ -52,7 +51,7 @@ class Case:
     def __init__(self, name: str, gamma0: float, t0: float, folder: Path) -> None:
         self.name, self.gamma0 = name, gamma0
         self.experiment = gm.Experiment(gm.load_pack(name), gm.six_signals(), gamma0=gamma0, t0=t0)
-        self.parts = Parts(folder / f"{name}-{gamma0:g}.parts", key_of_run(self.experiment))
+        self.parts = Checkpoints(folder / f"{name}-{gamma0:g}.parts", key_of_run(self.experiment))
 
     def repeated(self) -> np.ndarray:
         """Recalls of the six signals, on the pack and on the same one an experiment without signal older, [2, 6, 256].
@@ -72,12 +71,12 @@ class Case:
 
     def kernel(self) -> gm.MemoryKernel:
         """The memory kernel on narrow bumps."""
-        return gm.memory_kernel(self.experiment, BUMPS, WIDTH, keep=self.parts, progress=say)
+        return gm.memory_kernel(self.experiment, BUMPS, WIDTH, cache=self.parts, progress=say)
 
     def recalled(self, name: str, signals: gm.Signals) -> np.ndarray:
         """Recalls of any signals, [S, 256], a batch at a time."""
         wanted = gm.replace(self.experiment, signals=signals)
-        return np.asarray(gm.run(wanted, batch=LARGEST_BATCH, keep=under(name, self.parts), progress=say).p_sig)
+        return np.asarray(gm.run(wanted, batch=LARGEST_BATCH, cache=self.parts.scoped(name), progress=say).p_sig)
 
 
 class Table:

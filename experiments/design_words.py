@@ -27,8 +27,8 @@ import gmem_jax as gm
 from gmem_jax.design.by_kernel import BUMPS, WIDTH
 from gmem_jax.experiment.recall import LARGEST_BATCH
 from gmem_jax.experiment.signals import bin_average
+from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.configuration import key_of_run
-from gmem_jax.files.parts import Parts
 from gmem_jax.reading import training
 from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.net import Net, accuracy
@@ -57,8 +57,8 @@ def main() -> None:
 
     for name in arguments.packs.split(","):
         any_words = gm.Experiment(gm.load_pack(name), gm.words(3), t0=arguments.t0)
-        measured = Parts(folder / f"{name}-t0-{arguments.t0:g}.kernel", key_of_run(any_words))
-        kernel = gm.memory_kernel(any_words, BUMPS, WIDTH, keep=measured, progress=say)
+        measured = Checkpoints(folder / f"{name}-t0-{arguments.t0:g}.kernel", key_of_run(any_words))
+        kernel = gm.memory_kernel(any_words, BUMPS, WIDTH, cache=measured, progress=say)
         for bits in map(int, arguments.bits.split(",")):
             if there(folder / TABLE, name, bits, arguments.t0, arguments.iterations):
                 continue
@@ -93,9 +93,9 @@ def design(
     experiment = gm.replace(any_words, signals=words)
     pack, t0 = experiment.pack.name, float(experiment.t0)
     stem = f"{pack}-{bits}-t0-{t0:g}"
-    parts = Parts(folder / f"{stem}.parts", key_of_run(experiment, iterations=iterations, batch=LARGEST_BATCH))
+    parts = Checkpoints(folder / f"{stem}.parts", key_of_run(experiment, iterations=iterations, batch=LARGEST_BATCH))
     found = gm.design_by_kernel(
-        experiment, iterations=iterations, batch=LARGEST_BATCH, kernel=kernel, keep=parts, progress=say
+        experiment, iterations=iterations, batch=LARGEST_BATCH, kernel=kernel, cache=parts, progress=say
     )
     gm.save_waveforms(folder / f"{stem}.csv", found.signals, words)
     templates = bin_average(every)

@@ -24,8 +24,8 @@ from design_words import drawn
 import gmem_jax as gm
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.signals import bin_average
+from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.configuration import key_of_run
-from gmem_jax.files.parts import Parts
 from gmem_jax.reading import training
 from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.net import Net, accuracy
@@ -82,9 +82,9 @@ def chosen(bits: int, most: int) -> np.ndarray:
 
 def run(experiment: gm.Experiment, file: Path) -> None:
     """Run what is not there yet, and keep it."""
-    parts = Parts(file.with_suffix(".parts"), key_of_run(experiment))
+    parts = Checkpoints(file.with_suffix(".parts"), key_of_run(experiment))
     began = time.perf_counter()
-    recall = gm.run(experiment, keep=parts, progress=say)
+    recall = gm.run(experiment, cache=parts, progress=say)
     gm.save_recall(file, recall, gm.resolved(experiment, time.perf_counter() - began))
     parts.discard()
 
@@ -92,7 +92,7 @@ def run(experiment: gm.Experiment, file: Path) -> None:
 def read(experiment: gm.Experiment, recall: gm.Recall, bits: int, number: np.ndarray, net: Net) -> Row:
     """F by every background, over the ringing period, and what is read of SUB2-BL."""
     scale, window = float(experiment.scale), float(recall.window) / float(experiment.t0)
-    first, second = (analysis.recalled(jnp.asarray(recall.stages[name].pressure)) for name in ("readout", "readout-2"))
+    first, second = (analysis.recalled(jnp.asarray(recall.stages[name].pressure)) for name in recall.protocol.reads)
     row: Row = {"bits": bits, "words": len(number)}
     width = window * recall.J.shape[-1]
     integral = np.asarray(analysis.running_mean(recall.J, width))

@@ -21,7 +21,7 @@ from drawn_words import run
 
 import gmem_jax as gm
 from gmem_jax.experiment import analysis
-from gmem_jax.files.parts import Parts
+from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.provenance import sources
 from gmem_jax.physics.state import together
 from gmem_jax.preparation.preparation import Recipe
@@ -72,8 +72,8 @@ def main() -> None:
 def prepared(file: Path, recipe: Recipe) -> gm.Pack:
     """The pack of that file; it is made if there is none."""
     if not file.exists():
-        parts = Parts(file.with_suffix(".parts"), {"recipe": asdict(recipe), **sources()})
-        gm.save_pack(file, gm.prepare(recipe, keep=parts, progress=say))
+        parts = Checkpoints(file.with_suffix(".parts"), {"recipe": asdict(recipe), **sources()})
+        gm.save_pack(file, gm.prepare(recipe, cache=parts, progress=say))
         parts.discard()
     return gm.load_pack(str(file))
 

@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Any
 from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.derivatives.jacobian import exact as jacobian
 from gmem_jax.design.kernel import MemoryKernel, memory_kernel
+from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.experiment.pack import Pack, pack_from, stack
 from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
 from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, waveform, words
-from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.configuration import experiment_from, resolved, written
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
 from gmem_jax.files.recalls import load_recall, save_recall

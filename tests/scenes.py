@@ -7,9 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.drive import Drive
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.protocol import Bin
 from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.hooke import Hooke
@@ -18,9 +16,11 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import Pairs, slack, sphere_centres, tabulate
 from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import uniform
-from gmem_jax.physics.sample import Sample, end_bin
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, Grains, State, replicate, still_box
+from gmem_jax.simulation.protocol import Bin
+from gmem_jax.simulation.sample import Sample, end_bin
+from gmem_jax.simulation.strain import StrainPath
 
 ELASTIC = Material(normal_damping=0.0)
 SPHERE = sphere()
@@ -118,7 +118,7 @@ class Motion:
 
     def box_at(self, time: jax.Array) -> Box:
         """The walls at `time` since the start of the stage."""
-        drive = Drive(self.lower, self.upper, self.delta0, self.gamma0, self.signals)
+        drive = StrainPath(self.lower, self.upper, self.delta0, self.gamma0, self.signals)
         return drive.box_at(Bin(self.start, self.stop, 1, 0, self.sheared), jnp.asarray(time), self.duration)
 
 
@@ -134,7 +134,7 @@ def advance_by(march):
             boxes = jax.vmap(motion.box_at)(count.reshape(-1, *(1 for _ in dt.shape)) * dt)
             wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, 3, state.replicas)), boxes)
             state, total = march(system, state, wide, dt, drag)
-            return end_bin(system, state, jax.tree.map(lambda leaf: leaf[-1], wide), total / steps)
+            return end_bin(system, state, jax.tree.map(lambda leaf: leaf[-1], wide), total / steps, 0.0)
 
         return jax.lax.scan(one_bin, state, first_bin + jnp.arange(bins))
 

@@ -5,9 +5,10 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.design.kernel import bumps
-from gmem_jax.experiment.signals import BINS, bin_average, words
+from gmem_jax.experiment.signals import bin_average, words
 from gmem_jax.reading import capacity
 from gmem_jax.reading.readers import bit_errors, confusion, information
+from gmem_jax.simulation.protocol import BINS
 
 J = np.asarray(bin_average(words(5)))
 

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.protocol import Bin
 from gmem_jax.experiment.signals import bit_width, words
 from gmem_jax.files.configuration import experiment_from, fingerprint, signals_from, written, written_signals
 from gmem_jax.files.named import named_experiment, named_signals
@@ -17,6 +15,8 @@ from gmem_jax.physics.contact.kinematics import transport
 from gmem_jax.physics.contact.path import led_contact
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import CHOICES, effects, points
+from gmem_jax.simulation.protocol import Bin
+from gmem_jax.simulation.strain import StrainPath
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
 
@@ -34,8 +34,8 @@ def test_defaults_are_those_that_the_table_of_choices_names() -> None:
 def test_the_share_of_the_shear_goes_to_each_axis(share: float) -> None:
     lower, upper = -jnp.ones((3, 1)), jnp.ones((3, 1))
     row, time = Bin(0.0, 1.0, 1, 0, True), jnp.asarray(0.3)
-    sheared = Drive(lower, upper, 0.05, 0.01, gm.six_signals(), share).box_at(row, time, 1.0).lengths
-    plain = Drive(lower, upper, 0.05).box_at(row, time, 1.0).lengths
+    sheared = StrainPath(lower, upper, 0.05, 0.01, gm.six_signals(), share).box_at(row, time, 1.0).lengths
+    plain = StrainPath(lower, upper, 0.05).box_at(row, time, 1.0).lengths
     np.testing.assert_allclose(sheared[:, 1], plain[:, 0] * np.array([1.0 - 0.01 * share, 1.0 + 0.01 * share, 1.0]))
 
 

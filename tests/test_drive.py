@@ -9,8 +9,9 @@ import pytest
 from scenes import Motion
 
 import gmem_jax as gm
-from gmem_jax.experiment.protocol import Stage, memory_protocol, preparation_cycle, split, table
+from gmem_jax.experiment.protocols import cycle, memory_protocol
 from gmem_jax.experiment.signals import Bumps, six_signals
+from gmem_jax.simulation.protocol import Protocol, Stage, table
 
 LOWER = jnp.asarray([[1.0], [-2.0], [0.5]])
 UPPER = jnp.asarray([[9.0], [8.0], [12.5]])
@@ -127,7 +128,7 @@ def test_where_u_stands_still_the_waveform_runs_in_time():
 
 
 def memory(rest=0.2, hold=0.2, store=2.0, second_readout=False) -> tuple[Stage, ...]:
-    return memory_protocol(rest, hold, store, second_readout=second_readout)
+    return memory_protocol(rest, hold, store, second_readout=second_readout).stages
 
 
 def test_the_protocol_is_continuous_in_u_and_takes_6_6_t0():
@@ -143,7 +144,7 @@ def test_only_encoding_moves_the_walls_with_shear():
 
 
 def test_a_preparation_cycle_has_no_shear_and_returns_to_the_start():
-    stages = preparation_cycle(rest=0.1, hold=0.3)
+    stages = cycle(rest=0.1, hold=0.3)
     assert not any(stage.sheared for stage in stages)
     assert [stage.length for stage in stages] == [0.1, 1.0, 0.3, 1.0]
     assert [stage.start == stage.stop for stage in stages] == [True, False, True, False]
@@ -171,7 +172,7 @@ def test_rest_hold_and_storage_have_lengths_of_their_own():
 
 
 def test_the_stages_are_split_before_the_first_shear():
-    common, own = split(memory(second_readout=True))
+    common, own = Protocol(memory(second_readout=True)).phases
     assert (common[-1].name, own[0].name) == ("rest-2", "encode")
     assert (*common, *own) == memory(second_readout=True)
 

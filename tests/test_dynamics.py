@@ -25,19 +25,19 @@ from scenes import (
     still,
 )
 
-from gmem_jax.experiment.host import Compiled
 from gmem_jax.experiment.signals import Bumps
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import clump
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.rotation import matrix
-from gmem_jax.physics.sample import check, observe
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Status, explain, replicate, still_box
+from gmem_jax.simulation.compiled import Compiled
+from gmem_jax.simulation.sample import check, measure
 
 CHECK = jax.jit(check)
-OBSERVE = jax.jit(observe)
+OBSERVE = jax.jit(measure)
 START = jax.jit(dynamics.start)
 AMPLITUDES = (1e-3, 5e-3, 2e-2, 3e-2)
 

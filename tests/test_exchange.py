@@ -13,11 +13,11 @@ from scenes import orientations
 import gmem_jax as gm
 from gmem_jax.bench import lammps
 from gmem_jax.command import app as cli
-from gmem_jax.experiment.frames import Frames, sphere_places
 from gmem_jax.files.exported import format_of, frames_of_pack
 from gmem_jax.files.foreign import load_spheres
 from gmem_jax.physics import grain
 from gmem_jax.preparation import imported
+from gmem_jax.simulation.frames import Frames, sphere_places
 
 SOURCE = Path(__file__).parent / "data" / "tetra-27.h5"
 PACK = gm.load_pack(SOURCE)

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.experiment.frames import Frames, joined, places, take
-from gmem_jax.experiment.recall import film_of
+from gmem_jax.experiment.recall import frame_schedule
 from gmem_jax.files.frames import load_frames, write_frames
 from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.schemas import RECALL
 from gmem_jax.physics.state import Grains, State
 from gmem_jax.physics.step import System, contact_forces, sphere_table
-from gmem_jax.preparation.preparation import film_of as film_of_preparation
+from gmem_jax.preparation.preparation import frame_schedule as preparation_schedule
+from gmem_jax.simulation.frames import Frames, concatenate, configuration, places
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
 TWO = gm.Bumps(jnp.asarray([[1.0, -0.6], [0.3, 1.0]]), jnp.asarray([[0.3, 0.7]] * 2), 0.3)
@@ -41,7 +41,7 @@ def same(one: Any, other: Any) -> None:
 
 
 def test_the_longest_stretch_without_a_frame_is_halved_first() -> None:
-    stages = gm.Experiment(PACK, TWO).stages
+    stages = gm.Experiment(PACK, TWO).protocol.stages
     five = places(stages, 5, 32)
     assert five == {"rest": [0], "hold": [52], "encode": [256], "store": [512], "readout": [256]}
     before = {(name, bins) for name in five for bins in five[name]}
@@ -56,14 +56,14 @@ def test_the_longest_stretch_without_a_frame_is_halved_first() -> None:
 @pytest.mark.parametrize("count", [1, 10_000])
 def test_too_few_frames_and_more_than_bins_are_refused(count: int) -> None:
     with pytest.raises(ValueError, match=f"for this run; got {count}"):
-        film_of(EXPERIMENT, count, 1)
+        frame_schedule(EXPERIMENT, count, 1)
     with pytest.raises(ValueError, match=f"for this recipe; got {count}"):
-        film_of_preparation(gm.Recipe(), count)
+        preparation_schedule(gm.Recipe(), count)
 
 
 def test_frames_of_a_signal_that_there_is_not_are_refused() -> None:
     with pytest.raises(ValueError, match="signals 1 to 2"):
-        film_of(EXPERIMENT, 5, 3)
+        frame_schedule(EXPERIMENT, 5, 3)
 
 
 def test_taking_frames_changes_no_other_bit(filmed: gm.Recall) -> None:
@@ -76,12 +76,12 @@ def test_the_batch_does_not_matter(filmed: gm.Recall) -> None:
 
 def test_frames_are_what_the_stages_say(filmed: gm.Recall) -> None:
     frames = frames_of(filmed)
-    wanted = places(EXPERIMENT.stages, COUNT, 32)
+    wanted = places(EXPERIMENT.protocol.stages, COUNT, 32)
     assert frames.stages == tuple(name for name in wanted for _ in wanted[name])
     np.testing.assert_array_equal(frames.position[0], PACK.position)
     step = float(filmed.dt) * EXPERIMENT.steps_per_bin
     passed, number = 0, 0
-    for stage in EXPERIMENT.stages:
+    for stage in EXPERIMENT.protocol:
         sample = filmed.stages[stage.name]
         replica = 2 if sample.pressure.shape[-1] > 1 else 0
         for bins in wanted.get(stage.name, []):
@@ -123,7 +123,9 @@ def test_the_forces_of_a_frame_are_those_on_the_spheres() -> None:
     table, _ = sphere_table(PACK.clump, grains)
     on_spheres, _ = jax.jit(contact_forces)(system, table, history, jnp.zeros(()), jnp.asarray(True))
     lower, upper = np.asarray(PACK.lower), np.asarray(PACK.upper)
-    frames = joined({"rest": (take(system, state, lower, upper, 0.0, 0.0),)}, np.asarray(PACK.clump.offsets))
+    frames = concatenate(
+        {"rest": (configuration(system, state, lower, upper, 0.0, 0.0),)}, np.asarray(PACK.clump.offsets)
+    )
     centres, (first, second) = frames.centres(0), frames.spheres.T
     normal = centres[second] - centres[first]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

@@ -21,12 +21,12 @@ from scenes import scene
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.experiment.protocol import Stage
-from gmem_jax.experiment.walk import walk_some
 from gmem_jax.native import build, calls, gpu
 from gmem_jax.physics.grain import sphere
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import System, start
+from gmem_jax.simulation.loop import rollout_chunk
+from gmem_jax.simulation.protocol import Stage
 
 BUILT, REASON = native.available()
 pytestmark = [
@@ -298,10 +298,10 @@ def test_a_bin_of_an_experiment_on_a_gpu_is_one_call_and_waits_for_nothing(monke
     monkeypatch.setattr(gpu, "missing", lambda: "")
     signals = gm.Bumps(jnp.asarray([[1.0], [-1.0]]), jnp.full((2, 1), 0.5), 0.8)
     experiment = gm.Experiment(PACK, signals, LAWS["H"], t0=300.0)
-    course, state = experiment.course(sheared=True), replicate(experiment.begin(), REPLICAS)
-    program = jax.jit(functools.partial(walk_some, most=4))
+    simulation, state = experiment.simulation(sheared=True), replicate(experiment.begin(), REPLICAS)
+    program = jax.jit(functools.partial(rollout_chunk, most=4))
     allowed = [export.DisabledSafetyCheck.custom_call(target) for target in gpu.TARGETS]
-    row = Stage("encode", 0.0, 1.0, 1.0, sheared=True).bin(0)
-    text = export.export(program, platforms=["cuda"], disabled_checks=allowed)(course, state, row, 4).mlir_module()
+    row = Stage("encode", 0.0, 1.0, 1.0, "write", sheared=True).bin(0)
+    text = export.export(program, platforms=["cuda"], disabled_checks=allowed)(simulation, state, row, 4).mlir_module()
     assert text.count("custom_call @gmem_advance") == 1
     assert "stablehlo.case" not in text  # the host would wait for its condition

@@ -12,11 +12,11 @@ from scenes import with_skin
 
 import gmem_jax as gm
 from gmem_jax.derivatives import gradient, jacobian
-from gmem_jax.experiment import checkpoint
-from gmem_jax.experiment.recall import run, simulate
+from gmem_jax.experiment.recall import run
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.reading import classify
+from gmem_jax.simulation import scan
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 SHORT = {"t0": 75.0, "dt": 0.3, "rest": 0.1, "hold": 0.1, "store": 0.2}  # one step per bin: some 900 steps in all
@@ -46,10 +46,10 @@ def test_nested_checkpoints_change_neither_values_nor_derivatives(length: int) -
         end, seen = scan(body, start, jnp.arange(length))
         return end + jnp.sum(seen * jnp.arange(length))
 
-    assert checkpoint.inner_length(12) == 3
-    assert checkpoint.inner_length(256) == 16
-    assert checkpoint.inner_length(668) == 25  # 4 x 167 would keep 171 states
-    nested = jax.value_and_grad(lambda x: run(x, checkpoint.scan))(0.3)
+    assert scan.inner_length(12) == 3
+    assert scan.inner_length(256) == 16
+    assert scan.inner_length(668) == 25  # 4 x 167 would keep 171 states
+    nested = jax.value_and_grad(lambda x: run(x, scan.scan))(0.3)
     plain = jax.value_and_grad(lambda x: run(x, jax.lax.scan))(0.3)
     np.testing.assert_allclose(nested, plain, rtol=1e-14)
 
@@ -179,7 +179,7 @@ def test_the_classifier_is_differentiated_through_the_recall_to_the_waveform(exp
 
     def at(step: float) -> float:
         moved = gm.replace(at_words, {"signals.amplitudes": words.amplitudes + step * toss})
-        return float(loss(moved, simulate(moved).p_sig))
+        return float(loss(moved, run(moved).p_sig))
 
     # The net works in single precision: a loss of about 1 has 1e-7 of noise, 2e-4 of a difference over 2 x 3e-4.
     step = 3e-4

@@ -15,7 +15,7 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.command.exchange import export
 from gmem_jax.files import tree
-from gmem_jax.files.parts import load_part, save_part
+from gmem_jax.files.checkpoints import load_part, save_part
 from gmem_jax.files.seal import BLOCK, seal
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"

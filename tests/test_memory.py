@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.experiment import host
-from gmem_jax.experiment.recall import COPIES, GRAIN_BYTES, default_batch, forget, shear, walker
-from gmem_jax.experiment.signals import BINS
-from gmem_jax.files.parts import Parts
+from gmem_jax.experiment.recall import COPIES, GRAIN_BYTES, apply_waveforms, default_batch, runner_of
+from gmem_jax.files.checkpoints import Checkpoints
+from gmem_jax.simulation.checkpoints import no_cache
+from gmem_jax.simulation.observers import forward
+from gmem_jax.simulation.protocol import BINS
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 SHORT = {"t0": 75.0, "dt": 0.3, "store": 0.2}  # one step per bin: some 1,200 steps in all
@@ -100,12 +101,12 @@ def test_33_replicas_of_all_stages_run_in_one_compiled_program(pack: gm.Pack) ->
     signals = gm.Bumps(jnp.linspace(-1.0, 1.0, 32)[:, None], jnp.full((32, 1), 0.5), 0.2)
     experiment = gm.Experiment(pack, signals, t0=75.0, store=0.3, rest=0.01, hold=0.01)
     common, own = experiment.phases
-    on = walker(experiment)
-    on.play(*common)
-    shear(on, experiment)
-    before = host.forward.program._cache_size()
-    on.play(*own)  # stages of 256 and 77 bins, in chunks of 32 and fewer
-    assert host.forward.program._cache_size() == before + 1
+    on = runner_of(experiment)
+    on.run_stages(*common)
+    apply_waveforms(on, experiment)
+    before = forward.program._cache_size()
+    on.run_stages(*own)  # stages of 256 and 77 bins, in chunks of 32 and fewer
+    assert forward.program._cache_size() == before + 1
     assert on.state.replicas == 33
 
 
@@ -161,8 +162,8 @@ def test_single_precision_is_refused(pack: gm.Pack) -> None:
 
 
 def test_batches_are_one_run_and_can_be_resumed(pack: gm.Pack, recall: gm.Recall, tmp_path: Path) -> None:
-    def some(batch: int, parts: Parts | None = None) -> gm.Recall:
-        return gm.run(gm.Experiment(pack, gm.six_signals(), **SHORT), batch=batch, keep=parts or forget)
+    def some(batch: int, parts: Checkpoints | None = None) -> gm.Recall:
+        return gm.run(gm.Experiment(pack, gm.six_signals(), **SHORT), batch=batch, cache=parts or no_cache)
 
     undisturbed = some(4)
     # A batch's replicas see the same forces in the same order; XLA's vector code differs with their number.
@@ -173,7 +174,7 @@ def test_batches_are_one_run_and_can_be_resumed(pack: gm.Pack, recall: gm.Recall
     class KilledError(Exception):
         """In place of a signal that cannot be caught."""
 
-    class Dying(Parts):
+    class Dying(Checkpoints):
         def __call__(self, name: str, run: object) -> object:
             if name == "batch-0001":
                 raise KilledError
@@ -181,12 +182,12 @@ def test_batches_are_one_run_and_can_be_resumed(pack: gm.Pack, recall: gm.Recall
 
     with pytest.raises(KilledError):
         some(4, Dying(tmp_path / "parts", {"batch": 4}))
-    left = Parts(tmp_path / "parts", {"batch": 4})
+    left = Checkpoints(tmp_path / "parts", {"batch": 4})
     assert left.finished() == 2
     for one, other in zip(jax.tree.leaves(some(4, left)), jax.tree.leaves(undisturbed), strict=True):
         np.testing.assert_array_equal(one, other)
     with pytest.raises(gm.FileFormatError, match=r"another batch \(4, now 5\)"):
-        Parts(tmp_path / "parts", {"batch": 5})
+        Checkpoints(tmp_path / "parts", {"batch": 5})
     left.discard()
     assert not (tmp_path / "parts").exists()
 

@@ -13,9 +13,9 @@ import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.pytree import pytree
-from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import State, replicate
 from gmem_jax.physics.step import System, start
+from gmem_jax.simulation.sample import Sample
 
 BUILT, REASON = native.available()
 # Without a C++ compiler there is no native backend to compare; plain JAX is then all there is.

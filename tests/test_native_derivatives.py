@@ -13,14 +13,13 @@ from scenes import Motion, advance_by
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.protocol import Stage
-from gmem_jax.experiment.signals import BINS
-from gmem_jax.experiment.walk import Course, walk, walk_some
 from gmem_jax.physics import step as dynamics
-from gmem_jax.physics.sample import observe
 from gmem_jax.physics.state import State, replicate
 from gmem_jax.physics.step import System, start
+from gmem_jax.simulation.loop import Simulation, rollout, rollout_chunk
+from gmem_jax.simulation.protocol import BINS, Stage
+from gmem_jax.simulation.sample import measure
+from gmem_jax.simulation.strain import StrainPath
 
 BUILT, REASON = native.available()
 # Without a C++ compiler there is no native backend to compare; plain JAX is then all there is.
@@ -101,7 +100,7 @@ def test_both_modes_agree_with_plain_jax(name: str, isotropic: bool) -> None:
     moments = system.clump.inertia * (1.0 if isotropic else jnp.asarray([0.8, 1.0, 1.3]))
     system = replace(system, clump=replace(system.clump, isotropic=isotropic, inertia=moments))
     theta = arguments(system, state)
-    touching = observe(system, state, motion().box_at(180.0), jnp.ones((3, 3))).contacts
+    touching = measure(system, state, motion().box_at(180.0), jnp.ones((3, 3))).contacts
     assert np.all(np.asarray(touching) > 5.0)
 
     def both(march: native.March) -> Callable[..., Any]:
@@ -206,19 +205,21 @@ def test_every_instruction_set_has_the_same_derivatives(monkeypatch: pytest.Monk
 def test_bins_counted_only_at_run_time_are_differentiated_forwards() -> None:
     system, state = squeezed(LAWS["H"])
     walls = motion()
-    drive = Drive(walls.lower, walls.upper, walls.delta0, walls.gamma0, walls.signals)
-    encode = Stage("encode", 0.0, 1.0, 100.0 / BINS, sheared=True)  # of 100 bins of 10 steps: as long as `motion`
+    drive = StrainPath(walls.lower, walls.upper, walls.delta0, walls.gamma0, walls.signals)
+    encode = Stage(
+        "encode", 0.0, 1.0, 100.0 / BINS, "write", sheared=True
+    )  # of 100 bins of 10 steps: as long as `motion`
 
-    def course(mu: jax.Array, backend: str) -> Course:
-        return Course(replace(system, friction=gm.Hooke(mu=mu)), drive, 0.3, steps=10, backend=backend)
+    def simulation(mu: jax.Array, backend: str) -> Simulation:
+        return Simulation(replace(system, friction=gm.Hooke(mu=mu)), drive, 0.3, steps=10, backend=backend)
 
     for backend in ("native", "jax"):
 
         def counted(mu: jax.Array, count: Any, by: str = backend) -> jax.Array:
-            return walk_some(course(mu, by), state, encode.bin(60), count, 3)[1].pressure[:2]
+            return rollout_chunk(simulation(mu, by), state, encode.bin(60), count, 3)[1].pressure[:2]
 
         def listed(mu: jax.Array, by: str = backend) -> jax.Array:
-            return walk(course(mu, by), state, encode.rows(60, 2))[1].pressure
+            return rollout(simulation(mu, by), state, encode.rows(60, 2))[1].pressure
 
         slope = jax.jit(lambda mu, count, of=counted: jax.jvp(lambda mu: of(mu, count), (mu,), (1.0,)))(0.3, 2)
         for found, known in zip(slope, jax.jvp(listed, (0.3,), (1.0,)), strict=True):

@@ -63,7 +63,7 @@ def test_a_recall_draws_itself(recalled: tuple[gm.Experiment, gm.Recall], tmp_pa
     (axis,) = recall.plot("z", experiment).figure.axes
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("time ($t_c$)", "coordination Z")
     total = sum(len(line.get_xdata()) for line in axis.lines if len(line.get_xdata()) > 2)
-    assert total == sum(stage.bins for stage in experiment.stages)
+    assert total == experiment.protocol.bins
     (axis,) = recall.plot("p_x", against="u").figure.axes
     assert axis.get_xlabel() == "compression variable u"
     assert [label.get_text() for label in axis.figure.legends[0].get_texts()][-1].startswith("readout")

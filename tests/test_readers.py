@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gmem_jax.experiment.protocols import memory_protocol
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average, six_signals, word_bits, words
-from gmem_jax.physics.sample import Sample
 from gmem_jax.reading import readers
+from gmem_jax.simulation.sample import Sample
 
 J = {bits: np.asarray(bin_average(words(bits))) for bits in (1, 3, 5)}
 
@@ -135,7 +136,8 @@ def recall(bits: int, second: bool) -> Recall:
     if second:
         stages["readout-2"] = sample(jnp.broadcast_to(jnp.linspace(1.0, 2.0, 256), first.shape))
     rest = {name: jnp.zeros(()) for name in Recall.__dataclass_fields__}
-    return Recall(**rest | {"J": signals, "p_sig": signals, "stages": stages})
+    protocol = memory_protocol(0.2, 0.2, 2.0, second_readout=second)
+    return Recall(**rest | {"J": signals, "p_sig": signals, "stages": stages, "protocol": protocol})
 
 
 def test_words_are_read_by_sub2_bl_where_there_is_a_second_readout() -> None:

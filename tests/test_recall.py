@@ -11,8 +11,8 @@ from scenes import SPHERE, scene
 
 import gmem_jax as gm
 from gmem_jax.experiment.recall import Recall, finish
-from gmem_jax.physics.sample import Sample, end_bin
 from gmem_jax.physics.state import Status
+from gmem_jax.simulation.sample import Sample, end_bin
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
 FINISH = jax.jit(finish)
@@ -95,12 +95,12 @@ def test_a_fatal_bit_of_any_replica_leaves_no_numbers(bit: Status) -> None:
 def test_an_overlap_beyond_the_range_of_the_law_is_flagged_by_replica(p_max: float, flagged: bool) -> None:
     law = gm.Mindlin(p_max=jnp.asarray([0.2, p_max]), points=8)
     system, state, box = scene(SPHERE, [[0.0, 0.0, 0.0], [1.9, 0.0, 0.0]], friction=law, replicas=2)
-    after, sample = jax.jit(end_bin)(system, state, box, jnp.zeros((3, 2)))
+    after, sample = jax.jit(end_bin)(system, state, box, jnp.zeros((3, 2)), 0.0)
     np.testing.assert_allclose(sample.largest_overlap, 0.1, rtol=1e-12)
     assert [int(bits) for bits in after.status] == [0, Status.OVERLAP_RANGE if flagged else 0]
 
 
 def test_laws_without_a_range_are_never_flagged() -> None:
     system, state, box = scene(SPHERE, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    after, _ = jax.jit(end_bin)(system, state, box, jnp.zeros((3, 1)))
+    after, _ = jax.jit(end_bin)(system, state, box, jnp.zeros((3, 1)), 0.0)
     assert int(after.status[0]) == 0

@@ -20,11 +20,11 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.command import app
 from gmem_jax.experiment import analysis
-from gmem_jax.experiment.frames import Frames
-from gmem_jax.physics.sample import Sample
 from gmem_jax.show import plots
 from gmem_jax.show.report import Report, table
 from gmem_jax.show.scene import Quantity, at_rest, links, packed, quantities
+from gmem_jax.simulation.frames import Frames
+from gmem_jax.simulation.sample import Sample
 
 PACK_FILE = Path(__file__).parent / "data" / "tetra-27.h5"
 PACK = gm.load_pack(PACK_FILE)
@@ -105,16 +105,17 @@ def made_up() -> gm.Recall:
     u = (np.arange(256) + 0.5) / 256
     p_sig = 0.3 * float(EXPERIMENT.scale) * (integral + 0.1 * np.sin(40 * u))
     stages, wide = OrderedDict(), 1
-    for stage in EXPERIMENT.stages:
+    for stage in EXPERIMENT.protocol:
         wide = 3 if stage.sheared else wide
         slope = np.linspace(1.0, 2.0, stage.bins)[:, None] * np.linspace(1.0, 1.01, wide)
         vectors = {name: 1e-3 * np.repeat(slope[:, None], 3, axis=1) for name in ("pressure", "lengths")}
-        stages[stage.name] = Sample(**{entry.name: slope for entry in fields(Sample)} | vectors)
+        u = np.broadcast_to(np.linspace(stage.start, stage.stop, stage.bins)[:, None], slope.shape)
+        stages[stage.name] = Sample(**{entry.name: slope for entry in fields(Sample)} | vectors | {"u": u})
     numbers: dict[str, Any] = {name: np.asarray(0.3) for name in ("gain", "fidelity", "dt")}
     numbers |= {"windowed_gain": np.asarray(0.31), "windowed_fidelity": np.asarray(0.35), "window": np.asarray(40.0)}
     per_replica = {"residual_speed": np.full(3, 1e-4), "status": np.array([0, 0, int(gm.Status.RINGING)])}
     curves = {"u": u, "shear": integral, "J": integral, "p_sig": p_sig}
-    return gm.Recall(**numbers, **per_replica, **curves, stages=stages, frames=squeezed())
+    return gm.Recall(**numbers, **per_replica, **curves, stages=stages, protocol=EXPERIMENT.protocol, frames=squeezed())
 
 
 def test_packs_stand_in_one_table_only_if_nothing_else_differs(folder: Path, tmp_path: Path) -> None:

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.experiment.host import silent
 from gmem_jax.reproduce import claims, draw, figures
 from gmem_jax.reproduce import run as reproducing
 from gmem_jax.reproduce.compare import Conditions, Estimate, Point, compare, compared
 from gmem_jax.reproduce.draw import power
 from gmem_jax.reproduce.figures import FIGURES, SCALES, Figure, packs, scale_of, spec_of
+from gmem_jax.simulation.progress import silent
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import work

@@ -12,9 +12,10 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.design import by_kernel, drive, waveforms
 from gmem_jax.design import kernel as response
-from gmem_jax.experiment.host import Checkpoint, forget
-from gmem_jax.experiment.recall import prefix_of, simulate
-from gmem_jax.experiment.signals import BINS, bin_average
+from gmem_jax.experiment.recall import prefix_of, run
+from gmem_jax.experiment.signals import bin_average
+from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint, ResultCache
+from gmem_jax.simulation.protocol import BINS
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 SHORT = {"t0": 75.0, "dt": 0.3, "rest": 0.1, "hold": 0.1, "store": 0.2}
@@ -70,12 +71,12 @@ def test_less_noise_means_finer_resolution() -> None:
 
 def test_a_prefix_serves_several_simulations(experiment: gm.Experiment) -> None:
     whole = gm.run(experiment)
-    begun = prefix_of(experiment)
+    prefix = prefix_of(experiment)
     for _ in range(2):  # the same programs on the same state: the same bits
-        found = simulate(experiment, begun)
+        found = run(experiment, prefix=prefix)
         np.testing.assert_array_equal(found.p_sig, whole.p_sig)
         assert float(found.fidelity) == float(whole.fidelity)
-        assert list(found.stages) == ["encode", "store", "readout"]
+        np.testing.assert_array_equal(found.stages["compress"].pressure, whole.stages["compress"].pressure)
 
 
 def test_odd_and_even_parts_add_up_to_the_recall_of_each_bump(
@@ -83,7 +84,7 @@ def test_odd_and_even_parts_add_up_to_the_recall_of_each_bump(
 ) -> None:
     amplitudes = np.asarray([[0.0, 1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0, 0.0]])
     signals = response.bumps(amplitudes, 0.3)
-    p_sig = simulate(gm.replace(experiment, signals=signals)).p_sig
+    p_sig = run(gm.replace(experiment, signals=signals)).p_sig
     np.testing.assert_allclose(kernel.predict(signals), p_sig, atol=1e-6 * np.abs(np.asarray(p_sig)).max())
 
 
@@ -116,7 +117,6 @@ def test_design_inverts_a_linear_memory(monkeypatch: pytest.MonkeyPatch, experim
     def push(run: gm.Experiment, direction: dict, **_: object) -> SimpleNamespace:
         return SimpleNamespace(p_sig_slope=direction["signals.amplitudes"] @ odd)
 
-    monkeypatch.setattr(waveforms, "simulate", linear)
     monkeypatch.setattr(waveforms, "run", linear)
     monkeypatch.setattr(waveforms, "prefix_of", lambda *_, **__: None)
     monkeypatch.setattr(waveforms, "push", push)
@@ -210,13 +210,14 @@ def test_a_design_goes_on_from_an_earlier_one(monkeypatch: pytest.MonkeyPatch, e
 def test_all_recalls_of_a_design_begin_where_one_prefix_ended(experiment: gm.Experiment) -> None:
     parts: list[str] = []
 
-    def keep(name: str, play: Callable[[Checkpoint], Any]) -> Any:
-        parts.append(name)
-        return forget(name, play)
+    class Listing(ResultCache):
+        def __call__(self, name: str, run: Callable[[Checkpoint], Any]) -> Any:
+            parts.append(name)
+            return run(NO_CHECKPOINT)
 
-    found = gm.design_by_kernel(experiment, iterations=3, n=3, width=0.5, measured=1, keep=keep)
+    found = gm.design_by_kernel(experiment, iterations=3, n=3, width=0.5, measured=1, cache=Listing())
     recalls = ["untouched", "trial-0", "slopes-1", "trial-1", "slopes-2", "trial-2", "verified"]
-    assert sorted(parts) == sorted(["prefix", "kernel-basis", *(f"{name}-batch-0000" for name in recalls)])
+    assert sorted(parts) == sorted(["prefix", "kernel-basis-batch-0000", *(f"{name}-batch-0000" for name in recalls)])
     fresh = gm.run(gm.replace(experiment, signals=found.signals))
     np.testing.assert_array_equal(found.p_sig, np.asarray(fresh.p_sig))
 

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.host import Action, Walker, work_of
-from gmem_jax.experiment.protocol import Stage
 from gmem_jax.experiment.recall import finish
-from gmem_jax.experiment.walk import Course
 from gmem_jax.physics.pairs import sphere_centres
-from gmem_jax.physics.sample import Sample, end_bin
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import State, Status, replicate
 from gmem_jax.physics.step import System, start
+from gmem_jax.simulation.loop import Simulation
+from gmem_jax.simulation.observers import Chunk, Observer
+from gmem_jax.simulation.progress import work_of
+from gmem_jax.simulation.protocol import Stage
+from gmem_jax.simulation.runner import Runner
+from gmem_jax.simulation.sample import Sample, end_bin
+from gmem_jax.simulation.strain import StrainPath
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
 AT, TURNED = PACK.position[..., None], PACK.quaternion[..., None]
@@ -26,15 +28,15 @@ AT, TURNED = PACK.position[..., None], PACK.quaternion[..., None]
 COMPRESS = Stage("compress", 0.0, 1.0, 64 / 256)
 
 
-def compress(skin: float, **settings: object) -> tuple[Walker, np.ndarray]:
-    """A frictional compression of the 27-grain pack on lists of this skin; the walk and the wall pressures."""
+def compress(skin: float, **settings: object) -> tuple[Runner, np.ndarray]:
+    """A frictional compression of the 27-grain pack on lists of this skin; the runner and the wall pressures."""
     box = PACK.box
     still = start(System(PACK.clump, gm.Hooke(), PACK.pairs), AT, TURNED, box)
     finder = PairFinder(PACK.clump, np.asarray(box.lengths)[:, 0], skin)
     system = System(PACK.clump, gm.Hooke(), finder(still.grains, PACK.clump, box))
-    course = Course(system, Drive(box.lower, box.upper, 0.05), 0.3, steps=2)
-    walker = Walker(course, start(system, AT, TURNED, box), finder=finder, skin=skin, **settings)
-    return walker, np.asarray(walker.play(COMPRESS)["compress"].pressure)
+    simulation = Simulation(system, StrainPath(box.lower, box.upper, 0.05), 0.3, steps=2)
+    runner = Runner(simulation, start(system, AT, TURNED, box), finder=finder, skin=skin, **settings)
+    return runner, np.asarray(runner.run_stages(COMPRESS)["compress"].pressure)
 
 
 # 0.12 R beyond the contacts of an uncompressed box does not survive the affine strain of 2.5 %; of 0.01 R nothing is
@@ -49,29 +51,28 @@ def test_a_list_that_goes_stale_is_rebuilt_and_its_chunk_redone_with_the_same_re
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
-class Counted(Action):
-    """Going forwards, counting the chunks that were done and those that stand."""
+class Counted(Observer):
+    """Counts the chunks that were run and those that stand."""
 
     def __init__(self) -> None:
         self.done = self.stand = 0
 
-    def chunk(self, *given: object) -> tuple[State, Sample, object]:
+    def step(self, chunk: Chunk) -> None:
         self.done += 1
-        return super().chunk(*given)
 
-    def accept(self, *given: object) -> None:
+    def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
         self.stand += 1
 
 
 # The affine strain uses up 0.12 R steadily, so that what the last chunk took foretells the next one.
-def test_a_walk_that_foresees_throws_no_chunk_away() -> None:
+def test_a_runner_that_foresees_throws_no_chunk_away() -> None:
     _, expected = compress(0.8)
     late, early = Counted(), Counted()
-    compress(0.12, chunk=2, action=late)
-    walker, found = compress(0.12, chunk=2, action=early, foresees=True)
+    compress(0.12, chunk=2, observers=(late,))
+    runner, found = compress(0.12, chunk=2, observers=(early,), foresees=True)
     assert late.done > late.stand == 32
     assert early.done == early.stand == 32
-    assert 1 <= walker.rebuilds <= 8
+    assert 1 <= runner.rebuilds <= 8
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
@@ -83,11 +84,11 @@ def test_the_result_does_not_depend_on_the_length_of_a_chunk() -> None:
 
 
 def test_a_broken_run_stops_and_names_the_stage() -> None:
-    walker, _ = compress(0.8)
-    position = walker.state.grains.position.at[0, 0, 0].set(jnp.nan)
-    walker.state = replace(walker.state, grains=replace(walker.state.grains, position=position))
+    runner, _ = compress(0.8)
+    position = runner.state.grains.position.at[0, 0, 0].set(jnp.nan)
+    runner.state = replace(runner.state, grains=replace(runner.state.grains, position=position))
     with pytest.raises(gm.RunFailedError, match=r"doomed: .*not a finite number"):
-        walker.play(Stage("doomed", 0.0, 0.0, 1 / 256))
+        runner.run_stages(Stage("doomed", 0.0, 0.0, 1 / 256))
 
 
 def test_progress_rises_to_one_and_names_the_stage() -> None:
@@ -111,11 +112,11 @@ def test_only_while_the_walls_stand_still_is_there_a_drag() -> None:
     """Bit for bit: a drag of zero is none."""
 
     def pressures(drag: float) -> dict[str, np.ndarray]:
-        course = Course(
-            System(PACK.clump, gm.Hooke(), PACK.pairs), Drive(PACK.box.lower, PACK.box.upper, 0.05), 0.3, drag
+        simulation = Simulation(
+            System(PACK.clump, gm.Hooke(), PACK.pairs), StrainPath(PACK.box.lower, PACK.box.upper, 0.05), 0.3, drag
         )
-        walker = Walker(course, start(course.system, AT, TURNED, PACK.box))
-        played = walker.play(Stage("compress", 0.0, 1.0, 16 / 256), Stage("hold", 1.0, 1.0, 16 / 256))
+        runner = Runner(simulation, start(simulation.system, AT, TURNED, PACK.box))
+        played = runner.run_stages(Stage("compress", 0.0, 1.0, 16 / 256), Stage("hold", 1.0, 1.0, 16 / 256))
         return {name: np.asarray(sample.pressure) for name, sample in played.items()}
 
     free, damped = pressures(0.0), pressures(0.01)
@@ -156,7 +157,7 @@ def test_an_overlap_beyond_the_law_is_flagged_in_its_replica_and_no_other() -> N
     overlap = 2.0 - distances.min()
 
     def flagged(law: object) -> list[int]:
-        state, sample = end_bin(System(PACK.clump, law, PACK.pairs), still, PACK.box, jnp.zeros((3, 2)))
+        state, sample = end_bin(System(PACK.clump, law, PACK.pairs), still, PACK.box, jnp.zeros((3, 2)), 0.0)
         np.testing.assert_allclose(sample.largest_overlap, overlap, rtol=1e-12)
         return np.asarray(state.status).tolist()
 

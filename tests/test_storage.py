@@ -11,8 +11,8 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.files.atomic import atomic
+from gmem_jax.files.checkpoints import Checkpoints, load_part, locked, save_part
 from gmem_jax.files.hdf5 import writing
-from gmem_jax.files.parts import Parts, load_part, locked, save_part
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.state import Grains, State
 
@@ -106,8 +106,8 @@ def test_a_part_that_is_kept_is_not_run_again(tmp_path: Path) -> None:
         ran.append(len(ran))
         return {"answer": np.arange(3) + len(ran)}
 
-    first = Parts(tmp_path / "parts", {"seed": 1})("one", work)
-    again = Parts(tmp_path / "parts", {"seed": 1})
+    first = Checkpoints(tmp_path / "parts", {"seed": 1})("one", work)
+    again = Checkpoints(tmp_path / "parts", {"seed": 1})
     np.testing.assert_array_equal(again("one", work)["answer"], first["answer"])
     assert (ran, again.finished()) == ([0], 1)
     again("two", work)
@@ -117,11 +117,13 @@ def test_a_part_that_is_kept_is_not_run_again(tmp_path: Path) -> None:
 
 
 def test_parts_of_another_run_are_refused(tmp_path: Path) -> None:
-    Parts(tmp_path / "parts", {"seed": 1, "pack": "a"})
-    Parts(tmp_path / "parts", {"seed": 1, "pack": "b"})("one", lambda _: np.zeros(1))  # nothing was finished: no matter
+    Checkpoints(tmp_path / "parts", {"seed": 1, "pack": "a"})
+    Checkpoints(tmp_path / "parts", {"seed": 1, "pack": "b"})(
+        "one", lambda _: np.zeros(1)
+    )  # nothing was finished: no matter
     with pytest.raises(gm.FileFormatError, match=r"another pack \('b', now 'a'\)"):
-        Parts(tmp_path / "parts", {"seed": 1, "pack": "a"})
-    assert Parts(tmp_path / "parts", {"seed": 1, "pack": "a"}, restart=True).finished() == 0
+        Checkpoints(tmp_path / "parts", {"seed": 1, "pack": "a"})
+    assert Checkpoints(tmp_path / "parts", {"seed": 1, "pack": "a"}, restart=True).finished() == 0
 
 
 def test_a_part_is_a_table_of_arrays(tmp_path: Path) -> None:
@@ -140,7 +142,7 @@ def test_a_part_is_a_table_of_arrays(tmp_path: Path) -> None:
 
 def test_an_output_belongs_to_one_run_at_a_time(tmp_path: Path) -> None:
     output = tmp_path / "out.h5"
-    other = "from pathlib import Path; import sys; from gmem_jax.files.parts import locked\n"
+    other = "from pathlib import Path; import sys; from gmem_jax.files.checkpoints import locked\n"
     other += "with locked(Path(sys.argv[1])): pass"
     with locked(output):
         refused = subprocess.run([sys.executable, "-c", other, str(output)], capture_output=True, text=True)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
-from gmem_jax.experiment.host import silent
 from gmem_jax.files.atomic import atomic
+from gmem_jax.simulation.progress import silent
 from gmem_jax.sweeps.executors import Executor, Submitted, executor
 from gmem_jax.sweeps.plan import plan, point
 from gmem_jax.sweeps.spec import read_spec, spec_of

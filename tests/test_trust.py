@@ -13,13 +13,13 @@ import pytest
 from budget import Budget
 
 import gmem_jax as gm
-from gmem_jax.experiment import doubts as limits
-from gmem_jax.experiment.doubts import doubts
-from gmem_jax.experiment.walk import walls
+from gmem_jax.experiment import validity as limits
+from gmem_jax.experiment.validity import validity
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
-from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Box, State, Status
+from gmem_jax.simulation.loop import walls
+from gmem_jax.simulation.sample import Sample
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
 LARGER = gm.load_pack("tetra-325-a")
@@ -49,7 +49,7 @@ def judged(overlap: object = 0.0, inertial: object = 0.0, rise: float = 0.0, **c
     )
     prefix = jax.tree.map(lambda leaf: leaf[:, :1], nothing)
     stages = OrderedDict(compress=prefix, encode=middle, readout=nothing)
-    bits = jax.jit(doubts)(experiment, stages, jnp.asarray(0.5), jnp.asarray(0.5 + rise))
+    bits = jax.jit(validity)(experiment, stages, jnp.asarray(0.5), jnp.asarray(0.5 + rise))
     return [int(each) for each in jnp.broadcast_to(bits, 3)]
 
 
@@ -150,17 +150,17 @@ def march_recorded(system: dynamics.System, state: State, dt: float, boxes: Box,
 def energy_terms(dt: float) -> tuple[dict[str, float], float]:
     """Where the work of the walls went in a whole recall of 27 grains, and the sum of its magnitudes over stages."""
     experiment = gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=75.0, dt=dt, backend="jax", **SHORT)
-    bins_of = jax.jit(lambda course, rows: jax.vmap(lambda row: walls(course, row, 2))(rows))
+    bins_of = jax.jit(lambda simulation, rows: jax.vmap(lambda row: walls(simulation, row, 2))(rows))
     boxes, drag, ends = [], [], [0]
     for stages, sheared in zip(experiment.phases, (False, True), strict=True):
         for stage in stages:
             rows = jax.tree.map(jnp.asarray, stage.rows(0, stage.bins))
-            whole = bins_of(experiment.course(sheared=sheared), rows)  # leaves [bins, steps, 3, 2]
+            whole = bins_of(experiment.simulation(sheared=sheared), rows)  # leaves [bins, steps, 3, 2]
             boxes.append(jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, 3, 2)[..., 1:], whole))
             drag.append(np.full(len(boxes[-1].lower), experiment.drag if stage.start == stage.stop else 0.0))
             ends.append(ends[-1] + len(drag[-1]))
     path, drags = jax.tree.map(lambda *parts: np.concatenate(parts), *boxes), np.concatenate(drag)
-    system, step = experiment.course(sheared=False).system, experiment.timing.dt
+    system, step = experiment.simulation(sheared=False).system, experiment.timing.dt
     states, forces = march_recorded(system, experiment.begin(), step, path, drags)
     budget = Budget(system, states, forces, path, step)
     terms = {**budget.terms(), "dragged": budget.integral(2.0 * drags * budget.kinetic())}

@@ -17,7 +17,7 @@ from gmem_jax.native import gpu
 from gmem_jax.native.gpu import Needs
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
-from gmem_jax.physics.sample import observe
+from gmem_jax.simulation import sample
 
 PACKS = ("tetra-1024-a", "tetra-10240-b")
 REPLICAS = (1, 8, 32, 128)
@@ -60,8 +60,8 @@ def bytes_per_grain_step(pack: Pack, law: str = "H") -> dict[str, float]:
         candidates and the grains of those that touch, which caches may hold. "held": memory of a grain and replica,
         between steps and in the arrays of a call.
     """
-    course, state = measure.encode(pack, measure.LAWS[law], 1, "native")
-    touching = float(observe(course.system, state, pack.box, jnp.ones((3, 1))).contacts[0])
+    simulation, state = measure.encode(pack, measure.LAWS[law], 1, "native")
+    touching = float(sample.measure(simulation.system, state, pack.box, jnp.ones((3, 1)), 0.0).contacts[0])
     sides = 2.0 * float(np.asarray(pack.pairs.valid).sum()) / pack.grains
     remembered = {"H": 3, "M1": 4}[law]
     spheres, own = pack.clump.spheres, 9 + 10

@@ -29,12 +29,9 @@ from gmem_jax.bench.race import REPEATS, Rival, Row, race
 from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.host import forward, worst
-from gmem_jax.experiment.pack import SKIN, Pack, pair_finder, smallest_box
-from gmem_jax.experiment.protocol import Stage
+from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import run as gmem_run
 from gmem_jax.experiment.signals import Bumps
-from gmem_jax.experiment.walk import Course
 from gmem_jax.files.provenance import provenance
 from gmem_jax.physics.contact import laws
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -44,10 +41,16 @@ from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.rotation import matrix
 from gmem_jax.physics.state import Grains, State, Status, explain, replicate, still_box
 from gmem_jax.physics.step import System
+from gmem_jax.simulation.loop import Simulation
+from gmem_jax.simulation.neighbors import SKIN, pair_finder
+from gmem_jax.simulation.observers import forward
+from gmem_jax.simulation.protocol import Stage
+from gmem_jax.simulation.runner import status_of
+from gmem_jax.simulation.strain import smallest_box
 
 LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
 T0 = 1.8e3  # duration of the compression that is timed, t_c, if not chosen
-ENCODE = Stage("encode", 0.0, 1.0, 1.0, sheared=True)
+ENCODE = Stage("encode", 0.0, 1.0, 1.0, "write", sheared=True)
 BINS = 8  # bins per timed call, so that checks and samples weigh as in a run; which does 32 at once
 AGREEMENT = 1e-8  # of the pressure, between backends: round-off grown over a few hundred steps
 LAMMPS_LISTS = ((0.1, 20), (0.2, 50), (0.2, 1000), (0.3, 1000))  # (skin in R, steps between checks) tried for LAMMPS
@@ -68,29 +71,29 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str, t0: float = T0) -> tuple[Course, State]:
-    """The start of an encode stage: what a walk needs."""
+def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str, t0: float = T0) -> tuple[Simulation, State]:
+    """The start of an encode stage: what a rollout needs."""
     heights = jnp.linspace(-1.0, 1.0, max(1, replicas - 1))[:, None]
     signals = Bumps(heights, jnp.full_like(heights, 0.1), 0.2)
     experiment = Experiment(pack, signals, law, t0=t0, backend=backend)
-    course = experiment.course(sheared=replicas > 1)
-    return course, replicate(experiment.begin(), replicas)
+    simulation = experiment.simulation(sheared=replicas > 1)
+    return simulation, replicate(experiment.begin(), replicas)
 
 
 def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, seconds: float = 0.5) -> Rival:
-    """A walk of some bins on a backend, compiled; timed for about `seconds` each time.
+    """A rollout of some bins on a backend, compiled; timed for about `seconds` each time.
 
     Raises:
         RuntimeError: if the simulation breaks down.
     """
-    course, state = encode(pack, LAWS[law], replicas, backend, t0)
-    call = (course, state, ENCODE.bin(0), BINS)
+    simulation, state = encode(pack, LAWS[law], replicas, backend, t0)
+    call = (simulation, state, ENCODE.bin(0), BINS)
     began = time.perf_counter()
     binary = forward.program.lower(*call, most=BINS).compile()
     compile_s = time.perf_counter() - began
     final, sample = jax.block_until_ready(binary(*call))  # warm-up
-    if Status(worst(final)).fatal:
-        raise RuntimeError(f"{backend}, {law}, {pack.name}: {explain(worst(final))}")
+    if Status(status_of(final)).fatal:
+        raise RuntimeError(f"{backend}, {law}, {pack.name}: {explain(status_of(final))}")
     pressure = np.asarray(sample.pressure)
     p_xy = float(pressure[-1, 0, -1] - pressure[-1, 1, -1])
 
@@ -99,13 +102,13 @@ def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, 
         while calls < 1 or time.perf_counter() - began < seconds:
             jax.block_until_ready(binary(*call))
             calls += 1
-        return 1e6 * (time.perf_counter() - began) / (calls * BINS * course.steps * pack.grains * replicas)
+        return 1e6 * (time.perf_counter() - began) / (calls * BINS * simulation.steps * pack.grains * replicas)
 
     return Rival(Row(backend, law, pack.grains, replicas, compile_s=compile_s, p_xy=p_xy), once)
 
 
 def measure(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 0.5) -> Row:
-    """Time a walk of some bins on a backend by itself."""
+    """Time a rollout of some bins on a backend by itself."""
     return race([rival(pack, backend, law, replicas, seconds=seconds)])[0]
 
 
@@ -196,8 +199,8 @@ def tile(pack: Pack, times: tuple[int, int, int]) -> Pack:
 def _peak_memory(load: Callable[[str], Pack], name: str, backend: str, law: str, replicas: int) -> int:
     """Peak resident bytes of a fresh process that runs one bin."""
     jax.config.update("jax_enable_x64", True)
-    course, state = encode(load(name), LAWS[law], replicas, backend)
-    jax.block_until_ready(forward(course, state, ENCODE.bin(0), 1, most=BINS))
+    simulation, state = encode(load(name), LAWS[law], replicas, backend)
+    jax.block_until_ready(forward(simulation, state, ENCODE.bin(0), 1, most=BINS))
     return _peak_bytes()
 
 

@@ -10,7 +10,7 @@ from typer.exceptions import TyperException
 
 from gmem_jax.command import benchmark, classify, derive, exchange, packs, recalls, report, reproduce, show, sweep
 from gmem_jax.command.console import RunInterruptedError, say
-from gmem_jax.experiment.host import RunFailedError
+from gmem_jax.errors import RunFailedError
 from gmem_jax.files.programs import keep_programs
 
 app = typer.Typer(rich_markup_mode=None, help="Waveform memory in granular packs.")

@@ -14,10 +14,10 @@ import typer
 from rich import progress
 from rich.console import Console
 
-from gmem_jax.experiment.host import Progress
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checked import NAME, title
 from gmem_jax.files.results import finite
+from gmem_jax.simulation.progress import Progress
 
 log = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
 out = Console(highlight=False, markup=False)

@@ -28,8 +28,7 @@ from gmem_jax.design.drive import PARAMETERS, design_drive, start_within
 from gmem_jax.design.kernel import memory_kernel, relative_error
 from gmem_jax.design.stored import save_kernel
 from gmem_jax.experiment.experiment import Experiment, value_at
-from gmem_jax.experiment.host import CHUNK, Checkpoint, Keep, within
-from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run_bytes, simulate
+from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run, run_bytes
 from gmem_jax.experiment.signals import Bumps, Spline
 from gmem_jax.files import schemas
 from gmem_jax.files.configuration import fingerprint, key_of_run, pack_fingerprint, resolved
@@ -39,6 +38,9 @@ from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
 from gmem_jax.show import figures, tables
 from gmem_jax.show.kinds import kernel_facts
+from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
+from gmem_jax.simulation.observers import CHUNK
+from gmem_jax.simulation.progress import within
 
 GRADIENT = 11.0  # cost of a gradient in runs; see benchmarks
 MANY = 16  # signals above which one kernel serves all rather than a Jacobian each
@@ -87,7 +89,7 @@ def gradient_command(
     law = experiment.friction
     names = {"waveform": waves, **{name: path for name, path in PARAMETERS.items() if _has(law, path)}}
     # The way back needs the state at the beginning of every chunk.
-    chunks = sum(stage.bins for stage in experiment.stages) / CHUNK
+    chunks = experiment.protocol.bins / CHUNK
     _announce(experiment, "gradient", GRADIENT, experiment.signals.count, 1.0 + chunks / COPIES)
     with resumable(output, key_of_run(experiment, by=list(names)), restart=restart) as parts:
         found = _gradient(experiment, tuple(names.values()), parts)
@@ -131,14 +133,14 @@ def _of_waveforms(
     return rows
 
 
-def _gradient(experiment: Experiment, by: tuple[str, ...], keep: Keep) -> Gradient:
+def _gradient(experiment: Experiment, by: tuple[str, ...], cache: ResultCache) -> Gradient:
     with reporting(goes_on=True) as progress:
 
         def run(checkpoint: Checkpoint) -> tuple[Any, ...]:
             found = value_and_grad(experiment, by, checkpoint=checkpoint, progress=progress)
             return found.value, tuple(found.slope[name] for name in by), found.p_sig
 
-        value, slopes, p_sig = keep("gradient", run)
+        value, slopes, p_sig = cache("gradient", run)
     return Gradient(value, dict(zip(by, slopes, strict=True)), p_sig)
 
 
@@ -167,11 +169,11 @@ def kernel_command(
     _announce(experiment, "kernel", 1.0 + runs, 2 * n)
     with resumable(output, key_of_run(experiment, n=n, width=width), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
-            begun = prefix_of(experiment, keep=parts, progress=within(progress, 0.0, 0.05))
+            prefix = prefix_of(experiment, cache=parts, progress=within(progress, 0.0, 0.05))
             most = within(progress, 0.05, 0.05 + 0.95 * runs / (1.0 + runs))
-            kernel = memory_kernel(experiment, n, width, begun=begun, keep=parts, progress=most)
+            kernel = memory_kernel(experiment, n, width, prefix=prefix, cache=parts, progress=most)
             rest = within(progress, 0.05 + 0.95 * runs / (1.0 + runs), 1.0)
-            p_sig = parts("check", lambda at: simulate(experiment, begun, checkpoint=at, progress=rest).p_sig)
+            p_sig = run(experiment, prefix=prefix, cache=parts.scoped("check"), progress=rest).p_sig
         signals = experiment.signals
         result = {
             "pack": pack,
@@ -286,7 +288,7 @@ def design_command(
     with resumable(output, key_of_run(experiment, by=by, **{**options, **begun}), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             design = by_kernel.design_by_kernel if by == "kernel" else waveforms.design_waveforms
-            found = design(experiment, keep=parts, progress=progress, **options)
+            found = design(experiment, cache=parts, progress=progress, **options)
         way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
         save_waveforms(output, found.signals, experiment.signals, design=way)
     if drawn:
@@ -350,7 +352,7 @@ def tune_command(
     key = key_of_run(first, packs=[pack_fingerprint(each.pack) for each in experiments], bounds=list(limits.items()))
     with resumable(output, key, restart=restart) as parts:
         with reporting(goes_on=True) as progress:
-            found = design_drive(experiments, limits, iterations=iterations, keep=parts, progress=progress)
+            found = design_drive(experiments, limits, iterations=iterations, cache=parts, progress=progress)
         result: dict[str, Any] = {
             "packs": names,
             "before": found.before,

@@ -10,9 +10,9 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from gmem_jax.command.console import claim
+from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.signals import Signals
-from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.named import named_experiment
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.waveforms import load_target

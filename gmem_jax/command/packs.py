@@ -23,16 +23,16 @@ from gmem_jax.command.console import (
 )
 from gmem_jax.command.resuming import Restart, resumable
 from gmem_jax.experiment.experiment import PAPER_T0
-from gmem_jax.experiment.frames import Frames
 from gmem_jax.files.configuration import fingerprint
 from gmem_jax.files.home import kept_pack
 from gmem_jax.files.packs import STANDARD, list_packs, save_pack
 from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics import grain
 from gmem_jax.physics.contact.frictionless import Frictionless
-from gmem_jax.physics.sample import Sample
-from gmem_jax.preparation.preparation import Recipe, film_of, grain_steps, prepare
+from gmem_jax.preparation.preparation import Recipe, frame_schedule, grain_steps, prepare
 from gmem_jax.show import tables
+from gmem_jax.simulation.frames import Frames
+from gmem_jax.simulation.sample import Sample
 
 
 def info(as_json: AsJson = False) -> None:
@@ -115,7 +115,7 @@ def prepare_command(
     elif output is None:
         raise InputError("--output is missing: name a file, or a standard pack like tetra-31680-a")
     require_name(name)
-    film_of(recipe, frames)  # refuses what cannot be before anything is begun
+    frame_schedule(recipe, frames)  # refuses what cannot be before anything is begun
     claim(output, ".h5", force=force)
     backend = native.name(backend, Frictionless())
     announce(f"{recipe.grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * recipe.grains, backend)
@@ -126,7 +126,7 @@ def prepare_command(
     with resumable(output, key, restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             kept: Any = {"log": stages, "frames": frames, "film": film}
-            pack = prepare(recipe, clump, name=name, backend=backend, keep=parts, progress=progress, **kept)
+            pack = prepare(recipe, clump, name=name, backend=backend, cache=parts, progress=progress, **kept)
         save_pack(output, pack, stages, *film)
     seconds = time.perf_counter() - began
     rest = pack.info["at_rest"]

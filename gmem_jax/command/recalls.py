@@ -26,7 +26,7 @@ from gmem_jax.command.options import Chosen, with_experiment
 from gmem_jax.command.resuming import Restart, batch_for, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.recall import film_of, replica_bins, run, run_bytes
+from gmem_jax.experiment.recall import frame_schedule, replica_bins, run, run_bytes
 from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.packs import list_packs, load_pack
@@ -58,7 +58,7 @@ def _run(
     film: Any = {"frames": frames, "frames_of": frames_of}
     with resumable(data, key_of_run(experiment, batch=batch, **film), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
-            recall = jax.block_until_ready(run(experiment, batch=batch, keep=parts, progress=progress, **film))
+            recall = jax.block_until_ready(run(experiment, batch=batch, cache=parts, progress=progress, **film))
         configuration = resolved(experiment, time.perf_counter() - began)
         if target is not None:
             configuration["target"] = written_signals(target)
@@ -91,7 +91,7 @@ def recall_command(
     """Store waveforms in a pack and recall them."""
     (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
     target = chosen.target(experiment.signals.count)
-    film_of(experiment, frames, frames_of)  # refuses what cannot be before anything is begun
+    frame_schedule(experiment, frames, frames_of)  # refuses what cannot be before anything is begun
     film: Any = {"frames": frames, "frames_of": frames_of}
     row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
     emit(as_json, row, *tables.recall_lines(row, configuration))

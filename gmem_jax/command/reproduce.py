@@ -10,9 +10,9 @@ import typer
 from rich.table import Table
 
 from gmem_jax.command.console import AsJson, InputError, emit, reporting, say
-from gmem_jax.experiment.host import Progress, RunFailedError
+from gmem_jax.errors import RunFailedError
 from gmem_jax.files.atomic import probe
-from gmem_jax.files.parts import locked
+from gmem_jax.files.checkpoints import locked
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import Effect
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
@@ -28,6 +28,7 @@ from gmem_jax.reproduce.run import (
     summary_of,
     weigh,
 )
+from gmem_jax.simulation.progress import Progress
 from gmem_jax.sweeps.executors import executor as executor_named
 from gmem_jax.sweeps.store import Store
 

@@ -12,7 +12,7 @@ from gmem_jax.command.console import say
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import default_batch
 from gmem_jax.files.atomic import sweep
-from gmem_jax.files.parts import Parts, locked
+from gmem_jax.files.checkpoints import Checkpoints, locked
 
 Restart = Annotated[bool, typer.Option("--restart", help="Discard what an interrupted run left, and begin anew.")]
 
@@ -24,13 +24,13 @@ def folder_of(output: Path) -> Path:
 
 def batch_for(experiment: Experiment, output: Path, wanted: int | None = None, *, restart: bool = False) -> int:
     """Signals to run together: as wanted, as in the parts of an unfinished run, or what fits the free memory."""
-    kept = None if restart else Parts.key_of(folder_of(output)).get("batch")
+    kept = None if restart else Checkpoints.key_of(folder_of(output)).get("batch")
     known = wanted or (kept if isinstance(kept, int) and kept > 0 else None)
     return known or default_batch(experiment, psutil.virtual_memory().available)
 
 
 @contextmanager
-def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[Parts]:
+def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[Checkpoints]:
     """The parts of a run into `output`, there as long as it is not written: discarded if the block succeeds.
 
     Args:
@@ -43,7 +43,7 @@ def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[P
     """
     with locked(output):
         sweep(output.parent, output.name)
-        parts = Parts(folder_of(output), key, restart=restart)
+        parts = Checkpoints(folder_of(output), key, restart=restart)
         if parts.finished() or parts.begun():
             begun = " and one that is begun" if parts.begun() else ""
             say(f"going on from {parts.folder}: {parts.finished()} finished parts{begun}")

@@ -8,9 +8,9 @@ import typer
 from rich.table import Table
 
 from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, reporting, say
-from gmem_jax.experiment.host import RunFailedError
-from gmem_jax.files.atomic import FileFormatError, probe
-from gmem_jax.files.parts import locked
+from gmem_jax.errors import FileFormatError, RunFailedError
+from gmem_jax.files.atomic import probe
+from gmem_jax.files.checkpoints import locked
 from gmem_jax.physics.state import SENTENCES, Status
 from gmem_jax.show.tables import cell
 from gmem_jax.sweeps.executors import executor as executor_named

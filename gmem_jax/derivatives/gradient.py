@@ -1,7 +1,7 @@
 """Derivatives of a whole memory experiment on the host, chunk by chunk, in both directions.
 
-`jax.grad` and `jax.jvp` of `gm.fidelity` work as they are. The walks here do the same in the chunks of
-`experiment.host`: they report progress, compile small programs, make stale lists anew, and need one state per chunk
+`jax.grad` and `jax.jvp` of `gm.fidelity` work as they are. The observers here do the same in the chunks of
+`simulation.runner`: they report progress, compile small programs, make stale lists anew, and need one state per chunk
 and the replay of one chunk. What is differentiated by is named: "gamma0", "friction.mu", "signals.amplitudes", ...
 """
 
@@ -15,22 +15,16 @@ import numpy as np
 
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, value_at
 from gmem_jax.experiment.experiment import replace as with_values
-from gmem_jax.experiment.host import (
-    NOWHERE,
-    Action,
-    Checkpoint,
-    Compiled,
-    Move,
-    Progress,
-    Walker,
-    silent,
-    within,
-    work_of,
-)
-from gmem_jax.experiment.protocol import Bin, Stage
-from gmem_jax.experiment.recall import shear, walker
-from gmem_jax.experiment.walk import Course, walk, walk_some
+from gmem_jax.experiment.recall import apply_waveforms, runner_of
 from gmem_jax.physics.state import State
+from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint
+from gmem_jax.simulation.compiled import Compiled
+from gmem_jax.simulation.loop import Simulation, rollout, rollout_chunk
+from gmem_jax.simulation.observers import CHUNK, Chunk, Move, Observer
+from gmem_jax.simulation.progress import Progress, silent, within, work_of
+from gmem_jax.simulation.protocol import Bin
+from gmem_jax.simulation.runner import Runner
+from gmem_jax.simulation.sample import Sample
 
 Loss = Callable[[Experiment, jax.Array], jax.Array]
 """From an experiment and its p_sig [S, 256] to a number."""
@@ -51,7 +45,7 @@ def gain_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
 
 
 def _is_moving(path: Any, leaf: Any) -> bool:
-    """Whether a number of a course is differentiated by: not the list, nor the shape of the grain.
+    """Whether a number of a simulation is differentiated by: not the list, nor the shape of the grain.
 
     The native library has no derivatives by sphere offsets; `jax.grad` of plain JAX does.
     """
@@ -59,17 +53,17 @@ def _is_moving(path: Any, leaf: Any) -> bool:
     return not fixed and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
 
 
-def _numbers(course: Course) -> list[jax.Array]:
-    """The numbers of a course that are differentiated by."""
-    leaves = jax.tree_util.tree_leaves_with_path(course)
+def _numbers(simulation: Simulation) -> list[jax.Array]:
+    """The numbers of a simulation that are differentiated by."""
+    leaves = jax.tree_util.tree_leaves_with_path(simulation)
     return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf)]
 
 
-def _with_numbers(course: Course, numbers: Sequence[jax.Array]) -> Course:
-    """The course with other numbers in the place of `_numbers`."""
+def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array]) -> Simulation:
+    """The simulation with other numbers in the place of `_numbers`."""
     left = iter(numbers)
-    leaves, structure = jax.tree_util.tree_flatten_with_path(course)
-    filled: Course = jax.tree.unflatten(
+    leaves, structure = jax.tree_util.tree_flatten_with_path(simulation)
+    filled: Simulation = jax.tree.unflatten(
         structure, [next(left) if _is_moving(path, leaf) else leaf for path, leaf in leaves]
     )
     return filled
@@ -79,27 +73,27 @@ def _moving(state: State) -> Moving:
     return state.grains, state.history
 
 
-def _push(course: Course, state: State, first: Bin, count: Any, slopes: Any, most: int) -> Any:
+def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int) -> Any:
     """A chunk and its tangent."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        after, sample = walk_some(
-            _with_numbers(course, numbers), State(moving[0], moving[1], state.status), first, count, most
+        after, sample = rollout_chunk(
+            _with_numbers(simulation, numbers), State(moving[0], moving[1], state.status), first, count, most
         )
         return (_moving(after), sample.pressure), (after.status, sample)
 
-    (moving, _), slope, (status, sample) = jax.jvp(chunk, (_numbers(course), _moving(state)), slopes, has_aux=True)
+    (moving, _), slope, (status, sample) = jax.jvp(chunk, (_numbers(simulation), _moving(state)), slopes, has_aux=True)
     return State(moving[0], moving[1], status), sample, slope
 
 
-def _pull(course: Course, state: State, rows: Bin, slopes: tuple[Moving, jax.Array]) -> Any:
+def _pull(simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving, jax.Array]) -> Any:
     """Derivatives by numbers and state before a chunk, from those by state and pressures after it."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        after, sample = walk(_with_numbers(course, numbers), State(moving[0], moving[1], state.status), rows)
+        after, sample = rollout(_with_numbers(simulation, numbers), State(moving[0], moving[1], state.status), rows)
         return _moving(after), sample.pressure
 
-    return jax.vjp(chunk, _numbers(course), _moving(state))[1](slopes)
+    return jax.vjp(chunk, _numbers(simulation), _moving(state))[1](slopes)
 
 
 _pushed = Compiled(_push, static_argnames="most")
@@ -107,11 +101,11 @@ _pulled = Compiled(_pull)
 
 
 @dataclass
-class _Pushing(Action):
+class _Pushing(Observer):
     """Carries a tangent along.
 
     Attributes:
-        numbers: tangent of the course's numbers.
+        numbers: tangent of the simulation's numbers.
         moving: tangent of the state now; None as long as nothing has one.
         slopes: derivatives of the pressures of every stage, by chunks.
     """
@@ -119,18 +113,25 @@ class _Pushing(Action):
     numbers: Any
     moving: Moving | None
     slopes: dict[str, list[np.ndarray]] = field(default_factory=dict)
+    _next: tuple[Moving, jax.Array] | None = None
 
-    def chunk(self, course: Course, state: State, first: Bin, count: int, most: int) -> Any:
+    def step(self, chunk: Chunk) -> tuple[State, Sample] | None:
+        """Run the chunk with its tangent."""
         if self.moving is None:
-            after, sample, _ = super().chunk(course, state, first, count, most)
-            return after, sample, (None, jnp.zeros_like(sample.pressure))
-        return _pushed(course, state, first, count, (self.numbers, self.moving), most=most)
+            return None
+        slopes = (self.numbers, self.moving)
+        after, sample, self._next = _pushed(chunk.simulation, chunk.state, chunk.row, chunk.count, slopes, most=CHUNK)
+        return after, sample
 
-    def accept(self, course: Course, state: State, stage: Stage, first: Bin, count: int, more: Any) -> None:
-        self.moving, change = more
-        self.slopes.setdefault(stage.name, []).append(np.asarray(change)[:count])
+    def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
+        """Keep the derivatives of the pressures."""
+        change = jnp.zeros_like(sample.pressure)
+        if self._next is not None:
+            (self.moving, change), self._next = self._next, None
+        self.slopes.setdefault(chunk.stage.name, []).append(np.asarray(change)[: chunk.count])
 
-    def renew(self, history: Any, move: Move, blank: Any) -> None:
+    def rebuild(self, history: Any, move: Move, blank: Any) -> None:
+        """Move the tangent of the history too."""
         if self.moving is not None:
             self.moving = self.moving[0], move(self.moving[1], jax.tree.map(jnp.zeros_like, blank))
 
@@ -144,29 +145,31 @@ class _Piece(NamedTuple):
 
 
 @dataclass
-class _Remembering(Action):
+class _Remembering(Observer):
     """Remembers the way, to go back on it."""
 
     tape: list[_Piece] = field(default_factory=list)
-    numbers: Any = None  # derivatives by the course's numbers so far
-    readouts: Mapping[str, np.ndarray] = field(default_factory=dict)  # derivatives by the readouts' pressures
+    numbers: Any = None  # derivatives by the simulation's numbers so far
+    reads: Mapping[str, np.ndarray] = field(default_factory=dict)  # derivatives by the pressures that are read
 
-    def accept(self, course: Course, state: State, stage: Stage, first: Bin, count: int, more: Any) -> None:
-        begun = int(first.number)
-        rows = stage.rows(begun, count)
+    def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
+        """Remember the state before the chunk, and how to go back through it."""
+        simulation, before, first, count = chunk.simulation, chunk.state, chunk.first, chunk.count
+        rows = chunk.stage.rows(first, count)
 
         def back(slope: Moving) -> Moving:
-            known = self.readouts.get(stage.name)
-            shape = (count, 3, state.replicas)
-            own = np.zeros(shape) if known is None else known[begun : begun + count]
-            by_numbers, before = _pulled(course, state, rows, (slope, jnp.asarray(own)))
+            known = self.reads.get(chunk.stage.name)
+            shape = (count, 3, before.replicas)
+            own = np.zeros(shape) if known is None else known[first : first + count]
+            by_numbers, by_state = _pulled(simulation, before, rows, (slope, jnp.asarray(own)))
             self.numbers = by_numbers if self.numbers is None else jax.tree.map(jnp.add, self.numbers, by_numbers)
-            moving: Moving = before
+            moving: Moving = by_state
             return moving
 
-        self.tape.append(_Piece(back, stage.name, count * state.replicas))
+        self.tape.append(_Piece(back, chunk.stage.name, count * before.replicas))
 
-    def renew(self, history: Any, move: Move, blank: Any) -> None:
+    def rebuild(self, history: Any, move: Move, blank: Any) -> None:
+        """Remember how the history was moved."""
         _, pull = jax.vjp(lambda old: move(old, blank), history)
         self.tape.append(_Piece(lambda slope: (slope[0], pull(slope[1])[0])))
 
@@ -212,26 +215,26 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
     theta, tangent = _theta(experiment, direction), jax.tree.map(jnp.asarray, dict(direction))
     along = _along(experiment)
     common, own = experiment.phases
-    on = walker(experiment, progress=progress)
+    on = runner_of(experiment, progress=progress)
     on.total_work = _work(experiment, on)
     wide = on.state.replicas > 1
     slope: Moving | None = None
     if acts_on_prefix(list(theta)):
         slope = jax.jvp(lambda theta: _moving(along(theta).begin()), (theta,), (tangent,))[1]
-    action = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope)
-    on.action = action
-    samples = on.play(*common)
-    if action.moving is None:
-        action.moving = jax.tree.map(jnp.zeros_like, _moving(on.state))
+    pushing = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope)
+    on.observers = (pushing,)
+    samples = on.run_stages(*common)
+    if pushing.moving is None:
+        pushing.moving = jax.tree.map(jnp.zeros_like, _moving(on.state))
     if not wide:
-        action.moving = jax.tree.map(lambda leaf: jnp.repeat(leaf, experiment.replicas, axis=-1), action.moving)
-    action.numbers = _number_slope(experiment, theta, tangent, sheared=True)
-    shear(on, experiment)
-    samples |= on.play(*own)
+        pushing.moving = jax.tree.map(lambda leaf: jnp.repeat(leaf, experiment.replicas, axis=-1), pushing.moving)
+    pushing.numbers = _number_slope(experiment, theta, tangent, sheared=True)
+    apply_waveforms(on, experiment)
+    samples |= on.run_stages(*own)
     pressure = {name: np.asarray(sample.pressure) for name, sample in samples.items()}
-    slopes = {name: np.concatenate(parts) for name, parts in action.slopes.items()}
-    readouts, changes = ({name: jnp.asarray(of[name]) for name in of if "readout" in name} for of in (pressure, slopes))
-    return Pushed(pressure, slopes, experiment.recalled(readouts), experiment.recalled(changes))
+    slopes = {name: np.concatenate(parts) for name, parts in pushing.slopes.items()}
+    read, change = ({name: jnp.asarray(of[name]) for name in experiment.protocol.reads} for of in (pressure, slopes))
+    return Pushed(pressure, slopes, experiment.recalled(read), experiment.recalled(change))
 
 
 def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
@@ -253,12 +256,12 @@ def _along(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
 
 def _number_slope(experiment: Experiment, theta: Any, tangent: Any, *, sheared: bool) -> Any:
     def numbers(theta: Any) -> list[jax.Array]:
-        return _numbers(with_values(experiment, theta).course(sheared=sheared))
+        return _numbers(with_values(experiment, theta).simulation(sheared=sheared))
 
     return jax.jvp(numbers, (theta,), (tangent,))[1]
 
 
-def _work(experiment: Experiment, on: Walker) -> float:
+def _work(experiment: Experiment, on: Runner) -> float:
     common, own = experiment.phases
     return work_of(common, on.state.replicas) + work_of(own, experiment.replicas)
 
@@ -283,7 +286,7 @@ def value_and_grad(
     by: Sequence[str] = ("signals", "gamma0", "friction"),
     *,
     loss: Loss = fidelity_of,
-    checkpoint: Checkpoint = NOWHERE,
+    checkpoint: Checkpoint = NO_CHECKPOINT,
     progress: Progress = silent,
 ) -> Gradient:
     """Reverse mode: a number and its derivatives by all parameters, through the whole experiment.
@@ -305,31 +308,31 @@ def value_and_grad(
     """
     theta, along = _theta(experiment, by), _along(experiment)
     common, own = experiment.phases
-    on = walker(experiment, progress=within(progress, 0.0, FORWARDS))
+    on = runner_of(experiment, progress=within(progress, 0.0, FORWARDS))
     on.total_work = _work(experiment, on)
     prefix, rest = _Remembering(), _Remembering()
-    on.action = prefix if acts_on_prefix(by) else Action()
+    on.observers = (prefix,) if acts_on_prefix(by) else ()
     _, pull_begin = jax.vjp(lambda theta: _moving(along(theta).begin()), theta)
-    on.play(*common)
+    on.run_stages(*common)
     fan_out = jax.linear_transpose(_fan_out(experiment), _moving(on.state))
-    on.action = rest
-    shear(on, experiment)
-    samples = on.play(*own)
+    on.observers = (rest,)
+    apply_waveforms(on, experiment)
+    samples = on.run_stages(*own)
 
-    def final(theta: Any, readouts: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def final(theta: Any, pressures: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
         changed = along(theta)
-        p_sig = changed.recalled(readouts)
+        p_sig = changed.recalled(pressures)
         return loss(changed, p_sig), p_sig
 
-    readouts = {name: jnp.asarray(samples[name].pressure) for name in samples if "readout" in name}
+    pressures = {name: jnp.asarray(samples[name].pressure) for name in experiment.protocol.reads}
     # Not compiled: it is another function in every call, and compiling it takes longer than doing it.
     last = jax.value_and_grad(final, argnums=(0, 1), has_aux=True)
-    (value, p_sig), (slope, by_readouts) = last(theta, readouts)
-    rest.readouts = {name: np.asarray(by) for name, by in by_readouts.items()}
+    (value, p_sig), (slope, by_pressures) = last(theta, pressures)
+    rest.reads = {name: np.asarray(by) for name, by in by_pressures.items()}
 
     def pull_numbers(sheared: bool, found: Any) -> Any:
         def numbers(theta: Any) -> list[jax.Array]:
-            return _numbers(along(theta).course(sheared=sheared))
+            return _numbers(along(theta).simulation(sheared=sheared))
 
         return jax.vjp(numbers, theta)[1](found)[0]
 
@@ -358,9 +361,9 @@ class _Backwards:
     def __init__(self, progress: Progress, ways: Sequence[_Remembering], checkpoint: Checkpoint) -> None:
         self.progress, self.ways, self.checkpoint = progress, ways, checkpoint
         self.total, self.done = sum(piece.work for way in ways for piece in way.tape), 0
-        self.kept = checkpoint.begun()
-        if self.kept:
-            for way, left, numbers in zip(ways, self.kept["left"].tolist(), self.kept["numbers"], strict=True):
+        self.saved = checkpoint.restore()
+        if self.saved:
+            for way, left, numbers in zip(ways, self.saved["left"].tolist(), self.saved["numbers"], strict=True):
                 self.done += sum(piece.work for piece in way.tape[left:])
                 del way.tape[left:]
                 way.numbers = list(numbers) or None
@@ -368,8 +371,8 @@ class _Backwards:
     def through(self, way: _Remembering, slope: Moving) -> Moving:
         """From derivatives by the state at the end of a way to those at its beginning."""
         number = next(place for place, one in enumerate(self.ways) if one is way)
-        if self.kept and int(self.kept["way"]) == number:
-            slope = self.kept["slope"]
+        if self.saved and int(self.saved["way"]) == number:
+            slope = self.saved["slope"]
 
         def standing() -> dict[str, Any]:
             left = np.asarray([len(one.tape) for one in self.ways])
@@ -382,5 +385,5 @@ class _Backwards:
             if piece.work:
                 self.done += piece.work
                 self.progress(f"back through {piece.name}", 0.0, self.done / self.total)
-                self.checkpoint.reached(standing)
+                self.checkpoint.maybe_save(standing)
         return slope

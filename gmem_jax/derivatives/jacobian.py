@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.derivatives import gradient
+from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
-from gmem_jax.experiment.host import Progress, silent, within
-from gmem_jax.experiment.recall import Recall, simulate
+from gmem_jax.experiment.recall import Recall, run
 from gmem_jax.experiment.signals import Bumps
+from gmem_jax.simulation.progress import Progress, silent, within
 
 LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
 
@@ -54,9 +55,9 @@ def _law_values(experiment: Experiment) -> list[float]:
     return [float(value_at(experiment, path)) for path in LAW.values()]
 
 
-def _sheared(pressure: dict[str, np.ndarray]) -> np.ndarray:
-    """p_x - p_y of the stages from the encoding on, [replicas, bins]."""
-    joined = np.concatenate([pressure[name] for name in ("encode", "store", "readout")])
+def _p_xy(experiment: Experiment, pressure: dict[str, np.ndarray]) -> np.ndarray:
+    """p_x - p_y from the first stage that writes to the first that reads, [replicas, bins]."""
+    joined = np.concatenate([pressure[name] for name in experiment.protocol.first_memory])
     result: np.ndarray = (joined[:, 0] - joined[:, 1]).T
     return result
 
@@ -89,7 +90,7 @@ def exact(experiment: Experiment, *, law: bool = True, progress: Progress = sile
     pushed = gradient.push(drive, direction, progress=within(progress, 0.0, share))
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
-    p_sig, p_xy = [np.asarray(pushed.p_sig_slope)], [_sheared(pushed.slope)[1:]]
+    p_sig, p_xy = [np.asarray(pushed.p_sig_slope)], [_p_xy(experiment, pushed.slope)[1:]]
     if law:
         two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # replicas 0, 1: no signal; 2, 3: it
         wide = {path: jnp.full(4, value_at(experiment, path)) for path in LAW.values()}
@@ -99,10 +100,9 @@ def exact(experiment: Experiment, *, law: bool = True, progress: Progress = sile
             "friction.stiffness": jnp.asarray([0.0, 1.0, 0.0, 1.0]),
         }
         pushed = gradient.push(laws, direction, progress=within(progress, share, 1.0))
-        readout = pushed.slope["readout"]
-        change = np.flip(readout[:, 0] - readout[:, 1], axis=0).T
+        change = np.asarray(analysis.recalled(jnp.asarray(pushed.slope[experiment.protocol.reads[0]])))
         p_sig.append(-(change[2:] - change[:2]))
-        p_xy.append(_sheared(pushed.slope)[2:])
+        p_xy.append(_p_xy(experiment, pushed.slope)[2:])
         names += LAW
         values += _law_values(experiment)
     return Jacobian(tuple(names), np.asarray(values), np.concatenate(p_sig), np.concatenate(p_xy))
@@ -121,8 +121,8 @@ def differences(experiment: Experiment, relative: float, *, law: bool = True, pr
     gamma0 = np.full(2 * n + 3, float(experiment.gamma0))
     gamma0[-2:] *= [1.0 + relative, 1.0 - relative]
     drive = replace(experiment, signals=_copies(bumps, jnp.asarray(row + steps)), gamma0=jnp.asarray(gamma0))
-    found = simulate(drive, progress=progress)
-    recalled, p_xy = np.asarray(found.p_sig), _sheared(_pressures(found))[1:]
+    found = run(drive, progress=progress)
+    recalled, p_xy = np.asarray(found.p_sig), _p_xy(experiment, _pressures(found))[1:]
     widths = np.full((n + 1, 1), 2.0 * relative)
     widths[n] *= float(experiment.gamma0)
     up, down = [*range(n), 2 * n], [*range(n, 2 * n), 2 * n + 1]
@@ -138,11 +138,10 @@ def differences(experiment: Experiment, relative: float, *, law: bool = True, pr
         }
         rows = jnp.asarray(np.concatenate([np.zeros((3, n)), np.repeat(row, 4, axis=0)]))
         other = replace(experiment, {**shifted, "signals": _copies(bumps, rows)})
-        pressure = _pressures(simulate(other, progress=progress))
-        readout = pressure["readout"]
-        change = np.flip(readout[:, 0] - readout[:, 1], axis=0).T
+        pressure = _pressures(run(other, progress=progress))
+        change = np.asarray(analysis.recalled(jnp.asarray(pressure[experiment.protocol.reads[0]])))
         signal = -(change[4:] - change[:4])
-        p_xy = _sheared(pressure)[4:]
+        p_xy = _p_xy(experiment, pressure)[4:]
         widths = 2.0 * relative * np.asarray(law_values)[:, None]
         slopes[0].append((signal[[0, 2]] - signal[[1, 3]]) / widths)
         slopes[1].append((p_xy[[0, 2]] - p_xy[[1, 3]]) / widths)

@@ -23,9 +23,10 @@ from gmem_jax.design.waveforms import (
     verified,
 )
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Keep, Progress, forget, remembering, sharing, silent, under
 from gmem_jax.experiment.recall import PREFIX, prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline
+from gmem_jax.simulation.checkpoints import ResultCache, no_cache
+from gmem_jax.simulation.progress import Progress, silent
 
 BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
 WIDTH = 0.08  # of them, in u
@@ -82,7 +83,7 @@ def design_by_kernel(
     damping: float = DAMPING,
     measured: int = 0,
     batch: int | None = None,
-    keep: Keep = forget,
+    cache: ResultCache = no_cache,
     progress: Progress = silent,
 ) -> Design:
     """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
@@ -100,7 +101,7 @@ def design_by_kernel(
         measured: directions along which the slopes of a waveform are measured twice on the way, on average: those that
             miss most have most of the runs, up to all n directions, the kernel's strongest first.
         batch: signals that run together; default all of them.
-        keep: asked for every part of every simulation, so that a design can be resumed (see `gmem_jax.files.parts`).
+        cache: asked for every part of every simulation, so that a design can be resumed.
         progress: told about every chunk.
 
     Raises:
@@ -118,18 +119,18 @@ def design_by_kernel(
         n, width = len(kernel.centres), kernel.width
     work = Work(cost(experiment, iterations, 0 if kernel else n, measured), progress)
 
-    once = remembering(keep)
+    once = cache.memoised()
 
     def recall(name: str, changed: Experiment, runs: float = 1.0) -> np.ndarray:
-        kept = sharing(PREFIX, once, under(name, keep))
-        return np.asarray(run(changed, batch=batch, keep=kept, progress=work.next(runs, name)).p_sig)
+        kept = cache.scoped(name).shared(PREFIX, once)
+        return np.asarray(run(changed, batch=batch, cache=kept, progress=work.next(runs, name)).p_sig)
 
     target = np.asarray(experiment.integral())
     untouched = recall("untouched", experiment)
     if kernel is None:
         told = work.next(2.0 * n / len(target), "kernel")
-        begun = prefix_of(experiment, keep=once)
-        kernel = memory_kernel(experiment, n, width, begun=begun, keep=under("kernel", keep), progress=told)
+        prefix = prefix_of(experiment, cache=once)
+        kernel = memory_kernel(experiment, n, width, prefix=prefix, cache=cache.scoped("kernel"), progress=told)
     original = experiment.compare(jnp.asarray(untouched))
     firm = np.full((len(target), 1), damping * np.linalg.norm(kernel.odd, 2))
 

@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
 
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
-from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent
 from gmem_jax.experiment.recall import run
+from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
+from gmem_jax.simulation.progress import Progress, silent
 
 PARAMETERS = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.stiffness"}
 
@@ -59,8 +58,7 @@ def design_drive(
     *,
     iterations: int = 6,
     spread: float = 0.2,
-    optimiser: optax.GradientTransformation | None = None,
-    keep: Keep = forget,
+    cache: ResultCache = no_cache,
     progress: Progress = silent,
 ) -> TunedDrive:
     """Choose gamma0 and parameters of the friction law within bounds so that the mean fidelity of some packs grows.
@@ -76,8 +74,7 @@ def design_drive(
         bounds: lowest and highest value by name: "gamma0", "mu", "stiffness" (any of them), or another dotted name.
         iterations: steps; each costs 2 n + 1 runs a pack for n parameters.
         spread: of the differences at first, in parts of each parameter.
-        optimiser: what makes a step of the logarithms of a gradient of length `spread`; default the gradient itself.
-        keep: asked for the fidelity of every run, so that a long search can be resumed (see `gmem_jax.files.parts`).
+        cache: asked for the fidelity of every run, so that a long search can be resumed.
         progress: told about every run.
 
     Raises:
@@ -99,14 +96,12 @@ def design_drive(
             def recall(_: Checkpoint, changed: Experiment = changed) -> jax.Array:
                 return run(changed).fidelity
 
-            found.append(float(keep(f"run-{done:05d}", recall)))
+            found.append(float(cache(f"run-{done:05d}", recall)))
             done += 1
             progress(f"F = {np.mean(found):.4f}", 0.0, done / total)
         return np.asarray(found)
 
-    optimiser = optax.sgd(1.0) if optimiser is None else optimiser
     logs = np.log(start)
-    memory = optimiser.init(jnp.asarray(logs))
     found = each(logs)
     history = [(logs, float(found.mean()))]
     for _ in range(iterations):
@@ -119,8 +114,7 @@ def design_drive(
             seen += zip(sides, (up, down), strict=True)
         # As long as the differences reach: the slope says nothing of what is further away.
         along = -slope * spread / max(float(np.linalg.norm(slope)), 1e-12)
-        updates, memory = optimiser.update(jnp.asarray(along), memory, jnp.asarray(logs))
-        stepped = np.clip(np.asarray(optax.apply_updates(jnp.asarray(logs), updates)), lowest, highest)
+        stepped = np.clip(logs - along, lowest, highest)
         seen.append((stepped, each(stepped)))
         before, (logs, found) = logs, max(seen, key=lambda pair: float(pair[1].mean()))
         spread = 0.5 * spread if logs is before else spread

@@ -14,9 +14,11 @@ import numpy as np
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Keep, Progress, Walker, forget, silent
-from gmem_jax.experiment.recall import simulate
-from gmem_jax.experiment.signals import BINS, Bumps, Signals, bin_average
+from gmem_jax.experiment.recall import Prefix, run
+from gmem_jax.experiment.signals import Bumps, Signals, bin_average
+from gmem_jax.simulation.checkpoints import ResultCache, no_cache
+from gmem_jax.simulation.progress import Progress, silent
+from gmem_jax.simulation.protocol import BINS
 
 FINE = 2048  # points of v for inner products of basis functions
 
@@ -145,8 +147,8 @@ def memory_kernel(
     n: int = 17,
     width: float = 0.2,
     *,
-    begun: Walker | None = None,
-    keep: Keep = forget,
+    prefix: Prefix | None = None,
+    cache: ResultCache = no_cache,
     progress: Progress = silent,
 ) -> MemoryKernel:
     """Measure the memory kernel of a pack.
@@ -155,8 +157,8 @@ def memory_kernel(
         experiment: pack and parameters; its signals do not matter.
         n: basis waveforms; 2 n + 1 replicas are run.
         width: of the bumps; narrow ones drive the walls faster.
-        begun: what `recall.prefix_of` gave for the same pack and law, if there is one.
-        keep: asked for the recalls of the basis, so that a long run can be resumed (see `gmem_jax.files.parts`).
+        prefix: what `recall.prefix_of` gave for the same pack and law, if there is one.
+        cache: asked for the recalls of the basis, so that a long run can be resumed (see `gmem_jax.files.checkpoints`).
         progress: told about every chunk.
 
     Raises:
@@ -169,7 +171,7 @@ def memory_kernel(
     wanted = replace(experiment, signals=both)
     if jnp.ndim(wanted.scale):
         raise ValueError("a kernel is measured at one gamma0 and one delta0, not one for each replica")
-    p_sig = np.asarray(keep("basis", lambda at: simulate(wanted, begun, checkpoint=at, progress=progress).p_sig))
+    p_sig = np.asarray(run(wanted, prefix=prefix, cache=cache.scoped("basis"), progress=progress).p_sig)
     plus, minus = p_sig[:n], p_sig[n:]
     return MemoryKernel(
         u=(np.arange(BINS) + 0.5) / BINS,

@@ -1,8 +1,8 @@
 """Inverse design: waveforms whose nonlinear recall follows wanted curves.
 
 Waveforms are corrected by the exact Jacobian of the recall around the present ones: one tangent per amplitude, as
-replicas of one run (`gradient.push`). A damped Gauss-Newton step is handed to an optax optimiser as a preconditioned
-gradient, and simulated before it is accepted.
+replicas of one run (`gradient.push`). A damped Gauss-Newton step is simulated before it is accepted,
+whole and in parts.
 """
 
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from gmem_jax.derivatives.gradient import push
 from gmem_jax.design.kernel import FINE, bumps, nearest
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Keep, Progress, forget, silent, within
-from gmem_jax.experiment.recall import prefix_of, run, simulate
+from gmem_jax.experiment.recall import prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline, waveform
+from gmem_jax.simulation.checkpoints import ResultCache, no_cache
+from gmem_jax.simulation.progress import Progress, silent, within
 
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)
@@ -146,8 +146,7 @@ def design_waveforms(
     width: float = WIDTH,
     gain: float | None = None,
     damping: Sequence[float] = DAMPING,
-    optimiser: optax.GradientTransformation | None = None,
-    keep: Keep = forget,
+    cache: ResultCache = no_cache,
     progress: Progress = silent,
 ) -> Design:
     """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
@@ -160,27 +159,23 @@ def design_waveforms(
         gain: wanted common gain; default half of the untouched waveforms' own, so that the bound leaves room.
         damping: of the steps one after the other, in parts of the Jacobian's largest singular value; the last for all
             that follow.
-        optimiser: what makes a step of a preconditioned gradient; default the whole step, shortened if the recall
-            gets worse.
-        keep: asked for every simulation and Jacobian, so that a design can be resumed (see `gmem_jax.files.parts`).
+        cache: asked for every simulation and Jacobian, so that a design can be resumed.
         progress: told about every chunk.
 
     Raises:
         RunFailedError: if a simulation broke down.
     """
     refuse_several_scales(experiment)
-    work, prefix = Work(cost(experiment, iterations, n), progress), _prefix(experiment)
-    begun = prefix_of(experiment, keep=keep, progress=work.next(prefix))
+    work, share = Work(cost(experiment, iterations, n), progress), _prefix(experiment)
+    prefix = prefix_of(experiment, cache=cache, progress=work.next(share))
     target = np.asarray(experiment.integral())
-    untouched = keep("untouched", lambda at: simulate(experiment, begun, checkpoint=at, progress=work.next(1.0)).p_sig)
+    untouched = run(experiment, prefix=prefix, cache=cache.scoped("untouched"), progress=work.next(1.0)).p_sig
     original = experiment.compare(jnp.asarray(untouched))
     before, own_gain = float(original.fidelity), float(original.gain)
     gain = 0.5 * own_gain if gain is None else gain
     wanted = gain * float(experiment.scale) * target
     basis = bumps(np.eye(n), width)
     amplitudes = bounded(nearest(basis, experiment.signals) * gain / own_gain, width)
-    optimiser = optax.sgd(1.0) if optimiser is None else optimiser
-    memory = optimiser.init(jnp.asarray(amplitudes))
     count = len(target)
 
     def make(rows: jax.Array | np.ndarray) -> Experiment:
@@ -188,14 +183,14 @@ def design_waveforms(
 
     def recall(name: str, rows: np.ndarray) -> np.ndarray:
         on = work.next(len(rows) / count, name)
-        return np.asarray(keep(name, lambda at: simulate(make(rows), begun, checkpoint=at, progress=on).p_sig))
+        return np.asarray(run(make(rows), prefix=prefix, cache=cache.scoped(name), progress=on).p_sig)
 
     def jacobians(name: str, at: np.ndarray) -> np.ndarray:
         """dp_sig / da of every signal, [S, n, 256]."""
         rows, directions = np.repeat(at, n, axis=0), np.tile(np.eye(n), (count, 1))
         direction = {"signals.amplitudes": jnp.asarray(directions)}
         on = work.next(TANGENT * n, f"F = {history[-1]:.4f}")
-        slope = keep(name, lambda _: push(make(rows), direction, progress=on).p_sig_slope)
+        slope = cache(name, lambda _: push(make(rows), direction, progress=on).p_sig_slope)
         return np.asarray(slope).reshape(count, n, -1)
 
     p_sig = recall("projected", amplitudes)
@@ -204,14 +199,13 @@ def design_waveforms(
         local = jacobians(f"jacobian-{iteration}", amplitudes)
         damped = damping[min(iteration, len(damping) - 1)]
         steps = correction(local, wanted - p_sig, damped * np.linalg.norm(local, 2, axis=(1, 2))[:, None])
-        updates, memory = optimiser.update(jnp.asarray(-steps), memory, jnp.asarray(amplitudes))
-        tried = [bounded(amplitudes + fraction * np.asarray(updates), width) for fraction in FRACTIONS]
+        tried = [bounded(amplitudes + fraction * steps, width) for fraction in FRACTIONS]
         candidates = np.stack([amplitudes, *tried])
         recalls = np.stack([p_sig, *recall(f"tried-{iteration}", np.concatenate(tried)).reshape(len(tried), count, -1)])
         chosen = np.linalg.norm(recalls - wanted, axis=2).argmin(axis=0), np.arange(count)
         amplitudes, p_sig = candidates[chosen], recalls[chosen]
         history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
     signals = sampled(bumps(amplitudes, width))
-    last = work.next(1.0 + prefix, "verified")
-    fresh = np.asarray(keep("verified", lambda _: run(replace(experiment, signals=signals), progress=last).p_sig))
-    return verified(experiment, signals, fresh, np.asarray(untouched), history)
+    last = work.next(1.0 + share, "verified")
+    fresh = run(replace(experiment, signals=signals), cache=cache.scoped("verified"), progress=last).p_sig
+    return verified(experiment, signals, np.asarray(fresh), np.asarray(untouched), history)

@@ -1,1 +1,1 @@
-"""One memory experiment: its description, its walls, the one loop that walks through it, and what it recalls."""
+"""One memory experiment: its description, its protocols, and what it recalls."""

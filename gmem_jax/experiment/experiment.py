@@ -13,18 +13,19 @@ import numpy as np
 
 from gmem_jax import native
 from gmem_jax.experiment import analysis
-from gmem_jax.experiment.drive import Drive
 from gmem_jax.experiment.html import brief, facts
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.protocol import Stage, memory_protocol, split
-from gmem_jax.experiment.signals import BINS, Signals, bin_average, part
-from gmem_jax.experiment.walk import Course
+from gmem_jax.experiment.protocols import memory_protocol
+from gmem_jax.experiment.signals import Signals, bin_average, part
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar, impossible, parameter, pytree, settle, static, traced
 from gmem_jax.physics.state import State, Status, replicate
 from gmem_jax.physics.step import System, start
+from gmem_jax.simulation.loop import Simulation
+from gmem_jax.simulation.protocol import BINS, Protocol, Stage
+from gmem_jax.simulation.strain import StrainPath
 
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
@@ -55,7 +56,7 @@ class Experiment:
         material: the elastic solid.
         gamma0: shear amplitude.
         shear_share: of it on each axis: L_x shrinks and L_y grows by this part of gamma; see
-            `gmem_jax.experiment.drive.Drive`.
+            `gmem_jax.simulation.strain.StrainPath`.
         delta0: areal compression; default the pack's own. Another value makes `run` warn.
         t0: duration of one compression, in t_c. The paper's is 1.8e4.
         hold_drag: viscous drag while the walls stand still, 1 / t_c; default 0.05 for t0 below the paper's, else 0.
@@ -192,24 +193,24 @@ class Experiment:
         return Timing(self.t0 / (BINS * self.steps_per_bin), self.steps_per_bin)
 
     @property
-    def stages(self) -> tuple[Stage, ...]:
-        """The protocol."""
+    def protocol(self) -> Protocol:
+        """The stages that are gone through."""
         again = self.background != "sub0"
         return memory_protocol(self.rest, self.hold, self.store, second_readout=again, shear=self.shear)
 
     @property
     def phases(self) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
         """The shear-free prefix, run once for all signals; and the stages from the first sheared one on."""
-        return split(self.stages)
+        return self.protocol.phases
 
-    def course(self, *, sheared: bool) -> Course:
-        """What a walk is told, in the prefix or after it."""
+    def simulation(self, *, sheared: bool) -> Simulation:
+        """What a rollout is told, in the prefix or after it."""
         lower, upper = self.pack.box.lower, self.pack.box.upper
         gamma0, signals, share = (self.gamma0, self.signals, self.shear_share) if sheared else (0.0, None, 1.0)
         dt, steps = self.timing
-        return Course(
+        return Simulation(
             System(self.pack.clump, self.friction, self.pack.pairs, self.material),
-            Drive(lower, upper, self.compression, gamma0, signals, share),
+            StrainPath(lower, upper, self.compression, gamma0, signals, share),
             dt,
             self.drag,
             steps=steps,
@@ -222,7 +223,7 @@ class Experiment:
         before = {name: value for name, value in replica_parameters(self).items() if name not in AFTER_PREFIX}
         wide = self.replicas if any(jnp.ndim(value) for value in before.values()) else 1
         position, quaternion = replicate((self.pack.position[..., None], self.pack.quaternion[..., None]), wide)
-        state = start(self.course(sheared=False).system, position, quaternion, self.pack.box)
+        state = start(self.simulation(sheared=False).system, position, quaternion, self.pack.box)
         bits = jnp.where(self._impossible(), int(Status.IMPOSSIBLE), 0)
         bits |= jnp.where(jnp.all(jnp.asarray(self.timing.dt) <= LARGEST_STEP), 0, int(Status.STEP_TOO_LARGE))
         return dataclasses.replace(state, status=state.status | bits.astype(jnp.int32))
@@ -247,11 +248,9 @@ class Experiment:
         averaged: jax.Array = bin_average(self.signals)
         return averaged
 
-    def recalled(self, readouts: Mapping[str, jax.Array]) -> jax.Array:
+    def recalled(self, pressures: Mapping[str, jax.Array]) -> jax.Array:
         """p_sig of every signal in ascending u, [S, 256], in E, from the pressures [256, 3, S + 1] by stage."""
-        first = analysis.recalled(readouts["readout"])
-        second = analysis.recalled(readouts["readout-2"]) if "readout-2" in readouts else None
-        return analysis.subtract(self.background, first, second)
+        return analysis.subtract(self.background, *(analysis.recalled(pressures[name]) for name in self.protocol.reads))
 
     def compare(self, p_sig: jax.Array) -> analysis.Match:
         """Gain and fidelity of recalled signals [S, 256]."""
@@ -267,7 +266,7 @@ class Experiment:
             "delta0": self.compression,
             "t0 (t_c)": self.t0,
             "dt (t_c)": dt,
-            "steps": self.steps_per_bin * sum(stage.bins for stage in self.stages),
+            "steps": self.steps_per_bin * self.protocol.bins,
             **{name: getattr(self, name) for name in ("background", "backend", "precision")},
         }
         return facts("Experiment", rows)

@@ -10,17 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import native
 from gmem_jax.experiment.html import brief, facts
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree
-from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, Grains, still_box
-
-SKIN = 0.3
-"""Skin of the neighbour list of an experiment, in R. Measured non-affine displacements over a full compression stay
-below 0.11 R at N = 325 to 3267, so one list serves a whole experiment; the margin covers the shear and a repeat."""
+from gmem_jax.simulation.neighbors import SKIN, pair_finder
+from gmem_jax.simulation.strain import smallest_box
 
 
 @pytree
@@ -87,18 +83,6 @@ class Pack:
     def view(self) -> Any:
         """The pack in 3D, for notebooks; `gmem_jax.show.view` stands floors above, and is loaded when asked for."""
         return importlib.import_module("gmem_jax.show.view").view(self)
-
-
-def smallest_box(lower: np.ndarray, upper: np.ndarray, delta0: float) -> np.ndarray:
-    """Edge lengths of the box at u = 1, [3]."""
-    shrink = np.sqrt(1.0 - delta0)
-    lengths: np.ndarray = (np.asarray(upper) - np.asarray(lower)) * np.array([shrink, shrink, 1.0])
-    return lengths
-
-
-def pair_finder(clump: Clump, extent: np.ndarray, skin: float, **sizes: Any) -> PairFinder:
-    """A `PairFinder` that searches in the library where there is one."""
-    return PairFinder(clump, extent, skin, search=native.search(), **sizes)
 
 
 def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: Box, delta0: float) -> Pairs:

@@ -6,40 +6,28 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import analysis, html
-from gmem_jax.experiment.devices import spread_over
-from gmem_jax.experiment.doubts import doubts
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
-from gmem_jax.experiment.frames import Film, Frames, Taken, joined, places
-from gmem_jax.experiment.host import (
-    CHUNK,
-    NOWHERE,
-    Checkpoint,
-    Compiled,
-    Keep,
-    Progress,
-    Walker,
-    forget,
-    refuse,
-    require_x64,
-    silent,
-    within,
-    work_of,
-    worst,
-)
-from gmem_jax.experiment.pack import smallest_box
-from gmem_jax.experiment.protocol import Stage, table
-from gmem_jax.experiment.signals import BINS
-from gmem_jax.experiment.walk import walk
-from gmem_jax.physics.pytree import Scalar, pytree, traced
-from gmem_jax.physics.sample import Sample
+from gmem_jax.experiment.validity import validity
+from gmem_jax.physics.pytree import Scalar, pytree, static, traced
 from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
+from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
+from gmem_jax.simulation.compiled import Compiled, require_x64
+from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, concatenate, places
+from gmem_jax.simulation.loop import rollout
+from gmem_jax.simulation.observers import CHUNK
+from gmem_jax.simulation.progress import Progress, silent, work_of
+from gmem_jax.simulation.protocol import BINS, Protocol, Stage, table
+from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
+from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.sharding import placement_of
+from gmem_jax.simulation.strain import smallest_box
 
 REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than this part of the walls' speed
 COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
@@ -66,9 +54,10 @@ class Recall:
         residual_speed: largest grain speed when the readout began, over the walls' speed, [S + 1].
         status: bits of `Status`, [S + 1]; replica 0 is the zero signal. Those of
             `DOUBTFUL` leave the numbers as they are.
-        stages: samples of every stage by name, leading axis bins; one replica before "encode". Ordered: JAX sorts the
-            keys of plain dictionaries.
+        stages: samples of every stage by name, leading axis bins; one replica before the first waveform. Ordered: JAX
+            sorts the keys of plain dictionaries.
         dt: the time step used, in t_c.
+        protocol: the stages that were gone through.
         frames: configurations of one replica along the run, if they were asked for.
     """
 
@@ -85,6 +74,7 @@ class Recall:
     status: jax.Array
     stages: OrderedDict[str, Sample]
     dt: Scalar
+    protocol: Protocol = static()
     frames: Frames | None = None
 
     def plot(self, what: str = "signals", experiment: Experiment | None = None, *, against: str = "time") -> Any:
@@ -114,11 +104,11 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
     pack, t0 = experiment.pack, experiment.t0
     step = experiment.timing.dt
     wall_speed = 0.5 * (pack.upper - pack.lower)[0] * (1.0 - jnp.sqrt(1.0 - experiment.compression)) / t0
-    residual = stages["store"].largest_speed[-1] / wall_speed
+    residual = stages[experiment.protocol.before_read].largest_speed[-1] / wall_speed
     status = status | jnp.where(residual < REST_SPEED, 0, int(Status.NOT_AT_REST)).astype(jnp.int32)
     # A factor, not a choice: the derivative of what is broken must be NaN too.
     sound = jnp.where(jnp.any(status & ~int(DOUBTFUL)), jnp.nan, 1.0)
-    p_sig = sound * experiment.recalled({name: stages[name].pressure for name in stages if "readout" in name})
+    p_sig = sound * experiment.recalled({name: stages[name].pressure for name in experiment.protocol.reads})
     integral = experiment.integral()
     match = experiment.compare(p_sig)
     smooth = analysis.compare(p_sig, integral, experiment.scale, pack.ringing_period / jnp.max(jnp.asarray(t0)))
@@ -134,14 +124,15 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
         windowed_fidelity=smooth.fidelity,
         window=pack.ringing_period,
         residual_speed=residual,
-        status=status | doubts(experiment, stages, match.fidelity, smooth.fidelity),
+        status=status | validity(experiment, stages, match.fidelity, smooth.fidelity),
         stages=stages,
         dt=step,
+        protocol=experiment.protocol,
     )
 
 
 def _by_stage(sample: Sample, stages: tuple[Stage, ...]) -> "OrderedDict[str, Sample]":
-    """The samples of a walk through stages, apart."""
+    """The samples of a rollout of stages, apart."""
     ends = np.cumsum([stage.bins for stage in stages])
     places = [slice(end - stage.bins, end) for stage, end in zip(stages, ends, strict=True)]
     return OrderedDict(
@@ -153,8 +144,8 @@ def _by_stage(sample: Sample, stages: tuple[Stage, ...]) -> "OrderedDict[str, Sa
 @jax.jit
 def _recall(experiment: Experiment) -> Recall:
     common, own = experiment.phases
-    state, before = walk(experiment.course(sheared=False), experiment.begin(), table(common))
-    state, after = walk(experiment.course(sheared=True), experiment.fan_out(state), table(own))
+    state, before = rollout(experiment.simulation(sheared=False), experiment.begin(), table(common))
+    state, after = rollout(experiment.simulation(sheared=True), experiment.fan_out(state), table(own))
     return finish(experiment, _by_stage(before, common) | _by_stage(after, own), state.status)
 
 
@@ -187,8 +178,8 @@ _fan_out = Compiled(Experiment.fan_out)
 finished = Compiled(finish)
 
 
-def walker(experiment: Experiment, **options: Any) -> Walker:
-    """A walk on the host, at the beginning of the experiment.
+def runner_of(experiment: Experiment, **options: Any) -> Runner:
+    """A runner at the beginning of the experiment.
 
     Raises:
         ValueError: if 64-bit mode is off, or the experiment is traced.
@@ -199,94 +190,135 @@ def walker(experiment: Experiment, **options: Any) -> Walker:
     pack, deepest = experiment.pack, float(np.max(np.asarray(experiment.compression)))
     smallest = smallest_box(np.asarray(pack.lower), np.asarray(pack.upper), deepest)
     state = _begin(experiment)
-    refuse(worst(state), "begin")
-    return Walker(experiment.course(sheared=False), state, smallest, **options)
+    raise_if_fatal(status_of(state), "begin")
+    return Runner(experiment.simulation(sheared=False), state, smallest, **options)
 
 
-def shear(walker: Walker, experiment: Experiment) -> None:
-    """Bring a walk from the end of the prefix to the beginning of the encoding: all replicas, with their waveforms."""
-    walker.course = experiment.course(sheared=True).with_pairs(walker.course.system.pairs)
-    walker.state = _fan_out(experiment, walker.state)
+def apply_waveforms(runner: Runner, experiment: Experiment) -> None:
+    """Bring a runner from the end of the prefix to the first sheared stage: all replicas, with their waveforms."""
+    runner.simulation = experiment.simulation(sheared=True).with_pairs(runner.simulation.system.pairs)
+    runner.state = _fan_out(experiment, runner.state)
+
+
+class Prefix(NamedTuple):
+    """The stages that all waveforms have in common, done.
+
+    Attributes:
+        runner: at their end.
+        samples: theirs.
+    """
+
+    runner: Runner
+    samples: "OrderedDict[str, Sample]"
+
+
+def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress: Progress = silent) -> Prefix:
+    """Run the shear-free prefix, common to all waveforms on this pack under this law, for any number of `run`.
+
+    Args:
+        experiment: pack, law and protocol.
+        cache: asked for the part "prefix".
+        progress: told about every chunk.
+
+    Raises:
+        RunFailedError: if the simulation broke down.
+    """
+    common, _ = experiment.phases
+    runner = runner_of(experiment, progress=progress)
+    runner.total_work = work_of(common, runner.state.replicas)
+    return Prefix(runner, runner.run_cached(PREFIX, cache, *common))
 
 
 def run(
     experiment: Experiment,
     *,
+    prefix: Prefix | None = None,
     batch: int | None = None,
     devices: Sequence[jax.Device] | None = None,
     frames: int = 0,
     frames_of: int = 1,
-    keep: Keep = forget,
+    cache: ResultCache = no_cache,
     progress: Progress = silent,
 ) -> Recall:
-    """Run an experiment on the host, in chunks: stale neighbour lists are made anew, a broken run raises.
+    """Run an experiment on the host, in chunks: stale neighbour lists are built anew, a broken run raises.
 
     With several processes (`jax.distributed`) all must call it alike, and all get the recall; one should keep it.
 
     Args:
         experiment: the experiment.
+        prefix: what `prefix_of` gave for the same pack and law, if it was run already.
         batch: signals that run together; default all of them. Each batch has a zero signal of its own.
         devices: that share out the replicas; default all that JAX sees, also those of other processes.
         frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
         frames_of: the signal whose they are, from 1; 0 for the zero signal.
-        keep: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
+        cache: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).
         progress: told about every chunk.
 
     Raises:
         ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
-            for too many or too few frames, or a signal that there is not.
+            for too many or too few frames, frames of a prefix that was run before, or a signal that there is not.
         RunFailedError: if the simulation broke down.
     """
     count, size = experiment.signals.count, batch or experiment.signals.count
     if size < 1:
         raise ValueError(f"batch must be at least 1, got {batch}")
-    film = film_of(experiment, frames, frames_of)
-    begun = walker(experiment, progress=progress, film=film)
-    warn_of_another_compression(experiment)
     if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
         raise ValueError("parameters with a value for each replica need all signals in one batch")
+    if prefix and frames:
+        raise ValueError("frames begin with the prefix: run it in the same call")
+    schedule = frame_schedule(experiment, frames, frames_of)
+    warn_of_another_compression(experiment)
     common, own = experiment.phases
     firsts = range(0, count, size)
-    done = work_of(common, begun.state.replicas)
-    begun.total_work = done + sum(work_of(own, 1 + min(size, count - first)) for first in firsts)
-    samples = begun.play_part(PREFIX, keep, *common)
+    work = sum(work_of(own, 1 + min(size, count - first)) for first in firsts)
+    recorders = [FrameRecorder(schedule)] if frames else []
+    if prefix is None:
+        runner = runner_of(experiment, progress=progress, observers=tuple(recorders))
+        runner.total_work = work_of(common, runner.state.replicas) + work
+        prefix = Prefix(runner, runner.run_cached(PREFIX, cache, *common))
+        done = work_of(common, runner.state.replicas)
+    else:
+        runner = prefix.runner.fork(progress=progress, total_work=work)
+        done = 0.0
     parts: list[tuple[dict[str, Sample], jax.Array]] = []
-    taken: Taken = {}
+    recorded = recorders[0].recorded if recorders else OrderedDict()
     for number, first in enumerate(firsts):
         last = min(first + size, count)
         few = experiment if size >= count else with_part(experiment, first, last)
-        filmed = first < frames_of <= last or frames_of == first == 0
-        own_film = Film(film.wanted, max(0, frames_of - first)) if filmed else Film()
-        on = begun.afresh(work=done, film=own_film)
+        wanted = bool(frames) and (first < frames_of <= last or frames_of == first == 0)
+        recorder = FrameRecorder(FrameSchedule(schedule.wanted if wanted else {}, max(0, frames_of - first)))
+        recorder.restore(recorded)
+        on = runner.fork(work=done, observers=(recorder,))
 
-        def run_batch(checkpoint: Checkpoint, few: Experiment = few, on: Walker = on) -> Any:
-            shear(on, few)
-            on.put_on(spread_over(few.replicas, devices))
-            samples = on.play(*own, checkpoint=checkpoint)
-            return (samples, on.status()), on.taken
+        def run_batch(
+            checkpoint: Checkpoint, few: Experiment = few, on: Runner = on, recorder: FrameRecorder = recorder
+        ) -> Any:
+            apply_waveforms(on, few)
+            on.place_on(placement_of(few.replicas, devices))
+            samples = on.run_stages(*own, checkpoint=checkpoint)
+            return (samples, on.status()), recorder.saved()
 
-        found_part, all_taken = keep(f"batch-{number:04d}", run_batch)
+        found_part, seen = cache(f"batch-{number:04d}", run_batch)
         parts.append(found_part)
-        taken = all_taken if filmed else taken
+        recorded = seen if wanted else recorded
         done += work_of(own, 1 + last - first)
     after_prefix, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
-    found: Recall = finished(experiment, samples | after_prefix, jnp.asarray(status))
-    return (
-        found
-        if frames == 0
-        else dataclasses.replace(found, frames=joined(taken, np.asarray(experiment.pack.clump.offsets), frames_of))
-    )
+    found: Recall = finished(experiment, prefix.samples | after_prefix, jnp.asarray(status))
+    if not frames:
+        return found
+    offsets = np.asarray(experiment.pack.clump.offsets)
+    return dataclasses.replace(found, frames=concatenate(recorded, offsets, frames_of))
 
 
-def film_of(experiment: Experiment, frames: int, of: int) -> Film:
-    """What is to be taken of a run: `frames` configurations of the replica of a signal.
+def frame_schedule(experiment: Experiment, frames: int, of: int) -> FrameSchedule:
+    """What is to be recorded of a run: `frames` configurations of the replica of a signal.
 
     Raises:
         ValueError: for too many or too few, or a signal that there is not.
     """
     if not 0 <= of <= experiment.signals.count:
         raise ValueError(f"frames of signal {of}: there are signals 1 to {experiment.signals.count}, and 0 for none")
-    return Film(places(experiment.stages, frames, CHUNK), of) if frames else Film()
+    return FrameSchedule(places(experiment.protocol.stages, frames, CHUNK), of) if frames else FrameSchedule()
 
 
 def replica_bins(experiment: Experiment, batch: int) -> int:
@@ -328,49 +360,3 @@ def run_bytes(experiment: Experiment, batch: int) -> int:
 def default_batch(experiment: Experiment, available: int) -> int:
     """Signals that may run together in half of the `available` bytes; at most `LARGEST_BATCH`."""
     return int(max(1, min(LARGEST_BATCH, 0.5 * available / _replica_bytes(experiment) - 1)))
-
-
-def prefix_of(experiment: Experiment, *, keep: Keep = forget, progress: Progress = silent) -> Walker:
-    """A walk that has done the shear-free prefix, common to all waveforms on this pack; see `simulate`.
-
-    Args:
-        experiment: pack, law and protocol.
-        keep: asked for the part "prefix".
-        progress: told about every chunk.
-
-    Raises:
-        RunFailedError: if the simulation broke down.
-    """
-    common, _ = experiment.phases
-    begun = walker(experiment, progress=progress)
-    begun.total_work = work_of(common, begun.state.replicas)
-    begun.play_part(PREFIX, keep, *common)
-    return begun
-
-
-def simulate(
-    experiment: Experiment,
-    begun: Walker | None = None,
-    *,
-    checkpoint: Checkpoint = NOWHERE,
-    progress: Progress = silent,
-) -> Recall:
-    """`run` from a prefix that is done already; the stages of the prefix are not in the result.
-
-    Args:
-        experiment: the experiment.
-        begun: what `prefix_of` gave for the same pack and law; it can be used again. Run here if not given.
-        checkpoint: where to go on, and where to keep how far it is.
-        progress: told about every chunk.
-
-    Raises:
-        RunFailedError: if the simulation broke down.
-    """
-    share = 0.1 if begun is None else 0.0
-    begun = prefix_of(experiment, progress=within(progress, 0.0, share)) if begun is None else begun
-    _, own = experiment.phases
-    all_work = work_of(own, experiment.replicas)
-    on = begun.afresh(progress=within(progress, share, 1.0), work=0.0, total_work=all_work)
-    shear(on, experiment)
-    found: Recall = finished(experiment, on.play(*own, checkpoint=checkpoint), on.state.status)
-    return found

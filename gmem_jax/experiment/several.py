@@ -14,12 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, replace, replica_parameters, value_at
-from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent, work_of
-from gmem_jax.experiment.recall import PREFIX, Recall, finished, walker, warn_of_another_compression
+from gmem_jax.experiment.recall import PREFIX, Recall, finished, runner_of, warn_of_another_compression
 from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import pytree
+from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
+from gmem_jax.simulation.progress import Progress, silent, work_of
+from gmem_jax.simulation.sharding import placement_of
 
 
 @pytree
@@ -59,7 +60,7 @@ def match(one: Experiment, other: Experiment) -> bool:
     and need lists that all would have to go through (six mu with 0 among them: twice the time), so that mu = 0 matches
     only itself.
     """
-    alike = ("stages", "steps_per_bin", "background", "backend", "precision", "material")
+    alike = ("protocol", "steps_per_bin", "background", "backend", "precision", "material")
     laws = [str(jax.tree.structure(each.friction)) for each in (one, other)]
     scalars = all(jnp.ndim(value) == 0 for each in (one, other) for value in replica_parameters(each).values())
     slips = [float(np.min(getattr(each.friction, "mu", 1.0))) == 0.0 for each in (one, other)]
@@ -112,7 +113,7 @@ def run_several(
     experiments: Sequence[Experiment],
     *,
     devices: Sequence[jax.Device] | None = None,
-    keep: Keep = forget,
+    cache: ResultCache = no_cache,
     progress: Progress = silent,
 ) -> list[Recall]:
     """Run experiments side by side, as replicas of one run; the recall of each.
@@ -120,7 +121,7 @@ def run_several(
     Args:
         experiments: that `match` each other.
         devices: that share out the replicas; default all that JAX sees.
-        keep: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
+        cache: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).
         progress: told about every chunk.
 
     Raises:
@@ -139,24 +140,24 @@ def run_several(
     loud = 1 + int(np.argmax(np.any(np.asarray(bin_average(sets[0])), axis=1)))  # the prefix applies none of them
     silence = Chosen(sets, jnp.full(max(1, len(one_each) - 1), loud))
     everything = side.wide(owners, side.signals())
-    on = walker(side.wide(one_each, silence), progress=progress)
+    on = runner_of(side.wide(one_each, silence), progress=progress)
     on.total_work = work_of(common, on.state.replicas) + work_of(own, len(owners))
 
     def rest(checkpoint: Checkpoint) -> Any:
         # One replica if nothing that acts on the prefix differs.
         place = side.prefix[owners] if on.state.replicas > 1 else np.zeros(len(owners), int)
-        pairs = on.course.system.pairs
+        pairs = on.simulation.system.pairs
         if pairs.reference.shape[-1] > 1:
             pairs = dataclasses.replace(pairs, reference=jnp.asarray(pairs.reference)[..., place])
-        on.course = everything.course(sheared=True).with_pairs(pairs)
+        on.simulation = everything.simulation(sheared=True).with_pairs(pairs)
         on.state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., place], on.state)
-        on.put_on(spread_over(len(owners), devices))
-        samples = on.play(*own, checkpoint=checkpoint)
+        on.place_on(placement_of(len(owners), devices))
+        samples = on.run_stages(*own, checkpoint=checkpoint)
         return samples, on.status()
 
-    before = on.play_part(PREFIX, keep, *common)
-    on = on.afresh()
-    after, status = keep("after", rest)
+    before = on.run_cached(PREFIX, cache, *common)
+    on = on.fork()
+    after, status = cache("after", rest)
     found = []
     for number, each in enumerate(experiments):
         begun, ended = side.first[number : number + 2]

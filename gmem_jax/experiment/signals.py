@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.pytree import Scalar, pytree, traced
+from gmem_jax.simulation.protocol import BINS
 
 LONGEST_WORD = 12  # bits
 PAD = 2.0  # bits left free at either end of a word
 WIDTH = 1.0  # of the bumps of a word, in bits
-BINS = 256  # bins of u in the paper: the resolution of every recorded signal
 
 
 @runtime_checkable

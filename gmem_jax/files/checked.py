@@ -13,8 +13,8 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from gmem_jax.experiment.signals import BINS
-from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.errors import FileFormatError
+from gmem_jax.simulation.protocol import BINS
 
 KINDS = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",), "text": ("bytes",)}
 FIXED = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that have one length in every file

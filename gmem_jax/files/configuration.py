@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax import native
+from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import (
@@ -24,7 +25,6 @@ from gmem_jax.experiment.signals import (
     word_bits,
     words,
 )
-from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw

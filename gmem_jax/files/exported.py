@@ -9,10 +9,10 @@ from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
-from gmem_jax.experiment.frames import Frames
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import optional
+from gmem_jax.simulation.frames import Frames
 
 RADIUS = 1.0
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.errors import FileFormatError
 from gmem_jax.files.checked import optional, refusing, require, require_finite
 
 LARGEST = 1 << 30  # bytes of a file

@@ -7,10 +7,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gmem_jax.experiment.frames import Frames
 from gmem_jax.files.checked import refusing, require, require_finite, title, whole
 from gmem_jax.files.hdf5 import Content, reading, write_arrays
 from gmem_jax.files.schemas import FRAMES
+from gmem_jax.simulation.frames import Frames
 
 GROUP = "frames"
 

@@ -19,19 +19,18 @@ from typing import Any, BinaryIO
 import h5py
 import numpy as np
 
-from gmem_jax.experiment.protocol import compression_at
-from gmem_jax.experiment.signals import BINS
+from gmem_jax.errors import FileFormatError
 from gmem_jax.files import tree
-from gmem_jax.files.atomic import FileFormatError, atomic
+from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import Array, fit, refusing
 from gmem_jax.files.schemas import DIMENSIONS, STAGE
 from gmem_jax.files.seal import BLOCK, seal, sealed
-from gmem_jax.physics.sample import Sample
+from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.sample import Sample
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PATIENCE, _PACE = 5.0, 2e7  # seconds, and bytes a second, that copying an old file may take
 _SAMPLE = tuple(entry.name for entry in fields(Sample))
-_LATER = "wall_contacts"  # NaN in older files, which lack it
 
 
 class Content(tree.Tree):
@@ -78,11 +77,9 @@ class Content(tree.Tree):
         stages = OrderedDict()
         for stage in sorted(orders, key=orders.__getitem__):
             path = f"{group}/{stage}/"
-            known = [name for name in _SAMPLE if name != _LATER or path + name in self.datasets]
-            found = self.arrays({path + name: STAGE[name] for name in known})
-            own: Any = {name: found[path + name] for name in known}
-            own.setdefault(_LATER, np.full_like(own["contacts"], np.nan))
-            stages[stage] = Sample(**own)
+            found = self.arrays({path + name: STAGE[name] for name in _SAMPLE})
+            own: Any = {name: found[path + name] for name in _SAMPLE}
+            stages[stage] = Sample(**{**own, "u": np.broadcast_to(own["u"][:, None], own["filling"].shape)})
         return stages
 
 
@@ -199,7 +196,7 @@ def write_samples(group: h5py.Group, stages: Mapping[str, Sample]) -> None:
         stage.attrs["order"] = number
         bins, wide = np.shape(sample.filling)
         ends = np.arange(1, bins + 1)
-        values = {**vars(sample), "time": (passed + ends) / BINS, "u": compression_at(name, ends / bins)}
+        values = {**vars(sample), "time": (passed + ends) / BINS, "u": np.asarray(sample.u)[:, 0]}
         passed += bins
         write_arrays(stage, STAGE if wide > 1 else _COMMON, values)
 

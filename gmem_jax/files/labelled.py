@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.experiment.protocol import compression_at
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.signals import BINS
 from gmem_jax.files.checked import optional
 from gmem_jax.files.schemas import RECALL, STAGE
+from gmem_jax.simulation.protocol import BINS
 
 
 def described(name: str) -> dict[str, str]:
@@ -35,10 +34,9 @@ def recall_dataset(recall: Recall, names: list[str], configuration: Mapping[str,
     xarray = optional("xarray", "export")
     stages, replicas = recall.stages, len(recall.status)
     bins = {name: len(sample.filling) for name, sample in stages.items()}
-    ends = [compression_at(name, np.arange(1, count + 1) / count) for name, count in bins.items()]
     joined: dict[str, Any] = {
         "time": np.arange(1, sum(bins.values()) + 1) / BINS,
-        "u_of_time": np.concatenate(ends),
+        "u_of_time": np.concatenate([np.asarray(sample.u)[:, 0] for sample in stages.values()]),
         "stage": np.repeat(list(bins), list(bins.values())),
     }
     data = {}

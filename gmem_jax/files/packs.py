@@ -9,7 +9,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.frames import Frames
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files import soundness
 from gmem_jax.files.checked import json_of, refusing, require, title
@@ -19,7 +18,8 @@ from gmem_jax.files.home import kept_pack
 from gmem_jax.files.schemas import PACK
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import candidates, tabulate
-from gmem_jax.physics.sample import Sample
+from gmem_jax.simulation.frames import Frames
+from gmem_jax.simulation.sample import Sample
 
 STANDARD = re.compile(r"tetra-([1-9][0-9]{1,6})-([a-z])")
 """Names of standard packs: the number of tetra grains, and a letter for the seed, a for 1."""

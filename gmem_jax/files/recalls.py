@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.signals import BINS
-from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.checked import (
     Array,
     is_number,
@@ -31,10 +28,10 @@ from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
 from gmem_jax.files.labelled import recall_csv, recall_dataset
 from gmem_jax.files.schemas import RECALL
-from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Status
+from gmem_jax.simulation.protocol import BINS, Protocol
+from gmem_jax.simulation.sample import Sample
 
-_OLDEST = "gmem-recall/1"
 _EVERY_BIT = int(sum(Status))
 
 
@@ -49,6 +46,7 @@ def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> No
         names = names.astype("S2")  # single letters are characters of one text to netCDF
     with writing(path, RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
+        file.attrs["protocol"] = json.dumps(recall.protocol.to_list())
         write_arrays(file, _declared(np.ndim(recall.dt)), {**vars(recall), "signal": names})
         write_samples(file.create_group("stages"), recall.stages)
         if recall.frames is not None:
@@ -113,34 +111,20 @@ def load_recall(path: Path) -> StoredRecall:
             other.
     """
     with refusing(path, "recall"):
-        with reading(path, RECALL.name, *RECALL.before) as content:
+        with reading(path, RECALL.name) as content:
             configuration = json_of(content.text("configuration"), "configuration")
             _check_configuration(configuration)
-            recall = _recall_of(content, configuration)
+            recall = _recall_of(content)
         _check(recall)
         return StoredRecall(recall, configuration)
 
 
-def _recall_of(content: Content, configuration: dict[str, Any]) -> Recall:
+def _recall_of(content: Content) -> Recall:
     dt = content.datasets.get("dt")
-    declared = _declared(0 if dt is None else len(dt.shape))
-    if content.schema != RECALL.name:
-        del declared["signal"]
-    if content.schema == _OLDEST:
-        del declared["shear"]
-    found = content.arrays(declared)
-    found.pop("signal", None)  # the configuration has them too, in all versions
-    if content.schema == _OLDEST:
-        found["shear"] = _waveforms(configuration, found["u"], found["J"])
-    return Recall(**found, stages=content.samples("stages"), frames=read_frames(content))  # type: ignore[arg-type]
-
-
-def _waveforms(configuration: dict[str, Any], u: np.ndarray, integral: np.ndarray) -> np.ndarray:
-    """I(u) of the signals that a configuration writes down, [S, 256]; NaN for those of own kinds, which it cannot."""
-    try:
-        return np.asarray(signals_from(configuration["experiment"]["signals"]).shear(jnp.asarray(u))).T
-    except (ValueError, KeyError, TypeError):
-        return np.full_like(integral, np.nan)
+    found = content.arrays(_declared(0 if dt is None else len(dt.shape)))
+    found.pop("signal")  # the configuration has them too
+    protocol = Protocol.from_list(json.loads(content.text("protocol")))
+    return Recall(**found, stages=content.samples("stages"), protocol=protocol, frames=read_frames(content))  # type: ignore[arg-type]
 
 
 def _check_configuration(configuration: dict[str, Any]) -> None:
@@ -171,15 +155,17 @@ def _check(recall: Recall) -> None:
     if not np.any(status & ~int(DOUBTFUL)):
         measured = {name: getattr(recall, name) for name in ("p_sig", *MEASURES, "window", "residual_speed")}
         require_finite(measured)
-    if "readout" not in recall.stages:
-        raise FileFormatError("incomplete file, the stage 'readout' is missing")
+    reads = recall.protocol.reads
+    require(len(reads) > 0, "its protocol reads nothing")
+    for name in reads:
+        require(name in recall.stages, f"incomplete file, the stage {name!r} is missing")
     for name, stage in recall.stages.items():
         require(title(name), "the name of a stage is not a line of text")
-        _check_stage(name, stage, replicas)
+        _check_stage(name, stage, replicas, read=name in reads)
 
 
-def _check_stage(name: str, stage: Sample, replicas: int) -> None:
+def _check_stage(name: str, stage: Sample, replicas: int, *, read: bool) -> None:
     bins, wide = np.shape(stage.pressure)[0], np.shape(stage.pressure)[-1]
     require(bins > 0 and wide in (1, replicas), f"stage {name!r} has {wide} replicas, must have 1 or {replicas}")
-    if "readout" in name:
+    if read:
         require((bins, wide) == (BINS, replicas), f"stage {name!r} must have {BINS} bins of {replicas} replicas")

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gmem_jax.files.atomic import FileFormatError, atomic
+from gmem_jax.errors import FileFormatError
+from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import is_number, json_of, refusing, require, title, whole
 from gmem_jax.files.schemas import GRADIENT, READING, TUNED, Schema
 

@@ -59,7 +59,7 @@ STAGE = {  # of a recall or a preparation, in stages/NAME; `common` is the last 
     "largest_speed": Array("real", ("time", "replica"), "R/t_c", "of a grain, at the end of the bin"),
     "coordination": Array("real", ("time", "replica"), "1", "Z, touching grains per grain, rattlers included"),
     "contacts": Array("real", ("time", "replica"), "1", "touching spheres per grain, times two"),
-    "wall_contacts": Array("real", ("time", "replica"), "1", "spheres touching a wall per grain; not in older files"),
+    "wall_contacts": Array("real", ("time", "replica"), "1", "spheres touching a wall per grain"),
     "filling": Array("real", ("time", "replica"), "1", "phi, volume of the grains over that of the box"),
     "largest_overlap": Array("real", ("time", "replica"), "R", "deepest contact at the end of the bin"),
     "inertial_number": Array("real", ("time", "replica"), "1", "I of the compression; 0 without pressure"),
@@ -109,7 +109,7 @@ PACK = Schema(
 )
 
 RECALL = Schema(
-    "gmem-recall/3",
+    "gmem-recall/0.1",
     "Recall (.h5)",
     "What a pack gave back of S signals: `gmem recall`, `gmem demo`, the points of a sweep, `gm.save_recall`.",
     {

@@ -8,7 +8,7 @@ import hashlib
 from pathlib import Path
 from typing import BinaryIO
 
-from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.errors import FileFormatError
 
 BLOCK = 512  # the smallest user block of HDF5
 _MARK = b"gmem sha256 "

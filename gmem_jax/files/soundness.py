@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.experiment.frames import sphere_places
 from gmem_jax.files.checked import is_number, numbers, require, require_fields, require_finite, title, whole
+from gmem_jax.simulation.frames import sphere_places
 
 UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
 DEEPEST = 0.5  # R, overlap of spheres at rest; packs are at 0.1, and Hertz's law is long wrong at 0.5

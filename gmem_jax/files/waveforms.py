@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.signals import Signals, Spline
-from gmem_jax.files.atomic import FileFormatError, atomic
+from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import json_of, numbers, read_npy, refusing, require_fields, title
 from gmem_jax.files.configuration import signals_from, written_signals
 

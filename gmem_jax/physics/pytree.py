@@ -6,7 +6,7 @@ structure that a program is compiled for; a `label` is carried along but compile
 
 import math
 from collections.abc import Iterator
-from dataclasses import field, fields, is_dataclass
+from dataclasses import MISSING, field, fields, is_dataclass
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -42,7 +42,7 @@ def parameter(default: Any, within: str = "(-inf, inf)") -> Any:
     return field(default=default, metadata={"interval": _interval(within)})
 
 
-def static(default: Any) -> Any:
+def static(default: Any = MISSING) -> Any:
     """A field that programs are compiled for: hashable, and no array."""
     return field(default=default, metadata={"static": True})
 

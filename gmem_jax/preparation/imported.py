@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gmem_jax.experiment.host import Progress, silent
-from gmem_jax.experiment.pack import SKIN, Pack, find_pairs
-from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.errors import FileFormatError
+from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.files.checked import require
 from gmem_jax.files.foreign import Spheres, load_spheres
 from gmem_jax.files.packs import check_pack
@@ -24,6 +23,8 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import still_box
 from gmem_jax.physics.step import System
 from gmem_jax.preparation.ringing import ringing_period
+from gmem_jax.simulation.neighbors import SKIN
+from gmem_jax.simulation.progress import Progress, silent
 
 MISFIT = 1e-3  # R, by which spheres may lie elsewhere than in a rigid grain
 _NAMED = 1e-4  # R, by which the edges of a tetra grain may differ from those of a whole number of 1e-4 in overlap

@@ -9,9 +9,9 @@ from jax import lax
 
 from gmem_jax.physics.pairs import slack, sphere_centres
 from gmem_jax.physics.pytree import Scalar, pytree
-from gmem_jax.physics.sample import check
 from gmem_jax.physics.state import Box, State
 from gmem_jax.physics.step import System
+from gmem_jax.simulation.sample import check
 
 March = Callable[..., tuple[State, jax.Array]]
 """The signature of `gmem_jax.physics.step.march`."""

@@ -10,26 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax import native
-from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.frames import Film, Frames, joined, places
-from gmem_jax.experiment.host import (
-    Checkpoint,
-    Compiled,
-    Keep,
-    Progress,
-    RunFailedError,
-    Walker,
-    forget,
-    refuse,
-    require_x64,
-    silent,
-    work_of_bin,
-    worst,
-)
-from gmem_jax.experiment.pack import Pack, find_pairs, pair_finder, smallest_box
-from gmem_jax.experiment.protocol import Stage, preparation_cycle
-from gmem_jax.experiment.signals import BINS
-from gmem_jax.experiment.walk import Course
+from gmem_jax.errors import RunFailedError
+from gmem_jax.experiment.pack import Pack, find_pairs
+from gmem_jax.experiment.protocols import cycle
 from gmem_jax.files.provenance import provenance
 from gmem_jax.physics import rotation
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -37,11 +20,21 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, tetra
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import Grains, still_box
 from gmem_jax.physics.step import System, accelerate, start
 from gmem_jax.preparation.piston import BLOCK, Pressed, Servo, largest_speed, press
 from gmem_jax.preparation.ringing import ringing_period
+from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
+from gmem_jax.simulation.compiled import Compiled, require_x64
+from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, concatenate, places
+from gmem_jax.simulation.loop import Simulation
+from gmem_jax.simulation.neighbors import pair_finder
+from gmem_jax.simulation.observers import Chunk
+from gmem_jax.simulation.progress import Progress, silent, work_of_bin
+from gmem_jax.simulation.protocol import BINS, Stage
+from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
+from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.strain import StrainPath, smallest_box
 
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
 FREE_CANDIDATES = 68  # a grain of a pressed pack with that skin: one program for all lists
@@ -181,14 +174,15 @@ FILMED = ("gas", "press", "settle")  # stages after which a configuration is tak
 
 
 def _cycles(recipe: Recipe) -> tuple[Stage, ...]:
-    cycle = preparation_cycle(recipe.rest, recipe.hold)
     return tuple(
-        replace(stage, name=f"cycle {n}: {stage.name}") for n in range(1, recipe.cycles + 1) for stage in cycle
+        replace(stage, name=f"cycle {n}: {stage.name}")
+        for n in range(1, recipe.cycles + 1)
+        for stage in cycle(recipe.rest, recipe.hold)
     )
 
 
-def film_of(recipe: Recipe, frames: int) -> Film:
-    """What is to be taken of the cycles: of `frames` configurations those beside the lattice, `FILMED` and the pack.
+def frame_schedule(recipe: Recipe, frames: int) -> FrameSchedule:
+    """What is to be recorded of the cycles: of `frames` configurations those beside the lattice, `FILMED` and the pack.
 
     Raises:
         ValueError: for too many or too few.
@@ -198,14 +192,14 @@ def film_of(recipe: Recipe, frames: int) -> Film:
     if frames and not always <= frames <= always + bins:
         raise ValueError(f"frames must be 0 for none, or {always} to {always + bins} for this recipe; got {frames}")
     if frames <= always:
-        return Film()
+        return FrameSchedule()
     wanted = places(stages, frames - always + 1, CYCLE_CHUNK)
     wanted[stages[0].name].remove(0)  # where "settle" ended
-    return Film(wanted)
+    return FrameSchedule(wanted)
 
 
 class _Preparation:
-    """One preparation on its way: a `Walker` with one replica and no friction, and the walls as they are now."""
+    """One preparation on its way: a `Runner` with one replica and no friction, and the walls as they are now."""
 
     def __init__(
         self,
@@ -214,12 +208,12 @@ class _Preparation:
         material: Material,
         backend: str,
         frames: int,
-        keep: Keep,
+        cache: ResultCache,
         progress: Progress,
     ) -> None:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
-        self.recipe, self.keep, self.filmed, self.lengths = recipe, keep, frames > 0, lengths
-        film = film_of(recipe, frames)
+        self.recipe, self.cache, self.filmed, self.lengths = recipe, cache, frames > 0, lengths
+        self.frames = FrameRecorder(frame_schedule(recipe, frames))
         self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
         steps = max(1, math.ceil(recipe.t0 / (BINS * recipe.dt) * (1.0 - 1e-12)))
         self.dt = recipe.t0 / (BINS * steps)
@@ -234,57 +228,61 @@ class _Preparation:
         state = accelerate(system, replace(state, grains=grains), self.box)
         expected = expected_time(recipe, float(lengths[2])) / (self.dt * steps) * work_of_bin(1)
         self.march = native.marcher(native.name(backend, system.friction))
-        course = Course(system, self._drive(), self.dt, recipe.drag, steps=steps, backend=backend)
-        self.walker = Walker(course, state, finder=finder, progress=progress, total_work=expected, film=film)
+        simulation = Simulation(system, self._path(), self.dt, recipe.drag, steps=steps, backend=backend)
+        self.runner = Runner(
+            simulation, state, finder=finder, progress=progress, total_work=expected, observers=(self.frames,)
+        )
         self.log: dict[str, Sample] = {}
-        self.take("gas")
+        self.record("gas")
 
-    def _drive(self) -> Drive:
-        return Drive(self.box.lower, self.box.upper, self.recipe.delta0)
+    def _path(self) -> StrainPath:
+        return StrainPath(self.box.lower, self.box.upper, self.recipe.delta0)
 
-    def take(self, name: str) -> None:
-        """Keep the configuration that there is now, at u = 0, if any are to be kept."""
+    def record(self, name: str) -> None:
+        """Record the configuration that there is now, at u = 0, if any are wanted."""
         if self.filmed:
-            self.walker.take(name, self.walker.state, np.asarray(self.box.lower), np.asarray(self.box.upper), 0.0)
+            runner, still = self.runner, Stage(name, 0.0, 0.0, 0.0, "hold")
+            now = Chunk(runner.simulation, runner.state, still, 0, 0, runner.time, runner.gather)
+            self.frames.record(now, runner.state, np.asarray(self.box.lower), np.asarray(self.box.upper), 0.0)
 
     def press(self, name: str, servo: Servo, duration: float, drag: float) -> Pressed:
         """Run the servo until it has settled or `duration` is over; the list is made anew as often as needed."""
-        kept, pressed = self.keep(name, lambda checkpoint: self._press(checkpoint, name, servo, duration, drag))
-        self.walker.restore(kept)
+        kept, pressed = self.cache(name, lambda checkpoint: self._press(checkpoint, name, servo, duration, drag))
+        self.runner.restore(kept)
         self.box = pressed.box
-        self.take(name)
+        self.record(name)
         return cast(Pressed, pressed)
 
     def _press(
         self, checkpoint: Checkpoint, name: str, servo: Servo, duration: float, drag: float
     ) -> tuple[Any, Pressed]:
-        walker = self.walker
-        block, per_bin = BLOCK * self.dt, BLOCK / walker.course.steps
+        runner = self.runner
+        block, per_bin = BLOCK * self.dt, BLOCK / runner.simulation.steps
         no = jnp.asarray(False)
-        pressed = Pressed(walker.state, self.box, jnp.zeros(1), jnp.asarray(0), no, no)
+        pressed = Pressed(runner.state, self.box, jnp.zeros(1), jnp.asarray(0), no, no)
         left = math.ceil(duration / block)
-        if begun := checkpoint.begun():
-            walker.restore(begun["walker"])
-            pressed, left = begun["pressed"], int(begun["left"])
+        if saved := checkpoint.restore():
+            runner.restore(saved["runner"])
+            pressed, left = saved["pressed"], int(saved["left"])
 
         def standing() -> dict[str, Any]:
-            return {"walker": walker.kept(), "pressed": pressed, "left": np.asarray(left)}
+            return {"runner": runner.snapshot(), "pressed": pressed, "left": np.asarray(left)}
 
         while left > 0:
-            system = walker.course.system
+            system = runner.simulation.system
             pressed = _press(system, pressed, servo, self.dt, drag, blocks=min(CALL, left), march=self.march)
-            refuse(worst(pressed.state), name)
-            walker.state, self.box = pressed.state, pressed.box
+            raise_if_fatal(status_of(pressed.state), name)
+            runner.state, self.box = pressed.state, pressed.box
             done = int(pressed.blocks)
             left -= done
-            walker.report(name, done * per_bin, float(done * block))
+            runner.report(name, done * per_bin, float(done * block))
             if bool(pressed.settled):
                 break
             if bool(pressed.crowded):
-                walker.renew(self.box)
-                pressed = replace(pressed, state=walker.state)
-            checkpoint.reached(standing)
-        return walker.kept(), pressed
+                runner.renew(self.box)
+                pressed = replace(pressed, state=runner.state)
+            checkpoint.maybe_save(standing)
+        return runner.snapshot(), pressed
 
     def compact(self) -> float:
         """Gas, then pressure: returns p_z once the pack is at rest under it and the wall is fixed."""
@@ -295,8 +293,8 @@ class _Preparation:
         approach = Servo(recipe.pressure, recipe.piston_speed, recipe.piston_gain, 0.1, math.inf)
         self.press("press", approach, 4.0 * height / recipe.piston_speed, 0.0)
         settle = replace(approach, error=recipe.pressure_error, quiet=recipe.settled_speed)
-        self.walker.finder = pair_finder(self.walker.course.system.clump, self.lengths, DENSE_SKIN)
-        self.walker.renew(self.box)
+        self.runner.finder = pair_finder(self.runner.simulation.system.clump, self.lengths, DENSE_SKIN)
+        self.runner.renew(self.box)
         pressed = self.press("settle", settle, recipe.patience, recipe.drag)
         if not bool(pressed.settled):
             raise RunFailedError(
@@ -308,39 +306,39 @@ class _Preparation:
 
     def cycle(self) -> None:
         """Frictionless compress/decompress cycles of the x and y walls, then rest until quiet."""
-        recipe, walker = self.recipe, self.walker
-        walker.course = replace(walker.course, drive=self._drive())
-        walker.finder, walker.skin, walker.chunk, walker.foresees = None, DENSE_SKIN, CYCLE_CHUNK, True
-        walker.smallest = smallest_box(
+        recipe, runner = self.recipe, self.runner
+        runner.simulation = replace(runner.simulation, path=self._path())
+        runner.finder, runner.skin, runner.chunk, runner.foresees = None, DENSE_SKIN, CYCLE_CHUNK, True
+        runner.smallest = smallest_box(
             np.asarray(self.box.lower)[:, 0], np.asarray(self.box.upper)[:, 0], recipe.delta0
         )
-        walker.renew(self.box)
-        self.log |= walker.play_part("cycles", self.keep, *_cycles(recipe))
-        rest = Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1))
-        last, kept = self.keep(rest.name, lambda checkpoint: self._until_quiet(checkpoint, rest))
-        walker.restore(kept)
+        runner.renew(self.box)
+        self.log |= runner.run_cached("cycles", self.cache, *_cycles(recipe))
+        rest = Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1), "hold")
+        last, kept = self.cache(rest.name, lambda checkpoint: self._until_quiet(checkpoint, rest))
+        runner.restore(kept)
         self.log |= last
-        self.take(rest.name)
+        self.record(rest.name)
 
     def _until_quiet(self, checkpoint: Checkpoint, rest: Stage) -> tuple[Any, Any]:
-        """Rest as often as needed: the samples of the last time, and where the walker stands."""
-        recipe, walker, waited = self.recipe, self.walker, 0.0
-        if begun := checkpoint.begun():
-            walker.restore(begun["walker"])
-            waited = float(begun["waited"])
+        """Rest as often as needed: the samples of the last time, and where the runner stands."""
+        recipe, runner, waited = self.recipe, self.runner, 0.0
+        if saved := checkpoint.restore():
+            runner.restore(saved["runner"])
+            waited = float(saved["waited"])
 
         def standing() -> dict[str, Any]:
-            return {"walker": walker.kept(), "waited": np.asarray(waited)}
+            return {"runner": runner.snapshot(), "waited": np.asarray(waited)}
 
         while True:
-            last = walker.play(rest)
+            last = runner.run_stages(rest)
             waited += rest.length * recipe.t0
-            speed = float(largest_speed(walker.state))
+            speed = float(largest_speed(runner.state))
             if speed <= recipe.quiet:
-                return last, walker.kept()
+                return last, runner.snapshot()
             if waited > recipe.patience:
                 raise RunFailedError(f"rest: largest speed {speed:.1e} R/t_c after {waited:g} t_c")
-            checkpoint.reached(standing)
+            checkpoint.maybe_save(standing)
 
 
 def prepare(
@@ -351,7 +349,7 @@ def prepare(
     friction: FrictionLaw | None = None,
     name: str = "",
     backend: str = "auto",
-    keep: Keep = forget,
+    cache: ResultCache = no_cache,
     progress: Progress = silent,
     log: dict[str, Sample] | None = None,
     frames: int = 0,
@@ -367,7 +365,7 @@ def prepare(
         friction: law under which the ringing period of the finished pack is measured; default `Hooke()`.
         name: of the pack; default from grain, size and seed.
         backend: "auto", "jax" or "native".
-        keep: asked for every part, so that a long preparation can be resumed (see `gmem_jax.files.parts`).
+        cache: asked for every part, so that a long preparation can be resumed.
         progress: told about every chunk.
         log: filled with the samples of every cycle stage, if given.
         frames: configurations to keep: the lattice, the ends of gas, pressing and settling, the pack, and from six on
@@ -382,28 +380,30 @@ def prepare(
     require_x64()
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = grain or tetra(), material or Material()
-    preparation = _Preparation(recipe, clump, material, backend, frames, keep, progress)
+    preparation = _Preparation(recipe, clump, material, backend, frames, cache, progress)
     preparation.compact()
     preparation.cycle()
     if log is not None:
         log.update(preparation.log)
     if film is not None and frames:
         centre = np.asarray(0.5 * (preparation.box.lower + preparation.box.upper))[:, 0]  # the origin of the pack
-        film.append(joined(preparation.walker.taken, np.asarray(clump.offsets), centre=centre))
+        film.append(concatenate(preparation.frames.recorded, np.asarray(clump.offsets), centre=centre))
     return _finish(preparation, material, friction or Hooke(), name)
 
 
 def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw, name: str) -> Pack:
     """The pack at rest, with what was measured on it."""
-    recipe, walker, box = preparation.recipe, preparation.walker, preparation.box
-    grains, clump = walker.state.grains, walker.course.system.clump
+    recipe, runner, box = preparation.recipe, preparation.runner, preparation.box
+    grains, clump = runner.state.grains, runner.simulation.system.clump
     position, quaternion = np.asarray(grains.position)[..., 0], np.asarray(grains.quaternion)[..., 0]
     centre = np.asarray(0.5 * (box.lower + box.upper))
     box = still_box(box.lower - centre, box.upper - centre)
     position = position - centre[:, 0]
     pairs = find_pairs(clump, position, quaternion, box, recipe.delta0)
     system = System(clump, friction, pairs, material)
-    backend = "jax" if walker.course.backend == "jax" else "auto"  # the experiment's law may be one of the user's own
+    backend = (
+        "jax" if runner.simulation.backend == "jax" else "auto"
+    )  # the experiment's law may be one of the user's own
     at_rest = jnp.asarray(position)[..., None], grains.quaternion, box
     period = ringing_period(system, *at_rest, preparation.dt, backend=backend)
     last = jax.tree.map(lambda leaf: leaf[-1, ..., 0].tolist(), preparation.log["rest"])
@@ -411,11 +411,11 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
         "recipe": asdict(recipe),
         "grain": clump.shape,
         "material": asdict(material),
-        "rebuilds": walker.rebuilds,
-        "simulated_time": walker.time,
+        "rebuilds": runner.rebuilds,
+        "simulated_time": runner.time,
         "at_rest": asdict(last),
         **provenance(),
-        "backend": native.name(walker.course.backend, Frictionless()),
+        "backend": native.name(runner.simulation.backend, Frictionless()),
     }
     return Pack(
         clump=clump,

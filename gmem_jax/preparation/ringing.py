@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.host import Progress, Walker, silent, work_of
-from gmem_jax.experiment.protocol import Stage
-from gmem_jax.experiment.signals import BINS
-from gmem_jax.experiment.walk import Course
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.state import Box
 from gmem_jax.physics.step import System, accelerate, start
+from gmem_jax.simulation.loop import Simulation
+from gmem_jax.simulation.progress import Progress, silent, work_of
+from gmem_jax.simulation.protocol import BINS, Stage
+from gmem_jax.simulation.runner import Runner
+from gmem_jax.simulation.strain import StrainPath
 
 KICK = 2.0e-5  # strain rate of the kick, 1 / t_c: strains of about 1e-4, below which the response is linear enough
 STEPS = 4  # steps per sample
@@ -59,9 +59,9 @@ def ringing_period(
     rate = KICK * jnp.asarray([-1.0, 1.0, 0.0])[:, None]
     velocity = rate * (position - 0.5 * (box.lower + box.upper))
     state = accelerate(system, replace(state, grains=replace(state.grains, velocity=velocity)), box)
-    still = Course(system, Drive(box.lower, box.upper, 0.0), dt, steps=STEPS, backend=backend)
-    ringing = Stage("ringing", 0.0, 0.0, bins / BINS)
-    walker = Walker(still, state, progress=progress, total_work=work_of([ringing], 1))
-    sample = walker.play(ringing)["ringing"]
+    still = Simulation(system, StrainPath(box.lower, box.upper, 0.0), dt, steps=STEPS, backend=backend)
+    ringing = Stage("ringing", 0.0, 0.0, bins / BINS, "hold")
+    runner = Runner(still, state, progress=progress, total_work=work_of([ringing], 1))
+    sample = runner.run_stages(ringing)["ringing"]
     pressure = np.asarray(sample.pressure)[:, :, 0]
     return spectrum_peak(pressure[:, 0] - pressure[:, 1], STEPS * float(dt))

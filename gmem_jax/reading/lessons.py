@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.experiment.signals import BINS, bin_average, bit_width, words
+from gmem_jax.experiment.signals import bin_average, bit_width, words
+from gmem_jax.simulation.protocol import BINS
 
 RATIOS = 64  # of noise to signal at which the size of a set is calculated, and joined by straight lines: right to 1e-5
 

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 
-from gmem_jax.experiment.signals import BINS
 from gmem_jax.reading.lessons import Lessons
+from gmem_jax.simulation.protocol import BINS
 
 
 class Perceptron(nn.Module):

@@ -14,8 +14,9 @@ import numpy as np
 import optax
 from flax import serialization
 
-from gmem_jax.experiment.signals import BINS, LONGEST_WORD
-from gmem_jax.files.atomic import FileFormatError, atomic
+from gmem_jax.errors import FileFormatError
+from gmem_jax.experiment.signals import LONGEST_WORD
+from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import (
     Array,
     fit,
@@ -30,6 +31,7 @@ from gmem_jax.files.checked import (
 from gmem_jax.files.seal import BLOCK, seal, sealed
 from gmem_jax.reading.lessons import Examples, Lessons, examples
 from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
+from gmem_jax.simulation.protocol import BINS
 
 SCHEMA = "gmem-classifier/2"
 _BEFORE = "gmem-classifier/1"  # the same, without a seal

@@ -11,13 +11,14 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import compare, recalled, remembered_after, spread
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.recall import Recall, shear, walker
-from gmem_jax.experiment.signals import BINS, six_signals
+from gmem_jax.experiment.recall import Recall, apply_waveforms, runner_of
+from gmem_jax.experiment.signals import six_signals
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.state import State
 from gmem_jax.reproduce.figures import Values, crossed
+from gmem_jax.simulation.protocol import BINS
 
 STORES = (0.5, 2.0, 8.0)  # t0
 STANDARD = 2.0
@@ -44,7 +45,7 @@ class Verdict(NamedTuple):
 
 def stress_is_minus_j(recall: Recall) -> Verdict:
     """p_xy at u = 1 is -C J(1): of what was applied, the pack keeps the integral of the shear."""
-    p_xy = recalled(jnp.asarray(recall.stages["readout"].pressure))
+    p_xy = recalled(jnp.asarray(recall.stages[recall.protocol.reads[0]].pressure))
     kept = np.asarray(p_xy[1:, -1] - p_xy[0, -1])  # u ascends: the readout begins with the last
     whole = np.asarray(recall.J)[:, -1]
     slope = float(whole @ kept / (whole @ whole))
@@ -59,7 +60,7 @@ def stress_is_minus_j(recall: Recall) -> Verdict:
 
 def speeds_decay(free: Recall, t0: float) -> Verdict:
     """In storage, without any drag, the largest grain speed decays exponentially."""
-    speed = np.asarray(free.stages["store"].largest_speed).max(axis=-1)
+    speed = np.asarray(free.stages[free.protocol.before_read].largest_speed).max(axis=-1)
     time = (np.arange(len(speed)) + 0.5) * t0 / BINS
     rate, start = np.polyfit(time, np.log(speed), 1)
     scatter = float(np.exp(np.std(np.log(speed) - rate * time - start)))
@@ -82,7 +83,7 @@ def storage_costs_nothing(recalls: Mapping[float, Recall]) -> Verdict:
 
 def reading_erases(recall: Recall, scale: float) -> Verdict:
     """The first readout erases the memory: the second is uncorrelated with J."""
-    first, second = (recalled(jnp.asarray(recall.stages[name].pressure)) for name in ("readout", "readout-2"))
+    first, second = (recalled(jnp.asarray(recall.stages[name].pressure)) for name in recall.protocol.reads)
     gain = float(compare(analysis.subtract("sub0", first), recall.J, scale).gain)
     correlation, left = (spread(values) for values in remembered_after(second, recall.J, scale))
     return Verdict(
@@ -135,10 +136,10 @@ def non_affine(before: State, after: State) -> float:
 def rearrangement(pack: Pack, friction: Any, t0: float) -> float:
     """How far grains are from where they were after one cycle without shear, in R; root mean square."""
     experiment = Experiment(pack, six_signals(), friction, t0=t0)
-    on = walker(experiment)
+    on = runner_of(experiment)
     before = on.state
     common, _ = experiment.phases
-    on.play(*common[:4])
+    on.run_stages(*common[:4])
     return non_affine(before, on.state)
 
 
@@ -173,11 +174,11 @@ def forces_tell_nothing(experiment: Experiment) -> Verdict:
     Kolmogorov's distance between the distributions with and without a signal, beside that of two halves of one pack's
     contacts, which is what chance makes.
     """
-    on = walker(experiment)
+    on = runner_of(experiment)
     common, own = experiment.phases
-    on.play(*common)
-    shear(on, experiment)
-    on.play(own[0])
+    on.run_stages(*common)
+    apply_waveforms(on, experiment)
+    on.run_stages(own[0])
     forces = normal_forces(experiment, on.state)
     samples = [np.sort(column[column > 0.0]) for column in forces.T]
     scaled = [sample / sample.mean() for sample in samples]

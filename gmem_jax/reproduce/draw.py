@@ -14,10 +14,10 @@ from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import Bumps, six_signals
 from gmem_jax.experiment.signals import words as all_words
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.sample import Sample
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, counted
 from gmem_jax.show.figures import pyplot, save
+from gmem_jax.simulation.sample import Sample
 
 LABELS = {
     "mu": "friction coefficient $\\mu$",

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from gmem_jax import native
 from gmem_jax.bench.measure import rival
+from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.host import Progress, RunFailedError, require_x64, silent
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.physics.contact.laws import entry_of, law_named
@@ -27,6 +27,8 @@ from gmem_jax.reproduce.two_grains import two_grains_figure
 from gmem_jax.show.figures import recall_figure
 from gmem_jax.show.render import packs_figure
 from gmem_jax.show.tables import summary
+from gmem_jax.simulation.compiled import require_x64
+from gmem_jax.simulation.progress import Progress, silent
 from gmem_jax.sweeps.executors import Executor, Processes
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store

@@ -15,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.analysis import compare
-from gmem_jax.experiment.signals import BINS, Signals, bin_average, part, six_signals
+from gmem_jax.experiment.signals import Signals, bin_average, part, six_signals
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.path import contact_path
 from gmem_jax.reproduce.single_contact import write_columns
 from gmem_jax.show.figures import pyplot, save
+from gmem_jax.simulation.protocol import BINS
 
 DELTA0 = 0.05
 STORE = 0.2  # t0, in the picture

@@ -9,9 +9,9 @@ import numpy as np
 
 from gmem_jax.design.kernel import MemoryKernel
 from gmem_jax.design.stored import load_kernel
+from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.experiment.signals import waveform
-from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.checked import is_number, refusing
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.packs import load_pack, load_stages, pack_called

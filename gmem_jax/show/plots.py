@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 
 from gmem_jax.design.kernel import MemoryKernel
-from gmem_jax.experiment.protocol import compression_at
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.signals import BINS
 from gmem_jax.files.checked import optional
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.sample import Sample
+from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.sample import Sample
 
 MOST = 12  # panels of recalled signals
 LINES = 7  # replicas of a time series: the zero signal and six others
@@ -118,7 +117,7 @@ def series(stages: Mapping[str, Sample], names: Sequence[str], t0: float | None)
     ends = np.cumsum(bins)
     tick, unit = (1.0 / BINS, "t<sub>0</sub>") if t0 is None else (t0 / BINS, "t<sub>c</sub>")
     time = tick * (np.arange(ends[-1]) + 1.0)
-    u = np.concatenate([compression_at(name, (np.arange(n) + 1.0) / n) for name, n in zip(stages, bins, strict=True)])
+    u = np.concatenate([np.asarray(sample.u)[:, 0] for sample in stages.values()])
 
     def along(quantity: str, replica: int) -> np.ndarray:
         parts = [np.asarray(getattr(sample, quantity)) for sample in stages.values()]

@@ -13,11 +13,10 @@ import numpy as np
 from rich.table import Table
 
 from gmem_jax.design.stored import load_kernel
+from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment import analysis
-from gmem_jax.experiment.frames import Frames
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.signals import BINS, Signals, bin_average, waveform
-from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.experiment.signals import Signals, bin_average, waveform
 from gmem_jax.files.checked import is_number, refusing
 from gmem_jax.files.configuration import names_of, pack_fingerprint, signals_from
 from gmem_jax.files.frames import load_frames
@@ -28,12 +27,14 @@ from gmem_jax.files.results import load_result
 from gmem_jax.files.schemas import GRADIENT, READING, TUNED
 from gmem_jax.files.waveforms import load_design, load_target, load_waveforms
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import Status, explain
 from gmem_jax.reading.readers import confusion
 from gmem_jax.show import plots, tables, view
 from gmem_jax.show.kinds import NOISE, kernel_facts
 from gmem_jax.show.scene import at_rest
+from gmem_jax.simulation.frames import Frames
+from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.sample import Sample
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.table import rows as points_of
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.experiment.frames import Frames, sphere_places
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import candidates
+from gmem_jax.simulation.frames import Frames, sphere_places
 
 SHOWN = 0.995  # part of all values that a colour bar spans: the few beyond it have the last colour
 MILLI = 1e3

@@ -5,11 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gmem_jax.experiment.protocol import compression_at
-from gmem_jax.experiment.signals import BINS
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.sample import Sample
 from gmem_jax.show.drawing import Drawing, blank
+from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.sample import Sample
 
 AGAINST = ("time", "u")
 _KPA = float(Material().modulus) / 1e3
@@ -117,8 +116,7 @@ def _against_time(axis: Any, stages: Mapping[str, Sample], quantity: Quantity, t
 
 
 def _against_u(axis: Any, stages: Mapping[str, Sample], quantity: Quantity) -> None:
-    ends = {name: np.arange(1, len(sample.filling) + 1) / len(sample.filling) for name, sample in stages.items()}
-    moving = {name: u for name in stages if np.ptp(u := compression_at(name, ends[name])) > 0.0}
+    moving = {name: u for name, sample in stages.items() if np.ptp(u := np.asarray(sample.u)[:, 0]) > 0.0}
     for place, (name, u) in enumerate(moving.items()):
         curves = quantity.curves(stages[name])
         for number, (label, values) in enumerate(curves.items()):

@@ -43,7 +43,7 @@ def _number(cell: str) -> str | float:
 
 def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
     """The numbers of one recall and its resolved configuration, for JSON output and `recall_table`."""
-    readout = recall.stages["readout"]
+    readout = recall.stages[recall.protocol.reads[0]]
     pressure = np.asarray(readout.pressure)
     unit = Material().modulus
     status = together(recall.status)
@@ -104,9 +104,9 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
     "second_readout" has mean and standard error over the S signals of the correlation with J and of the gain. Words
     are sums of few bits, so that their errors are not independent: the spread over packs is the better measure.
     """
-    if "readout-2" not in recall.stages:
+    if len(recall.protocol.reads) < 2:
         return {}
-    first, second = (analysis.recalled(recall.stages[name].pressure) for name in ("readout", "readout-2"))
+    first, second = (analysis.recalled(recall.stages[name].pressure) for name in recall.protocol.reads)
     scale = relative_scale(configuration)
     rows: dict[str, dict[str, float]] = {name: {} for name in analysis.BACKGROUNDS}
     for prefix, window in (("", None), ("windowed_", recall.window / np.max(configuration["t0"]))):

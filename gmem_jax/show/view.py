@@ -7,11 +7,11 @@ from importlib import resources
 from pathlib import Path
 from string import Template
 
-from gmem_jax.experiment.frames import Frames
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.material import Material
 from gmem_jax.show.scene import at_rest, packed
+from gmem_jax.simulation.frames import Frames
 
 HEIGHT = 730  # pixels of a view in a notebook
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gmem_jax.experiment.host import RunFailedError
+from gmem_jax.errors import RunFailedError
 from gmem_jax.files.checked import optional
 from gmem_jax.sweeps import work
 from gmem_jax.sweeps.store import Store

@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.errors import FileFormatError
 
 TABLES = ("experiment", "vary", "zip", "points", "prepare", "run")
 PREPARE = "prepare."

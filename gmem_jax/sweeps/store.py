@@ -19,9 +19,10 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.atomic import FileFormatError, atomic, sweep
-from gmem_jax.files.parts import locked
+from gmem_jax.files.atomic import atomic, sweep
+from gmem_jax.files.checkpoints import locked
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.sweeps.plan import Point
 

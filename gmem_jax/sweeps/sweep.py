@@ -13,18 +13,19 @@ import jax
 import numpy as np
 import psutil
 
+from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
-from gmem_jax.experiment.host import Progress, RunFailedError, silent, within, work_of_bin
 from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall, replica_bins
+from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
-from gmem_jax.files.parts import Parts
 from gmem_jax.files.provenance import sources
 from gmem_jax.physics.state import explain, together
 from gmem_jax.preparation.preparation import Recipe, grain_steps
+from gmem_jax.simulation.progress import Progress, silent, within, work_of_bin
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.plan import ABREAST, Point, digest, groups, plan, point
 from gmem_jax.sweeps.spec import PREPARE, Spec
@@ -102,8 +103,8 @@ def sweep(
         share = sum(one.experiment.replicas for one in group)
         on = within(progress, done / total, (done + share) / total)
         keys, experiments = [one.key for one in group], [one.experiment for one in group]
-        keep = Parts(store.folder / "parts" / digest(keys), {"keys": keys}) if store else None
-        found |= run_group(keys, experiments, store=store, keep=keep, progress=on)
+        cache = Checkpoints(store.folder / "parts" / digest(keys), {"keys": keys}) if store else None
+        found |= run_group(keys, experiments, store=store, cache=cache, progress=on)
         done += share
     return Results(Result(one.values, found[one.key]) for one in points)
 

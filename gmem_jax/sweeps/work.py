@@ -18,18 +18,19 @@ from typing import Any
 
 import jax
 
+from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.host import Progress, RunFailedError, forget, silent
 from gmem_jax.experiment.recall import Recall, run
 from gmem_jax.experiment.several import run_several
-from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.configuration import experiment_from, resolved
 from gmem_jax.files.packs import load_pack, save_pack
-from gmem_jax.files.parts import Parts
 from gmem_jax.files.programs import keep_programs
 from gmem_jax.physics import grain
-from gmem_jax.physics.sample import Sample
 from gmem_jax.preparation.preparation import Recipe, prepare
+from gmem_jax.simulation.checkpoints import no_cache
+from gmem_jax.simulation.progress import Progress, silent
+from gmem_jax.simulation.sample import Sample
 from gmem_jax.sweeps.store import Store
 
 EVERY = 1.0  # s between two reports of progress
@@ -46,7 +47,7 @@ def run_group(
     *,
     store: Store | None = None,
     batch: int | None = None,
-    keep: Parts | None = None,
+    cache: Checkpoints | None = None,
     progress: Progress = silent,
 ) -> dict[str, Recall]:
     """Run points that match each other, and keep their recalls in a store; the recalls by key.
@@ -56,15 +57,15 @@ def run_group(
     """
     began = time.perf_counter()
     if len(experiments) == 1:
-        recalls = [run(experiments[0], batch=batch, keep=keep or forget, progress=progress)]
+        recalls = [run(experiments[0], batch=batch, cache=cache or no_cache, progress=progress)]
     else:
-        recalls = run_several(experiments, keep=keep or forget, progress=progress)
+        recalls = run_several(experiments, cache=cache or no_cache, progress=progress)
     seconds = (time.perf_counter() - began) / len(recalls)
     if store:
         for key, experiment, recall in zip(keys, experiments, recalls, strict=True):
             store.save(key, jax.block_until_ready(recall), resolved(experiment, seconds))
-    if keep:
-        keep.discard()
+    if cache:
+        cache.discard()
     return dict(zip(keys, recalls, strict=True))
 
 
@@ -94,18 +95,18 @@ class _Worker:
                 self.store.fail(keys[0], reason)
                 print(f"{keys[0]}: {reason}", file=sys.stderr, flush=True)
 
-    def _parts(self, job: dict[str, Any]) -> Parts:
+    def _parts(self, job: dict[str, Any]) -> Checkpoints:
         key = {"job": job["name"], "batch": job.get("batch")}
         try:
-            return Parts(self.store.parts(job), key)
+            return Checkpoints(self.store.parts(job), key)
         except FileFormatError:  # begun with another batch
-            return Parts(self.store.parts(job), key, restart=True)
+            return Checkpoints(self.store.parts(job), key, restart=True)
 
     def _prepare(self, job: dict[str, Any]) -> None:
         parts = self._parts(job)
         stages: dict[str, Sample] = {}
         say = self.progress(job["name"])
-        pack = prepare(Recipe(**job["recipe"]), clump_of(job["grain"]), keep=parts, progress=say, log=stages)
+        pack = prepare(Recipe(**job["recipe"]), clump_of(job["grain"]), cache=parts, progress=say, log=stages)
         save_pack(self.store.pack_at(job["name"]), pack, stages)
         parts.discard()
 
@@ -114,8 +115,10 @@ class _Worker:
         return [experiment_from(one, self.packs(one["pack"]["source"])) for one in written]
 
     def _run(self, job: dict[str, Any]) -> None:
-        say, keep = self.progress(job["name"]), self._parts(job)
-        run_group(job["points"], self._experiments(job), store=self.store, batch=job["batch"], keep=keep, progress=say)
+        say, cache = self.progress(job["name"]), self._parts(job)
+        run_group(
+            job["points"], self._experiments(job), store=self.store, batch=job["batch"], cache=cache, progress=say
+        )
 
     def _one_by_one(self, job: dict[str, Any]) -> None:
         for number, key in enumerate(job["points"]):

@@ -19,13 +19,13 @@ import scenes
 
 import gmem_jax as gm
 from gmem_jax.bench import lammps
-from gmem_jax.experiment.host import Compiled
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.rotation import cross, dot
 from gmem_jax.physics.state import Box
+from gmem_jax.simulation.compiled import Compiled
 
 REASON = lammps.missing()
 # LAMMPS comes with the optional `oracle` extra, which `make test` installs; elsewhere it may not load.

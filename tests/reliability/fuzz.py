@@ -35,13 +35,14 @@ import gmem_jax as gm
 from gmem_jax.command import app, derive, packs, recalls
 from gmem_jax.command import show as showing
 from gmem_jax.command.sweep import planned
+from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files import tree
-from gmem_jax.files.atomic import FileFormatError
-from gmem_jax.files.parts import load_part, save_part
+from gmem_jax.files.checkpoints import load_part, save_part
 from gmem_jax.files.seal import BLOCK, seal
 from gmem_jax.files.waveforms import load_target
-from gmem_jax.physics.sample import Sample
+from gmem_jax.simulation.protocol import Protocol, Stage
+from gmem_jax.simulation.sample import Sample
 from gmem_jax.sweeps.spec import read_spec
 
 PATIENCE = 10.0  # seconds for one input
@@ -121,8 +122,10 @@ def _recall(experiment: gm.Experiment) -> Recall:
     curves = dict.fromkeys(("shear", "J", "p_sig"), np.sin(np.arange(count * 256.0)).reshape(count, 256))
     single = dict.fromkeys(("gain", "fidelity", "windowed_gain", "windowed_fidelity", "window", "dt"), np.asarray(0.25))
     stages = OrderedDict(rest=_sample(5, 1), readout=_sample(256, count + 1))
+    protocol = Protocol((Stage("rest", 1.0, 1.0, 5 / 256, "hold"), Stage("readout", 1.0, 0.0, 1.0, "read")))
     status = np.zeros(count + 1, np.int32)
-    return Recall(u=u, **curves, **single, residual_speed=np.full(count + 1, 1e-3), status=status, stages=stages)
+    of_replicas = {"residual_speed": np.full(count + 1, 1e-3), "status": status}
+    return Recall(u=u, **curves, **single, **of_replicas, stages=stages, protocol=protocol)
 
 
 def _unsealed(new: Path, old: Path, schema: str) -> None:

@@ -13,13 +13,13 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from gmem_jax.experiment.walk import Course
 from gmem_jax.physics.state import State
+from gmem_jax.simulation.loop import Simulation
 
 AXIS = "replicas"
 
 
-def local(array: Any) -> np.ndarray:
+def to_host(array: Any) -> np.ndarray:
     """An array that may lie on several devices, or on those of other processes, on this host."""
     if isinstance(array, jax.Array) and not array.is_fully_addressable:
         array = multihost_utils.process_allgather(array, tiled=True)
@@ -27,7 +27,7 @@ def local(array: Any) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Spread:
+class Placement:
     """Where replicas are put.
 
     Attributes:
@@ -45,28 +45,28 @@ class Spread:
         return whole
 
     def _put(self, leaf: Any, *axes: str | None) -> jax.Array:
-        placed: jax.Array = jax.device_put(local(leaf), NamedSharding(self.mesh, PartitionSpec(*axes)))
+        placed: jax.Array = jax.device_put(to_host(leaf), NamedSharding(self.mesh, PartitionSpec(*axes)))
         return placed
 
     def _put_last(self, leaf: Any) -> jax.Array:
         """With the replica axis last, [..., B], padded already or not."""
-        leaf = local(leaf)[..., : self.replicas]
+        leaf = to_host(leaf)[..., : self.replicas]
         more = np.repeat(leaf[..., :1], self.padded - leaf.shape[-1], axis=-1)
         wide = np.concatenate([leaf, more], axis=-1)
         return self._put(wide, *(None for _ in wide.shape[1:]), AXIS)
 
     def put_state(self, state: State) -> State:
         """A state of B replicas."""
-        spread: State = jax.tree.map(self._put_last, state)
-        return spread
+        placed: State = jax.tree.map(self._put_last, state)
+        return placed
 
-    def put_course(self, course: Course) -> Course:
-        """A course: lists and parameters of the law that differ between replicas are split, the rest is everywhere."""
-        system = course.system
+    def put_simulation(self, simulation: Simulation) -> Simulation:
+        """A simulation: lists and parameters of a law are split if replicas differ in them, the rest is everywhere."""
+        system = simulation.system
         reference = system.pairs.reference
         own = self._put_last(reference) if reference.shape[-1] > 1 else self._put(reference)
         friction = jax.tree.map(self._put_number, system.friction)
-        everywhere: Course = jax.tree.map(self._put, course)
+        everywhere: Simulation = jax.tree.map(self._put, simulation)
         pairs = replace(everywhere.system.pairs, reference=own)
         return replace(everywhere, system=replace(everywhere.system, pairs=pairs, friction=friction))
 
@@ -74,12 +74,12 @@ class Spread:
         """A number for all replicas, or one for each, [B]."""
         return self._put_last(leaf) if np.shape(leaf) in ((self.replicas,), (self.padded,)) else self._put(leaf)
 
-    def back(self, tree: Any) -> Any:
+    def gather(self, tree: Any) -> Any:
         """Leaves [..., padded] as numpy arrays [..., B]."""
-        return jax.tree.map(lambda leaf: local(leaf)[..., : self.replicas], tree)
+        return jax.tree.map(lambda leaf: to_host(leaf)[..., : self.replicas], tree)
 
 
-def spread_over(replicas: int, devices: Sequence[jax.Device] | None = None) -> Spread | None:
+def placement_of(replicas: int, devices: Sequence[jax.Device] | None = None) -> Placement | None:
     """How some replicas are shared out over devices, default all of them; None where there is nothing to share."""
     found = list(jax.devices() if devices is None else devices)[:replicas]
-    return Spread(replicas, Mesh(np.asarray(found), (AXIS,))) if len(found) > 1 and replicas > 1 else None
+    return Placement(replicas, Mesh(np.asarray(found), (AXIS,))) if len(found) > 1 and replicas > 1 else None

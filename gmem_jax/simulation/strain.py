@@ -1,19 +1,28 @@
 """How the walls move: compression u(t), shear gamma(u) (paper, Sec. II)."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from gmem_jax.experiment.protocol import Bin, Numbers
-from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.state import Box
+from gmem_jax.simulation.protocol import Bin, Numbers
+
+
+class Waveforms(Protocol):
+    """What drives a shear: a pytree."""
+
+    def shear(self, u: jax.Array) -> jax.Array:
+        """I_s(u) of S waveforms, [..., S], for u of shape [...]."""
+        ...
 
 
 @pytree
 @dataclass(frozen=True)
-class Drive:
+class StrainPath:
     """Prescribed walls: u runs linearly during a stage, the shear follows a waveform of u (of time, if u stands still).
 
     L_x = X (1 - share gamma), L_y = Y (1 + share gamma) with X, Y = L0 (1 - (1 - sqrt(1 - delta0)) u); z does not
@@ -32,7 +41,7 @@ class Drive:
     upper: jax.Array
     delta0: Scalar
     gamma0: Scalar = 0.0
-    signals: Signals | None = None
+    signals: Waveforms | None = None
     share: Scalar = 0.5
 
     def _shear(self, u: Numbers, sheared: Numbers) -> jax.Array:
@@ -63,3 +72,10 @@ class Drive:
         now, rate = jax.jvp(lengths, (time,), (jnp.ones_like(time),))
         centre = 0.5 * (self.lower + self.upper)
         return Box(centre - 0.5 * now, centre + 0.5 * now, -0.5 * rate, 0.5 * rate)
+
+
+def smallest_box(lower: np.ndarray, upper: np.ndarray, delta0: float) -> np.ndarray:
+    """Edge lengths of the box at u = 1, [3]."""
+    shrink = np.sqrt(1.0 - delta0)
+    lengths: np.ndarray = (np.asarray(upper) - np.asarray(lower)) * np.array([shrink, shrink, 1.0])
+    return lengths

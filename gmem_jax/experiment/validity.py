@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.signals import BINS
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import Status
+from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.sample import Sample
 
 DEEPEST = 0.2  # R; there a contact's radius is 0.32 R, which Hertz takes for small. delta0 = 0.05 makes 0.14 to 0.17
 FASTEST = 5e-3  # inertial number; at 6e-3 (t0 = 180) F is 0.25 to 0.29 on packs that have 0.68 to 0.87 when not hurried
@@ -29,7 +29,7 @@ LARGEST_FRICTION = 10.0  # no pair of materials has it; beyond it G changes by 2
 LARGEST_STIFFNESS = 1.5  # of friction, in k_n: d f_n / dp is 1.5 k_n sqrt(p), which Mindlin's contacts do not reach
 
 
-def doubts(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Array, windowed: jax.Array) -> jax.Array:
+def validity(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Array, windowed: jax.Array) -> jax.Array:
     """The bits of `Status` that leave the numbers as they are, but for NOT_AT_REST.
 
     Args:

@@ -1,4 +1,4 @@
-"""Parts of a long run, kept beside its output until it is whole.
+"""Finished parts and checkpoints of a long run, kept beside its output until it is whole.
 
 A part is a sealed .npz file: its arrays, and how they make up a pytree (JSON). Nothing in it is code.
 """
@@ -18,11 +18,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from gmem_jax.experiment.host import Checkpoint, RunFailedError
-from gmem_jax.files.atomic import FileFormatError, atomic, sweep
+from gmem_jax.errors import FileFormatError, RunFailedError
+from gmem_jax.files.atomic import atomic, sweep
 from gmem_jax.files.checked import json_of, read_npy, refusing, require
 from gmem_jax.files.seal import BLOCK, seal, sealed
 from gmem_jax.physics.pytree import KINDS
+from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 
 PART_SCHEMA = "gmem-part/2"
 EVERY = 120.0  # s between checkpoints of an unfinished part: doing it again must cost more than writing them
@@ -109,27 +110,27 @@ def _members(archive: zipfile.ZipFile, size: int) -> dict[str, np.ndarray]:
     return found
 
 
-class _Standing(Checkpoint):
+class _StoredCheckpoint(Checkpoint):
     """How far a part is, in two generations: whenever a writer dies, one of them is whole."""
 
     def __init__(self, stem: Path) -> None:
         self._now, self._before = stem.with_name(f"{stem.name}.now"), stem.with_name(f"{stem.name}.before")
         self._last, self._keeps = time.monotonic(), True
 
-    def begun(self) -> Any:
+    def restore(self) -> Any:
         for path in (self._now, self._before):
             with contextlib.suppress(FileFormatError, FileNotFoundError):
                 return load_part(path)
         return None
 
-    def reached(self, standing: Callable[[], Any], *, milestone: bool = False) -> None:
+    def maybe_save(self, state: Callable[[], Any], *, milestone: bool = False) -> None:
         passed = time.monotonic() - self._last
         if not self._keeps or passed < (AT_MILESTONES if milestone else EVERY):
             return
         if self._now.exists():
             self._now.replace(self._before)
         try:
-            save_part(self._now, standing())
+            save_part(self._now, state())
         except TypeError:  # a law of the user's may remember in classes of its own: there is nothing to go on from
             self._keeps = False
         self._last = time.monotonic()
@@ -140,8 +141,8 @@ class _Standing(Checkpoint):
             path.unlink(missing_ok=True)
 
 
-class Parts:
-    """Parts of a long run, in a folder beside its output: what `gm.run` and others take as `keep`.
+class Checkpoints(ResultCache):
+    """Checkpoints of a long run, in a folder beside its output: what `gm.run` and others take as `cache`.
 
     What is finished is kept as it is, what is not as a checkpoint of every few minutes.
 
@@ -187,15 +188,15 @@ class Parts:
         path = self.folder / f"{name}.npz"
         if path.is_file():
             return load_part(path)
-        standing = _Standing(self.folder / name)
+        checkpoint = _StoredCheckpoint(self.folder / name)
         try:
-            result = jax.tree.map(np.asarray, run(standing))
+            result = jax.tree.map(np.asarray, run(checkpoint))
         except RunFailedError:
-            standing.discard()  # whoever tries again changes something
+            checkpoint.discard()  # whoever tries again changes something
             raise
-        with contextlib.suppress(TypeError):  # see `_Standing`
+        with contextlib.suppress(TypeError):  # see `_StoredCheckpoint`
             save_part(path, result)
-        standing.discard()
+        checkpoint.discard()
         return result
 
     def finished(self) -> int:

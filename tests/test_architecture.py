@@ -12,8 +12,10 @@ import gmem_jax
 
 ROOT = Path(gmem_jax.__file__).parent
 FLOORS = (
+    "errors",
     "physics",
     "native",
+    "simulation",
     "experiment",
     "files",
     "preparation",
@@ -41,7 +43,7 @@ MODULES = modules()
 
 
 def imports(name: str) -> set[str]:
-    """The modules of this package that a module imports anywhere in it, late ones and those for types included."""
+    """The modules of this package that a module imports anywhere in it: late, for types, and by strings too."""
     found = set()
     for node in ast.walk(ast.parse(MODULES[name].read_text())):
         if isinstance(node, ast.Import):

@@ -1,4 +1,4 @@
-"""What is recorded of a run, and what is watched in it."""
+"""What is recorded of every bin, and what is checked at its end."""
 
 from dataclasses import dataclass, replace
 
@@ -8,7 +8,7 @@ from jax import lax
 
 from gmem_jax.physics.contact.friction import largest_overlap
 from gmem_jax.physics.pairs import slack, sphere_centres
-from gmem_jax.physics.pytree import pytree
+from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import dot, matrix
 from gmem_jax.physics.state import Box, State, Status
 from gmem_jax.physics.step import System
@@ -17,9 +17,10 @@ from gmem_jax.physics.step import System
 @pytree
 @dataclass(frozen=True)
 class Sample:
-    """What is recorded of one bin of steps; a walk adds a leading axis of bins.
+    """What is recorded of one bin of steps; a rollout adds a leading axis of bins.
 
     Attributes:
+        u: compression variable at the end of the bin, [B].
         pressure: (p_x, p_y, p_z), mean of the two opposite walls at their instantaneous area, averaged over the
             steps of the bin, [3, B], in E.
         lengths: box edges at the end of the bin, [3, B], in R.
@@ -27,12 +28,13 @@ class Sample:
         largest_speed: at the end of the bin, [B], in R / t_c.
         coordination: Z, touching grain pairs per grain times two, rattlers included, walls not, [B].
         contacts: touching sphere pairs per grain times two, [B].
-        wall_contacts: spheres touching a wall per grain, once for each wall, [B]; NaN in files from before it was kept.
+        wall_contacts: spheres touching a wall per grain, once for each wall, [B].
         filling: phi, volume of the grains over that of the box, [B].
         largest_overlap: deepest sphere-sphere contact at the end of the bin, [B], in R.
         inertial_number: I = (strain rate of the x axis) sqrt(m / (D p)), p the mean of p_x and p_y, [B]; 0 without p.
     """
 
+    u: jax.Array
     pressure: jax.Array
     lengths: jax.Array
     kinetic_energy: jax.Array
@@ -68,8 +70,8 @@ def check(system: System, state: State, box: Box) -> State:
     return replace(state, status=state.status | bits)
 
 
-def observe(system: System, state: State, box: Box, pressure: jax.Array) -> Sample:
-    """The instantaneous quantities of a `Sample`, beside the given bin-averaged pressure."""
+def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scalar) -> Sample:
+    """The instantaneous quantities of a `Sample`, beside the bin-averaged pressure and u, which are given."""
     grains, clump, pairs = state.grains, system.clump, system.pairs
     spheres = sphere_centres(grains, clump)
     square = dot(spheres[pairs.second] - spheres[pairs.first], spheres[pairs.second] - spheres[pairs.first])[:, 0]
@@ -85,6 +87,7 @@ def observe(system: System, state: State, box: Box, pressure: jax.Array) -> Samp
     loaded = squeezing > 0.0
     inertial = rate * jnp.sqrt(clump.mass / (clump.diameter * jnp.where(loaded, squeezing, 1.0)))
     return Sample(
+        u=jnp.broadcast_to(u, pressure.shape[1:]),
         pressure=pressure,
         lengths=lengths,
         kinetic_energy=0.5 * jnp.sum(energy, axis=0),
@@ -98,10 +101,10 @@ def observe(system: System, state: State, box: Box, pressure: jax.Array) -> Samp
     )
 
 
-def end_bin(system: System, state: State, box: Box, pressure: jax.Array) -> tuple[State, Sample]:
+def end_bin(system: System, state: State, box: Box, pressure: jax.Array, u: Scalar) -> tuple[State, Sample]:
     """Check the state at the end of a bin and take its sample; `pressure` is the bin's average, [3, B]."""
     state = check(system, state, box)
-    sample = observe(system, state, box, pressure)
+    sample = measure(system, state, box, pressure, u)
     beyond = sample.largest_overlap > largest_overlap(system.friction)
     bits = jnp.where(beyond, int(Status.OVERLAP_RANGE), 0).astype(jnp.int32)
     return replace(state, status=state.status | bits), sample

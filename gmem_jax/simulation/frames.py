@@ -1,20 +1,24 @@
 """Configurations along a run: grains, walls and contact forces of one replica at some moments, kept to be looked at.
 
-Watching changes nothing: frames are taken from states that a walk goes through anyway, or that it goes through again.
+Watching changes nothing: frames are recorded from states that a run goes through anyway, or goes through again.
 """
 
 import itertools
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.protocol import Stage
 from gmem_jax.physics.pytree import pytree, static
 from gmem_jax.physics.state import State
 from gmem_jax.physics.step import System, contact_loads, relative_motion, sphere_table
+from gmem_jax.simulation.observers import Chunk, Observer
+from gmem_jax.simulation.protocol import Stage
+from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.sharding import to_host
 
 FEWEST = 2  # the first configuration and the last
 
@@ -102,13 +106,13 @@ def sphere_places(position: np.ndarray, quaternion: np.ndarray, offsets: np.ndar
     return np.asarray((np.asarray(position)[:, None] + turned).reshape(-1, 3))
 
 
-Taken = Mapping[str, tuple[Frame, ...]]
+Recorded = Mapping[str, tuple[Frame, ...]]
 """Frames by stage, in the order of the run: an ordered dictionary, since JAX sorts the keys of plain ones."""
 
 
 @dataclass(frozen=True)
-class Film:
-    """Which configurations of a walk are taken.
+class FrameSchedule:
+    """Which configurations of a run are recorded.
 
     Attributes:
         wanted: finished bins of a stage after which one is, by the stage's name.
@@ -122,10 +126,70 @@ class Film:
         """The wanted numbers of finished bins above `first` and up to `last`."""
         return [bins for bins in self.wanted.get(stage, ()) if first < bins <= last]
 
-    @property
-    def from_the_beginning(self) -> str:
-        """The stage before which one is taken; "" for none."""
-        return next((name for name, places in self.wanted.items() if 0 in places), "")
+    def begins(self, stage: str) -> bool:
+        """Whether one is wanted before a stage begins."""
+        return 0 in self.wanted.get(stage, ())
+
+
+class FrameRecorder(Observer):
+    """Records configurations, each as it was seen: those within a chunk are run up to once more."""
+
+    def __init__(self, schedule: FrameSchedule) -> None:
+        self.schedule = schedule
+        self.recorded: OrderedDict[str, tuple[Frame, ...]] = OrderedDict()
+
+    def step(self, chunk: Chunk) -> None:
+        """Record the configuration before the first bin of a stage, if it is wanted."""
+        name, path = chunk.stage.name, chunk.simulation.path
+        if chunk.first == 0 and self.schedule.begins(name) and name not in self.recorded:
+            self.record(chunk, chunk.state, np.asarray(path.lower), np.asarray(path.upper), chunk.stage.start)
+
+    def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
+        """Record what is wanted of a chunk."""
+        for done in self.schedule.between(chunk.stage.name, chunk.first, chunk.first + chunk.count):
+            bins = done - chunk.first
+            then, then_sample = (state, sample) if bins == chunk.count else chunk.run(bins)
+            half = 0.5 * chunk.gather(then_sample.lengths)[bins - 1]
+            path, stage = chunk.simulation.path, chunk.stage
+            centre = 0.5 * np.asarray(path.lower + path.upper)
+            u = stage.start + (stage.stop - stage.start) * done / stage.bins
+            self.record(chunk, then, centre - half, centre + half, u, chunk.simulation.duration(bins))
+
+    def record(
+        self, chunk: Chunk, state: State, lower: np.ndarray, upper: np.ndarray, u: float, later: float = 0.0
+    ) -> None:
+        """Record a configuration.
+
+        Args:
+            chunk: in which it lies.
+            state: then.
+            lower: planes of the box, [3, 1] or [3, B].
+            upper: planes, likewise.
+            u: compression.
+            later: time from the beginning of the chunk to then, in t_c.
+        """
+        name, simulation, replicas = chunk.stage.name, chunk.simulation, state.replicas
+        one = self.schedule.replica if replicas > 1 else 0
+        friction, dt = jax.tree.map(
+            lambda leaf: to_host(leaf)[one : one + 1] if np.shape(leaf) == (replicas,) else to_host(leaf),
+            (simulation.system.friction, simulation.dt),
+        )
+        state, lower, upper = jax.tree.map(
+            lambda leaf: leaf[..., one : one + 1] if np.shape(leaf)[-1] > 1 else leaf,
+            (chunk.gather(state), lower, upper),
+        )
+        time = (chunk.time + later) * float(np.max(dt)) / float(np.max(to_host(simulation.dt)))
+        system = replace(jax.tree.map(to_host, simulation.system), friction=friction)
+        frame = configuration(system, state, lower[:, 0], upper[:, 0], time, u)
+        self.recorded = OrderedDict({**self.recorded, name: (*self.recorded.get(name, ()), frame)})
+
+    def saved(self) -> OrderedDict[str, tuple[Frame, ...]]:
+        """What was recorded so far."""
+        return self.recorded
+
+    def restore(self, saved: OrderedDict[str, tuple[Frame, ...]]) -> None:
+        """Go on after these."""
+        self.recorded = OrderedDict(saved)
 
 
 def places(stages: Sequence[Stage], count: int, every: int) -> dict[str, list[int]]:
@@ -171,8 +235,8 @@ def _contacts(system: System, state: State) -> tuple[jax.Array, jax.Array, jax.A
     return kin.touching, normal, friction
 
 
-def take(system: System, state: State, lower: np.ndarray, upper: np.ndarray, time: float, u: float) -> Frame:
-    """A configuration.
+def configuration(system: System, state: State, lower: np.ndarray, upper: np.ndarray, time: float, u: float) -> Frame:
+    """The configuration that a state of one replica is in.
 
     Args:
         system: what the state is one of.
@@ -199,16 +263,16 @@ def take(system: System, state: State, lower: np.ndarray, upper: np.ndarray, tim
     )
 
 
-def joined(taken: Taken, offsets: np.ndarray, signal: int = 0, centre: np.ndarray | float = 0.0) -> Frames:
+def concatenate(recorded: Recorded, offsets: np.ndarray, signal: int = 0, centre: np.ndarray | float = 0.0) -> Frames:
     """Frames as one.
 
     Args:
-        taken: by stage, at least one.
+        recorded: by stage, at least one.
         offsets: of a grain's spheres, [K, 3].
         signal: whose replica it is.
         centre: what becomes the origin, [3].
     """
-    every = [frame for frames in taken.values() for frame in frames]
+    every = [frame for frames in recorded.values() for frame in frames]
     stacked = {name: np.stack([getattr(frame, name) for frame in every]) for name in ("time", "u", "quaternion")}
     moved = {
         name: np.stack([getattr(frame, name) - centre for frame in every]) for name in ("position", "lower", "upper")
@@ -223,6 +287,6 @@ def joined(taken: Taken, offsets: np.ndarray, signal: int = 0, centre: np.ndarra
         **contacts,
         start=np.cumsum([0, *(len(frame.spheres) for frame in every)]),
         offsets=np.asarray(offsets),
-        stages=tuple(name for name, frames in taken.items() for _ in frames),
+        stages=tuple(name for name, frames in recorded.items() for _ in frames),
         signal=signal,
     )

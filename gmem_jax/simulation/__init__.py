@@ -1,0 +1,1 @@
+"""How grains are moved through a protocol: knows walls, stages and bins, and no memory experiment."""
