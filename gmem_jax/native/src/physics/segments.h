@@ -1,0 +1,151 @@
+// What is stored of Mindlin's f. All attached rings are changed alike in every step: what all have got is kept once, and
+// only the outermost ring, which is filling, by itself. The rings inside are looked at when a contact reaches a ring more
+// or less. Those that were attached together share their f for ever: kept are segments of equal rings. (A contact of the
+// shipped packs has 37 rings in 2 segments at rest, and 52 in 22 where it is compressed.)
+
+#pragma once
+
+#include "numbers/vectors.h"
+
+namespace gmem {
+namespace GMEM_ISA {
+
+// Every lane has its own segments: number k of one may begin elsewhere than number k of another.
+template <class V>
+struct Segment {
+  Flat<V> force;  // f without what is common to all
+  V start;        // its first ring; it ends where the next one begins, the last at the outermost ring
+};
+
+// Where a segment begins that a lane does not have: beyond all rings.
+constexpr double kNowhere = 1e9;
+
+template <class V>
+inline Segment<V> no_segment() { return {Flat<V>{}, splat<V>(kNowhere)}; }
+
+template <class V>
+inline void copy_lane(Segment<V>& to, int l, const Segment<V>& from) {
+  copy_lane(to.force.along, l, from.force.along);
+  copy_lane(to.force.across, l, from.force.across);
+  copy_lane(to.start, l, from.start);
+}
+
+// Of all rings of a contact.
+template <class V>
+struct Layers {
+  Flat<V> common;  // what is to be added to the f of every segment
+  Flat<V> inside;  // the sum of w f over the rings inside the outermost
+  Flat<V> rim;     // f of the outermost
+};
+
+template <class V>
+inline Layers<V> load_layers(const V* p) { return {{p[0], p[1]}, {p[2], p[3]}, {p[4], p[5]}}; }
+template <class V>
+inline void store_layers(V* p, const Layers<V>& a) {
+  p[0] = a.common.along, p[1] = a.common.across;
+  p[2] = a.inside.along, p[3] = a.inside.across;
+  p[4] = a.rim.along, p[5] = a.rim.across;
+}
+
+// The layers of a contact whose outermost ring was `before` (-1: none is attached) and is `outer` now, in the lanes where
+// that differs: rings that it left are forgotten, new ones begin with nothing. Ring 0 weighs less than one by `lacking`.
+template <class V, class Segments>
+void reattach(Segments& segments, Layers<V>& layers, V before, V outer, double lacking) {
+  segments.remember();
+  const V one = splat<V>(1.0), nowhere = splat<V>(kNowhere);
+  const Mask<V> grows = before < outer, shrinks = outer < before, differs = grows | shrinks;
+  const Flat<V> common = zero_unless(differs, layers.common);
+  V last = -one, count{};
+  Flat<V> force{}, inside{}, rim{};
+  const int stored = segments.count();
+  for (int k = 0; k < stored + 2; ++k) {
+    Segment<V> segment = k < stored ? segments.get(k) : no_segment<V>();
+    segment.force = segment.force + common;
+    const Mask<V> stays = segment.start < outer, reaches = segment.start <= outer, begins = grows & (outer <= segment.start);
+    rim = select(shrinks & reaches, segment.force, rim);
+    // First the ring that was the outermost, then those that were passed in this step.
+    const Mask<V> former = begins & (last < before);
+    const Mask<V> passed = begins & (before <= last) & (last <= before) & (before + one < outer);
+    const Mask<V> there = stays | former | passed;
+    if (!bits(there | reaches)) break;
+    const V start = select(stays, segment.start, select(former, before, before + one));
+    inside = fma(zero_unless(there, start - last), force, inside);
+    force = select(there, zero_unless(stays | former, select(stays, segment.force, layers.rim)), force);
+    if (lacking != 0.0 && k == 0) inside = fma(splat<V>(-lacking), force, inside);
+    last = select(there, start, last);
+    count = count + zero_unless(there, one);
+    segments.set(k, {force, select(there, start, nowhere)});
+  }
+  segments.keep(count);
+  inside = fma(outer - last, force, inside);
+  layers = {select(differs, Flat<V>{}, layers.common), select(differs, inside, layers.inside),
+            select(differs, rim, layers.rim)};
+}
+
+// Segments that lie `stride` apart.
+template <class V, class Stored = Segment<V>>
+struct StoredSegments {
+  Stored* first;
+  long long stride;
+  int* stored;  // in the lane that has most
+  int rings;
+  Segment<V>* seen = nullptr;  // where `remember` copies them, one after the other, and how many they are
+  int* seen_count = nullptr;
+
+  int points() const { return rings; }
+  int count() const { return *stored; }
+  const Segment<V>& get(int k) const { return first[k * stride]; }
+  void set(int k, const Segment<V>& segment) { static_cast<Segment<V>&>(first[k * stride]) = segment; }
+  void keep(V counts) { *stored = static_cast<int>(largest(counts)); }
+  void remember() const {
+    if (!seen) return;
+    *seen_count = count();
+    for (int k = 0; k < count(); ++k) seen[k] = get(k);
+  }
+
+  // From rings, of which `ring(j)` reads one. With `apart` each is a segment of its own, whatever it holds.
+  template <class Ring>
+  Layers<V> load(V outer, double lacking, bool apart, const Ring& ring) {
+    const int end = static_cast<int>(largest(outer)) + 1;
+    int found[kLanes<V>] = {};
+    *stored = 0;
+    Flat<V> previous{};
+    Layers<V> layers{};
+    for (int j = 0; j < end; ++j) {
+      const Segment<V> segment{ring(j), splat<V>(j)};
+      const Mask<V> within = segment.start < outer;
+      layers.inside = fma(zero_unless(within, splat<V>(j == 0 ? 1.0 - lacking : 1.0)), segment.force, layers.inside);
+      layers.rim = select(segment.start <= outer, segment.force, layers.rim);
+      const unsigned begins = bits(within) & (apart || j == 0 ? ~0u : bits(differ(segment.force, previous)));
+      previous = segment.force;
+      for (int l = 0; begins && l < kLanes<V>; ++l) {
+        if (!(begins >> l & 1)) continue;
+        if (found[l] == *stored) set((*stored)++, no_segment<V>());
+        copy_lane(static_cast<Segment<V>&>(first[found[l]++ * stride]), l, segment);
+      }
+    }
+    return layers;
+  }
+
+  // The first `end` rings of a contact that reaches to `outer`, to `put(j, f)`.
+  template <class Put>
+  void unload(const Layers<V>& layers, V outer, int end, const Put& put) const {
+    int next[kLanes<V>] = {};  // segment of each lane
+    Segment<V> now = no_segment<V>();
+    V until{};  // where they begin
+    for (int j = 0; j < end; ++j) {
+      const V at = splat<V>(j);
+      const unsigned begins = bits(until <= at);
+      for (int l = 0; begins && l < kLanes<V>; ++l) {
+        if (!(begins >> l & 1)) continue;
+        copy_lane(now, l, next[l] < *stored ? get(next[l]) : no_segment<V>());
+        const int after = ++next[l];
+        copy_lane(until, l, after < *stored ? get(after).start : splat<V>(kNowhere));
+      }
+      put(j, zero_unless(at <= outer, select(at < outer, now.force + layers.common, layers.rim)));
+    }
+  }
+};
+
+}  // namespace GMEM_ISA
+}  // namespace gmem
