@@ -21,7 +21,7 @@ from gmem_jax.preparation import imported
 
 SOURCE = Path(__file__).parent / "data" / "tetra-27.h5"
 PACK = gm.load_pack(SOURCE)
-MASS = float(PACK.clump.mass)
+MASS, SOLID = float(PACK.clump.mass), gm.Material()
 SINGLE = 1e-6  # R, of positions in single precision in a box of some 7 R
 
 
@@ -54,7 +54,7 @@ def run_frames(pack_frames: Frames) -> Frames:
 def written(folder: Path, name: str, frames: Frames) -> Path:
     chosen = format_of(name, several=frames.count > 1)
     path = folder / f"out{chosen.suffix}"
-    chosen.write(path, frames, MASS)
+    chosen.write(path, frames, MASS, SOLID)
     return path
 
 
@@ -184,7 +184,7 @@ def test_other_lengths_become_radii(pack_frames: Frames, tmp_path: Path) -> None
         ("xlo xhi", "xlo", "no rectangular box"),
         ("Atoms", "Velocities", "must be .* one of"),
         ("\n1 1 -", "\n1 1 -9", "outside the box"),
-        ("\n1 1 ", "\n1 1 x", "not a readable LAMMPS data file"),
+        ("\n1 1 ", "\n1 1 x", "line 12: x is 'x-.*finite number"),
         ("108 atoms", "107 atoms", "declares 107 atoms"),
     ],
 )

@@ -177,10 +177,21 @@ def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) 
     if pack_fingerprint(pack) != of_pack["sha256"]:
         raise FileFormatError(f"{of_pack['source']}: not the pack that this was made with (its content has changed)")
     own = {name: _number(value) for name, value in configuration.items() if name not in _PARTS}
-    material = {name: _number(value) for name, value in configuration["material"].items() if name not in _GONE}
-    return Experiment(
-        pack, signals_from(configuration["signals"]), _law_from(configuration["friction"]), Material(**material), **own
-    )
+    material = material_from(configuration["material"])
+    return Experiment(pack, signals_from(configuration["signals"]), _law_from(configuration["friction"]), material, **own)
+
+
+def material_from(written: Mapping[str, Any]) -> Material:
+    """The material of a written form; the default of none.
+
+    Raises:
+        FileFormatError: if it has a field that no material has.
+        ValueError: for impossible numbers.
+    """
+    known = {entry.name for entry in fields(Material)}
+    if odd := sorted(set(written) - known - set(_GONE)):
+        raise FileFormatError(f"its material has a field {odd[0]!r}, which none has")
+    return Material(**{name: _number(value) for name, value in written.items() if name in known})
 
 
 def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
