@@ -25,6 +25,7 @@ from gmem_jax.experiment.signals import (
     words,
 )
 from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.checked import numbers, require
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
@@ -188,6 +189,7 @@ def material_from(written: Mapping[str, Any]) -> Material:
         FileFormatError: if it has a field that no material has.
         ValueError: for impossible numbers.
     """
+    require(isinstance(written, Mapping) and all(map(numbers, written.values())), "its material is no object of numbers")
     known = {entry.name for entry in fields(Material)}
     if odd := sorted(set(written) - known - set(_GONE)):
         raise FileFormatError(f"its material has a field {odd[0]!r}, which none has")

@@ -220,9 +220,11 @@ def _lines(frames: Frames, number: int) -> Any:
     pairs = frames.spheres[own]
     mesh = optional("pyvista", "vtk").PolyData()
     mesh.points = frames.centres(number)
-    mesh.lines = np.column_stack([np.full(len(pairs), 2), pairs]).ravel()  # a mesh made with no lines has vertices
-    mesh.cell_data["normal_force"] = frames.normal_force[own]
-    mesh.cell_data["friction_force"] = frames.friction_force[own]
+    mesh.lines = np.column_stack([np.full(len(pairs), 2), pairs]).ravel()  # one made with no lines would have vertices
+    for name in ("normal_force", "friction_force"):  # by VTK itself: pyvista refuses vectors where there are none
+        array = optional("vtkmodules.util.numpy_support", "vtk").numpy_to_vtk(getattr(frames, name)[own], deep=True)
+        array.SetName(name)
+        mesh.GetCellData().AddArray(array)
     return mesh
 
 
