@@ -1,4 +1,4 @@
-"""Files of other programs: what a number in them means is honoured, or refused in one line with the line it stands in."""
+"""Files of other programs: what a number in them means is honoured, or refused in one line that names its line."""
 
 import gzip
 import sys
@@ -174,7 +174,10 @@ def sized(*values: str) -> str:
         (data(ROWS[0], "2 2 1 nan 0 0"), "line 13: x is 'nan', must be a finite number"),
         (data(ROWS[0], "2 2 1 0.99 1e999 0"), "line 13: y is '1e999', must be a finite number"),
         (data(ROWS[0], "2 2 1 0.99 0 1_0"), "line 13: z is '1_0', must be a finite number"),
-        (data(*(f"{row} {flags}" for row, flags in zip(ROWS, ("0 0 0", "0 -1 0"), strict=True))), "line 13: image flag"),
+        (
+            data(*(f"{row} {flags}" for row, flags in zip(ROWS, ("0 0 0", "0 -1 0"), strict=True))),
+            "line 13: image flag",
+        ),
         (data(ROWS[0], f"{ROWS[1]} 0 0 0"), "line 13: 9 columns, must be 6"),
         (sized("2", "-5", "2"), "line 13: density is '-5', must be a positive number"),
         (sized("2", "nan", "2"), "line 13: density is 'nan', must be a positive number"),

@@ -72,6 +72,7 @@ def import_command(
     save_pack(output, pack)
     say(f"wrote {output}: {pack.grains} grains, {pack.clump.shape}")
     facts = {"pack": pack.name, "output": str(output), "grains": pack.grains, "grain": pack.clump.shape}
+    facts["notes"] = pack.info["imported"]["notes"]
     emit(as_json, {**facts, "ringing_period": float(pack.ringing_period), "status": 0}, tables.pack_table(pack))
 
 

@@ -179,7 +179,9 @@ def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) 
         raise FileFormatError(f"{of_pack['source']}: not the pack that this was made with (its content has changed)")
     own = {name: _number(value) for name, value in configuration.items() if name not in _PARTS}
     material = material_from(configuration["material"])
-    return Experiment(pack, signals_from(configuration["signals"]), _law_from(configuration["friction"]), material, **own)
+    return Experiment(
+        pack, signals_from(configuration["signals"]), _law_from(configuration["friction"]), material, **own
+    )
 
 
 def material_from(written: Mapping[str, Any]) -> Material:
@@ -189,7 +191,9 @@ def material_from(written: Mapping[str, Any]) -> Material:
         FileFormatError: if it has a field that no material has.
         ValueError: for impossible numbers.
     """
-    require(isinstance(written, Mapping) and all(map(numbers, written.values())), "its material is no object of numbers")
+    require(
+        isinstance(written, Mapping) and all(map(numbers, written.values())), "its material is no object of numbers"
+    )
     known = {entry.name for entry in fields(Material)}
     if odd := sorted(set(written) - known - set(_GONE)):
         raise FileFormatError(f"its material has a field {odd[0]!r}, which none has")

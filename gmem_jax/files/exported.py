@@ -180,8 +180,7 @@ def write_pvd(path: Path, frames: Frames, mass: float, material: Material) -> No
     folder = path.with_suffix("")
     if not folder.name.isprintable():
         raise ValueError(f"{str(path)!r}: its name has characters that XML cannot hold; name another file")
-    hidden = {"dir": path.parent, "prefix": f".{folder.name}.", "suffix": ".tmp"}
-    with atomic(path) as temporary, tempfile.TemporaryDirectory(**hidden) as made:
+    with atomic(path) as temporary, tempfile.TemporaryDirectory(".tmp", f".{folder.name}.", path.parent) as made:
         rows = []
         for number in range(frames.count):
             meshes = {"spheres": _points(frames, number, material), "contacts": _lines(frames, number)}

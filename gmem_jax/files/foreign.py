@@ -14,17 +14,17 @@ LARGEST = 1 << 30  # bytes of a file
 _GSD = b"\xdf\x65\xdf\x65\xdf\x65\xdf\x65"
 _CONVERTED = "write a LAMMPS data file or GSD from it (LAMMPS: write_data; OVITO: Export File)"
 _OTHERS = (  # how files begin that are asked for in vain, what they are, and what to do
-    (rb"\x1f\x8b|BZh|\xfd7zXZ|\x28\xb5\x2f\xfd|PK\x03\x04", "a compressed file", "unpack it first"),
+    (rb"\x1f\x8b|BZh[1-9]1AY|\xfd7zXZ|\x28\xb5\x2f\xfd|PK\x03\x04", "a compressed file", "unpack it first"),
     (
         rb"gmem sha256|.{0,2048}\x89HDF\r\n",
         "an HDF5 file",
         "packs of gmem are used as they are, `gmem export` writes them for others",
     ),
-    (rb"ITEM:", "a LAMMPS dump", _CONVERTED),
+    (rb"ITEM: [A-Z]", "a LAMMPS dump", _CONVERTED),
     (rb"LammpS RestartT", "a LAMMPS restart file", _CONVERTED),
     (rb"\s*\d+\s*\n[^\n]*(Lattice|Properties) *=", "an extended XYZ file", _CONVERTED),
     (rb"\s*\d+\s*\n[^\n]*\n\s*[A-Za-z]+(\s+[-+.\d][-+.\deE]*){3}", "an XYZ file", _CONVERTED),
-    (rb"<\?xml|<VTKFile|# vtk", "a VTK file", _CONVERTED),
+    (rb"<\?xml|<VTKFile|# vtk DataFile", "a VTK file", _CONVERTED),
     (rb".{0,4096}\x00", "a file that is no text", _CONVERTED),
 )
 

@@ -22,9 +22,9 @@ _STYLES = {  # of atoms: columns
 }
 _HYBRID = ("hybrid sphere molecular", "hybrid molecular sphere")  # LAMMPS itself writes no more than "hybrid"
 _READ = ("Atoms", "Molecules", "Masses", "Atom Type Labels")
-_WHOLE = re.compile(r"[+-]?\d{1,15}")
 _ATOMS = re.compile(r"\s*\S+\s+atoms\s*(#.*)?")
-_REAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_WHOLE = re.compile(r"[+-]?[0-9]{1,15}")
+_REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _MOST, _TINY = np.finfo(float).max, np.finfo(float).tiny
 _REALS = (_REAL, -_MOST, _MOST, "a finite number")
 _COLUMNS = {  # those that are not just real: how they are written, from where to where they go, in words
@@ -89,13 +89,15 @@ def read_lammps(path: Path, radius: float) -> Read:
     box = _box(head)
     atoms = sections.get("Atoms", _Section("", []))
     style = _style_of(atoms, radius)
-    labels = {row.words[-1]: row.words[0] for row in sections.get("Atom Type Labels", atoms._replace(rows=[])).rows}
+    labels = {words[-1]: words[0] for _, words in sections.get("Atom Type Labels", _Section("", [])).rows}
     types = _count(head, "atom types")
     named = _table(atoms, _STYLES[style].split(), types, labels)
-    require(_count(head, "atoms") == len(named["id"]), _declares(head, len(named["id"])))
+    declared, found = _count(head, "atoms"), len(named["id"])
+    require(declared == found, f"line {head['atoms'].line}: it declares {declared} atoms and holds {found}")
     if "mol" not in named:
         named["mol"] = _molecules(sections, named["id"])
-    notes = [f"its sections {', '.join(left)} are left out"] if (left := [n for n in sections if n not in _READ]) else []
+    left = [name[:_SHOWN] for name in sections if name not in _READ]
+    notes = [f"its sections {', '.join(left)} are left out"] if left else []
     grain, loose = named["mol"].astype(np.int64), named["mol"] == 0.0
     if loose.any():
         notes.append(f"{loose.sum()} of its atoms belong to no molecule: each is a grain of one sphere")
@@ -133,7 +135,7 @@ def _parts(lines: list[str]) -> tuple[dict[str, _Row], dict[str, _Section]]:
             continue
         if all(word[0].isalpha() for word in words):
             name, rows = " ".join(words), []
-            require(name not in sections, f"line {line}: a second section {name[:_SHOWN]!r}")
+            require(name not in sections or name not in _READ, f"line {line}: a second section {name!r}")
             sections[name] = _Section(" ".join(comment.split()), rows)
         elif rows is not None:
             rows.append(_Row(line, words))
@@ -151,10 +153,6 @@ def _count(head: Mapping[str, _Row], name: str) -> int:
     line, words = head[name]
     require(len(words) == 1 and _WHOLE.fullmatch(words[0]), f"line {line}: must be 'N {name}' with a whole number N")
     return int(words[0])
-
-
-def _declares(head: Mapping[str, _Row], found: int) -> str:
-    return f"line {head['atoms'].line}: it declares {head['atoms'].words[0]} atoms and holds {found}"
 
 
 def _box(head: Mapping[str, _Row]) -> np.ndarray:

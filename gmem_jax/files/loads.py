@@ -37,5 +37,6 @@ def pressure_tensor(frames: Frames, number: int, walls: np.ndarray) -> np.ndarra
     force = frames.normal_force[own, None] * normal - frames.friction_force[own]
     total = force.T @ (position[other // each] - position[one // each])
     planes = np.where(walls > 0.0, frames.lower[number], frames.upper[number])
-    total += walls.T @ (np.repeat(position, each, axis=0) - centres) + np.diag(np.sum(walls * (centres - planes), axis=0))
+    total += walls.T @ (np.repeat(position, each, axis=0) - centres)
+    total += np.diag(np.sum(walls * (centres - planes), axis=0))
     return np.asarray(total / np.prod(frames.upper[number] - frames.lower[number]))

@@ -106,10 +106,10 @@ def import_pack(
         FileNotFoundError: if there is no such file.
         FileFormatError: if it cannot be read, or is no pack at rest of equal grains of equal spheres in a box.
         ValueError: for an impossible radius or delta0, or if the pressure on the walls does not ring.
+        RunFailedError: if the grains cannot be simulated.
 
     Warns:
-        UserWarning: of what the file holds besides and the pack does not.
-        RunFailedError: if the grains cannot be simulated.
+        UserWarning: of what the file holds and the pack does not.
     """
     if not 0.0 < delta0 < 0.5:
         raise ValueError(f"delta0 must be in (0, 0.5), got {delta0:g}")
