@@ -361,7 +361,8 @@ def test_the_commands_there_and_back(
     assert gmem(monkeypatch, "export", SOURCE, "--to", "lammps", "-o", data, "--json") == 0
     assert json.loads(capsys.readouterr().out)["spheres"] == 108
     assert gmem(monkeypatch, "import", data, "-o", pack, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["grain"] == "tetra(0.6)"
+    told = json.loads(capsys.readouterr().out)
+    assert (told["grain"], told["notes"]) == ("tetra(0.6)", [])
     assert gmem(monkeypatch, "export", pack, "--to", "pdb", "-o", data) == 2
     assert "must be one of gsd, vtk, xyz, lammps" in capsys.readouterr().err
     assert gmem(monkeypatch, "export", pack, "--to", "xyz", "--frames", "-o", tmp_path / "a.xyz") == 2
