@@ -1244,8 +1244,8 @@ MUTATIONS = (
     mutation(
         "material-of-the-paper",
         "files/configuration.py",
-        "Material(**material), **own",
-        "Material(), **own",
+        'material_from(configuration["material"])\n',
+        "Material()\n",
         "test_the_written_form_reads_back_to_the_same_experiment[m2]",
     ),
     mutation(

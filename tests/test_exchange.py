@@ -4,6 +4,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,15 +14,17 @@ from scenes import orientations
 import gmem_jax as gm
 from gmem_jax.bench import lammps
 from gmem_jax.command import app as cli
+from gmem_jax.files import exported
 from gmem_jax.files.exported import format_of, frames_of_pack
 from gmem_jax.files.foreign import load_spheres
+from gmem_jax.files.loads import pressure_tensor, wall_forces
 from gmem_jax.physics import grain
 from gmem_jax.preparation import imported
 from gmem_jax.simulation.frames import Frames, sphere_places
 
 SOURCE = Path(__file__).parent / "data" / "tetra-27.h5"
 PACK = gm.load_pack(SOURCE)
-MASS = float(PACK.clump.mass)
+MASS, SOLID = float(PACK.clump.mass), gm.Material()
 SINGLE = 1e-6  # R, of positions in single precision in a box of some 7 R
 
 
@@ -54,7 +57,7 @@ def run_frames(pack_frames: Frames) -> Frames:
 def written(folder: Path, name: str, frames: Frames) -> Path:
     chosen = format_of(name, several=frames.count > 1)
     path = folder / f"out{chosen.suffix}"
-    chosen.write(path, frames, MASS)
+    chosen.write(path, frames, MASS, SOLID)
     return path
 
 
@@ -74,6 +77,104 @@ def test_gsd_reads_what_was_written(run_frames: Frames, tmp_path: Path) -> None:
             lengths = (run_frames.upper - run_frames.lower)[number]
             np.testing.assert_allclose(frame.configuration.box, [*lengths, 0, 0, 0], rtol=1e-6)
             np.testing.assert_array_equal(frame.log["time"], run_frames.time[number])
+            own = slice(*run_frames.start[number : number + 2])
+            np.testing.assert_array_equal(frame.bonds.group, run_frames.spheres[own])
+            np.testing.assert_array_equal(frame.log["bonds/normal_force"], run_frames.normal_force[own])
+            np.testing.assert_array_equal(frame.log["bonds/friction_force"], run_frames.friction_force[own])
+            assert frame.log["particles/wall_force"].shape == (108, 3)
+
+
+def without_contacts(frames: Frames) -> Frames:
+    """Two configurations, of which the first has none, as the lattice that a preparation begins with."""
+    kept = {name: getattr(frames, name)[1:] for name in ("spheres", "normal_force", "friction_force")}
+    return replace(frames, start=np.array([0, 0, 2]), **kept)
+
+
+def test_a_frame_without_contacts_is_written_like_any_other(run_frames: Frames, tmp_path: Path) -> None:
+    frames = without_contacts(run_frames)
+    pyvista, hoomd = pytest.importorskip("pyvista"), pytest.importorskip("gsd.hoomd")
+    reader = pyvista.get_reader(written(tmp_path, "vtk", frames).as_posix())
+    for number, lines in ((0, 0), (1, 2)):
+        reader.set_active_time_point(number)
+        spheres, contacts = reader.read()
+        assert (spheres.n_points, contacts.n_lines) == (108, lines)
+        assert b'NumberOfVerts="0"' in (tmp_path / "out" / f"contacts-{number:04d}.vtp").read_bytes()
+        np.testing.assert_array_equal(contacts.cell_data["normal_force"], [2.0, 3.0][:lines])
+        assert contacts.GetCellData().GetArray("friction_force").GetNumberOfComponents() == 3
+    with hoomd.open(written(tmp_path, "gsd", frames), "r") as file:
+        assert [frame.bonds.N for frame in file] == [0, 2]
+        assert [len(frame.log["bonds/normal_force"]) for frame in file] == [0, 2]
+
+
+@pytest.mark.parametrize("name", ["R & D", "a < b", 'say "so"', "it's", "Körner", "two  spaces"])
+def test_a_series_of_any_name_is_xml(run_frames: Frames, tmp_path: Path, name: str) -> None:
+    pyvista = pytest.importorskip("pyvista")
+    path = tmp_path / f"{name}.pvd"
+    format_of("vtk", several=True).write(path, run_frames, MASS, SOLID)
+    files = [entry.get("file") for entry in ElementTree.parse(path).iter("DataSet")]
+    assert len(files) == 4
+    assert all((tmp_path / str(file)).is_file() for file in files)
+    assert pyvista.get_reader(path.as_posix()).time_values == [0.0, 41.5]
+
+
+def test_a_series_that_cannot_be_written_leaves_nothing(
+    monkeypatch: pytest.MonkeyPatch, run_frames: Frames, tmp_path: Path
+) -> None:
+    pytest.importorskip("pyvista")
+    with pytest.raises(ValueError, match="characters that XML cannot hold"):
+        format_of("vtk", several=True).write(tmp_path / "a\x01.pvd", run_frames, MASS, SOLID)
+    real, written_before = exported._write_vtp, []
+
+    def full(path: Path, mesh: object) -> None:
+        if len(written_before) == 3:
+            raise OSError("no space left")
+        written_before.append(path)
+        real(path, mesh)
+
+    monkeypatch.setattr(exported, "_write_vtp", full)
+    with pytest.raises(OSError, match="no space left"):
+        format_of("vtk", several=True).write(tmp_path / "a.pvd", run_frames, MASS, SOLID)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_pressure_tensor_of_a_pack_at_rest_is_what_its_walls_measured(
+    pack_frames: Frames, run_frames: Frames, tmp_path: Path
+) -> None:
+    measured = PACK.info["at_rest"]["pressure"]
+    walls = wall_forces(pack_frames, 0, SOLID)
+    tensor = pressure_tensor(pack_frames, 0, walls)
+    np.testing.assert_allclose(np.diag(tensor), measured, rtol=1e-5)
+    np.testing.assert_allclose(tensor, tensor.T, atol=1e-5 * max(measured))
+    assert np.all(np.diag(pressure_tensor(pack_frames, 0, 0.0 * walls)) < 0.8 * np.array(measured))
+    moved = replace(run_frames, start=np.array([0, 0, 0]), spheres=np.zeros((0, 2), int), normal_force=np.zeros(0))
+    moved = replace(moved, friction_force=np.zeros((0, 3)))
+    one, other = (pressure_tensor(moved, number, wall_forces(moved, number, SOLID)) for number in (0, 1))
+    np.testing.assert_allclose(one, other, rtol=1e-9)  # wherever the box lies
+    told = written(tmp_path, "xyz", pack_frames).read_text().splitlines()[1]
+    found = np.array(told.split('pressure_tensor="')[1].split('"')[0].split(), float)
+    np.testing.assert_array_equal(found.reshape(3, 3), tensor)
+
+
+def test_friction_shears_the_pressure_tensor() -> None:
+    """Two spheres along x that touch; the friction on the first is along +y, so the second is dragged to -y."""
+    two = Frames(
+        time=np.zeros(1),
+        u=np.zeros(1),
+        position=np.array([[[2.0, 5.0, 5.0], [3.9, 5.0, 5.0]]]),
+        quaternion=np.array([[[1.0, 0.0, 0.0, 0.0]] * 2]),
+        lower=np.zeros((1, 3)),
+        upper=np.full((1, 3), 10.0),
+        start=np.array([0, 1]),
+        spheres=np.array([[0, 1]]),
+        normal_force=np.array([3.0]),
+        friction_force=np.array([[0.0, 2.0, 0.0]]),
+        offsets=np.zeros((1, 3)),
+        stages=("rest",),
+    )
+    tensor = pressure_tensor(two, 0, wall_forces(two, 0, SOLID))
+    wanted = np.zeros((3, 3))
+    wanted[:2, 0] = 3.0 * 1.9 / 1000.0, -2.0 * 1.9 / 1000.0
+    np.testing.assert_allclose(tensor, wanted, atol=1e-15)
 
 
 def test_paraview_reads_what_was_written(run_frames: Frames, pack_frames: Frames, tmp_path: Path) -> None:
@@ -82,6 +183,11 @@ def test_paraview_reads_what_was_written(run_frames: Frames, pack_frames: Frames
     np.testing.assert_array_equal(spheres.points, pack_frames.centres(0))
     np.testing.assert_array_equal(spheres["grain"], grains(pack_frames) + 1)
     np.testing.assert_array_equal(spheres["radius"], 1.0)
+    walls = wall_forces(pack_frames, 0, SOLID)
+    np.testing.assert_array_equal(spheres["wall_force"], walls)
+    np.testing.assert_array_equal(
+        spheres.field_data["pressure_tensor"].reshape(3, 3), pressure_tensor(pack_frames, 0, walls)
+    )
     reader = pyvista.get_reader(written(tmp_path, "vtk", run_frames).as_posix())
     assert reader.time_values == [0.0, 41.5]
     reader.set_active_time_value(41.5)
@@ -184,7 +290,7 @@ def test_other_lengths_become_radii(pack_frames: Frames, tmp_path: Path) -> None
         ("xlo xhi", "xlo", "no rectangular box"),
         ("Atoms", "Velocities", "must be .* one of"),
         ("\n1 1 -", "\n1 1 -9", "outside the box"),
-        ("\n1 1 ", "\n1 1 x", "not a readable LAMMPS data file"),
+        ("\n1 1 ", "\n1 1 x", "line 12: x is 'x-.*finite number"),
         ("108 atoms", "107 atoms", "declares 107 atoms"),
     ],
 )
@@ -228,6 +334,23 @@ def test_a_folder_beside_a_series_is_filled_by_force_only(
     assert not list((tmp_path / "run").iterdir())
     assert gmem(monkeypatch, *command, "--force") == 0
     assert len(list((tmp_path / "run").iterdir())) == 4
+    (tmp_path / "linked").symlink_to(tmp_path / "run", target_is_directory=True)
+    assert gmem(monkeypatch, *command[:-1], tmp_path / "linked.pvd", "--force") == 2
+    assert "linked beside it exists" in capsys.readouterr().err
+
+
+def test_an_exported_pack_has_its_contacts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    hoomd, pyvista = pytest.importorskip("gsd.hoomd"), pytest.importorskip("pyvista")
+    touching = round(0.5 * PACK.info["at_rest"]["contacts"] * PACK.grains)
+    assert gmem(monkeypatch, "export", SOURCE, "--to", "gsd", "-o", tmp_path / "a.gsd") == 0
+    with hoomd.open(tmp_path / "a.gsd", "r") as file:
+        assert len(file[0].bonds.group) == touching
+        overlap = PACK.info["at_rest"]["largest_overlap"]
+        force = float(SOLID.normal_stiffness) * overlap**1.5
+        np.testing.assert_allclose(file[0].log["bonds/normal_force"].max(), force, rtol=1e-9)
+    assert gmem(monkeypatch, "export", SOURCE, "--to", "vtk", "-o", tmp_path / "a.pvd") == 0
+    spheres, contacts = pyvista.get_reader((tmp_path / "a.pvd").as_posix()).read()
+    assert (spheres.n_points, contacts.n_lines) == (108, touching)
 
 
 @pytest.mark.usefixtures("quick")
@@ -238,7 +361,8 @@ def test_the_commands_there_and_back(
     assert gmem(monkeypatch, "export", SOURCE, "--to", "lammps", "-o", data, "--json") == 0
     assert json.loads(capsys.readouterr().out)["spheres"] == 108
     assert gmem(monkeypatch, "import", data, "-o", pack, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["grain"] == "tetra(0.6)"
+    told = json.loads(capsys.readouterr().out)
+    assert (told["grain"], told["notes"]) == ("tetra(0.6)", [])
     assert gmem(monkeypatch, "export", pack, "--to", "pdb", "-o", data) == 2
     assert "must be one of gsd, vtk, xyz, lammps" in capsys.readouterr().err
     assert gmem(monkeypatch, "export", pack, "--to", "xyz", "--frames", "-o", tmp_path / "a.xyz") == 2

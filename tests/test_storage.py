@@ -3,6 +3,8 @@
 import subprocess
 import sys
 from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -10,11 +12,15 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
+from gmem_jax.experiment.pack import stack
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import Checkpoints, load_part, locked, save_part
+from gmem_jax.files.exported import frames_of_pack
+from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.state import Grains, State
+from gmem_jax.simulation.sample import Sample
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 
@@ -29,6 +35,46 @@ def test_a_pack_survives_the_file_bit_for_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(pack.pairs, key), getattr(again.pairs, key))
     assert again.info == pack.info
     assert again.clump.isotropic
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda pack: replace(pack, name="two\nlines"), "its name"),
+        (lambda pack: replace(pack, name="n" * 201), "its name"),
+        (lambda pack: replace(pack, clump=replace(pack.clump, shape="\x1b[2J")), "its name or that of its grain"),
+        (lambda pack: replace(pack, record="[]"), "its record is not a JSON object"),
+        (lambda pack: replace(pack, position=2.0 * pack.position), "a grain lies outside the box"),
+        (lambda pack: replace(pack, quaternion=1.1 * pack.quaternion), "a quaternion is not of length 1"),
+        (lambda pack: replace(pack, ringing_period=pack.ringing_period * -1.0), "its ringing period is not positive"),
+        (lambda pack: stack([pack, pack]), r"'position' has shape \[2, 27, 3\]"),
+        (lambda pack: replace(pack, position=pack.position.astype("float32")), "its numbers are in single precision"),
+    ],
+)
+def test_a_pack_that_could_not_be_read_is_not_written(
+    tmp_path: Path, change: Callable[[gm.Pack], gm.Pack], reason: str
+) -> None:
+    path = tmp_path / "a.h5"
+    with pytest.raises(gm.FileFormatError, match=f"is not written, since it could not be read: {reason}"):
+        gm.save_pack(path, change(gm.load_pack(PACK)))
+    assert not list(tmp_path.iterdir())
+
+
+def test_frames_and_stages_that_could_not_be_read_are_not_written(tmp_path: Path) -> None:
+    pack = gm.load_pack(PACK)
+    frames = frames_of_pack(pack)
+    for wrong, reason in (
+        (replace(frames, position=np.nan * frames.position), "not finite"),
+        (replace(frames, stages=("one", "two")), "not of one number"),
+        (replace(frames, stages=("two\nlines",)), "no names"),
+    ):
+        with pytest.raises(gm.FileFormatError, match=reason):
+            gm.save_pack(tmp_path / "a.h5", pack, frames=wrong)
+    with pytest.raises(gm.FileFormatError, match="'gas/1' is no name of a stage"):
+        gm.save_pack(tmp_path / "a.h5", pack, {"gas/1": Sample(*[np.zeros(1)] * 10)})
+    assert not list(tmp_path.iterdir())
+    gm.save_pack(tmp_path / "a.h5", pack, frames=frames)
+    assert load_frames(tmp_path / "a.h5").count == 1
 
 
 def test_a_truncated_file_is_refused(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from gmem_jax.command.console import AsJson, Force, InputError, Output, claim, emit, reporting, require_name, say
+from gmem_jax.files.configuration import material_from
 from gmem_jax.files.exported import FORMATS, format_of, frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
@@ -27,21 +28,24 @@ def export(
     file = pack_called(str(file)) or file
     if schema_of(file) in (PACK.name, *PACK.before):
         pack = load_pack(file)
-        mass, found = float(pack.clump.mass), load_frames(file) if frames else frames_of_pack(pack)
+        material = material_from(pack.info.get("material", {}))
+        mass, found = float(pack.clump.mass), load_frames(file) if frames else frames_of_pack(pack, material)
         command = "prepare"
     else:
         recall, configuration = load_recall(file)
+        material = material_from(configuration.get("experiment", {}).get("material", {}))
         mass, found, command, frames = configuration["grain"]["mass"], recall.frames, "recall", True
     if found is None:
         raise InputError(f"{file}: holds no configurations; keep some with gmem {command} --frames 16")
-    chosen = format_of(to, several=frames)
+    chosen = format_of(to, several=frames, suffix=output.suffix)
     claim(output, chosen.suffix, inputs=(file,), force=force)
     beside = output.with_suffix("")
-    if chosen.folder and beside.exists() and not (force and beside.is_dir()):
+    taken = beside.exists() or beside.is_symlink()
+    if chosen.folder and taken and not (force and beside.is_dir() and not beside.is_symlink()):
         raise InputError(
             f"--output {output}: {beside} beside it exists; name another file, or allow --force to fill it"
         )
-    chosen.write(output, found, mass)
+    chosen.write(output, found, mass, material)
     _, grains, _ = found.position.shape
     facts = {"output": str(output), "frames": found.count, "grains": grains, "spheres": grains * len(found.offsets)}
     say(f"wrote {output}: {facts['frames']} x {facts['spheres']} spheres in {grains} grains")
@@ -68,6 +72,7 @@ def import_command(
     save_pack(output, pack)
     say(f"wrote {output}: {pack.grains} grains, {pack.clump.shape}")
     facts = {"pack": pack.name, "output": str(output), "grains": pack.grains, "grain": pack.clump.shape}
+    facts["notes"] = pack.info["imported"]["notes"]
     emit(as_json, {**facts, "ringing_period": float(pack.ringing_period), "status": 0}, tables.pack_table(pack))
 
 

@@ -25,6 +25,7 @@ from gmem_jax.experiment.signals import (
     word_bits,
     words,
 )
+from gmem_jax.files.checked import numbers, require
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
@@ -177,10 +178,26 @@ def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) 
     if pack_fingerprint(pack) != of_pack["sha256"]:
         raise FileFormatError(f"{of_pack['source']}: not the pack that this was made with (its content has changed)")
     own = {name: _number(value) for name, value in configuration.items() if name not in _PARTS}
-    material = {name: _number(value) for name, value in configuration["material"].items() if name not in _GONE}
+    material = material_from(configuration["material"])
     return Experiment(
-        pack, signals_from(configuration["signals"]), _law_from(configuration["friction"]), Material(**material), **own
+        pack, signals_from(configuration["signals"]), _law_from(configuration["friction"]), material, **own
     )
+
+
+def material_from(written: Mapping[str, Any]) -> Material:
+    """The material of a written form; the default of none.
+
+    Raises:
+        FileFormatError: if it has a field that no material has.
+        ValueError: for impossible numbers.
+    """
+    require(
+        isinstance(written, Mapping) and all(map(numbers, written.values())), "its material is no object of numbers"
+    )
+    known = {entry.name for entry in fields(Material)}
+    if odd := sorted(set(written) - known - set(_GONE)):
+        raise FileFormatError(f"its material has a field {odd[0]!r}, which none has")
+    return Material(**{name: _number(value) for name, value in written.items() if name in known})
 
 
 def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:

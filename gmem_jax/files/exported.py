@@ -3,37 +3,45 @@
 What is written is spheres, each with its grain's number; formats and fields are listed in docs/exchange.md.
 """
 
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, TextIO
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import optional
-from gmem_jax.simulation.frames import Frames
+from gmem_jax.files.loads import pressure_tensor, wall_forces
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.pairs import candidates
+from gmem_jax.simulation.frames import Frames, sphere_places
 
 RADIUS = 1.0
 
 
-def frames_of_pack(pack: Pack) -> Frames:
-    """A pack at rest as one configuration, without its contacts."""
-    of_pack = (pack.position, pack.quaternion, pack.lower, pack.upper)
-    position, quaternion, lower, upper = (np.asarray(array)[None] for array in of_pack)
+def frames_of_pack(pack: Pack, material: Material = Material()) -> Frames:
+    """A pack as the one configuration that it is: normal forces of its overlaps, and no friction, which no pack has."""
+    position, quaternion, offsets = (np.asarray(x) for x in (pack.position, pack.quaternion, pack.clump.offsets))
+    spheres = candidates(pack.pairs).T
+    centres = sphere_places(position, quaternion, offsets)
+    overlap = 2.0 - np.linalg.norm(centres[spheres[:, 1]] - centres[spheres[:, 0]], axis=1)
+    touching = overlap > 0.0
     return Frames(
         time=np.zeros(1),
         u=np.zeros(1),
-        position=position,
-        quaternion=quaternion,
-        lower=lower,
-        upper=upper,
-        start=np.zeros(2, int),
-        spheres=np.zeros((0, 2), np.int32),
-        normal_force=np.zeros(0),
-        friction_force=np.zeros((0, 3)),
-        offsets=np.asarray(pack.clump.offsets),
-        stages=("rest",),
+        position=position[None],
+        quaternion=quaternion[None],
+        lower=np.asarray(pack.lower)[None],
+        upper=np.asarray(pack.upper)[None],
+        start=np.array([0, touching.sum()]),
+        spheres=spheres[touching],
+        normal_force=float(material.normal_stiffness) * overlap[touching] ** 1.5,
+        friction_force=np.zeros((int(touching.sum()), 3)),
+        offsets=offsets,
+        stages=("at rest",),
     )
 
 
@@ -42,8 +50,15 @@ def _grain_numbers(frames: Frames) -> np.ndarray:
     return np.repeat(np.arange(1, frames.position.shape[1] + 1, dtype=np.int32), len(frames.offsets))
 
 
-def write_gsd(path: Path, frames: Frames, mass: float) -> None:
-    """GSD, as HOOMD-blue and OVITO read it: particles are spheres, `body` is the grain's number from 0.
+def _contacts(frames: Frames, number: int) -> slice:
+    """Which contacts are those of a frame."""
+    return slice(*frames.start[number : number + 2])
+
+
+def write_gsd(path: Path, frames: Frames, mass: float, material: Material) -> None:
+    """GSD, as HOOMD-blue and OVITO read it: particles are spheres, bonds are contacts, `body` is the grain from 0.
+
+    Bonds have their `normal_force` and `friction_force`, particles the `wall_force` on them.
 
     Raises:
         ValueError: if the package gsd is not there.
@@ -63,20 +78,31 @@ def write_gsd(path: Path, frames: Frames, mass: float) -> None:
             frame.particles.diameter = np.full(len(grain), 2.0 * RADIUS)
             frame.particles.mass = np.full(len(grain), mass / each)
             frame.particles.body = grain
-            frame.log = {"time": frames.time[[number]], "u": frames.u[[number]]}
+            own, walls = _contacts(frames, number), wall_forces(frames, number, material)
+            frame.bonds.N, frame.bonds.types = len(frames.spheres[own]), ["contact"]
+            frame.bonds.typeid, frame.bonds.group = np.zeros(frame.bonds.N, np.uint32), frames.spheres[own]
+            frame.log = {
+                "time": frames.time[[number]],
+                "u": frames.u[[number]],
+                "pressure_tensor": pressure_tensor(frames, number, walls).ravel(),
+                "particles/wall_force": walls,
+                "bonds/normal_force": frames.normal_force[own],
+                "bonds/friction_force": frames.friction_force[own],
+            }
             file.append(frame)
 
 
-def write_xyz(path: Path, frames: Frames, mass: float) -> None:
+def write_xyz(path: Path, frames: Frames, mass: float, material: Material) -> None:
     """Extended XYZ, as OVITO and ASE read it: `molecule` is the grain's number from 1.
 
     Raises:
         OSError: if the path cannot be written.
     """
     grain = _grain_numbers(frames)
-    with atomic(path) as temporary, temporary.open("w") as file:
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for number in range(frames.count):
             lower, lengths = frames.lower[number], frames.upper[number] - frames.lower[number]
+            tensor = pressure_tensor(frames, number, wall_forces(frames, number, material))
             facts = {
                 "Lattice": " ".join(f"{edge:.17g}" for edge in np.diag(lengths).ravel()),
                 "Origin": " ".join(f"{plane:.17g}" for plane in lower),
@@ -84,13 +110,14 @@ def write_xyz(path: Path, frames: Frames, mass: float) -> None:
                 "pbc": "F F F",
                 "Time": f"{frames.time[number]:.17g}",
                 "u": f"{frames.u[number]:.17g}",
-                "stage": frames.stages[number],
+                "stage": frames.stages[number].replace("\\", "\\\\").replace('"', '\\"'),
+                "pressure_tensor": " ".join(f"{part:.17g}" for part in tensor.ravel()),
             }
             file.write(f"{len(grain)}\n" + " ".join(f'{name}="{value}"' for name, value in facts.items()) + "\n")
             _rows(file, "S %.17g %.17g %.17g 1 %d", frames.centres(number), grain)
 
 
-def write_lammps(path: Path, frames: Frames, mass: float) -> None:
+def write_lammps(path: Path, frames: Frames, mass: float, material: Material) -> None:
     """A LAMMPS data file for `atom_style hybrid sphere molecular`, of the first configuration: molecules are grains.
 
     The density is such that the spheres of a grain have its mass together.
@@ -100,7 +127,7 @@ def write_lammps(path: Path, frames: Frames, mass: float) -> None:
     """
     grain, each = _grain_numbers(frames), len(frames.offsets)
     density = mass / (each * 4.0 * np.pi / 3.0 * RADIUS**3)
-    with atomic(path) as temporary, temporary.open("w") as file:
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(f"gmem: {frames.position.shape[1]} grains of {each} spheres, lengths in R\n\n")
         file.write(f"{len(grain)} atoms\n1 atom types\n\n")
         for axis, lower, upper in zip("xyz", frames.lower[0], frames.upper[0], strict=True):
@@ -110,14 +137,14 @@ def write_lammps(path: Path, frames: Frames, mass: float) -> None:
         _rows(file, row, np.arange(1, len(grain) + 1), frames.centres(0), grain)
 
 
-def write_dump(path: Path, frames: Frames, mass: float) -> None:
+def write_dump(path: Path, frames: Frames, mass: float, material: Material) -> None:
     """A LAMMPS text dump of all configurations: id, mol, type, x, y, z, radius.
 
     Raises:
         OSError: if the path cannot be written.
     """
     grain = _grain_numbers(frames)
-    with atomic(path) as temporary, temporary.open("w") as file:
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for number in range(frames.count):
             file.write(f"ITEM: TIMESTEP\n{number}\nITEM: NUMBER OF ATOMS\n{len(grain)}\nITEM: BOX BOUNDS ff ff ff\n")
             for lower, upper in zip(frames.lower[number], frames.upper[number], strict=True):
@@ -131,59 +158,72 @@ def _rows(file: TextIO, form: str, *columns: np.ndarray) -> None:
     np.savetxt(file, np.column_stack(columns), fmt=form)
 
 
-def write_vtp(path: Path, frames: Frames, mass: float) -> None:
-    """VTK polygonal data, as ParaView reads it: a point for every sphere, with `radius` and `grain` (from 1).
+def write_vtp(path: Path, frames: Frames, mass: float, material: Material) -> None:
+    """VTK polygonal data, as ParaView reads it: a point for every sphere, with `radius`, `grain` and `wall_force`.
 
     Raises:
         ValueError: if the package pyvista is not there.
         OSError: if the path cannot be written.
     """
-    _write_vtp(path, _points(frames, 0))
+    _write_vtp(path, _points(frames, 0, material))
 
 
-def write_pvd(path: Path, frames: Frames, mass: float) -> None:
+def write_pvd(path: Path, frames: Frames, mass: float, material: Material) -> None:
     """A ParaView series: a .pvd file, and beside it a folder of its name with spheres and contacts of every frame.
 
-    A contact is a line between two centres with its `normal_force` and `friction_force`.
+    A contact is a line between two centres with its `normal_force` and `friction_force`. All or nothing is written.
 
     Raises:
-        ValueError: if the package pyvista is not there.
+        ValueError: if the package pyvista is not there, or the file's name cannot stand in XML.
         OSError: if the path cannot be written.
     """
     folder = path.with_suffix("")
-    folder.mkdir(exist_ok=True)
-    rows = []
-    for number in range(frames.count):
-        for part, (name, made) in enumerate((("spheres", _points), ("contacts", _lines))):
-            file = folder / f"{name}-{number:04d}.vtp"
-            _write_vtp(file, made(frames, number))
-            rows.append(
-                f'<DataSet timestep="{frames.time[number]:.17g}" part="{part}" file="{folder.name}/{file.name}"/>'
-            )
-    head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>\n'
-    with atomic(path) as temporary:
-        temporary.write_text(head + "\n".join(rows) + "\n</Collection></VTKFile>\n")
+    if not folder.name.isprintable():
+        raise ValueError(f"{str(path)!r}: its name has characters that XML cannot hold; name another file")
+    with atomic(path) as temporary, tempfile.TemporaryDirectory(".tmp", f".{folder.name}.", path.parent) as made:
+        rows = []
+        for number in range(frames.count):
+            meshes = {"spheres": _points(frames, number, material), "contacts": _lines(frames, number)}
+            for part, (name, mesh) in enumerate(meshes.items()):
+                file = f"{name}-{number:04d}.vtp"
+                _write_vtp(Path(made, file), mesh)
+                rows.append(
+                    f'<DataSet timestep="{frames.time[number]:.17g}" part="{part}" '
+                    f"file={quoteattr(f'{folder.name}/{file}')}/>"
+                )
+        head = '<?xml version="1.0" encoding="utf-8"?>\n<VTKFile type="Collection" version="0.1"><Collection>\n'
+        temporary.write_text(head + "\n".join(rows) + "\n</Collection></VTKFile>\n", encoding="utf-8")
+        folder.mkdir(exist_ok=True)
+        for whole in Path(made).iterdir():
+            whole.replace(folder / whole.name)
 
 
-def _points(frames: Frames, number: int) -> Any:
-    grain = _grain_numbers(frames)
+def _points(frames: Frames, number: int, material: Material) -> Any:
+    grain, walls = _grain_numbers(frames), wall_forces(frames, number, material)
     mesh = optional("pyvista", "vtk").PolyData(frames.centres(number))
-    mesh["radius"], mesh["grain"] = np.full(len(grain), RADIUS), grain
-    facts = {"lower": frames.lower[number], "upper": frames.upper[number], "u": frames.u[[number]]}
-    for name, values in {**facts, "time": frames.time[[number]]}.items():
+    mesh["radius"], mesh["grain"], mesh["wall_force"] = np.full(len(grain), RADIUS), grain, walls
+    facts = {
+        "lower": frames.lower[number],
+        "upper": frames.upper[number],
+        "u": frames.u[[number]],
+        "time": frames.time[[number]],
+        "pressure_tensor": pressure_tensor(frames, number, walls).ravel(),
+    }
+    for name, values in facts.items():
         mesh.field_data[name] = values
     return mesh
 
 
 def _lines(frames: Frames, number: int) -> Any:
-    own = slice(*frames.start[number : number + 2])
+    own = _contacts(frames, number)
     pairs = frames.spheres[own]
-    lines = np.column_stack([np.full(len(pairs), 2), pairs]).ravel()
-    mesh = optional("pyvista", "vtk").PolyData(frames.centres(number), lines=lines)
-    mesh.cell_data["normal_force"], mesh.cell_data["friction_force"] = (
-        frames.normal_force[own],
-        frames.friction_force[own],
-    )
+    mesh = optional("pyvista", "vtk").PolyData()
+    mesh.points = frames.centres(number)
+    mesh.lines = np.column_stack([np.full(len(pairs), 2), pairs]).ravel()  # one made with no lines would have vertices
+    for name in ("normal_force", "friction_force"):  # by VTK itself: pyvista refuses vectors where there are none
+        array = optional("vtkmodules.util.numpy_support", "vtk").numpy_to_vtk(getattr(frames, name)[own], deep=True)
+        array.SetName(name)
+        mesh.GetCellData().AddArray(array)
     return mesh
 
 
@@ -201,13 +241,13 @@ class Format(NamedTuple):
 
     Attributes:
         suffix: of its files.
-        write: writes frames, of grains of a mass.
+        write: writes frames, of grains of a mass and a material.
         series: likewise for several configurations, where that is another kind of file.
         folder: whether it writes a folder, too, of the file's name without its suffix.
     """
 
     suffix: str
-    write: Callable[[Path, Frames, float], None]
+    write: Callable[[Path, Frames, float, Material], None]
     series: "Format | None" = None
     folder: bool = False
 
@@ -220,8 +260,13 @@ FORMATS = {
 }
 
 
-def format_of(name: str, *, several: bool) -> Format:
+def format_of(name: str, *, several: bool, suffix: str = "") -> Format:
     """A format by its name.
+
+    Args:
+        name: one of `FORMATS`.
+        several: whether there are several configurations.
+        suffix: of the file; that of a series asks for one of a single configuration, too.
 
     Raises:
         ValueError: if there is none of that name.
@@ -229,4 +274,4 @@ def format_of(name: str, *, several: bool) -> Format:
     if name not in FORMATS:
         raise ValueError(f"--to must be one of {', '.join(FORMATS)}; got {name!r}")
     found = FORMATS[name]
-    return found.series if several and found.series else found
+    return found.series if found.series and (several or suffix.lower() == found.series.suffix) else found

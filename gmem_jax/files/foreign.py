@@ -1,25 +1,32 @@
 """Spheres of rigid grains read from files of others: LAMMPS data files and GSD."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gmem_jax.errors import FileFormatError
 from gmem_jax.files.checked import optional, refusing, require, require_finite
+from gmem_jax.files.lammpsdata import SAME, Read, one_value, read_lammps
 
 LARGEST = 1 << 30  # bytes of a file
-_STYLES = {  # of LAMMPS atoms that belong to molecules: columns
-    "molecular": "id mol type x y z",
-    "bond": "id mol type x y z",
-    "angle": "id mol type x y z",
-    "full": "id mol type q x y z",
-    "hybrid sphere molecular": "id type x y z diameter density mol",
-    "hybrid molecular sphere": "id type x y z mol diameter density",
-    "sphere": "id type diameter density x y z",  # molecules in a section of their own
-}
-_SAME = 1e-5  # by which radii may differ from the one that is meant; GSD is in single precision
+_GSD = b"\xdf\x65\xdf\x65\xdf\x65\xdf\x65"
+_CONVERTED = "write a LAMMPS data file or GSD from it (LAMMPS: write_data; OVITO: Export File)"
+_OTHERS = (  # how files begin that are asked for in vain, what they are, and what to do
+    (rb"\x1f\x8b|BZh[1-9]1AY|\xfd7zXZ|\x28\xb5\x2f\xfd|PK\x03\x04", "a compressed file", "unpack it first"),
+    (
+        rb"gmem sha256|.{0,2048}\x89HDF\r\n",
+        "an HDF5 file",
+        "packs of gmem are used as they are, `gmem export` writes them for others",
+    ),
+    (rb"ITEM: [A-Z]", "a LAMMPS dump", _CONVERTED),
+    (rb"LammpS RestartT", "a LAMMPS restart file", _CONVERTED),
+    (rb"\s*\d+\s*\n[^\n]*(Lattice|Properties) *=", "an extended XYZ file", _CONVERTED),
+    (rb"\s*\d+\s*\n[^\n]*\n\s*[A-Za-z]+(\s+[-+.\d][-+.\deE]*){3}", "an XYZ file", _CONVERTED),
+    (rb"<\?xml|<VTKFile|# vtk DataFile", "a VTK file", _CONVERTED),
+    (rb".{0,4096}\x00", "a file that is no text", _CONVERTED),
+)
 
 
 @dataclass(frozen=True)
@@ -30,33 +37,44 @@ class Spheres:
         centres: in the order of the file within a grain, [N, K, 3].
         lower: lower planes of the box, [3].
         upper: upper planes, [3].
+        density: of the spheres, in the file's units; None where it has none.
+        notes: what was done with what the file holds besides.
     """
 
     centres: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+    density: float | None = None
+    notes: tuple[str, ...] = ()
 
 
 def load_spheres(path: Path, radius: float = 1.0) -> Spheres:
     """The grains of a LAMMPS data file (molecules) or a GSD file (bodies; its last frame).
 
     Args:
-        path: a file; GSD by its suffix .gsd, LAMMPS otherwise.
+        path: a file; GSD by how it begins or by its suffix .gsd, LAMMPS otherwise.
         radius: of the spheres in the file's unit of length, which becomes R.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it cannot be read, its radii are others, or its grains differ in their number of spheres.
+        FileFormatError: if it cannot be read, holds what no pack has, its radii or densities are others than one, or
+            its grains differ in their number of spheres.
         ValueError: if the radius is not positive, or the package gsd is not there.
     """
     if not 0.0 < radius < np.inf:
         raise ValueError(f"--radius must be positive, got {radius:g}")
-    gsd = Path(path).suffix.lower() == ".gsd"
+    path = Path(path)
+    gsd = path.suffix.lower() == ".gsd"
     with refusing(path, "GSD file" if gsd else "LAMMPS data file"):
-        require(Path(path).stat().st_size <= LARGEST, f"it is larger than {LARGEST >> 20} MB")
-        centres, grain, radii, box = (_gsd if gsd else _lammps)(Path(path))
+        require(path.stat().st_size <= LARGEST, f"it is larger than {LARGEST >> 20} MB")
+        with path.open("rb") as file:
+            begins = file.read(1 << 13)
+        gsd = gsd or begins.startswith(_GSD)
+        for pattern, what, how in () if begins.startswith(_GSD) else _OTHERS:
+            require(not re.match(pattern, begins, re.DOTALL), f"it is {what}; {how}")
+        centres, grain, radii, box, density, notes = _gsd(path) if gsd else read_lammps(path, radius)
         require_finite({"positions": centres, "planes of the box": box})
-        odd = np.abs(radii - radius) > _SAME * radius
+        odd = np.abs(radii - radius) > SAME * radius
         require(
             ~odd,
             f"its spheres must have radius {radius:g}, found {radii[odd][0] if odd.any() else 0:g}; "
@@ -64,19 +82,15 @@ def load_spheres(path: Path, radius: float = 1.0) -> Spheres:
         )
         _, counts = np.unique(grain, return_counts=True)
         require(len(counts) > 0, "it holds no spheres")
-        require(
-            counts == counts[0], f"its grains have {counts.min()} to {counts.max()} spheres, all must have the same"
-        )
+        told = "; ".join([f"its grains have {counts.min()} to {counts.max()} spheres, all must have the same", *notes])
+        require(counts == counts[0], told)
         order = np.argsort(grain, kind="stable")
         lower, upper = box / radius
-        return Spheres(centres[order].reshape(len(counts), counts[0], 3) / radius, lower, upper)
+        shaped = centres[order].reshape(len(counts), counts[0], 3) / radius
+        return Spheres(shaped, lower, upper, density, notes)
 
 
-_Read = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Centres [S, 3], grains [S], radii [S] (none where there are none), and planes of the box [2, 3]."""
-
-
-def _gsd(path: Path) -> _Read:
+def _gsd(path: Path) -> Read:
     with optional("gsd.hoomd", "export").open(path, "r") as file:
         frame = file[-1]
     own: Any = frame.particles
@@ -85,66 +99,16 @@ def _gsd(path: Path) -> _Read:
     require(np.asarray(tilts) == 0.0, "its box is not rectangular")
     free = body < 0
     grain = np.where(free, len(body) + np.arange(len(body)), body)
-    central = ~free & (body == np.arange(len(body)))  # HOOMD marks each rigid body by a particle of a type of its own
+    # HOOMD marks each rigid body by a particle of a type of its own, which has the body's number, as others have
+    _, place, members = np.unique(grain, return_inverse=True, return_counts=True)
+    central = ~free & (body == np.arange(len(body))) & (members[place] > 1)
     of_types = np.isin(kind, kind[central]) & ~np.isin(kind, kind[~central])
     kept = ~of_types
-    centres, diameter = np.asarray(own.position, float), np.asarray(own.diameter, float)
-    return centres[kept], grain[kept], 0.5 * diameter[kept], np.stack([-0.5 * lengths, 0.5 * lengths])
-
-
-def _lammps(path: Path) -> _Read:
-    lines = path.read_text().splitlines()
-    head, sections = _sections(lines)
-    bounds = [head.get(f"{axis}lo {axis}hi") for axis in "xyz"]
-    require(all(bound is not None and len(bound) == 2 for bound in bounds), "it has no rectangular box (xlo xhi, ...)")
-    require("xy xz yz" not in head, "its box is not rectangular")
-    style, rows = next(((hint, rows) for name, (hint, rows) in sections.items() if name == "Atoms"), ("", []))
     require(
-        style in _STYLES,
-        f"its atoms are of style {style[:40]!r}, must be (in a comment, as in 'Atoms # molecular') one of "
-        f"{', '.join(_STYLES)}",
+        np.asarray(own.image)[kept] == 0, "its particles have images: a pack lies within walls, not in a periodic box"
     )
-    columns = _STYLES[style].split()
-    table = _table(rows, len(columns))
-    declared = head.get("atoms", ["no"])[0]
-    require(declared == str(len(table)), f"it declares {declared} atoms and holds {len(table)}")
-    named = dict(zip(columns, table.T, strict=False))
-    table = table[np.argsort(named["id"], kind="stable")]
-    named = dict(zip(columns, table.T, strict=False))
-    if "mol" not in named:
-        require("Molecules" in sections, "its atoms belong to no molecules")
-        molecules = _table(sections["Molecules"][1], 2)
-        require(len(molecules) == len(table), "not every atom is in its section of molecules")
-        named["mol"] = molecules[np.argsort(molecules[:, 0], kind="stable"), 1]
-    centres = np.stack([named[axis] for axis in "xyz"], axis=1)
-    radii = 0.5 * named.get("diameter", np.zeros(0))
-    return centres, named["mol"].astype(np.int64), radii, np.array(bounds, float).T
-
-
-def _sections(lines: list[str]) -> tuple[dict[str, list[str]], dict[str, tuple[str, list[str]]]]:
-    """The header's numbers by their keywords; the sections by name, with the comment behind it and their rows."""
-    head: dict[str, list[str]] = {}
-    sections: dict[str, tuple[str, list[str]]] = {}
-    rows: list[str] | None = None
-    for line in lines[1:]:
-        text, _, comment = (part.strip() for part in line.partition("#"))
-        if not text:
-            continue
-        if text[0].isalpha():
-            rows = []
-            sections[text] = (" ".join(comment.split()), rows)
-        elif rows is not None:
-            rows.append(text)
-        else:
-            words = text.split()
-            numbers = [word for word in words if not word[0].isalpha()]
-            head[" ".join(words[len(numbers) :])] = numbers
-    return head, sections
-
-
-def _table(rows: list[str], columns: int) -> np.ndarray:
-    require(len(rows) > 0, "a section of it holds no rows")
-    table = np.loadtxt(rows, ndmin=2)
-    if table.shape[1] < columns:
-        raise FileFormatError(f"its rows have {table.shape[1]} columns, must have {columns}")
-    return np.asarray(table)
+    one_value("mass", np.asarray(own.mass, float)[kept])
+    centres, diameter = np.asarray(own.position, float), np.asarray(own.diameter, float)
+    notes = ("its velocities are left out",) if np.any(own.velocity) else ()
+    box = np.stack([-0.5 * lengths, 0.5 * lengths])
+    return Read(centres[kept], grain[kept], 0.5 * diameter[kept], box, notes=notes)

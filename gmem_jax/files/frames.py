@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gmem_jax.files.checked import refusing, require, require_finite, title, whole
+from gmem_jax.files.checked import fit, refusing, require, require_finite, title, whole
 from gmem_jax.files.hdf5 import Content, reading, write_arrays
 from gmem_jax.files.schemas import FRAMES
 from gmem_jax.simulation.frames import Frames
@@ -33,15 +33,22 @@ def read_frames(content: Content) -> Frames | None:
         return None
     found = content.arrays({f"{GROUP}/{name}": array for name, array in FRAMES.items()})
     stages, signal = json.loads(content.text("stages", GROUP)), content.attributes[GROUP].get("signal")
-    require(isinstance(stages, list) and all(map(title, stages)), "the stages of its frames are no names")
+    require(isinstance(stages, list), "the stages of its frames are no names")
     require(isinstance(signal, np.integer) and whole(int(signal)), "the signal of its frames is no number")
     own = {name: found[f"{GROUP}/{name}"] for name in FRAMES}
     frames = Frames(**own, stages=tuple(stages), signal=int(signal))  # type: ignore[arg-type]
-    _check(frames)
+    check_frames(frames)
     return frames
 
 
-def _check(frames: Frames) -> None:
+def check_frames(frames: Frames) -> None:
+    """Refuse frames that a file would be refused for.
+
+    Raises:
+        FileFormatError: saying what is wrong.
+    """
+    fit(FRAMES, vars(frames))
+    require(all(map(title, frames.stages)), "the stages of its frames are no names")
     require_finite({f"frames/{entry.name}": getattr(frames, entry.name) for entry in fields(frames)[:11]})
     start, spheres = frames.start, frames.spheres
     count, per_grain = frames.position.shape[1] * len(frames.offsets), len(frames.offsets)

@@ -9,10 +9,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files import soundness
-from gmem_jax.files.checked import json_of, refusing, require, title
-from gmem_jax.files.frames import write_frames
+from gmem_jax.files.checked import fit, json_of, refusing, require, title
+from gmem_jax.files.frames import check_frames, write_frames
 from gmem_jax.files.hdf5 import reading, write_arrays, write_samples, writing
 from gmem_jax.files.home import kept_pack
 from gmem_jax.files.schemas import PACK
@@ -42,8 +43,17 @@ def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None, f
     """Write a pack, and the time series of its preparation and configurations along it if given.
 
     Raises:
+        FileFormatError: if `load_pack` would refuse it, saying why; nothing is written.
         OSError: if the path cannot be written.
     """
+    try:
+        check_pack(pack)
+        if frames is not None:
+            check_frames(frames)
+        for name in stages or {}:
+            require(title(name) and name.strip(".") and "/" not in name, f"{name!r:.50} is no name of a stage")
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: is not written, since it could not be read: {error}") from error
     clump, values = pack.clump, _arrays(pack)
     with writing(path, PACK.name) as file:
         file.attrs["name"] = pack.name
@@ -64,7 +74,21 @@ def check_pack(pack: Pack) -> None:
         FileFormatError: saying what is wrong.
     """
     arrays = {path: np.asarray(array) for path, array in _arrays(pack).items()}
-    soundness.check(arrays, isotropic=pack.clump.isotropic, record=pack.info)
+    fit(PACK.arrays, arrays)
+    require(
+        all(arrays[path].dtype != np.float32 for path in PACK.arrays),
+        'its numbers are in single precision: call jax.config.update("jax_enable_x64", True) before it is made or read',
+    )
+    _check(arrays, pack.clump.isotropic, pack.name, pack.clump.shape, pack.record)
+
+
+def _check(found: dict[str, np.ndarray], isotropic: Any, label: Any, shape: Any, record: Any) -> None:
+    """What a pack must be to be written, and to be read."""
+    require(
+        isinstance(isotropic, bool | np.bool_), "incomplete file, attribute 'isotropic' is missing or not a truth value"
+    )
+    require(title(label) and title(shape), "its name or that of its grain is not a short line of text")
+    soundness.check(found, isotropic=bool(isotropic), record=json_of(record, "record"))
 
 
 def load_pack(source: str | Path) -> Pack:
@@ -84,11 +108,7 @@ def load_pack(source: str | Path) -> Pack:
             found = content.arrays(PACK.arrays)
             label, record, shape = content.text("name"), content.text("record"), content.text("shape", "clump")
             isotropic = content.attributes["clump"].get("isotropic")
-        require(
-            isinstance(isotropic, np.bool_), "incomplete file, attribute 'isotropic' is missing or not a truth value"
-        )
-        require(title(label) and title(shape), "its name or that of its grain is not a short line of text")
-        soundness.check(found, isotropic=bool(isotropic), record=json_of(record, "record"))
+        _check(found, isotropic, label, shape, record)
         clump = Clump(
             **{key: jnp.asarray(found[f"clump/{key}"]) for key in _CLUMP}, isotropic=bool(isotropic), shape=shape
         )

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.files.checked import require
 from gmem_jax.files.foreign import Spheres, load_spheres
+from gmem_jax.files.lammpsdata import SAME
 from gmem_jax.files.packs import check_pack
 from gmem_jax.files.provenance import provenance
 from gmem_jax.files.soundness import pairs_within
@@ -104,8 +106,11 @@ def import_pack(
     Raises:
         FileNotFoundError: if there is no such file.
         FileFormatError: if it cannot be read, or is no pack at rest of equal grains of equal spheres in a box.
-        ValueError: for an impossible radius or delta0.
+        ValueError: for an impossible radius or delta0, or if the pressure on the walls does not ring.
         RunFailedError: if the grains cannot be simulated.
+
+    Warns:
+        UserWarning: of what the file holds and the pack does not.
     """
     if not 0.0 < delta0 < 0.5:
         raise ValueError(f"delta0 must be in (0, 0.5), got {delta0:g}")
@@ -120,11 +125,19 @@ def _pack_of(
     read: Spheres, path: Path, delta0: float, name: str, law: FrictionLaw, radius: float, progress: Progress
 ) -> Pack:
     require((read.centres > read.lower) & (read.centres < read.upper), "a grain lies outside the box")
+    _require_pressed(read)
     pairs_within(read.centres.reshape(-1, 3), 2.0 + SKIN, read.centres.shape[1])  # refuses a heap
     grain = clump_of(read.centres[0])
     position, quaternion = lay(read.centres, np.asarray(grain.offsets))
     box = still_box(jnp.asarray(read.lower)[:, None], jnp.asarray(read.upper)[:, None])
-    record = {"imported": {"file": path.name, "radius": radius}, "grain": grain.shape, **provenance()}
+    notes = list(read.notes)
+    own = float(grain.mass) / (grain.spheres * 4.0 * np.pi / 3.0)  # spread over its spheres, which overlap, as exported
+    if read.density is not None and not np.isclose(read.density, (1.0, own), rtol=SAME).any():
+        notes.append(f"the density {read.density:g} of its spheres is left out: that of grains is the unit rho")
+    for note in notes:
+        warnings.warn(f"{path}: {note}", stacklevel=3)
+    imported = {"file": path.name, "radius": radius, "notes": notes}
+    record = {"imported": imported, "grain": grain.shape, **provenance()}
     made = Pack(
         clump=grain,
         position=jnp.asarray(position),
@@ -141,3 +154,9 @@ def _pack_of(
     system = System(grain, law, made.pairs, Material())
     at = (made.position[..., None], made.quaternion[..., None], made.box)
     return replace(made, ringing_period=jnp.asarray(ringing_period(system, *at, DT, progress)))
+
+
+def _require_pressed(read: Spheres) -> None:
+    """Walls along x and y that nobody touches ring with nothing."""
+    lower, upper = (read.centres - read.lower < 1.0), (read.upper - read.centres < 1.0)
+    require((lower | upper)[..., :2].any(), "its grains do not press on the walls: this is no pack at rest")

@@ -20,13 +20,19 @@ STEPS = 4  # steps per sample
 
 
 def spectrum_peak(series: np.ndarray, spacing: float) -> float:
-    """Period of the strongest oscillation in `series`, sampled every `spacing` (Hann window, parabolic peak)."""
+    """Period of the strongest oscillation in `series`, sampled every `spacing` (Hann window, parabolic peak).
+
+    Raises:
+        ValueError: if there is none.
+    """
     steps = np.arange(series.size)
     flat = series - np.polyval(np.polyfit(steps, series, 1), steps)
     padded = 16 * series.size
     power = np.abs(np.fft.rfft(flat * np.hanning(series.size), padded)) ** 2
     power[: 3 * 16] = 0.0  # fewer than three periods in the record are drift, not ringing
     peak = int(np.argmax(power))
+    if not power[peak] > 0.0:
+        raise ValueError("a kick does not make the pressure on the walls ring: grains do not press on them")
     below, at, above = power[peak - 1 : peak + 2] if 0 < peak < power.size - 1 else (0.0, 1.0, 0.0)
     return padded * spacing / (peak + 0.5 * (below - above) / (below - 2.0 * at + above))
 
@@ -51,6 +57,9 @@ def ringing_period(
         dt: time step, in t_c.
         progress: told about the run.
         backend: who does the steps.
+
+    Raises:
+        ValueError: if the walls feel nothing of the kick.
     """
     lengths = box.lengths
     duration = 40.0 * float(jnp.max(lengths))  # some 15 periods: the mode's speed is about 0.4 R / t_c

@@ -18,7 +18,7 @@ class ProgressBar:
         self._display = _notebook()
 
     def __call__(self, stage: str, moment: float, fraction: float) -> None:
-        """Show how far a run is; see `gmem_jax.experiment.host.Progress`."""
+        """Show how far a run is; see `gmem_jax.simulation.progress.Progress`."""
         now = time.perf_counter()
         if self._first < 0.0:
             self._began, self._first = now, fraction  # what came before the first chunk was compiling

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.experiment.pack import Pack
+from gmem_jax.files.exported import frames_of_pack
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import candidates
-from gmem_jax.simulation.frames import Frames, sphere_places
+from gmem_jax.simulation.frames import Frames
 
 SHOWN = 0.995  # part of all values that a colour bar spans: the few beyond it have the last colour
 MILLI = 1e3
@@ -59,27 +58,7 @@ class Links:
     force: np.ndarray
 
 
-def at_rest(pack: Pack) -> Frames:
-    """A pack as the one frame that it is: the normal forces of its overlaps, and no friction, which no pack has yet."""
-    position, quaternion, offsets = (np.asarray(x) for x in (pack.position, pack.quaternion, pack.clump.offsets))
-    spheres = candidates(pack.pairs).T
-    centres = sphere_places(position, quaternion, offsets)
-    overlap = 2.0 - np.linalg.norm(centres[spheres[:, 1]] - centres[spheres[:, 0]], axis=1)
-    touching = overlap > 0.0
-    return Frames(
-        time=np.zeros(1),
-        u=np.zeros(1),
-        position=position[None],
-        quaternion=quaternion[None],
-        lower=np.asarray(pack.lower)[None],
-        upper=np.asarray(pack.upper)[None],
-        start=np.array([0, touching.sum()]),
-        spheres=spheres[touching],
-        normal_force=float(Material().normal_stiffness) * overlap[touching] ** 1.5,
-        friction_force=np.zeros((int(touching.sum()), 3)),
-        offsets=offsets,
-        stages=("at rest",),
-    )
+at_rest = frames_of_pack
 
 
 def links(frames: Frames) -> Links:

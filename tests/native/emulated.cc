@@ -8,21 +8,6 @@ namespace cuda {
 
 namespace {
 
-template <class Function>
-void with_law(const Which& which, const Function& function) {
-  switch (which.law) {
-    case Law::hooke: return function(Hooke{});
-    case Law::mindlin_rescaled: return function(Rescaled{});
-    case Law::mindlin:
-      switch (which.variant) {
-        case Variant::averaged: return function(Layered<Variant::averaged>{});
-        case Variant::paper: return function(Layered<Variant::paper>{});
-        default: return function(Layered<Variant::exact>{});
-      }
-    default: return function(Frictionless{});
-  }
-}
-
 template <class V, class Law>
 void run(Kernel kernel, int threads, const Arguments& a, int step) {
   namespace k = gmem::GMEM_ISA;
@@ -52,7 +37,7 @@ Launcher::~Launcher() { delete static_cast<const Which*>(kernels_); }
 
 void Launcher::operator()(Kernel kernel, int threads, const Arguments& a, int step) const {
   const Which& which = *static_cast<const Which*>(kernels_);
-  with_law(which, [&](auto law) {
+  with_law(which.law, which.variant, [&](auto law) {
     using L = decltype(law);
     if (which.task == Task::forward) return run<double, L>(kernel, threads, a, step);
     run<gmem::GMEM_ISA::Dual<double>, L>(kernel, threads, a, step);

@@ -20,32 +20,32 @@ V* touch(Law law, V apart, V* to) {
   const double numbers[kParameters] = {0.3, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.9, 0.06};
   for (int r = 0; r < kParameters; ++r) row[r] = splat<V>(numbers[r]);
   const auto vec = [](double x, double y, double z) { return Vec<V>{splat<V>(x), splat<V>(y), splat<V>(z)}; };
-  const Meeting<V> meeting{apart * vec(0.6, 0.8, 0.0),   vec(0.5, 0.7, 0.1),   vec(-0.4, -0.6, 0.1),
+  const ContactInput<V> meeting{apart * vec(0.6, 0.8, 0.0),   vec(0.5, 0.7, 0.1),   vec(-0.4, -0.6, 0.1),
                          vec(2e-3, -1e-3, 3e-3),       vec(1e-3, 4e-3, 0.0), vec(0.0, -2e-3, 1e-3)};
   V history[10] = {splat<V>(2e-4), splat<V>(-1e-4), splat<V>(5e-4), splat<V>(0.03)};
   if (Law::kLayered) store_vec(history, vec(0.8, -0.6, 0.0)), history[kLastOverlap] = splat<V>(0.01);
   Contact<V> contact;
-  meet(meeting, dot(meeting.separation, meeting.separation), contact);
+  relative_motion(meeting, dot(meeting.separation, meeting.separation), contact);
   contact.history = history;
   close(&contact, 1, row);
   const LawParameters<V> parameters(row + kLaw, row[kDt]);
-  Run<V> run[kPoints];
+  Segment<V> segment[kPoints];
   int stored;
-  StoredRuns<V> runs{run, 1, &stored, kPoints};
+  StoredSegments<V> segments{segment, 1, &stored, kPoints};
   if constexpr (Law::kLayered) {
     const auto ring = [&](int j) { return splat<V>(1e-4) * Flat<V>{splat<V>(j / 2), splat<V>(1 - j / 3)}; };
     const V outer = Reach<V, Law::variant>(history[kLastOverlap], parameters, kPoints).outer;
-    store_layers(history + kLayers, runs.load(outer, kLacking<Law::variant>, false, ring));
-    friction(law, &contact, 1, parameters, [&](int) { return runs; });
+    store_layers(history + kLayers, segments.load(outer, kLacking<Law::variant>, false, ring));
+    friction(law, &contact, 1, parameters, [&](int) { return segments; });
   } else {
     friction(law, &contact, 1, parameters);
   }
-  const Push<V> found = push(contact);
+  const ContactLoads<V> found = push(contact);
   for (const Vec<V>& part : {found.force, found.torque_one, found.torque_other}) store_vec(to, part), to += 3;
   for (int q = 0; q < Law::kHistory; ++q) *to++ = history[q];
   if constexpr (Law::kLayered) {
     const V outer = Reach<V, Law::variant>(history[kLastOverlap], parameters, kPoints).outer;
-    runs.unload(load_layers(history + kLayers), outer, kPoints, [&](int, Flat<V> f) { *to++ = f.along, *to++ = f.across; });
+    segments.unload(load_layers(history + kLayers), outer, kPoints, [&](int, Flat<V> f) { *to++ = f.along, *to++ = f.across; });
   }
   return to;
 }
@@ -59,7 +59,7 @@ V* move(V shift, V* to) {
   const Quaternion<V> q{splat<V>(0.8), vec(0.6, 0.0, 0.0)};
   const Grain<V> grain{shift * vec(1.0, 2.0, 2.0), q, vec(0.01, 0.02, 0.0), vec(0.0, 0.01, 0.03),
                        vec(1e-3, 0.0, 0.0),        vec(0.0, 0.0, 1e-3)};
-  const Midway<V> m = begin_step(p, grain);
+  const HalfStep<V> m = begin_step(p, grain);
   const WallState<V> box{vec(0.0, 0.0, 0.0), vec(9.0, 9.0, 9.0), vec(1e-3, 0.0, 0.0), vec(0.0, 0.0, -1e-3)};
   const double offsets[6] = {0.5, 0.1, 0.0, -0.4, 0.0, 0.3};
   WallForces<V> on{};

@@ -98,7 +98,7 @@ void plans_keep_neighbours_together_and_padding_apart() {
   CHECK(plan.candidates == 3 && plan.padding == 1 && plan.padding_row[0] == 1 && plan.domains == 1);
   for (int g = 0; g < 4; ++g) CHECK(plan.grain[g] == g);
   for (int c = 0; c < 3; ++c) {
-    CHECK(plan.candidate[c].one == c && plan.candidate[c].other == c + 1 && plan.candidate[c].guest == -1);
+    CHECK(plan.candidate[c].one == c && plan.candidate[c].other == c + 1 && plan.candidate[c].remote == -1);
     CHECK(plan.candidate[c].row == (c + 2) % 4);
   }
   CHECK(plan_for(row.list()) == store);  // remembered
@@ -114,7 +114,7 @@ void lists_that_lead_astray_are_refused() {
   CHECK(!refused(1, 3));
 }
 
-// A kernel whose third block, or every team's last thread, runs out of memory.
+// A kernel whose third block, or every team's last thread, segments out of memory.
 std::size_t no_scratch(const Problem&, const Block&) { return 64; }
 void fail(const Problem&, const Block& block, Team& team, int rank, void*) {
   team.barrier();

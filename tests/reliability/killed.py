@@ -24,7 +24,7 @@ import h5py
 import psutil
 
 from gmem_jax.command import app
-from gmem_jax.files import parts
+from gmem_jax.files import checkpoints
 from gmem_jax.sweeps import work
 
 PACK = str(Path(__file__).parents[1] / "data" / "tetra-27.h5")
@@ -56,7 +56,7 @@ def start(arguments: list[str], log: Path) -> int:
     child = os.fork()
     if child:
         return child
-    parts.EVERY, parts.AT_MILESTONES = 0.2, 0.0
+    checkpoints.EVERY, checkpoints.AT_MILESTONES = 0.2, 0.0
     target = os.open(log, os.O_CREAT | os.O_WRONLY | os.O_APPEND)
     os.dup2(target, 1)
     os.dup2(target, 2)

@@ -25,12 +25,12 @@ inline Wants operator+(Wants one, const Wants& other) {
 }
 
 inline Wants histories(Law law) {
-  switch (law) {
-    case Law::hooke: return {{"forces", "P3B"}};
-    case Law::mindlin_rescaled: return {{"forces", "P3B"}, {"overlaps", "P1B"}};
-    case Law::mindlin: return {{"layers", "PQ2B"}, {"frames", "P3B"}, {"overlaps", "P1B"}};
-    default: return {};
-  }
+  return with_law(law, Variant::exact, [](auto law) {
+    Wants wants;
+    for (const Leaf& leaf : decltype(law)::kLeaves)
+      if (leaf.name) wants.push_back({leaf.name, leaf.axes});
+    return wants;
+  });
 }
 
 inline Wants fields_of_grains() {

@@ -24,7 +24,7 @@ enum StateRow { kStatePosition = 0, kStateQuaternion = 3, kStateVelocity = 7, kS
 enum MidRow { kMidPosition = 0, kMidQuaternion = 3, kMidVelocity = 7, kMidSpin = 10, kMidHalfVelocity = 13,
               kMidHalfSpin = 16, kMidForce = 19, kMidTorque = 22, kMid = 25 };
 // What a contact adds to the bars of a grain of another domain.
-enum GuestRow { kGuestCentre = 0, kGuestPosition = 3, kGuestVelocity = 6, kGuestSpin = 9, kGuest = 12 };
+enum RemoteRow { kRemoteCentre = 0, kRemotePosition = 3, kRemoteVelocity = 6, kRemoteSpin = 9, kRemote = 12 };
 
 inline void add_vec(Real* to, Vec<Real> a) { store_vec(to, load_vec(to) + a); }
 
@@ -60,8 +60,62 @@ struct TapedParameters {
   }
 };
 
+// The memory of an `Adjoint`. What is kept of every step is given room for all candidates; memory that contacts apart
+// leave untouched is not used.
 template <class Law>
-struct Adjoint {
+struct AdjointLayout {
+  using V = Real;
+
+  EngineLayout<Replicas<Law, Real>> of_forward;
+  V* state;         // [steps, N, kState]: at the beginning of each step
+  V* total;         // [steps, N, 6]: force and torque in it
+  Trace<V>* trace;  // [steps]
+  V* state_bar;     // [N, kState]
+  V* mid_bar;       // [N, kMid]
+  V* sphere_bar;    // [S, 3]
+  V* remote_bar;    // [remotes, kRemote]
+  V* history_bar;   // [candidates, kHistory and the forces of Mindlin's segments, 2 Q]
+  V* domain_bar;    // [domains, kParameters]
+  V* chunk_bar;     // [chunks, kParameters]
+  V* wall_bar;      // [chunks, kWalls], of one step
+
+  // Numbers in the history of a contact.
+  static int remembered(const Problem& p) { return Law::kHistory + (Law::kLayered ? 2 * p.points : 0); }
+
+  // With `fills` the traces of the steps are written down too: one thread does it, the others see it after a barrier.
+  void place(const Problem& p, const Block& block, Arena& arena, bool fills = false) {
+    of_forward.place(p, block, arena);
+    const Plan& plan = *block.pack->plan;
+    const std::size_t steps = block.lanes[0].steps, grains = p.grains, candidates = plan.candidates;
+    const std::size_t layered = Law::kLayered ? candidates : 0, chunks = gmem::GMEM_ISA::chunks(p);
+    state = arena.take<V>(steps * grains * kState);
+    total = arena.take<V>(steps * grains * 6);
+    trace = arena.take<Trace<V>>(steps);
+    for (std::size_t step = 0; step < steps; ++step) {
+      Trace<V> t;
+      t.touched = arena.take<bool>(candidates + 1);
+      t.history = arena.take<V>(candidates * Law::kHistory);
+      t.segment = arena.take<Segment<V>>(layered * p.points);
+      t.segments = arena.take<int>(layered);
+      if (fills) trace[step] = t;
+    }
+    state_bar = arena.take<V>(grains * kState);
+    mid_bar = arena.take<V>(grains * kMid);
+    sphere_bar = arena.take<V>(static_cast<std::size_t>(p.spheres()) * 3);
+    remote_bar = arena.take<V>(static_cast<std::size_t>(plan.remotes) * kRemote);
+    history_bar = arena.take<V>(candidates * remembered(p));
+    domain_bar = arena.take<V>(static_cast<std::size_t>(plan.domains) * kParameters);
+    chunk_bar = arena.take<V>(chunks * kParameters);
+    wall_bar = arena.take<V>(chunks * kWalls);
+  }
+};
+
+template <class Law>
+struct Adjoint : AdjointLayout<Law> {
+  using Layout = AdjointLayout<Law>;
+  using Layout::state, Layout::total, Layout::trace, Layout::state_bar, Layout::mid_bar, Layout::sphere_bar;
+  using Layout::remote_bar, Layout::history_bar, Layout::domain_bar, Layout::chunk_bar, Layout::wall_bar;
+  using Layout::remembered;
   using V = Real;
   using Forward = Engine<Replicas<Law, Real>>;
 
@@ -73,65 +127,17 @@ struct Adjoint {
   const int rank, steps;
   Tape recorded;
 
-  V* state;        // [steps, N, kState]: at the beginning of each step
-  V* total;        // [steps, N, 6]: force and torque in it
-  Trace<V>* trace;    // [steps]
-  V* state_bar;    // [N, kState]
-  V* mid_bar;      // [N, kMid]
-  V* sphere_bar;   // [S, 3]
-  V* guest_bar;    // [guests, kGuest]
-  V* history_bar;  // [candidates, kHistory and the forces of Mindlin's runs, 2 Q]
-  V* domain_bar;   // [domains, kParameters]
-  V* chunk_bar;    // [chunks, kParameters]
-  V* wall_bar;     // [chunks, kWalls], of one step
-
-  // What is kept of every step is given room for all candidates; memory that contacts apart leave untouched is not used.
-  static std::size_t carve(const Problem& p, const Block& block, Carver& carver, Adjoint* to) {
-    Forward::carve(p, block, carver, to ? &to->forward : nullptr);
-    const Plan& plan = *block.pack->plan;
-    const std::size_t steps = block.lanes[0].steps, grains = p.grains, candidates = plan.candidates;
-    const std::size_t layered = Law::kLayered ? candidates : 0;
-    V* state = carver.take<V>(steps * grains * kState);
-    V* total = carver.take<V>(steps * grains * 6);
-    Trace<V>* trace = carver.take<Trace<V>>(steps);
-    for (std::size_t step = 0; step < steps; ++step) {
-      Trace<V> t;
-      t.touched = carver.take<bool>(candidates + 1);
-      t.history = carver.take<V>(candidates * Law::kHistory);
-      t.run = carver.take<Run<V>>(layered * p.points);
-      t.runs = carver.take<int>(layered);
-      if (to && to->rank == 0) trace[step] = t;  // the others see it after the barrier in `load`
-    }
-    V* state_bar = carver.take<V>(grains * kState);
-    V* mid_bar = carver.take<V>(grains * kMid);
-    V* sphere_bar = carver.take<V>(static_cast<std::size_t>(p.spheres()) * 3);
-    V* guest_bar = carver.take<V>(static_cast<std::size_t>(plan.guests) * kGuest);
-    V* history_bar = carver.take<V>(candidates * remembered(p));
-    V* domain_bar = carver.take<V>(static_cast<std::size_t>(plan.domains) * kParameters);
-    V* chunk_bar = carver.take<V>(static_cast<std::size_t>(Forward::chunks(p)) * kParameters);
-    V* wall_bar = carver.take<V>(static_cast<std::size_t>(Forward::chunks(p)) * kWalls);
-    if (to) {
-      to->state = state, to->total = total, to->trace = trace, to->state_bar = state_bar, to->mid_bar = mid_bar;
-      to->sphere_bar = sphere_bar, to->guest_bar = guest_bar, to->history_bar = history_bar;
-      to->domain_bar = domain_bar, to->chunk_bar = chunk_bar, to->wall_bar = wall_bar;
-    }
-    return carver.used;
-  }
-
   Adjoint(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : forward(problem, block, team, rank, scratch), problem(problem), block(block), plan(*block.pack->plan), team(team),
         rank(rank), steps(block.lanes[0].steps) {
-    Carver carver{static_cast<char*>(scratch)};
-    carve(problem, block, carver, this);
-    forward.mode.hot = forward.hot;
+    Arena arena{static_cast<char*>(scratch)};
+    this->place(problem, block, arena, rank == 0);  // `forward` has found the same at the beginning
     forward.mode.apart = true;
   }
 
-  // Numbers in the history of a contact.
-  static int remembered(const Problem& p) { return Law::kHistory + (Law::kLayered ? 2 * p.points : 0); }
   V* history_of(std::size_t c) const { return history_bar + c * remembered(problem); }
 
-  int chunks() const { return forward.chunks(problem); }
+  int chunks() const { return gmem::GMEM_ISA::chunks(problem); }
   V* of_grain(V* array, int u, int rows) const { return array + static_cast<std::size_t>(u) * rows; }
 
   // Calls `each(u)` for this rank's grains.
@@ -235,16 +241,16 @@ struct Adjoint {
     team.barrier();
   }
 
-  // From the bars of rings to those of the layers and runs that they are in at the end.
+  // From the bars of rings to those of the layers and segments that they are in at the end.
   void to_layers(std::size_t c) {
-    const StoredRuns<V> runs = forward.mode.runs_of(c);
+    const StoredSegments<V> segments = forward.mode.segments_of(c);
     const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
     const V outer = forward.mode.outermost(c, law);
     V *layers = history_of(c) + kLayers, *ring = history_of(c) + Law::kHistory;
     for (int q = kLayers; q < Law::kHistory; ++q) history_of(c)[q] = V{};
     for (int l = 0; l < W; ++l)
       for (int k = 0, j = 0; j < problem.points; ++j) {
-        if (k + 1 < runs.count() && runs.get(k + 1).start[l] <= j) ++k;
+        if (k + 1 < segments.count() && segments.get(k + 1).start[l] <= j) ++k;
         for (int axis = 0; axis < 2; ++axis) {
           const double bar = ring[2 * j + axis][l];
           ring[2 * j + axis][l] = 0.0;
@@ -254,7 +260,7 @@ struct Adjoint {
       }
   }
 
-  // From the bars of layers and runs at the beginning, when each ring is a run, to those of the rings.
+  // From the bars of layers and segments at the beginning, when each ring is a segment, to those of the rings.
   void to_rings(std::size_t c) {
     const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
     const Place place = place_of<Law>(plan.candidate[c].row, kLastOverlap);
@@ -305,13 +311,13 @@ struct Adjoint {
     const GrainParameters<Taped> constants(parameter.row);
     const auto mark = recorded.mark();
     for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
-      const Midway<V> m = forward.midway(u);
+      const HalfStep<V> m = forward.half_step_of(u);
       const V* before = total_of(step, u);
       const int first = recorded.mark().slots;
-      const Midway<Taped> midway{leaf(m.position), leaf(m.orientation), leaf(m.velocity),
+      const HalfStep<Taped> half{leaf(m.position), leaf(m.orientation), leaf(m.velocity),
                                  leaf(m.spin), leaf(m.half_velocity), leaf(m.half_spin)};
       const Vec<Taped> force = leaf(load_vec(before)), torque = leaf(load_vec(before + 3));
-      const Grain<Taped> g = end_step(constants, problem.isotropic, midway, force, torque);
+      const Grain<Taped> g = end_step(constants, problem.isotropic, half, force, torque);
       const Grain<V> bar = grain_of(of_grain(state_bar, u, kState));
       seed(g.position, bar.position);
       seed(g.orientation.w, bar.orientation.w);
@@ -330,17 +336,17 @@ struct Adjoint {
     parameter.add_bars(chunk_bar + static_cast<std::size_t>(chunk) * kParameters);
   }
 
-  // Mindlin's runs of one contact, on the tape: as they were, then as the law left them.
-  struct Runs {
+  // Mindlin's segments of one contact, on the tape: as they were, then as the law left them.
+  struct Segments {
     int rings;
-    std::vector<Run<Taped>>* now;
+    std::vector<Segment<Taped>>* now;
 
     int points() const { return rings; }
     int count() const { return static_cast<int>(now->size()); }
-    const Run<Taped>& get(int k) const { return (*now)[k]; }
-    void set(int k, const Run<Taped>& run) {
-      if (k == count()) now->push_back(run);
-      (*now)[k] = run;
+    const Segment<Taped>& get(int k) const { return (*now)[k]; }
+    void set(int k, const Segment<Taped>& segment) {
+      if (k == count()) now->push_back(segment);
+      (*now)[k] = segment;
     }
     void keep(Taped counts) { now->resize(static_cast<std::size_t>(largest(counts))); }
     void remember() const {}
@@ -367,38 +373,38 @@ struct Adjoint {
   // A contact apart has a blank history, whatever it was before.
   void forget(std::size_t c) {
     for (int q = 0; q < remembered(problem); ++q) history_of(c)[q] = V{};
-    const int guest = plan.candidate[c].guest;
-    if (guest >= 0)
-      for (int q = 0; q < kGuest; ++q) of_grain(guest_bar, guest, kGuest)[q] = V{};
+    const int remote = plan.candidate[c].remote;
+    if (remote >= 0)
+      for (int q = 0; q < kRemote; ++q) of_grain(remote_bar, remote, kRemote)[q] = V{};
   }
 
   void contact_back(std::size_t c, const Taped* parameter, const LawParameters<Taped>& law, const Trace<V>& seen) {
     constexpr int kMeeting = 18;
     const auto mark = recorded.mark();
     const Candidate& pair = plan.candidate[c];
-    const Meeting<V> m = forward.mode.meeting(pair, load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.one)),
+    const ContactInput<V> m = forward.mode.contact_input(pair, load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.one)),
                                            load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.other)));
-    const Meeting<Taped> meeting{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
+    const ContactInput<Taped> meeting{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
                                  leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
     Taped memory[Law::kHistory + 1];
     for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(seen.history[c * Law::kHistory + q]);
     Contact<Taped> contact;
     contact.history = memory;
-    meet(meeting, dot(meeting.separation, meeting.separation), contact);
+    relative_motion(meeting, dot(meeting.separation, meeting.separation), contact);
     close(&contact, 1, parameter);
-    std::vector<Run<Taped>> now;
-    const int leaves = recorded.mark().slots, before = Law::kLayered ? seen.runs[c] : -1;
+    std::vector<Segment<Taped>> now;
+    const int leaves = recorded.mark().slots, before = Law::kLayered ? seen.segments[c] : -1;
     for (int k = 0; k < before; ++k) {
-      const Run<V>& run = seen.run[c * problem.points + k];
-      now.push_back({{leaf(run.force.along), leaf(run.force.across)}, constant(run.start)});
+      const Segment<V>& segment = seen.segment[c * problem.points + k];
+      now.push_back({{leaf(segment.force.along), leaf(segment.force.across)}, constant(segment.start)});
     }
     if constexpr (Law::kLayered) {
-      friction(Law{}, &contact, 1, law, [&](int) { return Runs{problem.points, &now}; });
+      friction(Law{}, &contact, 1, law, [&](int) { return Segments{problem.points, &now}; });
     } else {
       friction(Law{}, &contact, 1, law);
     }
 
-    const Push<Taped> found = push(contact);
+    const ContactLoads<Taped> found = push(contact);
     const V* one = of_grain(mid_bar, pair.grain_one, kMid);
     const V* other = of_grain(mid_bar, pair.grain_other, kMid);
     V* bar = history_of(c);
@@ -406,13 +412,13 @@ struct Adjoint {
     seed(found.torque_one, load_vec(one + kMidTorque));
     seed(found.torque_other, load_vec(other + kMidTorque));
     for (int q = 0; q < Law::kHistory; ++q) seed(memory[q], bar[q]);
-    V* of_runs = bar + Law::kHistory;
+    V* of_segments = bar + Law::kHistory;
     for (std::size_t k = 0; k < now.size(); ++k)
-      seed(now[k].force.along, of_runs[2 * k]), seed(now[k].force.across, of_runs[2 * k + 1]);
+      seed(now[k].force.along, of_segments[2 * k]), seed(now[k].force.across, of_segments[2 * k + 1]);
     recorded.reverse(mark);
 
     for (int q = 0; q < Law::kHistory; ++q) bar[q] = recorded.bar(mark.slots + kMeeting + q);
-    for (int q = 0; before >= 0 && q < 2 * problem.points; ++q) of_runs[q] = q < 2 * before ? recorded.bar(leaves + q) : V{};
+    for (int q = 0; before >= 0 && q < 2 * problem.points; ++q) of_segments[q] = q < 2 * before ? recorded.bar(leaves + q) : V{};
     share_out(pair, mark.slots);
   }
 
@@ -431,18 +437,18 @@ struct Adjoint {
   };
 
   void give(const Candidate& pair, bool at_home, int sphere, int grain, const Given& bar) {
-    if (at_home || pair.guest < 0) {
+    if (at_home || pair.remote < 0) {
       add_vec(sphere_bar + 3 * static_cast<std::size_t>(sphere), bar.centre);
       V* to = of_grain(mid_bar, grain, kMid);
       add_vec(to + kMidPosition, bar.position);
       add_vec(to + kMidVelocity, bar.velocity);
       add_vec(to + kMidSpin, bar.spin);
     } else {
-      V* to = of_grain(guest_bar, pair.guest, kGuest);
-      store_vec(to + kGuestCentre, bar.centre);
-      store_vec(to + kGuestPosition, bar.position);
-      store_vec(to + kGuestVelocity, bar.velocity);
-      store_vec(to + kGuestSpin, bar.spin);
+      V* to = of_grain(remote_bar, pair.remote, kRemote);
+      store_vec(to + kRemoteCentre, bar.centre);
+      store_vec(to + kRemotePosition, bar.position);
+      store_vec(to + kRemoteVelocity, bar.velocity);
+      store_vec(to + kRemoteSpin, bar.spin);
     }
   }
 
@@ -460,7 +466,7 @@ struct Adjoint {
       const int first = recorded.mark().slots;
       const Grain<Taped> grain{leaf(g.position), leaf(g.orientation), leaf(g.velocity),
                                leaf(g.spin), leaf(g.acceleration), leaf(g.spin_rate)};
-      const Midway<Taped> m = begin_step(constants, grain);
+      const HalfStep<Taped> m = begin_step(constants, grain);
       WallForces<Taped> on{};
       V* of_spheres = of_grain(sphere_bar, u, 3 * spheres);
       V* bar = of_grain(mid_bar, u, kMid);
@@ -490,12 +496,12 @@ struct Adjoint {
   }
 
   void take_guests(int u, V* bar) {
-    for (int n = plan.guest_start[u]; n < plan.guest_start[u + 1]; ++n) {
-      const V* from = of_grain(guest_bar, n, kGuest);
-      add_vec(sphere_bar + 3 * static_cast<std::size_t>(plan.guest_sphere[n]), load_vec(from + kGuestCentre));
-      add_vec(bar + kMidPosition, load_vec(from + kGuestPosition));
-      add_vec(bar + kMidVelocity, load_vec(from + kGuestVelocity));
-      add_vec(bar + kMidSpin, load_vec(from + kGuestSpin));
+    for (int n = plan.remote_start[u]; n < plan.remote_start[u + 1]; ++n) {
+      const V* from = of_grain(remote_bar, n, kRemote);
+      add_vec(sphere_bar + 3 * static_cast<std::size_t>(plan.remote_sphere[n]), load_vec(from + kRemoteCentre));
+      add_vec(bar + kMidPosition, load_vec(from + kRemotePosition));
+      add_vec(bar + kMidVelocity, load_vec(from + kRemoteVelocity));
+      add_vec(bar + kMidSpin, load_vec(from + kRemoteSpin));
     }
   }
 

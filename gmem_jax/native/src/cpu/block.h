@@ -34,10 +34,35 @@ struct FieldPlace {
 constexpr FieldPlace kField[kFields] = {{true, kPosition, 3}, {false, kQuaternion, 4},   {true, kVelocity, 3},
                                         {true, kSpin, 3},     {false, kAcceleration, 3}, {false, kSpinRate, 3}};
 
+inline int chunks(const Problem& p) { return (p.grains + kChunk - 1) / kChunk; }
+
+// The memory of an `Engine`.
 template <class Mode>
-struct Engine {
+struct EngineLayout {
   using V = typename Mode::Number;
   static constexpr std::ptrdiff_t kNumber = sizeof(V) / sizeof(double);
+
+  V* hot;         // [units, kHot]
+  V* cold;        // [units, kCold]
+  double* walls;  // partial sums, [chunks, 2, 3] in the mode's own layout
+  V* fastest;     // squares of the largest half-step velocity and spin, [chunks, 2]
+  typename Mode::Layout of_mode;
+
+  void place(const Problem& p, const Block& block, Arena& arena) {
+    const std::size_t units = Mode::units(p), chunks = gmem::GMEM_ISA::chunks(p);
+    hot = arena.take<V>(units * kHot);
+    cold = arena.take<V>(units * kCold);
+    walls = arena.take<double>(chunks * 6 * kNumber);
+    fastest = arena.take<V>(chunks * 2);
+    of_mode.place(p, *block.pack->plan, arena);
+  }
+};
+
+template <class Mode>
+struct Engine : EngineLayout<Mode> {
+  using Layout = EngineLayout<Mode>;
+  using V = typename Mode::Number;
+  using Layout::hot, Layout::cold, Layout::walls, Layout::fastest, Layout::kNumber;
 
   const Problem& problem;
   const Block& block;
@@ -45,32 +70,16 @@ struct Engine {
   Team& team;
   const int rank;
   Mode mode;
-  V* hot;         // [units, kHot]
-  V* cold;        // [units, kCold]
-  double* walls;  // partial sums, [chunks, 2, 3] in the mode's own layout
-  V* fastest;     // squares of the largest half-step velocity and spin, [chunks, 2]
   V parameter[kParameters];
   GrainParameters<V> constants;
   double arm;           // of the outermost sphere of a grain
   double travel = 0.0;  // how much closer any two spheres can have come since the call began
 
-  static std::size_t carve(const Problem& p, const Block& block, Carver& carver, Engine* engine) {
-    const std::size_t units = Mode::units(p);
-    V* hot = carver.take<V>(units * kHot);
-    V* cold = carver.take<V>(units * kCold);
-    double* walls = carver.take<double>(static_cast<std::size_t>(chunks(p)) * 6 * kNumber);
-    V* fastest = carver.take<V>(static_cast<std::size_t>(chunks(p)) * 2);
-    if (engine) engine->hot = hot, engine->cold = cold, engine->walls = walls, engine->fastest = fastest;
-    return Mode::carve(p, *block.pack->plan, carver, engine ? &engine->mode : nullptr);
-  }
-
-  static int chunks(const Problem& p) { return (p.grains + kChunk - 1) / kChunk; }
-
   Engine(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : problem(problem), block(block), plan(*block.pack->plan), team(team), rank(rank), mode(problem, block) {
-    Carver carver{static_cast<char*>(scratch)};
-    carve(problem, block, carver, this);
-    mode.hot = hot;
+    Arena arena{static_cast<char*>(scratch)};
+    this->place(problem, block, arena);
+    mode.use(this->of_mode, hot);
     for (int row = 0; row < kParameters; ++row) parameter[row] = mode.per_lane(&Lane::parameters, row);
     constants = GrainParameters<V>(parameter);
     arm = 0.0;
@@ -99,7 +108,7 @@ struct Engine {
   void begin(int u, const Grain<V>& grain, const WallState<V>& box, double* wall_sums, V* speeds) {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
-    const Midway<V> m = begin_step(constants, grain);
+    const HalfStep<V> m = begin_step(constants, grain);
     speeds[0] = max(speeds[0], dot(m.half_velocity, m.half_velocity));
     speeds[1] = max(speeds[1], dot(m.half_spin, m.half_spin));
     c[kQuaternion] = m.orientation.w;
@@ -107,7 +116,7 @@ struct Engine {
     store_vec(c + kAcceleration, m.half_velocity);
     store_vec(c + kSpinRate, m.half_spin);
     store_vec(h + kPosition, m.position);
-    if constexpr (!Mode::kLooks) {
+    if constexpr (!Mode::kKeepsMotion) {
       store_vec(h + kVelocity, m.velocity);
       store_vec(h + kSpin, m.spin);
     }
@@ -119,10 +128,10 @@ struct Engine {
   }
 
   // What `begin` left of unit u: the same places.
-  Midway<V> midway(int u) const {
+  HalfStep<V> half_step_of(int u) const {
     const Grain<V> g = still(u);
-    Midway<V> m{g.position, g.orientation, g.velocity, g.spin, g.acceleration, g.spin_rate};
-    if constexpr (Mode::kLooks) mode.look(u, m.velocity, m.spin);
+    HalfStep<V> m{g.position, g.orientation, g.velocity, g.spin, g.acceleration, g.spin_rate};
+    if constexpr (Mode::kKeepsMotion) mode.read_motion(u, m.velocity, m.spin);
     return m;
   }
 
@@ -130,7 +139,7 @@ struct Engine {
   Grain<V> finish(int u) const {
     Vec<V> force, torque;
     mode.total_force(u, force, torque);
-    return end_step(constants, problem.isotropic, midway(u), force, torque);
+    return end_step(constants, problem.isotropic, half_step_of(u), force, torque);
   }
 
   void keep(int u, const Grain<V>& g) {

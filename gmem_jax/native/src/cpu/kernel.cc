@@ -14,22 +14,6 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-// Calls `function` with the law of `problem` as a type.
-template <class Function>
-auto with_law(const Problem& problem, const Function& function) {
-  switch (problem.law) {
-    case Law::hooke: return function(Hooke{});
-    case Law::mindlin_rescaled: return function(Rescaled{});
-    case Law::mindlin:
-      switch (problem.variant) {
-        case Variant::averaged: return function(Layered<Variant::averaged>{});
-        case Variant::paper: return function(Layered<Variant::paper>{});
-        default: return function(Layered<Variant::exact>{});
-      }
-    default: return function(Frictionless{});
-  }
-}
-
 // Calls `function` with what does the work as a type in an `As`.
 template <class T>
 struct As {
@@ -38,7 +22,7 @@ struct As {
 
 template <class Function>
 auto with_worker(const Problem& problem, [[maybe_unused]] const Block& block, const Function& function) {
-  return with_law(problem, [&](auto law) {
+  return with_law(problem.law, problem.variant, [&](auto law) {
     using L = decltype(law);
 #ifdef GMEM_DERIVATIVES
     return problem.task == Task::tangent ? function(As<Engine<Replicas<L, Dual<Real>>>>{}) : function(As<Adjoint<L>>{});
@@ -56,8 +40,9 @@ auto with_worker(const Problem& problem, [[maybe_unused]] const Block& block, co
 
 std::size_t scratch_bytes(const Problem& problem, const Block& block) {
   return with_worker(problem, block, [&](auto as) {
-    Carver carver{nullptr};
-    return decltype(as)::type::carve(problem, block, carver, nullptr);
+    Arena arena{nullptr};
+    typename decltype(as)::type::Layout().place(problem, block, arena);
+    return arena.used;
   });
 }
 

@@ -10,22 +10,21 @@
 namespace gmem {
 namespace GMEM_ISA {
 
+template <class Law>
 struct Marks {
   bool* touched;       // in any lane, at the last step: only then is there a history to forget
-  double* wake;        // the travel at which it may next touch: until then it need not be looked at
-  int* runs;           // Mindlin: how many are stored
+  double* next_check;  // the travel at which it may next touch: until then it need not be looked at
+  int* segments;       // Mindlin: how many are stored
   int* rings;          // ... of how many rings, at the beginning of the call; those beyond were zero
-};
 
-template <class Law>
-void carve_marks(const Plan& plan, Carver& carver, Marks* marks) {
-  const std::size_t count = static_cast<std::size_t>(plan.candidates) + 1;  // and a dummy
-  bool* touched = carver.take<bool>(count);
-  double* wake = carver.take<double>(count);
-  int* runs = carver.take<int>(Law::kLayered ? count : 0);
-  int* rings = carver.take<int>(Law::kLayered ? count : 0);
-  if (marks) *marks = {touched, wake, runs, rings};
-}
+  void place(const Plan& plan, Arena& arena) {
+    const std::size_t count = static_cast<std::size_t>(plan.candidates) + 1;  // and a dummy
+    touched = arena.take<bool>(count);
+    next_check = arena.take<double>(count);
+    segments = arena.take<int>(Law::kLayered ? count : 0);
+    rings = arena.take<int>(Law::kLayered ? count : 0);
+  }
+};
 
 // Rings that may hold something where the outermost is `outer`: one more, since JAX's root may differ in its last digit.
 template <class V>

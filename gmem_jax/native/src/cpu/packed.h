@@ -16,27 +16,47 @@ struct GrainRows {
   Row position, velocity, spin, force, torque;
 };
 
-struct alignas(Row) RowOfRun : Run<double> {};
+struct alignas(Row) RowOfSegment : Segment<double> {};
+
+// The memory of a `Packed`.
+template <class Law>
+struct PackedLayout {
+  static constexpr int kHistoryRows = (Law::kHistory + 3) / 4;
+
+  Row* sphere;            // [S + 2]: centres; the last two are far apart and fill up vectors
+  GrainRows* grain;       // [N + 1]
+  Row* remote;            // [remotes, 2]: force and torque
+  Row* history;           // [candidates + 1, kHistoryRows]
+  RowOfSegment* segment;  // [Q, candidates + 1] of the Mindlin law: those that are few lie together
+  Marks<Law> marks;
+
+  void place(const Problem& p, const Plan& plan, Arena& arena) {
+    const std::size_t candidates = static_cast<std::size_t>(plan.candidates) + 1;
+    const std::size_t grains = (static_cast<std::size_t>(p.grains) + W - 1) / W * W;
+    sphere = arena.take<Row>(grains * p.spheres_per_grain + 2);
+    grain = arena.take<GrainRows>(grains + 1);
+    remote = arena.take<Row>(static_cast<std::size_t>(plan.remotes) * 2);
+    history = arena.take<Row>(candidates * kHistoryRows);
+    marks.place(plan, arena);
+    segment = arena.take<RowOfSegment>(Law::kLayered ? candidates * p.points : 0);
+  }
+};
 
 template <class Law>
-struct Packed {
+struct Packed : PackedLayout<Law> {
+  using Layout = PackedLayout<Law>;
+  using Layout::sphere, Layout::grain, Layout::remote, Layout::history, Layout::segment, Layout::marks;
   using Number = Real;
   using V = Real;
   using OfContacts = Real;
-  static constexpr bool kLooks = false;
-  static constexpr int kHistoryRows = (Law::kHistory + 3) / 4;
+  static constexpr bool kKeepsMotion = false;
+  using Layout::kHistoryRows;
 
   const Problem& problem;
   const Block& block;
   const Plan& plan;
   const Lane& lane;
-  V* hot;            // the engine's
-  Row* sphere;       // [S + 2]: centres; the last two are far apart and fill up vectors
-  GrainRows* grain;  // [N + 1]
-  Row* guest;        // [guests, 2]: force and torque
-  Row* history;      // [candidates + 1, kHistoryRows]
-  RowOfRun* run;     // [Q, candidates + 1] of the Mindlin law: those that are few lie together
-  Marks marks;
+  V* hot;  // the engine's
 
   Packed(const Problem& problem, const Block& block)
       : problem(problem), block(block), plan(*block.pack->plan), lane(block.lanes[0]) {}
@@ -44,19 +64,7 @@ struct Packed {
   static int units(const Problem& p) { return (p.grains + W - 1) / W; }
   static int unit_of(int grain) { return grain / W; }
 
-  static std::size_t carve(const Problem& p, const Plan& plan, Carver& carver, Packed* mode) {
-    const std::size_t candidates = static_cast<std::size_t>(plan.candidates) + 1;
-    const std::size_t grains = static_cast<std::size_t>(units(p)) * W;
-    Row* sphere = carver.take<Row>(grains * p.spheres_per_grain + 2);
-    GrainRows* grain = carver.take<GrainRows>(grains + 1);
-    Row* guest = carver.take<Row>(static_cast<std::size_t>(plan.guests) * 2);
-    Row* history = carver.take<Row>(candidates * kHistoryRows);
-    if (mode) mode->sphere = sphere, mode->grain = grain, mode->guest = guest, mode->history = history;
-    carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
-    RowOfRun* run = carver.take<RowOfRun>(Law::kLayered ? candidates * p.points : 0);
-    if (mode) mode->run = run;
-    return carver.used;
-  }
+  void use(const Layout& layout, V* of_engine) { static_cast<Layout&>(*this) = layout, hot = of_engine; }
 
   V per_lane(const double* Lane::*array, std::ptrdiff_t row) const { return splat<V>((lane.*array)[row * problem.stride]); }
 
@@ -88,8 +96,8 @@ struct Packed {
     }
   }
 
-  std::ptrdiff_t run_stride() const { return plan.candidates + 1; }
-  StoredRuns<double, RowOfRun> runs_of(std::size_t c) const { return {run + c, run_stride(), marks.runs + c, problem.points}; }
+  std::ptrdiff_t segment_stride() const { return plan.candidates + 1; }
+  StoredSegments<double, RowOfSegment> segments_of(std::size_t c) const { return {segment + c, segment_stride(), marks.segments + c, problem.points}; }
   // Number q of the history of a contact.
   double& remembered(std::size_t c, int q) const { return reinterpret_cast<double*>(history + c * kHistoryRows)[q]; }
   double outermost(std::size_t c, const LawParameters<V>& law) const {
@@ -99,7 +107,7 @@ struct Packed {
   void load_history(std::ptrdiff_t c, const LawParameters<V>& law) {
     const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = false;
-    marks.wake[c] = -1.0;  // not looked at yet
+    marks.next_check[c] = -1.0;  // not looked at yet
     for (int q = 0; q < Law::kGiven; ++q) {
       const Place place = place_of<Law>(row, q);
       remembered(c, q) = lane.history_in[place.leaf][place.row * problem.stride];
@@ -111,7 +119,7 @@ struct Packed {
         const double* from = lane.history_in[0] + (row * problem.points + j) * 2 * problem.stride;
         return Flat<double>{from[0], from[problem.stride]};
       };
-      store_layers(&remembered(c, kLayers), runs_of(c).load(outer, kLacking<Law::variant>, false, ring));
+      store_layers(&remembered(c, kLayers), segments_of(c).load(outer, kLacking<Law::variant>, false, ring));
     }
   }
 
@@ -124,7 +132,7 @@ struct Packed {
     if constexpr (Law::kLayered) {
       const double outer = outermost(c, law);
       const Layers<double> layers = load_layers(&remembered(c, kLayers));
-      runs_of(c).unload(layers, outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Flat<double> f) {
+      segments_of(c).unload(layers, outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Flat<double> f) {
         double* to = lane.history_out[0] + (row * problem.points + j) * 2 * problem.stride;
         to[0] = f.along, to[problem.stride] = f.across;
       });
@@ -183,9 +191,9 @@ struct Packed {
       f[l] = g < problem.grains ? grain[g].force : Row{};
       t[l] = g < problem.grains ? grain[g].torque : Row{};
       if (g >= problem.grains) continue;
-      for (int n = plan.guest_start[g]; n < plan.guest_start[g + 1]; ++n) {
-        f[l] += guest[2 * static_cast<std::size_t>(n)];
-        t[l] += guest[2 * static_cast<std::size_t>(n) + 1];
+      for (int n = plan.remote_start[g]; n < plan.remote_start[g + 1]; ++n) {
+        f[l] += remote[2 * static_cast<std::size_t>(n)];
+        t[l] += remote[2 * static_cast<std::size_t>(n) + 1];
       }
     }
     force = columns(load_rows([&](int l) { return f + l; }));
@@ -208,24 +216,24 @@ struct Packed {
   // --- contacts
 
   // Of W contacts.
-  struct Runs {
-    RowOfRun* first[W];
+  struct Segments {
+    RowOfSegment* first[W];
     int* stored[W];
     std::ptrdiff_t stride;
     int rings, most, lanes;
 
     int points() const { return rings; }
     int count() const { return most; }
-    Run<V> get(int k) const {
+    Segment<V> get(int k) const {
       const Row none{0.0, 0.0, kNowhere};
       const Rows rows = load_rows([&](int l) {
         return k < *stored[l] ? reinterpret_cast<const Row*>(first[l] + k * stride) : &none;
       });
-      const Vec<V> run = columns(rows);
-      return {{run.x, run.y}, run.z};
+      const Vec<V> segment = columns(rows);
+      return {{segment.x, segment.y}, segment.z};
     }
-    void set(int k, const Run<V>& run) {
-      const Rows rows = rows_of({run.force.along, run.force.across, run.start});
+    void set(int k, const Segment<V>& segment) {
+      const Rows rows = rows_of({segment.force.along, segment.force.across, segment.start});
       for (int l = 0; l < lanes; ++l) *reinterpret_cast<Row*>(first[l] + k * stride) = row_of(rows, l);
     }
     void keep(V counts) {
@@ -251,7 +259,7 @@ struct Packed {
       int found = 0;
       for (int c = look; c < look_end; ++c) {
         awake[found] = c;
-        found += !(marks.wake[c] > travel);  // also where it is not a number
+        found += !(marks.next_check[c] > travel);  // also where it is not a number
       }
       for (int n = 0; n < found; ++n) {
         const int c = awake[n];
@@ -278,20 +286,20 @@ struct Packed {
     const Row d = sphere[plan.candidate[c].other] - sphere[plan.candidate[c].one];
     const double square = fma(d[2], d[2], fma(d[1], d[1], d[0] * d[0]));
     if (square < 4.0) return marks.touched[c] = true;
-    if (marks.wake[c] < 0.0) blank(c);
-    marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(square) - 2.0);
+    if (marks.next_check[c] < 0.0) blank(c);
+    marks.next_check[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(square) - 2.0);
     return false;
   }
 
   void forget(std::size_t c) {
     for (int r = 0; r < kHistoryRows; ++r) history[c * kHistoryRows + r] = Row{};
-    if constexpr (Law::kLayered) marks.runs[c] = 0;
+    if constexpr (Law::kLayered) marks.segments[c] = 0;
   }
 
   void blank(std::size_t c) {
     forget(c);
-    const int n = plan.candidate[c].guest;
-    if (n >= 0) guest[2 * static_cast<std::size_t>(n)] = guest[2 * static_cast<std::size_t>(n) + 1] = Row{};
+    const int n = plan.candidate[c].remote;
+    if (n >= 0) remote[2 * static_cast<std::size_t>(n)] = remote[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
 
   void compute(const int* touching, int count, const V* parameter, const LawParameters<V>& law) {
@@ -304,13 +312,13 @@ struct Packed {
       group[n] = group_of(touching + n * W, count - n * W);
       contact[n].history = memory[n];
       read_history(group[n], memory[n]);
-      const Meeting<V> m = meeting(group[n]);
-      meet(m, dot(m.separation, m.separation), contact[n]);
+      const ContactInput<V> m = contact_input(group[n]);
+      relative_motion(m, dot(m.separation, m.separation), contact[n]);
     }
     close(contact, groups, parameter);
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
     if constexpr (Law::kLayered) {
-      friction(Law{}, contact, groups, law, [&](int n) { return runs_of(group[n]); });
+      friction(Law{}, contact, groups, law, [&](int n) { return segments_of(group[n]); });
     } else {
       friction(Law{}, contact, groups, law);
     }
@@ -338,7 +346,7 @@ struct Packed {
     return g;
   }
 
-  GMEM_INLINE Meeting<V> meeting(const Group& g) const {
+  GMEM_INLINE ContactInput<V> contact_input(const Group& g) const {
     const auto one = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); }); };
     const auto other = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_other].*row); }); };
     const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l].one; });
@@ -367,21 +375,21 @@ struct Packed {
     }
   }
 
-  Runs runs_of(const Group& g) {
-    Runs runs;
-    runs.stride = run_stride();
-    runs.rings = problem.points;
-    runs.most = 0;
-    runs.lanes = g.count;
+  Segments segments_of(const Group& g) {
+    Segments segments;
+    segments.stride = segment_stride();
+    segments.rings = problem.points;
+    segments.most = 0;
+    segments.lanes = g.count;
     for (int l = 0; l < W; ++l) {
-      runs.first[l] = run + g.c[l];
-      runs.stored[l] = marks.runs + g.c[l];
-      runs.most = *runs.stored[l] > runs.most ? *runs.stored[l] : runs.most;
+      segments.first[l] = segment + g.c[l];
+      segments.stored[l] = marks.segments + g.c[l];
+      segments.most = *segments.stored[l] > segments.most ? *segments.stored[l] : segments.most;
     }
-    return runs;
+    return segments;
   }
 
-  GMEM_INLINE void add(const Group& g, const Push<V>& push) {
+  GMEM_INLINE void add(const Group& g, const ContactLoads<V>& push) {
     const Rows force = rows_of(push.force);
     const Rows torque_one = rows_of(push.torque_one), torque_other = rows_of(push.torque_other);
     Row f[W], t_one[W], t_other[W];
@@ -394,10 +402,10 @@ struct Packed {
   GMEM_INLINE void add(const Candidate& pair, Row force, Row torque_one, Row torque_other) {
     GrainRows &one = grain[pair.grain_one], &other = grain[pair.grain_other];
     const bool away_is_one = pair.grain_one > pair.grain_other;
-    if (pair.guest < 0 || !away_is_one) one.force += force, one.torque += torque_one;
-    if (pair.guest < 0 || away_is_one) other.force -= force, other.torque += torque_other;
-    if (pair.guest >= 0) {
-      Row* to = guest + 2 * static_cast<std::size_t>(pair.guest);
+    if (pair.remote < 0 || !away_is_one) one.force += force, one.torque += torque_one;
+    if (pair.remote < 0 || away_is_one) other.force -= force, other.torque += torque_other;
+    if (pair.remote >= 0) {
+      Row* to = remote + 2 * static_cast<std::size_t>(pair.remote);
       to[0] = away_is_one ? force : -force;
       to[1] = away_is_one ? torque_one : torque_other;
     }

@@ -133,26 +133,26 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
 
   // Guests, numbered by the grain they act on so that it finds them together.
   std::vector<int32_t> visits(list.grains + 1, 0);
-  const auto guest = [&](const Candidate& c) { return domain_of[home(c)] != domain_of[away(c)]; };
-  for (const Candidate& c : candidates) visits[away(c) + 1] += guest(c);
+  const auto remote = [&](const Candidate& c) { return domain_of[home(c)] != domain_of[away(c)]; };
+  for (const Candidate& c : candidates) visits[away(c) + 1] += remote(c);
   std::partial_sum(visits.begin(), visits.end(), visits.begin());
-  store->guest_start = visits;
-  store->guest_sphere.resize(store->guest_start.back());
+  store->remote_start = visits;
+  store->remote_sphere.resize(store->remote_start.back());
   for (Candidate& c : candidates) {
-    if (!guest(c)) continue;
-    c.guest = visits[away(c)]++;
-    store->guest_sphere[c.guest] = away(c) == c.grain_one ? c.one : c.other;
+    if (!remote(c)) continue;
+    c.remote = visits[away(c)]++;
+    store->remote_sphere[c.remote] = away(c) == c.grain_one ? c.one : c.other;
   }
 
   store->plan = {count,
                  static_cast<int>(store->domain_candidate.size()) - 1,
-                 store->guest_start.back(),
+                 store->remote_start.back(),
                  static_cast<int>(store->padding_row.size()),
                  store->grain.data(),
                  candidates.data(),
                  store->domain_candidate.data(),
-                 store->guest_start.data(),
-                 store->guest_sphere.data(),
+                 store->remote_start.data(),
+                 store->remote_sphere.data(),
                  store->padding_row.data()};
   return store;
 }

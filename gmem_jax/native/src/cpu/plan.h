@@ -4,7 +4,7 @@
 // Grains are renumbered so that neighbours in space are neighbours in memory. They are divided into domains of about
 // equal numbers of candidates. A candidate belongs to the domain of its lower-numbered grain; one thread computes a
 // domain's contacts in order and adds the forces to that domain's grains at once. Forces on grains of other domains
-// ("guests") are stored, and added when the grain is moved.
+// ("remote" forces) are stored, and added when the grain is moved.
 
 #pragma once
 
@@ -28,7 +28,7 @@ struct List {
 // A plan and the memory it points to.
 struct PlanStore {
   Plan plan;
-  std::vector<int32_t> grain, domain_candidate, guest_start, guest_sphere, padding_row;
+  std::vector<int32_t> grain, domain_candidate, remote_start, remote_sphere, padding_row;
   std::vector<Candidate> candidate;
 };
 

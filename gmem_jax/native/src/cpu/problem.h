@@ -34,7 +34,7 @@ struct Problem {
 struct Candidate {
   int32_t one, other;              // spheres
   int32_t grain_one, grain_other;  // their grains
-  int32_t guest;                   // where the force on the grain of another domain waits, or -1
+  int32_t remote;                   // where the force on the grain of another domain waits, or -1
   int32_t row;                     // in the arrays of the call
 };
 
@@ -42,13 +42,13 @@ struct Candidate {
 struct Plan {
   int candidates;
   int domains;
-  int guests;
+  int remotes;
   int padding;                      // rows of the list without a candidate
   const int32_t* grain;             // number in the call of each grain, [N]
   const Candidate* candidate;       // by domain
   const int32_t* domain_candidate;  // first candidate of each domain, [domains + 1]
-  const int32_t* guest_start;       // the guests of each grain: guest_start[g] to guest_start[g + 1], [N + 1]
-  const int32_t* guest_sphere;      // that each guest acts on, [guests]
+  const int32_t* remote_start;       // the remotes of each grain: remote_start[g] to remote_start[g + 1], [N + 1]
+  const int32_t* remote_sphere;      // that each remote acts on, [remotes]
   const int32_t* padding_row;       // [padding]
 };
 
@@ -84,8 +84,9 @@ struct Block {
 // The threads that share one block; see team.h.
 class Team;
 
-// Hands out aligned pieces of the scratch memory; every thread of a team repeats the same sequence.
-struct Carver {
+// Hands out aligned pieces of the scratch memory; every thread of a team repeats the same sequence. With `base` null it
+// only counts.
+struct Arena {
   char* base;
   std::size_t used = 0;
 

@@ -19,8 +19,8 @@ template <class V>
 struct Trace {
   bool* touched = nullptr;  // [candidates]
   V* history;               // [candidates, kHistory] of the law
-  Run<V>* run;              // [candidates, Q], where a contact came to another ring
-  int* runs;                // [candidates]; -1 where it did not
+  Segment<V>* segment;      // [candidates, Q], where a contact came to another ring
+  int* segments;            // [candidates]; -1 where it did not
 };
 
 template <class V>
@@ -50,17 +50,40 @@ GMEM_INLINE Single<N> overlap_of(const Contact<Single<N>>& c) {
 
 // What contacts look up of a grain, in their precision.
 template <class C>
-struct Looks {
+struct GrainMotion {
   C velocity[3], spin[3];
+};
+
+// The memory of a `Replicas`.
+template <class Law, class V, class C>
+struct ReplicasLayout {
+  V* sphere;               // [S, 3]: centres
+  GrainMotion<C>* motion;  // [N], in mixed precision; in the other, `hot` has all
+  C* remote;               // [remotes, 6]: force and torque
+  C* history;              // [candidates, Law::kHistory]
+  Segment<C>* segment;     // [Q, candidates] of the Mindlin law: those that are few lie together
+  Marks<Law> marks;
+
+  void place(const Problem& p, const Plan& plan, Arena& arena) {
+    const std::size_t candidates = plan.candidates;
+    sphere = arena.take<V>(static_cast<std::size_t>(p.spheres()) * 3);
+    motion = arena.take<GrainMotion<C>>(std::is_same<V, C>::value ? 0 : p.grains);
+    remote = arena.take<C>(static_cast<std::size_t>(plan.remotes) * 6);
+    history = arena.take<C>(candidates * Law::kHistory);
+    marks.place(plan, arena);
+    segment = arena.take<Segment<C>>(Law::kLayered ? candidates * p.points : 0);
+  }
 };
 
 // V is the number of grains, C that of contacts and their histories: the same, or single precision.
 template <class Law, class V, class C = V>
-struct Replicas {
+struct Replicas : ReplicasLayout<Law, V, C> {
+  using Layout = ReplicasLayout<Law, V, C>;
+  using Layout::sphere, Layout::motion, Layout::remote, Layout::history, Layout::segment, Layout::marks;
   using Number = V;
   using OfContacts = C;
   static constexpr bool kMixed = !std::is_same<V, C>::value;
-  static constexpr bool kLooks = kMixed;
+  static constexpr bool kKeepsMotion = kMixed;
 
   const Problem& problem;
   const Block& block;
@@ -68,12 +91,6 @@ struct Replicas {
   bool adjacent;  // the lanes are neighbours in every array of the call
   bool together;  // they all have the same number of steps
   V* hot;         // the engine's
-  V* sphere;      // [S, 3]: centres
-  Looks<C>* looks;  // [N], in mixed precision; in the other, `hot` has all
-  C* guest;       // [guests, 6]: force and torque
-  C* history;     // [candidates, Law::kHistory]
-  Run<C>* run;    // [Q, candidates] of the Mindlin law: those that are few lie together
-  Marks marks;
   Trace<C> trace;
   bool apart = false;  // Mindlin's rings each by itself, for their derivatives
 
@@ -95,18 +112,7 @@ struct Replicas {
   static int units(const Problem& p) { return p.grains; }
   static int unit_of(int grain) { return grain; }
 
-  static std::size_t carve(const Problem& p, const Plan& plan, Carver& carver, Replicas* mode) {
-    const std::size_t candidates = plan.candidates;
-    V* sphere = carver.take<V>(static_cast<std::size_t>(p.spheres()) * 3);
-    Looks<C>* looks = carver.take<Looks<C>>(kMixed ? p.grains : 0);
-    C* guest = carver.take<C>(static_cast<std::size_t>(plan.guests) * 6);
-    C* history = carver.take<C>(candidates * Law::kHistory);
-    if (mode) mode->sphere = sphere, mode->looks = looks, mode->guest = guest, mode->history = history;
-    carve_marks<Law>(plan, carver, mode ? &mode->marks : nullptr);
-    Run<C>* run = carver.take<Run<C>>(Law::kLayered ? candidates * p.points : 0);
-    if (mode) mode->run = run;
-    return carver.used;
-  }
+  void use(const Layout& layout, V* of_engine) { static_cast<Layout&>(*this) = layout, hot = of_engine; }
 
   // Number `row` of an array in every lane; a short block repeats its last replica.
   template <class Pointer>
@@ -178,9 +184,9 @@ struct Replicas {
     }
   }
 
-  StoredRuns<V> runs_of(std::size_t c) const {
-    if (!trace.touched) return {run + c, plan.candidates, marks.runs + c, problem.points};
-    return {run + c, plan.candidates, marks.runs + c, problem.points, trace.run + c * problem.points, trace.runs + c};
+  StoredSegments<V> segments_of(std::size_t c) const {
+    if (!trace.touched) return {segment + c, plan.candidates, marks.segments + c, problem.points};
+    return {segment + c, plan.candidates, marks.segments + c, problem.points, trace.segment + c * problem.points, trace.segments + c};
   }
   V outermost(std::size_t c, const LawParameters<V>& law) const {
     return Reach<V, Law::variant>(history[c * Law::kHistory + kLastOverlap], law, problem.points).outer;
@@ -189,7 +195,7 @@ struct Replicas {
   void load_history(std::ptrdiff_t c, const LawParameters<V>& law) {
     const std::ptrdiff_t row = plan.candidate[c].row;
     marks.touched[c] = true;
-    marks.wake[c] = 0.0;
+    marks.next_check[c] = 0.0;
     for (int q = 0; q < Law::kGiven; ++q) {
       const Place place = place_of<Law>(row, q);
       history[c * Law::kHistory + q] =
@@ -203,7 +209,7 @@ struct Replicas {
         const std::ptrdiff_t from = (row * problem.points + j) * 2;
         return Flat<V>{read(in, from), read(in, from + 1)};
       };
-      store_layers(history + c * Law::kHistory + kLayers, runs_of(c).load(outer, kLacking<Law::variant>, apart, ring));
+      store_layers(history + c * Law::kHistory + kLayers, segments_of(c).load(outer, kLacking<Law::variant>, apart, ring));
     }
   }
 
@@ -217,7 +223,7 @@ struct Replicas {
     if constexpr (Law::kLayered) {
       const V outer = outermost(c, law);
       const Layers<V> layers = load_layers(history + c * Law::kHistory + kLayers);
-      runs_of(c).unload(layers, outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Flat<V> f) {
+      segments_of(c).unload(layers, outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Flat<V> f) {
         const auto out = [](const Lane& lane) { return lane.history_out[0]; };
         const std::ptrdiff_t to = (row * problem.points + j) * 2;
         write(out, to, f.along, steps_done);
@@ -248,25 +254,25 @@ struct Replicas {
   void put_grain(int u, Vec<V>, [[maybe_unused]] Vec<V> velocity, [[maybe_unused]] Vec<V> spin, Vec<V> force,
                  Vec<V> torque) {
     if constexpr (kMixed) {
-      store_vec(looks[u].velocity, convert<C>(velocity));
-      store_vec(looks[u].spin, convert<C>(spin));
+      store_vec(motion[u].velocity, convert<C>(velocity));
+      store_vec(motion[u].spin, convert<C>(spin));
     }
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kForce, force);
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque, torque);
   }
 
   // Velocities that `put_grain` left: drag and gyroscopic torques are in the precision of contacts.
-  void look(int u, Vec<V>& velocity, Vec<V>& spin) const {
-    velocity = convert<V>(load_vec(looks[u].velocity));
-    spin = convert<V>(load_vec(looks[u].spin));
+  void read_motion(int u, Vec<V>& velocity, Vec<V>& spin) const {
+    velocity = convert<V>(load_vec(motion[u].velocity));
+    spin = convert<V>(load_vec(motion[u].spin));
   }
 
   void total_force(int u, Vec<V>& force, Vec<V>& torque) const {
     force = load_vec(hot + static_cast<std::size_t>(u) * kHot + kForce);
     torque = load_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque);
-    for (int n = plan.guest_start[u]; n < plan.guest_start[u + 1]; ++n) {
-      force = force + convert<V>(load_vec(guest + 6 * static_cast<std::size_t>(n)));
-      torque = torque + convert<V>(load_vec(guest + 6 * static_cast<std::size_t>(n) + 3));
+    for (int n = plan.remote_start[u]; n < plan.remote_start[u + 1]; ++n) {
+      force = force + convert<V>(load_vec(remote + 6 * static_cast<std::size_t>(n)));
+      torque = torque + convert<V>(load_vec(remote + 6 * static_cast<std::size_t>(n) + 3));
     }
   }
 
@@ -291,7 +297,7 @@ struct Replicas {
   void remember(std::size_t c) {
     trace.touched[c] = true;
     for (int q = 0; q < Law::kHistory; ++q) trace.history[c * Law::kHistory + q] = history[c * Law::kHistory + q];
-    if constexpr (Law::kLayered) trace.runs[c] = -1;
+    if constexpr (Law::kLayered) trace.segments[c] = -1;
   }
 
   void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel) {
@@ -305,7 +311,7 @@ struct Replicas {
       int found = 0;
       for (int c = look; c < look_end; ++c) {
         awake[found] = c;
-        found += !(marks.wake[c] > travel);  // also where it is not a number
+        found += !(marks.next_check[c] > travel);  // also where it is not a number
       }
       for (int n = 0; n < found; ++n) {
         const int c = awake[n];
@@ -325,12 +331,12 @@ struct Replicas {
         const V square = dot(other - one, other - one);
         if (!bits_less(square, contact_square)) {
           if (marks.touched[c]) forget(c, pair);
-          marks.wake[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(smallest(square)) - 2.0);
+          marks.next_check[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(smallest(square)) - 2.0);
           continue;
         }
         marks.touched[c] = true;
         if (trace.touched) remember(c);
-        meet(meeting(pair, one, other), convert<C>(square), contact[count]);
+        relative_motion(contact_input(pair, one, other), convert<C>(square), contact[count]);
         if constexpr (kMixed) contact[count].before = convert<C>(contact_square - square);
         contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
         touching[count++] = c;
@@ -345,7 +351,7 @@ struct Replicas {
   void compute(const int* touching, int count, Contact<C>* contact, const C* parameter, const LawParameters<C>& law) {
     close(contact, count, parameter);
     if constexpr (Law::kLayered) {
-      friction(Law{}, contact, count, law, [&](int n) { return runs_of(touching[n]); });
+      friction(Law{}, contact, count, law, [&](int n) { return segments_of(touching[n]); });
     } else {
       friction(Law{}, contact, count, law);
     }
@@ -355,16 +361,16 @@ struct Replicas {
   void forget(std::size_t c, const Candidate& pair) {
     marks.touched[c] = false;
     for (int q = 0; q < Law::kHistory; ++q) history[c * Law::kHistory + q] = C{};
-    if constexpr (Law::kLayered) marks.runs[c] = 0;
-    if (pair.guest >= 0)
-      for (int q = 0; q < 6; ++q) guest[6 * static_cast<std::size_t>(pair.guest) + q] = C{};
+    if constexpr (Law::kLayered) marks.segments[c] = 0;
+    if (pair.remote >= 0)
+      for (int q = 0; q < 6; ++q) remote[6 * static_cast<std::size_t>(pair.remote) + q] = C{};
   }
 
-  GMEM_INLINE Meeting<C> meeting(const Candidate& pair, Vec<V> centre_one, Vec<V> centre_other) const {
+  GMEM_INLINE ContactInput<C> contact_input(const Candidate& pair, Vec<V> centre_one, Vec<V> centre_other) const {
     const V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
     const V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
     if constexpr (kMixed) {
-      const Looks<C>&of_one = looks[pair.grain_one], &of_other = looks[pair.grain_other];
+      const GrainMotion<C>&of_one = motion[pair.grain_one], &of_other = motion[pair.grain_other];
       const Vec<C> separation = convert<C>(centre_other - centre_one), half = splat<C>(0.5) * separation;
       return {separation,
               convert<C>(centre_one - load_vec(one + kPosition)) + half,
@@ -384,20 +390,20 @@ struct Replicas {
   }
 
   // The lower-numbered grain is at home in this domain, the other may be elsewhere.
-  GMEM_INLINE void add(const Candidate& pair, const Push<C>& push) {
+  GMEM_INLINE void add(const Candidate& pair, const ContactLoads<C>& push) {
     V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
     V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
     const bool away_is_one = pair.grain_one > pair.grain_other;
-    if (pair.guest < 0 || !away_is_one) {
+    if (pair.remote < 0 || !away_is_one) {
       store_vec(one + kForce, load_vec(one + kForce) + convert<V>(push.force));
       store_vec(one + kTorque, load_vec(one + kTorque) + convert<V>(push.torque_one));
     }
-    if (pair.guest < 0 || away_is_one) {
+    if (pair.remote < 0 || away_is_one) {
       store_vec(other + kForce, load_vec(other + kForce) - convert<V>(push.force));
       store_vec(other + kTorque, load_vec(other + kTorque) + convert<V>(push.torque_other));
     }
-    if (pair.guest >= 0) {
-      C* to = guest + 6 * static_cast<std::size_t>(pair.guest);
+    if (pair.remote >= 0) {
+      C* to = remote + 6 * static_cast<std::size_t>(pair.remote);
       store_vec(to, away_is_one ? push.force : -push.force);
       store_vec(to + 3, away_is_one ? push.torque_one : push.torque_other);
     }

@@ -50,7 +50,7 @@ struct Arguments {
   Table cold;       // orientation, half-step velocity and spin, [N, 10, L]
   Table pressure;   // summed over steps, [N, 3, L]
   Table history;    // beside rings, [2 P, kHistory, L]
-  Table runs;       // of rings of the Mindlin law: force and first ring, [2 P, Q, 3, L]
+  Table segments;   // of rings of the Mindlin law: force and first ring, [2 P, Q, 3, L]
   int* stored;      // ... how many, [2 P, L]
 };
 

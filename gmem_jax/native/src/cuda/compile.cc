@@ -71,13 +71,7 @@ void keep(const std::string& path, const std::string& code) {
 }
 
 std::string law_as_type(const Which& which) {
-  static const char* const variants[] = {"exact", "averaged", "paper"};
-  switch (which.law) {
-    case Law::hooke: return "Hooke";
-    case Law::mindlin_rescaled: return "Rescaled";
-    case Law::mindlin: return std::string("Layered<Variant::") + variants[static_cast<int>(which.variant)] + ">";
-    default: return "Frictionless";
-  }
+  return with_law(which.law, which.variant, [](auto law) { return std::string(decltype(law)::kType); });
 }
 
 std::string compiled(const Nvrtc& nvrtc, const std::string& architecture, const Which& which, std::string* log) {

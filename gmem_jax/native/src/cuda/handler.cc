@@ -34,18 +34,13 @@ Wants arguments_of(Task task, Law law) {
 Wants results_of(Law law) {
   const Wants between = {{"hot", "2DN9L"},  {"spheres", "2DS3L"},  {"cold", "DNCL"},
                          {"sums", "DN3L"}, {"memories", "DMHL"}};
-  const Wants layered = {{"runs", "DMQ3L"}, {"stored", "ML", ffi::S32}};
+  const Wants layered = {{"segments", "DMQ3L"}, {"stored", "ML", ffi::S32}};
   const Wants all = fields_of_grains() + pressures() + histories(law) + between;
   return law == Law::mindlin ? all + layered : all;
 }
 
 int numbers_remembered(Law law) {
-  switch (law) {
-    case Law::hooke: return Hooke::kHistory;
-    case Law::mindlin_rescaled: return Rescaled::kHistory;
-    case Law::mindlin: return Layered<Variant::exact>::kHistory;
-    default: return Frictionless::kHistory;
-  }
+  return with_law(law, Variant::exact, [](auto law) { return static_cast<int>(decltype(law)::kHistory); });
 }
 
 template <class T>
@@ -135,7 +130,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.pressure = between(next(), a.grains * int64_t{3});
   a.history = between(next(), reader.size('M') * reader.size('H'));
   if (which.law == Law::mindlin) {
-    a.runs = between(next(), reader.size('M') * points * 3);
+    a.segments = between(next(), reader.size('M') * points * 3);
     a.stored = reinterpret_cast<int*>(next());
   }
 

@@ -69,18 +69,18 @@ struct Lane {
   }
 };
 
-// The runs of one side, in one lane; see physics/runs.h.
+// The segments of one side, in one lane; see physics/segments.h.
 template <class V>
-struct Runs {
+struct Segments {
   Column<V> at;
   int* stored;
   int rings;
 
   int points() const { return rings; }
   int count() const { return *stored; }
-  Run<V> get(int k) const { return {{at[3 * k], at[3 * k + 1]}, at[3 * k + 2]}; }
-  void set(int k, const Run<V>& run) const {
-    at.put(3 * k, run.force.along), at.put(3 * k + 1, run.force.across), at.put(3 * k + 2, run.start);
+  Segment<V> get(int k) const { return {{at[3 * k], at[3 * k + 1]}, at[3 * k + 2]}; }
+  void set(int k, const Segment<V>& segment) const {
+    at.put(3 * k, segment.force.along), at.put(3 * k + 1, segment.force.across), at.put(3 * k + 2, segment.start);
   }
   void keep(V counts) const { *stored = static_cast<int>(largest(counts)); }
   void remember() const {}
@@ -122,9 +122,9 @@ int outermost(const Lane<V>& on, long long side, const LawParameters<V>& law) {
 }
 
 template <class V>
-Runs<V> runs_of(const Lane<V>& on, long long side) {
+Segments<V> segments_of(const Lane<V>& on, long long side) {
   const Arguments& a = on.a;
-  Column<V> at = on.in(a.runs);
+  Column<V> at = on.in(a.segments);
   at.value += side * a.points * 3 * at.stride;
   if (__is_class(V)) at.slope += side * a.points * 3 * at.stride;
   return {at, a.stored + side * a.lanes + on.lane, a.points};
@@ -135,7 +135,7 @@ template <class V>
 GMEM_INLINE void begin(const Lane<V>& on, int grain, const GrainParameters<V>& constants, const Grain<V>& from,
                        int next) {
   const Arguments& a = on.a;
-  const Midway<V> m = begin_step(constants, from);
+  const HalfStep<V> m = begin_step(constants, from);
   const Column<V> hot = on.in(a.hot[next]), cold = on.in(a.cold), sphere = on.in(a.sphere[next]);
   const long long h = grain * 9ll, c = grain * 10ll;
   hot.put(h, m.position), hot.put(h + 3, m.velocity), hot.put(h + 6, m.spin);
@@ -193,7 +193,7 @@ void enter(const Arguments& a, int thread) {
       const Column<V> rings = on.in(a.history_in[0]);
       const long long first = 2ll * row * a.points;
       V layers[Law::kHistory - kLayers];
-      store_layers(layers, runs_of(on, side).load(outermost<V, Law>(on, side, law), kLacking<Law::variant>, [&](int j) {
+      store_layers(layers, segments_of(on, side).load(outermost<V, Law>(on, side, law), kLacking<Law::variant>, [&](int j) {
         return Flat<V>{rings[first + 2 * j], rings[first + 2 * j + 1]};
       }));
       for (int n = kLayers; n < Law::kHistory; ++n)
@@ -213,7 +213,7 @@ struct Load {
 
 // The contact of one side, which touches.
 template <class V, class Law>
-GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side& side, const Midway<V>& own,
+GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side& side, const HalfStep<V>& own,
                        Vec<V> here, Vec<V> there, const V* parameter, const LawParameters<V>& law, Load<V>& load) {
   const Arguments& a = on.a;
   const bool first = side.other >= 0;
@@ -226,7 +226,7 @@ GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side&
   const auto pick = [first](Vec<V> one, Vec<V> two) {
     return Vec<V>{select(first, one.x, two.x), select(first, one.y, two.y), select(first, one.z, two.z)};
   };
-  const Meeting<V> meeting{pick(gap, -gap),
+  const ContactInput<V> meeting{pick(gap, -gap),
                            pick(point - own.position, point - position),
                            pick(point - position, point - own.position),
                            pick(velocity - own.velocity, own.velocity - velocity),
@@ -235,16 +235,16 @@ GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side&
   V history[Law::kHistory + 1];
   for (int n = 0; n < Law::kHistory; ++n) history[n] = stored[number * Law::kHistory + n];
   Contact<V> contact;
-  meet(meeting, dot(gap, gap), contact);
+  relative_motion(meeting, dot(gap, gap), contact);
   contact.history = history;
   close(&contact, 1, parameter);
   if constexpr (Law::kLayered) {
-    friction(Law{}, &contact, 1, law, [&](int) { return runs_of(on, number); });
+    friction(Law{}, &contact, 1, law, [&](int) { return segments_of(on, number); });
   } else {
     friction(Law{}, &contact, 1, law);
   }
   for (int n = 0; n < Law::kHistory; ++n) stored.put(number * Law::kHistory + n, history[n]);
-  const Push<V> p = push(contact);
+  const ContactLoads<V> p = push(contact);
   load.force = load.force + pick(p.force, -p.force);
   load.torque = load.torque + pick(p.torque_one, p.torque_other);
 }
@@ -256,7 +256,7 @@ inline void forget(const Lane<V>& on, long long number) {
   if (Law::kHistory > kLastOverlap && is_zero(stored[number * Law::kHistory + kLastOverlap])) return;
   for (int n = 0; n < Law::kHistory; ++n)
     if (!is_zero(stored[number * Law::kHistory + n])) stored.put(number * Law::kHistory + n, V{});
-  if constexpr (Law::kLayered) runs_of(on, number).keep(V{});
+  if constexpr (Law::kLayered) segments_of(on, number).keep(V{});
 }
 
 // One step. Thread of grain and lane.
@@ -270,7 +270,7 @@ void advance(const Arguments& a, int step, int thread) {
   const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
   const Column<V> hot = on.in(a.hot[now]), cold = on.in(a.cold), sphere = on.in(a.sphere[now]);
   const long long h = grain * 9ll, c = grain * 10ll;
-  Midway<V> own{hot.vec(h), {}, hot.vec(h + 3), hot.vec(h + 6), {}, {}};
+  HalfStep<V> own{hot.vec(h), {}, hot.vec(h + 3), hot.vec(h + 6), {}, {}};
   Load<V> load{};
   const int end = a.start.of(on.entry)[grain + 1];
   for (int number = a.start.of(on.entry)[grain]; number < end; ++number) {
@@ -342,7 +342,7 @@ void leave(const Arguments& a, int thread) {
       const Column<V> history = on.in(a.history);
       V layers[Law::kHistory - kLayers];
       for (int n = kLayers; n < Law::kHistory; ++n) layers[n - kLayers] = history[side * Law::kHistory + n];
-      runs_of(on, side).unload(load_layers(layers), outermost<V, Law>(on, side, law), put);
+      segments_of(on, side).unload(load_layers(layers), outermost<V, Law>(on, side, law), put);
     }
   }
 }

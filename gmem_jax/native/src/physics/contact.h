@@ -9,7 +9,7 @@ namespace GMEM_ISA {
 
 // The two spheres of a contact, i and j, and their grains.
 template <class V>
-struct Meeting {
+struct ContactInput {
   Vec<V> separation;              // of the spheres, j - i
   Vec<V> lever_one, lever_other;  // from the grains' centres to the contact point, halfway between the spheres
   Vec<V> velocity;                // of the grains, j - i
@@ -19,7 +19,7 @@ struct Meeting {
 // Levers and relative motion, unprojected. The first part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
 template <class V>
-GMEM_INLINE void meet(const Meeting<V>& m, V square, Contact<V>& c) {
+GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, Contact<V>& c) {
   c.normal = m.separation;
   c.square = square;
   c.sliding = add_cross(add_cross(m.velocity, m.spin_other, m.lever_other), m.lever_one, m.spin_one);
@@ -32,7 +32,7 @@ GMEM_INLINE void meet(const Meeting<V>& m, V square, Contact<V>& c) {
 template <class V>
 GMEM_INLINE V overlap_of(const Contact<V>& c) { return fnma(c.square, c.inverse, splat<V>(2.0)); }
 
-// From what `meet` left to normals, sliding velocities and normal forces. The second part of
+// From what `relative_motion` left to normals, sliding velocities and normal forces. The second part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
 template <class V>
 inline void close(Contact<V>* c, int count, const V* parameter) {
@@ -59,12 +59,12 @@ inline void close(Contact<V>* c, int count, const V* parameter) {
 // Force on i, and torques about the centres of both grains (j takes the opposite force).
 // gmem_jax/physics/step.py: contact_forces
 template <class V>
-struct Push {
+struct ContactLoads {
   Vec<V> force, torque_one, torque_other;
 };
 
 template <class V>
-GMEM_INLINE Push<V> push(const Contact<V>& c) {
+GMEM_INLINE ContactLoads<V> push(const Contact<V>& c) {
   const Vec<V> force = fnma(c.normal_force, c.normal, c.force);
   return {force, cross(c.lever_one, force), cross(force, c.lever_other)};
 }

@@ -4,7 +4,7 @@
 
 #include "numbers/vectors.h"
 #include "physics/parameters.h"
-#include "physics/runs.h"
+#include "physics/segments.h"
 
 namespace gmem {
 namespace GMEM_ISA {
@@ -198,11 +198,11 @@ GMEM_INLINE Vec<V> any_tangent(Vec<V> normal) {
   return {select(near_x, V{}, one), zero_unless(near_x, one), V{}};
 }
 
-// `runs_of(n)` are those of contact n: with `points()`; `count()`, of the lane that has most; `get(k)` and `set(k, run)`;
+// `segments_of(n)` are those of contact n: with `points()`; `count()`, of the lane that has most; `get(k)` and `set(k, run)`;
 // `keep(counts)`, of each lane; and `remember()`, called before they change.
 // gmem_jax/physics/contact/mindlin.py: Mindlin.__call__
-template <class V, Variant variant, class RunsOf>
-GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, const LawParameters<V>& law, const RunsOf& runs_of) {
+template <class V, Variant variant, class SegmentsOf>
+GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, const LawParameters<V>& law, const SegmentsOf& segments_of) {
   const V one = splat<V>(1.0), lacking = splat<V>(kLacking<variant>);
   const auto frame = [](const Contact<V>& now) {
     return select(now.history[kLastOverlap] > V{}, load_vec(now.history), any_tangent(now.normal));
@@ -213,8 +213,8 @@ GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, const LawP
   V weight[kTogether], total[kTogether];  // of the rings inside the outermost; of all
   Mask<V> attached[kTogether];
   for (int n = 0; n < count; ++n) {
-    auto runs = runs_of(n);
-    const int points = runs.points();
+    auto segments = segments_of(n);
+    const int points = segments.points();
     const Reach<V, variant> before(c[n].history[kLastOverlap], law, points), now(c[n].overlap, law, points);
     Layers<V> layers = load_layers(c[n].history + kLayers);
     if (variant == Variant::averaged) {  // the force in a ring that fills stays: Mindlin._diluted
@@ -223,7 +223,7 @@ GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, const LawP
       layers.rim = select(grows, filled / select(grows, fills, one), one) * layers.rim;
     }
     if (bits_less(before.outer, now.outer) | bits_less(now.outer, before.outer))
-      reattach(runs, layers, before.outer, now.outer, kLacking<variant>);
+      reattach(segments, layers, before.outer, now.outer, kLacking<variant>);
     store_layers(c[n].history + kLayers, layers);
 
     const Mask<V> beyond = V{} < now.outer;

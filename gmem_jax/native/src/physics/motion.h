@@ -23,7 +23,7 @@ struct Grain {
 
 // ... with position and orientation at its end, velocities predicted for it, and those of the middle of the step.
 template <class V>
-struct Midway {
+struct HalfStep {
   Vec<V> position;
   Quaternion<V> orientation;
   Vec<V> velocity, spin, half_velocity, half_spin;
@@ -50,7 +50,7 @@ struct GrainParameters {
 // First half of a step: positions and orientations at its end, and velocities predicted for it.
 // gmem_jax/physics/step.py: step (up to the forces)
 template <class V>
-GMEM_INLINE Midway<V> begin_step(const GrainParameters<V>& p, const Grain<V>& g) {
+GMEM_INLINE HalfStep<V> begin_step(const GrainParameters<V>& p, const Grain<V>& g) {
   const Vec<V> half_velocity = fma(p.half_dt, g.acceleration, g.velocity), half_spin = fma(p.half_dt, g.spin_rate, g.spin);
   return {fma(p.dt, half_velocity, g.position),
           turn(g.orientation, p.dt * half_spin),
@@ -75,7 +75,7 @@ inline Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropic, 
 // Second half: accelerations and velocities; position and orientation stay.
 // gmem_jax/physics/step.py: step (from the forces on)
 template <class V>
-GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const Midway<V>& m, Vec<V> force, Vec<V> torque) {
+GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const HalfStep<V>& m, Vec<V> force, Vec<V> torque) {
   const Vec<V> acceleration = fnma(p.drag, m.velocity, p.inverse_mass * force);
   const Vec<V> spin_rate = fnma(p.drag, m.spin, angular_acceleration(p, isotropic, m.orientation, m.spin, torque));
   return {m.position,   m.orientation, fma(p.half_dt, acceleration, m.half_velocity), fma(p.half_dt, spin_rate, m.half_spin),
@@ -127,7 +127,7 @@ inline void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> lever
 // Finds the spheres of a grain, handed to `put(k, centre)`, and what the walls do to them; whether they are near them.
 // gmem_jax/physics/step.py: sphere_table
 template <class V, class Put>
-GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const Midway<V>& m, const double* offsets, int spheres,
+GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const double* offsets, int spheres,
                             double arm, const WallState<V>& box, WallForces<V>& on, const Put& put) {
   const Matrix<V> rotation = matrix(m.orientation);
   const bool near = bits_less(V{}, deepest(splat<V>(1.0 + arm), m.position, box)) != 0;

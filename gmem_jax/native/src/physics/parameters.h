@@ -27,8 +27,16 @@ constexpr int kSpinning = kLaw + 3;
 // Where a history has the overlap of the last step, if it has it; and Mindlin's `Layers`.
 constexpr int kLastOverlap = 3, kLayers = 4;
 
-// The laws as types.
+// One array of a history, as a call has it: its name, and its axes (see call/signature.h).
+struct Leaf {
+  const char *name, *axes;
+};
+
+// The laws as types. `kType` is what its type is called, for the compiler of a GPU's kernels; `kLeaves` are the arrays of
+// its history, up to the first without a name.
 struct Frictionless {
+  static constexpr const char* kType = "Frictionless";
+  static constexpr Leaf kLeaves[kMaxHistory] = {};
   static constexpr int kHistory = 0;  // numbers remembered of a contact from step to step, beside Mindlin's layers
   static constexpr int kGiven = 0;    // those of them, the first, that come and go in the arrays of a call
   static constexpr int kVectors = 0;  // those of these that are components of a vector
@@ -36,6 +44,8 @@ struct Frictionless {
 };
 
 struct Hooke {
+  static constexpr const char* kType = "Hooke";
+  static constexpr Leaf kLeaves[kMaxHistory] = {{"forces", "P3B"}};
   static constexpr int kHistory = 3;
   static constexpr int kGiven = 3;
   static constexpr int kVectors = 3;
@@ -43,6 +53,8 @@ struct Hooke {
 };
 
 struct Rescaled {
+  static constexpr const char* kType = "Rescaled";
+  static constexpr Leaf kLeaves[kMaxHistory] = {{"forces", "P3B"}, {"overlaps", "P1B"}};
   static constexpr int kHistory = 4;  // force, overlap
   static constexpr int kGiven = 4;
   static constexpr int kVectors = 3;
@@ -51,11 +63,31 @@ struct Rescaled {
 
 template <Variant variant_>
 struct Layered {
+  static constexpr const char* kType = variant_ == Variant::averaged ? "Layered<Variant::averaged>"
+                                       : variant_ == Variant::paper  ? "Layered<Variant::paper>"
+                                                                     : "Layered<Variant::exact>";
+  static constexpr Leaf kLeaves[kMaxHistory] = {{"layers", "PQ2B"}, {"frames", "P3B"}, {"overlaps", "P1B"}};
   static constexpr int kHistory = 10;  // frame, overlap, `Layers`; the rings inside are kept apart
   static constexpr int kGiven = 4;
   static constexpr int kVectors = 3;
   static constexpr bool kLayered = true;
   static constexpr Variant variant = variant_;
 };
+
+// Calls `function` with a law as a type: the one place where a number becomes a law, on every platform.
+template <class Function>
+auto with_law(Law law, Variant variant, const Function& function) {
+  switch (law) {
+    case Law::hooke: return function(Hooke{});
+    case Law::mindlin_rescaled: return function(Rescaled{});
+    case Law::mindlin:
+      switch (variant) {
+        case Variant::averaged: return function(Layered<Variant::averaged>{});
+        case Variant::paper: return function(Layered<Variant::paper>{});
+        default: return function(Layered<Variant::exact>{});
+      }
+    default: return function(Frictionless{});
+  }
+}
 
 }  // namespace gmem

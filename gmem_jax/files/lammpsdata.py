@@ -1,0 +1,243 @@
+"""LAMMPS data files: spheres and the molecules they belong to, every number checked and refused with its line."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gmem_jax.errors import FileFormatError
+from gmem_jax.files.checked import require
+
+SAME = 1e-5  # by which radii, masses and densities may differ from the one that is meant; GSD is in single precision
+_STYLES = {  # of atoms: columns
+    "molecular": "id mol type x y z",
+    "bond": "id mol type x y z",
+    "angle": "id mol type x y z",
+    "full": "id mol type q x y z",
+    "hybrid sphere molecular": "id type x y z diameter density mol",
+    "hybrid molecular sphere": "id type x y z mol diameter density",
+    "sphere": "id type diameter density x y z",  # molecules in a section of their own, or none
+}
+_HYBRID = ("hybrid sphere molecular", "hybrid molecular sphere")  # LAMMPS itself writes no more than "hybrid"
+_READ = ("Atoms", "Molecules", "Masses", "Atom Type Labels")
+_ATOMS = re.compile(r"\s*\S+\s+atoms\s*(#.*)?")
+_WHOLE = re.compile(r"[+-]?[0-9]{1,15}")
+_REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_MOST, _TINY = np.finfo(float).max, np.finfo(float).tiny
+_REALS = (_REAL, -_MOST, _MOST, "a finite number")
+_COLUMNS = {  # those that are not just real: how they are written, from where to where they go, in words
+    "id": (_WHOLE, 1.0, _MOST, "a whole number from 1"),
+    "mol": (_WHOLE, 0.0, _MOST, "a whole number from 0"),  # 0 is none
+    "type": (_WHOLE, 1.0, _MOST, "a label, or a whole number from 1"),
+    "diameter": (_REAL, _TINY, _MOST, "a positive number"),
+    "density": (_REAL, _TINY, _MOST, "a positive number"),
+    "mass": (_REAL, 0.0, _MOST, "a number from 0"),
+    "q": (_REAL, 0.0, 0.0, "0: grains carry no charge"),
+    "image flag": (_WHOLE, 0.0, 0.0, "0: a pack lies within walls, not in a periodic box"),
+    "tilt": (_REAL, 0.0, 0.0, "0: the box of a pack is rectangular"),
+}
+_SHOWN = 40  # characters of what is wrong
+
+
+class Read(NamedTuple):
+    """What a file of others holds of S spheres, in its own lengths.
+
+    Attributes:
+        centres: [S, 3].
+        grain: which each belongs to, by any whole number, [S].
+        radii: [S]; empty where the file has none.
+        box: planes, [2, 3].
+        density: of the spheres; None where the file has none.
+        notes: what was done with what the file holds besides.
+    """
+
+    centres: np.ndarray
+    grain: np.ndarray
+    radii: np.ndarray
+    box: np.ndarray
+    density: float | None = None
+    notes: tuple[str, ...] = ()
+
+
+class _Row(NamedTuple):
+    line: int
+    words: list[str]
+
+
+class _Section(NamedTuple):
+    hint: str
+    rows: list[_Row]
+
+
+def read_lammps(path: Path, radius: float) -> Read:
+    """The spheres of a LAMMPS data file in the order of their ids; atoms without a molecule are grains of their own.
+
+    Args:
+        path: the file.
+        radius: that its spheres should have; tells the columns of `Atoms # hybrid` apart.
+
+    Raises:
+        OSError: if it cannot be read.
+        FileFormatError: naming the line that is wrong, or what is missing.
+    """
+    with path.open(encoding="utf-8", errors="backslashreplace") as file:  # a title may be in any encoding
+        lines = file.read().split("\n")
+    require(any(map(_ATOMS.fullmatch, lines)), "it is no LAMMPS data file, which has a line 'N atoms', and no GSD file")
+    head, sections = _parts(lines)
+    box = _box(head)
+    atoms = sections.get("Atoms", _Section("", []))
+    style = _style_of(atoms, radius)
+    labels = {words[-1]: words[0] for _, words in sections.get("Atom Type Labels", _Section("", [])).rows}
+    types = _count(head, "atom types")
+    named = _table(atoms, _STYLES[style].split(), types, labels)
+    declared, found = _count(head, "atoms"), len(named["id"])
+    require(declared == found, f"line {head['atoms'].line}: it declares {declared} atoms and holds {found}")
+    if "mol" not in named:
+        named["mol"] = _molecules(sections, named["id"])
+    left = [name[:_SHOWN] for name in sections if name not in _READ]
+    notes = [f"its sections {', '.join(left)} are left out"] if left else []
+    grain, loose = named["mol"].astype(np.int64), named["mol"] == 0.0
+    if loose.any():
+        notes.append(f"{loose.sum()} of its atoms belong to no molecule: each is a grain of one sphere")
+        grain[loose] = grain.max() + 1 + np.arange(loose.sum())
+    order = np.argsort(named["id"])
+    centres = np.stack([named[axis] for axis in "xyz"], axis=1)
+    density = one_value("density", named["density"]) if "density" in named else None
+    if density is None and "Masses" in sections:
+        masses = _table(sections["Masses"], ["type", "mass"], types, labels)
+        one_value("mass", masses["mass"][np.isin(masses["type"], named["type"])])
+    radii = 0.5 * named["diameter"][order] if "diameter" in named else np.zeros(0)
+    return Read(centres[order], grain[order], radii, box, density, tuple(notes))
+
+
+def one_value(what: str, values: np.ndarray) -> float:
+    """The one value that all spheres have.
+
+    Raises:
+        FileFormatError: if they differ.
+    """
+    low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
+    require(high - low <= SAME * abs(high), f"its spheres have a {what} of {low:g} to {high:g}, all must have the same")
+    return float(high)
+
+
+def _parts(lines: list[str]) -> tuple[dict[str, _Row], dict[str, _Section]]:
+    """The header's lines by their keywords, and the sections by name."""
+    head: dict[str, _Row] = {}
+    sections: dict[str, _Section] = {}
+    rows: list[_Row] | None = None
+    for line, whole in enumerate(lines[1:], 2):
+        text, _, comment = (part.strip() for part in whole.partition("#"))
+        words = text.split()
+        if not words:
+            continue
+        if all(word[0].isalpha() for word in words):
+            name, rows = " ".join(words), []
+            require(name not in sections or name not in _READ, f"line {line}: a second section {name!r}")
+            sections[name] = _Section(" ".join(comment.split()), rows)
+        elif rows is not None:
+            rows.append(_Row(line, words))
+        else:
+            numbers = [word for word in words if not word[0].isalpha()]
+            name = " ".join(words[len(numbers) :])
+            known = words[0] in numbers and name not in head
+            require(known, f"line {line}: {text[:_SHOWN]!r} is no line of a header, or one that was there before")
+            head[name] = _Row(line, numbers)
+    return head, sections
+
+
+def _count(head: Mapping[str, _Row], name: str) -> int:
+    require(name in head, f"it has no line 'N {name}', as a LAMMPS data file has")
+    line, words = head[name]
+    require(len(words) == 1 and _WHOLE.fullmatch(words[0]), f"line {line}: must be 'N {name}' with a whole number N")
+    return int(words[0])
+
+
+def _box(head: Mapping[str, _Row]) -> np.ndarray:
+    """The planes, [2, 3]."""
+    bounds = []
+    for axis in "xyz":
+        name = f"{axis}lo {axis}hi"
+        require(name in head, "it has no rectangular box (xlo xhi, ...)")
+        line, words = head[name]
+        values = _column(name, words, [line] * len(words))
+        require(len(values) == 2 and values[0] < values[-1], f"line {line}: must be {name}, the first the smaller")
+        bounds.append(values)
+    if "xy xz yz" in head:
+        line, words = head["xy xz yz"]
+        _column("tilt", words, [line] * len(words))
+    return np.array(bounds).T
+
+
+def _style_of(atoms: _Section, radius: float) -> str:
+    """What the comment behind `Atoms` says; of LAMMPS' own "hybrid" the order in which diameters are those meant."""
+    if atoms.hint != "hybrid":
+        require(
+            atoms.hint in _STYLES,
+            f"its atoms are of style {atoms.hint[:_SHOWN]!r}, must be (in a comment, as in 'Atoms # molecular') one of "
+            f"{', '.join(_STYLES)}",
+        )
+        return atoms.hint
+    fits = []
+    for style in _HYBRID:
+        names = _STYLES[style].split()
+        rows = [dict(zip(names, row.words, strict=False)) for row in atoms.rows]
+        whole = all(_WHOLE.fullmatch(row.get("mol", "")) for row in rows)
+        sizes = [row["diameter"] for row in rows if _REAL.fullmatch(row.get("diameter", ""))]
+        if whole and len(sizes) == len(rows) and np.all(np.abs(np.array(sizes, float) - 2.0 * radius) <= SAME * radius):
+            fits.append(style)
+    require(len(fits) < 2, f"'Atoms # hybrid' does not tell its columns: write {' or '.join(_HYBRID)} in that comment")
+    return fits[0] if fits else _HYBRID[0]
+
+
+def _table(section: _Section, names: list[str], types: int, labels: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """The columns of a section by name, as real numbers, which are exact for whole ones of up to 15 digits."""
+    rows = section.rows
+    require(len(rows) > 0, "a section of it holds no rows")
+    flags = 3 * (names[0] == "id" and len(rows[0].words) == len(names) + 3)
+    width = len(names) + flags
+    for line, words in rows:
+        if len(words) != width:
+            told = f"{width} ({' '.join(names)}{', and image flags' if flags else ''})"
+            raise FileFormatError(f"line {line}: {len(words)} columns, must be {told}")
+    lines, found = [row.line for row in rows], {}
+    for place, name in enumerate([*names, *["image flag"] * flags]):
+        known = labels if name == "type" else {}
+        words = [known.get(row.words[place], row.words[place]) for row in rows]
+        most = types if name == "type" else np.inf
+        found[name] = _column(name, words, lines, most)
+    if names[0] == "id":
+        _require_once(found["id"], lines)
+    return found
+
+
+def _column(name: str, words: list[str], lines: list[int], most: float = np.inf) -> np.ndarray:
+    form, low, high, told = _COLUMNS.get(name, _REALS)
+    values = np.array([float(word) if form.fullmatch(word) else np.nan for word in words])
+    for odd in np.flatnonzero(~((low <= values) & (values <= min(high, most)))):
+        upto = f" to {most:g}" if most < np.inf else ""
+        raise FileFormatError(f"line {lines[odd]}: {name} is {words[odd][:_SHOWN]!r}, must be {told}{upto}")
+    return values
+
+
+def _require_once(ids: np.ndarray, lines: list[int]) -> None:
+    order = np.argsort(ids, kind="stable")
+    for place in np.flatnonzero(np.diff(ids[order]) == 0.0):
+        first, second = order[place : place + 2]
+        raise FileFormatError(f"line {lines[second]}: atom {ids[second]:.0f} stands in line {lines[first]}, too")
+
+
+def _molecules(sections: Mapping[str, _Section], ids: np.ndarray) -> np.ndarray:
+    """The molecule of every atom from the section Molecules; 0 for all where there is none."""
+    if "Molecules" not in sections:
+        return np.zeros(len(ids))
+    rows = sections["Molecules"].rows
+    table = _table(sections["Molecules"], ["id", "mol"], 0, {})
+    for odd in np.flatnonzero(~np.isin(table["id"], ids)):
+        raise FileFormatError(f"line {rows[odd].line}: there is no atom {table['id'][odd]:.0f}")
+    for absent in ids[~np.isin(ids, table["id"])]:
+        raise FileFormatError(f"atom {absent:.0f} is not in its section Molecules")
+    order = np.argsort(table["id"])
+    return np.asarray(table["mol"][order][np.searchsorted(table["id"][order], ids)])
