@@ -30,6 +30,7 @@ from gmem_jax.experiment.host import (
 from gmem_jax.experiment.protocol import Bin, Stage
 from gmem_jax.experiment.recall import shear, walker
 from gmem_jax.experiment.walk import Course, walk, walk_some
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State
 
 Loss = Callable[[Experiment, jax.Array], jax.Array]
@@ -193,6 +194,7 @@ class Pushed:
     p_sig_slope: jax.Array
 
 
+@usual_rules()
 def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Progress = silent) -> Pushed:
     """Forward mode: the derivative of a whole experiment along a direction.
 
@@ -278,6 +280,7 @@ class Gradient:
     p_sig: jax.Array
 
 
+@usual_rules()
 def value_and_grad(
     experiment: Experiment,
     by: Sequence[str] = ("signals", "gamma0", "friction"),

@@ -15,6 +15,7 @@ from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.host import Progress, silent, within
 from gmem_jax.experiment.recall import Recall, simulate
 from gmem_jax.experiment.signals import Bumps
+from gmem_jax.physics.rules import usual_rules
 
 LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
 
@@ -65,6 +66,7 @@ def _pressures(recall: Recall) -> dict[str, np.ndarray]:
     return {name: np.asarray(sample.pressure) for name, sample in recall.stages.items()}
 
 
+@usual_rules()
 def exact(experiment: Experiment, *, law: bool = True, progress: Progress = silent) -> Jacobian:
     """Forward mode, parameters as replicas; two runs, because mu and the stiffness act on the prefix too.
 

@@ -26,6 +26,7 @@ from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Keep, Progress, forget, remembering, sharing, silent, under
 from gmem_jax.experiment.recall import PREFIX, prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline
+from gmem_jax.physics.rules import usual_rules
 
 BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
 WIDTH = 0.08  # of them, in u
@@ -70,6 +71,7 @@ def refuse_another_drive(kernel: MemoryKernel, experiment: Experiment) -> None:
             raise ValueError(f"the kernel is of {name} = {getattr(kernel, name):g}, the experiment's is {float(own):g}")
 
 
+@usual_rules()
 def design_by_kernel(
     experiment: Experiment,
     *,

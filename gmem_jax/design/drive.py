@@ -11,6 +11,7 @@ import optax
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent
 from gmem_jax.experiment.recall import run
+from gmem_jax.physics.rules import usual_rules
 
 PARAMETERS = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.stiffness"}
 
@@ -53,6 +54,7 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
     return found
 
 
+@usual_rules()
 def design_drive(
     experiments: Sequence[Experiment],
     bounds: dict[str, tuple[float, float]],

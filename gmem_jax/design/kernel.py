@@ -17,6 +17,7 @@ from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Keep, Progress, Walker, forget, silent
 from gmem_jax.experiment.recall import simulate
 from gmem_jax.experiment.signals import BINS, Bumps, Signals, bin_average
+from gmem_jax.physics.rules import usual_rules
 
 FINE = 2048  # points of v for inner products of basis functions
 
@@ -71,6 +72,7 @@ class MemoryKernel:
     def _match(self) -> analysis.Match:
         return analysis.compare(jnp.asarray(self.odd), bin_average(self.basis), self.delta0 * self.gamma0)
 
+    @usual_rules()
     def gain(self) -> float:
         """G of the ideal kernel G E delta0 (v < u) that is nearest to this one on the basis."""
         return float(self._match().gain)
@@ -107,10 +109,12 @@ class MemoryKernel:
             widths.append((right + back) / FINE)
         return float(np.mean(widths))
 
+    @usual_rules()
     def coefficients(self, signals: Signals) -> np.ndarray:
         """Amplitudes of the basis functions that come nearest to waveforms, [S, n]."""
         return nearest(self.basis, signals)
 
+    @usual_rules()
     def predict(self, signals: Signals, *, even: bool = True) -> np.ndarray:
         """p_sig of waveforms by superposition, [S, 256], in E, at the kernel's gamma0.
 
@@ -120,6 +124,7 @@ class MemoryKernel:
         """
         return self.recalled(self.coefficients(signals), even=even)
 
+    @usual_rules()
     def recalled(self, amplitudes: np.ndarray, *, even: bool = True) -> np.ndarray:
         """`predict` for amplitudes of the basis functions, [S, n]."""
         linear: np.ndarray = amplitudes @ self.odd
@@ -140,6 +145,7 @@ def nearest(basis: Signals, signals: Signals) -> np.ndarray:
     return result
 
 
+@usual_rules()
 def memory_kernel(
     experiment: Experiment,
     n: int = 17,

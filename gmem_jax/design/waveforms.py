@@ -19,6 +19,7 @@ from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Keep, Progress, forget, silent, within
 from gmem_jax.experiment.recall import prefix_of, run, simulate
 from gmem_jax.experiment.signals import Signals, Spline, waveform
+from gmem_jax.physics.rules import usual_rules
 
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)
@@ -138,6 +139,7 @@ def refuse_several_scales(experiment: Experiment) -> None:
         raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
 
 
+@usual_rules()
 def design_waveforms(
     experiment: Experiment,
     *,

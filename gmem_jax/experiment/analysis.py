@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.rules import usual_rules
 
 MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
 """What is said of every recall: G and F of the set, and both averaged over the ringing period (`compare`)."""
@@ -139,6 +140,7 @@ def remembered_after(second: jax.Array, integral: jax.Array, scale: Scalar) -> t
     return correlation(residue, integral), jnp.sum(template * residue, axis=-1) / jnp.sum(template * template, axis=-1)
 
 
+@usual_rules()
 def running_mean(series: jax.Array, width: Scalar) -> jax.Array:
     """Mean over a window of `width` bins (need not be whole) along the last axis, [..., bins].
 

@@ -23,6 +23,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar, impossible, parameter, pytree, settle, static, traced
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State, Status, replicate
 from gmem_jax.physics.step import System, start
 
@@ -95,6 +96,7 @@ class Experiment:
     precision: str = static("double")
     steps_per_bin: int = dataclasses.field(init=False, default=1, metadata={"static": True})
 
+    @usual_rules()
     def __post_init__(self) -> None:
         for name in ("dt", "rest", "hold", "store"):
             object.__setattr__(self, name, _static_number(name, getattr(self, name)))
@@ -328,6 +330,7 @@ class Changes(TypedDict, total=False):
     precision: str
 
 
+@usual_rules()
 def replace(
     experiment: Experiment, values: Mapping[str, Any] | None = None, /, **changes: Unpack[Changes]
 ) -> Experiment:

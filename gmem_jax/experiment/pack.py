@@ -15,6 +15,7 @@ from gmem_jax.experiment.html import brief, facts
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, Grains, still_box
 
@@ -109,6 +110,7 @@ def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: 
     return pair_finder(clump, smallest, SKIN)(grains, clump, box, smallest)
 
 
+@usual_rules()
 def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: str = "") -> Pack:
     """The same box and grain with other centres [N, 3] and orientations [N, 4], and their own neighbour list.
 
@@ -119,6 +121,7 @@ def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: s
     return replace(pack, position=position, quaternion=quaternion, pairs=pairs, name=name or pack.name, record=record)
 
 
+@usual_rules()
 def stack(packs: Sequence[Pack]) -> Pack:
     """Packs of one size and grain as one `Pack` with a leading axis on every array, for `jax.vmap`.
 

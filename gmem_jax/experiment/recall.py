@@ -38,6 +38,7 @@ from gmem_jax.experiment.protocol import Stage, table
 from gmem_jax.experiment.signals import BINS
 from gmem_jax.experiment.walk import walk
 from gmem_jax.physics.pytree import Scalar, pytree, traced
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
 
@@ -158,6 +159,7 @@ def _recall(experiment: Experiment) -> Recall:
     return finish(experiment, _by_stage(before, common) | _by_stage(after, own), state.status)
 
 
+@usual_rules()
 def recall(experiment: Experiment) -> Recall:
     """Run an experiment as one traced computation, for jit, vmap and grad; compiled once for each structure.
 
@@ -209,6 +211,7 @@ def shear(walker: Walker, experiment: Experiment) -> None:
     walker.state = _fan_out(experiment, walker.state)
 
 
+@usual_rules()
 def run(
     experiment: Experiment,
     *,
@@ -330,6 +333,7 @@ def default_batch(experiment: Experiment, available: int) -> int:
     return int(max(1, min(LARGEST_BATCH, 0.5 * available / _replica_bytes(experiment) - 1)))
 
 
+@usual_rules()
 def prefix_of(experiment: Experiment, *, keep: Keep = forget, progress: Progress = silent) -> Walker:
     """A walk that has done the shear-free prefix, common to all waveforms on this pack; see `simulate`.
 
@@ -348,6 +352,7 @@ def prefix_of(experiment: Experiment, *, keep: Keep = forget, progress: Progress
     return begun
 
 
+@usual_rules()
 def simulate(
     experiment: Experiment,
     begun: Walker | None = None,

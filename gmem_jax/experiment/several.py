@@ -20,6 +20,7 @@ from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent,
 from gmem_jax.experiment.recall import PREFIX, Recall, finished, walker, warn_of_another_compression
 from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import pytree
+from gmem_jax.physics.rules import usual_rules
 
 
 @pytree
@@ -108,6 +109,7 @@ class _Side:
         return Chosen(tuple(sets), jnp.asarray(numbers[1:]))
 
 
+@usual_rules()
 def run_several(
     experiments: Sequence[Experiment],
     *,

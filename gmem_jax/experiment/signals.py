@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.pytree import Scalar, pytree, traced
+from gmem_jax.physics.rules import usual_rules
 
 LONGEST_WORD = 12  # bits
 PAD = 2.0  # bits left free at either end of a word
@@ -131,6 +132,7 @@ class Spline:
         return width * (before + x * (a + x * (b / 2.0 + x * (c / 3.0 + x * d / 4.0))))
 
 
+@usual_rules()
 def six_signals() -> Bumps:
     """The paper's signals 1 to 6 (Sec. II, Fig. 5): one to three bumps of width 0.2."""
     bumps: list[tuple[list[float], list[float]]] = [
@@ -160,6 +162,7 @@ def word_bits(bits: int) -> np.ndarray:
     return np.arange(2**bits)[:, None] >> places & 1
 
 
+@usual_rules()
 def words(bits: int, pad: float = PAD, width: float = WIDTH) -> Bumps:
     """All binary words of a length (App. A): J is a plateau of height +u_b / pi for a 1 and -u_b / pi for a 0.
 
@@ -190,6 +193,7 @@ def bit_width(bits: int, pad: float = PAD) -> float:
     return 1.0 / (bits + 2.0 * pad)
 
 
+@usual_rules()
 def waveform(samples: jax.typing.ArrayLike) -> Spline:
     """Any waveform from its samples.
 
@@ -212,6 +216,7 @@ def waveform(samples: jax.typing.ArrayLike) -> Spline:
     return Spline(nodes=jnp.pad(values, ((0, 0), (1, 1))))
 
 
+@usual_rules()
 @functools.partial(jax.jit, static_argnames=("bins", "points"))  # fused: 4,096 words would fill the memory otherwise
 def bin_average(signals: Signals, bins: int = BINS, points: int = 16) -> jax.Array:
     """J_s averaged over each bin of u, [S, bins] (midpoint rule on `points` per bin)."""

@@ -19,6 +19,7 @@ from gmem_jax.files.home import kept_pack
 from gmem_jax.files.schemas import PACK
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import candidates, tabulate
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.sample import Sample
 
 STANDARD = re.compile(r"tetra-([1-9][0-9]{1,6})-([a-z])")
@@ -38,6 +39,7 @@ def _arrays(pack: Pack) -> dict[str, Any]:
     return {**values, "pairs/candidates": candidates(pack.pairs), "pairs/reference": reference}
 
 
+@usual_rules()
 def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None, frames: Frames | None = None) -> None:
     """Write a pack, and the time series of its preparation and configurations along it if given.
 
@@ -67,6 +69,7 @@ def check_pack(pack: Pack) -> None:
     soundness.check(arrays, isotropic=pack.clump.isotropic, record=pack.info)
 
 
+@usual_rules()
 def load_pack(source: str | Path) -> Pack:
     """Read a pack from a file, or by name, neighbour list included.
 
@@ -125,7 +128,7 @@ def pack_called(name: str) -> Path | None:
     if name in list_packs():
         return Path(str(resources.files("gmem_jax") / "packs" / f"{name}.h5"))
     made = kept_pack(name)
-    return made if STANDARD.fullmatch(name) and made.is_file() else None
+    return made if made and STANDARD.fullmatch(name) and made.is_file() else None
 
 
 def list_packs() -> list[str]:

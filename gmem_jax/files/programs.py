@@ -31,7 +31,10 @@ def keep_programs() -> None:
     chosen = os.environ.get(SWITCH, "")
     if chosen == "off" or getattr(jax.config, "jax_compilation_cache_dir", None):
         return
-    folder = Path(chosen) if chosen else kept() / f"jax-{jax.__version__}-{_processor()}"
+    home = kept()
+    if not chosen and home is None:
+        return
+    folder = Path(chosen) if chosen else home / f"jax-{jax.__version__}-{_processor()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

@@ -31,6 +31,7 @@ from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
 from gmem_jax.files.labelled import recall_csv, recall_dataset
 from gmem_jax.files.schemas import RECALL
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Status
 
@@ -38,6 +39,7 @@ _OLDEST = "gmem-recall/1"
 _EVERY_BIT = int(sum(Status))
 
 
+@usual_rules()
 def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> None:
     """Write a recall with its resolved configuration.
 
@@ -104,6 +106,7 @@ class StoredRecall(NamedTuple):
         return recall_csv(self.recall, self.names)
 
 
+@usual_rules()
 def load_recall(path: Path) -> StoredRecall:
     """Read a recall and its configuration, which the result can be unpacked into.
 

@@ -12,11 +12,13 @@ from gmem_jax.experiment.signals import Signals, Spline
 from gmem_jax.files.atomic import FileFormatError, atomic
 from gmem_jax.files.checked import json_of, numbers, read_npy, refusing, require_fields, title
 from gmem_jax.files.configuration import signals_from, written_signals
+from gmem_jax.physics.rules import usual_rules
 
 _LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB
 _TARGET, _DESIGN = "# target: ", "# design: "
 
 
+@usual_rules()
 def load_waveforms(path: Path) -> np.ndarray:
     """Waveform samples [S, n] from a CSV (one column per signal) or NPY ([n] or [S, n]) file.
 
@@ -108,6 +110,7 @@ def _is_number(cell: str) -> bool:
     return True
 
 
+@usual_rules()
 def save_waveforms(
     path: Path, signals: Spline, target: Signals | None = None, *, design: Mapping[str, Any] | None = None
 ) -> None:

@@ -305,7 +305,13 @@ def _primitive(
             raise NotImplementedError("the native backend runs on CPUs and CUDA GPUs; use backend='auto' or 'jax'")
         return in_plain_jax(context, *values, definition=definition, **static)
 
-    primitive.def_impl(jax.jit(primitive.bind, static_argnames=("tree", "call", "definition")))
+    compiled = jax.jit(primitive.bind, static_argnames=("tree", "call", "definition"))
+
+    def alone(*leaves: Any, **static: Any) -> Any:
+        with jax.disable_jit(False):  # where it is off, `compiled` would call itself
+            return compiled(*leaves, **static)
+
+    primitive.def_impl(alone)
     primitive.def_abstract_eval(abstract)
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, library, platform="cpu")

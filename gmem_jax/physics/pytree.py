@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.rules import usual_rules
+
 Scalar = float | jax.Array
 """A parameter: one number, or an array that broadcasts against the replica axis [B]."""
 
@@ -108,6 +110,7 @@ def _parameters(made: Any) -> Iterator[tuple[str, Interval]]:
             yield entry.name, entry.metadata["interval"]
 
 
+@usual_rules()
 def settle(made: Any) -> None:
     """Bring the parameters of a new object to one kind of number, and refuse those outside their interval.
 

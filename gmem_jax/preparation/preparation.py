@@ -37,6 +37,7 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, tetra
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import Grains, still_box
 from gmem_jax.physics.step import System, accelerate, start
@@ -343,6 +344,7 @@ class _Preparation:
             checkpoint.reached(standing)
 
 
+@usual_rules()
 def prepare(
     recipe: Recipe | None = None,
     grain: Clump | None = None,

@@ -23,6 +23,7 @@ from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
 from gmem_jax.files.provenance import sources
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import explain, together
 from gmem_jax.preparation.preparation import Recipe, grain_steps
 from gmem_jax.sweeps.executors import Executor
@@ -63,6 +64,7 @@ class Results(list[Result]):
         return listing(f"Sweep of {len(self)} points", [*names, "G", "F", "status"], rows)
 
 
+@usual_rules()
 def sweep(
     experiment: Experiment,
     vary: Mapping[str, Sequence[Any]],
