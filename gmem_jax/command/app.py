@@ -11,6 +11,7 @@ from typer.exceptions import TyperException
 from gmem_jax.command import benchmark, classify, derive, exchange, packs, recalls, report, reproduce, show, sweep
 from gmem_jax.command.console import RunInterruptedError, say
 from gmem_jax.experiment.host import RunFailedError
+from gmem_jax.experiment.telling import told_elsewhere
 from gmem_jax.files.programs import keep_programs
 from gmem_jax.physics.rules import StartError, why_not_started
 
@@ -46,7 +47,8 @@ def main() -> None:
     keep_programs()
     warnings.showwarning = _one_line
     try:
-        code = app(args=sys.argv[1:] or ["--help"], prog_name="gmem", standalone_mode=False)
+        with told_elsewhere():
+            code = app(args=sys.argv[1:] or ["--help"], prog_name="gmem", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except TyperException as error:
         problem = error.format_message()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich import progress
 
-from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, emit, log, say
+from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, drawing, emit, log, say
 from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
@@ -105,8 +105,9 @@ def classify_command(
         title = (
             f"{tables.cell(configuration['pack'])}, {stored.bits} bits: accuracy {net['accuracy']:.3f} ({seeds} nets)"
         )
-        figures.confusion_figure(drawn, confusion(net["read"], len(stored.signals)), title)
-    say(f"wrote {output}" + (f" and {drawn}" if drawn else ""))
+        with drawing(drawn):
+            figures.confusion_figure(drawn, confusion(net["read"], len(stored.signals)), title)
+    say(f"wrote {output}" + (f" and {drawn}" if drawn and drawn.exists() else ""))
     emit(as_json, result, *tables.reading_tables(result))
 
 

@@ -18,6 +18,7 @@ from gmem_jax.command.console import (
     Picture,
     announce,
     claim,
+    drawing,
     emit,
     reporting,
     say,
@@ -65,8 +66,9 @@ def _run(
         save_recall(data, recall, configuration)
     if picture is not None:
         title = tables.heading(configuration)
-        figures.recall_figure(picture, recall, experiment.scale, title, configuration["signals"])
-    say(f"wrote {data}" + (f" and {picture}" if picture else ""))
+        with drawing(picture):
+            figures.recall_figure(picture, recall, experiment.scale, title, configuration["signals"])
+    say(f"wrote {data}" + (f" and {picture}" if picture and picture.exists() else ""))
     row = {**tables.summary(recall, configuration), "seconds": configuration["seconds"], "output": str(data)}
     if row["status"]:
         say(f"warning: {row['status_text']}", style="yellow")

@@ -29,6 +29,7 @@ from gmem_jax.experiment.host import (
 )
 from gmem_jax.experiment.protocol import Bin, Stage
 from gmem_jax.experiment.recall import shear, walker
+from gmem_jax.experiment.telling import Telling, callback, telling
 from gmem_jax.experiment.walk import Course, walk, walk_some
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State
@@ -281,13 +282,14 @@ class Gradient:
 
 
 @usual_rules()
+@telling
 def value_and_grad(
     experiment: Experiment,
     by: Sequence[str] = ("signals", "gamma0", "friction"),
     *,
     loss: Loss = fidelity_of,
     checkpoint: Checkpoint = NOWHERE,
-    progress: Progress = silent,
+    progress: Telling = None,
 ) -> Gradient:
     """Reverse mode: a number and its derivatives by all parameters, through the whole experiment.
 
@@ -300,15 +302,16 @@ def value_and_grad(
             "friction.mu", "t0" or "pack.position". Shapes of grains are not among them (use `jax.grad`).
         loss: what is differentiated; default the fidelity.
         checkpoint: where to go on and to keep how far it is on the way back; the way forward, a tenth, is done again.
-        progress: told about every chunk of both ways.
+        progress: told about every chunk of both ways; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: for a name that is no field.
         RunFailedError: if the simulation broke down.
     """
+    tell = callback(progress)
     theta, along = _theta(experiment, by), _along(experiment)
     common, own = experiment.phases
-    on = walker(experiment, progress=within(progress, 0.0, FORWARDS))
+    on = walker(experiment, progress=within(tell, 0.0, FORWARDS))
     on.total_work = _work(experiment, on)
     prefix, rest = _Remembering(), _Remembering()
     on.action = prefix if acts_on_prefix(by) else Action()
@@ -337,7 +340,7 @@ def value_and_grad(
         return jax.vjp(numbers, theta)[1](found)[0]
 
     back = jax.tree.map(jnp.zeros_like, _moving(on.state))
-    way = _Backwards(within(progress, FORWARDS, 1.0), (rest, prefix), checkpoint)
+    way = _Backwards(within(tell, FORWARDS, 1.0), (rest, prefix), checkpoint)
     back = way.through(rest, back)
     slope = jax.tree.map(jnp.add, slope, pull_numbers(True, rest.numbers))
     if acts_on_prefix(by):

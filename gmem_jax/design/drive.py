@@ -9,8 +9,9 @@ import numpy as np
 import optax
 
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
-from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent
+from gmem_jax.experiment.host import Checkpoint, Keep, forget
 from gmem_jax.experiment.recall import run
+from gmem_jax.experiment.telling import Telling, callback, telling
 from gmem_jax.physics.rules import usual_rules
 
 PARAMETERS = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.stiffness"}
@@ -55,6 +56,7 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
 
 
 @usual_rules()
+@telling
 def design_drive(
     experiments: Sequence[Experiment],
     bounds: dict[str, tuple[float, float]],
@@ -63,7 +65,7 @@ def design_drive(
     spread: float = 0.2,
     optimiser: optax.GradientTransformation | None = None,
     keep: Keep = forget,
-    progress: Progress = silent,
+    progress: Telling = None,
 ) -> TunedDrive:
     """Choose gamma0 and parameters of the friction law within bounds so that the mean fidelity of some packs grows.
 
@@ -80,12 +82,13 @@ def design_drive(
         spread: of the differences at first, in parts of each parameter.
         optimiser: what makes a step of the logarithms of a gradient of length `spread`; default the gradient itself.
         keep: asked for the fidelity of every run, so that a long search can be resumed (see `gmem_jax.files.parts`).
-        progress: told about every run.
+        progress: told about every run; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
         RunFailedError: if a simulation broke down.
     """
+    tell = callback(progress)
     names = list(bounds)
     paths = [PARAMETERS.get(name, name) for name in names]
     start = start_within(experiments, bounds)
@@ -103,7 +106,7 @@ def design_drive(
 
             found.append(float(keep(f"run-{done:05d}", recall)))
             done += 1
-            progress(f"F = {np.mean(found):.4f}", 0.0, done / total)
+            tell(f"F = {np.mean(found):.4f}", 0.0, done / total)
         return np.asarray(found)
 
     optimiser = optax.sgd(1.0) if optimiser is None else optimiser

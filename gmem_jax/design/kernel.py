@@ -14,9 +14,10 @@ import numpy as np
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Keep, Progress, Walker, forget, silent
+from gmem_jax.experiment.host import Keep, Walker, forget
 from gmem_jax.experiment.recall import simulate
 from gmem_jax.experiment.signals import BINS, Bumps, Signals, bin_average
+from gmem_jax.experiment.telling import Telling, callback, telling
 from gmem_jax.physics.rules import usual_rules
 
 FINE = 2048  # points of v for inner products of basis functions
@@ -146,6 +147,7 @@ def nearest(basis: Signals, signals: Signals) -> np.ndarray:
 
 
 @usual_rules()
+@telling
 def memory_kernel(
     experiment: Experiment,
     n: int = 17,
@@ -153,7 +155,7 @@ def memory_kernel(
     *,
     begun: Walker | None = None,
     keep: Keep = forget,
-    progress: Progress = silent,
+    progress: Telling = None,
 ) -> MemoryKernel:
     """Measure the memory kernel of a pack.
 
@@ -163,19 +165,20 @@ def memory_kernel(
         width: of the bumps; narrow ones drive the walls faster.
         begun: what `recall.prefix_of` gave for the same pack and law, if there is one.
         keep: asked for the recalls of the basis, so that a long run can be resumed (see `gmem_jax.files.parts`).
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: if n < 2, or gamma0 or delta0 differ between replicas.
         RunFailedError: if the simulation broke down.
     """
+    tell = callback(progress)
     if n < 2:
         raise ValueError(f"a kernel needs at least 2 basis waveforms, got {n}")
     both = bumps(np.concatenate([np.eye(n), -np.eye(n)]), width)
     wanted = replace(experiment, signals=both)
     if jnp.ndim(wanted.scale):
         raise ValueError("a kernel is measured at one gamma0 and one delta0, not one for each replica")
-    p_sig = np.asarray(keep("basis", lambda at: simulate(wanted, begun, checkpoint=at, progress=progress).p_sig))
+    p_sig = np.asarray(keep("basis", lambda at: simulate(wanted, begun, checkpoint=at, progress=tell).p_sig))
     plus, minus = p_sig[:n], p_sig[n:]
     return MemoryKernel(
         u=(np.arange(BINS) + 0.5) / BINS,

@@ -16,9 +16,10 @@ import optax
 from gmem_jax.derivatives.gradient import push
 from gmem_jax.design.kernel import FINE, bumps, nearest
 from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.host import Keep, Progress, forget, silent, within
+from gmem_jax.experiment.host import Keep, Progress, forget, within
 from gmem_jax.experiment.recall import prefix_of, run, simulate
 from gmem_jax.experiment.signals import Signals, Spline, waveform
+from gmem_jax.experiment.telling import Telling, callback, telling
 from gmem_jax.physics.rules import usual_rules
 
 NODES = 127  # samples of a designed waveform
@@ -140,6 +141,7 @@ def refuse_several_scales(experiment: Experiment) -> None:
 
 
 @usual_rules()
+@telling
 def design_waveforms(
     experiment: Experiment,
     *,
@@ -150,7 +152,7 @@ def design_waveforms(
     damping: Sequence[float] = DAMPING,
     optimiser: optax.GradientTransformation | None = None,
     keep: Keep = forget,
-    progress: Progress = silent,
+    progress: Telling = None,
 ) -> Design:
     """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
 
@@ -165,13 +167,14 @@ def design_waveforms(
         optimiser: what makes a step of a preconditioned gradient; default the whole step, shortened if the recall
             gets worse.
         keep: asked for every simulation and Jacobian, so that a design can be resumed (see `gmem_jax.files.parts`).
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         RunFailedError: if a simulation broke down.
     """
+    tell = callback(progress)
     refuse_several_scales(experiment)
-    work, prefix = Work(cost(experiment, iterations, n), progress), _prefix(experiment)
+    work, prefix = Work(cost(experiment, iterations, n), tell), _prefix(experiment)
     begun = prefix_of(experiment, keep=keep, progress=work.next(prefix))
     target = np.asarray(experiment.integral())
     untouched = keep("untouched", lambda at: simulate(experiment, begun, checkpoint=at, progress=work.next(1.0)).p_sig)

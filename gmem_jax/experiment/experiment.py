@@ -14,7 +14,7 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.drive import Drive
-from gmem_jax.experiment.html import brief, facts
+from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocol import Stage, memory_protocol, split
 from gmem_jax.experiment.signals import BINS, Signals, bin_average, part
@@ -259,7 +259,7 @@ class Experiment:
         """Gain and fidelity of recalled signals [S, 256]."""
         return analysis.compare(p_sig, self.integral(), self.scale)
 
-    def _repr_html_(self) -> str:
+    def _facts(self) -> Facts:
         pack, dt = self.pack, self.timing.dt
         rows = {
             "pack": f"{pack.name}, {pack.grains} grains",
@@ -272,7 +272,13 @@ class Experiment:
             "steps": self.steps_per_bin * sum(stage.bins for stage in self.stages),
             **{name: getattr(self, name) for name in ("background", "backend", "precision")},
         }
-        return facts("Experiment", rows)
+        return "Experiment", rows
+
+    def __repr__(self) -> str:
+        return line(self, self._facts)
+
+    def _repr_html_(self) -> str:
+        return facts(*self._facts())
 
 
 _OPEN = 1e-9  # of a waveform where it should vanish

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax import native
-from gmem_jax.experiment.html import brief, facts
+from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree
@@ -73,7 +73,7 @@ class Pack:
         info: dict[str, Any] = json.loads(self.record)
         return info
 
-    def _repr_html_(self) -> str:
+    def _facts(self) -> Facts:
         rest = self.info.get("at_rest", {})
         measured = {"filling phi": "filling", "coordination Z": "coordination", "pressure (E)": "pressure"}
         rows = {
@@ -83,7 +83,13 @@ class Pack:
             "T1 (t_c)": self.ringing_period,
             **{label: rest[name] for label, name in measured.items() if name in rest},
         }
-        return facts(f"Pack {self.name}", rows)
+        return f"Pack {self.name}", rows
+
+    def __repr__(self) -> str:
+        return line(self, self._facts)
+
+    def _repr_html_(self) -> str:
+        return facts(*self._facts())
 
     def view(self) -> Any:
         """The pack in 3D, for notebooks; `gmem_jax.show.view` stands floors above, and is loaded when asked for."""

@@ -36,6 +36,7 @@ from gmem_jax.experiment.host import (
 from gmem_jax.experiment.pack import smallest_box
 from gmem_jax.experiment.protocol import Stage, table
 from gmem_jax.experiment.signals import BINS
+from gmem_jax.experiment.telling import Telling, callback, telling
 from gmem_jax.experiment.walk import walk
 from gmem_jax.physics.pytree import Scalar, pytree, traced
 from gmem_jax.physics.rules import usual_rules
@@ -102,12 +103,18 @@ class Recall:
         from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
         return from_above.plot(self, what, experiment, against)
 
-    def _repr_html_(self) -> str:
+    def _facts(self) -> html.Facts:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}
         rows = {**measures, "F over T1": self.windowed_fidelity, "T1 (t_c)": self.window}
         if not traced(self.status):
             rows["status"] = explain(together(self.status))
-        return html.facts(f"Recall of {self.J.shape[-2]} signals", rows)
+        return f"Recall of {self.J.shape[-2]} signals", rows
+
+    def __repr__(self) -> str:
+        return html.line(self, self._facts)
+
+    def _repr_html_(self) -> str:
+        return html.facts(*self._facts())
 
 
 def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
@@ -212,6 +219,7 @@ def shear(walker: Walker, experiment: Experiment) -> None:
 
 
 @usual_rules()
+@telling
 def run(
     experiment: Experiment,
     *,
@@ -220,7 +228,7 @@ def run(
     frames: int = 0,
     frames_of: int = 1,
     keep: Keep = forget,
-    progress: Progress = silent,
+    progress: Telling = None,
 ) -> Recall:
     """Run an experiment on the host, in chunks: stale neighbour lists are made anew, a broken run raises.
 
@@ -233,18 +241,19 @@ def run(
         frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
         frames_of: the signal whose they are, from 1; 0 for the zero signal.
         keep: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
             for too many or too few frames, or a signal that there is not.
         RunFailedError: if the simulation broke down.
     """
+    tell = callback(progress)
     count, size = experiment.signals.count, batch or experiment.signals.count
     if size < 1:
         raise ValueError(f"batch must be at least 1, got {batch}")
     film = film_of(experiment, frames, frames_of)
-    begun = walker(experiment, progress=progress, film=film)
+    begun = walker(experiment, progress=tell, film=film)
     warn_of_another_compression(experiment)
     if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
         raise ValueError("parameters with a value for each replica need all signals in one batch")

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.html import line
 from gmem_jax.physics.pytree import Scalar, pytree, traced
 from gmem_jax.physics.rules import usual_rules
 
@@ -65,6 +66,9 @@ class Bumps:
     centres: jax.Array
     width: Scalar
 
+    def __repr__(self) -> str:
+        return line(self, lambda: (f"{self.count} signals", {"bumps": self.centres.shape[-1], "width": self.width}))
+
     @property
     def count(self) -> int:
         """Number of signals S."""
@@ -96,6 +100,9 @@ class Spline:
     """
 
     nodes: jax.Array
+
+    def __repr__(self) -> str:
+        return line(self, lambda: (f"{self.count} signals", {"nodes": self.nodes.shape[-1]}))
 
     @property
     def count(self) -> int:

@@ -98,6 +98,9 @@ class StoredRecall(NamedTuple):
         from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
         return from_above.recall_drawing(self.recall, what, self.configuration, against=against)
 
+    def __repr__(self) -> str:
+        return repr(self.recall)
+
     def _repr_html_(self) -> str:
         return self.recall._repr_html_()
 

@@ -22,13 +22,13 @@ from gmem_jax.experiment.host import (
     forget,
     refuse,
     require_x64,
-    silent,
     work_of_bin,
     worst,
 )
 from gmem_jax.experiment.pack import Pack, find_pairs, pair_finder, smallest_box
 from gmem_jax.experiment.protocol import Stage, preparation_cycle
 from gmem_jax.experiment.signals import BINS
+from gmem_jax.experiment.telling import Telling, callback, telling
 from gmem_jax.experiment.walk import Course
 from gmem_jax.files.provenance import provenance
 from gmem_jax.physics import rotation
@@ -345,6 +345,7 @@ class _Preparation:
 
 
 @usual_rules()
+@telling
 def prepare(
     recipe: Recipe | None = None,
     grain: Clump | None = None,
@@ -354,7 +355,7 @@ def prepare(
     name: str = "",
     backend: str = "auto",
     keep: Keep = forget,
-    progress: Progress = silent,
+    progress: Telling = None,
     log: dict[str, Sample] | None = None,
     frames: int = 0,
     film: list[Frames] | None = None,
@@ -370,7 +371,7 @@ def prepare(
         name: of the pack; default from grain, size and seed.
         backend: "auto", "jax" or "native".
         keep: asked for every part, so that a long preparation can be resumed (see `gmem_jax.files.parts`).
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
         log: filled with the samples of every cycle stage, if given.
         frames: configurations to keep: the lattice, the ends of gas, pressing and settling, the pack, and from six on
             some of the cycles (see `frames.places`). The pack stays as it is.
@@ -381,10 +382,11 @@ def prepare(
         ValueError: for impossible numbers, or if 64-bit mode is off.
         RunFailedError: if the simulation broke down or did not come to rest.
     """
+    tell = callback(progress)
     require_x64()
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = grain or tetra(), material or Material()
-    preparation = _Preparation(recipe, clump, material, backend, frames, keep, progress)
+    preparation = _Preparation(recipe, clump, material, backend, frames, keep, tell)
     preparation.compact()
     preparation.cycle()
     if log is not None:

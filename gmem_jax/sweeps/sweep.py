@@ -15,10 +15,11 @@ import psutil
 
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
-from gmem_jax.experiment.host import Progress, RunFailedError, silent, within, work_of_bin
+from gmem_jax.experiment.host import Progress, RunFailedError, within, work_of_bin
 from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall, replica_bins
+from gmem_jax.experiment.telling import Telling, callback, telling
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
@@ -65,12 +66,13 @@ class Results(list[Result]):
 
 
 @usual_rules()
+@telling
 def sweep(
     experiment: Experiment,
     vary: Mapping[str, Sequence[Any]],
     folder: Path | str | None = None,
     *,
-    progress: Progress = silent,
+    progress: Telling = None,
 ) -> Results:
     """Run every combination of some values, in this process; what may run side by side does.
 
@@ -78,7 +80,7 @@ def sweep(
         experiment: what all have in common.
         vary: values by dotted name, like {"friction.mu": [0.0, 0.5], "pack": packs}; packs also by name.
         folder: keeps the results; what is there already is not computed again.
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Returns:
         The points in the order of `itertools.product`, the last name fastest.
@@ -87,6 +89,7 @@ def sweep(
         ValueError: for a name that is no field, or an impossible value.
         RunFailedError: if a simulation broke down.
     """
+    tell = callback(progress)
     packs = functools.cache(load_pack)  # points on one pack object can run side by side
     points = []
     for row in itertools.product(*vary.values()):
@@ -102,7 +105,7 @@ def sweep(
     total, done = sum(one.experiment.replicas for one in missing) or 1, 0
     for group in jobs:
         share = sum(one.experiment.replicas for one in group)
-        on = within(progress, done / total, (done + share) / total)
+        on = within(tell, done / total, (done + share) / total)
         keys, experiments = [one.key for one in group], [one.experiment for one in group]
         keep = Parts(store.folder / "parts" / digest(keys), {"keys": keys}) if store else None
         found |= run_group(keys, experiments, store=store, keep=keep, progress=on)
