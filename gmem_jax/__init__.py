@@ -64,6 +64,10 @@ def __getattr__(name: str) -> Any:
     return module if name in ("capacity", "classify") else getattr(module, name)
 
 
+def __dir__() -> list[str]:
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]
+
+
 __all__ = [
     "Bumps",
     "Clump",

@@ -6,13 +6,14 @@ and the replay of one chunk. What is differentiated by is named: "gamma0", "fric
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.arguments import require_names
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, value_at
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.host import (
@@ -37,6 +38,7 @@ from gmem_jax.physics.state import State
 Loss = Callable[[Experiment, jax.Array], jax.Array]
 """From an experiment and its p_sig [S, 256] to a number."""
 
+FIXED = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
 FORWARDS = 0.1  # of a gradient's time is the way forward
 
 Moving = tuple[Any, Any]  # grains and history: what of a state can be differentiated
@@ -243,11 +245,25 @@ def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
     Raises:
         ValueError: if there is no such name, or it holds what has no derivative.
     """
-    theta = {name: jax.tree.map(jnp.asarray, value_at(experiment, name)) for name in names}
+    require_names(names, "by")
+    found = {name: value_at(experiment, name) for name in names}
+    for name, tree in found.items():
+        if name in FIXED or not all(
+            _is_number(leaf) for leaf in jax.tree.leaves(tree, is_leaf=lambda leaf: leaf is None)
+        ):
+            raise ValueError(
+                f"{name} is fixed when a program is compiled and has no derivative; "
+                "numbers like gamma0, friction.mu, signals.amplitudes and pack.position have"
+            )
+    theta = {name: jax.tree.map(jnp.asarray, tree) for name, tree in found.items()}
     for name, tree in theta.items():
         if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
             raise ValueError(f"{name} holds more than floats; name what to differentiate by, like pack.position")
     return theta
+
+
+def _is_number(leaf: Any) -> bool:
+    return isinstance(leaf, float | int | np.ndarray | jax.Array)
 
 
 def _along(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,8 @@ from gmem_jax.physics.rules import usual_rules
 
 MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
 """What is said of every recall: G and F of the set, and both averaged over the ringing period (`compare`)."""
-BACKGROUNDS = ("sub0", "sub2", "sub2-bl")
+Background = Literal["sub0", "sub2", "sub2-bl"]
+BACKGROUNDS: tuple[Background, ...] = get_args(Background)
 """Ways to remove the background: the zero signal's run; the same run's second readout; that without its line."""
 
 

@@ -13,12 +13,15 @@ import numpy as np
 
 from gmem_jax import native
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.analysis import Background
+from gmem_jax.experiment.arguments import require_once, require_parts
 from gmem_jax.experiment.drive import Drive
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.protocol import Stage, memory_protocol, split
+from gmem_jax.experiment.protocol import Shear, Stage, memory_protocol, split
 from gmem_jax.experiment.signals import BINS, Signals, bin_average, part
 from gmem_jax.experiment.walk import Course
+from gmem_jax.native import Backend, Precision
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.material import Material
@@ -90,17 +93,18 @@ class Experiment:
     rest: float = static(0.2)
     hold: float = static(0.2)
     store: float = static(2.0)
-    background: str = static("sub0")
-    shear: str = static("during")
-    backend: str = static("auto")
-    precision: str = static("double")
+    background: Background = static("sub0")
+    shear: Shear = static("during")
+    backend: Backend = static("auto")
+    precision: Precision = static("double")
     steps_per_bin: int = dataclasses.field(init=False, default=1, metadata={"static": True})
 
     @usual_rules()
     def __post_init__(self) -> None:
+        require_parts(self.pack, self.signals, self.friction)
         for name in ("dt", "rest", "hold", "store"):
             object.__setattr__(self, name, _static_number(name, getattr(self, name)))
-        object.__setattr__(self, "background", self.background.lower())
+        object.__setattr__(self, "background", str(self.background).lower())
         settle(self)
         if self.background not in analysis.BACKGROUNDS:
             raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {self.background!r}")
@@ -330,10 +334,10 @@ class Changes(TypedDict, total=False):
     rest: float
     hold: float
     store: float
-    background: str
-    shear: str
-    backend: str
-    precision: str
+    background: Background
+    shear: Shear
+    backend: Backend
+    precision: Precision
 
 
 @usual_rules()
@@ -351,9 +355,10 @@ def replace(
         changes: what changes by field.
 
     Raises:
-        ValueError: if there is no such field, or the new experiment is impossible.
+        ValueError: if there is no such field, it is given twice, or the new experiment is impossible.
     """
     found: dict[str, Any] = dict(changes)
+    require_once(values or {}, changes)
     for path, value in (values or {}).items():
         name, *deeper = path.split(".")
         _require_field(experiment, name)

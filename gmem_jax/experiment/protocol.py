@@ -3,12 +3,15 @@
 import itertools
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
 
 from gmem_jax.experiment.signals import BINS
+
+Shear = Literal["during", "before"]
+"""When waveforms are applied: during the compression, or before it."""
 
 Numbers = float | np.ndarray | jax.Array
 """A number, or a column of a table."""

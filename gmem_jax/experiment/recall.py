@@ -249,7 +249,8 @@ def run(
         RunFailedError: if the simulation broke down.
     """
     tell = callback(progress)
-    count, size = experiment.signals.count, batch or experiment.signals.count
+    count = experiment.signals.count
+    size = count if batch is None else batch
     if size < 1:
         raise ValueError(f"batch must be at least 1, got {batch}")
     film = film_of(experiment, frames, frames_of)

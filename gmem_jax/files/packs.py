@@ -40,14 +40,16 @@ def _arrays(pack: Pack) -> dict[str, Any]:
 
 
 @usual_rules()
-def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None, frames: Frames | None = None) -> None:
+def save_pack(
+    path: str | Path, pack: Pack, stages: dict[str, Sample] | None = None, frames: Frames | None = None
+) -> None:
     """Write a pack, and the time series of its preparation and configurations along it if given.
 
     Raises:
         OSError: if the path cannot be written.
     """
     clump, values = pack.clump, _arrays(pack)
-    with writing(path, PACK.name) as file:
+    with writing(Path(path), PACK.name) as file:
         file.attrs["name"] = pack.name
         file.attrs["record"] = pack.record
         write_arrays(file, PACK.arrays, values)

@@ -40,7 +40,7 @@ _EVERY_BIT = int(sum(Status))
 
 
 @usual_rules()
-def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> None:
+def save_recall(path: str | Path, recall: Recall, configuration: dict[str, Any]) -> None:
     """Write a recall with its resolved configuration.
 
     Raises:
@@ -49,7 +49,7 @@ def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> No
     names = np.asarray([name.encode() for name in signal_names(recall, configuration)])
     if names.dtype.itemsize == 1:
         names = names.astype("S2")  # single letters are characters of one text to netCDF
-    with writing(path, RECALL.name) as file:
+    with writing(Path(path), RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
         write_arrays(file, _declared(np.ndim(recall.dt)), {**vars(recall), "signal": names})
         write_samples(file.create_group("stages"), recall.stages)
@@ -110,7 +110,7 @@ class StoredRecall(NamedTuple):
 
 
 @usual_rules()
-def load_recall(path: Path) -> StoredRecall:
+def load_recall(path: str | Path) -> StoredRecall:
     """Read a recall and its configuration, which the result can be unpacked into.
 
     Raises:
@@ -118,6 +118,7 @@ def load_recall(path: Path) -> StoredRecall:
         FileFormatError: if the file is damaged, not a complete recall of this schema, or its numbers do not fit each
             other.
     """
+    path = Path(path)
     with refusing(path, "recall"):
         with reading(path, RECALL.name, *RECALL.before) as content:
             configuration = json_of(content.text("configuration"), "configuration")

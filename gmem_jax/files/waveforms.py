@@ -19,7 +19,7 @@ _TARGET, _DESIGN = "# target: ", "# design: "
 
 
 @usual_rules()
-def load_waveforms(path: Path) -> np.ndarray:
+def load_waveforms(path: str | Path) -> np.ndarray:
     """Waveform samples [S, n] from a CSV (one column per signal) or NPY ([n] or [S, n]) file.
 
     Row k is I at u = k / (n + 1), k = 1..n. A CSV may have one header line of names.
@@ -112,7 +112,7 @@ def _is_number(cell: str) -> bool:
 
 @usual_rules()
 def save_waveforms(
-    path: Path, signals: Spline, target: Signals | None = None, *, design: Mapping[str, Any] | None = None
+    path: str | Path, signals: Spline, target: Signals | None = None, *, design: Mapping[str, Any] | None = None
 ) -> None:
     """Write waveforms as a CSV that `load_waveforms` and `gmem recall --signals` read: a column for every signal.
 
@@ -131,5 +131,5 @@ def save_waveforms(
         header = f"{_DESIGN}{json.dumps(design)}\n{header}"
     if target is not None:
         header = f"{_TARGET}{json.dumps(written_signals(target))}\n{header}"
-    with atomic(path) as temporary:
+    with atomic(Path(path)) as temporary:
         np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g")

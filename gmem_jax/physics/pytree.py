@@ -4,12 +4,14 @@ A field is data (an array, a number, another pytree) unless it says otherwise: `
 structure that a program is compiled for; a `label` is carried along but compiles nothing anew.
 """
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import field, fields, is_dataclass
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 
@@ -89,7 +91,24 @@ def pytree(cls: type[T]) -> type[T]:
         return made
 
     jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+    if cls.__module__.startswith("gmem_jax."):
+        jax.export.register_pytree_node_serialization(
+            cls,
+            serialized_name=f"gmem_jax.{cls.__name__}",
+            serialize_auxdata=lambda structure: json.dumps(structure).encode(),
+            deserialize_auxdata=_structure,
+        )
     return cls
+
+
+def _structure(written: bytes | bytearray) -> Any:
+    """What `flatten` gives beside the children, from an exported program."""
+    fixed, labels = json.loads(written)
+    return tuple(map(_hashable, fixed)), _Labels(labels)
+
+
+def _hashable(value: Any) -> Any:
+    return tuple(map(_hashable, value)) if isinstance(value, list) else value
 
 
 def traced(*trees: Any) -> bool:

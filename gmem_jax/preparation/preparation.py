@@ -353,7 +353,7 @@ def prepare(
     material: Material | None = None,
     friction: FrictionLaw | None = None,
     name: str = "",
-    backend: str = "auto",
+    backend: native.Backend = "auto",
     keep: Keep = forget,
     progress: Telling = None,
     log: dict[str, Sample] | None = None,

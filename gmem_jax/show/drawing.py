@@ -20,7 +20,7 @@ class Drawing:
 
     figure: Any
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write it, in the format of the path's suffix.
 
         Raises:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import psutil
 
+from gmem_jax.experiment.arguments import require_values
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.host import Progress, RunFailedError, within, work_of_bin
@@ -90,6 +91,7 @@ def sweep(
         RunFailedError: if a simulation broke down.
     """
     tell = callback(progress)
+    require_values(vary)
     packs = functools.cache(load_pack)  # points on one pack object can run side by side
     points = []
     for row in itertools.product(*vary.values()):
