@@ -39,7 +39,7 @@ from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
 from gmem_jax.show import figures, tables
-from gmem_jax.show.kinds import kernel_facts
+from gmem_jax.show.kinds import kernel_facts, kernel_lines
 
 GRADIENT = 11.0  # cost of a gradient in runs; see benchmarks
 MANY = 16  # signals above which one kernel serves all rather than a Jacobian each
@@ -191,8 +191,7 @@ def kernel_command(
     if drawn:
         with drawing(drawn):
             figures.kernel_figure(drawn, kernel, noise / float(Material().modulus), tables.cell(pack))
-    lines = [f"{key}: {result[key]:.3f}" for key in ("gain", "distance", "asymmetry", "resolution")]
-    lines.append(f"values above {noise:g} Pa: {result['capacity']} of {n}")
+    lines = kernel_lines(result, noise, n)
     lines.append("superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"]))
     emit(as_json, result, "\n".join(lines))
 

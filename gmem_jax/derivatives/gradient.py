@@ -248,9 +248,7 @@ def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
     require_names(names, "by")
     found = {name: value_at(experiment, name) for name in names}
     for name, tree in found.items():
-        if name in FIXED or not all(
-            _is_number(leaf) for leaf in jax.tree.leaves(tree, is_leaf=lambda leaf: leaf is None)
-        ):
+        if name in FIXED or not all(map(_is_number, jax.tree.leaves(tree))):
             raise ValueError(
                 f"{name} is fixed when a program is compiled and has no derivative; "
                 "numbers like gamma0, friction.mu, signals.amplitudes and pack.position have"

@@ -31,10 +31,12 @@ def keep_programs() -> None:
     chosen = os.environ.get(SWITCH, "")
     if chosen == "off" or getattr(jax.config, "jax_compilation_cache_dir", None):
         return
-    home = kept()
-    if not chosen and home is None:
+    if chosen:
+        folder = Path(chosen)
+    elif home := kept():
+        folder = home / f"jax-{jax.__version__}-{_processor()}"
+    else:
         return
-    folder = Path(chosen) if chosen else home / f"jax-{jax.__version__}-{_processor()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

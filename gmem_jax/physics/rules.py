@@ -32,7 +32,8 @@ def why_not_started() -> str:
         jax.devices()
     except Exception as error:  # RuntimeError for an unknown platform, a bare AssertionError for one without a device
         said = " ".join(str(error).split()) or "there is no such device"
-        asked = f" with JAX_PLATFORMS={jax.config.jax_platforms}" if jax.config.jax_platforms else ""
+        platforms = getattr(jax.config, "jax_platforms", None)
+        asked = f" with JAX_PLATFORMS={platforms}" if platforms else ""
         return f"JAX does not start{asked}: {said}; unset JAX_PLATFORMS, or set it to cpu"
     return ""
 
