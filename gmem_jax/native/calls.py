@@ -380,7 +380,7 @@ ad.primitive_transposes[_tangent_p] = _transpose
 # The library has the derivative of the steps and not that of the derivative, which plain JAX has.
 def _no_second(primals: Any, tangents: Any, **_: Any) -> Any:
     raise NotImplementedError(
-        "second derivatives are not in the native backend; use backend='jax' (docs/howto/gradients.md: what they cost)"
+        "second derivatives are not in the native backend; use backend='jax' (what they cost: docs/howto/gradients.md)"
     )
 
 

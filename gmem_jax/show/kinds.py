@@ -104,6 +104,11 @@ def _pack(file: Path, against: str) -> Shown:
     return Shown(facts, [tables.pack_table(pack)], drawn)
 
 
+def _plain(label: str) -> str:
+    """The label of an axis without the marks of formulas."""
+    return label.replace("$", "").replace("\\", "")
+
+
 KERNEL_WORDS = {
     "gain": "G of the perfect integral that comes nearest",
     "distance": "from that integral: 0 none, 1 nothing of it",
@@ -128,7 +133,7 @@ PLOTS = {
     "fidelity": "F of the points",
     "windowed_gain": "G after a running mean over the ringing period",
     "windowed_fidelity": "F after the same",
-    **{name: f"{quantity.label}, over the stages" for name, quantity in QUANTITIES.items()},
+    **{name: f"{_plain(quantity.label)}, over the stages" for name, quantity in QUANTITIES.items()},
 }
 """What every picture shows, in words."""
 
