@@ -100,6 +100,7 @@ def classify_command(
     seconds = time.perf_counter() - began
     result = {"recall": str(recall), "pack": configuration["pack"], "status": status, "seconds": seconds, **result}
     save_result(output, READING, result)
+    told = f"wrote {output}"
     if drawn:
         net = result["readers"]["net"]
         title = (
@@ -107,7 +108,8 @@ def classify_command(
         )
         with drawing(drawn):
             figures.confusion_figure(drawn, confusion(net["read"], len(stored.signals)), title)
-    say(f"wrote {output}" + (f" and {drawn}" if drawn and drawn.exists() else ""))
+            told += f" and {drawn}"
+    say(told)
     emit(as_json, result, *tables.reading_tables(result))
 
 
