@@ -13,7 +13,7 @@ from gmem_jax.command.console import RunInterruptedError, say
 from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.experiment.telling import told_elsewhere
 from gmem_jax.files.programs import keep_programs
-from gmem_jax.physics.rules import StartError, why_not_started
+from gmem_jax.physics.rules import StartError, usual_rules, why_not_started
 
 app = typer.Typer(rich_markup_mode=None, help="Waveform memory in granular packs.")
 for group in (packs, recalls, show, exchange, classify, derive, sweep, report, reproduce, benchmark):
@@ -46,8 +46,10 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     keep_programs()
     warnings.showwarning = _one_line
+    if jax.config.jax_disable_jit:
+        say("warning: JAX_DISABLE_JIT is set: nothing is compiled, and a run takes hours for seconds", style="yellow")
     try:
-        with told_elsewhere():
+        with told_elsewhere(), usual_rules():
             code = app(args=sys.argv[1:] or ["--help"], prog_name="gmem", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except TyperException as error:

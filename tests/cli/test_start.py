@@ -46,6 +46,13 @@ def test_a_setting_that_jax_refuses_when_it_is_imported_is_told_in_one_line() ->
     assert line.count("\n") == 1
 
 
+def test_flags_of_jax_do_not_stop_a_command_and_one_that_slows_it_is_told(tmp_path: Path) -> None:
+    strict = {"JAX_TRANSFER_GUARD": "disallow", "JAX_NUMPY_RANK_PROMOTION": "raise"}
+    said("show", PACK, "--plot", "grains", "-o", tmp_path / "x.png", code=0, **strict)
+    line = said("info", code=0, JAX_DISABLE_JIT="1")
+    assert line.splitlines()[0].startswith("warning: JAX_DISABLE_JIT is set: nothing is compiled")
+
+
 @pytest.mark.parametrize("threads", ["0", "abc"])
 def test_a_wrong_number_of_threads_is_told_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, threads: str
