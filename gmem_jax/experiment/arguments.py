@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,7 +25,10 @@ def require_parts(pack: Any, signals: Any, friction: Any) -> None:
         numbers = isinstance(signals, list | tuple | np.ndarray) or hasattr(signals, "shape")
         made = "gm.waveform makes waveforms of samples" if numbers else "as gm.six_signals(), gm.words(3)"
         raise ValueError(f"signals must be waveforms, got {_said(signals)}; {made}")
-    if isinstance(friction, type) or not isinstance(friction, FrictionLaw):
+    plain = isinstance(friction, float | int | str) or hasattr(friction, "shape")
+    # A class that JAX does not know may be a law in the making: `Experiment` says what it lacks.
+    unregistered = not plain and jax.tree_util.all_leaves([friction])
+    if isinstance(friction, type) or not (unregistered or isinstance(friction, FrictionLaw)):
         if isinstance(friction, type):
             made = f"make one with its parameters, as {friction.__name__}(mu=1.0)"
         else:
