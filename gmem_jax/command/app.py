@@ -46,7 +46,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     keep_programs()
     warnings.showwarning = _one_line
-    if jax.config.jax_disable_jit:
+    if getattr(jax.config, "jax_disable_jit", False):
         say("warning: JAX_DISABLE_JIT is set: nothing is compiled, and a run takes hours for seconds", style="yellow")
     try:
         with told_elsewhere(), usual_rules():

@@ -163,7 +163,7 @@ def _kernel(file: Path) -> Shown:
     about = {"pack": pack, "n": len(kernel.centres), "width": kernel.width, "gamma0": kernel.gamma0}
     facts = kernel_facts(kernel, NOISE)
     lines = [f"memory kernel of {pack}: {about['n']} bumps of width {kernel.width:g}, gamma0 = {kernel.gamma0:g}"]
-    lines += kernel_lines(facts, NOISE, about["n"])
+    lines += kernel_lines(facts, NOISE, len(kernel.centres))
     floor = NOISE / float(Material().modulus)
     drawn: dict[str, Draw] = {
         "kernel": lambda path: figures.kernel_figure(path, kernel, floor, pack),
