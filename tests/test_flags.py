@@ -1,8 +1,10 @@
 """The package under every flag that makes JAX strict, or lets it show what it does: the numbers stay as they are."""
 
 import contextlib
+import itertools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,7 +22,16 @@ FLAGS: dict[str, Callable[[], contextlib.AbstractContextManager]] = {
     "checks": lambda: jax.enable_checks(True),
     "no transfers": lambda: jax.transfer_guard("disallow"),
 }
-SLOW = pytest.param("jax", marks=pytest.mark.slow)
+COMPILED_ANEW = ("nothing is NaN", "no tracer leaks", "checks")  # the others share the programs of no flag
+
+
+def cases(*fast: str) -> list[Any]:
+    """Every flag on both backends; slow are those that compile for ten seconds and more."""
+    found = []
+    for flag, backend in itertools.product(FLAGS, ("native", "jax")):
+        slow = flag in COMPILED_ANEW or backend not in fast
+        found.append(pytest.param(flag, backend, marks=[pytest.mark.slow] * slow, id=f"{flag}-{backend}"))
+    return found
 
 
 def made(backend: str) -> gm.Experiment:
@@ -39,8 +50,7 @@ def slope_of(experiment: gm.Experiment) -> jax.Array:
     return jax.jit(jax.grad(fidelity))(jax.device_put(1e-3))
 
 
-@pytest.mark.parametrize("backend", ["native", "jax"])
-@pytest.mark.parametrize("flag", FLAGS)
+@pytest.mark.parametrize(("flag", "backend"), cases("native", "jax"))
 def test_an_experiment_has_the_same_numbers_under(flag: str, backend: str) -> None:
     expected = gm.run(made(backend))
     with FLAGS[flag]():
@@ -50,8 +60,7 @@ def test_an_experiment_has_the_same_numbers_under(flag: str, backend: str) -> No
     np.testing.assert_allclose(traced.p_sig, expected.p_sig, rtol=1e-6)
 
 
-@pytest.mark.parametrize("backend", ["native", SLOW])
-@pytest.mark.parametrize("flag", FLAGS)
+@pytest.mark.parametrize(("flag", "backend"), cases("native"))
 def test_a_gradient_has_the_same_numbers_under(flag: str, backend: str) -> None:
     names = ["gamma0", "friction.mu", "signals.amplitudes"]
     expected = gm.value_and_grad(made(backend), names)
