@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from gmem_jax.design.drive import TunedDrive, design_drive
     from gmem_jax.design.waveforms import Design, design_waveforms
     from gmem_jax.reading import capacity, classify
-    from gmem_jax.show.progress import ProgressBar
     from gmem_jax.show.view import view
+    from gmem_jax.simulation.progress import ProgressBar
     from gmem_jax.sweeps.sweep import sweep
 
 _LATER = {  # what loads flax or optax, or is seldom asked for, or stands above what does, by where it is
@@ -50,7 +50,7 @@ _LATER = {  # what loads flax or optax, or is seldom asked for, or stands above 
     "design_drive": "gmem_jax.design.drive",
     "capacity": "gmem_jax.reading.capacity",
     "classify": "gmem_jax.reading.classify",
-    "ProgressBar": "gmem_jax.show.progress",
+    "ProgressBar": "gmem_jax.simulation.progress",
     "sweep": "gmem_jax.sweeps.sweep",
     "view": "gmem_jax.show.view",
 }
@@ -61,6 +61,10 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 'gmem_jax' has no attribute {name!r}")
     module = importlib.import_module(_LATER[name])
     return module if name in ("capacity", "classify") else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]
 
 
 __all__ = [

@@ -4,12 +4,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+os.environ["GMEM_COMPILE_CACHE"] = "off"  # before the package, which tells its library as soon as it is imported
+
 import jax
 import pytest
 
 import gmem_jax as gm
-
-os.environ["GMEM_COMPILE_CACHE"] = "off"
 
 jax.config.update("jax_enable_x64", True)
 

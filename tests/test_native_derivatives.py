@@ -227,6 +227,20 @@ def test_bins_counted_only_at_run_time_are_differentiated_forwards() -> None:
             np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-18)
 
 
+@pytest.mark.parametrize("march", [native.march, pytest.param(dynamics.march, marks=pytest.mark.slow)])
+def test_nothing_changes_where_programs_are_not_compiled_as_a_whole(march: native.March) -> None:
+    system = System(PACK.clump, LAWS["H"], PACK.pairs)
+    state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
+    boxes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), PACK.box)
+
+    def pressure(dt: jax.Array) -> jax.Array:
+        return jnp.sum(march(system, state, boxes, dt, 0.0)[1])
+
+    compiled = jax.jit(jax.value_and_grad(pressure))(jnp.asarray(0.3))
+    with jax.disable_jit():
+        assert_close(jax.value_and_grad(pressure)(jnp.asarray(0.3)), compiled)
+
+
 def test_second_derivatives_are_refused_in_one_line() -> None:
     system, state = squeezed(LAWS["H"])
     theta = arguments(system, state)

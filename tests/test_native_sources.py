@@ -42,7 +42,7 @@ def instruction_sets() -> dict[str, tuple[str, ...]]:
     return {name: build.INSTRUCTION_SETS[name] for name in known}
 
 
-@pytest.mark.parametrize("name", ["numbers", "physics", "runs", "threads"])
+@pytest.mark.parametrize("name", ["numbers", "physics", "segments", "threads"])
 def test_unit_tests_in_cpp(name: str, tmp_path: Path) -> None:
     more = [str(build.SOURCES / source) for source in THREADS] if name == "threads" else []
     sets = instruction_sets() if name != "threads" else {"baseline": ()}

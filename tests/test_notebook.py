@@ -1,5 +1,7 @@
 """What a notebook shows: short tables in the place of objects, pictures, progress."""
 
+import inspect
+import io
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +14,7 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.experiment.html import listing
 from gmem_jax.show import recalls
+from gmem_jax.simulation.progress import ProgressChoice, callback, no_further_bar, shows_progress
 from gmem_jax.sweeps.sweep import Result, Results
 
 
@@ -30,6 +33,24 @@ def test_objects_are_shown_as_short_tables(recalled: tuple[gm.Experiment, gm.Rec
         assert table.startswith("<table>")
         assert table.count("<tr>") < 15
         assert all(word in table for word in words), table
+
+
+def test_objects_are_one_line_in_a_terminal(recalled: tuple[gm.Experiment, gm.Recall], tmp_path: Path) -> None:
+    experiment, recall = recalled
+    gm.save_recall(tmp_path / "r.h5", recall, gm.resolved(experiment, 0.0))
+    for shown, words in (
+        (experiment.pack, "<Pack tetra(0.6)-27-seed1: grains = 27 tetra(0.6), "),
+        (experiment, "27 grains, signals = 2, bumps, friction = Hooke, mu = 1, gamma0 = 0.001, "),
+        (recall, f"<Recall of 2 signals: G = {float(recall.gain):.4g}, "),
+        (gm.load_recall(tmp_path / "r.h5"), "<Recall of 2 signals: "),
+        (gm.six_signals(), "<6 signals: bumps = 3, width = 0.2>"),
+        (gm.waveform([0.1, 0.2]), "<1 signals: nodes = 4>"),
+        (jax.tree.map(lambda _: None, experiment), "<Experiment>"),
+    ):
+        assert words in repr(shown)
+        assert len(repr(shown)) < 400
+        assert "\n" not in repr(shown)
+    jax.jit(lambda each: repr(each) and each.gamma0)(experiment)
 
 
 def test_objects_are_shown_inside_transformations_too(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
@@ -101,3 +122,71 @@ def test_progress_is_shown_in_a_terminal_and_in_a_notebook(
     gm.ProgressBar()("<rest>", 0.0, 0.25)
     assert shown[0]["text/html"] == '<progress value="0.2500" max="1"></progress> 25% &lt;rest&gt;'
     assert capsys.readouterr().err == ""
+
+
+class Terminal(io.StringIO):
+    """What a person looks at."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_run_is_watched_in_a_terminal_unless_it_is_told_not_to(
+    recalled: tuple[gm.Experiment, gm.Recall], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "IPython", raising=False)
+    experiment, told = recalled[0], []
+
+    def said(**options: Any) -> str:
+        monkeypatch.setattr(sys, "stderr", shown := Terminal())
+        gm.run(experiment, **options)
+        return shown.getvalue()
+
+    assert said().endswith("\n")
+    assert "encode" in said() or "readout" in said()
+    assert said(progress=False) == ""
+    assert said(progress=lambda *now: told.append(now)) == ""
+    assert told[-1][-1] == 1.0
+    with no_further_bar():
+        assert said() == ""
+    monkeypatch.setattr(sys, "stderr", nobody := io.StringIO())
+    gm.run(experiment)
+    assert nobody.getvalue() == ""
+
+
+def test_a_run_in_another_shows_no_bar_of_its_own_and_a_broken_one_ends_its_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delitem(sys.modules, "IPython", raising=False)
+    monkeypatch.setattr(sys, "stderr", shown := Terminal())
+
+    @shows_progress
+    def inner(progress: ProgressChoice = None) -> None:
+        callback(progress)("inner", 0.0, 0.5)
+
+    @shows_progress
+    def outer(progress: ProgressChoice = None) -> None:
+        callback(progress)("outer", 0.0, 0.5)
+        inner()
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        outer()
+    assert "outer" in shown.getvalue()
+    assert "inner" not in shown.getvalue()
+    assert shown.getvalue().endswith("\n")
+
+
+def test_everything_that_runs_for_long_tells_how_far_it_is() -> None:
+    for one in (
+        gm.run,
+        gm.prepare,
+        gm.sweep,
+        gm.value_and_grad,
+        gm.jacobian,
+        gm.memory_kernel,
+        gm.design_waveforms,
+        gm.design_by_kernel,
+        gm.design_drive,
+    ):
+        assert inspect.signature(one).parameters["progress"].default is None

@@ -85,7 +85,8 @@ def test_the_wheel_says_what_it_is(built: Built) -> None:
     assert found["Keywords"]
     assert "waveform" in found.get_payload()
     [scripts] = [name for name in archive.namelist() if name.endswith("entry_points.txt")]
-    assert "gmem = gmem_jax.command.app:main" in archive.read(scripts).decode()
+    assert "gmem = gmem_start:main" in archive.read(scripts).decode()
+    assert "gmem_start.py" in archive.namelist()
 
 
 def test_the_version_is_the_same_wherever_it_stands() -> None:

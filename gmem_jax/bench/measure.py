@@ -75,7 +75,7 @@ def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str, t0: float 
     """The start of an encode stage: what a rollout needs."""
     heights = jnp.linspace(-1.0, 1.0, max(1, replicas - 1))[:, None]
     signals = Bumps(heights, jnp.full_like(heights, 0.1), 0.2)
-    experiment = Experiment(pack, signals, law, t0=t0, backend=backend)
+    experiment = Experiment(pack, signals, law, t0=t0, backend=native.name(backend, law))
     simulation = experiment.simulation(sheared=replicas > 1)
     return simulation, replicate(experiment.begin(), replicas)
 
@@ -225,7 +225,7 @@ def memory(load: Callable[[str], Pack], name: str, grains: int, backend: str, la
 def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int, t0: float) -> dict[str, float]:
     jax.config.update("jax_enable_x64", True)
     amplitudes = np.random.default_rng(0).normal(scale=0.2, size=(6, values))
-    experiment = Experiment(load(name), bumps(amplitudes, 0.2), t0=t0, backend=backend)
+    experiment = Experiment(load(name), bumps(amplitudes, 0.2), t0=t0, backend=native.name(backend, Hooke()))
 
     def seconds(run: Callable[[], Any]) -> float:
         taken = []

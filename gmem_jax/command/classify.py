@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich import progress
 
-from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, emit, log, say
+from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, drawing, emit, log, say
 from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
@@ -100,13 +100,16 @@ def classify_command(
     seconds = time.perf_counter() - began
     result = {"recall": str(recall), "pack": configuration["pack"], "status": status, "seconds": seconds, **result}
     save_result(output, READING, result)
+    told = f"wrote {output}"
     if drawn:
         net = result["readers"]["net"]
         title = (
             f"{tables.cell(configuration['pack'])}, {stored.bits} bits: accuracy {net['accuracy']:.3f} ({seeds} nets)"
         )
-        figures.confusion_figure(drawn, confusion(net["read"], len(stored.signals)), title)
-    say(f"wrote {output}" + (f" and {drawn}" if drawn else ""))
+        with drawing(drawn):
+            figures.confusion_figure(drawn, confusion(net["read"], len(stored.signals)), title)
+            told += f" and {drawn}"
+    say(told)
     emit(as_json, result, *tables.reading_tables(result))
 
 

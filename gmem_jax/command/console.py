@@ -132,6 +132,16 @@ def _bytes(count: float) -> str:
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
+@contextlib.contextmanager
+def drawing(picture: Path) -> Iterator[None]:
+    """A picture beside a result that is written already: what goes wrong with it is a warning, and nothing is lost."""
+    try:
+        yield
+    except Exception as error:  # matplotlib's, by the user's fonts and settings
+        why = " ".join(str(error).split()) or type(error).__name__
+        say(f"warning: {picture}: could not be drawn ({why})", style="yellow")
+
+
 class RunInterruptedError(KeyboardInterrupt):
     """Ctrl-C in a run whose finished parts are kept."""
 

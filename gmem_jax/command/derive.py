@@ -17,6 +17,7 @@ from gmem_jax.command.console import (
     Picture,
     announce,
     claim,
+    drawing,
     emit,
     reporting,
 )
@@ -37,7 +38,7 @@ from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.material import Material
 from gmem_jax.show import figures, tables
-from gmem_jax.show.kinds import kernel_facts
+from gmem_jax.show.kinds import kernel_facts, kernel_lines
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 from gmem_jax.simulation.observers import CHUNK
 from gmem_jax.simulation.progress import within
@@ -109,7 +110,8 @@ def gradient_command(
         }
         save_result(output, schemas.GRADIENT, {**result, "configuration": resolved(experiment, result["seconds"])})
     if drawn:
-        figures.gradient_figure(drawn, rows, f"{tables.cell(pack)}: F = {result['fidelity']:.4f}")
+        with drawing(drawn):
+            figures.gradient_figure(drawn, rows, f"{tables.cell(pack)}: F = {result['fidelity']:.4f}")
     lines = [f"F = {result['fidelity']:.4f}"]
     lines += [f"dF/d{name} = {gradient[name]:.5g}" for name in gradient if name != "waveform"]
     for number, row in enumerate(gradient["waveform"]):
@@ -189,9 +191,9 @@ def kernel_command(
         }
         save_kernel(output, kernel, resolved(experiment, time.perf_counter() - began))
     if drawn:
-        figures.kernel_figure(drawn, kernel, noise / float(Material().modulus), tables.cell(pack))
-    lines = [f"{key}: {result[key]:.3f}" for key in ("gain", "distance", "asymmetry", "resolution")]
-    lines.append(f"values above {noise:g} Pa: {result['capacity']} of {n}")
+        with drawing(drawn):
+            figures.kernel_figure(drawn, kernel, noise / float(Material().modulus), tables.cell(pack))
+    lines = kernel_lines(result, noise, n)
     lines.append("superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"]))
     emit(as_json, result, "\n".join(lines))
 
@@ -292,8 +294,9 @@ def design_command(
         way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
         save_waveforms(output, found.signals, experiment.signals, design=way)
     if drawn:
-        figures.design_figure(drawn, found, float(experiment.scale), tables.cell(pack))
-        figures.history_figure(history, {tables.cell(pack): found.history})
+        with drawing(drawn):
+            figures.design_figure(drawn, found, float(experiment.scale), tables.cell(pack))
+            figures.history_figure(history, {tables.cell(pack): found.history})
     result = {
         "pack": pack,
         "before": found.before,
@@ -366,7 +369,8 @@ def tune_command(
         }
         save_result(output, schemas.TUNED, {**result, "configuration": resolved(first, result["seconds"])})
     if drawn:
-        figures.history_figure(drawn, {" ".join(map(tables.cell, names)): [value for _, value in found.history]})
+        with drawing(drawn):
+            figures.history_figure(drawn, {" ".join(map(tables.cell, names)): [value for _, value in found.history]})
     values = ", ".join(f"{name} = {value:.4g}" for name, value in found.values.items())
     emit(as_json, result, f"mean F {found.before:.4f} -> {found.fidelity:.4f} with {values}; wrote {output}")
 

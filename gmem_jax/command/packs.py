@@ -106,6 +106,8 @@ def prepare_command(
         if output is not None or name or recipe != _DEFAULT or (shape, overlap) != ("tetra", 0.6):
             raise InputError(f"{standard}: the name of a standard pack says all about it; leave other options away")
         recipe, name, output = standard_recipe(standard), standard, kept_pack(standard)
+        if output is None:
+            raise InputError(f"{standard}: there is no home folder to keep it in; set XDG_CACHE_HOME")
         try:
             output.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:

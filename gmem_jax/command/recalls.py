@@ -18,6 +18,7 @@ from gmem_jax.command.console import (
     Picture,
     announce,
     claim,
+    drawing,
     emit,
     reporting,
     say,
@@ -63,10 +64,13 @@ def _run(
         if target is not None:
             configuration["target"] = written_signals(target)
         save_recall(data, recall, configuration)
+    told = f"wrote {data}"
     if picture is not None:
         title = tables.heading(configuration)
-        figures.recall_figure(picture, recall, experiment.scale, title, configuration["signals"])
-    say(f"wrote {data}" + (f" and {picture}" if picture else ""))
+        with drawing(picture):
+            figures.recall_figure(picture, recall, experiment.scale, title, configuration["signals"])
+            told += f" and {picture}"
+    say(told)
     row = {**tables.summary(recall, configuration), "seconds": configuration["seconds"], "output": str(data)}
     if row["status"]:
         say(f"warning: {row['status_text']}", style="yellow")

@@ -9,7 +9,7 @@ import typer
 from gmem_jax.command import sweep
 from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, say
 from gmem_jax.show.drawing import FORMATS
-from gmem_jax.show.kinds import Draw, shown, sweep_pictures
+from gmem_jax.show.kinds import PLOTS, Draw, shown, sweep_pictures
 from gmem_jax.show.stages import AGAINST
 
 
@@ -54,7 +54,7 @@ def show(
 def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None, force: bool) -> None:
     names = {name.lower(): name for name in pictures}
     if plot == "list":
-        sys.stdout.write("\n".join(pictures) + "\n")
+        sys.stdout.writelines(f"{name:17}  {PLOTS[name]}\n" for name in pictures)
         return
     if plot.lower() not in names:
         raise InputError(f"--plot {plot}: there is no such picture of {file}; there are {', '.join(pictures)}")

@@ -6,22 +6,24 @@ and the replay of one chunk. What is differentiated by is named: "gamma0", "fric
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.arguments import require_names
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, value_at
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.recall import apply_waveforms, runner_of
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint
 from gmem_jax.simulation.compiled import Compiled
 from gmem_jax.simulation.loop import Simulation, rollout, rollout_chunk
 from gmem_jax.simulation.observers import CHUNK, Chunk, Move, Observer
-from gmem_jax.simulation.progress import Progress, silent, within, work_of
+from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within, work_of
 from gmem_jax.simulation.protocol import Bin
 from gmem_jax.simulation.runner import Runner
 from gmem_jax.simulation.sample import Sample
@@ -29,6 +31,7 @@ from gmem_jax.simulation.sample import Sample
 Loss = Callable[[Experiment, jax.Array], jax.Array]
 """From an experiment and its p_sig [S, 256] to a number."""
 
+FIXED = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
 FORWARDS = 0.1  # of a gradient's time is the way forward
 
 Moving = tuple[Any, Any]  # grains and history: what of a state can be differentiated
@@ -196,6 +199,7 @@ class Pushed:
     p_sig_slope: jax.Array
 
 
+@usual_rules()
 def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Progress = silent) -> Pushed:
     """Forward mode: the derivative of a whole experiment along a direction.
 
@@ -243,11 +247,23 @@ def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
     Raises:
         ValueError: if there is no such name, or it holds what has no derivative.
     """
-    theta = {name: jax.tree.map(jnp.asarray, value_at(experiment, name)) for name in names}
+    require_names(names, "by")
+    found = {name: value_at(experiment, name) for name in names}
+    for name, tree in found.items():
+        if name in FIXED or not all(map(_is_number, jax.tree.leaves(tree))):
+            raise ValueError(
+                f"{name} is fixed when a program is compiled and has no derivative; "
+                "numbers like gamma0, friction.mu, signals.amplitudes and pack.position have"
+            )
+    theta = {name: jax.tree.map(jnp.asarray, tree) for name, tree in found.items()}
     for name, tree in theta.items():
         if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
             raise ValueError(f"{name} holds more than floats; name what to differentiate by, like pack.position")
     return theta
+
+
+def _is_number(leaf: Any) -> bool:
+    return isinstance(leaf, float | int | np.ndarray | jax.Array)
 
 
 def _along(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
@@ -281,13 +297,15 @@ class Gradient:
     p_sig: jax.Array
 
 
+@usual_rules()
+@shows_progress
 def value_and_grad(
     experiment: Experiment,
     by: Sequence[str] = ("signals", "gamma0", "friction"),
     *,
     loss: Loss = fidelity_of,
     checkpoint: Checkpoint = NO_CHECKPOINT,
-    progress: Progress = silent,
+    progress: ProgressChoice = None,
 ) -> Gradient:
     """Reverse mode: a number and its derivatives by all parameters, through the whole experiment.
 
@@ -300,15 +318,16 @@ def value_and_grad(
             "friction.mu", "t0" or "pack.position". Shapes of grains are not among them (use `jax.grad`).
         loss: what is differentiated; default the fidelity.
         checkpoint: where to go on and to keep how far it is on the way back; the way forward, a tenth, is done again.
-        progress: told about every chunk of both ways.
+        progress: told about every chunk of both ways; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: for a name that is no field.
         RunFailedError: if the simulation broke down.
     """
+    tell = callback(progress)
     theta, along = _theta(experiment, by), _along(experiment)
     common, own = experiment.phases
-    on = runner_of(experiment, progress=within(progress, 0.0, FORWARDS))
+    on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))
     on.total_work = _work(experiment, on)
     prefix, rest = _Remembering(), _Remembering()
     on.observers = (prefix,) if acts_on_prefix(by) else ()
@@ -337,7 +356,7 @@ def value_and_grad(
         return jax.vjp(numbers, theta)[1](found)[0]
 
     back = jax.tree.map(jnp.zeros_like, _moving(on.state))
-    way = _Backwards(within(progress, FORWARDS, 1.0), (rest, prefix), checkpoint)
+    way = _Backwards(within(tell, FORWARDS, 1.0), (rest, prefix), checkpoint)
     back = way.through(rest, back)
     slope = jax.tree.map(jnp.add, slope, pull_numbers(True, rest.numbers))
     if acts_on_prefix(by):

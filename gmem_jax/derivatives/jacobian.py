@@ -15,7 +15,8 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import Recall, run
 from gmem_jax.experiment.signals import Bumps
-from gmem_jax.simulation.progress import Progress, silent, within
+from gmem_jax.physics.rules import usual_rules
+from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within
 
 LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
 
@@ -66,18 +67,21 @@ def _pressures(recall: Recall) -> dict[str, np.ndarray]:
     return {name: np.asarray(sample.pressure) for name, sample in recall.stages.items()}
 
 
-def exact(experiment: Experiment, *, law: bool = True, progress: Progress = silent) -> Jacobian:
+@usual_rules()
+@shows_progress
+def exact(experiment: Experiment, *, law: bool = True, progress: ProgressChoice = None) -> Jacobian:
     """Forward mode, parameters as replicas; two runs, because mu and the stiffness act on the prefix too.
 
     Args:
         experiment: of one signal of n bumps.
         law: whether to take derivatives by mu and stiffness also.
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: if there is another number of signals, they are not bumps, or the background is not sub0.
         RunFailedError: if the simulation broke down.
     """
+    tell = callback(progress)
     bumps, row = _one_signal(experiment)
     n = row.shape[1]
     rows = np.repeat(row, n + 1, axis=0)
@@ -87,7 +91,7 @@ def exact(experiment: Experiment, *, law: bool = True, progress: Progress = sile
         "gamma0": jnp.zeros(n + 2).at[-1].set(1.0),
     }
     share = 0.7 if law else 1.0
-    pushed = gradient.push(drive, direction, progress=within(progress, 0.0, share))
+    pushed = gradient.push(drive, direction, progress=within(tell, 0.0, share))
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
     p_sig, p_xy = [np.asarray(pushed.p_sig_slope)], [_p_xy(experiment, pushed.slope)[1:]]
@@ -99,7 +103,7 @@ def exact(experiment: Experiment, *, law: bool = True, progress: Progress = sile
             "friction.mu": jnp.asarray([1.0, 0.0, 1.0, 0.0]),
             "friction.stiffness": jnp.asarray([0.0, 1.0, 0.0, 1.0]),
         }
-        pushed = gradient.push(laws, direction, progress=within(progress, share, 1.0))
+        pushed = gradient.push(laws, direction, progress=within(tell, share, 1.0))
         change = np.asarray(analysis.recalled(jnp.asarray(pushed.slope[experiment.protocol.reads[0]])))
         p_sig.append(-(change[2:] - change[:2]))
         p_xy.append(_p_xy(experiment, pushed.slope)[2:])

@@ -25,8 +25,9 @@ from gmem_jax.design.waveforms import (
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import PREFIX, prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
-from gmem_jax.simulation.progress import Progress, silent
+from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress
 
 BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
 WIDTH = 0.08  # of them, in u
@@ -71,6 +72,8 @@ def refuse_another_drive(kernel: MemoryKernel, experiment: Experiment) -> None:
             raise ValueError(f"the kernel is of {name} = {getattr(kernel, name):g}, the experiment's is {float(own):g}")
 
 
+@usual_rules()
+@shows_progress
 def design_by_kernel(
     experiment: Experiment,
     *,
@@ -84,7 +87,7 @@ def design_by_kernel(
     measured: int = 0,
     batch: int | None = None,
     cache: ResultCache = no_cache,
-    progress: Progress = silent,
+    progress: ProgressChoice = None,
 ) -> Design:
     """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
 
@@ -102,13 +105,14 @@ def design_by_kernel(
             miss most have most of the runs, up to all n directions, the kernel's strongest first.
         batch: signals that run together; default all of them.
         cache: asked for every part of every simulation, so that a design can be resumed.
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: if the kernel was measured at another gamma0 or delta0, or either differs between replicas, or there
             are not as many waveforms to start from as signals.
         RunFailedError: if a simulation broke down.
     """
+    tell = callback(progress)
     refuse_several_scales(experiment)
     if start is not None and start.count != experiment.signals.count:
         raise ValueError(
@@ -117,7 +121,7 @@ def design_by_kernel(
     if kernel is not None:
         refuse_another_drive(kernel, experiment)
         n, width = len(kernel.centres), kernel.width
-    work = Work(cost(experiment, iterations, 0 if kernel else n, measured), progress)
+    work = Work(cost(experiment, iterations, 0 if kernel else n, measured), tell)
 
     once = cache.memoised()
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import run
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
-from gmem_jax.simulation.progress import Progress, silent
+from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress
 
 PARAMETERS = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.stiffness"}
 
@@ -52,6 +53,8 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
     return found
 
 
+@usual_rules()
+@shows_progress
 def design_drive(
     experiments: Sequence[Experiment],
     bounds: dict[str, tuple[float, float]],
@@ -59,7 +62,7 @@ def design_drive(
     iterations: int = 6,
     spread: float = 0.2,
     cache: ResultCache = no_cache,
-    progress: Progress = silent,
+    progress: ProgressChoice = None,
 ) -> TunedDrive:
     """Choose gamma0 and parameters of the friction law within bounds so that the mean fidelity of some packs grows.
 
@@ -75,12 +78,13 @@ def design_drive(
         iterations: steps; each costs 2 n + 1 runs a pack for n parameters.
         spread: of the differences at first, in parts of each parameter.
         cache: asked for the fidelity of every run, so that a long search can be resumed.
-        progress: told about every run.
+        progress: told about every run; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
         RunFailedError: if a simulation broke down.
     """
+    tell = callback(progress)
     names = list(bounds)
     paths = [PARAMETERS.get(name, name) for name in names]
     start = start_within(experiments, bounds)
@@ -98,7 +102,7 @@ def design_drive(
 
             found.append(float(cache(f"run-{done:05d}", recall)))
             done += 1
-            progress(f"F = {np.mean(found):.4f}", 0.0, done / total)
+            tell(f"F = {np.mean(found):.4f}", 0.0, done / total)
         return np.asarray(found)
 
     logs = np.log(start)

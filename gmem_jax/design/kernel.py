@@ -16,8 +16,9 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import Prefix, run
 from gmem_jax.experiment.signals import Bumps, Signals, bin_average
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
-from gmem_jax.simulation.progress import Progress, silent
+from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress
 from gmem_jax.simulation.protocol import BINS
 
 FINE = 2048  # points of v for inner products of basis functions
@@ -73,6 +74,7 @@ class MemoryKernel:
     def _match(self) -> analysis.Match:
         return analysis.compare(jnp.asarray(self.odd), bin_average(self.basis), self.delta0 * self.gamma0)
 
+    @usual_rules()
     def gain(self) -> float:
         """G of the ideal kernel G E delta0 (v < u) that is nearest to this one on the basis."""
         return float(self._match().gain)
@@ -109,10 +111,12 @@ class MemoryKernel:
             widths.append((right + back) / FINE)
         return float(np.mean(widths))
 
+    @usual_rules()
     def coefficients(self, signals: Signals) -> np.ndarray:
         """Amplitudes of the basis functions that come nearest to waveforms, [S, n]."""
         return nearest(self.basis, signals)
 
+    @usual_rules()
     def predict(self, signals: Signals, *, even: bool = True) -> np.ndarray:
         """p_sig of waveforms by superposition, [S, 256], in E, at the kernel's gamma0.
 
@@ -122,6 +126,7 @@ class MemoryKernel:
         """
         return self.recalled(self.coefficients(signals), even=even)
 
+    @usual_rules()
     def recalled(self, amplitudes: np.ndarray, *, even: bool = True) -> np.ndarray:
         """`predict` for amplitudes of the basis functions, [S, n]."""
         linear: np.ndarray = amplitudes @ self.odd
@@ -142,6 +147,8 @@ def nearest(basis: Signals, signals: Signals) -> np.ndarray:
     return result
 
 
+@usual_rules()
+@shows_progress
 def memory_kernel(
     experiment: Experiment,
     n: int = 17,
@@ -149,7 +156,7 @@ def memory_kernel(
     *,
     prefix: Prefix | None = None,
     cache: ResultCache = no_cache,
-    progress: Progress = silent,
+    progress: ProgressChoice = None,
 ) -> MemoryKernel:
     """Measure the memory kernel of a pack.
 
@@ -159,19 +166,20 @@ def memory_kernel(
         width: of the bumps; narrow ones drive the walls faster.
         prefix: what `recall.prefix_of` gave for the same pack and law, if there is one.
         cache: asked for the recalls of the basis, so that a long run can be resumed (see `gmem_jax.files.checkpoints`).
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: if n < 2, or gamma0 or delta0 differ between replicas.
         RunFailedError: if the simulation broke down.
     """
+    tell = callback(progress)
     if n < 2:
         raise ValueError(f"a kernel needs at least 2 basis waveforms, got {n}")
     both = bumps(np.concatenate([np.eye(n), -np.eye(n)]), width)
     wanted = replace(experiment, signals=both)
     if jnp.ndim(wanted.scale):
         raise ValueError("a kernel is measured at one gamma0 and one delta0, not one for each replica")
-    p_sig = np.asarray(run(wanted, prefix=prefix, cache=cache.scoped("basis"), progress=progress).p_sig)
+    p_sig = np.asarray(run(wanted, prefix=prefix, cache=cache.scoped("basis"), progress=tell).p_sig)
     plus, minus = p_sig[:n], p_sig[n:]
     return MemoryKernel(
         u=(np.arange(BINS) + 0.5) / BINS,

@@ -17,8 +17,9 @@ from gmem_jax.design.kernel import FINE, bumps, nearest
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline, waveform
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
-from gmem_jax.simulation.progress import Progress, silent, within
+from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within
 
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)
@@ -138,6 +139,8 @@ def refuse_several_scales(experiment: Experiment) -> None:
         raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
 
 
+@usual_rules()
+@shows_progress
 def design_waveforms(
     experiment: Experiment,
     *,
@@ -147,7 +150,7 @@ def design_waveforms(
     gain: float | None = None,
     damping: Sequence[float] = DAMPING,
     cache: ResultCache = no_cache,
-    progress: Progress = silent,
+    progress: ProgressChoice = None,
 ) -> Design:
     """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
 
@@ -160,13 +163,14 @@ def design_waveforms(
         damping: of the steps one after the other, in parts of the Jacobian's largest singular value; the last for all
             that follow.
         cache: asked for every simulation and Jacobian, so that a design can be resumed.
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         RunFailedError: if a simulation broke down.
     """
+    tell = callback(progress)
     refuse_several_scales(experiment)
-    work, share = Work(cost(experiment, iterations, n), progress), _prefix(experiment)
+    work, share = Work(cost(experiment, iterations, n), tell), _prefix(experiment)
     prefix = prefix_of(experiment, cache=cache, progress=work.next(share))
     target = np.asarray(experiment.integral())
     untouched = run(experiment, prefix=prefix, cache=cache.scoped("untouched"), progress=work.next(1.0)).p_sig

@@ -2,17 +2,19 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.rules import usual_rules
 
 MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
 """What is said of every recall: G and F of the set, and both averaged over the ringing period (`compare`)."""
-BACKGROUNDS = ("sub0", "sub2", "sub2-bl")
+Background = Literal["sub0", "sub2", "sub2-bl"]
+BACKGROUNDS: tuple[Background, ...] = get_args(Background)
 """Ways to remove the background: the zero signal's run; the same run's second readout; that without its line."""
 
 
@@ -139,6 +141,7 @@ def remembered_after(second: jax.Array, integral: jax.Array, scale: Scalar) -> t
     return correlation(residue, integral), jnp.sum(template * residue, axis=-1) / jnp.sum(template * template, axis=-1)
 
 
+@usual_rules()
 def running_mean(series: jax.Array, width: Scalar) -> jax.Array:
     """Mean over a window of `width` bins (need not be whole) along the last axis, [..., bins].
 

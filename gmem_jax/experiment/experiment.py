@@ -13,14 +13,18 @@ import numpy as np
 
 from gmem_jax import native
 from gmem_jax.experiment import analysis
-from gmem_jax.experiment.html import brief, facts
+from gmem_jax.experiment.analysis import Background
+from gmem_jax.experiment.arguments import require_once, require_parts
+from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.protocols import memory_protocol
+from gmem_jax.experiment.protocols import Shear, memory_protocol
 from gmem_jax.experiment.signals import Signals, bin_average, part
+from gmem_jax.native import Backend, Precision
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar, impossible, parameter, pytree, settle, static, traced
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State, Status, replicate
 from gmem_jax.physics.step import System, start
 from gmem_jax.simulation.loop import Simulation
@@ -90,16 +94,18 @@ class Experiment:
     rest: float = static(0.2)
     hold: float = static(0.2)
     store: float = static(2.0)
-    background: str = static("sub0")
-    shear: str = static("during")
-    backend: str = static("auto")
-    precision: str = static("double")
+    background: Background = static("sub0")
+    shear: Shear = static("during")
+    backend: Backend = static("auto")
+    precision: Precision = static("double")
     steps_per_bin: int = dataclasses.field(init=False, default=1, metadata={"static": True})
 
+    @usual_rules()
     def __post_init__(self) -> None:
+        require_parts(self.pack, self.signals, self.friction)
         for name in ("dt", "rest", "hold", "store"):
             object.__setattr__(self, name, _static_number(name, getattr(self, name)))
-        object.__setattr__(self, "background", self.background.lower())
+        object.__setattr__(self, "background", str(self.background).lower())
         settle(self)
         if self.background not in analysis.BACKGROUNDS:
             raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {self.background!r}")
@@ -256,7 +262,7 @@ class Experiment:
         """Gain and fidelity of recalled signals [S, 256]."""
         return analysis.compare(p_sig, self.integral(), self.scale)
 
-    def _repr_html_(self) -> str:
+    def _facts(self) -> Facts:
         pack, dt = self.pack, self.timing.dt
         rows = {
             "pack": f"{pack.name}, {pack.grains} grains",
@@ -269,7 +275,13 @@ class Experiment:
             "steps": self.steps_per_bin * self.protocol.bins,
             **{name: getattr(self, name) for name in ("background", "backend", "precision")},
         }
-        return facts("Experiment", rows)
+        return "Experiment", rows
+
+    def __repr__(self) -> str:
+        return line(self, self._facts)
+
+    def _repr_html_(self) -> str:
+        return facts(*self._facts())
 
 
 _OPEN = 1e-9  # of a waveform where it should vanish
@@ -321,12 +333,13 @@ class Changes(TypedDict, total=False):
     rest: float
     hold: float
     store: float
-    background: str
-    shear: str
-    backend: str
-    precision: str
+    background: Background
+    shear: Shear
+    backend: Backend
+    precision: Precision
 
 
+@usual_rules()
 def replace(
     experiment: Experiment, values: Mapping[str, Any] | None = None, /, **changes: Unpack[Changes]
 ) -> Experiment:
@@ -341,9 +354,10 @@ def replace(
         changes: what changes by field.
 
     Raises:
-        ValueError: if there is no such field, or the new experiment is impossible.
+        ValueError: if there is no such field, it is given twice, or the new experiment is impossible.
     """
     found: dict[str, Any] = dict(changes)
+    require_once(values or {}, changes)
     for path, value in (values or {}).items():
         name, *deeper = path.split(".")
         _require_field(experiment, name)

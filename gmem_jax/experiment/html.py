@@ -1,6 +1,6 @@
-"""Short tables that a notebook shows in the place of an object."""
+"""What is shown in the place of an object: a line in a terminal, a short table in a notebook."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -22,6 +22,19 @@ def brief(value: Any) -> str:
         return str(value)
     low, high = numbers.min(), numbers.max()
     return f"{low:.4g}" if numbers.ndim == 0 or low == high else f"{low:.4g} to {high:.4g}"
+
+
+Facts = tuple[str, Mapping[str, Any]]
+"""A title, and what is worth saying by name."""
+
+
+def line(made: Any, found: Callable[[], Facts]) -> str:
+    """The facts of an object in one line; its class alone where its leaves are no numbers, as `jax.tree.map` makes."""
+    try:
+        title, rows = found()
+        return f"<{title}: {', '.join(f'{name} = {brief(value)}' for name, value in rows.items())}>"
+    except (AttributeError, TypeError, ValueError):
+        return f"<{type(made).__name__}>"
 
 
 def facts(title: str, rows: Mapping[str, Any]) -> str:

@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.html import brief, facts
+from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Box, Grains, still_box
 from gmem_jax.simulation.neighbors import SKIN, pair_finder
 from gmem_jax.simulation.strain import smallest_box
@@ -68,7 +69,7 @@ class Pack:
         info: dict[str, Any] = json.loads(self.record)
         return info
 
-    def _repr_html_(self) -> str:
+    def _facts(self) -> Facts:
         rest = self.info.get("at_rest", {})
         measured = {"filling phi": "filling", "coordination Z": "coordination", "pressure (E)": "pressure"}
         rows = {
@@ -78,7 +79,13 @@ class Pack:
             "T1 (t_c)": self.ringing_period,
             **{label: rest[name] for label, name in measured.items() if name in rest},
         }
-        return facts(f"Pack {self.name}", rows)
+        return f"Pack {self.name}", rows
+
+    def __repr__(self) -> str:
+        return line(self, self._facts)
+
+    def _repr_html_(self) -> str:
+        return facts(*self._facts())
 
     def view(self) -> Any:
         """The pack in 3D, for notebooks; `gmem_jax.show.view` stands floors above, and is loaded when asked for."""
@@ -93,6 +100,7 @@ def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: 
     return pair_finder(clump, smallest, SKIN)(grains, clump, box, smallest)
 
 
+@usual_rules()
 def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: str = "") -> Pack:
     """The same box and grain with other centres [N, 3] and orientations [N, 4], and their own neighbour list.
 
@@ -103,6 +111,7 @@ def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: s
     return replace(pack, position=position, quaternion=quaternion, pairs=pairs, name=name or pack.name, record=record)
 
 
+@usual_rules()
 def stack(packs: Sequence[Pack]) -> Pack:
     """Packs of one size and grain as one `Pack` with a leading axis on every array, for `jax.vmap`.
 

@@ -1,8 +1,12 @@
 """The protocols of the paper."""
 
 from dataclasses import replace
+from typing import Literal
 
 from gmem_jax.simulation.protocol import Protocol, Stage
+
+Shear = Literal["during", "before"]
+"""When waveforms are applied: during the compression, or before it."""
 
 
 def cycle(rest: float, hold: float) -> tuple[Stage, ...]:

@@ -16,13 +16,14 @@ from gmem_jax.experiment import analysis, html
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
 from gmem_jax.experiment.validity import validity
 from gmem_jax.physics.pytree import Scalar, pytree, static, traced
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.compiled import Compiled, require_x64
 from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, concatenate, places
 from gmem_jax.simulation.loop import rollout
 from gmem_jax.simulation.observers import CHUNK
-from gmem_jax.simulation.progress import Progress, silent, work_of
+from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, work_of
 from gmem_jax.simulation.protocol import BINS, Protocol, Stage, table
 from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
 from gmem_jax.simulation.sample import Sample
@@ -91,12 +92,18 @@ class Recall:
         from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
         return from_above.plot(self, what, experiment, against)
 
-    def _repr_html_(self) -> str:
+    def _facts(self) -> html.Facts:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}
         rows = {**measures, "F over T1": self.windowed_fidelity, "T1 (t_c)": self.window}
         if not traced(self.status):
             rows["status"] = explain(together(self.status))
-        return html.facts(f"Recall of {self.J.shape[-2]} signals", rows)
+        return f"Recall of {self.J.shape[-2]} signals", rows
+
+    def __repr__(self) -> str:
+        return html.line(self, self._facts)
+
+    def _repr_html_(self) -> str:
+        return html.facts(*self._facts())
 
 
 def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
@@ -149,6 +156,7 @@ def _recall(experiment: Experiment) -> Recall:
     return finish(experiment, _by_stage(before, common) | _by_stage(after, own), state.status)
 
 
+@usual_rules()
 def recall(experiment: Experiment) -> Recall:
     """Run an experiment as one traced computation, for jit, vmap and grad; compiled once for each structure.
 
@@ -212,6 +220,7 @@ class Prefix(NamedTuple):
     samples: "OrderedDict[str, Sample]"
 
 
+@usual_rules()
 def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress: Progress = silent) -> Prefix:
     """Run the shear-free prefix, common to all waveforms on this pack under this law, for any number of `run`.
 
@@ -229,6 +238,8 @@ def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress
     return Prefix(runner, runner.run_cached(PREFIX, cache, *common))
 
 
+@usual_rules()
+@shows_progress
 def run(
     experiment: Experiment,
     *,
@@ -238,7 +249,7 @@ def run(
     frames: int = 0,
     frames_of: int = 1,
     cache: ResultCache = no_cache,
-    progress: Progress = silent,
+    progress: ProgressChoice = None,
 ) -> Recall:
     """Run an experiment on the host, in chunks: stale neighbour lists are built anew, a broken run raises.
 
@@ -252,14 +263,16 @@ def run(
         frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
         frames_of: the signal whose they are, from 1; 0 for the zero signal.
         cache: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
             for too many or too few frames, frames of a prefix that was run before, or a signal that there is not.
         RunFailedError: if the simulation broke down.
     """
-    count, size = experiment.signals.count, batch or experiment.signals.count
+    tell = callback(progress)
+    count = experiment.signals.count
+    size = count if batch is None else batch
     if size < 1:
         raise ValueError(f"batch must be at least 1, got {batch}")
     if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
@@ -273,12 +286,12 @@ def run(
     work = sum(work_of(own, 1 + min(size, count - first)) for first in firsts)
     recorders = [FrameRecorder(schedule)] if frames else []
     if prefix is None:
-        runner = runner_of(experiment, progress=progress, observers=tuple(recorders))
+        runner = runner_of(experiment, progress=tell, observers=tuple(recorders))
         runner.total_work = work_of(common, runner.state.replicas) + work
         prefix = Prefix(runner, runner.run_cached(PREFIX, cache, *common))
         done = work_of(common, runner.state.replicas)
     else:
-        runner = prefix.runner.fork(progress=progress, total_work=work)
+        runner = prefix.runner.fork(progress=tell, total_work=work)
         done = 0.0
     parts: list[tuple[dict[str, Sample], jax.Array]] = []
     recorded = recorders[0].recorded if recorders else OrderedDict()

@@ -18,6 +18,7 @@ from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, replace, re
 from gmem_jax.experiment.recall import PREFIX, Recall, finished, runner_of, warn_of_another_compression
 from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import pytree
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.progress import Progress, silent, work_of
 from gmem_jax.simulation.sharding import placement_of
@@ -109,6 +110,7 @@ class _Side:
         return Chosen(tuple(sets), jnp.asarray(numbers[1:]))
 
 
+@usual_rules()
 def run_several(
     experiments: Sequence[Experiment],
     *,

@@ -13,7 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.html import line
 from gmem_jax.physics.pytree import Scalar, pytree, traced
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import BINS
 
 LONGEST_WORD = 12  # bits
@@ -64,6 +66,9 @@ class Bumps:
     centres: jax.Array
     width: Scalar
 
+    def __repr__(self) -> str:
+        return line(self, lambda: (f"{self.count} signals", {"bumps": self.centres.shape[-1], "width": self.width}))
+
     @property
     def count(self) -> int:
         """Number of signals S."""
@@ -95,6 +100,9 @@ class Spline:
     """
 
     nodes: jax.Array
+
+    def __repr__(self) -> str:
+        return line(self, lambda: (f"{self.count} signals", {"nodes": self.nodes.shape[-1]}))
 
     @property
     def count(self) -> int:
@@ -131,6 +139,7 @@ class Spline:
         return width * (before + x * (a + x * (b / 2.0 + x * (c / 3.0 + x * d / 4.0))))
 
 
+@usual_rules()
 def six_signals() -> Bumps:
     """The paper's signals 1 to 6 (Sec. II, Fig. 5): one to three bumps of width 0.2."""
     bumps: list[tuple[list[float], list[float]]] = [
@@ -160,6 +169,7 @@ def word_bits(bits: int) -> np.ndarray:
     return np.arange(2**bits)[:, None] >> places & 1
 
 
+@usual_rules()
 def words(bits: int, pad: float = PAD, width: float = WIDTH) -> Bumps:
     """All binary words of a length (App. A): J is a plateau of height +u_b / pi for a 1 and -u_b / pi for a 0.
 
@@ -190,6 +200,7 @@ def bit_width(bits: int, pad: float = PAD) -> float:
     return 1.0 / (bits + 2.0 * pad)
 
 
+@usual_rules()
 def waveform(samples: jax.typing.ArrayLike) -> Spline:
     """Any waveform from its samples.
 
@@ -212,6 +223,7 @@ def waveform(samples: jax.typing.ArrayLike) -> Spline:
     return Spline(nodes=jnp.pad(values, ((0, 0), (1, 1))))
 
 
+@usual_rules()
 @functools.partial(jax.jit, static_argnames=("bins", "points"))  # fused: 4,096 words would fill the memory otherwise
 def bin_average(signals: Signals, bins: int = BINS, points: int = 16) -> jax.Array:
     """J_s averaged over each bin of u, [S, bins] (midpoint rule on `points` per bin)."""

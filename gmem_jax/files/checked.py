@@ -11,9 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+import jax
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
+from gmem_jax.physics.rules import require_started
 from gmem_jax.simulation.protocol import BINS
 
 KINDS = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",), "text": ("bytes",)}
@@ -30,7 +32,8 @@ def refusing(path: Path, what: str) -> Iterator[None]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: for every other error.
+        FileFormatError: for every other error of the file's.
+        StartError: if JAX does not start; see `gmem_jax.physics.rules`.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -39,7 +42,10 @@ def refusing(path: Path, what: str) -> Iterator[None]:
     except FileFormatError as error:
         said = str(error)
         raise FileFormatError(said if str(path) in said else f"{path}: {said}") from error
+    except jax.errors.JaxRuntimeError:  # of the machine's, like no memory on a device
+        raise
     except Exception as error:  # a broken file may make a parser stumble in any way
+        require_started()
         said = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())[:_SHOWN]
         raise FileFormatError(f"{path}: not a readable {what} ({said or type(error).__name__})") from error
 

@@ -31,6 +31,7 @@ from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.rules import usual_rules
 
 _SIGNALS = {"bumps": Bumps, "spline": Spline}
 # What files from before there was such a field did; laws, material and words: their defaults of today.
@@ -139,6 +140,7 @@ def _law_from(written: Mapping[str, Any]) -> FrictionLaw:
     return law_named(written["law"], **parameters)
 
 
+@usual_rules()
 def written(experiment: Experiment) -> dict[str, Any]:
     """An experiment as JSON: every field, the pack by its source and content.
 
@@ -156,6 +158,7 @@ def written(experiment: Experiment) -> dict[str, Any]:
     }
 
 
+@usual_rules()
 def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) -> Experiment:
     """The experiment of a written form.
 
@@ -211,6 +214,7 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
     return {**own, **more, "backend": native.name(experiment.backend, experiment.friction), **sources()}
 
 
+@usual_rules()
 def resolved(experiment: Experiment, seconds: float) -> dict[str, Any]:
     """All that is to be known of a result: the experiment as written, what its defaults came to, and where it ran."""
     pack, law, entry = experiment.pack, experiment.friction, entry_of(experiment.friction)

@@ -4,11 +4,17 @@ import os
 from pathlib import Path
 
 
-def kept() -> Path:
-    """The package's folder in the user's cache, which need not exist."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gmem_jax"
+def kept() -> Path | None:
+    """The package's folder in the user's cache, which need not exist; None for a user without a home."""
+    if chosen := os.environ.get("XDG_CACHE_HOME"):
+        return Path(chosen) / "gmem_jax"
+    try:
+        return Path.home() / ".cache" / "gmem_jax"
+    except RuntimeError:
+        return None
 
 
-def kept_pack(name: str) -> Path:
-    """Where `gmem prepare NAME` keeps a standard pack; it need not be there."""
-    return kept() / "packs" / f"{name}.h5"
+def kept_pack(name: str) -> Path | None:
+    """Where `gmem prepare NAME` keeps a standard pack; it need not be there. None as in `kept`."""
+    folder = kept()
+    return folder and folder / "packs" / f"{name}.h5"

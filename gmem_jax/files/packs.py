@@ -19,6 +19,7 @@ from gmem_jax.files.home import kept_pack
 from gmem_jax.files.schemas import PACK
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import candidates, tabulate
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import Sample
 
@@ -39,7 +40,10 @@ def _arrays(pack: Pack) -> dict[str, Any]:
     return {**values, "pairs/candidates": candidates(pack.pairs), "pairs/reference": reference}
 
 
-def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None, frames: Frames | None = None) -> None:
+@usual_rules()
+def save_pack(
+    path: str | Path, pack: Pack, stages: dict[str, Sample] | None = None, frames: Frames | None = None
+) -> None:
     """Write a pack, and the time series of its preparation and configurations along it if given.
 
     Raises:
@@ -55,7 +59,7 @@ def save_pack(path: Path, pack: Pack, stages: dict[str, Sample] | None = None, f
     except FileFormatError as error:
         raise FileFormatError(f"{path}: is not written, since it could not be read: {error}") from error
     clump, values = pack.clump, _arrays(pack)
-    with writing(path, PACK.name) as file:
+    with writing(Path(path), PACK.name) as file:
         file.attrs["name"] = pack.name
         file.attrs["record"] = pack.record
         write_arrays(file, PACK.arrays, values)
@@ -91,6 +95,7 @@ def _check(found: dict[str, np.ndarray], isotropic: Any, label: Any, shape: Any,
     soundness.check(found, isotropic=bool(isotropic), record=json_of(record, "record"))
 
 
+@usual_rules()
 def load_pack(source: str | Path) -> Pack:
     """Read a pack from a file, or by name, neighbour list included.
 
@@ -145,7 +150,7 @@ def pack_called(name: str) -> Path | None:
     if name in list_packs():
         return Path(str(resources.files("gmem_jax") / "packs" / f"{name}.h5"))
     made = kept_pack(name)
-    return made if STANDARD.fullmatch(name) and made.is_file() else None
+    return made if made and STANDARD.fullmatch(name) and made.is_file() else None
 
 
 def list_packs() -> list[str]:

@@ -31,7 +31,12 @@ def keep_programs() -> None:
     chosen = os.environ.get(SWITCH, "")
     if chosen == "off" or getattr(jax.config, "jax_compilation_cache_dir", None):
         return
-    folder = Path(chosen) if chosen else kept() / f"jax-{jax.__version__}-{_processor()}"
+    if chosen:
+        folder = Path(chosen)
+    elif home := kept():
+        folder = home / f"jax-{jax.__version__}-{_processor()}"
+    else:
+        return
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

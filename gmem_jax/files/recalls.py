@@ -28,6 +28,7 @@ from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
 from gmem_jax.files.labelled import recall_csv, recall_dataset
 from gmem_jax.files.schemas import RECALL
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import DOUBTFUL, Status
 from gmem_jax.simulation.protocol import BINS, Protocol
 from gmem_jax.simulation.sample import Sample
@@ -35,7 +36,8 @@ from gmem_jax.simulation.sample import Sample
 _EVERY_BIT = int(sum(Status))
 
 
-def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> None:
+@usual_rules()
+def save_recall(path: str | Path, recall: Recall, configuration: dict[str, Any]) -> None:
     """Write a recall with its resolved configuration.
 
     Raises:
@@ -44,7 +46,7 @@ def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> No
     names = np.asarray([name.encode() for name in signal_names(recall, configuration)])
     if names.dtype.itemsize == 1:
         names = names.astype("S2")  # single letters are characters of one text to netCDF
-    with writing(path, RECALL.name) as file:
+    with writing(Path(path), RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
         file.attrs["protocol"] = json.dumps(recall.protocol.to_list())
         write_arrays(file, _declared(np.ndim(recall.dt)), {**vars(recall), "signal": names})
@@ -94,6 +96,9 @@ class StoredRecall(NamedTuple):
         from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
         return from_above.recall_drawing(self.recall, what, self.configuration, against=against)
 
+    def __repr__(self) -> str:
+        return repr(self.recall)
+
     def _repr_html_(self) -> str:
         return self.recall._repr_html_()
 
@@ -102,7 +107,8 @@ class StoredRecall(NamedTuple):
         return recall_csv(self.recall, self.names)
 
 
-def load_recall(path: Path) -> StoredRecall:
+@usual_rules()
+def load_recall(path: str | Path) -> StoredRecall:
     """Read a recall and its configuration, which the result can be unpacked into.
 
     Raises:
@@ -110,6 +116,7 @@ def load_recall(path: Path) -> StoredRecall:
         FileFormatError: if the file is damaged, not a complete recall of this schema, or its numbers do not fit each
             other.
     """
+    path = Path(path)
     with refusing(path, "recall"):
         with reading(path, RECALL.name) as content:
             configuration = json_of(content.text("configuration"), "configuration")

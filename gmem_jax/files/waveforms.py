@@ -13,12 +13,14 @@ from gmem_jax.experiment.signals import Signals, Spline
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import json_of, numbers, read_npy, refusing, require_fields, title
 from gmem_jax.files.configuration import signals_from, written_signals
+from gmem_jax.physics.rules import usual_rules
 
 _LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB
 _TARGET, _DESIGN = "# target: ", "# design: "
 
 
-def load_waveforms(path: Path) -> np.ndarray:
+@usual_rules()
+def load_waveforms(path: str | Path) -> np.ndarray:
     """Waveform samples [S, n] from a CSV (one column per signal) or NPY ([n] or [S, n]) file.
 
     Row k is I at u = k / (n + 1), k = 1..n. A CSV may have one header line of names.
@@ -109,8 +111,9 @@ def _is_number(cell: str) -> bool:
     return True
 
 
+@usual_rules()
 def save_waveforms(
-    path: Path, signals: Spline, target: Signals | None = None, *, design: Mapping[str, Any] | None = None
+    path: str | Path, signals: Spline, target: Signals | None = None, *, design: Mapping[str, Any] | None = None
 ) -> None:
     """Write waveforms as a CSV that `load_waveforms` and `gmem recall --signals` read: a column for every signal.
 
@@ -129,5 +132,5 @@ def save_waveforms(
         header = f"{_DESIGN}{json.dumps(design)}\n{header}"
     if target is not None:
         header = f"{_TARGET}{json.dumps(written_signals(target))}\n{header}"
-    with atomic(path) as temporary:
+    with atomic(Path(path)) as temporary:
         np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g")

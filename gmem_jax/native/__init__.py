@@ -15,11 +15,12 @@ when it is not right about how many blocks of replicas fit into them. JAX does n
 
 import ctypes
 import functools
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -40,8 +41,10 @@ from gmem_jax.physics.step import System
 March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 """The signature of `gmem_jax.physics.step.march`."""
 
-BACKENDS = ("auto", "jax", "native")
-PRECISIONS = ("double", "mixed")
+Backend = Literal["auto", "jax", "native"]
+Precision = Literal["double", "mixed"]
+BACKENDS: tuple[Backend, ...] = get_args(Backend)
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 _LAW_NUMBERS = 5  # rows of the parameter array for a law's own, as in parameters.h
 _VARIANTS = ("exact", "averaged", "paper")
@@ -108,7 +111,7 @@ def needs(law: FrictionLaw, architecture: str, *, tangent: bool = False) -> dict
     return gpu.needs(ctypes.CDLL(str(_path())), *numbers, architecture, tangent=tangent)
 
 
-def name(backend: str, law: FrictionLaw) -> str:
+def name(backend: str, law: FrictionLaw) -> Backend:
     """What "auto" means for this friction law on JAX's default device, "jax" or "native"; others are themselves.
 
     Raises:
@@ -117,7 +120,7 @@ def name(backend: str, law: FrictionLaw) -> str:
     if backend not in BACKENDS:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
     if backend != "auto":
-        return backend
+        return cast(Backend, backend)
     if not available()[0] or not supports(law):
         return "jax"
     client = get_backend()
@@ -404,3 +407,10 @@ def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: 
     solid = (material.normal_stiffness, material.normal_damping, material.wall_stiffness)
     rows = (*numbers, clump.mass, *clump.inertia, *solid, *own)
     return jnp.stack([jnp.broadcast_to(jnp.asarray(row, jnp.float64), (replicas,)) for row in rows])
+
+
+# Now, and not when a march is first asked for: a program that `jax.export` wrote calls the library by name, in a
+# process that may have imported the package and no more. It starts no backend. While Python looks for the module of
+# ``python -m gmem_jax.native.build``, which compiles the library, it must not be imported yet.
+if getattr(sys, "argv", [""])[:1] != ["-m"]:
+    _load()

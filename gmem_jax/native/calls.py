@@ -305,7 +305,13 @@ def _primitive(
             raise NotImplementedError("the native backend runs on CPUs and CUDA GPUs; use backend='auto' or 'jax'")
         return in_plain_jax(context, *values, definition=definition, **static)
 
-    primitive.def_impl(jax.jit(primitive.bind, static_argnames=("tree", "call", "definition")))
+    compiled = jax.jit(primitive.bind, static_argnames=("tree", "call", "definition"))
+
+    def alone(*leaves: Any, **static: Any) -> Any:
+        with jax.disable_jit(False):  # where it is off, `compiled` would call itself
+            return compiled(*leaves, **static)
+
+    primitive.def_impl(alone)
     primitive.def_abstract_eval(abstract)
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, library, platform="cpu")
@@ -373,7 +379,9 @@ ad.primitive_transposes[_tangent_p] = _transpose
 
 # The library has the derivative of the steps and not that of the derivative, which plain JAX has.
 def _no_second(primals: Any, tangents: Any, **_: Any) -> Any:
-    raise NotImplementedError("second derivatives are not in the native backend; use backend='jax'")
+    raise NotImplementedError(
+        "second derivatives are not in the native backend; use backend='jax' (what they cost: docs/howto/gradients.md)"
+    )
 
 
 for _primitive_p in (_forward_p, _tangent_p, _adjoint_p):

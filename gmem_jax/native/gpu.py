@@ -56,8 +56,13 @@ def _cache() -> str:
     chosen = os.environ.get("GMEM_COMPILE_CACHE", "")
     if chosen == "off":
         return ""
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return str((Path(chosen) if chosen else home / "gmem_jax") / "kernels")
+    if chosen:
+        return str(Path(chosen) / "kernels")
+    try:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:  # a user without a home
+        return ""
+    return str(home / "gmem_jax" / "kernels")
 
 
 def register(library: ctypes.CDLL, sources: Path) -> None:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.pytree import label, pytree, static
+from gmem_jax.physics.rules import usual_rules
 
 _LINES = 700  # lines per side of the integration grid: volume and inertia to about 1e-5
 
@@ -78,6 +79,7 @@ def _sections(offsets: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     return volume, first, area * np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
+@usual_rules()
 def clump(offsets: Sequence[Sequence[float]] | np.ndarray, shape: str = "clump") -> Clump:
     """A rigid grain of unit spheres centred at `offsets`.
 
@@ -116,6 +118,7 @@ def clump(offsets: Sequence[Sequence[float]] | np.ndarray, shape: str = "clump")
     )
 
 
+@usual_rules()
 def sphere() -> Clump:
     """A grain of one unit sphere; mass and inertia are exact."""
     mass = 4.0 * np.pi / 3.0
@@ -129,6 +132,7 @@ def sphere() -> Clump:
     )
 
 
+@usual_rules()
 def tetra(overlap: float = 0.6) -> Clump:
     """Four unit spheres on a regular tetrahedron of edge 2 (1 - overlap).
 

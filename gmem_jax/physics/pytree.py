@@ -4,14 +4,18 @@ A field is data (an array, a number, another pytree) unless it says otherwise: `
 structure that a program is compiled for; a `label` is carried along but compiles nothing anew.
 """
 
+import json
 import math
 from collections.abc import Iterator
 from dataclasses import MISSING, field, fields, is_dataclass
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
+
+from gmem_jax.physics.rules import usual_rules
 
 Scalar = float | jax.Array
 """A parameter: one number, or an array that broadcasts against the replica axis [B]."""
@@ -87,7 +91,24 @@ def pytree(cls: type[T]) -> type[T]:
         return made
 
     jax.tree_util.register_pytree_with_keys(cls, flatten, unflatten)
+    if cls.__module__.startswith("gmem_jax."):
+        jax.export.register_pytree_node_serialization(
+            cls,
+            serialized_name=f"gmem_jax.{cls.__name__}",
+            serialize_auxdata=lambda structure: json.dumps(structure).encode(),
+            deserialize_auxdata=_structure,
+        )
     return cls
+
+
+def _structure(written: bytes | bytearray) -> Any:
+    """What `flatten` gives beside the children, from an exported program."""
+    fixed, labels = json.loads(written)
+    return tuple(map(_hashable, fixed)), _Labels(labels)
+
+
+def _hashable(value: Any) -> Any:
+    return tuple(map(_hashable, value)) if isinstance(value, list) else value
 
 
 def traced(*trees: Any) -> bool:
@@ -108,6 +129,7 @@ def _parameters(made: Any) -> Iterator[tuple[str, Interval]]:
             yield entry.name, entry.metadata["interval"]
 
 
+@usual_rules()
 def settle(made: Any) -> None:
     """Bring the parameters of a new object to one kind of number, and refuse those outside their interval.
 

@@ -49,7 +49,7 @@ DOUBTFUL = (
     | Status.LARGE_FRICTION
     | Status.LARGE_STIFFNESS
 )
-"""The bits that warn and leave the numbers as they are; where they are set is said in `gmem_jax.experiment.validity`."""
+"""The bits that warn and leave the numbers as they are; see `gmem_jax.experiment.validity`."""
 
 
 SENTENCES = {

@@ -22,6 +22,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, clump, sphere, tetra
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import still_box
 from gmem_jax.physics.step import System
 from gmem_jax.preparation.ringing import ringing_period
@@ -84,6 +85,7 @@ def lay(centres: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return middle - turned @ offsets.mean(axis=0), quaternion
 
 
+@usual_rules()
 def import_pack(
     path: Path,
     *,

@@ -20,6 +20,7 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, tetra
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Grains, still_box
 from gmem_jax.physics.step import System, accelerate, start
 from gmem_jax.preparation.piston import BLOCK, Pressed, Servo, largest_speed, press
@@ -30,7 +31,7 @@ from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, con
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.neighbors import pair_finder
 from gmem_jax.simulation.observers import Chunk
-from gmem_jax.simulation.progress import Progress, silent, work_of_bin
+from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, work_of_bin
 from gmem_jax.simulation.protocol import BINS, Stage
 from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
 from gmem_jax.simulation.sample import Sample
@@ -341,6 +342,8 @@ class _Preparation:
             checkpoint.maybe_save(standing)
 
 
+@usual_rules()
+@shows_progress
 def prepare(
     recipe: Recipe | None = None,
     grain: Clump | None = None,
@@ -350,7 +353,7 @@ def prepare(
     name: str = "",
     backend: str = "auto",
     cache: ResultCache = no_cache,
-    progress: Progress = silent,
+    progress: ProgressChoice = None,
     log: dict[str, Sample] | None = None,
     frames: int = 0,
     film: list[Frames] | None = None,
@@ -366,7 +369,7 @@ def prepare(
         name: of the pack; default from grain, size and seed.
         backend: "auto", "jax" or "native".
         cache: asked for every part, so that a long preparation can be resumed.
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
         log: filled with the samples of every cycle stage, if given.
         frames: configurations to keep: the lattice, the ends of gas, pressing and settling, the pack, and from six on
             some of the cycles (see `frames.places`). The pack stays as it is.
@@ -377,10 +380,11 @@ def prepare(
         ValueError: for impossible numbers, or if 64-bit mode is off.
         RunFailedError: if the simulation broke down or did not come to rest.
     """
+    tell = callback(progress)
     require_x64()
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = grain or tetra(), material or Material()
-    preparation = _Preparation(recipe, clump, material, backend, frames, cache, progress)
+    preparation = _Preparation(recipe, clump, material, backend, frames, cache, tell)
     preparation.compact()
     preparation.cycle()
     if log is not None:

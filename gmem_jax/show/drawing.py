@@ -1,7 +1,9 @@
 """Pictures that are files, or shown by a notebook. Matplotlib is imported on first use, and no display is asked for."""
 
+import contextlib
 import io
 import textwrap
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ class Drawing:
 
     figure: Any
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write it, in the format of the path's suffix.
 
         Raises:
@@ -26,7 +28,7 @@ class Drawing:
         """
         path = Path(path)
         with atomic(path) as temporary:
-            self.figure.savefig(temporary, format=path.suffix.removeprefix("."), dpi=DPI)
+            self._write(temporary, format=path.suffix.removeprefix("."), dpi=DPI)
 
     def title(self, *lines: str) -> None:
         """Put lines over it, broken where the picture ends."""
@@ -35,8 +37,24 @@ class Drawing:
 
     def _repr_png_(self) -> bytes:
         content = io.BytesIO()
-        self.figure.savefig(content, format="png", dpi=100)
+        self._write(content, format="png", dpi=100)
         return content.getvalue()
+
+    def _write(self, target: Any, **options: Any) -> None:
+        with without_tex(self.figure):
+            self.figure.savefig(target, **options)
+
+
+@contextlib.contextmanager
+def without_tex(figure: Any) -> Iterator[None]:
+    """Draw a figure by matplotlib alone, whatever the user's matplotlibrc says: LaTeX may not be there."""
+    import matplotlib
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_usetex(False)
+    with matplotlib.rc_context({"text.usetex": False}):  # numbers at the axes are made while it is drawn
+        yield
 
 
 def blank(rows: int = 1, columns: int = 1, *, size: tuple[float, float], **shared: Any) -> tuple[Drawing, Any]:

@@ -22,6 +22,7 @@ def pyplot() -> Any:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    plt.rcParams["text.usetex"] = False
     return plt
 
 

@@ -1,7 +1,7 @@
 """What any file that a command writes holds: facts, lines for a person, and the pictures that can be drawn of it."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -104,6 +104,46 @@ def _pack(file: Path, against: str) -> Shown:
     return Shown(facts, [tables.pack_table(pack)], drawn)
 
 
+def _plain(label: str) -> str:
+    """The label of an axis without the marks of formulas."""
+    return label.replace("$", "").replace("\\", "")
+
+
+KERNEL_WORDS = {
+    "gain": "G of the perfect integral that comes nearest",
+    "distance": "from that integral: 0 none, 1 nothing of it",
+    "asymmetry": "of the recalls of a waveform and its negative: 0 for a linear memory",
+    "resolution": "width in v of a point of the waveform that is read back",
+}
+"""What is printed of a kernel, in words; more in docs/glossary.md."""
+
+PLOTS = {
+    "signals": "recalled signals beside the integral J",
+    "waveforms": "what was stored: waveforms I, or slopes by them",
+    "all": "an image of all signals, a row each",
+    "grains": "the grains in their box",
+    "kernel": "M(u, v) and its singular values",
+    "recalls": "recalls of the kernel's bumps",
+    "confusion": "words stored against words read",
+    "bits": "error rate of each bit, by reader",
+    "history": "F by iteration",
+    "values": "parameters by iteration",
+    "weights": "a net's weights by u",
+    "gain": "G of the points",
+    "fidelity": "F of the points",
+    "windowed_gain": "G after a running mean over the ringing period",
+    "windowed_fidelity": "F after the same",
+    **{name: f"{_plain(quantity.label)}, over the stages" for name, quantity in QUANTITIES.items()},
+}
+"""What every picture shows, in words."""
+
+
+def kernel_lines(facts: Mapping[str, Any], noise: float, n: int) -> list[str]:
+    """`kernel_facts` for a person."""
+    lines = [f"{key}: {facts[key]:.3f}  ({words})" for key, words in KERNEL_WORDS.items()]
+    return [*lines, f"values above {noise:g} Pa: {facts['capacity']} of {n}  (independent ones, told from this noise)"]
+
+
 def kernel_facts(kernel: MemoryKernel, noise: float) -> dict[str, Any]:
     """What a kernel says of a memory; `noise` in Pa RMS."""
     modulus = float(Material().modulus)
@@ -123,8 +163,7 @@ def _kernel(file: Path) -> Shown:
     about = {"pack": pack, "n": len(kernel.centres), "width": kernel.width, "gamma0": kernel.gamma0}
     facts = kernel_facts(kernel, NOISE)
     lines = [f"memory kernel of {pack}: {about['n']} bumps of width {kernel.width:g}, gamma0 = {kernel.gamma0:g}"]
-    lines += [f"{key}: {facts[key]:.3f}" for key in ("gain", "distance", "asymmetry", "resolution")]
-    lines.append(f"values above {NOISE:g} Pa: {facts['capacity']} of {about['n']}")
+    lines += kernel_lines(facts, NOISE, len(kernel.centres))
     floor = NOISE / float(Material().modulus)
     drawn: dict[str, Draw] = {
         "kernel": lambda path: figures.kernel_figure(path, kernel, floor, pack),

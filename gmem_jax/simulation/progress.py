@@ -1,13 +1,31 @@
-"""How far a run is: what is told to whoever waits for it, and in which unit."""
+"""How far a run is: what is told to whoever waits for it, and in which unit; and the bar that shows it.
 
-from collections.abc import Callable, Iterable
+By default a bar appears in a terminal or a notebook, for the outermost call alone.
+"""
+
+import contextlib
+import functools
+import importlib
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextvars import ContextVar
+from html import escape
+from typing import Any, ParamSpec, TypeVar
 
 from gmem_jax.simulation.protocol import Stage
 
 Progress = Callable[[str, float, float], None]
 """Called with the stage's name, the simulated time so far (t_c) and the fraction of the whole work done (0 to 1)."""
 
+ProgressChoice = Progress | bool | None
+"""A callback; False for none; True for a bar; None for a bar in a terminal or a notebook, and nothing elsewhere."""
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
 STEP = 1.0  # work of a step beside its replicas', in theirs: 0.9 at 10,240 grains, 1.4 at 3,267 and 2 at 325
+EVERY = 0.3  # seconds between changes of what a bar shows
 
 
 def silent(stage: str, time: float, fraction: float) -> None:
@@ -27,3 +45,103 @@ def work_of_bin(replicas: int) -> float:
 def work_of(stages: Iterable[Stage], replicas: int) -> float:
     """What some stages cost, in replica-bins."""
     return sum(stage.bins for stage in stages) * work_of_bin(replicas)
+
+
+class ProgressBar:
+    """A bar for `gm.run(experiment, progress=gm.ProgressBar())`, and whatever else takes a progress callback."""
+
+    _line = ""  # what stands unfinished in the terminal
+
+    def __init__(self) -> None:
+        self._began = self._told = time.perf_counter()
+        self._first = -1.0
+        self._display = _notebook()
+
+    def __call__(self, stage: str, moment: float, fraction: float) -> None:
+        """Show how far a run is; see `Progress`."""
+        now = time.perf_counter()
+        if self._first < 0.0:
+            self._began, self._first = now, fraction  # what came before the first chunk was compiling
+        elif now - self._told < EVERY and fraction < 1.0:
+            return
+        self._told = now
+        words = f"{fraction:.0%} {stage}" + (f", t = {moment:.0f} t_c" if moment else "")
+        done = fraction - self._first
+        if done > 0.01 and fraction < 1.0:
+            words += f", {(now - self._began) * (1.0 - fraction) / done:.0f} s left"
+        if self._display is not None:
+            bar = f'<progress value="{fraction:.4f}" max="1"></progress> {escape(words)}'
+            self._display.update({"text/html": bar, "text/plain": words}, raw=True)
+        else:
+            self._line = "" if fraction >= 1.0 else words
+            sys.stderr.write(f"\r\033[K{words}" + ("" if self._line else "\n"))
+            sys.stderr.flush()
+
+    def close(self) -> None:
+        """Leave the terminal at the beginning of a line, and the notebook without a bar that never moved."""
+        if self._line:
+            sys.stderr.write("\n")
+            self._line = ""
+        if self._display is not None and self._first < 0.0:
+            self._display.update({"text/plain": ""}, raw=True)
+
+
+def watched() -> bool:
+    """Whether someone looks on: at a notebook, or at a terminal in which the program runs."""
+    return _shell() is not None or (sys.stderr is not None and sys.stderr.isatty())
+
+
+def _notebook() -> Any:
+    """Where a notebook shows something that changes; None elsewhere."""
+    if _shell() is None:
+        return None
+    return importlib.import_module("IPython.display").display({"text/plain": "compiling"}, raw=True, display_id=True)
+
+
+def _shell() -> Any:
+    """The notebook's; None elsewhere."""
+    module = sys.modules.get("IPython")
+    shell = module.get_ipython() if module else None
+    return shell if hasattr(shell, "kernel") else None
+
+
+_bar_is_shown: ContextVar[bool] = ContextVar("_bar_is_shown", default=False)
+
+
+@contextlib.contextmanager
+def no_further_bar() -> Iterator[None]:
+    """Show no bar by default: a program, or an outer call, shows its own."""
+    before = _bar_is_shown.set(True)
+    try:
+        yield
+    finally:
+        _bar_is_shown.reset(before)
+
+
+def shows_progress(function: Callable[P, T]) -> Callable[P, T]:
+    """A function whose keyword `progress` is a `ProgressChoice`; what it calls shows no bar of its own."""
+
+    @functools.wraps(function)
+    def showing(*args: P.args, **kwargs: P.kwargs) -> T:
+        asked: Any = kwargs.get("progress")
+        with no_further_bar() if _bar_is_shown.get() else _bar(asked) as bar, no_further_bar():
+            return function(*args, **{**kwargs, "progress": asked if callable(asked) else bar})  # type: ignore[arg-type]
+
+    return showing
+
+
+@contextlib.contextmanager
+def _bar(asked: ProgressChoice) -> Iterator[Progress | None]:
+    if asked is False or callable(asked) or not (asked or watched()):
+        yield None
+        return
+    bar = ProgressBar()
+    try:
+        yield bar
+    finally:
+        bar.close()
+
+
+def callback(progress: ProgressChoice) -> Progress:
+    """What to call."""
+    return progress if callable(progress) else silent

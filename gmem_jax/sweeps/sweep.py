@@ -14,6 +14,7 @@ import numpy as np
 import psutil
 
 from gmem_jax.errors import RunFailedError
+from gmem_jax.experiment.arguments import require_values
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.html import listing
@@ -23,9 +24,10 @@ from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import sources
+from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import explain, together
 from gmem_jax.preparation.preparation import Recipe, grain_steps
-from gmem_jax.simulation.progress import Progress, silent, within, work_of_bin
+from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within, work_of_bin
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.plan import ABREAST, Point, digest, groups, plan, point
 from gmem_jax.sweeps.spec import PREPARE, Spec
@@ -64,12 +66,14 @@ class Results(list[Result]):
         return listing(f"Sweep of {len(self)} points", [*names, "G", "F", "status"], rows)
 
 
+@usual_rules()
+@shows_progress
 def sweep(
     experiment: Experiment,
     vary: Mapping[str, Sequence[Any]],
     folder: Path | str | None = None,
     *,
-    progress: Progress = silent,
+    progress: ProgressChoice = None,
 ) -> Results:
     """Run every combination of some values, in this process; what may run side by side does.
 
@@ -77,7 +81,7 @@ def sweep(
         experiment: what all have in common.
         vary: values by dotted name, like {"friction.mu": [0.0, 0.5], "pack": packs}; packs also by name.
         folder: keeps the results; what is there already is not computed again.
-        progress: told about every chunk.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Returns:
         The points in the order of `itertools.product`, the last name fastest.
@@ -86,6 +90,8 @@ def sweep(
         ValueError: for a name that is no field, or an impossible value.
         RunFailedError: if a simulation broke down.
     """
+    tell = callback(progress)
+    require_values(vary)
     packs = functools.cache(load_pack)  # points on one pack object can run side by side
     points = []
     for row in itertools.product(*vary.values()):
@@ -101,7 +107,7 @@ def sweep(
     total, done = sum(one.experiment.replicas for one in missing) or 1, 0
     for group in jobs:
         share = sum(one.experiment.replicas for one in group)
-        on = within(progress, done / total, (done + share) / total)
+        on = within(tell, done / total, (done + share) / total)
         keys, experiments = [one.key for one in group], [one.experiment for one in group]
         cache = Checkpoints(store.folder / "parts" / digest(keys), {"keys": keys}) if store else None
         found |= run_group(keys, experiments, store=store, cache=cache, progress=on)

@@ -14,6 +14,7 @@ from gmem_jax.files import schemas
 from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.show import recalls
+from gmem_jax.show.kinds import PLOTS
 from gmem_jax.sweeps.plan import point
 from gmem_jax.sweeps.store import Store
 
@@ -80,10 +81,13 @@ KINDS = {
         ["signals", "all", "Z", "p_x"],
     ),
     "pack.h5": (["27 tetra(0.6)"], ["grains", "phi"]),
-    "kernel.h5": (["5 bumps of width 0.2", "resolution"], ["kernel", "recalls"]),
+    "kernel.h5": (
+        ["5 bumps of width 0.2", "resolution: ", "(width in v of a point of the waveform that is read back)"],
+        ["kernel", "recalls"],
+    ),
     "gradient.json": (["dF/dgamma0 = 3", "signal 2: 2 3"], ["waveforms"]),
     "tuned.json": (["mean F 0.8000 -> 0.9000 with mu = 1.2"], ["history", "values"]),
-    "read.json": (["0.750"], ["confusion", "bits"]),
+    "read.json": (["0.750", "plug-in, the most; bitwise, bit by bit; Fano, the least"], ["confusion", "bits"]),
     "designed.csv": (["6 waveforms of 4 samples, designed", "F 0.5000 -> 0.9000"], ["waveforms", "history"]),
     "swept": (["mu", "0.5"], ["fidelity", "gain"]),
 }
@@ -101,6 +105,7 @@ def test_every_kind_of_file_is_printed_and_drawn(
     json.loads(capsys.readouterr().out)
     assert gmem(monkeypatch, "show", folder / name, "--plot", "list") == 0
     assert set(drawn) <= set(capsys.readouterr().out.split())
+    assert set(PLOTS) >= set(drawn)  # each in words
     for what in drawn:
         picture = tmp_path / f"{what}.png"
         assert gmem(monkeypatch, "show", folder / name, "--plot", what.upper(), "-o", picture) == 0

@@ -1,0 +1,78 @@
+"""What may stand where a pack, waveforms, a law or names belong: refused in one line that says what is right."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.signals import Signals
+from gmem_jax.physics.contact.friction import FrictionLaw
+
+
+def require_parts(pack: Any, signals: Any, friction: Any) -> None:
+    """Refuse what is no pack, no waveforms or no law.
+
+    Raises:
+        ValueError: saying what was given, and what makes the right thing of it.
+    """
+    if not isinstance(pack, Pack):
+        read = f"gm.load_pack({pack!r}) reads one" if isinstance(pack, str) else "see gm.load_pack and gm.prepare"
+        raise ValueError(f"pack must be a pack, got {_said(pack)}; {read}")
+    if isinstance(signals, type) or not isinstance(signals, Signals):
+        numbers = isinstance(signals, list | tuple | np.ndarray) or hasattr(signals, "shape")
+        made = "gm.waveform makes waveforms of samples" if numbers else "as gm.six_signals(), gm.words(3)"
+        raise ValueError(f"signals must be waveforms, got {_said(signals)}; {made}")
+    plain = isinstance(friction, float | int | str) or hasattr(friction, "shape")
+    # A class that JAX does not know may be a law in the making: `Experiment` says what it lacks.
+    unregistered = not plain and jax.tree_util.all_leaves([friction])
+    if isinstance(friction, type) or not (unregistered or isinstance(friction, FrictionLaw)):
+        if isinstance(friction, type):
+            made = f"make one with its parameters, as {friction.__name__}(mu=1.0)"
+        else:
+            made = f"gm.Hooke(mu={friction!r})" if isinstance(friction, float | int) else "as gm.Hooke(mu=1.0)"
+        raise ValueError(f"friction must be a friction law, got {_said(friction)}; {made}")
+
+
+def require_names(names: Any, argument: str) -> None:
+    """Refuse one name in the place of several.
+
+    Raises:
+        ValueError: saying how to write it.
+    """
+    if isinstance(names, str):
+        raise ValueError(f'{argument} is a sequence of names: write ["{names}"] for "{names}"')
+
+
+def require_values(vary: Mapping[str, Sequence[Any]]) -> None:
+    """Refuse one value in the place of several.
+
+    Raises:
+        ValueError: saying how to write it.
+    """
+    for name, values in vary.items():
+        if isinstance(values, str) or not isinstance(values, Iterable):
+            raise ValueError(f"{name} varies over a list of values: write [{values!r}] for {values!r}")
+
+
+def require_once(values: Mapping[str, Any], changes: Mapping[str, Any]) -> None:
+    """Refuse a field that is given twice, or after a part of it.
+
+    Raises:
+        ValueError: naming it.
+    """
+    earlier: list[str] = []
+    for name in values:
+        if name in changes or any(one.startswith(f"{name}.") for one in earlier):
+            raise ValueError(f"{name} is given twice; leave one away")
+        earlier.append(name)
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, type):
+        return f"the class {value.__name__}"
+    if isinstance(value, str | float | int | None):
+        return repr(value)
+    return f"an array of shape {jnp.shape(value)}" if hasattr(value, "shape") else f"a {type(value).__name__}"

@@ -1,0 +1,131 @@
+"""How the command starts, and what it says where JAX, the environment or the user's settings do not let it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+from test_cli import PACK, SHORT, gmem
+
+import gmem_jax as gm
+from gmem_jax.errors import FileFormatError
+from gmem_jax.files.home import kept, kept_pack
+from gmem_jax.physics.rules import StartError
+from gmem_jax.show import figures
+from gmem_jax.show.drawing import blank
+
+ENTRY = [sys.executable, "-c", "import sys; sys.argv[0] = 'gmem'; from gmem_start import main; main()"]
+
+
+def said(*arguments: object, code: int, **environment: str | None) -> str:
+    """What the command says on stderr, in a process of its own; None takes a variable away."""
+    own = {name: value for name, value in {**os.environ, **environment}.items() if value is not None}
+    done = subprocess.run([*ENTRY, *map(str, arguments)], env=own, capture_output=True, text=True, timeout=300)
+    assert done.returncode == code, done.stderr
+    return done.stderr
+
+
+@pytest.mark.parametrize("platform", ["cuda", "nonsense"])
+def test_a_jax_that_does_not_start_is_told_in_one_line_and_no_fault_of_the_pack(tmp_path: Path, platform: str) -> None:
+    line = said("recall", PACK, "-o", tmp_path / "x.h5", *SHORT, code=2, JAX_PLATFORMS=platform)
+    assert line.startswith(f"gmem: JAX does not start with JAX_PLATFORMS={platform}: ")
+    assert line.count("\n") == 1
+    assert line.endswith("unset JAX_PLATFORMS, or set it to cpu\n")
+    assert "pack" not in line
+
+
+def test_a_setting_that_jax_refuses_when_it_is_imported_is_told_in_one_line() -> None:
+    line = said("info", code=2, JAX_ENABLE_X64="perhaps")
+    assert line.startswith("gmem: cannot start: ")
+    assert "perhaps" in line
+    assert line.count("\n") == 1
+
+
+def test_flags_of_jax_do_not_stop_a_command_and_one_that_slows_it_is_told(tmp_path: Path) -> None:
+    strict = {"JAX_TRANSFER_GUARD": "disallow", "JAX_NUMPY_RANK_PROMOTION": "raise"}
+    said("show", PACK, "--plot", "grains", "-o", tmp_path / "x.png", code=0, **strict)
+    line = said("info", code=0, JAX_DISABLE_JIT="1")
+    assert line.splitlines()[0].startswith("warning: JAX_DISABLE_JIT is set: nothing is compiled")
+
+
+@pytest.mark.parametrize("threads", ["0", "abc"])
+def test_a_wrong_number_of_threads_is_told_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, threads: str
+) -> None:
+    monkeypatch.setenv("GMEM_THREADS", threads)
+    assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "x.h5", *SHORT) == 2
+    expected = f'gmem: GMEM_THREADS should be a number of threads from 1 to 4096; it is "{threads}"'
+    assert capsys.readouterr().err.splitlines()[-1] == expected
+
+
+def test_ctrl_c_while_it_is_imported_is_one_line() -> None:
+    # Imports as slow as on a cold disk, so that the signal comes while they run.
+    slow = "import sys, time; sys.meta_path.insert(0, type('Slow', (), {'find_spec': lambda *_: time.sleep(0.05)}))"
+    begun = "print(flush=True)"
+    command = [sys.executable, "-c", f"{slow}; {begun}; from gmem_start import main; main()"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.readline()
+        time.sleep(1.0)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=60)
+    assert error == "gmem: interrupted; nothing was begun\n"
+    assert process.returncode == 130
+
+
+def no_home() -> Path:
+    raise RuntimeError("Could not determine home directory.")
+
+
+def test_a_user_without_a_home_keeps_nothing_and_is_told_where_a_home_is_needed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.delenv("GMEM_COMPILE_CACHE")
+    monkeypatch.setattr(Path, "home", no_home)
+    assert kept() is None
+    assert kept_pack("tetra-31680-a") is None
+    assert gmem(monkeypatch, "--help") == 0
+    assert gmem(monkeypatch, "show", "tetra-325-a") == 0
+    capsys.readouterr()
+    assert gmem(monkeypatch, "prepare", "tetra-31680-a") == 2
+    assert "there is no home folder to keep it in; set XDG_CACHE_HOME" in capsys.readouterr().err
+
+
+def test_a_fault_of_jax_is_not_called_one_of_the_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("jax.devices", no_home)
+    (tmp_path / "broken.h5").write_bytes(b"no pack")
+    with pytest.raises(FileFormatError, match="not a readable"):
+        gm.load_pack(tmp_path / "broken.h5")
+    monkeypatch.setattr("gmem_jax.files.packs.tabulate", no_home)
+    with pytest.raises(StartError, match="JAX does not start"):
+        gm.load_pack(PACK)
+
+
+def test_pictures_need_no_latex_whatever_the_settings_of_matplotlib(tmp_path: Path) -> None:
+    with matplotlib.rc_context({"text.usetex": True}):
+        drawing, axes = blank(size=(3.0, 2.0))
+        axes[0, 0].plot([0.0, 1.0], label="50 % & more")
+        axes[0, 0].legend()
+        drawing.save(tmp_path / "drawing.png")
+    with matplotlib.rc_context({"text.usetex": True}):
+        figures.gradient_figure(tmp_path / "pyplot.png", [(np.arange(3), np.arange(3))], "a_b")
+    assert {path.name for path in tmp_path.iterdir()} == {"drawing.png", "pyplot.png"}
+
+
+def test_a_picture_that_cannot_be_drawn_loses_no_table(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("latex could not be found")
+
+    monkeypatch.setattr(figures, "recall_figure", broken)
+    assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "x.h5", *SHORT) == 0
+    captured = capsys.readouterr()
+    assert f"warning: {tmp_path / 'x.png'}: could not be drawn (latex could not be found)" in captured.err
+    assert "F" in captured.out
+    assert (tmp_path / "x.h5").is_file()
