@@ -10,7 +10,8 @@ import gmem_jax as gm
 from gmem_jax.physics.state import still_box
 from gmem_jax.physics.step import march
 from gmem_jax.preparation.piston import Pressed, Servo, press
-from gmem_jax.preparation.preparation import _gas, lattice
+from gmem_jax.preparation.preparation import _gas
+from gmem_jax.preparation.recipe import lattice
 
 PRESS = jax.jit(press, static_argnames=("blocks", "march"))
 TINY = gm.Recipe(grains=12, gas_time=500.0, t0=300.0, cycles=1)

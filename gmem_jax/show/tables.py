@@ -20,6 +20,7 @@ from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.configuration import signals_from
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain, together
+from gmem_jax.preparation.recipe import pressure_over_wanted
 
 SLOW_ENOUGH = 1.8e3  # t0, in t_c: G and F agree with those at ten times slower drives where nothing rings
 
@@ -277,6 +278,8 @@ def pack_table(pack: Pack) -> Table:
             ("p_x, p_y, p_z", f"{pressures} kPa"),
             ("largest speed", f"{rest['largest_speed']:.1e} R/t_c"),
         ]
+        if (met := pressure_over_wanted(pack.info)) is not None:
+            rows.append(("p_z over the wanted one", f"{met:.2f}"))
     if recipe:
         rows.append(("seed", str(recipe["seed"])))
     for key, value in rows:

@@ -24,7 +24,7 @@ from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
 from gmem_jax.files.provenance import sources
 from gmem_jax.physics.state import explain, together
-from gmem_jax.preparation.preparation import Recipe, grain_steps
+from gmem_jax.preparation.recipe import Recipe, grain_steps
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.plan import ABREAST, Point, digest, groups, plan, point
 from gmem_jax.sweeps.spec import PREPARE, Spec

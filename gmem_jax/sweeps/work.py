@@ -29,7 +29,8 @@ from gmem_jax.files.parts import Parts
 from gmem_jax.files.programs import keep_programs
 from gmem_jax.physics import grain
 from gmem_jax.physics.sample import Sample
-from gmem_jax.preparation.preparation import Recipe, prepare
+from gmem_jax.preparation.preparation import prepare
+from gmem_jax.preparation.recipe import Recipe
 from gmem_jax.sweeps.store import Store
 
 EVERY = 1.0  # s between two reports of progress
