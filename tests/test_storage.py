@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections import OrderedDict
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -11,6 +12,7 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax.files.atomic import atomic
+from gmem_jax.files.configuration import experiment_from, written
 from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.parts import Parts, load_part, locked, save_part
 from gmem_jax.files.waveforms import save_waveforms
@@ -29,6 +31,15 @@ def test_a_pack_survives_the_file_bit_for_bit(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(pack.pairs, key), getattr(again.pairs, key))
     assert again.info == pack.info
     assert again.clump.isotropic
+
+
+def test_a_pack_with_another_ringing_period_is_another_pack() -> None:
+    pack = gm.load_pack(PACK)
+    experiment = written(gm.Experiment(pack, gm.six_signals()))
+    other = replace(pack, ringing_period=1.1 * pack.ringing_period)  # F over T1 would be another
+    assert experiment_from(experiment, pack).pack is pack
+    with pytest.raises(gm.FileFormatError, match="not the pack that this was made with"):
+        experiment_from(experiment, other)
 
 
 def test_a_truncated_file_is_refused(tmp_path: Path) -> None:

@@ -81,11 +81,6 @@ def _check_box(found: Found) -> None:
     require(lower < upper, "a lower wall of the box is not below the upper one")
     require(0.0 < delta0 < 0.5, f"delta0 must be in (0, 0.5), got {delta0:g}")
     require(upper - lower < WIDEST, f"a box wider than {WIDEST:g} R is none of a pack at rest")
-    period, (shortest, longest) = float(found["ringing_period"]), period_bounds(upper - lower)
-    require(
-        shortest <= period <= longest,
-        f"its ringing period is {period:g} t_c, must be between {shortest:.3g} and {longest:.3g} in a box of this size",
-    )
     filling = _filling(found)
     require(
         LOOSEST < filling < DENSEST,
@@ -93,6 +88,11 @@ def _check_box(found: Found) -> None:
     )
     norm = np.linalg.norm(found["quaternion"], axis=1)
     require(np.abs(norm - 1.0) < UNIT, "a quaternion is not of length 1")
+    period, (shortest, longest) = float(found["ringing_period"]), period_bounds(upper - lower)
+    require(
+        shortest <= period <= longest,
+        f"its ringing period is {period:g} t_c, must be between {shortest:.3g} and {longest:.3g} in a box of this size",
+    )
 
 
 def period_bounds(lengths: np.ndarray) -> tuple[float, float]:

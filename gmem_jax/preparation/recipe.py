@@ -20,8 +20,8 @@ DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with
 APART = 1.02  # outer diameters of the grain: the least spacing of the lattice, so that grains turn freely
 SLOWEST_BINS = 1.8e3  # t_c: t0 whose bins and steps a preparation has outside its cycles, unless it is slower. What it
 # costs would grow as t0 falls otherwise: a bin is t0 / 256, a step no longer than that
-STEP = 20.0  # grains whose step takes as long as what every step costs beside its grains (native, N = 12 to 325)
-BIN = 5.0  # steps that what ends a bin takes as long as
+STEP = 200.0  # grain-steps that a step costs beside its grains: calls and lists (N = 16 to 250, native)
+BIN = 4000.0  # and that a bin of a cycle costs beside its steps
 
 
 def _number(default: float, within: str, words: str, unit: str = "") -> Any:
@@ -182,5 +182,4 @@ def grain_steps(recipe: Recipe, clump: Clump) -> float:
     """What a preparation will cost about: grains times steps, and what small packs and short bins cost beside them."""
     inside = sum(stage.bins for stage in cycles_of(recipe)), stepping(recipe.t0, recipe.dt)[0]
     outside = bins_outside(recipe, clump), stepping(max(recipe.t0, SLOWEST_BINS), recipe.dt)[0]
-    steps = sum(bins * (count + BIN) for bins, count in (inside, outside))
-    return (recipe.grains + STEP) * steps
+    return sum(bins * (steps * (recipe.grains + STEP) + BIN) for bins, steps in (inside, outside))
