@@ -143,7 +143,10 @@ def _with(
     own = [entry for entry in signature.parameters.values() if entry.name != name]
     added = [
         inspect.Parameter(
-            option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, typer.Option(help=words)]
+            option,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=default,
+            annotation=Annotated[kind, typer.Option(help=words)],
         )
         for option, (default, kind, words) in options.items()
     ]

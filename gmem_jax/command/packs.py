@@ -104,7 +104,8 @@ def prepare_command(
     output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write.")] = None,
     shape: Annotated[str, typer.Option(help="tetra, sphere, or a file of spheres: x y z r in every line.")] = "tetra",
     overlap: Annotated[
-        float | None, typer.Option(help=f"Overlap O of a tetra grain, in [0, 1); default {OVERLAP}.", show_default=False)
+        float | None,
+        typer.Option(help=f"Overlap O of a tetra grain, in [0, 1); default {OVERLAP}.", show_default=False),
     ] = None,
     name: Annotated[str, typer.Option(help="Name of the pack; default from grain, size and seed.")] = "",
     backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",

@@ -35,7 +35,6 @@ from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.state import together
 from gmem_jax.show import figures, tables
 
-
 TYPICAL = "tetra-325-e"  # of the five shipped packs of 325 that with the median F
 SHIPPED = {"packs": 5, "gain": (0.225, 0.040), "fidelity": (0.803, 0.096)}  # mean and SD of those, as `demo` runs them
 

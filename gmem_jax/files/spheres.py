@@ -29,7 +29,9 @@ def load_clump(path: Path) -> Clump:
     with refusing(path, "file of spheres"):
         require(path.stat().st_size <= _LARGEST, f"more than {MOST} lines of four numbers")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
-        rows = [_sphere(number, line) for number, line in enumerate(lines, 1) if line.strip() and line.strip()[0] != "#"]
+        rows = [
+            _sphere(number, line) for number, line in enumerate(lines, 1) if line.strip() and line.strip()[0] != "#"
+        ]
         require(0 < len(rows) <= MOST, f"it lists {len(rows)} spheres, must be 1 to {MOST}: {_COLUMNS} in every line")
         name = path.stem[:NAME]
         made = clump(np.asarray(rows), shape=name if title(name) else "clump")

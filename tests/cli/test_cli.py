@@ -197,7 +197,10 @@ def bad_files(folder: Path) -> dict[str, Path]:
 
 
 BAD = [
-    (["prepare", "--shape", "cube", "-o", "{out}"], "--shape must be tetra or sphere, or a file of spheres, got 'cube'"),
+    (
+        ["prepare", "--shape", "cube", "-o", "{out}"],
+        "--shape must be tetra or sphere, or a file of spheres, got 'cube'",
+    ),
     (["prepare", "--grains", "0", "-o", "{out}"], "grains must be at least 12 to jam between six walls, got 0"),
     (["prepare", "--overlap", "1.0", "-o", "{out}"], "overlap must be in [0, 1), got 1"),
     (["prepare", "--shape", "sphere", "--overlap", "0.3", "-o", "{out}"], "--overlap is that of a tetra grain"),
