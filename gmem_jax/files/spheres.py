@@ -6,9 +6,9 @@ import numpy as np
 
 from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.checked import NAME, refusing, require, title
+from gmem_jax.files.soundness import MOST
 from gmem_jax.physics.grain import Clump, clump
 
-MOST = 256  # spheres of a grain, as in a pack file
 _LARGEST = 1 << 16  # bytes: 256 lines of four long numbers
 _COLUMNS = "x y z r"
 

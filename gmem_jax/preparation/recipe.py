@@ -33,7 +33,7 @@ def _number(default: float, within: str, words: str, unit: str = "") -> Any:
 class Recipe:
     """The numbers of a preparation; what the paper leaves open is a field here (docs/physics.md, "Preparation").
 
-    Each field says what it means, where it must lie and its unit (`dataclasses.fields`); `gmem prepare --help` shows it.
+    Each field knows its meaning, interval and unit (`dataclasses.fields`): `gmem prepare --help` shows them.
 
     Attributes:
         grains: number of grains N.
@@ -148,8 +148,8 @@ def sites_of(recipe: Recipe, clump: Clump) -> tuple[tuple[int, int, int], np.nda
     width, height = sites[0] * apart[0], count * mass / (DENSE * (sites[0] * apart[0]) ** 2)
     if min(width, height) < diameter:
         raise ValueError(
-            f"{count} grains would make a pack of about {width:.1f} x {width:.1f} x {height:.1f} R, flatter than a grain "
-            f"({diameter:.1f} R): take more grains{', or a thicker gas' if spacing >= least else ''}"
+            f"{count} grains would make a pack of about {width:.1f} x {width:.1f} x {height:.1f} R, flatter than "
+            f"a grain ({diameter:.1f} R): take more grains{', or a thicker gas' if spacing >= least else ''}"
         )
     return sites, apart
 

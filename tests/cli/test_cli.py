@@ -199,7 +199,7 @@ def bad_files(folder: Path) -> dict[str, Path]:
 BAD = [
     (
         ["prepare", "--shape", "cube", "-o", "{out}"],
-        "--shape must be tetra or sphere, or a file of spheres, got 'cube'",
+        "must be tetra or sphere, or a file of spheres, got 'cube'",
     ),
     (["prepare", "--grains", "0", "-o", "{out}"], "grains must be at least 12 to jam between six walls, got 0"),
     (["prepare", "--overlap", "1.0", "-o", "{out}"], "overlap must be in [0, 1), got 1"),
