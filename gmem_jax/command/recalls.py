@@ -36,7 +36,11 @@ from gmem_jax.physics.state import together
 from gmem_jax.show import figures, tables
 
 TYPICAL = "tetra-325-e"  # of the five shipped packs of 325 that with the median F
-SHIPPED = {"packs": 5, "gain": (0.225, 0.040), "fidelity": (0.803, 0.096)}  # mean and SD of those, as `demo` runs them
+SHIPPED: dict[str, Any] = {
+    "packs": 5,
+    "gain": (0.225, 0.040),
+    "fidelity": (0.803, 0.096),
+}  # mean and SD of those, as `demo` runs them
 
 
 def _run(
@@ -133,7 +137,7 @@ def demo(
     bits = together([row["status"] for row in rows])
     total = {"status": bits, "seconds": sum(row["seconds"] for row in rows)}
     result: dict[str, Any] = {**means, **total, "packs": rows}
-    lines = [tables.recall_table(rows, configuration)]
+    lines: list[Any] = [tables.recall_table(rows, configuration)]
     if law == Hooke() and set(names) < set(default):
         result["shipped"] = SHIPPED
         (gain, gain_sd), (fidelity, fidelity_sd) = SHIPPED["gain"], SHIPPED["fidelity"]

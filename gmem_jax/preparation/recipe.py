@@ -172,7 +172,7 @@ def last_rest(recipe: Recipe) -> Stage:
 def bins_outside(recipe: Recipe, clump: Clump) -> float:
     """Bins that a preparation will take about before and after its cycles."""
     sites, apart = sites_of(recipe, clump)
-    width, height = sites[0] * apart[0], sites[2] * apart[2]
+    width, height = sites[0] * float(apart[0]), sites[2] * float(apart[2])
     dense = recipe.grains * float(clump.mass) / (DENSE * width**2)
     fall = max(0.0, height - dense) / min(recipe.piston_speed, recipe.piston_gain)
     return last_rest(recipe).bins + BINS * (recipe.gas_time + fall + SETTLING * dense) / max(recipe.t0, SLOWEST_BINS)
