@@ -24,7 +24,7 @@ from gmem_jax.experiment import analysis
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.provenance import sources
 from gmem_jax.physics.state import together
-from gmem_jax.preparation.preparation import Recipe
+from gmem_jax.preparation.recipe import Recipe
 
 STANDARD = Recipe()
 SHORT = Recipe(piston_gain=0.01, settled_speed=3e-3, quiet=2e-4)

@@ -31,7 +31,8 @@ from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.grain import Clump, clump, sphere, tetra
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain
-from gmem_jax.preparation.preparation import Recipe, prepare
+from gmem_jax.preparation.preparation import prepare
+from gmem_jax.preparation.recipe import Recipe
 
 if TYPE_CHECKING:
     from gmem_jax.design.by_kernel import design_by_kernel

@@ -253,5 +253,5 @@ def test_grains_that_press_on_no_wall_are_refused(
 
 
 def test_walls_that_do_not_ring_have_no_period() -> None:
-    with pytest.raises(ValueError, match="grains do not press"):
+    with pytest.raises(gm.RunFailedError, match="grains do not press"):
         spectrum_peak(np.zeros(64), 1.0)

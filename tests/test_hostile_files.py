@@ -129,6 +129,8 @@ CHANGES = [
     (scale("clump/mass", 1.001), "the filling on record"),
     (scale("clump/diameter", 1.01), "the grain's diameter"),
     (scale("delta0", 20.0), r"delta0 must be in \(0, 0.5\)"),
+    (scale("ringing_period", 5e7), r"its ringing period is .* t_c, must be between 6.36 and 147 in a box of this size"),
+    (scale("ringing_period", 0.1), "its ringing period is 1.96"),
     (squeeze, "its list misses spheres"),
     (negative, "a candidate is none of the 108 spheres"),
     (one_less, "its list misses spheres"),

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from scenes import SPHERE, column, scene
 
+import gmem_jax as gm
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import still_box
 from gmem_jax.preparation.ringing import ringing_period, spectrum_peak
@@ -42,6 +43,19 @@ def test_drift_is_not_taken_for_ringing() -> None:
     # A slope, and a single period in the whole record, both much larger than what rings.
     drift = 50.0 * TIME / TIME[-1] + 20.0 * wave(480.0)
     assert spectrum_peak(drift + wave(19.0), SPACING) == pytest.approx(19.0, rel=1e-2)
+
+
+def test_what_is_faster_than_any_wave_in_the_box_is_not_taken_for_its_ringing() -> None:
+    both = wave(19.0) + 3.0 * wave(7.0)
+    assert spectrum_peak(both, SPACING) == pytest.approx(7.0, rel=1e-3)
+    assert spectrum_peak(both, SPACING, shortest=10.0) == pytest.approx(19.0, rel=1e-3)
+
+
+def test_where_no_wall_feels_anything_there_is_no_ringing() -> None:
+    box = still_box(column([-5.0, -5.0, -5.0]), column([5.0, 5.0, 5.0]))
+    system, state, _ = scene(SPHERE, [[0.0, 0.0, 0.0]], box=box)
+    with pytest.raises(gm.RunFailedError, match="the x and y walls feel no oscillation"):
+        ringing_period(system, state.grains.position, state.grains.quaternion, box, jnp.asarray(0.3))
 
 
 def test_two_spheres_between_two_walls_ring_at_the_rate_of_their_springs() -> None:

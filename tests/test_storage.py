@@ -15,6 +15,7 @@ import gmem_jax as gm
 from gmem_jax.experiment.pack import stack
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import Checkpoints, load_part, locked, save_part
+from gmem_jax.files.configuration import experiment_from, written
 from gmem_jax.files.exported import frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import writing
@@ -75,6 +76,15 @@ def test_frames_and_stages_that_could_not_be_read_are_not_written(tmp_path: Path
     assert not list(tmp_path.iterdir())
     gm.save_pack(tmp_path / "a.h5", pack, frames=frames)
     assert load_frames(tmp_path / "a.h5").count == 1
+
+
+def test_a_pack_with_another_ringing_period_is_another_pack() -> None:
+    pack = gm.load_pack(PACK)
+    experiment = written(gm.Experiment(pack, gm.six_signals()))
+    other = replace(pack, ringing_period=1.1 * pack.ringing_period)  # F over T1 would be another
+    assert experiment_from(experiment, pack).pack is pack
+    with pytest.raises(gm.FileFormatError, match="not the pack that this was made with"):
+        experiment_from(experiment, other)
 
 
 def test_a_truncated_file_is_refused(tmp_path: Path) -> None:

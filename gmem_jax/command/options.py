@@ -19,6 +19,7 @@ from gmem_jax.files.waveforms import load_target
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.laws import LAWS, law_named
+from gmem_jax.preparation.recipe import Recipe, words_of
 
 _NAMES = ", ".join(entry.name for entry in LAWS)
 
@@ -119,23 +120,41 @@ def _default(name: str) -> Any:
 
 def with_experiment(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command all options of an experiment; it gets what they chose as `chosen`."""
-    options = {**_OTHERS, **_OF_LAW, **_FIELDS}
+    options = {
+        name: (_default(name), option.kind, option.words) for name, option in {**_OTHERS, **_OF_LAW, **_FIELDS}.items()
+    }
+    return _with(command, "chosen", Chosen, options)
+
+
+def with_recipe(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command every number of a preparation as an option; it gets the `recipe` that they make."""
+    options = {entry.name: (entry.default, entry.type, words_of(entry)) for entry in fields(Recipe)}
+    return _with(command, "recipe", lambda values: Recipe(**values), options)
+
+
+def _with(
+    command: Callable[..., None],
+    name: str,
+    make: Callable[[dict[str, Any]], Any],
+    options: dict[str, tuple[Any, Any, str]],
+) -> Callable[..., None]:
+    """A command with more options (default, type, help), which gets what `make` makes of their values as `name`."""
     signature = inspect.signature(command)
-    own = [entry for entry in signature.parameters.values() if entry.name != "chosen"]
+    own = [entry for entry in signature.parameters.values() if entry.name != name]
     added = [
         inspect.Parameter(
-            name,
+            option,
             inspect.Parameter.KEYWORD_ONLY,
-            default=_default(name),
-            annotation=Annotated[option.kind, typer.Option(help=option.words)],
+            default=default,
+            annotation=Annotated[kind, typer.Option(help=words)],
         )
-        for name, option in options.items()
+        for option, (default, kind, words) in options.items()
     ]
 
     @functools.wraps(command)
     def wrapper(**given: Any) -> None:
-        chosen = Chosen({name: given.pop(name) for name in options})
-        command(chosen=chosen, **given)
+        made = make({option: given.pop(option) for option in options})
+        command(**{name: made}, **given)
 
     wrapper.__signature__ = signature.replace(  # type: ignore[attr-defined]
         parameters=[entry.replace(kind=inspect.Parameter.KEYWORD_ONLY) for entry in own] + added

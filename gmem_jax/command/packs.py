@@ -21,15 +21,19 @@ from gmem_jax.command.console import (
     require_name,
     say,
 )
+from gmem_jax.command.options import with_recipe
 from gmem_jax.command.resuming import Restart, resumable
 from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.files.configuration import fingerprint
 from gmem_jax.files.home import kept_pack
 from gmem_jax.files.packs import STANDARD, list_packs, save_pack
 from gmem_jax.files.provenance import provenance, sources
+from gmem_jax.files.spheres import load_clump
 from gmem_jax.physics import grain
 from gmem_jax.physics.contact.frictionless import Frictionless
-from gmem_jax.preparation.preparation import Recipe, frame_schedule, grain_steps, prepare
+from gmem_jax.physics.grain import Clump
+from gmem_jax.preparation.preparation import frame_schedule, prepare
+from gmem_jax.preparation.recipe import Recipe, grain_steps, pressure_over_wanted
 from gmem_jax.show import tables
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import Sample
@@ -52,7 +56,7 @@ def info(as_json: AsJson = False) -> None:
 
 
 PREPARATION_BYTES = 2e4  # of memory a grain: lists while grains fly, at N = 10,240
-_DEFAULT = Recipe()
+OVERLAP = 0.6
 
 
 def standard_recipe(name: str) -> Recipe:
@@ -70,7 +74,27 @@ def standard_recipe(name: str) -> Recipe:
     return Recipe(grains=int(found[1]), seed=ord(found[2]) - ord("a") + 1, t0=PAPER_T0)
 
 
+def grain_of(shape: str, overlap: float | None) -> Clump:
+    """The grain that `--shape` and `--overlap` ask for.
+
+    Raises:
+        ValueError: if they ask for none.
+        FileNotFoundError: if there is no such file.
+    """
+    if shape == "tetra":
+        return grain.tetra(OVERLAP if overlap is None else overlap)
+    if overlap is not None:
+        raise InputError(f"--overlap is that of a tetra grain; leave it away with --shape {shape}")
+    if shape == "sphere":
+        return grain.sphere()
+    if "." not in shape and not Path(shape).is_file():
+        raise InputError(f"--shape must be tetra or sphere, or a file of spheres, got {shape!r}")
+    return load_clump(Path(shape))
+
+
+@with_recipe
 def prepare_command(
+    recipe: Recipe,
     standard: Annotated[
         str | None,
         typer.Argument(
@@ -78,15 +102,11 @@ def prepare_command(
         ),
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write.")] = None,
-    grains: Annotated[int, typer.Option(help="Number of grains N.")] = _DEFAULT.grains,
-    shape: Annotated[str, typer.Option(help="tetra or sphere.")] = "tetra",
-    overlap: Annotated[float, typer.Option(help="Overlap O of a tetra grain, in [0, 1).")] = 0.6,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = _DEFAULT.seed,
-    delta0: Annotated[
-        float, typer.Option(help="Areal compression of the cycles and of the experiment.")
-    ] = _DEFAULT.delta0,
-    t0: Annotated[float, typer.Option(help="Duration of one compression, t_c.")] = _DEFAULT.t0,
-    dt: Annotated[float, typer.Option(help="Largest time step, t_c.")] = _DEFAULT.dt,
+    shape: Annotated[str, typer.Option(help="tetra, sphere, or a file of spheres: x y z r in every line.")] = "tetra",
+    overlap: Annotated[
+        float | None,
+        typer.Option(help=f"Overlap O of a tetra grain, in [0, 1); default {OVERLAP}.", show_default=False),
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of the pack; default from grain, size and seed.")] = "",
     backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",
     frames: KeptFrames = 0,
@@ -98,12 +118,9 @@ def prepare_command(
 
     A standard pack (tetra-31680-a, or another N or letter) is made once and found by its name from then on.
     """
-    if shape not in ("tetra", "sphere"):
-        raise InputError(f"--shape must be tetra or sphere, got {shape!r}")
-    clump = grain.tetra(overlap) if shape == "tetra" else grain.sphere()
-    recipe = Recipe(grains=grains, seed=seed, delta0=delta0, t0=t0, dt=dt)
+    clump = grain_of(shape, overlap)
     if standard is not None:
-        if output is not None or name or recipe != _DEFAULT or (shape, overlap) != ("tetra", 0.6):
+        if output is not None or name or recipe != Recipe() or (shape, overlap) != ("tetra", None):
             raise InputError(f"{standard}: the name of a standard pack says all about it; leave other options away")
         recipe, name, output = standard_recipe(standard), standard, kept_pack(standard)
         if output is None:
@@ -134,6 +151,7 @@ def prepare_command(
     rest = pack.info["at_rest"]
     say(f"at rest: largest grain speed {rest['largest_speed']:.1e} R/t_c; wrote {output} in {seconds:.0f} s")
     result = {"pack": pack.name, "output": str(output), "seconds": seconds, "status": 0, **rest}
+    result["pressure_over_wanted"] = pressure_over_wanted(pack.info)
     emit(as_json, result, tables.pack_table(pack))
 
 

@@ -52,8 +52,9 @@ def fingerprint(tree: Any) -> str:
 
 
 def pack_fingerprint(pack: Pack) -> str:
-    """SHA-256 of what makes a pack: grain, centres, orientations, box; not of its list of candidates."""
-    return fingerprint((pack.clump, pack.position, pack.quaternion, pack.lower, pack.upper, pack.delta0))
+    """SHA-256 of what makes a pack: grain, centres, orientations, box, T1; not of its list of candidates."""
+    at = (pack.position, pack.quaternion, pack.lower, pack.upper)
+    return fingerprint((pack.clump, *at, pack.delta0, pack.ringing_period))
 
 
 def _plain(value: Any) -> Any:

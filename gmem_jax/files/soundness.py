@@ -17,6 +17,9 @@ GRAZING = 1e-9  # R: distances that may round to either side of a limit
 LOOSEST, DENSEST = 0.1, 0.85  # filling; packs are at 0.68, one squeezed to 0.9 would have 0.93
 WIDEST = 1e5  # R, of a box
 MOST = 256  # spheres of a grain
+FASTEST = 1.0  # R / t_c, of a rod of the solid: packs have 0.46 at 2e-3 E, and some p^(1/6) at other pressures
+LISTENED = 40.0  # longest edges, in t_c, for which T_1 is listened for: some 15 periods
+PERIODS = 3  # of the slowest mode that can be told from drift in that time
 _BALL = 4.0 * np.pi / 3.0
 
 Found = Mapping[str, np.ndarray]
@@ -77,7 +80,6 @@ def _check_box(found: Found) -> None:
     require(len(found["position"]) > 0, "it holds no grains")
     require(lower < upper, "a lower wall of the box is not below the upper one")
     require(0.0 < delta0 < 0.5, f"delta0 must be in (0, 0.5), got {delta0:g}")
-    require(found["ringing_period"] > 0.0, "its ringing period is not positive")
     require(upper - lower < WIDEST, f"a box wider than {WIDEST:g} R is none of a pack at rest")
     filling = _filling(found)
     require(
@@ -86,6 +88,17 @@ def _check_box(found: Found) -> None:
     )
     norm = np.linalg.norm(found["quaternion"], axis=1)
     require(np.abs(norm - 1.0) < UNIT, "a quaternion is not of length 1")
+    period, (shortest, longest) = float(found["ringing_period"]), period_bounds(upper - lower)
+    require(
+        shortest <= period <= longest,
+        f"its ringing period is {period:g} t_c, must be between {shortest:.3g} and {longest:.3g} in a box of this size",
+    )
+
+
+def period_bounds(lengths: np.ndarray) -> tuple[float, float]:
+    """Where T_1 of a box with these edges [3] can be, in t_c: a wave across it no faster than in the solid, and the
+    slowest that its measurement can tell."""
+    return float(np.min(lengths)) / FASTEST, LISTENED * float(np.max(lengths)) / PERIODS
 
 
 def _filling(found: Found) -> float:

@@ -36,14 +36,15 @@ class Interval(NamedTuple):
         return above & (value <= self.high if self.words.endswith("]") else value < self.high)
 
 
-def _interval(words: str) -> Interval:
+def interval(words: str) -> Interval:
+    """The interval of such words."""
     low, high = words[1:-1].split(",")
     return Interval(words, float(low), float(high))
 
 
 def parameter(default: Any, within: str = "(-inf, inf)") -> Any:
     """A data field that is a float: one number, or one for each replica [B]; `within` is an interval."""
-    return field(default=default, metadata={"interval": _interval(within)})
+    return field(default=default, metadata={"interval": interval(within)})
 
 
 def static(default: Any = MISSING) -> Any:

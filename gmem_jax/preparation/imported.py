@@ -147,7 +147,7 @@ def _pack_of(
         lower=jnp.asarray(read.lower),
         upper=jnp.asarray(read.upper),
         delta0=jnp.asarray(delta0),
-        ringing_period=jnp.asarray(1.0),
+        ringing_period=jnp.asarray(float(np.max(read.upper - read.lower))),  # until it is measured
         pairs=find_pairs(grain, position, quaternion, box, delta0),
         name=name,
         record=json.dumps(record),

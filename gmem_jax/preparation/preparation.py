@@ -2,7 +2,8 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass, replace
+import warnings
+from dataclasses import asdict, replace
 from typing import Any, cast
 
 import jax
@@ -12,7 +13,6 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.pack import Pack, find_pairs
-from gmem_jax.experiment.protocols import cycle
 from gmem_jax.files.provenance import provenance
 from gmem_jax.physics import rotation
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -24,6 +24,16 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Grains, still_box
 from gmem_jax.physics.step import System, accelerate, start
 from gmem_jax.preparation.piston import BLOCK, Pressed, Servo, largest_speed, press
+from gmem_jax.preparation.recipe import (
+    SLOWEST_BINS,
+    Recipe,
+    bins_outside,
+    cycles_of,
+    last_rest,
+    pressure_over_wanted,
+    sites_of,
+    stepping,
+)
 from gmem_jax.preparation.ringing import ringing_period
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.compiled import Compiled, require_x64
@@ -31,8 +41,15 @@ from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, con
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.neighbors import pair_finder
 from gmem_jax.simulation.observers import Chunk
-from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, work_of_bin
-from gmem_jax.simulation.protocol import BINS, Stage
+from gmem_jax.simulation.progress import (
+    Progress,
+    ProgressChoice,
+    callback,
+    shows_progress,
+    work_of,
+    work_of_bin,
+)
+from gmem_jax.simulation.protocol import Stage
 from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.strain import StrainPath, smallest_box
@@ -40,104 +57,18 @@ from gmem_jax.simulation.strain import StrainPath, smallest_box
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
 FREE_CANDIDATES = 68  # a grain of a pressed pack with that skin: one program for all lists
 FREE_CONTACTS = 48  # a sphere
-SETTLING = 500.0  # t_c that coming to rest took per R of a dense pack's height (170 to 880, N = 325 to 10,240)
 DENSE_SKIN = 0.5  # of a pressed pack: half of the candidates, half of the time; yet frictionless grains turn freely, so
 # that a list lasts only some 50 t_c of a cycle
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles
-FEWEST = 12  # grains of the smallest pack that was prepared
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
-DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with it all six are the paper's
+MET = 0.8, 1.25  # p_z of the finished pack over the wanted one; shipped packs have 0.84 to 1.00
 
 _press = Compiled(press, static_argnames=("march",))
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """The numbers of a preparation; what the paper leaves open is a field here (docs/physics.md, "Preparation").
-
-    Attributes:
-        grains: number of grains N.
-        seed: of orientations, velocities and spins.
-        delta0: areal compression of the cycles.
-        t0: duration of one compression, in t_c.
-        dt: largest time step, in t_c.
-        filling: of the lattice the gas starts from.
-        gas_speed: rms of each grain's initial velocity, and of its spin times R, in R / t_c.
-        gas_time: duration of the gas, in t_c.
-        pressure: p_z, in E.
-        piston_speed: largest speed of the +z wall, in R / t_c.
-        piston_gain: its speed per relative pressure error, in R / t_c.
-        cycles: number of compress/decompress cycles.
-        rest: rests at u = 0, in t0.
-        hold: hold at u = 1, in t0.
-        drag: viscous drag once the piston has met its pressure, and whenever the walls stand still, 1 / t_c. More of it
-            comes to rest later: soft frictionless modes are then overdamped.
-        settled_speed: largest grain speed at which the piston is fixed, in R / t_c.
-        quiet: largest grain speed of the finished pack, in R / t_c.
-        pressure_error: relative error of p_z at which the piston is fixed.
-        patience: longest time spent on coming to rest, in t_c; four times what 100,450 grains should need (`SETTLING`).
-    """
-
-    grains: int = 325
-    seed: int = 1
-    delta0: float = 0.05
-    t0: float = 1.8e3
-    dt: float = 0.3
-    filling: float = 0.30
-    gas_speed: float = 0.02
-    gas_time: float = 6.0e3
-    pressure: float = 2.0e-3
-    piston_speed: float = 0.02
-    piston_gain: float = 0.005
-    cycles: int = 2
-    rest: float = 0.2
-    hold: float = 0.2
-    drag: float = 0.01
-    settled_speed: float = 1.0e-5
-    quiet: float = 1.0e-6
-    pressure_error: float = 0.01
-    patience: float = 2.0e5
-
-    def __post_init__(self) -> None:
-        if self.grains < FEWEST:
-            raise ValueError(f"grains must be at least {FEWEST} to jam between six walls, got {self.grains}")
-        if self.seed < 0:
-            raise ValueError(f"seed must be a whole number from 0, got {self.seed}")
-        if not 0.0 < self.delta0 < 0.5:
-            raise ValueError(f"delta0 must be in (0, 0.5), got {self.delta0}")
-        if not 0.0 < self.filling < 0.6:
-            raise ValueError(f"filling of the gas must be in (0, 0.6), got {self.filling}")
-        if not 0.0 < self.dt <= 0.5:
-            raise ValueError(f"dt must be in (0, 0.5] t_c, got {self.dt}")
-        for name in ("cycles", "drag", "rest", "hold"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
-        for name in (
-            "t0",
-            "pressure",
-            "gas_speed",
-            "gas_time",
-            "piston_speed",
-            "piston_gain",
-            "settled_speed",
-            "quiet",
-            "pressure_error",
-            "patience",
-        ):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-
-
-def lattice(grains: int, filling: float = 0.30) -> tuple[int, int, int]:
-    """Sites (n, n, n_z) of a lattice of this filling that becomes about a cube when pressed (325 = 5 x 5 x 13)."""
-    side = max(2, round((grains * filling / DENSE) ** (1.0 / 3.0)))
-    return side, side, math.ceil(grains / side**2)
-
-
 def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array, jax.Array, np.ndarray]:
     """Positions [N, 3], quaternions [N, 4], velocities and spins [N, 3], and box lengths [3] of the lattice."""
-    spacing = _spacing(recipe, clump)
-    sites = lattice(recipe.grains, recipe.filling)
+    sites, spacing = sites_of(recipe, clump)
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in sites), indexing="ij"), axis=-1).reshape(-1, 3)
     cells = cells[np.argsort(cells[:, 2], kind="stable")][: recipe.grains]  # a last layer may be incomplete
     turn_key, velocity_key, spin_key = jax.random.split(jax.random.key(recipe.seed), 3)
@@ -151,35 +82,7 @@ def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array
     )
 
 
-def expected_time(recipe: Recipe, height: float) -> float:
-    """How long a preparation will take about, in t_c; `height` is that of the gas, in R."""
-    dense = height * recipe.filling / DENSE
-    fall = (height - dense) / min(recipe.piston_speed, recipe.piston_gain)
-    cycles = recipe.cycles * (2.0 + recipe.rest + recipe.hold) + recipe.rest
-    return recipe.gas_time + fall + SETTLING * dense + cycles * recipe.t0
-
-
-def grain_steps(recipe: Recipe, clump: Clump) -> float:
-    """What a preparation will cost about: grains times steps."""
-    height = lattice(recipe.grains, recipe.filling)[2] * _spacing(recipe, clump)
-    return recipe.grains * expected_time(recipe, height) / recipe.dt
-
-
-def _spacing(recipe: Recipe, clump: Clump) -> float:
-    """Of the lattice's sites, in R."""
-    side: float = (float(clump.mass) / recipe.filling) ** (1.0 / 3.0)
-    return max(side, 1.02 * float(clump.diameter))
-
-
 FILMED = ("gas", "press", "settle")  # stages after which a configuration is taken, if any are
-
-
-def _cycles(recipe: Recipe) -> tuple[Stage, ...]:
-    return tuple(
-        replace(stage, name=f"cycle {n}: {stage.name}")
-        for n in range(1, recipe.cycles + 1)
-        for stage in cycle(recipe.rest, recipe.hold)
-    )
 
 
 def frame_schedule(recipe: Recipe, frames: int) -> FrameSchedule:
@@ -188,7 +91,7 @@ def frame_schedule(recipe: Recipe, frames: int) -> FrameSchedule:
     Raises:
         ValueError: for too many or too few.
     """
-    always, stages = len(FILMED) + 2, _cycles(recipe)
+    always, stages = len(FILMED) + 2, cycles_of(recipe)
     bins = sum(stage.bins for stage in stages)
     if frames and not always <= frames <= always + bins:
         raise ValueError(f"frames must be 0 for none, or {always} to {always + bins} for this recipe; got {frames}")
@@ -216,8 +119,7 @@ class _Preparation:
         self.recipe, self.cache, self.filmed, self.lengths = recipe, cache, frames > 0, lengths
         self.frames = FrameRecorder(frame_schedule(recipe, frames))
         self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
-        steps = max(1, math.ceil(recipe.t0 / (BINS * recipe.dt) * (1.0 - 1e-12)))
-        self.dt = recipe.t0 / (BINS * steps)
+        steps, self.dt = stepping(max(recipe.t0, SLOWEST_BINS), recipe.dt)
         finder = pair_finder(
             clump, lengths, FREE_SKIN, capacity=FREE_CANDIDATES * recipe.grains, per_sphere=FREE_CONTACTS
         )
@@ -227,7 +129,7 @@ class _Preparation:
         system = System(clump, Frictionless(), finder(grains, clump, self.box), material)
         state = start(system, at, grains.quaternion, self.box)
         state = accelerate(system, replace(state, grains=grains), self.box)
-        expected = expected_time(recipe, float(lengths[2])) / (self.dt * steps) * work_of_bin(1)
+        expected = bins_outside(recipe, clump) * work_of_bin(1) + work_of(cycles_of(recipe), 1)
         self.march = native.marcher(native.name(backend, system.friction))
         simulation = Simulation(system, self._path(), self.dt, recipe.drag, steps=steps, backend=backend)
         self.runner = Runner(
@@ -285,14 +187,15 @@ class _Preparation:
             checkpoint.maybe_save(standing)
         return runner.snapshot(), pressed
 
-    def compact(self) -> float:
-        """Gas, then pressure: returns p_z once the pack is at rest under it and the wall is fixed."""
+    def compact(self) -> None:
+        """Gas, then pressure until the pack is at rest under it and the wall is fixed."""
         recipe = self.recipe
         closed = Servo(recipe.pressure, 0.0, 0.0, 0.0, 0.0)
         self.press("gas", closed, recipe.gas_time, 0.0)
         height = float(self.box.lengths[2, 0])
         approach = Servo(recipe.pressure, recipe.piston_speed, recipe.piston_gain, 0.1, math.inf)
-        self.press("press", approach, 4.0 * height / recipe.piston_speed, 0.0)
+        slowest = min(recipe.piston_speed, recipe.piston_gain)
+        self.press("press", approach, 4.0 * height / slowest, 0.0)
         settle = replace(approach, error=recipe.pressure_error, quiet=recipe.settled_speed)
         self.runner.finder = pair_finder(self.runner.simulation.system.clump, self.lengths, DENSE_SKIN)
         self.runner.renew(self.box)
@@ -303,19 +206,26 @@ class _Preparation:
                 f"{float(largest_speed(pressed.state)):.1e} R/t_c after {recipe.patience:g} t_c; allow more patience"
             )
         self.box = still_box(self.box.lower, self.box.upper)
-        return float(pressed.pressure[0])
+        lengths, diameter = np.asarray(self.box.lengths)[:, 0], float(self.runner.simulation.system.clump.diameter)
+        if lengths.min() < diameter:
+            raise RunFailedError(
+                f"settle: the pack is {' x '.join(f'{edge:.1f}' for edge in lengths)} R, flatter than a grain "
+                f"({diameter:.1f} R); take more grains or less pressure"
+            )
 
     def cycle(self) -> None:
         """Frictionless compress/decompress cycles of the x and y walls, then rest until quiet."""
-        recipe, runner = self.recipe, self.runner
-        runner.simulation = replace(runner.simulation, path=self._path())
+        recipe, runner, outside = self.recipe, self.runner, self.runner.simulation
+        steps, dt = stepping(recipe.t0, recipe.dt)
+        runner.simulation = replace(outside, path=self._path(), steps=steps, dt=dt)
         runner.finder, runner.skin, runner.chunk, runner.foresees = None, DENSE_SKIN, CYCLE_CHUNK, True
         runner.smallest = smallest_box(
             np.asarray(self.box.lower)[:, 0], np.asarray(self.box.upper)[:, 0], recipe.delta0
         )
         runner.renew(self.box)
-        self.log |= runner.run_cached("cycles", self.cache, *_cycles(recipe))
-        rest = Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1), "hold")
+        self.log |= runner.run_cached("cycles", self.cache, *cycles_of(recipe))
+        runner.simulation = replace(runner.simulation, steps=outside.steps, dt=outside.dt)
+        rest = last_rest(recipe)
         last, kept = self.cache(rest.name, lambda checkpoint: self._until_quiet(checkpoint, rest))
         runner.restore(kept)
         self.log |= last
@@ -333,7 +243,7 @@ class _Preparation:
 
         while True:
             last = runner.run_stages(rest)
-            waited += rest.length * recipe.t0
+            waited += rest.bins * runner.simulation.steps * self.dt
             speed = float(largest_speed(runner.state))
             if speed <= recipe.quiet:
                 return last, runner.snapshot()
@@ -378,7 +288,9 @@ def prepare(
 
     Raises:
         ValueError: for impossible numbers, or if 64-bit mode is off.
-        RunFailedError: if the simulation broke down or did not come to rest.
+        RunFailedError: if the simulation broke down, did not come to rest, or pressed the pack flatter than a grain.
+
+    Warns if the cycles left the pack with another p_z than was wanted (`MET`).
     """
     tell = callback(progress)
     require_x64()
@@ -392,7 +304,20 @@ def prepare(
     if film is not None and frames:
         centre = np.asarray(0.5 * (preparation.box.lower + preparation.box.upper))[:, 0]  # the origin of the pack
         film.append(concatenate(preparation.frames.recorded, np.asarray(clump.offsets), centre=centre))
-    return _finish(preparation, material, friction or Hooke(), name)
+    pack = _finish(preparation, material, friction or Hooke(), name)
+    _warn_of_another_pressure(pack)
+    return pack
+
+
+def _warn_of_another_pressure(pack: Pack) -> None:
+    met = pressure_over_wanted(pack.info)
+    if met is not None and not MET[0] < met < MET[1]:
+        recipe = pack.info["recipe"]
+        warnings.warn(
+            f"{pack.name}: p_z is {met:.2g} times the wanted {recipe['pressure']:g} E: {recipe['cycles']} cycles by "
+            f"delta0 = {recipe['delta0']:g} changed it after it was met; ask for another pressure, or for less delta0",
+            stacklevel=3,
+        )
 
 
 def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw, name: str) -> Pack:

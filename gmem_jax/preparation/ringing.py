@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.errors import RunFailedError
+from gmem_jax.files.soundness import LISTENED, PERIODS, period_bounds
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.state import Box
 from gmem_jax.physics.step import System, accelerate, start
@@ -19,20 +21,27 @@ KICK = 2.0e-5  # strain rate of the kick, 1 / t_c: strains of about 1e-4, below 
 STEPS = 4  # steps per sample
 
 
-def spectrum_peak(series: np.ndarray, spacing: float) -> float:
+def spectrum_peak(series: np.ndarray, spacing: float, shortest: float = 0.0) -> float:
     """Period of the strongest oscillation in `series`, sampled every `spacing` (Hann window, parabolic peak).
 
+    Args:
+        series: one number a sample.
+        spacing: between samples.
+        shortest: period that is looked for.
+
     Raises:
-        ValueError: if there is none.
+        RunFailedError: if nothing oscillates.
     """
     steps = np.arange(series.size)
     flat = series - np.polyval(np.polyfit(steps, series, 1), steps)
     padded = 16 * series.size
     power = np.abs(np.fft.rfft(flat * np.hanning(series.size), padded)) ** 2
-    power[: 3 * 16] = 0.0  # fewer than three periods in the record are drift, not ringing
+    power[: PERIODS * 16] = 0.0  # fewer periods in the record are drift, not ringing
+    if shortest > 0.0:
+        power[int(padded * spacing / shortest) + 1 :] = 0.0
     peak = int(np.argmax(power))
     if not power[peak] > 0.0:
-        raise ValueError("a kick does not make the pressure on the walls ring: grains do not press on them")
+        raise RunFailedError("ringing: the x and y walls feel no oscillation: grains do not press on them")
     below, at, above = power[peak - 1 : peak + 2] if 0 < peak < power.size - 1 else (0.0, 1.0, 0.0)
     return padded * spacing / (peak + 0.5 * (below - above) / (below - 2.0 * at + above))
 
@@ -58,11 +67,14 @@ def ringing_period(
         progress: told about the run.
         backend: who does the steps.
 
+    Returns:
+        A period within `soundness.period_bounds`.
+
     Raises:
-        ValueError: if the walls feel nothing of the kick.
+        RunFailedError: if the walls feel no oscillation.
     """
     lengths = box.lengths
-    duration = 40.0 * float(jnp.max(lengths))  # some 15 periods: the mode's speed is about 0.4 R / t_c
+    duration = LISTENED * float(jnp.max(lengths))
     bins = int(duration / (STEPS * float(dt)))
     state = start(system, position, quaternion, box)
     rate = KICK * jnp.asarray([-1.0, 1.0, 0.0])[:, None]
@@ -73,4 +85,6 @@ def ringing_period(
     runner = Runner(still, state, progress=progress, total_work=work_of([ringing], 1))
     sample = runner.run_stages(ringing)["ringing"]
     pressure = np.asarray(sample.pressure)[:, :, 0]
-    return spectrum_peak(pressure[:, 0] - pressure[:, 1], STEPS * float(dt))
+    shortest, longest = period_bounds(np.asarray(lengths)[:, 0])
+    found = spectrum_peak(pressure[:, 0] - pressure[:, 1], STEPS * float(dt), shortest)
+    return min(max(found, shortest), longest)  # a parabola may lie half a point of the spectrum beyond

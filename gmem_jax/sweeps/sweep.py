@@ -26,7 +26,7 @@ from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import sources
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import explain, together
-from gmem_jax.preparation.preparation import Recipe, grain_steps
+from gmem_jax.preparation.recipe import Recipe, grain_steps
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within, work_of_bin
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.plan import ABREAST, Point, digest, groups, plan, point

@@ -27,7 +27,8 @@ from gmem_jax.files.configuration import experiment_from, resolved
 from gmem_jax.files.packs import load_pack, save_pack
 from gmem_jax.files.programs import keep_programs
 from gmem_jax.physics import grain
-from gmem_jax.preparation.preparation import Recipe, prepare
+from gmem_jax.preparation.preparation import prepare
+from gmem_jax.preparation.recipe import Recipe
 from gmem_jax.simulation.checkpoints import no_cache
 from gmem_jax.simulation.progress import Progress, silent
 from gmem_jax.simulation.sample import Sample

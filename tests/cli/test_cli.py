@@ -197,11 +197,18 @@ def bad_files(folder: Path) -> dict[str, Path]:
 
 
 BAD = [
-    (["prepare", "--shape", "cube", "-o", "{out}"], "--shape must be tetra or sphere, got 'cube'"),
+    (
+        ["prepare", "--shape", "cube", "-o", "{out}"],
+        "must be tetra or sphere, or a file of spheres, got 'cube'",
+    ),
     (["prepare", "--grains", "0", "-o", "{out}"], "grains must be at least 12 to jam between six walls, got 0"),
     (["prepare", "--overlap", "1.0", "-o", "{out}"], "overlap must be in [0, 1), got 1"),
+    (["prepare", "--shape", "sphere", "--overlap", "0.3", "-o", "{out}"], "--overlap is that of a tetra grain"),
+    (["prepare", "--shape", "nowhere.txt", "-o", "{out}"], "nowhere.txt: no such file"),
+    (["prepare", "--pressure", "-2", "-o", "{out}"], "pressure must be in (0, inf) E, got -2"),
+    (["prepare", "--grains", "12", "--filling", "0.05", "-o", "{out}"], "flatter than a grain (3.0 R)"),
     (["prepare", "--dt", "0.6", "-o", "{out}"], "dt must be in (0, 0.5] t_c, got 0.6"),
-    (["prepare", "--seed", "-1", "-o", "{out}"], "seed must be a whole number from 0, got -1"),
+    (["prepare", "--seed", "-1", "-o", "{out}"], "seed must be in [0, 1e18], got -1"),
     (["prepare", "--backend", "foo", "-o", "{out}"], "backend must be one of auto, jax, native; got 'foo'"),
     (["prepare", "--name", "x" * 201, "-o", "{out}"], "--name: must be a line of at most 200 printable characters"),
     (["prepare", "-o", "/proc/nowhere/pack.h5"], "folder /proc/nowhere does not exist"),

@@ -1,6 +1,7 @@
 """What a command may write to, and what it never destroys."""
 
 import json
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
-from gmem_jax.command import packs
+from gmem_jax.command import packs, recalls
 from gmem_jax.files.results import finite
 from gmem_jax.files.waveforms import load_target
 from gmem_jax.show import tables
@@ -161,6 +162,82 @@ def test_a_standard_pack_is_made_once_and_found_by_its_name(
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc")
     assert gmem(monkeypatch, "prepare", "tetra-16-b") == 2
     assert "cannot make this folder" in capsys.readouterr().err
+
+
+def test_every_number_of_a_recipe_is_an_option_of_prepare(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    numbers = {
+        **{"grains": 13, "seed": 5, "delta0": 0.04, "t0": 70.0, "dt": 0.2, "filling": 0.25, "gas_speed": 0.03},
+        **{"gas_time": 300.0, "pressure": 3e-3, "piston_speed": 0.03, "piston_gain": 0.006, "cycles": 1, "rest": 0.3},
+        **{"hold": 0.1, "drag": 0.02, "settled_speed": 2e-5, "quiet": 2e-6, "pressure_error": 0.02, "patience": 1e5},
+    }
+    assert set(numbers) == {entry.name for entry in fields(gm.Recipe)}
+    options = [word for name, value in numbers.items() for word in (f"--{name.replace('_', '-')}", value)]
+    (tmp_path / "rod.txt").write_text("# three\n-0.5 0 0 1\n0,0,0,1\n\n0.5 0 0 1.0\n")
+    shape = ["--shape", tmp_path / "rod.txt"]
+    assert gmem(monkeypatch, "prepare", *shape, *options, "-o", tmp_path / "rods.h5", "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    pack = gm.load_pack(tmp_path / "rods.h5")
+    assert pack.info["recipe"] == numbers
+    assert (pack.name, pack.clump.spheres) == ("rod-13-seed5", 3)
+    assert said["pressure_over_wanted"] == pack.info["at_rest"]["pressure"][2] / 3e-3
+    assert gmem(monkeypatch, "show", tmp_path / "rods.h5") == 0
+    assert f"{said['pressure_over_wanted']:.2f}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0 0 0 1\n1 0 0 0.5\n", "line 2: r is 0.5, must be 1"),
+        ("0 0 0\n", "line 1: must be four numbers x y z r, got '0 0 0'"),
+        ("x y z r\n0 0 0 1\n", "line 1: must be four numbers"),
+        ("0 0 nan 1\n", "line 1: must be four numbers"),
+        ("# nothing\n", "it lists 0 spheres, must be 1 to 256"),
+        ("0 0 0 1\n" * 257, "it lists 257 spheres"),
+    ],
+)
+def test_a_file_of_spheres_that_is_none_is_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, text: str, words: str
+) -> None:
+    path = tmp_path / "grain.txt"
+    path.write_text(text)
+    assert gmem(monkeypatch, "prepare", "--shape", path, "-o", tmp_path / "out.h5") == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert str(path) in said
+    assert len(said.splitlines()) == 1
+
+
+def test_a_recall_of_few_spheres_says_that_they_hold_little() -> None:
+    few = {"grains": 325, "grain": {"shape": "sphere"}}
+    assert "325 spheres hold little: G = 0.04 ± 0.03 and F = 0.3 ± 0.2 were measured" in tables.note_on_size(few)
+    assert tables.note_on_size({**few, "grains": 3267}) == ""
+    assert tables.note_on_size({**few, "grain": {"shape": "tetra(0.6)"}}) == ""
+
+
+def test_the_demo_stores_in_the_pack_of_the_middle_and_says_what_packs_differ_by(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    measured = (Path(__file__).parents[2] / "docs" / "measured.md").read_text()
+    row = next(line for line in measured.splitlines() if line.startswith("| a / b / c / d / e |"))
+    fidelities = [float(value) for value in row.split("|")[3].split("/")]
+    assert "abcde"[fidelities.index(sorted(fidelities)[2])] == recalls.TYPICAL[-1]
+    (gain, gain_sd), (fidelity, fidelity_sd) = recalls.SHIPPED["gain"], recalls.SHIPPED["fidelity"]
+    assert f"| mean ± SD | {gain:.3f} ± {gain_sd:.3f} | {fidelity:.3f} ± {fidelity_sd:.3f} |" in measured
+    small, experiment, asked = gm.load_pack(PACK), gm.Experiment, []
+    monkeypatch.setattr(recalls, "load_pack", lambda name: asked.append(name) or small)
+    monkeypatch.setattr(recalls, "Experiment", lambda *parts: experiment(*parts, t0=60.0))
+    assert gmem(monkeypatch, "demo", "-o", tmp_path) == 0
+    said = capsys.readouterr().out
+    assert asked == [recalls.TYPICAL]
+    assert f"G = {gain:.3f} ± {gain_sd:.3f}" in said
+    assert f"F = {fidelity:.3f} ± {fidelity_sd:.3f} (mean ± SD)" in said
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    assert f'gm.load_pack("{recalls.TYPICAL}")' in readme
+    gains = [float(value) for value in row.split("|")[2].split("/")]
+    place = "abcde".index(recalls.TYPICAL[-1])
+    assert f"G = {gains[place]:.3f}, how large; F = {fidelities[place]:.3f}, how right" in readme
 
 
 def test_what_cannot_fit_is_refused_before_it_begins(

@@ -1,0 +1,50 @@
+"""A grain of one's own from a text file: a sphere in every line."""
+
+from pathlib import Path
+
+import numpy as np
+
+from gmem_jax.errors import FileFormatError
+from gmem_jax.files.checked import NAME, refusing, require, title
+from gmem_jax.files.soundness import MOST
+from gmem_jax.physics.grain import Clump, clump
+
+_LARGEST = 1 << 16  # bytes: 256 lines of four long numbers
+_COLUMNS = "x y z r"
+
+
+def load_clump(path: Path) -> Clump:
+    """The grain whose spheres a file lists: x, y, z and r of one in every line, apart by spaces or commas.
+
+    Lines that begin with # are comments. Lengths are in R, and r is 1: contact laws are for equal spheres.
+
+    Args:
+        path: the file; the grain is called by its name.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if it is no such file: naming the line.
+    """
+    path = Path(path)
+    with refusing(path, "file of spheres"):
+        require(path.stat().st_size <= _LARGEST, f"more than {MOST} lines of four numbers")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        rows = [
+            _sphere(number, line) for number, line in enumerate(lines, 1) if line.strip() and line.strip()[0] != "#"
+        ]
+        require(0 < len(rows) <= MOST, f"it lists {len(rows)} spheres, must be 1 to {MOST}: {_COLUMNS} in every line")
+        name = path.stem[:NAME]
+        made = clump(np.asarray(rows), shape=name if title(name) else "clump")
+    return made
+
+
+def _sphere(number: int, line: str) -> list[float]:
+    """The centre of the sphere in a line."""
+    try:
+        found = [float(cell) for cell in line.replace(",", " ").split()]
+    except ValueError:
+        found = []
+    if len(found) != 4 or not np.all(np.abs(found) < 1e3):
+        raise FileFormatError(f"line {number}: must be four numbers {_COLUMNS}, got {line.strip()[:40]!r}")
+    require(found[3] == 1.0, f"line {number}: r is {found[3]:g}, must be 1: all spheres are of radius R, which is 1")
+    return found[:3]

@@ -1,0 +1,184 @@
+"""The numbers of a preparation, where its grains begin, and what it will cost."""
+
+import math
+import operator
+from collections.abc import Mapping
+from dataclasses import Field, dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from gmem_jax.experiment.protocols import cycle
+from gmem_jax.files.checked import is_number
+from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.pytree import interval
+from gmem_jax.simulation.protocol import BINS, Stage
+
+SETTLING = 500.0  # t_c that coming to rest took per R of a dense pack's height (170 to 880, N = 325 to 10,240)
+FEWEST = 12  # grains of the smallest pack that was prepared
+DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with it all six are the paper's
+APART = 1.02  # outer diameters of the grain: the least spacing of the lattice, so that grains turn freely
+SLOWEST_BINS = 1.8e3  # t_c: t0 whose bins and steps a preparation has outside its cycles, unless it is slower. What it
+# costs would grow as t0 falls otherwise: a bin is t0 / 256, a step no longer than that
+STEP = 200.0  # grain-steps that a step costs beside its grains: calls and lists (N = 16 to 250, native)
+BIN = 4000.0  # and that a bin of a cycle costs beside its steps
+
+
+def _number(default: float, within: str, words: str, unit: str = "") -> Any:
+    """A field of a recipe: its default, the interval it must be in, its meaning, and its unit."""
+    return field(default=default, metadata={"interval": interval(within), "help": words, "unit": unit})
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The numbers of a preparation; what the paper leaves open is a field here (docs/physics.md, "Preparation").
+
+    Each field knows its meaning, interval and unit (`dataclasses.fields`): `gmem prepare --help` shows them.
+
+    Attributes:
+        grains: number of grains N.
+        seed: of orientations, velocities and spins.
+        delta0: areal compression of the cycles.
+        t0: duration of one compression, in t_c.
+        dt: largest time step, in t_c.
+        filling: of the lattice the gas starts from; less where grains are so long that they would not turn freely.
+        gas_speed: rms of each grain's initial velocity, and of its spin times R, in R / t_c.
+        gas_time: duration of the gas, in t_c.
+        pressure: p_z, in E, under which the piston is fixed; the cycles change it. Law H has one stiffness for all
+            overlaps: at another pressure give it k_H = k_M <sqrt(p)> over the contacts (docs/physics.md).
+        piston_speed: largest speed of the +z wall, in R / t_c.
+        piston_gain: its speed per relative pressure error, in R / t_c.
+        cycles: number of compress/decompress cycles.
+        rest: rests at u = 0, in t0.
+        hold: hold at u = 1, in t0.
+        drag: viscous drag once the piston has met its pressure, and whenever the walls stand still, 1 / t_c. More of it
+            comes to rest later: soft frictionless modes are then overdamped.
+        settled_speed: largest grain speed at which the piston is fixed, in R / t_c.
+        quiet: largest grain speed of the finished pack, in R / t_c.
+        pressure_error: relative error of p_z at which the piston is fixed.
+        patience: longest time spent on coming to rest, in t_c; four times what 100,450 grains should need (`SETTLING`).
+    """
+
+    grains: int = _number(325, "[12, inf)", "Number of grains N")
+    seed: int = _number(1, "[0, 1e18]", "Random seed")
+    delta0: float = _number(0.05, "(0, 0.5)", "Areal compression of the cycles and of the experiment")
+    t0: float = _number(1.8e3, "(0, inf)", "Duration of one compression", "t_c")
+    dt: float = _number(0.3, "(0, 0.5]", "Largest time step", "t_c")
+    filling: float = _number(0.30, "(0, 0.6)", "Of the lattice that the gas starts from; less for long grains")
+    gas_speed: float = _number(0.02, "(0, inf)", "Rms velocity, and spin times R, of the gas", "R/t_c")
+    gas_time: float = _number(6.0e3, "(0, inf)", "Duration of the gas", "t_c")
+    pressure: float = _number(
+        2.0e-3, "(0, inf)", "p_z before the cycles (law H: k_H follows it, see docs/howto/grain.md)", "E"
+    )
+    piston_speed: float = _number(0.02, "(0, inf)", "Largest speed of the upper wall", "R/t_c")
+    piston_gain: float = _number(0.005, "(0, inf)", "Its speed per relative error of p_z", "R/t_c")
+    cycles: int = _number(2, "[0, 1000]", "Compress/decompress cycles")
+    rest: float = _number(0.2, "[0, inf)", "Rests at u = 0", "t0")
+    hold: float = _number(0.2, "[0, inf)", "Holds at u = 1", "t0")
+    drag: float = _number(0.01, "[0, inf)", "Viscous drag while walls stand still", "1/t_c")
+    settled_speed: float = _number(1.0e-5, "(0, inf)", "Largest grain speed at which the piston is fixed", "R/t_c")
+    quiet: float = _number(1.0e-6, "(0, inf)", "Largest grain speed of the finished pack", "R/t_c")
+    pressure_error: float = _number(0.01, "(0, inf)", "Relative error of p_z at which the piston is fixed")
+    patience: float = _number(2.0e5, "(0, inf)", "Longest time spent on coming to rest", "t_c")
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):
+            given, within, unit = getattr(self, entry.name), entry.metadata["interval"], entry.metadata["unit"]
+            try:
+                value = _plain(entry.type, given)
+            except TypeError:
+                kind = "a whole number" if entry.type is int else "a number"
+                raise ValueError(f"{entry.name} must be {kind} in {within.words}, got {given!r}") from None
+            if entry.name == "grains" and value < FEWEST:
+                raise ValueError(f"grains must be at least {FEWEST} to jam between six walls, got {given}")
+            if not within.holds(value):
+                raise ValueError(f"{entry.name} must be in {within.words}{unit and ' ' + unit}, got {given}")
+            object.__setattr__(self, entry.name, value)
+
+
+def _plain(kind: Any, given: Any) -> float | int:
+    """A number of one kind, however it was written."""
+    if isinstance(given, bool | str):
+        raise TypeError
+    return operator.index(given) if kind is int else float(given)
+
+
+def words_of(entry: Field[Any]) -> str:
+    """What a field of a recipe means, in which unit, and where it must lie."""
+    unit = entry.metadata["unit"]
+    return f"{entry.metadata['help']}{unit and ', ' + unit}; in {entry.metadata['interval'].words}."
+
+
+def pressure_over_wanted(record: Mapping[str, Any]) -> float | None:
+    """p_z of a finished pack over that of its recipe, from what `Pack.info` says; None where it does not say."""
+    wanted, rest = record.get("recipe", {}).get("pressure"), record.get("at_rest")
+    return float(rest["pressure"][2]) / wanted if rest and is_number(wanted) and wanted > 0.0 else None
+
+
+def stepping(t0: float, dt: float) -> tuple[int, float]:
+    """Steps in a bin of t0 / 256, and their length in t_c: `dt` or a little less."""
+    steps = max(1, math.ceil(t0 / (BINS * dt) * (1.0 - 1e-12)))
+    return steps, t0 / (BINS * steps)
+
+
+def lattice(grains: int, filling: float = 0.30) -> tuple[int, int, int]:
+    """Sites (n, n, n_z) of a lattice of this filling that becomes about a cube when pressed (325 = 5 x 5 x 13)."""
+    side = max(2, round((grains * filling / DENSE) ** (1.0 / 3.0)))
+    return side, side, math.ceil(grains / side**2)
+
+
+def sites_of(recipe: Recipe, clump: Clump) -> tuple[tuple[int, int, int], np.ndarray]:
+    """Sites of the lattice along each axis, and their spacing [3] in R: a pressed pack is about a cube.
+
+    Grains that turn freely on a lattice of the recipe's filling are on that, which is cubic. Longer ones stand as far
+    apart as they are long, in columns in a box as wide as the pressed pack will be high.
+
+    Raises:
+        ValueError: if the pressed pack would be flatter than its grains.
+    """
+    mass, diameter = float(clump.mass), float(clump.diameter)
+    count, least = recipe.grains, APART * diameter
+    spacing = (mass / recipe.filling) ** (1.0 / 3.0)
+    cube = (count * mass / DENSE) ** (1.0 / 3.0)
+    if spacing >= least:
+        sites, apart = lattice(count, recipe.filling), np.full(3, spacing)
+    else:
+        side = max(1, int(cube / least))
+        sites, apart = (side, side, math.ceil(count / side**2)), np.array([cube / side, cube / side, least])
+    width, height = sites[0] * apart[0], count * mass / (DENSE * (sites[0] * apart[0]) ** 2)
+    if min(width, height) < diameter:
+        raise ValueError(
+            f"{count} grains would make a pack of about {width:.1f} x {width:.1f} x {height:.1f} R, flatter than "
+            f"a grain ({diameter:.1f} R): take more grains{', or a thicker gas' if spacing >= least else ''}"
+        )
+    return sites, apart
+
+
+def cycles_of(recipe: Recipe) -> tuple[Stage, ...]:
+    """The stages of all cycles."""
+    return tuple(
+        replace(stage, name=f"cycle {n}: {stage.name}")
+        for n in range(1, recipe.cycles + 1)
+        for stage in cycle(recipe.rest, recipe.hold)
+    )
+
+
+def last_rest(recipe: Recipe) -> Stage:
+    """What is repeated until the pack is quiet; its length is in `SLOWEST_BINS`, or t0 if that is longer."""
+    return Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1), "hold")
+
+
+def bins_outside(recipe: Recipe, clump: Clump) -> float:
+    """Bins that a preparation will take about before and after its cycles."""
+    sites, apart = sites_of(recipe, clump)
+    width, height = sites[0] * float(apart[0]), sites[2] * float(apart[2])
+    dense = recipe.grains * float(clump.mass) / (DENSE * width**2)
+    fall = max(0.0, height - dense) / min(recipe.piston_speed, recipe.piston_gain)
+    return last_rest(recipe).bins + BINS * (recipe.gas_time + fall + SETTLING * dense) / max(recipe.t0, SLOWEST_BINS)
+
+
+def grain_steps(recipe: Recipe, clump: Clump) -> float:
+    """What a preparation will cost about: grains times steps, and what small packs and short bins cost beside them."""
+    inside = sum(stage.bins for stage in cycles_of(recipe)), stepping(recipe.t0, recipe.dt)[0]
+    outside = bins_outside(recipe, clump), stepping(max(recipe.t0, SLOWEST_BINS), recipe.dt)[0]
+    return sum(bins * (steps * (recipe.grains + STEP) + BIN) for bins, steps in (inside, outside))
