@@ -48,7 +48,7 @@ def bench_command(
     before = None
     if baseline:
         with refusing(baseline, "bench.json"):
-            before = json_of(baseline.read_text(), "content")
+            before = json_of(baseline.read_text(encoding="utf-8"), "content")
     claim(output.parent / "bench.json" if not output.is_dir() else output / "bench.json", ".json", force=True)
     with reporting() as progress:
         result = measure.run(

@@ -74,7 +74,7 @@ def write_xyz(path: Path, frames: Frames, mass: float) -> None:
         OSError: if the path cannot be written.
     """
     grain = _grain_numbers(frames)
-    with atomic(path) as temporary, temporary.open("w") as file:
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for number in range(frames.count):
             lower, lengths = frames.lower[number], frames.upper[number] - frames.lower[number]
             facts = {
@@ -100,7 +100,7 @@ def write_lammps(path: Path, frames: Frames, mass: float) -> None:
     """
     grain, each = _grain_numbers(frames), len(frames.offsets)
     density = mass / (each * 4.0 * np.pi / 3.0 * RADIUS**3)
-    with atomic(path) as temporary, temporary.open("w") as file:
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(f"gmem: {frames.position.shape[1]} grains of {each} spheres, lengths in R\n\n")
         file.write(f"{len(grain)} atoms\n1 atom types\n\n")
         for axis, lower, upper in zip("xyz", frames.lower[0], frames.upper[0], strict=True):
@@ -117,7 +117,7 @@ def write_dump(path: Path, frames: Frames, mass: float) -> None:
         OSError: if the path cannot be written.
     """
     grain = _grain_numbers(frames)
-    with atomic(path) as temporary, temporary.open("w") as file:
+    with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for number in range(frames.count):
             file.write(f"ITEM: TIMESTEP\n{number}\nITEM: NUMBER OF ATOMS\n{len(grain)}\nITEM: BOX BOUNDS ff ff ff\n")
             for lower, upper in zip(frames.lower[number], frames.upper[number], strict=True):
@@ -128,7 +128,7 @@ def write_dump(path: Path, frames: Frames, mass: float) -> None:
 
 def _rows(file: TextIO, form: str, *columns: np.ndarray) -> None:
     """A line of this form for every row of the columns beside each other; whole numbers are exact as floats here."""
-    np.savetxt(file, np.column_stack(columns), fmt=form)
+    np.savetxt(file, np.column_stack(columns), fmt=form, encoding="utf-8")
 
 
 def write_vtp(path: Path, frames: Frames, mass: float) -> None:
@@ -162,7 +162,7 @@ def write_pvd(path: Path, frames: Frames, mass: float) -> None:
             )
     head = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1"><Collection>\n'
     with atomic(path) as temporary:
-        temporary.write_text(head + "\n".join(rows) + "\n</Collection></VTKFile>\n")
+        temporary.write_text(head + "\n".join(rows) + "\n</Collection></VTKFile>\n", encoding="utf-8")
 
 
 def _points(frames: Frames, number: int) -> Any:

@@ -93,7 +93,7 @@ def _gsd(path: Path) -> _Read:
 
 
 def _lammps(path: Path) -> _Read:
-    lines = path.read_text().splitlines()
+    lines = path.read_text(encoding="utf-8").splitlines()
     head, sections = _sections(lines)
     bounds = [head.get(f"{axis}lo {axis}hi") for axis in "xyz"]
     require(all(bound is not None and len(bound) == 2 for bound in bounds), "it has no rectangular box (xlo xhi, ...)")

@@ -129,4 +129,4 @@ def save_waveforms(
     if target is not None:
         header = f"{_TARGET}{json.dumps(written_signals(target))}\n{header}"
     with atomic(path) as temporary:
-        np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g")
+        np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g", encoding="utf-8")

@@ -75,7 +75,7 @@ def read_spec(path: Path) -> Spec:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        tables = tomllib.loads(path.read_text())
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: not TOML ({error})") from error
     try:
