@@ -5,14 +5,18 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import psutil
 import typer
 from rich import progress
 from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
 
 from gmem_jax.experiment.host import Progress
 from gmem_jax.files.atomic import probe
@@ -39,8 +43,29 @@ KeptFrames = Annotated[
 PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a pack that is shipped or made.")]
 
 
+# What was typed after the command that runs: the name on the command line of each option and argument by its own.
+GIVEN: ContextVar[Mapping[str, str]] = ContextVar("GIVEN", default=MappingProxyType({}))
+_WIDEST = 10_000  # columns of a terminal
+
+
 class InputError(ValueError):
     """Bad input, in words for the command line."""
+
+
+def refuse_idle(why: str, *names: str) -> None:
+    """Refuse options that were typed and would do nothing.
+
+    Args:
+        why: they would not: ends the sentence "--frames-of does nothing ...".
+        names: of the parameters of the command.
+
+    Raises:
+        InputError: naming the first that was.
+    """
+    given = GIVEN.get()
+    for name in names:
+        if name in given:
+            raise InputError(f"{given[name]} does nothing {why}")
 
 
 def say(line: str, **style: Any) -> None:
@@ -54,7 +79,10 @@ def emit(as_json: bool, result: Any, *tables: Any) -> None:
         sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
     else:
         for table in tables:
-            out.print(table, soft_wrap=isinstance(table, str))
+            if isinstance(table, Table):  # as wide as its numbers and words, if the terminal is not: rich would cut them
+                least = Measurement.get(out, out.options.update(max_width=_WIDEST), table).minimum
+                table.width = least if least > out.width else table.width
+            out.print(table, soft_wrap=isinstance(table, str), crop=False)
 
 
 def require_name(name: str) -> None:

@@ -9,11 +9,11 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from gmem_jax.command.console import claim
+from gmem_jax.command.console import claim, refuse_idle, say
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.signals import Signals
 from gmem_jax.files.atomic import FileFormatError
-from gmem_jax.files.named import named_experiment
+from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.waveforms import load_target
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -26,6 +26,7 @@ _NAMES = ", ".join(entry.name for entry in LAWS)
 class _Option(NamedTuple):
     kind: Any
     words: str
+    flags: tuple[str, ...] = ()
 
 
 _FIELDS = {  # of an experiment
@@ -53,9 +54,12 @@ _OF_LAW = {  # of its friction law
     "variant": _Option(str | None, "m2: averaged, exact or paper."),
 }
 _OTHERS = {
-    "signals": _Option(str, "six; words:L, all words of L bits; or a .csv (a column per signal) or .npy file."),
+    "signals": _Option(str, "six; words:L, all words of L bits; or a .npy or .csv file (a column per signal, one may be time)."),
     "word_pad": _Option(float | None, "words: bits left free at either end; default 2."),
     "word_width": _Option(float | None, "words: width of bumps, in bits; default 1."),
+    "smooth": _Option(float | None, "Samples in a file: width in u over which they are averaged."),
+    "taper": _Option(float | None, "Samples in a file: width in u at either end within which they are brought to zero."),
+    "scale": _Option(bool | None, "Samples in a file: divide them by the largest.", ("--scale",)),
     "wall_rigidity": _Option(float | None, "Stiffness of walls over that of rigid ones; default 1."),
     "friction": _Option(str, f"Friction law: {_NAMES}, or the paper's H, M1, M2."),
 }
@@ -107,8 +111,13 @@ class Chosen:
         """
         values = dict(self._values)
         if law_named(values["friction"]) == Frictionless():
+            refuse_idle(f"with --friction {values['friction']}", "mu")
             values["mu"] = None  # the option's default is not for this law
-        return named_experiment(load_pack(pack), values)
+        return named_experiment(load_pack(pack), values, self._signals)
+
+    @functools.cached_property
+    def _signals(self) -> Signals:
+        return named_signals(*waveforms_of(self._values), told=say)
 
 
 def _default(name: str) -> Any:
@@ -127,7 +136,7 @@ def with_experiment(command: Callable[..., None]) -> Callable[..., None]:
             name,
             inspect.Parameter.KEYWORD_ONLY,
             default=_default(name),
-            annotation=Annotated[option.kind, typer.Option(help=option.words)],
+            annotation=Annotated[option.kind, typer.Option(*option.flags, help=option.words)],
         )
         for name, option in options.items()
     ]

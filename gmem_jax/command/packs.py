@@ -17,6 +17,7 @@ from gmem_jax.command.console import (
     announce,
     claim,
     emit,
+    refuse_idle,
     reporting,
     require_name,
     say,
@@ -100,11 +101,13 @@ def prepare_command(
     """
     if shape not in ("tetra", "sphere"):
         raise InputError(f"--shape must be tetra or sphere, got {shape!r}")
+    if shape == "sphere":
+        refuse_idle("with --shape sphere; it is of tetra grains", "overlap")
     clump = grain.tetra(overlap) if shape == "tetra" else grain.sphere()
     recipe = Recipe(grains=grains, seed=seed, delta0=delta0, t0=t0, dt=dt)
     if standard is not None:
-        if output is not None or name or recipe != _DEFAULT or (shape, overlap) != ("tetra", 0.6):
-            raise InputError(f"{standard}: the name of a standard pack says all about it; leave other options away")
+        own = ("output", "grains", "shape", "overlap", "seed", "delta0", "t0", "dt", "name")
+        refuse_idle(f"beside {standard}: the name of a standard pack says all about it", *own)
         recipe, name, output = standard_recipe(standard), standard, kept_pack(standard)
         try:
             output.parent.mkdir(parents=True, exist_ok=True)

@@ -25,6 +25,7 @@ from gmem_jax.experiment.signals import (
     words,
 )
 from gmem_jax.files.atomic import FileFormatError
+from gmem_jax.files.checked import require_kinds
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
@@ -116,6 +117,7 @@ def signals_from(written: Mapping[str, Any]) -> Signals:
         return words(written["bits"], written.get("pad", PAD), written.get("width", WIDTH))
     if kind not in _SIGNALS:
         raise ValueError(f"signals of kind {kind!r} cannot be read back")
+    require_kinds(written)
     numbers = {name: value for name, value in written.items() if name != "kind"}
     made: Signals = _SIGNALS[kind](**{name: _number(value) for name, value in numbers.items()})
     return made
@@ -134,6 +136,7 @@ def written_law(law: FrictionLaw) -> dict[str, Any]:
 
 
 def _law_from(written: Mapping[str, Any]) -> FrictionLaw:
+    require_kinds(written)
     parameters = {name: _number(value) for name, value in written.items() if name != "law"}
     return law_named(written["law"], **parameters)
 
@@ -176,6 +179,8 @@ def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) 
     pack = load_pack(of_pack["source"]) if pack is None else pack
     if pack_fingerprint(pack) != of_pack["sha256"]:
         raise FileFormatError(f"{of_pack['source']}: not the pack that this was made with (its content has changed)")
+    require_kinds({name: value for name, value in configuration.items() if name not in _PARTS})
+    require_kinds(configuration["material"])
     own = {name: _number(value) for name, value in configuration.items() if name not in _PARTS}
     material = {name: _number(value) for name, value in configuration["material"].items() if name not in _GONE}
     return Experiment(

@@ -52,6 +52,7 @@ DENSE_SKIN = 0.5  # of a pressed pack: half of the candidates, half of the time;
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles
 FEWEST = 12  # grains of the smallest pack that was prepared
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
+LARGEST_SEED = (1 << 53) - 1  # what JSON holds exactly, whoever reads it
 DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with it all six are the paper's
 
 _press = Compiled(press, static_argnames=("march",))
@@ -107,8 +108,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if self.grains < FEWEST:
             raise ValueError(f"grains must be at least {FEWEST} to jam between six walls, got {self.grains}")
-        if self.seed < 0:
-            raise ValueError(f"seed must be a whole number from 0, got {self.seed}")
+        if not 0 <= self.seed <= LARGEST_SEED:
+            raise ValueError(f"seed must be a whole number from 0 to {LARGEST_SEED}, got {self.seed}")
         if not 0.0 < self.delta0 < 0.5:
             raise ValueError(f"delta0 must be in (0, 0.5), got {self.delta0}")
         if not 0.0 < self.filling < 0.6:

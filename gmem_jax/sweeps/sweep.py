@@ -19,6 +19,7 @@ from gmem_jax.experiment.host import Progress, RunFailedError, silent, within, w
 from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall, replica_bins
+from gmem_jax.files.checked import require_kinds
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
@@ -137,12 +138,16 @@ class Conductor:
 
     def __init__(self, spec: Spec, folder: Path, say: Tell, *, cost: float = COST) -> None:
         self.spec, self.store, self.say, self.cost = spec, Store(folder), say, cost
-        self._packs, self._signals = functools.cache(load_pack), functools.cache(named_signals)
+        self._packs = functools.cache(load_pack)
+        self._signals = functools.cache(functools.partial(named_signals, told=say))
         self.impossible: list[tuple[dict[str, Any], str]] = []
 
     def _recipe(self, values: Mapping[str, Any]) -> tuple[Recipe, dict[str, Any]]:
         """How a pack is to be made, and of which grain."""
         own = {name.removeprefix(PREPARE): value for name, value in values.items() if name.startswith(PREPARE)}
+        require_kinds({name: value for name, value in values.items() if name.startswith(PREPARE)})
+        if own.get("shape") == "sphere" and "overlap" in own:
+            raise ValueError("prepare.overlap does nothing with prepare.shape = 'sphere'; it is of tetra grains")
         shape = {name: own.pop(name, default) for name, default in GRAIN.items()}
         known = {field.name: field for field in fields(Recipe)}
         if unknown := sorted(set(own) - set(known)):
@@ -198,6 +203,7 @@ class Conductor:
         own = {name: value for name, value in values.items() if name != "pack" and not name.startswith(PREPARE)}
         if "pack" in values and (odd := [name for name in values if name.startswith(PREPARE)]):
             raise ValueError(f"a point has a pack and {odd[0]!r} of one to be made; give one of them")
+        require_kinds(values)
         return named_experiment(pack, own, self._signals(*waveforms_of(own)))
 
     def pack_of(self, values: Mapping[str, Any]) -> Pack:
