@@ -25,6 +25,7 @@ FLOORS = (
     "bench",
     "reproduce",
     "command",
+    "__main__",
 )
 
 

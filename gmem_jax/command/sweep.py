@@ -10,7 +10,6 @@ from rich.table import Table
 from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, refuse_idle, reporting, say
 from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.files.atomic import FileFormatError, probe
-from gmem_jax.files.checked import whole
 from gmem_jax.files.parts import locked
 from gmem_jax.physics.state import SENTENCES, Status
 from gmem_jax.show.tables import cell
@@ -70,7 +69,7 @@ def sweep_command(
     spec = read_spec(path)
     options = {name: value for name, value in spec.run.items() if name not in RUN}
     count = workers or spec.run.get("workers")
-    if count is not None and not (whole(count) and count > 0):
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
         raise InputError(f"{path}: workers must be a whole number from 1, got {count!r}")
     chosen = executor_named(executor or str(spec.run.get("executor", "processes")), count, options)
     target = output or path.with_suffix("")

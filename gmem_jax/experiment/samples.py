@@ -110,18 +110,13 @@ def _even(u: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 def _smoothed(u: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
     """Means over a width in u around k / 256; beyond its ends a curve goes on turned about them, so that they stay."""
-    known, rows = np.concatenate([-u[:0:-1], u, 2.0 - u[-2::-1]]), 2.0 * values
-    left, right = rows[:, :1] - values[:, :0:-1], rows[:, -1:] - values[:, -2::-1]
-    wide = np.concatenate([left, values, right], axis=1)
-    share = np.gradient(known)  # of each sample, where they are not at equal steps
-    means = []
-    for place in np.linspace(0.0, 1.0, BINS + 1):
-        first, last = np.searchsorted(known, (place - 0.5 * width, place + 0.5 * width))
-        if last - first < 2:
-            raise ValueError(f"smooth = {width:g} in u is less than samples are apart; give more, or 0")
-        weight = share[first:last] * np.cos(np.pi * (known[first:last] - place) / width) ** 2
-        means.append(wide[:, first:last] @ weight / weight.sum())
-    return np.stack(means, axis=1)
+    known = np.concatenate([-u[:0:-1], u, 2.0 - u[-2::-1]])
+    ends = 2.0 * values[:, :1] - values[:, :0:-1], 2.0 * values[:, -1:] - values[:, -2::-1]
+    wide = np.concatenate([ends[0], values, ends[1]], axis=1)
+    around = width * np.linspace(-0.5, 0.5, 33 + 2 * int(width * u.size))  # two points a sample, and some
+    weight = np.cos(np.pi * around / width) ** 2
+    places = np.linspace(0.0, 1.0, BINS + 1)
+    return np.array([[np.interp(at + around, known, row) @ weight for at in places] for row in wide]) / weight.sum()
 
 
 def require_closed(nodes: np.ndarray) -> None:
