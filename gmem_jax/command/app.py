@@ -39,9 +39,13 @@ class _Commands(TyperGroup):
             raise
 
 
+def _longest(names: list[str]) -> str:
+    return max(names, key=len)
+
+
 class _Command(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
-        named = {str(one.name): max(one.opts, key=len) for one in self.params}
+        named = {str(one.name): "/".join(map(_longest, filter(None, (one.opts, one.secondary_opts)))) for one in self.params}
         typed = {name for name in named if "COMMANDLINE" in str(ctx.get_parameter_source(name))}
         GIVEN.set({name: option for name, option in named.items() if name in typed})
         return super().invoke(ctx)

@@ -14,8 +14,8 @@ from typing import Annotated, Any
 import psutil
 import typer
 from rich import progress
+from rich.cells import cell_len
 from rich.console import Console
-from rich.measure import Measurement
 from rich.table import Table
 
 from gmem_jax.experiment.host import Progress
@@ -45,7 +45,6 @@ PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a pac
 
 # What was typed after the command that runs: the name on the command line of each option and argument by its own.
 GIVEN: ContextVar[Mapping[str, str]] = ContextVar("GIVEN", default=MappingProxyType({}))
-_WIDEST = 10_000  # columns of a terminal
 
 
 class InputError(ValueError):
@@ -79,10 +78,18 @@ def emit(as_json: bool, result: Any, *tables: Any) -> None:
         sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
     else:
         for table in tables:
-            if isinstance(table, Table):  # as wide as its numbers and words, if the terminal is not: rich would cut them
-                least = Measurement.get(out, out.options.update(max_width=_WIDEST), table).minimum
-                table.width = least if least > out.width else table.width
+            if isinstance(table, Table):
+                _keep_whole(table)
             out.print(table, soft_wrap=isinstance(table, str), crop=False)
+
+
+def _keep_whole(table: Table) -> None:
+    """Let a table be as wide as its numbers and words, if the terminal is not: rich would cut them."""
+    for column in table.columns:
+        if column.no_wrap or column.overflow != "fold":  # else it may be broken anywhere
+            texts = [str(column.header), *map(str, column.cells)]
+            pieces = [piece for text in texts for piece in (text.splitlines() if column.no_wrap else text.split())]
+            column.min_width = max([column.min_width or 0, *map(cell_len, pieces)])
 
 
 def require_name(name: str) -> None:

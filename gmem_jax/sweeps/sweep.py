@@ -145,7 +145,6 @@ class Conductor:
     def _recipe(self, values: Mapping[str, Any]) -> tuple[Recipe, dict[str, Any]]:
         """How a pack is to be made, and of which grain."""
         own = {name.removeprefix(PREPARE): value for name, value in values.items() if name.startswith(PREPARE)}
-        require_kinds({name: value for name, value in values.items() if name.startswith(PREPARE)})
         if own.get("shape") == "sphere" and "overlap" in own:
             raise ValueError("prepare.overlap does nothing with prepare.shape = 'sphere'; it is of tetra grains")
         shape = {name: own.pop(name, default) for name, default in GRAIN.items()}
@@ -195,6 +194,7 @@ class Conductor:
             tried += [{**first, **{name: values[place] for name, values in axis.items()}} for place in places]
         for values in tried:
             all_ = {**self.spec.shared, **values}
+            require_kinds(all_)
             if "pack" not in all_:
                 self._pack_job(all_)
             self._experiment(all_, self._packs(str(all_.get("pack", ANY_PACK))))
@@ -203,7 +203,6 @@ class Conductor:
         own = {name: value for name, value in values.items() if name != "pack" and not name.startswith(PREPARE)}
         if "pack" in values and (odd := [name for name in values if name.startswith(PREPARE)]):
             raise ValueError(f"a point has a pack and {odd[0]!r} of one to be made; give one of them")
-        require_kinds(values)
         return named_experiment(pack, own, self._signals(*waveforms_of(own)))
 
     def pack_of(self, values: Mapping[str, Any]) -> Pack:
