@@ -85,11 +85,14 @@ def emit(as_json: bool, result: Any, *tables: Any) -> None:
 
 def _keep_whole(table: Table) -> None:
     """Let a table be as wide as its numbers and words, if the terminal is not: rich would cut them."""
+    least = 1
     for column in table.columns:
-        if column.no_wrap or column.overflow != "fold":  # else it may be broken anywhere
-            texts = [str(column.header), *map(str, column.cells)]
-            pieces = [piece for text in texts for piece in (text.splitlines() if column.no_wrap else text.split())]
-            column.min_width = max([column.min_width or 0, *map(cell_len, pieces)])
+        breaks = column.overflow == "fold" and not column.no_wrap  # anywhere, but for its head
+        texts = [str(column.header), *map(str, () if breaks else column.cells)]
+        pieces = [piece for text in texts for piece in (text.splitlines() if column.no_wrap else text.split())]
+        column.min_width = max([column.min_width or 0, *map(cell_len, pieces)])
+        least += column.min_width + 3  # a blank on either side, and a rule
+    table.width = least if least > out.width else table.width
 
 
 def require_name(name: str) -> None:

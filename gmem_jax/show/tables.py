@@ -156,9 +156,7 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
     table = Table(title="Recall of the waveforms", caption=conditions(configuration))
     for column in ("pack", "G", "F", "G over T1", "F over T1", "T1 (t_c)", "status"):
         words = column in ("pack", "status")  # may wrap in a narrow terminal; numbers are never cut
-        least = len(column) if words else None
-        justify = "left" if words else "right"
-        table.add_column(column, justify=justify, no_wrap=not words, min_width=least, overflow="fold")
+        table.add_column(column, justify="left" if words else "right", no_wrap=not words, overflow="fold")
     for row in rows:
         numbers = [f"{row[key]:.3f}" for key in analysis.MEASURES]
         table.add_row(cell(row["pack"]), *numbers, f"{row['ringing_period']:.0f}", row["status_names"])
