@@ -61,7 +61,11 @@ def test_a_scale_is_common_to_all_signals() -> None:
 
 REFUSED = {
     "is zero at both ends: bring it there, as with --taper 0.1": (U, WAVE + 0.3, {}),
-    "more than the 20% that a pack can hold: smooth it, as with --smooth 0.05": (FINE, 0.3 * NOISE * (abs(FINE - 0.5) < 0.4), {}),
+    "more than the 20% that a pack can hold: smooth it, as with --smooth 0.05": (
+        FINE,
+        0.3 * NOISE * (abs(FINE - 0.5) < 0.4),
+        {},
+    ),
     "signal 2 changes by": (U, [WAVE, np.where(np.abs(U - 0.5) < 0.2, 1.0, 0.0)], {}),
     "times must rise; sample 2": (U[::-1], WAVE, {}),
     "a time or a sample is not a finite number": (U, np.where(U == 0.5, np.nan, WAVE), {}),

@@ -94,7 +94,10 @@ UNKNOWN = {
     "word": ({"experiment": {"pack": str(PACK)}, "vary": {"background": [1]}}, "background must be a text, got 1"),
     "pack": ({"vary": {"pack": [1]}}, "pack must be a text, got 1"),
     "part": ({"experiment": {"pack": str(PACK)}, "vary": {"steps": [2.5]}}, "steps must be a whole number, got 2.5"),
-    "flag": ({"experiment": {"pack": str(PACK), "scale": 1}, "vary": {"mu": [1]}}, "scale must be true or false, got 1"),
+    "flag": (
+        {"experiment": {"pack": str(PACK), "scale": 1}, "vary": {"mu": [1]}},
+        "scale must be true or false, got 1",
+    ),
     "recipe": ({"vary": {"prepare.delta0": ["0.05"]}}, "prepare.delta0 must be a number, got '0.05'"),
     "seeds": ({"vary": {"prepare.seed": [True]}}, "prepare.seed must be a whole number, got true"),
     "large seeds": ({"vary": {"prepare.seed": [1 << 63]}}, "seed must be a whole number from 0 to 9007199254740991"),

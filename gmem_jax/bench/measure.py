@@ -205,7 +205,11 @@ def _peak_bytes() -> int:
     """Peak resident bytes of this process."""
     status = Path("/proc/self/status")
     if status.is_file():  # Linux lets ru_maxrss of a child begin with its parent's
-        return next(1024 * int(line.split()[1]) for line in status.read_text(encoding="utf-8").splitlines() if line.startswith("VmHWM"))
+        return next(
+            1024 * int(line.split()[1])
+            for line in status.read_text(encoding="utf-8").splitlines()
+            if line.startswith("VmHWM")
+        )
     unit = 1 if sys.platform == "darwin" else 1024
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 

@@ -45,7 +45,9 @@ def _longest(names: list[str]) -> str:
 
 class _Command(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
-        named = {str(one.name): "/".join(map(_longest, filter(None, (one.opts, one.secondary_opts)))) for one in self.params}
+        named = {
+            str(one.name): "/".join(map(_longest, filter(None, (one.opts, one.secondary_opts)))) for one in self.params
+        }
         typed = {name for name in named if "COMMANDLINE" in str(ctx.get_parameter_source(name))}
         GIVEN.set({name: option for name, option in named.items() if name in typed})
         return super().invoke(ctx)

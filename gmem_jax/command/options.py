@@ -54,11 +54,15 @@ _OF_LAW = {  # of its friction law
     "variant": _Option(str | None, "m2: averaged, exact or paper."),
 }
 _OTHERS = {
-    "signals": _Option(str, "six; words:L, all words of L bits; or a .npy or .csv file (a column per signal, one may be time)."),
+    "signals": _Option(
+        str, "six; words:L, all words of L bits; or a .npy or .csv file (a column per signal, one may be time)."
+    ),
     "word_pad": _Option(float | None, "words: bits left free at either end; default 2."),
     "word_width": _Option(float | None, "words: width of bumps, in bits; default 1."),
     "smooth": _Option(float | None, "Samples in a file: width in u over which they are averaged."),
-    "taper": _Option(float | None, "Samples in a file: width in u at either end within which they are brought to zero."),
+    "taper": _Option(
+        float | None, "Samples in a file: width in u at either end within which they are brought to zero."
+    ),
     "scale": _Option(bool | None, "Samples in a file: divide them by the largest.", ("--scale",)),
     "wall_rigidity": _Option(float | None, "Stiffness of walls over that of rigid ones; default 1."),
     "friction": _Option(str, f"Friction law: {_NAMES}, or the paper's H, M1, M2."),

@@ -61,9 +61,7 @@ def show(
         emit(as_json, found.facts, *found.lines)
 
 
-def _draw(
-    file: Path, pictures: dict[str, Draw], plot: str, output: Path | None, force: bool, as_json: bool
-) -> None:
+def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None, force: bool, as_json: bool) -> None:
     names = {name.lower(): name for name in pictures}
     if plot == "list":
         refuse_idle("with --plot list, which draws nothing", "output")

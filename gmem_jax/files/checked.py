@@ -21,7 +21,19 @@ FIXED = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that hav
 LONGEST = 18  # digits of a whole number: no count or seed has more
 NAME = 200  # characters of what is printed
 PATH = 4096  # of a path
-TEXTS = ("pack", "signals", "friction", "law", "kind", "background", "shear", "backend", "precision", "variant", "shape")
+TEXTS = (
+    "pack",
+    "signals",
+    "friction",
+    "law",
+    "kind",
+    "background",
+    "shear",
+    "backend",
+    "precision",
+    "variant",
+    "shape",
+)
 COUNTS = ("steps", "points", "grains", "seed", "cycles")
 FLAGS = ("scale",)
 _SHOWN = 160  # characters of an error of some library
@@ -172,8 +184,11 @@ def require_kinds(values: Mapping[str, Any]) -> None:
             else (_numeric(value), "a number")
         )
         if value is not None and not right:
-            raise ValueError(f"{name} must be {words}, got {str(value)[:40]!r}" if isinstance(value, str) else
-                             f"{name} must be {words}, got {json.dumps(value, default=str)[:40]}")
+            raise ValueError(
+                f"{name} must be {words}, got {str(value)[:40]!r}"
+                if isinstance(value, str)
+                else f"{name} must be {words}, got {json.dumps(value, default=str)[:40]}"
+            )
 
 
 def _numeric(value: Any) -> bool:

@@ -110,7 +110,9 @@ def spec_of(tables: Mapping[str, Any]) -> Spec:
     spec = Spec({**shared, **own}, tuple(axes), tuple(extra), run)
     grid = set().union(*axes) if axes else set.intersection(*map(set, extra)) if extra else set()
     if idle := sorted(set(spec.shared) & grid):
-        raise ValueError(f"{idle[0]} varies, so that its value in [experiment] or [prepare] does nothing; leave one out")
+        raise ValueError(
+            f"{idle[0]} varies, so that its value in [experiment] or [prepare] does nothing; leave one out"
+        )
     twice = [name for name in spec.names if sum(name in axis for axis in axes) > 1]
     _require(not twice, f"{twice[:1]} varies twice")
     _require(bool(axes or extra), "nothing varies: give a table [vary], [[zip]] or [[points]]")
@@ -128,7 +130,9 @@ def _values(name: str, value: Any) -> list[Any]:
             f"{name}: give a list, or from, to and count (and factors = true)",
         )
         numbers = [value["from"], value["to"]]
-        _require(all(map(is_number, numbers)), f"{name}: from and to must be numbers, got {numbers[0]} and {numbers[1]}")
+        _require(
+            all(map(is_number, numbers)), f"{name}: from and to must be numbers, got {numbers[0]} and {numbers[1]}"
+        )
         count = value["count"]
         _require(
             whole(count) and 2 <= count <= MOST, f"{name}: count must be a whole number from 2 to {MOST}, got {count}"

@@ -254,5 +254,6 @@ class Store:
         """What the workers with such files said, who said something last at the end."""
         logs = (self.folder / "workers").glob("*.log")
         return "\n".join(
-            path.read_text(encoding="utf-8", errors="replace") for path in sorted(logs, key=lambda path: path.stat().st_mtime)
+            path.read_text(encoding="utf-8", errors="replace")
+            for path in sorted(logs, key=lambda path: path.stat().st_mtime)
         )

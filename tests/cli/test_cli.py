@@ -210,7 +210,10 @@ BAD = [
     (["prepare", "--overlap", "1.0", "-o", "{out}"], "overlap must be in [0, 1), got 1"),
     (["prepare", "--dt", "0.6", "-o", "{out}"], "dt must be in (0, 0.5] t_c, got 0.6"),
     (["prepare", "--seed", "-1", "-o", "{out}"], "seed must be a whole number from 0, got -1"),
-    (["prepare", "--seed", "9223372036854775808", "-o", "{out}"], "seed must be a whole number from 0 to 9007199254740991"),
+    (
+        ["prepare", "--seed", "9223372036854775808", "-o", "{out}"],
+        "seed must be a whole number from 0 to 9007199254740991",
+    ),
     (["prepare", "--backend", "foo", "-o", "{out}"], "backend must be one of auto, jax, native; got 'foo'"),
     (["prepare", "--name", "x" * 201, "-o", "{out}"], "--name: must be a line of at most 200 printable characters"),
     (["prepare", "-o", "/proc/nowhere/pack.h5"], "folder /proc/nowhere does not exist"),
