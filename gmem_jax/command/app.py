@@ -39,17 +39,14 @@ class _Commands(TyperGroup):
             raise
 
 
-def _longest(names: list[str]) -> str:
-    return max(names, key=len)
+def _longest(names: list[str]) -> list[str]:
+    return sorted(names, key=len)[-1:]
 
 
 class _Command(TyperCommand):
     def invoke(self, ctx: Any) -> Any:
-        named = {
-            str(one.name): "/".join(map(_longest, filter(None, (one.opts, one.secondary_opts)))) for one in self.params
-        }
-        typed = {name for name in named if "COMMANDLINE" in str(ctx.get_parameter_source(name))}
-        GIVEN.set({name: option for name, option in named.items() if name in typed})
+        typed = [one for one in self.params if "COMMANDLINE" in str(ctx.get_parameter_source(str(one.name)))]
+        GIVEN.set({str(one.name): "/".join(_longest(one.opts) + _longest(one.secondary_opts)) for one in typed})
         return super().invoke(ctx)
 
 

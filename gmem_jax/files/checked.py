@@ -21,18 +21,19 @@ FIXED = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that hav
 LONGEST = 18  # digits of a whole number: no count or seed has more
 NAME = 200  # characters of what is printed
 PATH = 4096  # of a path
+# Names in TOML and JSON and what stands there; under all others a number, or lists of them.
 TEXTS = (
     "pack",
     "signals",
     "friction",
     "law",
     "kind",
+    "shape",
     "background",
     "shear",
     "backend",
     "precision",
     "variant",
-    "shape",
 )
 COUNTS = ("steps", "points", "grains", "seed", "cycles")
 FLAGS = ("scale",)
@@ -174,21 +175,16 @@ def require_kinds(values: Mapping[str, Any]) -> None:
     """
     for name, value in values.items():
         kind = name.rpartition(".")[2]
-        right, words = (
-            (isinstance(value, str), "a text")
-            if kind in TEXTS
-            else (isinstance(value, bool), "true or false")
-            if kind in FLAGS
-            else (isinstance(value, int) and not isinstance(value, bool), "a whole number")
-            if kind in COUNTS
-            else (_numeric(value), "a number")
-        )
+        if kind in TEXTS:
+            right, words = isinstance(value, str), "a text"
+        elif kind in FLAGS:
+            right, words = isinstance(value, bool), "true or false"
+        elif kind in COUNTS:
+            right, words = isinstance(value, int) and not isinstance(value, bool), "a whole number"
+        else:
+            right, words = _numeric(value), "a number"
         if value is not None and not right:
-            raise ValueError(
-                f"{name} must be {words}, got {str(value)[:40]!r}"
-                if isinstance(value, str)
-                else f"{name} must be {words}, got {json.dumps(value, default=str)[:40]}"
-            )
+            raise ValueError(f"{name} must be {words}, got {json.dumps(value, default=str)[:_SHOWN]}")
 
 
 def _numeric(value: Any) -> bool:

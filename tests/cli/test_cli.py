@@ -209,7 +209,7 @@ BAD = [
     (["prepare", "--grains", "0", "-o", "{out}"], "grains must be at least 12 to jam between six walls, got 0"),
     (["prepare", "--overlap", "1.0", "-o", "{out}"], "overlap must be in [0, 1), got 1"),
     (["prepare", "--dt", "0.6", "-o", "{out}"], "dt must be in (0, 0.5] t_c, got 0.6"),
-    (["prepare", "--seed", "-1", "-o", "{out}"], "seed must be a whole number from 0, got -1"),
+    (["prepare", "--seed", "-1", "-o", "{out}"], "seed must be a whole number from 0 to 9007199254740991, got -1"),
     (
         ["prepare", "--seed", "9223372036854775808", "-o", "{out}"],
         "seed must be a whole number from 0 to 9007199254740991",
