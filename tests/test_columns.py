@@ -38,6 +38,7 @@ REFUSED = {
     "0.1 0.2\n0.3 0.4\n": "numbers separated by blanks ('0.3 0.4'); use commas",
     "time,t,a\n0,0,0\n1,1,1\n2,2,0\n": "time, t, a: must be one axis, and a column for each signal",
     "t\n0\n1\n2\n": "t: must be one axis",
+    "no,time,a\n1,0,0\n2,0.1,1\n3,0.3,0\n": "column 1 ('no') rises by equal steps",
     "t,a\n0,0\n1,1\n1,2\n3,0\n": "times must rise; sample 3 is not after the one before",
     "u,a\n0,0\n1,1\n2,0\n": "times from 0 to 2 lie outside 0 to 1",
     LAB: "signal 1 begins at 0.307 and ends at 0.665; a waveform is zero at both ends: bring it there, as with --taper",
@@ -53,6 +54,11 @@ def test_a_table_that_would_be_taken_for_another_is_refused(tmp_path: Path, text
         loaded(tmp_path, text)
     assert words in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_columns_that_are_numbered_are_signals(tmp_path: Path) -> None:
+    samples, _ = loaded(tmp_path, "t_1,t_2\n0.1,0.2\n0.4,0.3\n")
+    assert samples.shape == (2, 2)
 
 
 @pytest.mark.parametrize("name", ["time", "t", "Time (s)", "t [ms]", "time/s", "t_ms"])

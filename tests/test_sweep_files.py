@@ -140,11 +140,14 @@ def test_a_value_shared_by_the_grid_and_used_by_single_points_is_no_contradictio
         ("friction", "mu", "0.5"),
         ("material", "wall_rigidity", True),
         ("signals", "width", "0.2"),
+        ("words", "pad", "2"),
     ],
 )
 def test_what_is_no_number_is_refused_in_a_written_experiment(part: str, name: str, value: object) -> None:
     pack = gm.load_pack(PACK)
     form = gm.written(gm.Experiment(pack, gm.Bumps(np.ones((1, 1)), np.full((1, 1), 0.4), 0.2)))
+    if part == "words":
+        form["signals"], part = {"kind": "words", "bits": 2}, "signals"
     (form[part] if part else form)[name] = value
     with pytest.raises(ValueError, match=rf"^{name} must be a (number|text), got "):
         gm.experiment_from(form, pack)

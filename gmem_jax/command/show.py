@@ -30,6 +30,8 @@ def show(
 
     gmem show recall.h5 --plot signals -o x.png; gmem show recall.h5 --plot Z --against u -o z.png
     """
+    if against not in AGAINST:
+        raise InputError(f"--against {against}: must be one of {', '.join(AGAINST)}")
     if plot:
         refuse_idle("beside --plot", "csv")
     if not plot or plot == "list":
@@ -38,8 +40,6 @@ def show(
         refuse_idle(f"with --plot {plot}: only pictures of stages ({', '.join(QUANTITIES)}) have it", "against")
     if csv:
         refuse_idle("beside --csv", "as_json")
-    if against not in AGAINST:
-        raise InputError(f"--against {against}: must be one of {', '.join(AGAINST)}")
     folder = file.is_dir()
     if folder:
         store = sweep.there(file)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.signals import BINS, Spline, waveform
@@ -116,7 +117,8 @@ def _smoothed(u: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
     around = width * np.linspace(-0.5, 0.5, 33 + 2 * int(width * u.size))  # two points a sample, and some
     weight = np.cos(np.pi * around / width) ** 2
     places = np.linspace(0.0, 1.0, BINS + 1)
-    return np.array([[np.interp(at + around, known, row) @ weight for at in places] for row in wide]) / weight.sum()
+    means = [[np.interp(at + around, known, row) @ weight for at in places] for row in wide]
+    return np.array(means, float) / float(weight.sum())
 
 
 def require_closed(nodes: np.ndarray) -> None:
@@ -142,7 +144,7 @@ def require_gentle(nodes: np.ndarray) -> None:
     """
     count = nodes.shape[1] - 1
     at = np.linspace(0.0, 1.0, BINS * _FINE * max(1, -(-count // (BINS * _FINE))) + 1)  # every node of many, too
-    values = np.asarray(waveform(nodes[:, 1:-1]).shear(at)).T
+    values = np.asarray(waveform(nodes[:, 1:-1]).shear(jnp.asarray(at))).T
     apart = (len(at) - 1) // BINS
     change = np.abs(values[:, apart:] - values[:, :-apart])
     for number, row in enumerate(values):

@@ -10,7 +10,7 @@ import numpy as np
 from gmem_jax.files.atomic import FileFormatError
 
 _SEPARATORS = {";": "semicolons", "\t": "tabs"}
-_AXIS = re.compile(r"(u|t|time)(\s*([(\[].*[)\]]|[/_].*))?", re.IGNORECASE)
+_AXIS = re.compile(r"(u|t|time)(\s*[(\[].*[)\]])?|(t|time)\s*[/_]\s*[^\W\d]+", re.IGNORECASE)
 _NAMELESS = re.compile(r"(unnamed.*)?", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 _PAIRS = re.compile(r"\s*-?[01],\d+(,-?[01],\d+)*\s*")  # numbers of size 1 with decimal commas, cut at each of them
@@ -55,11 +55,11 @@ def read_columns(path: Path) -> Columns:
     said = () if separator == "," else (f"separated by {_SEPARATORS[separator]}",)
     _require_names(path, names, values, rows)
     axes = [place for place, name in enumerate(names) if _AXIS.fullmatch(name)]
-    if not axes:
-        _require_no_axis(path, names, values)
-        return Columns(values, said=said)
-    if len(axes) > 1 or len(names) == 1:
+    if len(axes) > 1 or len(axes) == len(values) > 0:
         raise FileFormatError(f"{path}: {', '.join(names)}: must be one axis, and a column for each signal")
+    _require_no_axis(path, names, values, axes)
+    if not axes:
+        return Columns(values, said=said)
     return Columns(np.delete(values, axes, axis=0), values[axes[0]], names[axes[0]], said)
 
 
@@ -96,11 +96,13 @@ def _require_names(path: Path, names: list[str], values: np.ndarray, rows: list[
         raise FileFormatError(f"{path}: column {nameless[0]} has no name, as row numbers have none; {_AS_AXIS}")
 
 
-def _require_no_axis(path: Path, names: list[str], values: np.ndarray) -> None:
+def _require_no_axis(path: Path, names: list[str], values: np.ndarray, axes: list[int]) -> None:
     """Refuse a column that rises by equal steps beside others: times, places or row numbers are no waveform."""
     if len(values) < 2 or values.shape[1] < 3:
         return
     for place, column in enumerate(values):
+        if place in axes:
+            continue
         name = names[place] if names else ""
         steps = np.diff(column)
         if steps[0] > 0.0 and np.allclose(steps, steps[0], rtol=1e-3, atol=0.0) and not _OWN.fullmatch(name):

@@ -110,6 +110,7 @@ def signals_from(written: Mapping[str, Any]) -> Signals:
     Raises:
         ValueError: if they are of a kind that has none, or its numbers make no waveforms.
     """
+    require_kinds(written)
     kind = written["kind"]
     if kind == "six":
         return six_signals()
@@ -117,7 +118,6 @@ def signals_from(written: Mapping[str, Any]) -> Signals:
         return words(written["bits"], written.get("pad", PAD), written.get("width", WIDTH))
     if kind not in _SIGNALS:
         raise ValueError(f"signals of kind {kind!r} cannot be read back")
-    require_kinds(written)
     numbers = {name: value for name, value in written.items() if name != "kind"}
     made: Signals = _SIGNALS[kind](**{name: _number(value) for name, value in numbers.items()})
     return made

@@ -70,7 +70,7 @@ def _places(found: Columns, said: list[str]) -> tuple[np.ndarray, tuple[float, f
     if found.axis is None:
         count = found.values.shape[1]
         return np.arange(1, count + 1) / (count + 1.0), (0.0, 1.0)
-    if found.name.lower() == "u":
+    if found.name.lower().startswith("u"):
         return found.axis, (0.0, 1.0)
     said.append(f"{found.name} from {found.axis[0]:g} to {found.axis[-1]:g} is u from 0 to 1")
     return found.axis, None
