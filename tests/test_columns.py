@@ -41,10 +41,8 @@ REFUSED = {
     "no,time,a\n1,0,0\n2,0.1,1\n3,0.3,0\n": "column 1 ('no') rises by equal steps",
     "t,a\n0,0\n1,1\n1,2\n3,0\n": "times must rise; sample 3 is not after the one before",
     "u,a\n0,0\n1,1\n2,0\n": "times from 0 to 2 lie outside 0 to 1",
-    LAB: "signal 1 begins at 0.307 and ends at 0.665; a waveform is zero at both ends: bring it there, as with --taper",
-    table(
-        VOLTS, names="voltage"
-    ): "more than the 20% that a pack can hold: it is zero at both ends; bring it there, as with --taper",
+    LAB: "signal 1 begins at 0.307 and ends at 0.665; a waveform is zero at both ends: bring it there",
+    table(VOLTS, names="voltage"): "that a pack can hold: it is zero at both ends; bring it there, with taper = 0.1",
 }
 
 

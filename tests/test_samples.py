@@ -60,8 +60,8 @@ def test_a_scale_is_common_to_all_signals() -> None:
 
 
 REFUSED = {
-    "is zero at both ends: bring it there, as with --taper 0.1": (U, WAVE + 0.3, {}),
-    "more than the 20% that a pack can hold: smooth it, as with --smooth 0.05": (
+    "is zero at both ends: bring it there, with taper = 0.1 (gmem recall --taper 0.1)": (U, WAVE + 0.3, {}),
+    "more than the 20% that a pack can hold: smooth it, with smooth = 0.05": (
         FINE,
         0.3 * NOISE * (abs(FINE - 0.5) < 0.4),
         {},

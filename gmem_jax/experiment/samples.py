@@ -9,9 +9,10 @@ import numpy as np
 from gmem_jax.experiment.signals import BINS, Spline, waveform
 
 STEEPEST = 0.2  # of its largest value, that a waveform may change by within a bin. Words of 12 bits, the steepest there
-# are, have 0.196. Noise that makes 0.23 changes J by 1 % and what a pack gives back by 28 %; see docs/howto/waveform.md
-OPEN = 0.01  # of its largest value, that a waveform may have at an end: no more than a bin of any slope it may have
+# are, have 0.196. Noise that makes 0.23 changes J by 1 % and what a pack gives back by 29 %; see docs/howto/waveform.md
+OPEN = 0.01  # of its largest value, that a waveform may have at an end (it is then set to zero)
 WIDEST = 0.5  # in u, of what is smoothed or tapered
+_TAPER = "bring it there, with taper = 0.1 (gmem recall --taper 0.1)"
 _FINE = 8  # points a bin, at which slopes are looked at
 
 Told = Callable[[str], None]
@@ -132,7 +133,7 @@ def require_closed(nodes: np.ndarray) -> None:
         if max(abs(begins), abs(ends)) > OPEN * np.max(np.abs(row)):
             raise ValueError(
                 f"signal {number + 1} begins at {begins:.3g} and ends at {ends:.3g}; a waveform is zero at both ends: "
-                "bring it there, as with --taper 0.1 (taper=0.1)"
+                + _TAPER
             )
 
 
@@ -162,5 +163,5 @@ def _help(place: float, nodes: np.ndarray, largest: float) -> str:
     """What would make a steep waveform gentle."""
     at_end = min(place, 1.0 - place) < 2.0 / (len(nodes) - 1) + 1.0 / BINS
     if at_end and max(abs(nodes[1]), abs(nodes[-2])) > STEEPEST * largest:
-        return "it is zero at both ends; bring it there, as with --taper 0.1 (taper=0.1)"
-    return "smooth it, as with --smooth 0.05 (smooth=0.05)"
+        return f"it is zero at both ends; {_TAPER}"
+    return "smooth it, with smooth = 0.05 (gmem recall --smooth 0.05)"
