@@ -19,6 +19,7 @@ from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.pack import Pack, pack_from, stack
 from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
+from gmem_jax.experiment.samples import waveform_from
 from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, waveform, words
 from gmem_jax.files.configuration import experiment_from, resolved, written
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
@@ -123,6 +124,7 @@ __all__ = [
     "value_and_grad",
     "view",
     "waveform",
+    "waveform_from",
     "words",
     "written",
 ]

@@ -27,6 +27,7 @@ FLOORS = (
     "bench",
     "reproduce",
     "command",
+    "__main__",
 )
 
 
@@ -45,7 +46,7 @@ MODULES = modules()
 def imports(name: str) -> set[str]:
     """The modules of this package that a module imports anywhere in it: late, for types, and by strings too."""
     found = set()
-    for node in ast.walk(ast.parse(MODULES[name].read_text())):
+    for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -90,6 +91,39 @@ print(xla_bridge.backends_are_initialized(), *heavy)
 def test_importing_the_package_or_its_command_starts_no_backend_and_loads_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", LOADING], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
+
+
+def text_without_encoding(source: str) -> list[int]:
+    """Lines that read or write text in whatever encoding the locale has."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        known = any(word.arg == "encoding" for word in node.keywords)
+        if called == "read_text":  # whose first argument is the encoding
+            known |= bool(node.args)
+        elif called == "open":
+            modes = [one.value for one in node.args if isinstance(one, ast.Constant) and isinstance(one.value, str)]
+            others = isinstance(node.func, ast.Attribute) and len(node.args) > len(modes)  # of an archive or a library
+            known |= others or any("b" in mode for mode in modes)
+        elif called not in ("write_text", "savetxt"):
+            continue
+        if not known:
+            found.append(node.lineno)
+    return found
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_text_is_utf_8_whatever_the_locale(name: str) -> None:
+    assert not text_without_encoding(MODULES[name].read_text(encoding="utf-8"))
+
+
+def test_text_in_the_locale_s_encoding_is_noticed() -> None:
+    bad = ["path.read_text()", "path.write_text(text)", "path.open()", "path.open('w')", "open(path, 'a')"]
+    bad += ["np.savetxt(path, values)"]
+    good = ["path.read_text('utf-8-sig')", "path.open('rb')", "open(path, 'w', encoding='utf-8')", "archive.open(name)"]
+    assert [text_without_encoding(line) for line in (*bad, *good)] == [[1]] * len(bad) + [[]] * len(good)
 
 
 def test_every_public_name_is_there() -> None:

@@ -58,7 +58,16 @@ BAD = {
     "[varied]\nmu = [1.0]": "no table 'varied'",
     "[experiment]\nmu = 1.0": "nothing varies",
     "mu = [": "not TOML",
-    "[vary]\nmu = {from = 0, to = 1, count = 2000000}": "count must be",
+    "[vary]\nmu = {from = 0, to = 1, count = 100000000}": "must be a whole number from 2 to 100000, got 100000000",
+    "[vary]\nmu = {from = 0, to = 1, count = 1}": "count must be a whole number from 2 to 100000, got 1",
+    "[vary]\nmu = {from = true, to = 1, count = 2}": "mu: from and to must be numbers, got True and 1",
+    "[vary]\nmu = {from = 0, to = '1', count = 2}": "mu: from and to must be numbers",
+    "[vary]\nmu = {from = 1, to = 2, count = 3, factors = 1}": "factors must be true or false",
+    "[experiment]\nmu = 1.0\n[vary]\nmu = [0.5, 1.0]": "mu varies, so that its value in [experiment]",
+    "[experiment]\nt0 = 60\n[[zip]]\nmu = [1, 2]\nt0 = [60, 90]": "t0 varies",
+    "[experiment]\nmu = 1.0\n[[points]]\nmu = 2.0": "mu varies",
+    "[prepare]\nseed = 1\n[vary]\n'prepare.seed' = [1, 2]": "prepare.seed varies",
+    "[experiment]\n'prepare.seed' = 1\n[prepare]\nseed = 2\n[vary]\nmu = [1]": "in [prepare] or in [experiment]",
     "vary = 3": "must be a table",
     "points = 3": "must be tables",
 }
@@ -80,6 +89,25 @@ UNKNOWN = {
     "range": ({"experiment": {"pack": str(PACK)}, "vary": {"mu": [1.0, -1.0]}}, "mu must be"),
     "shape": ({"vary": {"prepare.shape": ["cube"]}}, "tetra or sphere"),
     "grains": ({"vary": {"prepare.grains": [2]}}, "at least 12"),
+    "true": ({"experiment": {"pack": str(PACK)}, "vary": {"mu": [True]}}, "mu must be a number, got true"),
+    "text": ({"experiment": {"pack": str(PACK)}, "vary": {"mu": ["0.5"]}}, 'mu must be a number, got "0.5"'),
+    "word": ({"experiment": {"pack": str(PACK)}, "vary": {"background": [1]}}, "background must be a text, got 1"),
+    "pack": ({"vary": {"pack": [1]}}, "pack must be a text, got 1"),
+    "part": ({"experiment": {"pack": str(PACK)}, "vary": {"steps": [2.5]}}, "steps must be a whole number, got 2.5"),
+    "flag": (
+        {"experiment": {"pack": str(PACK), "scale": 1}, "vary": {"mu": [1]}},
+        "scale must be true or false, got 1",
+    ),
+    "recipe": ({"vary": {"prepare.delta0": ["0.05"]}}, 'prepare.delta0 must be a number, got "0.05"'),
+    "seeds": ({"vary": {"prepare.seed": [True]}}, "prepare.seed must be a whole number, got true"),
+    "large seeds": ({"vary": {"prepare.seed": [1 << 63]}}, "seed must be a whole number from 0 to 9007199254740991"),
+    "spheres": ({"prepare": {"shape": "sphere", "overlap": 0.3}, "vary": {"mu": [1]}}, "overlap does nothing"),
+    "dt": ({"experiment": {"pack": str(PACK), "dt": 0.2, "steps": 30}, "vary": {"mu": [1]}}, "dt does nothing"),
+    "two names": (
+        {"experiment": {"pack": str(PACK), "mu": 0.2}, "vary": {"friction.mu": [1]}},
+        "mu and friction.mu are one",
+    ),
+    "samples": ({"experiment": {"pack": str(PACK), "smooth": 0.1}, "vary": {"mu": [1]}}, "for samples in a file only"),
 }
 
 
@@ -88,6 +116,41 @@ def test_impossible_points_are_refused_before_anything_is_computed(tmp_path: Pat
     tables, problem = UNKNOWN[name]
     with pytest.raises(ValueError, match=problem):
         conductor(tmp_path, **tables).check()
+
+
+def test_a_sweep_is_utf_8_with_or_without_a_byte_order_mark(tmp_path: Path) -> None:
+    text = '# größe\n[experiment]\nt0 = 60\n[vary]\npack = ["tetra-325-a"]\nmu = [0.5, 1.0]\n'
+    for encoding in ("utf-8", "utf-8-sig"):
+        (tmp_path / "bom.toml").write_text(text, encoding=encoding)
+        assert read_spec(tmp_path / "bom.toml").names == ["pack", "mu"]
+
+
+def test_a_value_shared_by_the_grid_and_used_by_single_points_is_no_contradiction() -> None:
+    spec = spec_of({"experiment": {"mu": 1.0}, "vary": {"gamma0": [1e-3]}, "points": [{"mu": 2.0}]})
+    assert [{**spec.shared, **one} for one in spec.combinations()] == [{"mu": 1.0, "gamma0": 1e-3}, {"mu": 2.0}]
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [
+        ("", "gamma0", True),
+        ("", "gamma0", "1e-3"),
+        ("", "t0", [True]),
+        ("", "backend", 1),
+        ("friction", "mu", "0.5"),
+        ("material", "wall_rigidity", True),
+        ("signals", "width", "0.2"),
+        ("words", "pad", "2"),
+    ],
+)
+def test_what_is_no_number_is_refused_in_a_written_experiment(part: str, name: str, value: object) -> None:
+    pack = gm.load_pack(PACK)
+    form = gm.written(gm.Experiment(pack, gm.Bumps(np.ones((1, 1)), np.full((1, 1), 0.4), 0.2)))
+    if part == "words":
+        form["signals"], part = {"kind": "words", "bits": 2}, "signals"
+    (form[part] if part else form)[name] = value
+    with pytest.raises(ValueError, match=rf"^{name} must be a (number|text), got "):
+        gm.experiment_from(form, pack)
 
 
 def test_points_that_differ_in_replica_parameters_become_one_run(tmp_path: Path) -> None:

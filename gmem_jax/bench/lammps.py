@@ -65,7 +65,7 @@ def execute(script: Sequence[str], folder: Path, ranks: int = 1) -> str:
     Raises:
         RuntimeError: if LAMMPS fails, with the end of its output.
     """
-    (folder / "in.lammps").write_text("\n".join(script) + "\n")
+    (folder / "in.lammps").write_text("\n".join(script) + "\n", encoding="utf-8")
     command = [str(_program()), "-in", "in.lammps", "-log", "none"]
     if ranks > 1:
         command = [str(Path(sys.prefix) / "bin" / "mpiexec"), "-n", str(ranks), *command]
@@ -158,7 +158,7 @@ def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1
     lines += [f"{n + 1} {_row(*velocity[n], *spin[n])}" for n in range(len(flat))]
     lines += ["", "Molecules", ""]
     lines += [f"{n + 1} {molecule}" for n, molecule in enumerate(grain)]
-    (folder / "scene.data").write_text("\n".join(lines) + "\n")
+    (folder / "scene.data").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
     script = [
         "units lj",
@@ -182,7 +182,7 @@ def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1
             components = (*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2])
             row = _row(float(scene.clump.mass), *scene.position[n], *components, *scene.velocity[n], *momentum[n])
             bodies.append(f"{n + 1} {row} 0 0 0")
-        (folder / "scene.bodies").write_text("\n".join(bodies) + "\n")
+        (folder / "scene.bodies").write_text("\n".join(bodies) + "\n", encoding="utf-8")
     return script
 
 
@@ -296,7 +296,7 @@ def run(script: list[str], folder: Path, *, steps: int, every: int, per_grain: i
         script.append(f'fix walls all ave/time 1 1 {every} {columns} format " %.17g" file out.walls')
     execute([*script, f"run {steps}"], folder)
     columns_per_frame = len(OUTPUT.split())
-    text = (folder / "out.dump").read_text()
+    text = (folder / "out.dump").read_text(encoding="utf-8")
     frames = [
         np.array(block.split("\n", 1)[1].split(), dtype=float).reshape(-1, columns_per_frame)
         for block in re.split(r"ITEM: TIMESTEP", text.replace("ITEM: ATOMS", "\0"))[1:]

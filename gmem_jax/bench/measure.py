@@ -61,7 +61,7 @@ Say = Callable[[str, float], None]
 def processor() -> str:
     """The processor's name, and how many cores this process may use."""
     file = Path("/proc/cpuinfo")
-    lines = file.read_text().splitlines() if file.is_file() else []
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     return f"{names[0] if names else platform.processor()}, {cores()} cores"
 
@@ -208,7 +208,11 @@ def _peak_bytes() -> int:
     """Peak resident bytes of this process."""
     status = Path("/proc/self/status")
     if status.is_file():  # Linux lets ru_maxrss of a child begin with its parent's
-        return next(1024 * int(line.split()[1]) for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return next(
+            1024 * int(line.split()[1])
+            for line in status.read_text(encoding="utf-8").splitlines()
+            if line.startswith("VmHWM")
+        )
     unit = 1 if sys.platform == "darwin" else 1024
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 

@@ -121,4 +121,4 @@ def save(folder: Path, result: dict[str, Any], text: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in (("bench.json", json.dumps(result, indent=1) + "\n"), ("bench.md", text)):
         with atomic(folder / name) as path:
-            path.write_text(content)
+            path.write_text(content, encoding="utf-8")

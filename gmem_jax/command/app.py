@@ -2,23 +2,75 @@
 
 import sys
 import warnings
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import typer
+from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from gmem_jax.command import benchmark, classify, derive, exchange, packs, recalls, report, reproduce, show, sweep
-from gmem_jax.command.console import RunInterruptedError, say
+from gmem_jax.command.console import GIVEN, RunInterruptedError, emit, say
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.programs import keep_programs
+from gmem_jax.files.provenance import versions
 from gmem_jax.physics.rules import StartError, usual_rules, why_not_started
 from gmem_jax.simulation.progress import no_further_bar
 
-app = typer.Typer(rich_markup_mode=None, help="Waveform memory in granular packs.")
+_ELSEWHERE = {  # what is not a command and near none, and how it is done
+    "view": "gm.view shows a pack or a recall in a notebook, gmem report FILE as a page for a browser",
+    "run": "gmem recall runs an experiment, gmem sweep many",
+    "plot": "gmem show FILE --plot WHAT -o x.png draws what a file holds",
+    "train": "gmem classify trains nets and reads recalled words",
+    "convert": "gmem export writes a pack or a recall for other programs, gmem import reads a pack of theirs",
+    "list": "gmem info lists the packs, gmem show FILE says what a file holds",
+    "help": "gmem --help, or gmem COMMAND --help",
+    "version": "gmem --version",
+}
+
+
+class _Commands(TyperGroup):
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        try:
+            return super().resolve_command(ctx, args)
+        except TyperException as error:
+            if args[0] in _ELSEWHERE:
+                error.message = f"No such command {args[0]!r}: {_ELSEWHERE[args[0]]}"
+            elif "Did you mean" not in error.message:
+                error.message = f"No such command {args[0]!r}; there are {', '.join(self.commands)}"
+            raise
+
+
+def _longest(names: list[str]) -> list[str]:
+    return sorted(names, key=len)[-1:]
+
+
+class _Command(TyperCommand):
+    def invoke(self, ctx: Any) -> Any:
+        typed = [one for one in self.params if "COMMANDLINE" in str(ctx.get_parameter_source(str(one.name)))]
+        GIVEN.set({str(one.name): "/".join(_longest(one.opts) + _longest(one.secondary_opts)) for one in typed})
+        return super().invoke(ctx)
+
+
+app = typer.Typer(cls=_Commands, rich_markup_mode=None, help="Waveform memory in granular packs.")
 for group in (packs, recalls, show, exchange, classify, derive, sweep, report, reproduce, benchmark):
     for name, command in group.COMMANDS.items():
-        app.command(name)(command)
+        app.command(name, cls=_Command)(command)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        emit(False, {}, f"gmem-jax {versions()['gmem-jax']}")
+        raise typer.Exit
+
+
+@app.callback()
+def _gmem(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
 
 
 def _one_line(message: Warning | str, *_: Any, **__: Any) -> None:

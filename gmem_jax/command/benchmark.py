@@ -7,7 +7,7 @@ import typer
 
 from gmem_jax.bench import gpu, measure
 from gmem_jax.bench.table import markdown, save
-from gmem_jax.command.console import AsJson, InputError, claim, emit, reporting
+from gmem_jax.command.console import AsJson, InputError, claim, emit, refuse_idle, reporting
 from gmem_jax.files.checked import json_of, refusing
 from gmem_jax.files.packs import list_packs, load_pack
 
@@ -34,6 +34,8 @@ def bench_command(
     The folder's bench.json and bench.md are replaced, and hold what has been measured so far.
     """
     if device == "gpu":
+        others = ("output", "packs", "laws", "replicas", "t0", "with_lammps", "with_jax", "scaling", "baseline")
+        refuse_idle("with --device gpu, which measures one fixed set and writes no files", *others)
         return _on_gpu(as_json)
     shipped = {int(name.split("-")[1]): name for name in reversed(list_packs())}
     names = packs.split(",") if packs else [shipped[size] for size in sorted(shipped)]
@@ -48,7 +50,7 @@ def bench_command(
     before = None
     if baseline:
         with refusing(baseline, "bench.json"):
-            before = json_of(baseline.read_text(), "content")
+            before = json_of(baseline.read_text(encoding="utf-8"), "content")
     claim(output.parent / "bench.json" if not output.is_dir() else output / "bench.json", ".json", force=True)
     with reporting() as progress:
         result = measure.run(

@@ -5,14 +5,18 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import psutil
 import typer
 from rich import progress
+from rich.cells import cell_len
 from rich.console import Console
+from rich.table import Table
 
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checked import NAME, title
@@ -39,8 +43,28 @@ KeptFrames = Annotated[
 PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a pack that is shipped or made.")]
 
 
+# What was typed after the command that runs: the name on the command line of each option and argument by its own.
+GIVEN: ContextVar[Mapping[str, str]] = ContextVar("GIVEN", default=MappingProxyType({}))
+
+
 class InputError(ValueError):
     """Bad input, in words for the command line."""
+
+
+def refuse_idle(why: str, *names: str) -> None:
+    """Refuse options that were typed and would do nothing.
+
+    Args:
+        why: they would not: ends the sentence "--frames-of does nothing ...".
+        names: of the parameters of the command.
+
+    Raises:
+        InputError: naming the first that was.
+    """
+    given = GIVEN.get()
+    for name in names:
+        if name in given:
+            raise InputError(f"{given[name]} does nothing {why}")
 
 
 def say(line: str, **style: Any) -> None:
@@ -54,7 +78,21 @@ def emit(as_json: bool, result: Any, *tables: Any) -> None:
         sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
     else:
         for table in tables:
-            out.print(table, soft_wrap=isinstance(table, str))
+            if isinstance(table, Table):
+                _keep_whole(table)
+            out.print(table, soft_wrap=isinstance(table, str), crop=False)
+
+
+def _keep_whole(table: Table) -> None:
+    """Let a table be as wide as its numbers and words, if the terminal is not: rich would cut them."""
+    least = 1
+    for column in table.columns:
+        breaks = column.overflow == "fold" and not column.no_wrap  # anywhere, but for its head
+        texts = [str(column.header), *map(str, () if breaks else column.cells)]
+        pieces = [piece for text in texts for piece in (text.splitlines() if column.no_wrap else text.split())]
+        column.min_width = max([column.min_width or 0, *map(cell_len, pieces)])
+        least += column.min_width + 3  # a blank on either side, and a rule
+    table.width = least if least > out.width else table.width
 
 
 def require_name(name: str) -> None:

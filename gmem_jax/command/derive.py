@@ -19,6 +19,7 @@ from gmem_jax.command.console import (
     claim,
     drawing,
     emit,
+    refuse_idle,
     reporting,
 )
 from gmem_jax.command.options import Chosen, with_experiment
@@ -260,6 +261,8 @@ def design_command(
     """Pre-distort waveforms so that the recall follows their integrals; writes a CSV for `gmem recall` (minutes)."""
     if by not in (None, "jacobian", "kernel"):
         raise InputError(f"--by must be jacobian or kernel, got {by!r}")
+    if words is not None:
+        refuse_idle("beside --words, which says what they are", "signals")
     chosen = chosen if words is None else chosen.with_signals(f"words:{words}")
     (experiment,), drawn = chosen.claim([pack], output, ".csv", picture=picture, force=force)
     _needs_sub0(experiment)

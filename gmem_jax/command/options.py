@@ -2,18 +2,18 @@
 
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from gmem_jax.command.console import claim
+from gmem_jax.command.console import claim, refuse_idle, say
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.signals import Signals
-from gmem_jax.files.named import named_experiment
+from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.waveforms import load_target
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -27,6 +27,7 @@ _NAMES = ", ".join(entry.name for entry in LAWS)
 class _Option(NamedTuple):
     kind: Any
     words: str
+    flags: tuple[str, ...] = ()
 
 
 _FIELDS = {  # of an experiment
@@ -54,9 +55,16 @@ _OF_LAW = {  # of its friction law
     "variant": _Option(str | None, "m2: averaged, exact or paper."),
 }
 _OTHERS = {
-    "signals": _Option(str, "six; words:L, all words of L bits; or a .csv (a column per signal) or .npy file."),
+    "signals": _Option(
+        str, "six; words:L, all words of L bits; or a .npy or .csv file (a column per signal, one may be time)."
+    ),
     "word_pad": _Option(float | None, "words: bits left free at either end; default 2."),
     "word_width": _Option(float | None, "words: width of bumps, in bits; default 1."),
+    "smooth": _Option(float | None, "Samples in a file: width in u over which they are averaged."),
+    "taper": _Option(
+        float | None, "Samples in a file: width in u at either end within which they are brought to zero."
+    ),
+    "scale": _Option(bool | None, "Samples in a file: divide them by the largest.", ("--scale",)),
     "wall_rigidity": _Option(float | None, "Stiffness of walls over that of rigid ones; default 1."),
     "friction": _Option(str, f"Friction law: {_NAMES}, or the paper's H, M1, M2."),
 }
@@ -108,8 +116,13 @@ class Chosen:
         """
         values = dict(self._values)
         if law_named(values["friction"]) == Frictionless():
+            refuse_idle(f"with --friction {values['friction']}", "mu")
             values["mu"] = None  # the option's default is not for this law
-        return named_experiment(load_pack(pack), values)
+        return named_experiment(load_pack(pack), values, self._signals)
+
+    @functools.cached_property
+    def _signals(self) -> Signals:
+        return named_signals(*waveforms_of(self._values), told=say)
 
 
 def _default(name: str) -> Any:
@@ -121,14 +134,15 @@ def _default(name: str) -> Any:
 def with_experiment(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command all options of an experiment; it gets what they chose as `chosen`."""
     options = {
-        name: (_default(name), option.kind, option.words) for name, option in {**_OTHERS, **_OF_LAW, **_FIELDS}.items()
+        name: (_default(name), option.kind, option.words, option.flags)
+        for name, option in {**_OTHERS, **_OF_LAW, **_FIELDS}.items()
     }
     return _with(command, "chosen", Chosen, options)
 
 
 def with_recipe(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command every number of a preparation as an option; it gets the `recipe` that they make."""
-    options = {entry.name: (entry.default, entry.type, words_of(entry)) for entry in fields(Recipe)}
+    options = {entry.name: (entry.default, entry.type, words_of(entry), ()) for entry in fields(Recipe)}
     return _with(command, "recipe", lambda values: Recipe(**values), options)
 
 
@@ -136,9 +150,9 @@ def _with(
     command: Callable[..., None],
     name: str,
     make: Callable[[dict[str, Any]], Any],
-    options: dict[str, tuple[Any, Any, str]],
+    options: Mapping[str, tuple[Any, Any, str, tuple[str, ...]]],
 ) -> Callable[..., None]:
-    """A command with more options (default, type, help), which gets what `make` makes of their values as `name`."""
+    """A command with more options (default, type, help, flags); it gets what `make` makes of their values as `name`."""
     signature = inspect.signature(command)
     own = [entry for entry in signature.parameters.values() if entry.name != name]
     added = [
@@ -146,9 +160,9 @@ def _with(
             option,
             inspect.Parameter.KEYWORD_ONLY,
             default=default,
-            annotation=Annotated[kind, typer.Option(help=words)],
+            annotation=Annotated[kind, typer.Option(*flags, help=words)],
         )
-        for option, (default, kind, words) in options.items()
+        for option, (default, kind, words, flags) in options.items()
     ]
 
     @functools.wraps(command)

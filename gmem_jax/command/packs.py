@@ -1,7 +1,7 @@
 """`gmem info`, `gmem prepare`."""
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +17,7 @@ from gmem_jax.command.console import (
     announce,
     claim,
     emit,
+    refuse_idle,
     reporting,
     require_name,
     say,
@@ -120,8 +121,8 @@ def prepare_command(
     """
     clump = grain_of(shape, overlap)
     if standard is not None:
-        if output is not None or name or recipe != Recipe() or (shape, overlap) != ("tetra", None):
-            raise InputError(f"{standard}: the name of a standard pack says all about it; leave other options away")
+        own = ("output", "shape", "overlap", "name", *(entry.name for entry in fields(Recipe)))
+        refuse_idle(f"beside {standard}: the name of a standard pack says all about it", *own)
         recipe, name, output = standard_recipe(standard), standard, kept_pack(standard)
         if output is None:
             raise InputError(f"{standard}: there is no home folder to keep it in; set XDG_CACHE_HOME")

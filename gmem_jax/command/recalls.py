@@ -20,6 +20,7 @@ from gmem_jax.command.console import (
     claim,
     drawing,
     emit,
+    refuse_idle,
     reporting,
     say,
 )
@@ -102,6 +103,8 @@ def recall_command(
     """Store waveforms in a pack and recall them."""
     (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
     target = chosen.target(experiment.signals.count)
+    if not frames:
+        refuse_idle("without --frames, which says how many", "frames_of")
     frame_schedule(experiment, frames, frames_of)  # refuses what cannot be before anything is begun
     film: Any = {"frames": frames, "frames_of": frames_of}
     row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)

@@ -7,10 +7,12 @@ from typing import Annotated
 import typer
 
 from gmem_jax.command import sweep
-from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, say
+from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, refuse_idle, say
 from gmem_jax.show.drawing import FORMATS
 from gmem_jax.show.kinds import PLOTS, Draw, shown, sweep_pictures
-from gmem_jax.show.stages import AGAINST
+from gmem_jax.show.stages import AGAINST, QUANTITIES
+
+_OF_STAGES = {name.lower() for name in QUANTITIES}
 
 
 def show(
@@ -30,6 +32,14 @@ def show(
     """
     if against not in AGAINST:
         raise InputError(f"--against {against}: must be one of {', '.join(AGAINST)}")
+    if plot:
+        refuse_idle("beside --plot", "csv")
+    if not plot or plot == "list":
+        refuse_idle("unless something is drawn with --plot", "against", "force")
+    elif plot.lower() not in _OF_STAGES:
+        refuse_idle(f"with --plot {plot}: only pictures of stages ({', '.join(QUANTITIES)}) have it", "against")
+    if csv:
+        refuse_idle("beside --csv", "as_json")
     folder = file.is_dir()
     if folder:
         store = sweep.there(file)
@@ -38,7 +48,7 @@ def show(
         found = shown(file, against)
         pictures = found.pictures
     if plot:
-        _draw(file, pictures, plot, output, force)
+        _draw(file, pictures, plot, output, force, as_json)
     elif output is not None:
         raise InputError(f"--output {output}: say what to draw with --plot, one of {', '.join(pictures)}")
     elif csv:
@@ -51,11 +61,12 @@ def show(
         emit(as_json, found.facts, *found.lines)
 
 
-def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None, force: bool) -> None:
+def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None, force: bool, as_json: bool) -> None:
     names = {name.lower(): name for name in pictures}
     if plot == "list":
-        sys.stdout.writelines(f"{name:17}  {PLOTS[name]}\n" for name in pictures)
-        return
+        refuse_idle("with --plot list, which draws nothing", "output")
+        lines = "\n".join(f"{name:17}  {PLOTS[name]}" for name in pictures)
+        return emit(as_json, {"pictures": list(pictures), "status": 0}, lines)
     if plot.lower() not in names:
         raise InputError(f"--plot {plot}: there is no such picture of {file}; there are {', '.join(pictures)}")
     if output is None:
@@ -64,6 +75,7 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
         raise InputError(f"--output {output}: must end in one of {', '.join(FORMATS)}")
     pictures[names[plot.lower()]](claim(output, "", inputs=(file,), force=force))
     say(f"wrote {output}")
+    emit(as_json, {"output": str(output), "status": 0})
 
 
 COMMANDS = {"show": show}

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, reporting, say
+from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, refuse_idle, reporting, say
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
@@ -44,6 +44,11 @@ def sweep_command(
     gmem sweep mu.toml; gmem sweep status mu; gmem sweep show mu --over pack; gmem sweep export mu -o mu.csv
     """
     if what in VERBS:
+        refuse_idle(f"with {what}: it runs no points", "executor", "workers", "retry")
+        if what != "show":
+            refuse_idle(f"with {what}; it is of show", "over")
+        if what != "export":
+            refuse_idle(f"with {what}, which writes no file", "output", "force")
         if folder is None:
             raise InputError(f"gmem sweep {what}: name the folder of a sweep")
         store = there(folder)
@@ -54,13 +59,17 @@ def sweep_command(
         else:
             show(store, over, as_json)
         return
+    if folder is not None and Path(what).suffix == ".toml":
+        raise InputError(f"{folder}: does nothing after a sweep file; name its folder with -o {folder}")
+    refuse_idle("where a sweep is done: it goes on in its folder and replaces nothing", "force")
+    refuse_idle("where a sweep is done; gmem sweep show FOLDER --over has it", "over")
     path = Path(what)
     if path.suffix != ".toml":
         raise InputError(f"{what}: neither a sweep file (.toml) nor one of {', '.join(VERBS)}")
     spec = read_spec(path)
     options = {name: value for name, value in spec.run.items() if name not in RUN}
     count = workers or spec.run.get("workers")
-    if count is not None and (not isinstance(count, int) or count < 1):
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
         raise InputError(f"{path}: workers must be a whole number from 1, got {count!r}")
     chosen = executor_named(executor or str(spec.run.get("executor", "processes")), count, options)
     target = output or path.with_suffix("")

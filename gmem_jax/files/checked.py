@@ -23,6 +23,22 @@ FIXED = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that hav
 LONGEST = 18  # digits of a whole number: no count or seed has more
 NAME = 200  # characters of what is printed
 PATH = 4096  # of a path
+# Names in TOML and JSON and what stands there; under all others a number, or lists of them.
+TEXTS = (
+    "pack",
+    "signals",
+    "friction",
+    "law",
+    "kind",
+    "shape",
+    "background",
+    "shear",
+    "backend",
+    "precision",
+    "variant",
+)
+COUNTS = ("steps", "points", "grains", "seed", "cycles")
+FLAGS = ("scale",)
 _SHOWN = 160  # characters of an error of some library
 
 
@@ -152,6 +168,34 @@ def _whole(digits: str) -> int:
 def is_number(value: Any) -> bool:
     """Whether it is a finite real number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
+
+
+def require_kinds(values: Mapping[str, Any]) -> None:
+    """Refuse values of TOML, JSON or the command line that are not of the kind that their names ask for.
+
+    Args:
+        values: by name, which may be dotted; None stands for a default.
+
+    Raises:
+        ValueError: naming the first that is a text or true where a number should be, or the other way round.
+    """
+    for name, value in values.items():
+        kind = name.rpartition(".")[2]
+        if kind in TEXTS:
+            right, words = isinstance(value, str), "a text"
+        elif kind in FLAGS:
+            right, words = isinstance(value, bool), "true or false"
+        elif kind in COUNTS:
+            right, words = isinstance(value, int) and not isinstance(value, bool), "a whole number"
+        else:
+            right, words = _numeric(value), "a number"
+        if value is not None and not right:
+            raise ValueError(f"{name} must be {words}, got {json.dumps(value, default=str)[:_SHOWN]}")
+
+
+def _numeric(value: Any) -> bool:
+    """Whether it is a number, or lists of them; what is no JSON is judged by those who use it."""
+    return all(map(_numeric, value)) if isinstance(value, list) else not isinstance(value, bool | str | Mapping | None)
 
 
 def numbers(value: Any) -> bool:

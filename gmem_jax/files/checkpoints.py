@@ -171,14 +171,14 @@ class Checkpoints(ResultCache):
         self.folder.mkdir(exist_ok=True)
         sweep(self.folder)
         with atomic(self.folder / "run.json") as temporary:
-            temporary.write_text(json.dumps(wanted, indent=1))
+            temporary.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
 
     @staticmethod
     def key_of(folder: Path) -> dict[str, Any]:
         """The key stored in a folder of parts; empty if there is none that can be read."""
         card = Path(folder) / "run.json"
         try:
-            key = json.loads(card.read_text()) if card.is_file() else {}
+            key = json.loads(card.read_text(encoding="utf-8")) if card.is_file() else {}
         except (ValueError, OSError):
             key = {}
         return key if isinstance(key, dict) else {}
@@ -227,7 +227,7 @@ def locked(output: Path) -> Iterator[None]:
     import fcntl  # where there is none, as on Windows, there is no lock either
 
     lock = output.with_name(f".{output.name}.lock")
-    with lock.open("a+") as file:
+    with lock.open("a+", encoding="utf-8") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.fstat(file.fileno()).st_ino != lock.stat().st_ino:

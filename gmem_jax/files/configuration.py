@@ -25,7 +25,7 @@ from gmem_jax.experiment.signals import (
     word_bits,
     words,
 )
-from gmem_jax.files.checked import numbers, require
+from gmem_jax.files.checked import numbers, require, require_kinds
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
@@ -112,6 +112,7 @@ def signals_from(written: Mapping[str, Any]) -> Signals:
     Raises:
         ValueError: if they are of a kind that has none, or its numbers make no waveforms.
     """
+    require_kinds(written)
     kind = written["kind"]
     if kind == "six":
         return six_signals()
@@ -137,6 +138,7 @@ def written_law(law: FrictionLaw) -> dict[str, Any]:
 
 
 def _law_from(written: Mapping[str, Any]) -> FrictionLaw:
+    require_kinds(written)
     parameters = {name: _number(value) for name, value in written.items() if name != "law"}
     return law_named(written["law"], **parameters)
 
@@ -181,6 +183,8 @@ def experiment_from(configuration: Mapping[str, Any], pack: Pack | None = None) 
     pack = load_pack(of_pack["source"]) if pack is None else pack
     if pack_fingerprint(pack) != of_pack["sha256"]:
         raise FileFormatError(f"{of_pack['source']}: not the pack that this was made with (its content has changed)")
+    require_kinds({name: value for name, value in configuration.items() if name not in _PARTS})
+    require_kinds(configuration["material"])
     own = {name: _number(value) for name, value in configuration.items() if name not in _PARTS}
     material = material_from(configuration["material"])
     return Experiment(

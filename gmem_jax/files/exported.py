@@ -155,7 +155,7 @@ def write_dump(path: Path, frames: Frames, mass: float, material: Material) -> N
 
 def _rows(file: TextIO, form: str, *columns: np.ndarray) -> None:
     """A line of this form for every row of the columns beside each other; whole numbers are exact as floats here."""
-    np.savetxt(file, np.column_stack(columns), fmt=form)
+    np.savetxt(file, np.column_stack(columns), fmt=form, encoding="utf-8")
 
 
 def write_vtp(path: Path, frames: Frames, mass: float, material: Material) -> None:

@@ -16,7 +16,7 @@ SWITCH = "GMEM_COMPILE_CACHE"  # another folder, or "off"
 def _processor() -> str:
     """A few letters that differ between CPUs that cannot run each other's programs; homes are shared in clusters."""
     facts = Path("/proc/cpuinfo")
-    lines = facts.read_text().splitlines() if facts.is_file() else []
+    lines = facts.read_text(encoding="utf-8").splitlines() if facts.is_file() else []
     known = [line for line in lines if line.startswith(("model name", "flags", "Features"))][:2] or [
         platform.processor()
     ]

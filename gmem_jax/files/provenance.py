@@ -16,14 +16,14 @@ def _commit() -> str | None:
     head = git / "HEAD"
     if not head.is_file():
         return None
-    text = head.read_text().strip()
+    text = head.read_text(encoding="utf-8").strip()
     if not text.startswith("ref: "):
         return text
     name = text.removeprefix("ref: ")
     if (git / name).is_file():
-        return (git / name).read_text().strip()
+        return (git / name).read_text(encoding="utf-8").strip()
     packed = git / "packed-refs"
-    lines = packed.read_text().splitlines() if packed.is_file() else []
+    lines = packed.read_text(encoding="utf-8").splitlines() if packed.is_file() else []
     return next((line.split()[0] for line in lines if line.endswith(" " + name)), None)
 
 

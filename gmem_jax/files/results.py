@@ -36,7 +36,7 @@ def save_result(path: Path, schema: Schema, result: dict[str, Any]) -> None:
     }
     with atomic(path) as temporary:
         content = finite({"schema": schema.name, **result, "about": about})
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+        temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def load_result(path: Path) -> tuple[Schema, dict[str, Any]]:
@@ -49,7 +49,7 @@ def load_result(path: Path) -> tuple[Schema, dict[str, Any]]:
     path = Path(path)
     with refusing(path, "result"):
         require(path.stat().st_size <= _LARGEST, f"a result of more than {_LARGEST >> 20} MB")
-        found = json_of(path.read_text(), "content")
+        found = json_of(path.read_text(encoding="utf-8"), "content")
         schema = _schema_of(found)
         for name, field in schema.arrays.items():
             value, missing = _at(found, name)

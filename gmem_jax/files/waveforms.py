@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
+from gmem_jax.experiment.samples import Told, require_gentle, untold, waveform_from
 from gmem_jax.experiment.signals import Signals, Spline
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import json_of, numbers, read_npy, refusing, require_fields, title
+from gmem_jax.files.columns import Columns, read_columns
 from gmem_jax.files.configuration import signals_from, written_signals
 from gmem_jax.physics.rules import usual_rules
 
@@ -20,27 +22,61 @@ _TARGET, _DESIGN = "# target: ", "# design: "
 
 
 @usual_rules()
-def load_waveforms(path: str | Path) -> np.ndarray:
+def load_waveforms(
+    path: str | Path, *, smooth: float = 0.0, taper: float = 0.0, scale: bool = False, told: Told = untold
+) -> np.ndarray:
     """Waveform samples [S, n] from a CSV (one column per signal) or NPY ([n] or [S, n]) file.
 
-    Row k is I at u = k / (n + 1), k = 1..n. A CSV may have one header line of names.
+    Row k is I at u = k / (n + 1), k = 1..n, in the file and in what is returned. A CSV may have a line of names; a
+    column called u, or t or time with or without a unit, is the axis: times become u from 0 to 1, first to last.
+
+    Args:
+        path: the file.
+        smooth: width in u over which samples are averaged; see `waveform_from` for this and what follows.
+        taper: width in u at either end within which waveforms are brought to zero.
+        scale: whether to divide by the largest value of all.
+        told: gets a line on what was found and changed, if anything was: print, say.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it cannot be read as real numbers, is ragged, has a column of u, or holds numbers that are
-            not finite.
+        FileFormatError: if it cannot be read as real numbers, is ragged, has decimal commas, names that fit no columns
+            or an axis that is not called so; holds numbers that are not finite, or waveforms that no pack could hold.
     """
     path = Path(path)
     with refusing(path, "table of numbers"):
         if path.stat().st_size > _LARGEST:
             raise FileFormatError(f"{path}: waveforms in a file of more than {_LARGEST >> 20} MB")
-        values = _npy(path) if path.suffix.lower() == ".npy" else _csv(path)
+        found = Columns(_npy(path)) if path.suffix.lower() == ".npy" else read_columns(path)
+    values = found.values
     if values.ndim != 2 or values.shape[0] < 1 or values.shape[1] < 2:
         raise FileFormatError(f"{path}: a waveform needs at least 2 samples; found an array of shape {values.shape}")
     if not np.all(np.isfinite(values)):
         where = np.argwhere(~np.isfinite(values))[0]
         raise FileFormatError(f"{path}: sample {where[1] + 1} of signal {where[0] + 1} is not a finite number")
+    said = list(found.said)
+    try:
+        if found.axis is not None or smooth or taper or scale:
+            at, span = _places(found, said)
+            made = waveform_from(at, values, span=span, smooth=smooth, taper=taper, scale=scale, told=said.append)
+            values = np.asarray(made.nodes)[:, 1:-1]
+        elif not _marked(path, _TARGET):  # a design was simulated as it is
+            require_gentle(np.pad(values, ((0, 0), (1, 1))))
+    except ValueError as error:
+        raise FileFormatError(f"{path}: {error}") from error
+    if said:
+        told(f"{path}: {'; '.join(said)}")
     return values
+
+
+def _places(found: Columns, said: list[str]) -> tuple[np.ndarray, tuple[float, float] | None]:
+    """Where samples were taken, and what is u = 0 and 1 there; None for the first and the last."""
+    if found.axis is None:
+        count = found.values.shape[1]
+        return np.arange(1, count + 1) / (count + 1.0), (0.0, 1.0)
+    if found.name.lower().startswith("u"):
+        return found.axis, (0.0, 1.0)
+    said.append(f"{found.name} from {found.axis[0]:g} to {found.axis[-1]:g} is u from 0 to 1")
+    return found.axis, None
 
 
 def load_target(path: Path) -> Signals | None:
@@ -73,42 +109,22 @@ def load_design(path: Path) -> dict[str, Any]:
 
 def _comment(path: Path, mark: str) -> dict[str, Any]:
     """The JSON of a comment in one of the first two lines; {} if there is none."""
+    found = _marked(path, mark)
+    return json_of(found.decode(), mark.strip("# :")) if found else {}
+
+
+def _marked(path: Path, mark: str) -> bytes:
     with path.open("rb") as file:
         lines = [file.readline(_LARGEST) for _ in range(2)]
     for line in (line.removeprefix(codecs.BOM_UTF8) for line in lines):
         if line.startswith(mark.encode()):
-            return json_of(line.decode().removeprefix(mark), mark.strip("# :"))
-    return {}
+            return line.removeprefix(mark.encode())
+    return b""
 
 
 def _npy(path: Path) -> np.ndarray:
     with path.open("rb") as file:
         return np.atleast_2d(read_npy(file, path.stat().st_size, "it").astype(float))
-
-
-def _csv(path: Path) -> np.ndarray:
-    lines = [line for line in path.read_text("utf-8-sig").splitlines() if line.strip() and not line.startswith("#")]
-    if not lines:
-        return np.zeros((0, 0))
-    first = lines[0].split(",")
-    numbers = [_is_number(cell) for cell in first]
-    if any(numbers) and not all(numbers):
-        raise FileFormatError(f"{path}: its first line mixes numbers and words ({lines[0].strip()[:40]!r})")
-    names = [] if all(numbers) else [cell.strip().lower() for cell in first]
-    rows = lines[1:] if names else lines
-    values = np.loadtxt(rows, delimiter=",", ndmin=2).T if rows else np.zeros((0, 0))
-    u = (np.arange(values.shape[1]) + 1.0) / (values.shape[1] + 1.0)
-    if "u" in names or (len(values) > 1 and np.allclose(values[0], u, atol=1e-6)):
-        raise FileFormatError(f"{path}: has a column of u; give the waveforms alone, row k at u = k / (n + 1)")
-    return values
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 @usual_rules()
@@ -133,4 +149,4 @@ def save_waveforms(
     if target is not None:
         header = f"{_TARGET}{json.dumps(written_signals(target))}\n{header}"
     with atomic(Path(path)) as temporary:
-        np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g")
+        np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g", encoding="utf-8")

@@ -60,7 +60,7 @@ class Recipe:
     """
 
     grains: int = _number(325, "[12, inf)", "Number of grains N")
-    seed: int = _number(1, "[0, 1e18]", "Random seed")
+    seed: int = _number(1, "[0, 9007199254740991]", "Random seed, a number that JSON holds exactly")
     delta0: float = _number(0.05, "(0, 0.5)", "Areal compression of the cycles and of the experiment")
     t0: float = _number(1.8e3, "(0, inf)", "Duration of one compression", "t_c")
     dt: float = _number(0.3, "(0, 0.5]", "Largest time step", "t_c")

@@ -146,7 +146,7 @@ def write_csv(path: Path, found: Sequence[Effect]) -> None:
         OSError: if it cannot be written.
     """
     lines = rows(found)
-    with atomic(path) as temporary, temporary.open("w", newline="") as file:
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
         writer.writerows(lines)

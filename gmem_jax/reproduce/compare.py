@@ -212,7 +212,7 @@ def write_csv(path: Path, rows: Sequence[Compared]) -> None:
             | {"published_grains": row.grains, "published_mean": theirs.mean, "published_sd": theirs.sd}
             | {"published_packs": theirs.packs, "combined_errors_apart": row.errors_apart, "status": row.status}
         )
-    with atomic(path) as temporary, temporary.open("w", newline="") as file:
+    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
         for line in lines:

@@ -169,7 +169,7 @@ def judge(
     tetra, sphere = (conductor.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
     found = claims.verdicts(tetra, size.t0, runs[:-1], {"sphere": sphere})
     with atomic(_target(folder, "claims", scale, ".json")) as path:
-        path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n")
+        path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n", encoding="utf-8")
     return found
 
 

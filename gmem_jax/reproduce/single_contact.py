@@ -163,4 +163,12 @@ def write_columns(path: Path, names: list[str], columns: list[np.ndarray]) -> No
         OSError: if it cannot be written.
     """
     with atomic(path) as temporary:
-        np.savetxt(temporary, np.column_stack(columns), delimiter=",", header=",".join(names), comments="", fmt="%.8g")
+        np.savetxt(
+            temporary,
+            np.column_stack(columns),
+            delimiter=",",
+            header=",".join(names),
+            comments="",
+            fmt="%.8g",
+            encoding="utf-8",
+        )

@@ -31,7 +31,7 @@ def published(file: str = "six_signals.csv", **conditions: str | float) -> list[
 
     The tables are of arXiv:2603.14595 and its authors' public table of the data, `gmem-data`.
     """
-    text = (resources.files("gmem_jax") / "reference" / file).read_text()
+    text = (resources.files("gmem_jax") / "reference" / file).read_text(encoding="utf-8")
     rows = [{key: _number(cell) for key, cell in row.items()} for row in csv.DictReader(text.splitlines())]
     return [row for row in rows if all(row[key] == value for key, value in conditions.items())]
 

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from gmem_jax.errors import FileFormatError
+from gmem_jax.files.checked import is_number, whole
 
 TABLES = ("experiment", "vary", "zip", "points", "prepare", "run")
 PREPARE = "prepare."
@@ -75,7 +76,7 @@ def read_spec(path: Path) -> Spec:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        tables = tomllib.loads(path.read_text())
+        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: not TOML ({error})") from error
     try:
@@ -104,7 +105,14 @@ def spec_of(tables: Mapping[str, Any]) -> Spec:
         lengths = {name: len(values) for name, values in axis.items()}
         _require(len(set(lengths.values())) == 1, f"[[zip]]: {lengths} differ in length")
     own = {PREPARE + name: value for name, value in prepare.items()}
+    both = sorted(set(own) & set(shared))
+    _require(not both, f"{both[:1]}: give it in [prepare] or in [experiment], not in both")
     spec = Spec({**shared, **own}, tuple(axes), tuple(extra), run)
+    grid = set().union(*axes) if axes else set.intersection(*map(set, extra)) if extra else set()
+    if idle := sorted(set(spec.shared) & grid):
+        raise ValueError(
+            f"{idle[0]} varies, so that its value in [experiment] or [prepare] does nothing; leave one out"
+        )
     twice = [name for name in spec.names if sum(name in axis for axis in axes) > 1]
     _require(not twice, f"{twice[:1]} varies twice")
     _require(bool(axes or extra), "nothing varies: give a table [vary], [[zip]] or [[points]]")
@@ -122,8 +130,14 @@ def _values(name: str, value: Any) -> list[Any]:
             f"{name}: give a list, or from, to and count (and factors = true)",
         )
         numbers = [value["from"], value["to"]]
-        _require(all(isinstance(one, int | float) and math.isfinite(one) for one in numbers), f"{name}: not numbers")
-        _require(isinstance(value["count"], int) and 2 <= value["count"] <= MOST, f"{name}: count must be 2 or more")
+        _require(
+            all(map(is_number, numbers)), f"{name}: from and to must be numbers, got {numbers[0]} and {numbers[1]}"
+        )
+        count = value["count"]
+        _require(
+            whole(count) and 2 <= count <= MOST, f"{name}: count must be a whole number from 2 to {MOST}, got {count}"
+        )
+        _require(isinstance(value.get("factors", False), bool), f"{name}: factors must be true or false")
         low, high, last = float(numbers[0]), float(numbers[1]), value["count"] - 1
         if value.get("factors", False):
             _require(low > 0.0 and high > 0.0, f"{name}: equal factors need positive numbers")

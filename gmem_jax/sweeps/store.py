@@ -86,7 +86,7 @@ class Store:
             FileFormatError: if there is nothing of the kind.
         """
         try:
-            card = json.loads(self._card.read_text())
+            card = json.loads(self._card.read_text(encoding="utf-8"))
             if card["schema"] != SWEEP_SCHEMA:
                 raise FileFormatError(f"{self._card}: schema is {card['schema']!r}, expected {SWEEP_SCHEMA!r}")
             found = {"shared": dict(card["shared"]), "names": [str(name) for name in card["names"]]}
@@ -100,7 +100,7 @@ class Store:
     @staticmethod
     def _write(path: Path, value: Any) -> None:
         with atomic(path) as temporary:
-            temporary.write_text(json.dumps(value, indent=1))
+            temporary.write_text(json.dumps(value, indent=1), encoding="utf-8")
 
     def at(self, key: str) -> Path:
         """The file of a point's recall."""
@@ -119,7 +119,7 @@ class Store:
         found = {}
         for path in (self.folder / "failed").glob("*.json"):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                found[path.stem] = str(json.loads(path.read_text())["reason"])
+                found[path.stem] = str(json.loads(path.read_text(encoding="utf-8"))["reason"])
         return found
 
     def save(self, key: str, recall: Recall, configuration: dict[str, Any]) -> None:
@@ -189,12 +189,12 @@ class Store:
         found = []
         for path in (self.folder / "parts").glob(f"*/{JOB}"):
             with contextlib.suppress(OSError, ValueError):
-                found.append(json.loads(path.read_text()))
+                found.append(json.loads(path.read_text(encoding="utf-8")))
         return found
 
     def jobs(self) -> list[dict[str, Any]]:
         """The jobs that were put up, in order."""
-        return [json.loads(path.read_text()) for path in sorted((self.folder / "jobs").glob("*.json"))]
+        return [json.loads(path.read_text(encoding="utf-8")) for path in sorted((self.folder / "jobs").glob("*.json"))]
 
     def begun(self, keys: set[str]) -> list[dict[str, Any]]:
         """Unfinished runs of some points that a worker is at, or was: they go on as they were begun."""
@@ -236,7 +236,7 @@ class Store:
         # Not flushed to the disk: it is said again within seconds.
         path = self.folder / "workers" / f"{worker}.json"
         temporary = path.with_suffix(f".{os.getpid()}")
-        temporary.write_text(json.dumps({"job": job, "fraction": fraction, "what": what}))
+        temporary.write_text(json.dumps({"job": job, "fraction": fraction, "what": what}), encoding="utf-8")
         temporary.replace(path)
 
     def told(self) -> list[dict[str, Any]]:
@@ -244,7 +244,7 @@ class Store:
         found = []
         for path in (self.folder / "workers").glob("*.json"):
             with contextlib.suppress(OSError, ValueError):
-                found.append(json.loads(path.read_text()))
+                found.append(json.loads(path.read_text(encoding="utf-8")))
         return found
 
     def log_of(self, worker: str) -> Path:
@@ -255,5 +255,6 @@ class Store:
         """What the workers with such files said, who said something last at the end."""
         logs = (self.folder / "workers").glob("*.log")
         return "\n".join(
-            path.read_text(errors="replace") for path in sorted(logs, key=lambda path: path.stat().st_mtime)
+            path.read_text(encoding="utf-8", errors="replace")
+            for path in sorted(logs, key=lambda path: path.stat().st_mtime)
         )

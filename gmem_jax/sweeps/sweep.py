@@ -20,6 +20,7 @@ from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall, replica_bins
+from gmem_jax.files.checked import require_kinds
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
@@ -144,12 +145,15 @@ class Conductor:
 
     def __init__(self, spec: Spec, folder: Path, say: Tell, *, cost: float = COST) -> None:
         self.spec, self.store, self.say, self.cost = spec, Store(folder), say, cost
-        self._packs, self._signals = functools.cache(load_pack), functools.cache(named_signals)
+        self._packs = functools.cache(load_pack)
+        self._signals = functools.cache(functools.partial(named_signals, told=say))
         self.impossible: list[tuple[dict[str, Any], str]] = []
 
     def _recipe(self, values: Mapping[str, Any]) -> tuple[Recipe, dict[str, Any]]:
         """How a pack is to be made, and of which grain."""
         own = {name.removeprefix(PREPARE): value for name, value in values.items() if name.startswith(PREPARE)}
+        if own.get("shape") == "sphere" and "overlap" in own:
+            raise ValueError("prepare.overlap does nothing with prepare.shape = 'sphere'; it is of tetra grains")
         shape = {name: own.pop(name, default) for name, default in GRAIN.items()}
         known = {field.name: field for field in fields(Recipe)}
         if unknown := sorted(set(own) - set(known)):
@@ -197,6 +201,7 @@ class Conductor:
             tried += [{**first, **{name: values[place] for name, values in axis.items()}} for place in places]
         for values in tried:
             all_ = {**self.spec.shared, **values}
+            require_kinds(all_)
             if "pack" not in all_:
                 self._pack_job(all_)
             self._experiment(all_, self._packs(str(all_.get("pack", ANY_PACK))))

@@ -74,7 +74,7 @@ def export(store: Store, path: Path) -> None:
     suffix = path.suffix.lower()
     table = rows(store)
     if suffix == ".csv":
-        with atomic(path) as temporary, temporary.open("w", newline="") as file:
+        with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(table[0]))
             writer.writeheader()
             writer.writerows(table)

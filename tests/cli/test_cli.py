@@ -1,7 +1,9 @@
 """The `gmem` command as a user meets it: results, JSON, and one clear line for every kind of bad input."""
 
 import json
+import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +40,12 @@ def test_help_and_info_work(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     assert gmem(monkeypatch, "info") == 0
     lines = capsys.readouterr().out.splitlines()  # however narrow the terminal is
     assert {f"backend: {facts['backend']}", "shipped packs: " + ", ".join(facts["packs"])} <= set(lines)
+
+
+@pytest.mark.parametrize("command", [["-m", "gmem_jax"], ["-c", "from gmem_jax.command.app import main; main()"]])
+def test_the_version_is_told(command: list[str]) -> None:
+    done = subprocess.run([sys.executable, *command, "--version"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, f"gmem-jax {metadata.version('gmem-jax')}\n")
 
 
 COMMANDS = [
@@ -208,7 +216,8 @@ BAD = [
     (["prepare", "--pressure", "-2", "-o", "{out}"], "pressure must be in (0, inf) E, got -2"),
     (["prepare", "--grains", "12", "--filling", "0.05", "-o", "{out}"], "flatter than a grain (3.0 R)"),
     (["prepare", "--dt", "0.6", "-o", "{out}"], "dt must be in (0, 0.5] t_c, got 0.6"),
-    (["prepare", "--seed", "-1", "-o", "{out}"], "seed must be in [0, 1e18], got -1"),
+    (["prepare", "--seed", "-1", "-o", "{out}"], "seed must be in [0, 9007199254740991], got -1"),
+    (["prepare", "--seed", "9223372036854775808", "-o", "{out}"], "seed must be in [0, 9007199254740991]"),
     (["prepare", "--backend", "foo", "-o", "{out}"], "backend must be one of auto, jax, native; got 'foo'"),
     (["prepare", "--name", "x" * 201, "-o", "{out}"], "--name: must be a line of at most 200 printable characters"),
     (["prepare", "-o", "/proc/nowhere/pack.h5"], "folder /proc/nowhere does not exist"),
@@ -241,7 +250,10 @@ BAD = [
     (["classify", "{truncated.h5}", "-o", "{json}"], "its checksum does not fit its content"),
     (["classify", "nothing.h5", "-o", "{json}"], "nothing.h5: no such file"),
     (["classify", "nothing.h5", "--seeds", "0", "-o", "{out}"], "'--seeds'"),
-    (["sing"], "No such command"),
+    (["recall", "{pack}", "--friction", "M2", "--points", "9223372036854775808", "-o", "{out}"], "points must be 2 to"),
+    (["zzz"], "No such command 'zzz'; there are info, prepare, recall"),
+    (["recal"], "No such command 'recal'. Did you mean 'recall'?"),
+    (["view"], "gm.view shows a pack or a recall in a notebook, gmem report FILE as a page"),
     (["recall", "{pack}", "--loud"], "No such option"),
 ]
 

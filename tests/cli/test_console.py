@@ -3,8 +3,11 @@
 from collections.abc import Iterator
 
 import pytest
+from rich.console import Console
+from rich.table import Table
 
 from gmem_jax.command import console
+from gmem_jax.show import tables
 
 
 @pytest.fixture
@@ -26,3 +29,28 @@ def test_a_second_pass_has_a_time_left_of_its_own(clock: list[float], capsys: py
     packs, points = ([line for line in said if name in line] for name in ("packs", "points"))
     assert "  50%  packs, 50000 s left" in packs
     assert "  51%  points, 490 s left" in points
+
+
+ROW = {
+    "pack": "tetra-325-a",
+    "gain": 0.2591,
+    "fidelity": 0.6581,
+    "windowed_gain": 0.2612,
+    "windowed_fidelity": 0.9013,
+    "ringing_period": 39.7,
+    "status_names": "not_at_rest ringing",
+}
+CONDITIONS = {"mu": 1.0, "gamma0": 1e-3, "delta0": 0.05, "t0": 1800.0, "friction": "hooke"}
+
+
+@pytest.mark.parametrize("width", [1, 20, 40, 80, 200])
+def test_no_number_of_a_table_is_cut_however_narrow_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, width: int
+) -> None:
+    monkeypatch.setattr(console, "out", Console(highlight=False, markup=False, width=width))
+    other = Table("name", "value")
+    other.add_row("a long name", "123456789.25")
+    console.emit(False, {}, tables.recall_table([ROW, ROW], CONDITIONS), other)
+    said = capsys.readouterr().out
+    for number in ("0.259", "0.658", "0.261", "0.901", "40", "123456789.25"):
+        assert f" {number} " in said

@@ -70,8 +70,7 @@ def test_a_picture_that_is_there_counts_too(
     ("text", "words"),
     [
         ("0.1,x\n0.2,0.3\n0.1,0.2\n", "its first line mixes numbers and words"),
-        ("u,I\n0.25,1\n0.5,2\n0.75,1\n", "has a column of u"),
-        ("0.25,1\n0.5,2\n0.75,1\n", "has a column of u"),
+        ("0.25,1\n0.5,2\n0.75,1\n", "column 1 rises by equal steps, as times and row numbers do"),
         ("0\n0\n0\n", "every waveform is zero"),
     ],
 )

@@ -12,6 +12,8 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle, static
 from gmem_jax.physics.rotation import cross, dot
 
+MOST_POINTS = 10_000  # of a history; the paper has 100
+
 
 @pytree
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Mindlin:
         spinning: see `gmem_jax.physics.contact.hooke.Hooke`.
         p_max: largest overlap that the points cover, in R. Packs of the paper reach 0.16 at u = 1. Beyond it the
             outermost ring is extrapolated, and the run has failed (`Status.OVERLAP_RANGE`).
-        points: Q, at least 2.
+        points: Q, 2 to 10,000.
         variant: "averaged", "exact" or "paper".
 
     Raises:
@@ -80,8 +82,8 @@ class Mindlin:
 
     def __post_init__(self) -> None:
         settle(self)
-        if self.points < 2:
-            raise ValueError(f"Mindlin.points must be at least 2, got {self.points}")
+        if not 2 <= self.points <= MOST_POINTS:
+            raise ValueError(f"Mindlin.points must be 2 to {MOST_POINTS}, got {self.points}")
         if self.variant not in ("averaged", "exact", "paper"):
             raise ValueError(f"Mindlin.variant must be 'averaged', 'exact' or 'paper', got {self.variant!r}")
 

@@ -1,0 +1,168 @@
+"""Waveforms from samples of anything: times become u; noise is smoothed and ends are brought to zero where asked."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment.signals import Spline, waveform
+from gmem_jax.simulation.protocol import BINS
+
+STEEPEST = 0.2  # of its largest value, that a waveform may change by within a bin. Words of 12 bits, the steepest there
+# are, have 0.196. Noise that makes 0.23 changes J by 1 % and what a pack gives back by 29 %; see docs/howto/waveform.md
+OPEN = 0.01  # of its largest value, that a waveform may have at an end (it is then set to zero)
+WIDEST = 0.5  # in u, of what is smoothed or tapered
+_TAPER = "bring it there, with taper = 0.1 (gmem recall --taper 0.1)"
+_FINE = 8  # points a bin, at which slopes are looked at
+
+Told = Callable[[str], None]
+
+
+def untold(_: str) -> None:
+    """Tell nobody."""
+
+
+def waveform_from(
+    t: jax.typing.ArrayLike,
+    x: jax.typing.ArrayLike,
+    *,
+    span: tuple[float, float] | None = None,
+    smooth: float = 0.0,
+    taper: float = 0.0,
+    scale: bool = False,
+    told: Told = untold,
+) -> Spline:
+    """A waveform from what was measured or made at given times; these become u, from 0 to 1.
+
+    Samples at equal steps become the nodes of the curve as they are. Others, and those that are smoothed, are taken
+    over to equal steps of 1/256 or less, along straight lines. Nothing else is changed unless it is asked for: a curve
+    that no pack could hold is refused. What is asked for is done in the order of the arguments.
+
+    Args:
+        t: times or places, rising, [n], in any unit.
+        x: samples there, for one signal [n] or several [S, n]. A waveform has no unit, and 1 is its usual size.
+        span: the times at which u is 0 and 1, where the waveform is zero if there is no sample; default the first and
+            the last.
+        smooth: width in u over which samples are averaged (with the weight of a squared cosine); 0 leaves them alone.
+        taper: width in u at either end within which the waveform is brought to zero, by a squared sine; 0 leaves it.
+        scale: whether to divide by the largest value of all signals.
+        told: gets a line on what was changed, if anything was: print, say.
+
+    Raises:
+        ValueError: if the shapes do not fit, a number is not finite, times do not rise or lie outside the span, a width
+            is none; if a waveform does not begin or end at zero, or is steeper than a pack can follow: the line says
+            what would help.
+    """
+    places, values = np.asarray(t, float), np.atleast_2d(np.asarray(x, float))
+    if places.ndim != 1 or values.ndim != 2 or values.shape[1:] != places.shape or places.size < 2:
+        raise ValueError(
+            f"a waveform needs samples [n] or [signals, n] at times [n], n >= 2; got {np.shape(x)} at {np.shape(t)}"
+        )
+    if not (np.all(np.isfinite(places)) and np.all(np.isfinite(values))):
+        raise ValueError("a time or a sample is not a finite number")
+    if not np.all(np.diff(places) > 0.0):
+        raise ValueError(f"times must rise; sample {np.argmin(np.diff(places) > 0.0) + 2} is not after the one before")
+    for name, width in (("smooth", smooth), ("taper", taper)):
+        if not 0.0 <= width <= WIDEST:
+            raise ValueError(f"{name} must be in [0, {WIDEST}], a width in u, got {width}")
+    u = _placed(places, (places[0], places[-1]) if span is None else span)
+    missing = [int(u[0] > 0.0), int(u[-1] < 1.0)]
+    u, values = np.pad(u, missing, constant_values=(0.0, 1.0)), np.pad(values, ((0, 0), missing))
+    done = []
+    nodes = _smoothed(u, values, smooth) if smooth else _even(u, values)
+    if smooth:
+        taken = values - np.stack([np.interp(u, np.linspace(0.0, 1.0, BINS + 1), row) for row in nodes])
+        done.append(f"smoothed over {smooth:g} in u (which took away {np.sqrt(np.mean(taken**2)):.2g} rms)")
+    ends = float(np.max(np.abs(nodes[:, [0, -1]])))
+    if taper:
+        inwards = np.minimum(np.linspace(0.0, 1.0, nodes.shape[1]), np.linspace(1.0, 0.0, nodes.shape[1]))
+        nodes = nodes * np.sin(0.5 * np.pi * np.minimum(1.0, inwards / taper)) ** 2
+        done.append(f"brought to zero within {taper:g} in u of its ends (which were at {ends:.3g} at most)")
+    if scale and (largest := float(np.max(np.abs(nodes)))) > 0.0:
+        nodes = nodes / largest
+        done.append(f"divided by {largest:.4g}")
+    require_closed(nodes)
+    if ends > 1e-9 and not taper:
+        done.append(f"set to zero at its ends (which were at {ends:.2g} at most)")
+    require_gentle(nodes)
+    if done:
+        told("; ".join(done))
+    return waveform(nodes[:, 1:-1])
+
+
+def _placed(places: np.ndarray, span: tuple[float, float]) -> np.ndarray:
+    """Times as u."""
+    first, last = map(float, span)
+    if not first < last or not np.all(np.isfinite(span)):
+        raise ValueError(f"span must be two times, the later one last, got {span}")
+    u: np.ndarray = (places - first) / (last - first)
+    if u[0] < 0.0 or u[-1] > 1.0:
+        raise ValueError(f"times from {places[0]:g} to {places[-1]:g} lie outside {first:g} to {last:g}")
+    return u
+
+
+def _even(u: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Samples at equal steps of u: as they are if that is where they were, to a hundredth of a step."""
+    count = u.size - 1
+    if np.all(np.abs(u * count - np.arange(count + 1)) < 0.01):
+        return values
+    even = np.linspace(0.0, 1.0, max(count, BINS) + 1)
+    return np.stack([np.interp(even, u, row) for row in values])
+
+
+def _smoothed(u: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
+    """Means over a width in u around k / 256; beyond its ends a curve goes on turned about them, so that they stay."""
+    known = np.concatenate([-u[:0:-1], u, 2.0 - u[-2::-1]])
+    ends = 2.0 * values[:, :1] - values[:, :0:-1], 2.0 * values[:, -1:] - values[:, -2::-1]
+    wide = np.concatenate([ends[0], values, ends[1]], axis=1)
+    around = width * np.linspace(-0.5, 0.5, 33 + 2 * int(width * u.size))  # two points a sample, and some
+    weight = np.cos(np.pi * around / width) ** 2
+    places = np.linspace(0.0, 1.0, BINS + 1)
+    means = [[np.interp(at + around, known, row) @ weight for at in places] for row in wide]
+    return np.array(means, float) / float(weight.sum())
+
+
+def require_closed(nodes: np.ndarray) -> None:
+    """Refuse waveforms, nodes [S, n] with both ends, that are not zero there.
+
+    Raises:
+        ValueError: saying where, and what would help.
+    """
+    for number, row in enumerate(nodes):
+        begins, ends = row[0], row[-1]
+        if max(abs(begins), abs(ends)) > OPEN * np.max(np.abs(row)):
+            raise ValueError(
+                f"signal {number + 1} begins at {begins:.3g} and ends at {ends:.3g}; a waveform is zero at both ends: "
+                + _TAPER
+            )
+
+
+def require_gentle(nodes: np.ndarray) -> None:
+    """Refuse waveforms, nodes [S, n] with both ends, that change within a bin by more than a pack can follow.
+
+    Raises:
+        ValueError: saying where, and what would help.
+    """
+    count = nodes.shape[1] - 1
+    at = np.linspace(0.0, 1.0, BINS * _FINE * max(1, -(-count // (BINS * _FINE))) + 1)  # every node of many, too
+    values = np.asarray(waveform(nodes[:, 1:-1]).shear(jnp.asarray(at))).T
+    apart = (len(at) - 1) // BINS
+    change = np.abs(values[:, apart:] - values[:, :-apart])
+    for number, row in enumerate(values):
+        largest = float(np.max(np.abs(row)))
+        place = int(np.argmax(change[number]))
+        if change[number, place] > STEEPEST * largest:
+            raise ValueError(
+                f"signal {number + 1} changes by {change[number, place] / largest:.0%} of its largest value within "
+                f"1/256 in u at u = {at[place]:.3f}, more than the {STEEPEST:.0%} that a pack can hold: "
+                + _help(at[place], nodes[number], largest)
+            )
+
+
+def _help(place: float, nodes: np.ndarray, largest: float) -> str:
+    """What would make a steep waveform gentle."""
+    at_end = min(place, 1.0 - place) < 2.0 / (len(nodes) - 1) + 1.0 / BINS
+    if at_end and max(abs(nodes[1]), abs(nodes[-2])) > STEEPEST * largest:
+        return f"it is zero at both ends; {_TAPER}"
+    return "smooth it, with smooth = 0.05 (gmem recall --smooth 0.05)"

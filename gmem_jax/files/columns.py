@@ -1,0 +1,110 @@
+"""Tables of numbers in text, as spreadsheets and instruments write them: columns, their names, an axis among them."""
+
+import csv
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gmem_jax.errors import FileFormatError
+
+_SEPARATORS = {";": "semicolons", "\t": "tabs"}
+_AXIS = re.compile(r"(u|t|time)(\s*[(\[].*[)\]])?|(t|time)\s*[/_]\s*[^\W\d]+", re.IGNORECASE)
+_NAMELESS = re.compile(r"(unnamed.*)?", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
+_PAIRS = re.compile(r"\s*-?[01],\d+(,-?[01],\d+)*\s*")  # numbers of size 1 with decimal commas, cut at each of them
+_OWN = re.compile(r"signal_\d+")  # as `save_waveforms` names its columns
+_AS_AXIS = "call it u or time if it is the axis, else leave it out"
+
+
+class Columns(NamedTuple):
+    """What a table holds.
+
+    Attributes:
+        values: of every column but the axis, [S, n].
+        axis: its values, [n]; None if there is none.
+        name: of the axis.
+        said: what was found that need not be, for a person.
+    """
+
+    values: np.ndarray
+    axis: np.ndarray | None = None
+    name: str = ""
+    said: tuple[str, ...] = ()
+
+
+def read_columns(path: Path) -> Columns:
+    """The columns of a CSV: separated by commas, semicolons or tabs, with or without a line of names.
+
+    Raises:
+        FileFormatError: for decimal commas, names that fit no columns, and columns that are no samples and no axis.
+        ValueError: if it is no table of numbers.
+    """
+    lines = [line for line in path.read_text("utf-8-sig").splitlines() if line.strip() and not line.startswith("#")]
+    if not lines:
+        return Columns(np.zeros((0, 0)))
+    separator = next((one for one in _SEPARATORS if one in lines[0]), ",")
+    first = [cell.strip() for cell in next(csv.reader(lines[:1], delimiter=separator))]
+    numbers = [_is_number(cell) for cell in first]
+    if any(numbers) and not all(numbers):
+        raise FileFormatError(f"{path}: its first line mixes numbers and words ({lines[0].strip()[:40]!r})")
+    names = [] if all(numbers) else first
+    rows = lines[1:] if names else lines
+    values = _numbers(path, rows, separator) if rows else np.zeros((0, 0))
+    said = () if separator == "," else (f"separated by {_SEPARATORS[separator]}",)
+    _require_names(path, names, values, rows)
+    axes = [place for place, name in enumerate(names) if _AXIS.fullmatch(name)]
+    if len(axes) > 1 or len(axes) == len(values) > 0:
+        raise FileFormatError(f"{path}: {', '.join(names)}: must be one axis, and a column for each signal")
+    _require_no_axis(path, names, values, axes)
+    if not axes:
+        return Columns(values, said=said)
+    return Columns(np.delete(values, axes, axis=0), values[axes[0]], names[axes[0]], said)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(path: Path, rows: list[str], separator: str) -> np.ndarray:
+    """The numbers of a table by column."""
+    try:
+        return np.loadtxt(rows, delimiter=separator, ndmin=2, quotechar='"').T
+    except ValueError:
+        for cell in (cell.strip() for row in csv.reader(rows, delimiter=separator) for cell in row):
+            if _DECIMAL_COMMA.fullmatch(cell):
+                raise FileFormatError(f"{path}: decimal commas ({cell!r}); write numbers with points") from None
+            if len(cell.split()) > 1 and all(map(_is_number, cell.split())):
+                raise FileFormatError(f"{path}: numbers separated by blanks ({cell[:40]!r}); use commas") from None
+        raise
+
+
+def _require_names(path: Path, names: list[str], values: np.ndarray, rows: list[str]) -> None:
+    """Refuse names that do not fit the columns, and columns that are halves of numbers."""
+    count = len(values)
+    halves = len(names) * 2 == count if names else all(map(_PAIRS.fullmatch, rows)) and np.any(values[1::2] > 1.0)
+    if halves and "," in rows[0]:
+        raise FileFormatError(f"{path}: decimal commas ({rows[0].strip()[:40]!r}); write numbers with points")
+    if names and rows and len(names) != count:
+        raise FileFormatError(f"{path}: {len(names)} names over {count} columns; name each, or none")
+    if nameless := [place + 1 for place, name in enumerate(names) if _NAMELESS.fullmatch(name)]:
+        raise FileFormatError(f"{path}: column {nameless[0]} has no name, as row numbers have none; {_AS_AXIS}")
+
+
+def _require_no_axis(path: Path, names: list[str], values: np.ndarray, axes: list[int]) -> None:
+    """Refuse a column that rises by equal steps beside others: times, places or row numbers are no waveform."""
+    if len(values) < 2 or values.shape[1] < 3:
+        return
+    for place, column in enumerate(values):
+        if place in axes:
+            continue
+        name = names[place] if names else ""
+        steps = np.diff(column)
+        if steps[0] > 0.0 and np.allclose(steps, steps[0], rtol=1e-3, atol=0.0) and not _OWN.fullmatch(name):
+            called = f"column {place + 1}" + (f" ({name!r})" if name else "")
+            raise FileFormatError(f"{path}: {called} rises by equal steps, as times and row numbers do; {_AS_AXIS}")
