@@ -5,7 +5,7 @@
 and the replay of one chunk. What is differentiated by is named: "gamma0", "friction.mu", "signals.amplitudes", ...
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -30,6 +30,7 @@ from gmem_jax.experiment.host import (
 from gmem_jax.experiment.protocol import Bin, Stage
 from gmem_jax.experiment.recall import shear, walker
 from gmem_jax.experiment.walk import Course, walk, walk_some
+from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.state import State
 
 Loss = Callable[[Experiment, jax.Array], jax.Array]
@@ -50,27 +51,36 @@ def gain_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
     return experiment.compare(p_sig).gain
 
 
-def _is_moving(path: Any, leaf: Any) -> bool:
-    """Whether a number of a course is differentiated by: not the list, nor the shape of the grain.
+_OFFSETS = "pack.clump.offsets"
 
-    The native library has no derivatives by sphere offsets; `jax.grad` of plain JAX does.
+
+def _needs_offsets(names: Iterable[str]) -> bool:
+    """Whether any of the named parameters is or holds the offsets of the spheres in a grain."""
+    return any(f"{_OFFSETS}.".startswith(f"{name}.") for name in names)
+
+
+def _is_moving(path: Any, leaf: Any, offsets: bool) -> bool:
+    """Whether a number of a course is differentiated by: not the list, and the sphere offsets only if asked for.
+
+    The native library has no derivatives by offsets: with them all steps are differentiated in plain JAX.
     """
-    fixed = {"pairs", "offsets"} & {getattr(key, "name", None) for key in path}
+    place = jax.tree_util.keystr(path)
+    fixed = place.startswith(".system.pairs") or (place == ".system.clump.offsets" and not offsets)
     return not fixed and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
 
 
-def _numbers(course: Course) -> list[jax.Array]:
+def _numbers(course: Course, offsets: bool) -> list[jax.Array]:
     """The numbers of a course that are differentiated by."""
     leaves = jax.tree_util.tree_leaves_with_path(course)
-    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf)]
+    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf, offsets)]
 
 
-def _with_numbers(course: Course, numbers: Sequence[jax.Array]) -> Course:
+def _with_numbers(course: Course, numbers: Sequence[jax.Array], offsets: bool) -> Course:
     """The course with other numbers in the place of `_numbers`."""
     left = iter(numbers)
     leaves, structure = jax.tree_util.tree_flatten_with_path(course)
     filled: Course = jax.tree.unflatten(
-        structure, [next(left) if _is_moving(path, leaf) else leaf for path, leaf in leaves]
+        structure, [next(left) if _is_moving(path, leaf, offsets) else leaf for path, leaf in leaves]
     )
     return filled
 
@@ -79,31 +89,32 @@ def _moving(state: State) -> Moving:
     return state.grains, state.history
 
 
-def _push(course: Course, state: State, first: Bin, count: Any, slopes: Any, most: int) -> Any:
+def _push(course: Course, state: State, first: Bin, count: Any, slopes: Any, most: int, offsets: bool) -> Any:
     """A chunk and its tangent."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        after, sample = walk_some(
-            _with_numbers(course, numbers), State(moving[0], moving[1], state.status), first, count, most
-        )
+        changed = _with_numbers(course, numbers, offsets)
+        after, sample = walk_some(changed, State(moving[0], moving[1], state.status), first, count, most)
         return (_moving(after), sample.pressure), (after.status, sample)
 
-    (moving, _), slope, (status, sample) = jax.jvp(chunk, (_numbers(course), _moving(state)), slopes, has_aux=True)
+    at = (_numbers(course, offsets), _moving(state))
+    (moving, _), slope, (status, sample) = jax.jvp(chunk, at, slopes, has_aux=True)
     return State(moving[0], moving[1], status), sample, slope
 
 
-def _pull(course: Course, state: State, rows: Bin, slopes: tuple[Moving, jax.Array]) -> Any:
+def _pull(course: Course, state: State, rows: Bin, slopes: tuple[Moving, jax.Array], offsets: bool) -> Any:
     """Derivatives by numbers and state before a chunk, from those by state and pressures after it."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        after, sample = walk(_with_numbers(course, numbers), State(moving[0], moving[1], state.status), rows)
+        changed = _with_numbers(course, numbers, offsets)
+        after, sample = walk(changed, State(moving[0], moving[1], state.status), rows)
         return _moving(after), sample.pressure
 
-    return jax.vjp(chunk, _numbers(course), _moving(state))[1](slopes)
+    return jax.vjp(chunk, _numbers(course, offsets), _moving(state))[1](slopes)
 
 
-_pushed = Compiled(_push, static_argnames="most")
-_pulled = Compiled(_pull)
+_pushed = Compiled(_push, static_argnames=("most", "offsets"))
+_pulled = Compiled(_pull, static_argnames="offsets")
 
 
 @dataclass
@@ -113,18 +124,20 @@ class _Pushing(Action):
     Attributes:
         numbers: tangent of the course's numbers.
         moving: tangent of the state now; None as long as nothing has one.
+        offsets: whether sphere offsets are among the numbers.
         slopes: derivatives of the pressures of every stage, by chunks.
     """
 
     numbers: Any
     moving: Moving | None
+    offsets: bool
     slopes: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     def chunk(self, course: Course, state: State, first: Bin, count: int, most: int) -> Any:
         if self.moving is None:
             after, sample, _ = super().chunk(course, state, first, count, most)
             return after, sample, (None, jnp.zeros_like(sample.pressure))
-        return _pushed(course, state, first, count, (self.numbers, self.moving), most=most)
+        return _pushed(course, state, first, count, (self.numbers, self.moving), most=most, offsets=self.offsets)
 
     def accept(self, course: Course, state: State, stage: Stage, first: Bin, count: int, more: Any) -> None:
         self.moving, change = more
@@ -147,6 +160,7 @@ class _Piece(NamedTuple):
 class _Remembering(Action):
     """Remembers the way, to go back on it."""
 
+    offsets: bool  # whether sphere offsets are among the numbers
     tape: list[_Piece] = field(default_factory=list)
     numbers: Any = None  # derivatives by the course's numbers so far
     readouts: Mapping[str, np.ndarray] = field(default_factory=dict)  # derivatives by the readouts' pressures
@@ -159,7 +173,7 @@ class _Remembering(Action):
             known = self.readouts.get(stage.name)
             shape = (count, 3, state.replicas)
             own = np.zeros(shape) if known is None else known[begun : begun + count]
-            by_numbers, before = _pulled(course, state, rows, (slope, jnp.asarray(own)))
+            by_numbers, before = _pulled(course, state, rows, (slope, jnp.asarray(own)), offsets=self.offsets)
             self.numbers = by_numbers if self.numbers is None else jax.tree.map(jnp.add, self.numbers, by_numbers)
             moving: Moving = before
             return moving
@@ -218,7 +232,7 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
     slope: Moving | None = None
     if acts_on_prefix(list(theta)):
         slope = jax.jvp(lambda theta: _moving(along(theta).begin()), (theta,), (tangent,))[1]
-    action = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope)
+    action = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope, _needs_offsets(theta))
     on.action = action
     samples = on.play(*common)
     if action.moving is None:
@@ -238,9 +252,16 @@ def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
     """What stands at names, as arrays.
 
     Raises:
-        ValueError: if there is no such name, or it holds what has no derivative.
+        ValueError: if there is no such name, it holds what has no derivative, or it is within another.
     """
-    theta = {name: jax.tree.map(jnp.asarray, value_at(experiment, name)) for name in names}
+    theta = {}
+    for name in names:
+        if inside := next((other for other in names if name.startswith(f"{other}.")), ""):
+            raise ValueError(f"{name} is part of {inside}; name one of them")
+        value = value_at(experiment, name)
+        if value is None or isinstance(value, str):
+            raise ValueError(f"{name} is {value!r}, which has no derivative")
+        theta[name] = jax.tree.map(jnp.asarray, value)
     for name, tree in theta.items():
         if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
             raise ValueError(f"{name} holds more than floats; name what to differentiate by, like pack.position")
@@ -253,7 +274,7 @@ def _along(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
 
 def _number_slope(experiment: Experiment, theta: Any, tangent: Any, *, sheared: bool) -> Any:
     def numbers(theta: Any) -> list[jax.Array]:
-        return _numbers(with_values(experiment, theta).course(sheared=sheared))
+        return _numbers(with_values(experiment, theta).course(sheared=sheared), _needs_offsets(theta))
 
     return jax.jvp(numbers, (theta,), (tangent,))[1]
 
@@ -263,6 +284,7 @@ def _work(experiment: Experiment, on: Walker) -> float:
     return work_of(common, on.state.replicas) + work_of(own, experiment.replicas)
 
 
+@comparable
 @dataclass(frozen=True)
 class Gradient:
     """A number and its derivatives.
@@ -294,7 +316,8 @@ def value_and_grad(
     Args:
         experiment: where.
         by: what to differentiate by: dotted names of floats or of parts that hold them, like "signals.amplitudes",
-            "friction.mu", "t0" or "pack.position". Shapes of grains are not among them (use `jax.grad`).
+            "friction.mu", "t0" or "pack.position". None within another. "pack.clump" and its offsets take as long as
+            `jax.grad` of plain JAX does: the native library has no derivatives by the shape of a grain.
         loss: what is differentiated; default the fidelity.
         checkpoint: where to go on and to keep how far it is on the way back; the way forward, a tenth, is done again.
         progress: told about every chunk of both ways.
@@ -307,7 +330,8 @@ def value_and_grad(
     common, own = experiment.phases
     on = walker(experiment, progress=within(progress, 0.0, FORWARDS))
     on.total_work = _work(experiment, on)
-    prefix, rest = _Remembering(), _Remembering()
+    offsets = _needs_offsets(by)
+    prefix, rest = _Remembering(offsets), _Remembering(offsets)
     on.action = prefix if acts_on_prefix(by) else Action()
     _, pull_begin = jax.vjp(lambda theta: _moving(along(theta).begin()), theta)
     on.play(*common)
@@ -329,7 +353,7 @@ def value_and_grad(
 
     def pull_numbers(sheared: bool, found: Any) -> Any:
         def numbers(theta: Any) -> list[jax.Array]:
-            return _numbers(along(theta).course(sheared=sheared))
+            return _numbers(along(theta).course(sheared=sheared), offsets)
 
         return jax.vjp(numbers, theta)[1](found)[0]
 

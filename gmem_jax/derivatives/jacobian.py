@@ -15,10 +15,12 @@ from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.host import Progress, silent, within
 from gmem_jax.experiment.recall import Recall, simulate
 from gmem_jax.experiment.signals import Bumps
+from gmem_jax.physics.pytree import comparable
 
 LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
 
 
+@comparable
 @dataclass(frozen=True)
 class Jacobian:
     """Derivatives of one recalled signal.

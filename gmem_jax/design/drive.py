@@ -11,10 +11,12 @@ import optax
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.host import Checkpoint, Keep, Progress, forget, silent
 from gmem_jax.experiment.recall import run
+from gmem_jax.physics.pytree import comparable
 
 PARAMETERS = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.stiffness"}
 
 
+@comparable
 @dataclass(frozen=True)
 class TunedDrive:
     """Drive parameters found, and the way there.

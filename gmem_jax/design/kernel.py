@@ -17,10 +17,12 @@ from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Keep, Progress, Walker, forget, silent
 from gmem_jax.experiment.recall import simulate
 from gmem_jax.experiment.signals import BINS, Bumps, Signals, bin_average
+from gmem_jax.physics.pytree import comparable
 
 FINE = 2048  # points of v for inner products of basis functions
 
 
+@comparable
 @dataclass(frozen=True)
 class MemoryKernel:
     """The recall of n basis waveforms, for unit amplitude.

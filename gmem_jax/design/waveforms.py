@@ -19,6 +19,7 @@ from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.host import Keep, Progress, forget, silent, within
 from gmem_jax.experiment.recall import prefix_of, run, simulate
 from gmem_jax.experiment.signals import Signals, Spline, waveform
+from gmem_jax.physics.pytree import comparable
 
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)
@@ -29,6 +30,7 @@ WIDTH = 0.2  # of them, in u
 TANGENT = 2.5  # cost of a tangent in runs; see benchmarks
 
 
+@comparable
 @dataclass(frozen=True)
 class Design:
     """Waveforms found, and the way there.
