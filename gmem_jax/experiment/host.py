@@ -18,6 +18,7 @@ from gmem_jax.experiment.devices import Spread, local
 from gmem_jax.experiment.frames import Film, Frame, Taken, take
 from gmem_jax.experiment.pack import SKIN, pair_finder
 from gmem_jax.experiment.protocol import Bin, Stage
+from gmem_jax.experiment.stability import cause
 from gmem_jax.experiment.walk import Course, walk_some
 from gmem_jax.physics.pairs import carry_history, slack, sphere_centres
 from gmem_jax.physics.sample import Sample
@@ -150,14 +151,15 @@ def worst(state: State) -> int:
     return together(local(state.status))
 
 
-def refuse(status: int, where: str) -> None:
+def refuse(status: int, where: str, course: Course | None = None) -> None:
     """Raise if `status` says that the numbers are meaningless.
 
     Raises:
-        RunFailedError: naming the stage and what happened.
+        RunFailedError: naming the stage and what happened; and why, where a number of the course tells.
     """
     if Status(status).fatal:
-        raise RunFailedError(f"{where}: {explain(status)}")
+        why = "" if course is None else cause(course)
+        raise RunFailedError("; ".join(filter(None, (f"{where}: {explain(status)}", why))))
 
 
 forward = Compiled(walk_some, static_argnames="most")
@@ -335,7 +337,7 @@ class Walker:
             if status & Status.STALE_PAIRS:
                 self._renew_again(stage, first)
                 continue
-            refuse(status, stage.name)
+            refuse(status, stage.name, self.course)
             self.action.accept(self.course, self.state, stage, first, count, more)
             for bins in self.film.between(stage.name, done, done + count):
                 self._take_after(stage, done, bins - done, count, state, sample)
@@ -437,6 +439,7 @@ class Walker:
             self.skin *= 1.5
             self.finder = None
             if self.skin > WIDEST:
-                raise RunFailedError(f"{stage.name}: {explain(int(Status.STALE_PAIRS))}")
+                why = cause(self.course) or "the steps are unstable; use a smaller dt, or check pack and friction law"
+                raise RunFailedError(f"{stage.name}: grains moved by most of R within one bin: {why}")
         self._renewed_at = (stage.name, self.time)
         self.renew(self._box_before(first))

@@ -128,7 +128,10 @@ def _recall_of(content: Content, configuration: dict[str, Any]) -> Recall:
         del declared["signal"]
     if content.schema == _OLDEST:
         del declared["shear"]
+    if "rounding" not in content.datasets:
+        del declared["rounding"]
     found = content.arrays(declared)
+    found.setdefault("rounding", np.full(len(found["J"]), np.nan))
     found.pop("signal", None)  # the configuration has them too, in all versions
     if content.schema == _OLDEST:
         found["shear"] = _waveforms(configuration, found["u"], found["J"])

@@ -122,7 +122,8 @@ def _recall(experiment: gm.Experiment) -> Recall:
     single = dict.fromkeys(("gain", "fidelity", "windowed_gain", "windowed_fidelity", "window", "dt"), np.asarray(0.25))
     stages = OrderedDict(rest=_sample(5, 1), readout=_sample(256, count + 1))
     status = np.zeros(count + 1, np.int32)
-    return Recall(u=u, **curves, **single, residual_speed=np.full(count + 1, 1e-3), status=status, stages=stages)
+    lone = {"residual_speed": np.full(count + 1, 1e-3), "rounding": np.full(count, 1e-16)}
+    return Recall(u=u, **curves, **single, **lone, status=status, stages=stages)
 
 
 def _unsealed(new: Path, old: Path, schema: str) -> None:
