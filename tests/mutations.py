@@ -771,8 +771,8 @@ MUTATIONS = (
     mutation(
         "stale-chunk-stands",
         "experiment/host.py",
-        "self._renew_again(stage, first)\n                continue\n            refuse(status, stage.name)",
-        "self._renew_again(stage, first)\n            refuse(status & ~int(Status.STALE_PAIRS), stage.name)",
+        "                continue\n            refuse(status, stage.name, self.course)",
+        "            refuse(status & ~int(Status.STALE_PAIRS), stage.name)",
         "test_a_list_that_goes_stale_is_rebuilt_and_its_chunk_redone_with_the_same_result",
     ),
     mutation(
@@ -896,10 +896,45 @@ MUTATIONS = (
     ),
     mutation(
         "speed-of-both-walls",
-        "experiment/recall.py",
-        "wall_speed = 0.5 * (",
-        "wall_speed = 1.0 * (",
+        "experiment/doubts.py",
+        "return 0.5 * (pack.upper - pack.lower)",
+        "return 1.0 * (pack.upper - pack.lower)",
         "test_a_pack_is_at_rest_below_one_percent_of_the_speed_of_its_walls",
+    ),
+    mutation(
+        "unrest-of-a-moment",
+        "experiment/doubts.py",
+        "jnp.median(sample.largest_speed, axis=0)",
+        "jnp.max(sample.largest_speed, axis=0)",
+        "test_one_fast_moment_is_not_unrest",
+    ),
+    mutation(
+        "no-signal-is-no-noise",
+        "experiment/doubts.py",
+        "noise >= LARGEST_NOISE",
+        "(noise >= LARGEST_NOISE) & jnp.isfinite(noise)",
+        "test_each_doubt_is_that_of_its_replica_alone",
+    ),
+    mutation(
+        "offsets-without-derivatives",
+        "derivatives/gradient.py",
+        '(place == ".system.clump.offsets" and not offsets)',
+        'place == ".system.clump.offsets"',
+        "test_offsets_are_differentiated_by_when_they_are_named_and_not_otherwise",
+    ),
+    mutation(
+        "length-of-quaternions-counts",
+        "physics/rotation.py",
+        "return quaternion * (scale + jax.lax.stop_gradient(rest))",
+        "return quaternion * (scale + rest)",
+        "test_the_length_of_a_quaternion_has_no_derivative_and_its_direction_has",
+    ),
+    mutation(
+        "history-left-where-nothing-touches",
+        "contact/own_law.py",
+        "force, left = tried(-0.1, used)",
+        "force, left = tried(-0.1, blank)",
+        "test_a_law_that_returns_something_else_is_refused_by_name_when_an_experiment_is_made",
     ),
     mutation(
         "overlap-range-too-wide",
@@ -918,8 +953,8 @@ MUTATIONS = (
     mutation(
         "broken-by-choice",
         "experiment/recall.py",
-        "p_sig = sound * experiment.recalled(",
-        "p_sig = (lambda given: jnp.where(sound == 1.0, experiment.recalled(given), sound))(",
+        "p_sig = sound * found",
+        "p_sig = jnp.where(sound == 1.0, found, sound)",
         "test_a_broken_run_has_no_gradient_either",
     ),
     mutation(

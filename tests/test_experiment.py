@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -15,6 +15,7 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.experiment import recall as recalls
 from gmem_jax.experiment.experiment import Changes, Experiment, value_at
+from gmem_jax.physics.rotation import unit
 
 PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
 SHORT = {"t0": 75.0, "rest": 0.02, "hold": 0.02, "store": 0.02}
@@ -96,6 +97,101 @@ def test_a_law_made_of_another_may_be_registered_by_jax_itself() -> None:
     half = make(friction=gm.Hooke(mu=0.5), backend="jax")
     found, expected = (jax.jit(gm.gain)(one) for one in (experiment, half))
     np.testing.assert_allclose(found, expected, rtol=1e-6)  # another program: round-off of some 800 steps
+
+
+@pytest.mark.parametrize("way", ["pack_from", "replace", "traced"])
+def test_quaternions_of_any_length_are_brought_to_one(way: str) -> None:
+    long = PACK.quaternion * jnp.linspace(0.5, 2.0, 27)[:, None]
+    if way == "pack_from":
+        made = gm.pack_from(PACK, position=PACK.position, quaternion=long)
+        np.testing.assert_allclose(jnp.linalg.norm(made.quaternion, axis=1), 1.0, rtol=1e-15)
+        begun = gm.Experiment(made, BUMP, **SHORT).begin()
+    elif way == "replace":
+        begun = gm.replace(make(), {"pack.quaternion": long}).begin()
+    else:
+        begun = jax.jit(lambda q: gm.replace(make(), {"pack.quaternion": q}).begin())(long)
+    np.testing.assert_allclose(begun.grains.quaternion[..., 0], PACK.quaternion, rtol=1e-15, atol=1e-16)
+
+
+@pytest.mark.parametrize("name", gm.list_packs())
+def test_the_orientations_of_shipped_packs_stay_bit_for_bit(name: str) -> None:
+    pack = gm.load_pack(name)
+    np.testing.assert_array_equal(unit(pack.quaternion[..., None])[..., 0], pack.quaternion)
+
+
+def test_the_length_of_a_quaternion_has_no_derivative_and_its_direction_has() -> None:
+    def turned(quaternion: jax.Array) -> jax.Array:
+        return jnp.sum(unit(quaternion[:, None])[:, 0] * jnp.arange(4.0))
+
+    for quaternion in (PACK.quaternion[3], 1.5 * PACK.quaternion[3]):
+        slope = jax.grad(turned)(quaternion)
+        assert abs(float(slope @ quaternion)) < 1e-14
+        toss = jnp.asarray([0.3, -0.2, 0.5, 0.1])
+        difference = (turned(quaternion + 1e-6 * toss) - turned(quaternion - 1e-6 * toss)) / 2e-6
+        np.testing.assert_allclose(slope @ toss, difference, rtol=1e-7)
+
+
+def test_packs_that_cannot_be_are_refused_with_the_grain() -> None:
+    nowhere, still = PACK.position.at[4, 1].set(jnp.nan), PACK.quaternion.at[2].set(0.0)
+    with pytest.raises(ValueError, match="grain 5: a number is not finite"):
+        gm.pack_from(PACK, position=nowhere, quaternion=PACK.quaternion)
+    with pytest.raises(ValueError, match="grain 3: a number is not finite, or its quaternion is zero"):
+        gm.pack_from(PACK, position=PACK.position, quaternion=still)
+    with pytest.raises(ValueError, match=r"centres \[N, 3\] and quaternions \[N, 4\], got \(27, 3\), \(26, 4\)"):
+        gm.pack_from(PACK, position=PACK.position, quaternion=PACK.quaternion[:-1])
+    for name, value in {"pack.position": nowhere, "pack.quaternion": still}.items():
+        with pytest.raises(ValueError, match=r"grain [35]: a number is not finite"):
+            gm.run(gm.replace(make(), {name: value}))
+    with pytest.raises(ValueError, match=r"grain 7 does not lie in the box: its centre is at \[.*\], the box is from"):
+        gm.run(gm.replace(make(), {"pack.position": PACK.position.at[6, 2].add(9.0)}))
+
+
+def test_what_was_made_before_double_precision_is_refused_in_one_line() -> None:
+    jax.config.update("jax_enable_x64", False)
+    try:
+        pack, bumps = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5"), gm.six_signals()
+        early = gm.Experiment(pack, bumps, **SHORT)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    words = r"{0} is float32, and float64 is needed: make or load the {1} after jax.config.update"
+    with pytest.raises(ValueError, match=words.format("pack.clump.offsets", "pack")):
+        gm.Experiment(pack, BUMP)
+    with pytest.raises(ValueError, match=words.format("signals.amplitudes", "signals")):
+        gm.Experiment(PACK, bumps)
+    for start in (gm.run, gm.recall):
+        with pytest.raises(ValueError, match=words.format("pack.clump.offsets", "pack")):
+            start(early)
+
+
+def test_equal_is_true_or_false() -> None:
+    again = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
+    assert again == PACK
+    assert make() == gm.Experiment(again, gm.Bumps(BUMP.amplitudes + 0.0, BUMP.centres, 0.2), **SHORT)
+    assert make() != make(gamma0=2e-3)
+    assert make() != make(friction=gm.Hooke(mu=0.5))
+    assert make() != make(friction=gm.MindlinRescaled())
+    assert make() != make(gamma0=jnp.asarray([1e-3, 2e-3]))
+    assert gm.pack_from(PACK, position=PACK.position, quaternion=PACK.quaternion, name="other") != PACK
+    assert gm.stack([PACK, PACK]) != PACK
+    assert (PACK == "pack") is False
+    assert gm.words(2) == gm.words(2)
+    assert gm.words(2) != gm.words(3)
+    assert gm.tetra() == gm.tetra(0.6)
+    assert gm.tetra() != gm.sphere()
+    assert hash(gm.Hooke(mu=0.5)) == hash(gm.Hooke(mu=0.5))
+    assert gm.Hooke(mu=0.5) in {gm.Hooke(mu=0.5): 1}
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(PACK)
+
+
+def test_recalls_and_what_holds_arrays_are_comparable(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
+    experiment, recall = recalled
+    assert experiment == gm.replace(experiment)
+    assert recall == jax.tree.map(jnp.asarray, recall)
+    assert recall != jax.tree.map(lambda leaf: leaf + 1, recall)
+    kernel = gm.MemoryKernel(np.zeros(3), np.zeros((3, 2)), 0.1, np.zeros((2, 3)), np.zeros((2, 3)), 1e-3, 0.05)
+    assert kernel == replace(kernel, even=np.zeros((2, 3)))
+    assert kernel != replace(kernel, even=np.ones((2, 3)))
 
 
 def test_a_stack_of_packs_is_refused_at_once() -> None:

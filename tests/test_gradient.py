@@ -12,6 +12,7 @@ from scenes import with_skin
 
 import gmem_jax as gm
 from gmem_jax.derivatives import gradient, jacobian
+from gmem_jax.experiment.experiment import value_at
 from gmem_jax.experiment.recall import run
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.normal import hertz
@@ -98,11 +99,99 @@ def test_what_acts_on_the_prefix_is_recognised() -> None:
     assert not gradient.acts_on_prefix(["gamma0", "signals.centres"])
 
 
+def smooth(experiment: gm.Experiment, p_sig: jax.Array) -> jax.Array:
+    """Of everything in a recall, and of nothing that is nearly 0."""
+    return 1e6 * jnp.sum(p_sig * jnp.linspace(0.0, 1.0, p_sig.shape[-1])) + experiment.compare(p_sig).gain
+
+
+def all_names(experiment: gm.Experiment) -> list[str]:
+    """The dotted names of all arrays of floats in an experiment."""
+    leaves = jax.tree_util.tree_leaves_with_path(experiment)
+    floats = [path for path, leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
+    return [jax.tree_util.keystr(path).removeprefix(".") for path in floats]
+
+
+@pytest.fixture(scope="module")
+def whole(experiment: gm.Experiment) -> gm.Experiment:
+    """Every number of it given."""
+    given = gm.replace(experiment, t0=60.0, rest=0.02, hold=0.02, store=0.02, delta0=0.05, hold_drag=0.04)
+    return gm.replace(given, {"friction.spinning": 0.9})
+
+
+BY_SHAPE = "pack.clump.offsets"
+
+
+def require_differences(experiment: gm.Experiment, slopes: dict[str, Any]) -> None:
+    """Each derivative, along some direction, is that of central differences."""
+    for number, (name, slope) in enumerate(slopes.items()):
+        value = np.asarray(value_at(experiment, name))
+        toss = np.random.default_rng(number).normal(size=value.shape) * (np.abs(value).mean() + 1e-3)
+        up, down = (run(gm.replace(experiment, {name: jnp.asarray(value + by * toss)})) for by in (1e-7, -1e-7))
+        difference = float(smooth(experiment, up.p_sig) - smooth(experiment, down.p_sig)) / 2e-7
+        if name.split(".")[-1] in ("gamma0", "delta0", "width", "amplitudes", "centres"):  # the measure has them too
+            changed = [gm.replace(experiment, {name: jnp.asarray(value + by * toss)}) for by in (1e-7, -1e-7)]
+            difference = float(smooth(changed[0], up.p_sig) - smooth(changed[1], down.p_sig)) / 2e-7
+        # Some contacts of 27 grains begin to slide or touch within the step.
+        np.testing.assert_allclose(np.vdot(slope, toss), difference, rtol=2e-2, atol=1e-6, err_msg=name)
+
+
+def test_every_name_but_the_shape_of_the_grain_has_the_derivative_of_differences(whole: gm.Experiment) -> None:
+    names = [name for name in all_names(whole) if name != BY_SHAPE]
+    assert {"pack.lower", "pack.quaternion", "pack.clump.inertia", "material.poisson", "t0", "hold_drag"} < set(names)
+    found = gm.value_and_grad(whole, names, loss=smooth)
+    require_differences(whole, found.slope)
+    moved = {name for name, slope in found.slope.items() if np.any(np.asarray(slope))}
+    still = {"pack.delta0", "pack.ringing_period", "pack.clump.diameter", *(n for n in names if "pairs" in n)}
+    units = {f"material.{name}" for name in ("radius", "modulus", "density")}
+    assert set(names) - moved == still | units  # delta0 was given
+
+
+@pytest.mark.slow
+def test_every_name_has_the_derivative_of_grad_and_the_shape_of_the_grain_that_of_differences(
+    whole: gm.Experiment,
+) -> None:
+    names = all_names(whole)
+    found = gm.value_and_grad(whole, names, loss=smooth).slope
+    require_differences(whole, {BY_SHAPE: found[BY_SHAPE]})
+
+    def score(theta: dict[str, Any]) -> jax.Array:
+        changed = gm.replace(whole, theta)
+        return smooth(changed, gm.recall(changed).p_sig)
+
+    expected = jax.grad(score)({name: jnp.asarray(value_at(whole, name)) for name in names})
+    for name in names:
+        scale = np.abs(expected[name]).max()
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-6, atol=1e-8 * scale, err_msg=name)
+    assert np.all(np.abs(found[BY_SHAPE]).max(axis=1) > 0.0)
+
+
+@pytest.mark.slow
+def test_the_forward_mode_has_the_shape_of_the_grain_too(whole: gm.Experiment) -> None:
+    offsets, toss = whole.pack.clump.offsets, jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
+    along = gradient.push(whole, {BY_SHAPE: toss}).p_sig_slope
+    up, down = (run(gm.replace(whole, {BY_SHAPE: offsets + by * toss})).p_sig for by in (1e-7, -1e-7))
+    np.testing.assert_allclose(along, (up - down) / 2e-7, atol=2e-2 * np.abs(along).max())
+
+
+def test_offsets_are_differentiated_by_when_they_are_named_and_not_otherwise(experiment: gm.Experiment) -> None:
+    course = experiment.course(sheared=True)
+    for names, asked in ((["pack.clump"], True), ([BY_SHAPE], True), (["pack.clump.mass", "gamma0"], False)):
+        assert gradient._needs_offsets(names) == asked
+        shapes = [number.shape for number in gradient._numbers(course, gradient._needs_offsets(names))]
+        assert ((4, 3) in shapes) == asked
+
+
 def test_names_that_cannot_be_differentiated_by_are_refused(experiment: gm.Experiment) -> None:
     with pytest.raises(ValueError, match="Hooke has no field 'p_max'"):
         gm.value_and_grad(experiment, ["friction.p_max"])
     with pytest.raises(ValueError, match="pack holds more than floats"):
         gm.value_and_grad(experiment, ["pack"])
+    with pytest.raises(ValueError, match=r"friction.mu is part of friction; name one of them"):
+        gm.value_and_grad(experiment, ["friction", "friction.mu"])
+    with pytest.raises(ValueError, match="background is 'sub0', which has no derivative"):
+        gm.value_and_grad(experiment, ["background"])
+    with pytest.raises(ValueError, match="steps is None, which has no derivative"):
+        gm.value_and_grad(experiment, ["steps"])
 
 
 def test_a_jacobian_of_several_signals_is_refused(experiment: gm.Experiment) -> None:

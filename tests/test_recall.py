@@ -18,6 +18,9 @@ PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
 FINISH = jax.jit(finish)
 
 
+LOAD = 1e-5  # on every wall, some times as much as what is recalled
+
+
 @cache
 def experiment() -> gm.Experiment:
     """Two signals at 15 periods of ringing to a compression."""
@@ -37,15 +40,16 @@ def finished(speed: object = 0.0, ripple: float = 0.0, status: object = 0) -> Re
     signal = 0.3 * one.scale * one.integral()
     wave = jnp.sin(2.0 * jnp.pi * 15.0 * (jnp.arange(256) + 0.5) / 256.0)
     rows = jnp.concatenate([jnp.zeros((1, 256)), -signal - ripple * jnp.abs(signal).max() * wave])
-    pressure = jnp.zeros((256, 3, 3)).at[:, 0].set(jnp.flip(rows, axis=1).T)  # u falls during the readout
+    pressure = jnp.full((256, 3, 3), LOAD).at[:, 0].add(jnp.flip(rows, axis=1).T)  # u falls during the readout
 
     # A wall goes from half the box's length at u = 0 to sqrt(1 - delta0) of that at u = 1, in t0.
     of_walls = 0.5 * float((PACK.upper - PACK.lower)[0]) * (1.0 - np.sqrt(1.0 - float(PACK.delta0))) / one.t0
     speeds = jnp.zeros((4, 3)).at[-1].set(of_walls * jnp.asarray(speed)).at[0].set(1.0)  # only the end counts
 
     def sample(**given: jax.Array) -> Sample:
-        empty = jnp.zeros((len(next(iter(given.values()))), 3))
-        return Sample(**{name: empty for name in Sample.__dataclass_fields__} | given)
+        bins = len(next(iter(given.values())))
+        loaded = {"pressure": jnp.full((bins, 3, 3), LOAD)}
+        return Sample(**{name: jnp.zeros((bins, 3)) for name in Sample.__dataclass_fields__} | loaded | given)
 
     stages = {"store": sample(largest_speed=speeds), "readout": sample(pressure=pressure)}
     return FINISH(one, stages, jnp.broadcast_to(jnp.asarray(status, jnp.int32), 3))

@@ -114,7 +114,7 @@ def made_up() -> gm.Recall:
     numbers: dict[str, Any] = {name: np.asarray(0.3) for name in ("gain", "fidelity", "dt")}
     numbers |= {"windowed_gain": np.asarray(0.31), "windowed_fidelity": np.asarray(0.35), "window": np.asarray(40.0)}
     per_replica = {"residual_speed": np.full(3, 1e-4), "status": np.array([0, 0, int(gm.Status.RINGING)])}
-    curves = {"u": u, "shear": integral, "J": integral, "p_sig": p_sig}
+    curves = {"u": u, "shear": integral, "J": integral, "p_sig": p_sig, "rounding": np.full(2, 1e-16)}
     return gm.Recall(**numbers, **per_replica, **curves, stages=stages, protocol=EXPERIMENT.protocol, frames=squeezed())
 
 

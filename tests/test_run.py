@@ -1,8 +1,10 @@
 """The host loop: lists that go stale are rebuilt and the chunk redone, broken runs stop, progress and warnings."""
 
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,8 +13,9 @@ import gmem_jax as gm
 from gmem_jax.experiment.recall import finish
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.search import PairFinder
-from gmem_jax.physics.state import State, Status, replicate
+from gmem_jax.physics.state import State, Status, replicate, together
 from gmem_jax.physics.step import System, start
+from gmem_jax.simulation import stability
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.observers import Chunk, Observer
 from gmem_jax.simulation.progress import work_of
@@ -106,6 +109,71 @@ def test_every_status_bit_has_a_sentence() -> None:
         assert "use" in gm.explain(int(bit)) or "allocate" in gm.explain(int(bit))
     assert not Status.NOT_AT_REST.fatal
     assert (Status.NOT_AT_REST | Status.STALE_PAIRS).fatal
+
+
+NAMED = re.compile(r"\b(gm\.\w+|[a-z]+_[a-z_]+|[a-z]+0|dt|steps|store|mu|stiffness|precision|friction)\b")
+
+
+def test_the_sentences_name_options_that_there_are() -> None:
+    experiment = gm.Experiment(PACK, gm.six_signals(), gm.Mindlin())
+    seen = set()
+    for bit in Status:
+        text = gm.explain(int(bit))
+        assert "skin" not in text
+        remedy = text.partition("; ")[2]
+        for name in NAMED.findall(remedy):
+            seen.add(name)
+            owners = (experiment, experiment.friction, experiment.material, gm)
+            assert any(hasattr(owner, name.removeprefix("gm.")) for owner in owners), f"{bit.name}: {name}"
+    assert {"gm.run", "dt", "steps", "t0", "store", "hold_drag", "p_max", "gamma0", "delta0", "mu"} <= seen
+
+
+UNSTABLE = {
+    "hold_drag": {"hold_drag": 1e9},
+    "material.wall_rigidity": {"material": gm.Material(wall_rigidity=1e9)},
+    "material.normal_damping": {"material": gm.Material(normal_damping=1e9)},
+}
+FAST = {"t0": 60.0, "rest": 0.02, "hold": 0.02, "store": 0.02}
+
+
+@pytest.mark.parametrize("name", UNSTABLE)
+def test_a_run_that_broke_names_the_number_that_made_its_steps_unstable(name: str) -> None:
+    words = rf"rest: grains moved by most of R within one bin: {name} = 1e\+09 makes steps beyond .* unstable"
+    with pytest.raises(gm.RunFailedError, match=words):
+        gm.run(gm.Experiment(PACK, gm.words(1), **FAST, **UNSTABLE[name]))
+
+
+def test_a_run_in_sound_steps_has_no_cause() -> None:
+    for law in (gm.Hooke(), gm.Mindlin(), gm.Frictionless()):
+        assert stability.cause(gm.Experiment(PACK, gm.words(1), law, dt=0.5).course(sheared=True)) == ""
+    for by, numbers in {"stiffness": {"stiffness": 1e9}, "damping_time": {"damping_time": 1e9}}.items():
+        course = gm.Experiment(PACK, gm.words(1), gm.Hooke(**numbers)).course(sheared=True)
+        assert stability.cause(course).startswith(f"friction.{by} = 1e+09 makes steps")
+
+
+@pytest.mark.parametrize("ways", ["p_max", "own"])
+def test_an_overlap_beyond_the_law_is_told_as_that(ways: str) -> None:
+    @jax.tree_util.register_dataclass
+    @dataclass(frozen=True)
+    class Shallow(gm.Hooke):
+        largest_overlap = 0.01
+
+    law = gm.Mindlin(p_max=0.01, points=5) if ways == "p_max" else Shallow()
+    with pytest.raises(gm.RunFailedError, match="an overlap exceeded what the friction law covers; use a larger p_max"):
+        gm.run(gm.Experiment(PACK, gm.words(1), law, **FAST))
+
+
+def test_a_traced_recall_tells_a_stale_list_from_a_grain_outside_and_a_step_too_long() -> None:
+    experiment = gm.Experiment(PACK, gm.words(1), **FAST)
+    recall = jax.jit(lambda position, t0: gm.recall(gm.replace(experiment, {"pack.position": position, "t0": t0})))
+
+    def said(position: jax.Array, t0: float = 60.0) -> str:
+        return gm.explain(together(recall(position, t0).status))
+
+    assert "use gm.run, which makes it anew" in said(PACK.position.at[0].add(0.2))
+    assert "a grain left the box" in said(PACK.position.at[0, 2].add(20.0))
+    assert "is not a finite number" in said(PACK.position.at[0, 2].set(jnp.nan))
+    assert "the time step, t0 / (256 steps), exceeds 0.5 t_c; use more steps" in said(PACK.position, 300.0)
 
 
 def test_only_while_the_walls_stand_still_is_there_a_drag() -> None:

@@ -5,7 +5,7 @@
 and the replay of one chunk. What is differentiated by is named: "gamma0", "friction.mu", "signals.amplitudes", ...
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from gmem_jax.experiment.arguments import require_names
 from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, value_at
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.recall import apply_waveforms, runner_of
+from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint
@@ -47,27 +48,36 @@ def gain_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
     return experiment.compare(p_sig).gain
 
 
-def _is_moving(path: Any, leaf: Any) -> bool:
-    """Whether a number of a simulation is differentiated by: not the list, nor the shape of the grain.
+_OFFSETS = "pack.clump.offsets"
 
-    The native library has no derivatives by sphere offsets; `jax.grad` of plain JAX does.
+
+def _needs_offsets(names: Iterable[str]) -> bool:
+    """Whether any of the named parameters is or holds the offsets of the spheres in a grain."""
+    return any(f"{_OFFSETS}.".startswith(f"{name}.") for name in names)
+
+
+def _is_moving(path: Any, leaf: Any, offsets: bool) -> bool:
+    """Whether a number of a simulation is differentiated by: not the list, and the sphere offsets only if asked for.
+
+    The native library has no derivatives by offsets: with them all steps are differentiated in plain JAX.
     """
-    fixed = {"pairs", "offsets"} & {getattr(key, "name", None) for key in path}
+    place = jax.tree_util.keystr(path)
+    fixed = place.startswith(".system.pairs") or (place == ".system.clump.offsets" and not offsets)
     return not fixed and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
 
 
-def _numbers(simulation: Simulation) -> list[jax.Array]:
+def _numbers(simulation: Simulation, offsets: bool) -> list[jax.Array]:
     """The numbers of a simulation that are differentiated by."""
     leaves = jax.tree_util.tree_leaves_with_path(simulation)
-    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf)]
+    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf, offsets)]
 
 
-def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array]) -> Simulation:
+def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array], offsets: bool) -> Simulation:
     """The simulation with other numbers in the place of `_numbers`."""
     left = iter(numbers)
     leaves, structure = jax.tree_util.tree_flatten_with_path(simulation)
     filled: Simulation = jax.tree.unflatten(
-        structure, [next(left) if _is_moving(path, leaf) else leaf for path, leaf in leaves]
+        structure, [next(left) if _is_moving(path, leaf, offsets) else leaf for path, leaf in leaves]
     )
     return filled
 
@@ -76,31 +86,32 @@ def _moving(state: State) -> Moving:
     return state.grains, state.history
 
 
-def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int) -> Any:
+def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int, offsets: bool) -> Any:
     """A chunk and its tangent."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        after, sample = rollout_chunk(
-            _with_numbers(simulation, numbers), State(moving[0], moving[1], state.status), first, count, most
-        )
+        changed = _with_numbers(simulation, numbers, offsets)
+        after, sample = rollout_chunk(changed, State(moving[0], moving[1], state.status), first, count, most)
         return (_moving(after), sample.pressure), (after.status, sample)
 
-    (moving, _), slope, (status, sample) = jax.jvp(chunk, (_numbers(simulation), _moving(state)), slopes, has_aux=True)
+    at = (_numbers(simulation, offsets), _moving(state))
+    (moving, _), slope, (status, sample) = jax.jvp(chunk, at, slopes, has_aux=True)
     return State(moving[0], moving[1], status), sample, slope
 
 
-def _pull(simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving, jax.Array]) -> Any:
+def _pull(simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving, jax.Array], offsets: bool) -> Any:
     """Derivatives by numbers and state before a chunk, from those by state and pressures after it."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        after, sample = rollout(_with_numbers(simulation, numbers), State(moving[0], moving[1], state.status), rows)
+        changed = _with_numbers(simulation, numbers, offsets)
+        after, sample = rollout(changed, State(moving[0], moving[1], state.status), rows)
         return _moving(after), sample.pressure
 
-    return jax.vjp(chunk, _numbers(simulation), _moving(state))[1](slopes)
+    return jax.vjp(chunk, _numbers(simulation, offsets), _moving(state))[1](slopes)
 
 
-_pushed = Compiled(_push, static_argnames="most")
-_pulled = Compiled(_pull)
+_pushed = Compiled(_push, static_argnames=("most", "offsets"))
+_pulled = Compiled(_pull, static_argnames="offsets")
 
 
 @dataclass
@@ -110,11 +121,13 @@ class _Pushing(Observer):
     Attributes:
         numbers: tangent of the simulation's numbers.
         moving: tangent of the state now; None as long as nothing has one.
+        offsets: whether sphere offsets are among the numbers.
         slopes: derivatives of the pressures of every stage, by chunks.
     """
 
     numbers: Any
     moving: Moving | None
+    offsets: bool
     slopes: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _next: tuple[Moving, jax.Array] | None = None
 
@@ -123,7 +136,9 @@ class _Pushing(Observer):
         if self.moving is None:
             return None
         slopes = (self.numbers, self.moving)
-        after, sample, self._next = _pushed(chunk.simulation, chunk.state, chunk.row, chunk.count, slopes, most=CHUNK)
+        after, sample, self._next = _pushed(
+            chunk.simulation, chunk.state, chunk.row, chunk.count, slopes, most=CHUNK, offsets=self.offsets
+        )
         return after, sample
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
@@ -151,6 +166,7 @@ class _Piece(NamedTuple):
 class _Remembering(Observer):
     """Remembers the way, to go back on it."""
 
+    offsets: bool  # whether sphere offsets are among the numbers
     tape: list[_Piece] = field(default_factory=list)
     numbers: Any = None  # derivatives by the simulation's numbers so far
     reads: Mapping[str, np.ndarray] = field(default_factory=dict)  # derivatives by the pressures that are read
@@ -164,7 +180,8 @@ class _Remembering(Observer):
             known = self.reads.get(chunk.stage.name)
             shape = (count, 3, before.replicas)
             own = np.zeros(shape) if known is None else known[first : first + count]
-            by_numbers, by_state = _pulled(simulation, before, rows, (slope, jnp.asarray(own)))
+            back_from = (slope, jnp.asarray(own))
+            by_numbers, by_state = _pulled(simulation, before, rows, back_from, offsets=self.offsets)
             self.numbers = by_numbers if self.numbers is None else jax.tree.map(jnp.add, self.numbers, by_numbers)
             moving: Moving = by_state
             return moving
@@ -225,7 +242,7 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
     slope: Moving | None = None
     if acts_on_prefix(list(theta)):
         slope = jax.jvp(lambda theta: _moving(along(theta).begin()), (theta,), (tangent,))[1]
-    pushing = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope)
+    pushing = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope, _needs_offsets(theta))
     on.observers = (pushing,)
     samples = on.run_stages(*common)
     if pushing.moving is None:
@@ -245,12 +262,14 @@ def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
     """What stands at names, as arrays.
 
     Raises:
-        ValueError: if there is no such name, or it holds what has no derivative.
+        ValueError: if there is no such name, it holds what has no derivative, or it is within another.
     """
     require_names(names, "by")
     found = {name: value_at(experiment, name) for name in names}
     for name, tree in found.items():
-        if name in FIXED or not all(map(_is_number, jax.tree.leaves(tree))):
+        if inside := next((other for other in found if name.startswith(f"{other}.")), ""):
+            raise ValueError(f"{name} is part of {inside}; name one of them")
+        if name in FIXED or tree is None or not all(map(_is_number, jax.tree.leaves(tree))):
             raise ValueError(
                 f"{name} is fixed when a program is compiled and has no derivative; "
                 "numbers like gamma0, friction.mu, signals.amplitudes and pack.position have"
@@ -272,7 +291,7 @@ def _along(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
 
 def _number_slope(experiment: Experiment, theta: Any, tangent: Any, *, sheared: bool) -> Any:
     def numbers(theta: Any) -> list[jax.Array]:
-        return _numbers(with_values(experiment, theta).simulation(sheared=sheared))
+        return _numbers(with_values(experiment, theta).simulation(sheared=sheared), _needs_offsets(theta))
 
     return jax.jvp(numbers, (theta,), (tangent,))[1]
 
@@ -282,6 +301,7 @@ def _work(experiment: Experiment, on: Runner) -> float:
     return work_of(common, on.state.replicas) + work_of(own, experiment.replicas)
 
 
+@comparable
 @dataclass(frozen=True)
 class Gradient:
     """A number and its derivatives.
@@ -315,7 +335,8 @@ def value_and_grad(
     Args:
         experiment: where.
         by: what to differentiate by: dotted names of floats or of parts that hold them, like "signals.amplitudes",
-            "friction.mu", "t0" or "pack.position". Shapes of grains are not among them (use `jax.grad`).
+            "friction.mu", "t0" or "pack.position". None within another. "pack.clump" and its offsets take as long as
+            `jax.grad` of plain JAX does: the native library has no derivatives by the shape of a grain.
         loss: what is differentiated; default the fidelity.
         checkpoint: where to go on and to keep how far it is on the way back; the way forward, a tenth, is done again.
         progress: told about every chunk of both ways; default a bar in a terminal or a notebook, False for none.
@@ -329,7 +350,8 @@ def value_and_grad(
     common, own = experiment.phases
     on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))
     on.total_work = _work(experiment, on)
-    prefix, rest = _Remembering(), _Remembering()
+    offsets = _needs_offsets(by)
+    prefix, rest = _Remembering(offsets), _Remembering(offsets)
     on.observers = (prefix,) if acts_on_prefix(by) else ()
     _, pull_begin = jax.vjp(lambda theta: _moving(along(theta).begin()), theta)
     on.run_stages(*common)
@@ -351,7 +373,7 @@ def value_and_grad(
 
     def pull_numbers(sheared: bool, found: Any) -> Any:
         def numbers(theta: Any) -> list[jax.Array]:
-            return _numbers(along(theta).simulation(sheared=sheared))
+            return _numbers(along(theta).simulation(sheared=sheared), offsets)
 
         return jax.vjp(numbers, theta)[1](found)[0]
 

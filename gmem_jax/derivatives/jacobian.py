@@ -15,12 +15,14 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import Recall, run
 from gmem_jax.experiment.signals import Bumps
+from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within
 
 LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
 
 
+@comparable
 @dataclass(frozen=True)
 class Jacobian:
     """Derivatives of one recalled signal.

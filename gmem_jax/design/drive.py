@@ -8,6 +8,7 @@ import numpy as np
 
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import run
+from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress
@@ -15,6 +16,7 @@ from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progres
 PARAMETERS = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.stiffness"}
 
 
+@comparable
 @dataclass(frozen=True)
 class TunedDrive:
     """Drive parameters found, and the way there.

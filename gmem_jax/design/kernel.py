@@ -16,6 +16,7 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import Prefix, run
 from gmem_jax.experiment.signals import Bumps, Signals, bin_average
+from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress
@@ -24,6 +25,7 @@ from gmem_jax.simulation.protocol import BINS
 FINE = 2048  # points of v for inner products of basis functions
 
 
+@comparable
 @dataclass(frozen=True)
 class MemoryKernel:
     """The recall of n basis waveforms, for unit amplitude.

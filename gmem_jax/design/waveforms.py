@@ -17,6 +17,7 @@ from gmem_jax.design.kernel import FINE, bumps, nearest
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline, waveform
+from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within
@@ -30,6 +31,7 @@ WIDTH = 0.2  # of them, in u
 TANGENT = 2.5  # cost of a tangent in runs; see benchmarks
 
 
+@comparable
 @dataclass(frozen=True)
 class Design:
     """Waveforms found, and the way there.

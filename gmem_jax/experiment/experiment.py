@@ -15,6 +15,7 @@ from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
 from gmem_jax.experiment.arguments import require_once, require_parts
+from gmem_jax.experiment.asked import require_double, require_seen
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocols import Shear, memory_protocol
@@ -22,8 +23,10 @@ from gmem_jax.experiment.signals import Signals, bin_average, part
 from gmem_jax.native import Backend, Precision
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.own_law import require_law
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar, impossible, parameter, pytree, settle, static, traced
+from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State, Status, replicate
 from gmem_jax.physics.step import System, start
@@ -120,6 +123,10 @@ class Experiment:
             raise ValueError(f"steps must be a whole number from 1, got {self.steps!r}")
         object.__setattr__(self, "steps_per_bin", self._whole_steps())
         self._check_shapes()
+        if jax.config.read("jax_enable_x64"):
+            require_double(pack=self.pack, signals=self.signals)
+        if not native.supports(self.friction) and not traced(self.friction):
+            require_law(self.friction, self.replicas)
         self._check_waveforms()
         step = self.timing.dt
         if not traced(step) and not np.all(np.asarray(step) <= LARGEST_STEP):
@@ -168,11 +175,12 @@ class Experiment:
             return
         with jax.ensure_compile_time_eval():
             ends, within = (np.asarray(values) for values in _probe(self.signals))
-            silent = not np.any(within) and not np.any(np.asarray(bin_average(self.signals)))
+            integrals = np.asarray(bin_average(self.signals))
         if not np.all(np.isfinite(ends)) or np.max(np.abs(ends)) > _OPEN:
             raise ValueError(f"waveforms must vanish at u = 0 and u = 1; found {np.abs(ends).max():g} there")
-        if silent:
+        if not np.any(within) and not np.any(integrals):
             raise ValueError("every waveform is zero: there is nothing to recall, and no gain or fidelity")
+        require_seen(within, integrals)
 
     @property
     def replicas(self) -> int:
@@ -228,7 +236,8 @@ class Experiment:
         """The pack at rest with friction switched on: one replica, or all where parameters differ in the prefix."""
         before = {name: value for name, value in replica_parameters(self).items() if name not in AFTER_PREFIX}
         wide = self.replicas if any(jnp.ndim(value) for value in before.values()) else 1
-        position, quaternion = replicate((self.pack.position[..., None], self.pack.quaternion[..., None]), wide)
+        turned = unit(self.pack.quaternion[..., None])
+        position, quaternion = replicate((self.pack.position[..., None], turned), wide)
         state = start(self.simulation(sheared=False).system, position, quaternion, self.pack.box)
         bits = jnp.where(self._impossible(), int(Status.IMPOSSIBLE), 0)
         bits |= jnp.where(jnp.all(jnp.asarray(self.timing.dt) <= LARGEST_STEP), 0, int(Status.STEP_TOO_LARGE))

@@ -14,6 +14,7 @@ from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree
+from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Box, Grains, still_box
 from gmem_jax.simulation.neighbors import SKIN, pair_finder
@@ -104,8 +105,18 @@ def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: 
 def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: str = "") -> Pack:
     """The same box and grain with other centres [N, 3] and orientations [N, 4], and their own neighbour list.
 
-    What was measured of the old ones at rest is no part of its record.
+    Quaternions are brought to length 1. What was measured of the old ones at rest is no part of the record.
+
+    Raises:
+        ValueError: if a number is not finite, a quaternion is zero, or the shapes are not those of one pack.
     """
+    position, quaternion = jnp.asarray(position, float), jnp.asarray(quaternion, float)
+    if position.ndim != 2 or (position.shape[1], quaternion.shape) != (3, (len(position), 4)):
+        raise ValueError(f"a pack has centres [N, 3] and quaternions [N, 4], got {position.shape}, {quaternion.shape}")
+    quaternion = unit(quaternion[..., None])[..., 0]
+    broken = ~np.all(np.isfinite(np.concatenate([position, quaternion], axis=1)), axis=1)
+    if np.any(broken):
+        raise ValueError(f"grain {np.argmax(broken) + 1}: a number is not finite, or its quaternion is zero")
     pairs = find_pairs(pack.clump, np.asarray(position), np.asarray(quaternion), pack.box, float(pack.delta0))
     record = json.dumps({key: value for key, value in pack.info.items() if key != "at_rest"})
     return replace(pack, position=position, quaternion=quaternion, pairs=pairs, name=name or pack.name, record=record)

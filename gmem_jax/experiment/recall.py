@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import analysis, html
+from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
-from gmem_jax.experiment.validity import validity
+from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
 from gmem_jax.physics.pytree import Scalar, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
@@ -47,6 +48,7 @@ class Recall:
         shear: the waveforms I there, [S, 256].
         J: integrals of the waveforms, averaged over each bin, [S, 256].
         p_sig: recalled signals, [S, 256], in E.
+        rounding: what round-off makes of each, root mean square over the bins, [S], in E; see `doubts.rounding`.
         gain: G of the set.
         fidelity: F of the set.
         windowed_gain: G after a running mean of p_sig and J over the ringing period.
@@ -66,6 +68,7 @@ class Recall:
     shear: jax.Array
     J: jax.Array
     p_sig: jax.Array
+    rounding: jax.Array
     gain: jax.Array
     fidelity: jax.Array
     windowed_gain: jax.Array
@@ -110,12 +113,14 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
     """Subtract the background and compare with the integrals."""
     pack, t0 = experiment.pack, experiment.t0
     step = experiment.timing.dt
-    wall_speed = 0.5 * (pack.upper - pack.lower)[0] * (1.0 - jnp.sqrt(1.0 - experiment.compression)) / t0
-    residual = stages[experiment.protocol.before_read].largest_speed[-1] / wall_speed
+    residual = stages[experiment.protocol.before_read].largest_speed[-1] / compression_speed(experiment)
     status = status | jnp.where(residual < REST_SPEED, 0, int(Status.NOT_AT_REST)).astype(jnp.int32)
     # A factor, not a choice: the derivative of what is broken must be NaN too.
     sound = jnp.where(jnp.any(status & ~int(DOUBTFUL)), jnp.nan, 1.0)
-    p_sig = sound * experiment.recalled({name: stages[name].pressure for name in experiment.protocol.reads})
+    found = experiment.recalled({name: stages[name].pressure for name in experiment.protocol.reads})
+    p_sig = sound * found
+    noise = rounding(experiment, stages)
+    part = noise / readable(experiment, found)
     integral = experiment.integral()
     match = experiment.compare(p_sig)
     smooth = analysis.compare(p_sig, integral, experiment.scale, pack.ringing_period / jnp.max(jnp.asarray(t0)))
@@ -125,13 +130,14 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
         shear=experiment.signals.shear(u).T,
         J=integral,
         p_sig=p_sig,
+        rounding=noise,
         gain=match.gain,
         fidelity=match.fidelity,
         windowed_gain=smooth.gain,
         windowed_fidelity=smooth.fidelity,
         window=pack.ringing_period,
         residual_speed=residual,
-        status=status | validity(experiment, stages, match.fidelity, smooth.fidelity),
+        status=status | validity(experiment, stages, match.fidelity, smooth.fidelity, part),
         stages=stages,
         dt=step,
         protocol=experiment.protocol,
@@ -164,9 +170,10 @@ def recall(experiment: Experiment) -> Recall:
     into NaN. The pack's own neighbour list must last; `run` makes it anew.
 
     Raises:
-        ValueError: if 64-bit mode is off.
+        ValueError: if 64-bit mode is off, or was when the pack or the signals were made.
     """
     require_x64()
+    require_double(pack=experiment.pack, signals=experiment.signals)
     found: Recall = _recall(experiment)
     return found
 
@@ -190,11 +197,13 @@ def runner_of(experiment: Experiment, **options: Any) -> Runner:
     """A runner at the beginning of the experiment.
 
     Raises:
-        ValueError: if 64-bit mode is off, or the experiment is traced.
+        ValueError: if 64-bit mode is off, or was when the pack or the signals were made; or the experiment is traced.
     """
     require_x64()
+    require_double(pack=experiment.pack, signals=experiment.signals)
     if traced(experiment):
         raise ValueError("gm.run works on the host; inside jax.jit, jax.vmap or jax.grad use gm.recall")
+    require_inside(experiment.pack)
     pack, deepest = experiment.pack, float(np.max(np.asarray(experiment.compression)))
     smallest = smallest_box(np.asarray(pack.lower), np.asarray(pack.upper), deepest)
     state = _begin(experiment)

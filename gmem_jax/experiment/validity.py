@@ -10,9 +10,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
+from gmem_jax.experiment.analysis import compare
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.physics.contact.friction import CoulombLaw
+from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
@@ -26,10 +29,18 @@ RINGING = 0.03  # what averaging over T_1 may add to F: at N = 325 up to 0.005 a
 LARGEST_SHEAR = 0.25  # of delta0; gains are 1.4 to 1.7 times as large at 0.2, 2.1 to 2.6 at 0.3; the paper ends at 0.1
 LARGEST_WAVEFORM = 2.0  # |I|; the paper's signals have 1 at most, and gains are per gamma0
 LARGEST_FRICTION = 10.0  # no pair of materials has it; beyond it G changes by 2 % up to 1e6: hardly a contact slides
+FASTEST_GRAIN = 3.5  # wall speeds, for half of a stage; 1.2 to 2.3 in sound runs with friction, 5 to 18 in unstable
+NOISE = {  # of p_sig, over mean pressure and root of steps; measured, in these units: 1 to 3 (H), 15 (M1); 0.4 to 1.2
+    "double": 5.0 * 2.0**-53,
+    "mixed": 0.01 * 2.0**-24,
+}
+LARGEST_NOISE = 0.01  # of p_sig; G and F then change in the third digit
 LARGEST_STIFFNESS = 1.5  # of friction, in k_n: d f_n / dp is 1.5 k_n sqrt(p), which Mindlin's contacts do not reach
 
 
-def validity(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Array, windowed: jax.Array) -> jax.Array:
+def validity(
+    experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Array, windowed: jax.Array, noise: jax.Array
+) -> jax.Array:
     """The bits of `Status` that leave the numbers as they are, but for NOT_AT_REST.
 
     Args:
@@ -37,6 +48,7 @@ def validity(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Arra
         stages: samples of its stages by name, leading axis bins; one replica where all are alike.
         raw: F.
         windowed: F averaged over the ringing period.
+        noise: round-off in p_sig over its size, of every signal, [S]; see `rounding`.
 
     Returns:
         int32, broadcasts against [S + 1].
@@ -47,6 +59,8 @@ def validity(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Arra
     shear = jnp.asarray(experiment.gamma0) * waveform / experiment.compression
     law: Any = experiment.friction
     friction = jnp.asarray(law.mu if isinstance(law, CoulombLaw) else 0.0)
+    rubs = friction > 0.0 if isinstance(law, CoulombLaw) else not isinstance(law, Frictionless)
+    least = -_most([-(sample.pressure[:, 0] + sample.pressure[:, 1]) for sample in stages.values()])
     stiffness = jnp.asarray(law.stiffness if isinstance(law, Hooke | MindlinRescaled | Mindlin) else 0.0)
     found = {
         Status.DEEP_OVERLAP: deepest > DEEPEST,
@@ -56,6 +70,10 @@ def validity(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Arra
         Status.LARGE_WAVEFORM: waveform > LARGEST_WAVEFORM,
         Status.LARGE_FRICTION: friction > LARGEST_FRICTION,
         Status.LARGE_STIFFNESS: stiffness > LARGEST_STIFFNESS * experiment.material.normal_stiffness,
+        Status.RESTLESS: ((_restlessness(experiment, stages) > FASTEST_GRAIN) & rubs)
+        | (jnp.asarray(experiment.drag) * experiment.timing.dt > 1.0),
+        Status.ROUNDED: jnp.concatenate([jnp.zeros(1, bool), noise >= LARGEST_NOISE]),
+        Status.UNLOADED: least <= 0.0,
     }
     bits = jnp.zeros(1, jnp.int32)
     for bit, doubtful in found.items():
@@ -65,10 +83,51 @@ def validity(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Arra
 
 def _most(values: list[jax.Array]) -> jax.Array:
     """The largest of each replica over all bins of all stages, [B]."""
-    largest = jnp.asarray(0.0)
+    largest = jnp.asarray(-jnp.inf)
     for value in values:
         largest = jnp.maximum(largest, jnp.max(value, axis=0))
     return largest
+
+
+def compression_speed(experiment: Experiment) -> jax.Array:
+    """Of a wall of the x axis while the pack is compressed, in R / t_c; scalar or [S + 1]."""
+    pack, shrinks = experiment.pack, 1.0 - jnp.sqrt(1.0 - jnp.asarray(experiment.compression))
+    return 0.5 * (pack.upper - pack.lower)[0] * shrinks / experiment.t0
+
+
+def _restlessness(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.Array:
+    """Speed of the fastest grain over that of the walls, for half of a stage in which these move, [B]."""
+    slow, bin_time = compression_speed(experiment), jnp.asarray(experiment.t0) / BINS
+    moving = [stage.name for stage in experiment.protocol if stage.start != stage.stop]
+    found = [jnp.zeros((1, 1))]
+    for sample in (stages[name] for name in moving if name in stages):
+        walls = 0.5 * jnp.max(jnp.abs(jnp.diff(sample.lengths, axis=0)), axis=(0, 1)) / bin_time
+        found.append(jnp.median(sample.largest_speed, axis=0) / jnp.maximum(walls, slow)[None])
+    return _most(found)
+
+
+def rounding(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.Array:
+    """What round-off makes of p_sig, root mean square over the bins of each signal, [S], in E.
+
+    Each replica is rounded in its own way in every step, and its contacts remember that. What was measured (the
+    difference from a larger gamma0's p_sig, scaled) does not depend on the number of grains.
+    """
+    readout = stages[experiment.protocol.reads[0]].pressure[:, :2, 1:]
+    steps = experiment.steps_per_bin * experiment.protocol.bins
+    noise: jax.Array = lax.stop_gradient(NOISE[experiment.precision] * steps**0.5 * jnp.mean(readout, axis=(0, 1)))
+    return noise
+
+
+def readable(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
+    """Root mean square of recalled signals [S, 256], or of the part of them that is like J, whichever is less: [S].
+
+    Infinite for waveforms that are zero: nothing is read there.
+    """
+    integral, scale = experiment.integral(), jnp.asarray(experiment.scale)
+    template = scale / jnp.max(scale) * integral
+    alike = compare(p_sig, template, 1.0).gain * template
+    size = jnp.sqrt(jnp.min(jnp.mean(jnp.stack([p_sig, alike]) ** 2, axis=-1), axis=0))
+    return lax.stop_gradient(jnp.where(jnp.any(integral, axis=-1), size, jnp.inf))
 
 
 def _largest_waveforms(experiment: Experiment) -> jax.Array:

@@ -118,6 +118,7 @@ RECALL = Schema(
         "shear": Array("real", ("signal", "u"), "1", "I(u), the waveforms as applied, in parts of gamma0"),
         "J": Array("real", ("signal", "u"), "1", "J(u), their integrals averaged over each bin"),
         "p_sig": Array("real", ("signal", "u"), "E", "recalled signals, the background subtracted"),
+        "rounding": Array("real", ("signal",), "E", "round-off in p_sig, root mean square; not in older files"),
         "gain": Array("real", (), "1", "G of the set"),
         "fidelity": Array("real", (), "1", "F of the set"),
         "windowed_gain": Array("real", (), "1", "G after a running mean over the ringing period"),

@@ -71,9 +71,35 @@ KINDS: dict[str, type] = {}
 """Every class that `pytree` registered, by name: what files may hold."""
 
 
+def _alike(one: Any, other: Any) -> bool:
+    """Whether two values of fields are equal, arrays in shape and in every number."""
+    if one is other:
+        return True
+    if isinstance(one, np.ndarray | jax.Array) or isinstance(other, np.ndarray | jax.Array):
+        return bool(np.array_equal(one, other))
+    if isinstance(one, dict) and isinstance(other, dict):
+        return list(one) == list(other) and all(_alike(one[name], other[name]) for name in one)
+    if isinstance(one, tuple | list) and type(one) is type(other):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    return bool(one == other)
+
+
+def _equal(self: Any, other: Any) -> Any:
+    """Whether all fields are equal, arrays in shape and in every number."""
+    if type(other) is not type(self):
+        return NotImplemented
+    return all(_alike(getattr(self, entry.name), getattr(other, entry.name)) for entry in fields(self))
+
+
+def comparable(cls: type[T]) -> type[T]:
+    """Let `==` of a dataclass that holds arrays be True or False; its hash stays, as equal objects have equal ones."""
+    cls.__eq__ = _equal  # type: ignore[method-assign]
+    return cls
+
+
 def pytree(cls: type[T]) -> type[T]:
     """Register a frozen dataclass with JAX. Rebuilding one runs no checks: its leaves may be tracers, or anything."""
-    KINDS[cls.__name__] = cls
+    KINDS[comparable(cls).__name__] = cls
     kinds: dict[str, list[str]] = {"data": [], "static": [], "label": []}
     for entry in fields(cls):  # type: ignore[arg-type]
         kinds[next((kind for kind in ("static", "label") if kind in entry.metadata), "data")].append(entry.name)

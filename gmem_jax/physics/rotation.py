@@ -42,6 +42,19 @@ def turn(quaternion: jax.Array, angle: jax.Array) -> jax.Array:
     return unit
 
 
+_UNIT = 1e-12  # of a quaternion's length: nearer to 1 it stays as it is
+
+
+def unit(quaternion: jax.Array) -> jax.Array:
+    """Quaternions [..., 4, B] of any length but zero, brought to length 1; those that have it stay, bit for bit.
+
+    Their derivatives are those of the division by the length in both cases: the length itself counts for nothing.
+    """
+    scale = 1.0 / jnp.sqrt(jnp.sum(quaternion * quaternion, axis=-2, keepdims=True))
+    rest = jnp.where(jnp.abs(scale - 1.0) < _UNIT, 1.0 - scale, 0.0)
+    return quaternion * (scale + jax.lax.stop_gradient(rest))
+
+
 def uniform(key: jax.Array, count: int) -> jax.Array:
     """`count` unit quaternions, [count, 4], uniform over all orientations."""
     sample = jax.random.normal(key, (count, 4))

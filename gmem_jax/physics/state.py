@@ -32,6 +32,9 @@ class Status(enum.IntFlag):
     LARGE_WAVEFORM = 4096
     LARGE_FRICTION = 8192
     LARGE_STIFFNESS = 16384
+    RESTLESS = 32768
+    ROUNDED = 65536
+    UNLOADED = 131072
 
     @property
     def fatal(self) -> bool:
@@ -48,25 +51,31 @@ DOUBTFUL = (
     | Status.LARGE_WAVEFORM
     | Status.LARGE_FRICTION
     | Status.LARGE_STIFFNESS
+    | Status.RESTLESS
+    | Status.ROUNDED
+    | Status.UNLOADED
 )
 """The bits that warn and leave the numbers as they are; see `gmem_jax.experiment.validity`."""
 
 
 SENTENCES = {
-    Status.STALE_PAIRS: "grains moved further than the neighbour list allows; use a larger skin",
-    Status.OUTSIDE_BOX: "a grain left the box; use a smaller time step or check the pack",
-    Status.NOT_FINITE: "a position or a force is not a finite number; use a smaller time step or check the pack",
-    Status.NOT_AT_REST: "a hold ended before the pack was at rest; use a longer hold or a hold drag",
-    Status.OVERLAP_RANGE: "an overlap exceeded the p_max of the friction law; use a larger p_max",
-    Status.STEP_TOO_LARGE: "the time step exceeds 0.5 t_c; use a smaller dt",
+    Status.STALE_PAIRS: "grains moved further than the neighbour list allows; use gm.run, which makes it anew",
+    Status.OUTSIDE_BOX: "a grain left the box; use a smaller dt, or check where the grains of the pack lie",
+    Status.NOT_FINITE: "a position or a force is not a finite number; use a smaller dt, or check pack and friction law",
+    Status.NOT_AT_REST: "grains still move when the readout begins; use a longer store or a larger hold_drag",
+    Status.OVERLAP_RANGE: "an overlap exceeded what the friction law covers; use a larger p_max or a smaller delta0",
+    Status.STEP_TOO_LARGE: "the time step, t0 / (256 steps), exceeds 0.5 t_c; use more steps or a smaller t0",
     Status.IMPOSSIBLE: "a parameter or a waveform is impossible; use numbers that `Experiment` accepts outside a trace",
-    Status.DEEP_OVERLAP: "an overlap exceeded 0.2 R, and Hertz's law is for small ones; use less compression or shear",
-    Status.NOT_QUASI_STATIC: "the walls move too fast (an inertial number beyond 5e-3); use a larger t0 or less shear",
+    Status.DEEP_OVERLAP: "an overlap exceeded 0.2 R, and Hertz's law is for small ones; use a smaller delta0 or gamma0",
+    Status.NOT_QUASI_STATIC: "the walls move too fast (inertial number above 5e-3); use a larger t0 or smaller gamma0",
     Status.RINGING: "the pack rings: F over its period is larger by 0.03; use a larger t0, or F over T1",
     Status.SHEAR_BEYOND_COMPRESSION: "the shear exceeds delta0 / 4, where the gain depends on it; use a smaller gamma0",
     Status.LARGE_WAVEFORM: "a waveform exceeds 2, and gains are per gamma0; use waveforms up to 1 and a larger gamma0",
     Status.LARGE_FRICTION: "mu exceeds 10, as no material does, so that contacts hardly slide; use a smaller mu",
-    Status.LARGE_STIFFNESS: "tangential springs are stiffer than a Hertz contact is; use a stiffness below 1.5 k_n",
+    Status.LARGE_STIFFNESS: "tangential springs are stiffer than Hertz contacts; use stiffness < 1.5 normal_stiffness",
+    Status.RESTLESS: "grains move far faster than the walls, as in unstable steps; use a smaller dt or hold_drag",
+    Status.ROUNDED: "round-off is 1 % of p_sig or more; use a larger gamma0, or precision double if it was mixed",
+    Status.UNLOADED: "the walls carried nothing during a whole bin, and lost the pack; use a larger t0",
 }
 
 

@@ -25,6 +25,7 @@ from gmem_jax.simulation.progress import Progress, silent, work_of_bin
 from gmem_jax.simulation.protocol import Stage
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.sharding import Placement, to_host
+from gmem_jax.simulation.stability import cause
 
 
 def status_of(state: State) -> int:
@@ -32,14 +33,15 @@ def status_of(state: State) -> int:
     return together(to_host(state.status))
 
 
-def raise_if_fatal(status: int, where: str) -> None:
+def raise_if_fatal(status: int, where: str, simulation: Simulation | None = None) -> None:
     """Raise if `status` says that the numbers are meaningless.
 
     Raises:
-        RunFailedError: naming the stage and what happened.
+        RunFailedError: naming the stage and what happened; and why, where a number of the simulation tells.
     """
     if Status(status).fatal:
-        raise RunFailedError(f"{where}: {explain(status)}")
+        why = "" if simulation is None else cause(simulation)
+        raise RunFailedError("; ".join(filter(None, (f"{where}: {explain(status)}", why))))
 
 
 def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
@@ -182,7 +184,7 @@ class Runner:
         if status & Status.STALE_PAIRS:
             self._renew_stale(chunk)
             return
-        raise_if_fatal(status, stage.name)
+        raise_if_fatal(status, stage.name, self.simulation)
         for observer in observers:
             observer.commit(chunk, state, sample)
         self.state = state
@@ -240,6 +242,8 @@ class Runner:
             self.skin *= 1.5
             self.finder = None
             if self.skin > WIDEST:
-                raise RunFailedError(f"{chunk.stage.name}: {explain(int(Status.STALE_PAIRS))}")
+                why = cause(self.simulation)
+                why = why or "the steps are unstable; use a smaller dt, or check pack and friction law"
+                raise RunFailedError(f"{chunk.stage.name}: grains moved by most of R within one bin: {why}")
         self._renewed_at = (chunk.stage.name, self.time)
         self.renew(self.simulation.box_before(chunk.row))

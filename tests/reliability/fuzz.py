@@ -124,8 +124,8 @@ def _recall(experiment: gm.Experiment) -> Recall:
     stages = OrderedDict(rest=_sample(5, 1), readout=_sample(256, count + 1))
     protocol = Protocol((Stage("rest", 1.0, 1.0, 5 / 256, "hold"), Stage("readout", 1.0, 0.0, 1.0, "read")))
     status = np.zeros(count + 1, np.int32)
-    of_replicas = {"residual_speed": np.full(count + 1, 1e-3), "status": status}
-    return Recall(u=u, **curves, **single, **of_replicas, stages=stages, protocol=protocol)
+    lone = {"residual_speed": np.full(count + 1, 1e-3), "rounding": np.full(count, 1e-16), "status": status}
+    return Recall(u=u, **curves, **single, **lone, stages=stages, protocol=protocol)
 
 
 def _unsealed(new: Path, old: Path, schema: str) -> None:

@@ -1,0 +1,67 @@
+"""What is refused when an experiment is made or run, beside impossible numbers and shapes that do not fit."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.physics.pairs import sphere_offsets
+from gmem_jax.physics.rotation import unit
+
+
+def require_double(**parts: Any) -> None:
+    """Refuse arrays in less than double precision, as everything has that was made before JAX's 64-bit mode was on.
+
+    Raises:
+        ValueError: naming the first such array.
+    """
+    for name, part in parts.items():
+        for path, leaf in jax.tree_util.tree_leaves_with_path(part):
+            kind = getattr(leaf, "dtype", np.dtype(float))
+            if jnp.issubdtype(kind, jnp.floating) and kind.itemsize < 8:
+                raise ValueError(
+                    f"{name}{jax.tree_util.keystr(path)} is {kind}, and float64 is needed: make or load the {name} "
+                    'after jax.config.update("jax_enable_x64", True)'
+                )
+
+
+def require_inside(pack: Pack) -> None:
+    """Refuse a pack that does not lie in its box.
+
+    Raises:
+        ValueError: naming the first grain that does not, and where it lies; or whose place is no number.
+    """
+    position, quaternion = jnp.asarray(pack.position)[..., None], unit(jnp.asarray(pack.quaternion)[..., None])
+    arms = sphere_offsets(quaternion, pack.clump)
+    spheres = np.asarray(position[:, None] + arms)[..., 0]
+    inside = (spheres >= np.asarray(pack.lower)) & (spheres <= np.asarray(pack.upper))
+    out = ~np.all(inside, axis=(1, 2))
+    if np.any(out):
+        grain = int(np.argmax(out))
+        if not np.all(np.isfinite(spheres[grain])):
+            raise ValueError(f"pack {pack.name}: grain {grain + 1}: a number is not finite, or its quaternion is zero")
+        place, lower, upper = (np.round(np.asarray(one), 3) for one in (pack.position[grain], pack.lower, pack.upper))
+        raise ValueError(
+            f"pack {pack.name}: grain {grain + 1} does not lie in the box: its centre is at {place}, the box is from "
+            f"{lower} to {upper} (R)"
+        )
+
+
+def require_seen(middles: np.ndarray, integrals: np.ndarray) -> None:
+    """Refuse waveforms that are zero in the middle of every bin although their integrals are not.
+
+    Args:
+        middles: the waveforms there, [bins, S].
+        integrals: averaged over each bin, [S, bins].
+
+    Raises:
+        ValueError: naming the first such waveform.
+    """
+    unseen = np.any(integrals, axis=1) & ~np.any(middles, axis=0)
+    if np.any(unseen):
+        raise ValueError(
+            f"waveform {np.argmax(unseen) + 1} is zero in the middle of every bin of u: make it wider than a bin, "
+            f"1 / {len(middles)}"
+        )

@@ -1,0 +1,71 @@
+"""Which number of a run makes its steps unstable: what is said where a run broke.
+
+The steps are explicit. A spring k on a mass m needs dt < 2 sqrt(m / k) and a dashpot c needs dt < m / c, as the forces
+use velocities predicted to the end of a step. Here one contact is looked at, of an overlap as in a pack: what exceeds
+these bounds is a cause, what does not may still be one.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gmem_jax.physics.contact.laws import entry_of
+from gmem_jax.simulation.loop import Simulation
+from gmem_jax.simulation.sharding import to_host
+
+OVERLAP = 0.05  # R
+_USUAL = {  # what stands for a number that is asked whether it is the cause
+    "hold_drag": 0.0,
+    "material.wall_rigidity": 1.0,
+    "material.normal_damping": 0.23,
+    "friction.stiffness": 0.13,
+    "friction.damping_time": 0.069,
+}
+
+
+def longest_step(mass: float, plane_stiffness: float, numbers: Mapping[str, float]) -> float:
+    """The longest stable step for a grain on a wall and two grains with friction, in t_c.
+
+    Args:
+        mass: of a grain.
+        plane_stiffness: of its material.
+        numbers: those in `_USUAL`.
+    """
+    drag, rigidity, damping, spring, tangential_damping = (numbers[name] for name in _USUAL)
+    stiffness = plane_stiffness * math.sqrt(OVERLAP) * max(rigidity, 2.0**-0.5)  # or of two grains, of mass m / 2
+    rates = (
+        drag,
+        0.5 * math.sqrt(1.5 * stiffness / mass),
+        stiffness * damping / mass,
+        0.5 * math.sqrt(2.0 * spring / mass),
+        2.0 * spring * tangential_damping / mass,
+    )
+    return float(1.0 / max(rates))
+
+
+def cause(simulation: Simulation) -> str:
+    """The number that made a run unstable, as far as can be said; "" if none is beyond its bound."""
+    material, law = simulation.system.material, simulation.system.friction
+    known: dict[str, Any] = {"hold_drag": simulation.drag}
+    known |= {f"material.{name}": getattr(material, name) for name in ("wall_rigidity", "normal_damping")}
+    if entry_of(law):
+        known |= {f"friction.{name}": getattr(law, name, 0.0) for name in ("stiffness", "damping_time")}
+    numbers = {**_USUAL, **{name: _most(value) for name, value in known.items()}}
+    mass, plane, dt = _most(simulation.system.clump.mass), _most(material.plane_stiffness), _most(simulation.dt)
+
+    def longest(**changed: float) -> float:
+        return longest_step(mass, plane, {**numbers, **changed})
+
+    name = max(known, key=lambda one: longest(**{one: _USUAL[one]}))
+    if longest() >= dt or longest(**{name: _USUAL[name]}) <= longest():
+        return ""
+    return (
+        f"{name} = {numbers[name]:g} makes steps beyond {longest():.2g} t_c unstable, and dt is {dt:.2g}; "
+        f"use a smaller {name}"
+    )
+
+
+def _most(value: Any) -> float:
+    return float(np.max(to_host(value)))
