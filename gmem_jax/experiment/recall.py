@@ -16,7 +16,7 @@ from gmem_jax.experiment import analysis, html
 from gmem_jax.experiment.devices import spread_over
 from gmem_jax.experiment.doubts import doubts
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
-from gmem_jax.experiment.frames import Film, Frames, Taken, joined, places
+from gmem_jax.experiment.frames import Film, Frames, Taken, joined, places, places_at
 from gmem_jax.experiment.host import (
     CHUNK,
     NOWHERE,
@@ -87,19 +87,27 @@ class Recall:
     dt: Scalar
     frames: Frames | None = None
 
-    def plot(self, what: str = "signals", experiment: Experiment | None = None, *, against: str = "time") -> Any:
+    def plot(
+        self,
+        what: str = "signals",
+        experiment: Experiment | None = None,
+        *,
+        against: str = "time",
+        signals: Sequence[int] = (),
+    ) -> Any:
         """A picture of it, which a notebook shows: `.save(path)` writes it, `.figure` is matplotlib's.
 
         Args:
             what: "signals", "waveforms", "all"; or a quantity of the stages, like "pressure", "Z" or "phi".
             experiment: that it is of, for the names of signals and the conditions in the title.
             against: "time" or "u", for the stages.
+            signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
 
         Raises:
-            ValueError: if there is no such picture; it names those that there are.
+            ValueError: if there is no such picture, or no such signal; it names those that there are.
         """
         from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
-        return from_above.plot(self, what, experiment, against)
+        return from_above.plot(self, what, experiment, against, signals)
 
     def _repr_html_(self) -> str:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}
@@ -216,6 +224,7 @@ def run(
     devices: Sequence[jax.Device] | None = None,
     frames: int = 0,
     frames_of: int = 1,
+    frames_at: Sequence[float] = (),
     keep: Keep = forget,
     progress: Progress = silent,
 ) -> Recall:
@@ -229,18 +238,20 @@ def run(
         devices: that share out the replicas; default all that JAX sees, also those of other processes.
         frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
         frames_of: the signal whose they are, from 1; 0 for the zero signal.
+        frames_at: compressions u, 0 to 1, at which more are kept, each time that the run passes them, to the next of 256
+            bins: u = 0.5 gives one of every compression and decompression.
         keep: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.parts`).
         progress: told about every chunk.
 
     Raises:
         ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
-            for too many or too few frames, or a signal that there is not.
+            for too many or too few frames, a u beyond 0 and 1, or a signal that there is not.
         RunFailedError: if the simulation broke down.
     """
     count, size = experiment.signals.count, batch or experiment.signals.count
     if size < 1:
         raise ValueError(f"batch must be at least 1, got {batch}")
-    film = film_of(experiment, frames, frames_of)
+    film = film_of(experiment, frames, frames_of, frames_at)
     begun = walker(experiment, progress=progress, film=film)
     warn_of_another_compression(experiment)
     if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
@@ -273,20 +284,24 @@ def run(
     found: Recall = finished(experiment, samples | after_prefix, jnp.asarray(status))
     return (
         found
-        if frames == 0
+        if not film.wanted
         else dataclasses.replace(found, frames=joined(taken, np.asarray(experiment.pack.clump.offsets), frames_of))
     )
 
 
-def film_of(experiment: Experiment, frames: int, of: int) -> Film:
-    """What is to be taken of a run: `frames` configurations of the replica of a signal.
+def film_of(experiment: Experiment, frames: int, of: int, at: Sequence[float] = ()) -> Film:
+    """What is to be taken of a run: `frames` configurations of the replica of a signal, and those `at` compressions.
 
     Raises:
-        ValueError: for too many or too few, or a signal that there is not.
+        ValueError: for too many or too few, a u beyond 0 and 1, or a signal that there is not.
     """
     if not 0 <= of <= experiment.signals.count:
         raise ValueError(f"frames of signal {of}: there are signals 1 to {experiment.signals.count}, and 0 for none")
-    return Film(places(experiment.stages, frames, CHUNK), of) if frames else Film()
+    stages = experiment.stages
+    along = [places(stages, frames, CHUNK)] if frames else []
+    wanted = [*along, places_at(stages, at)]
+    both = {stage.name: sorted({bins for each in wanted for bins in each.get(stage.name, ())}) for stage in stages}
+    return Film({name: found for name, found in both.items() if found}, of)
 
 
 def replica_bins(experiment: Experiment, batch: int) -> int:
