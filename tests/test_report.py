@@ -351,6 +351,12 @@ def test_a_browser_draws_it_all_and_fetches_nothing(browser: Any) -> None:
     assert 0.05 < drawn < 0.9  # of the picture: grains before a light background
 
 
+def test_frames_are_opened_at_the_last(browser: Any) -> None:
+    assert browser.execute_script(
+        "const at = document.querySelector('.view .frame'); return at.max > 0 && at.value === at.max"
+    )
+
+
 def test_the_controls_change_the_picture(browser: Any) -> None:
     pictures = {browser.execute_script(PICTURE)[1]}
     controls = (("frame", 3), ("colour", "coordination"), ("show", "both"), ("show", "forces"), ("cut", 0.5))

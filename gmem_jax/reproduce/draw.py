@@ -62,13 +62,13 @@ def _sizes(sizes: Iterable[int]) -> str:
 
 
 def said_of(rows: Sequence[Compared], rate: str) -> str:
-    """The line under a title: sizes, rate (t0 in t_c), and what error bars are."""
+    """The line under a title: our sizes, rate (t0 in t_c) and packs, and what error bars are."""
     counts = sorted({row.ours.packs for row in rows})
     over = f"{counts[0]} to {counts[-1]} packs" if len(counts) > 1 else f"{counts[0]} packs"
     own = "one pack" if counts == [1] else f"mean ± SE over {over}"
     sizes = sorted({row.conditions.grains for row in rows})
     size = _sizes(sizes) if len(sizes) < 3 else f"N = {sizes[0]:,} to {sizes[-1]:,}"
-    return f"gmem_jax: {size}, $t_0$ = {rate} $t_c$, {own}; published: mean ± SE"
+    return f"gmem_jax: {size}, $t_0$ = {rate} $t_c$, {own}"
 
 
 def against(path: Path, rows: Sequence[Compared], across: Sequence[str], title: str) -> None:
@@ -91,7 +91,8 @@ def against(path: Path, rows: Sequence[Compared], across: Sequence[str], title: 
     for line, (name, shown) in zip(axes, lines.items(), strict=True):
         for axis, panel in zip(line, panels, strict=True):
             _curves(axis, [row for row in shown if _panel(row.measure) == panel], name, panel)
-    figure.suptitle(title, fontsize=10)
+    beside = "; published: mean ± SE" if any(row.theirs for row in rows) else ""
+    figure.suptitle(title + beside, fontsize=10)
     save(path, figure, also=VECTOR)
 
 
@@ -366,12 +367,11 @@ def words(
         smooth = mean_over_ringing(recall, np.asarray(stored.signals), configuration["t0"])
         for axis, word in zip(line, chosen, strict=False):
             axis.axhline(0.0, color="0.8", linewidth=0.8)
+            strong = stored.signals if smooth is None else smooth
             if smooth is not None:
-                axis.plot(recall.u, unit * stored.signals[word], color=PALE, linewidth=0.8, label="recalled, SUB2-BL")
-            strong, name = (stored.signals, "recalled, SUB2-BL") if smooth is None else (smooth, MEAN)
-            axis.plot(recall.u, unit * strong[word], color=OURS, linewidth=1.1, label=name)
-            integral = scale * stored.templates[word]
-            axis.plot(recall.u, integral, "--", color=THEIRS, linewidth=1.1, label=r"$G E \delta_0 \gamma_0 J$")
+                axis.plot(recall.u, unit * stored.signals[word], color=PALE, linewidth=0.8)
+            axis.plot(recall.u, unit * strong[word], color=OURS, linewidth=1.1)
+            axis.plot(recall.u, scale * stored.templates[word], "--", color=THEIRS, linewidth=1.1)
             axis.set_title(f"{word:0{stored.bits}b}", fontsize=8)
         for axis in line[len(chosen) :]:
             axis.set_visible(False)
@@ -381,7 +381,8 @@ def words(
         lowest = [axis for axis in column if axis.get_visible()][-1]
         lowest.tick_params(labelbottom=True)
         lowest.set_xlabel("u")
-    labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(*labels, fontsize=7, frameon=False, loc="lower center", ncols=3, bbox_to_anchor=(0.5, -0.02))
     figure.suptitle(title, fontsize=10)
-    save(path, figure, also=VECTOR)
+    ringing = any(mean_over_ringing(recall, recall.p_sig, known["t0"]) is not None for recall, known in recalls)
+    drawn = f"Pale: recalled, SUB2-BL; blue: {MEAN}" if ringing else "Blue: recalled, SUB2-BL"
+    caption = rf"{drawn}; red: $G E \delta_0 \gamma_0 J$. All panels have one scale."
+    save(path, figure, also=VECTOR, caption=caption)
