@@ -2,8 +2,8 @@
 
 python experiments/results_page.py [--redraw]
 
-What is published beside each point is looked up anew. With --redraw pictures are drawn anew too, those that show no more
-than their table holds and those that need no run; those of recalls (figs. 3, 4, 6 and 13) stay as they are.
+What is published beside each point is looked up anew. With --redraw pictures are drawn anew too, those that show no
+more than their table holds and those that need no run; those of recalls (figs. 3, 4, 6 and 13) stay as they are.
 """
 
 import argparse

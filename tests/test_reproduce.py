@@ -181,7 +181,11 @@ def test_each_condition_that_is_varied_has_its_line_of_panels(monkeypatch: pytes
     monkeypatch.setattr(draw, "save", lambda path, figure, also: drawn.append(figure))
     draw.against(tmp_path / "fig11.png", rows, ("gamma0", "overlap"), "title")
     panels = [
-        {tuple(line.get_xdata()) for line in axis.get_lines() if line.get_linestyle() != "None" and len(line.get_xdata())}
+        {
+            tuple(line.get_xdata())
+            for line in axis.get_lines()
+            if line.get_linestyle() != "None" and len(line.get_xdata())
+        }
         for axis in drawn[0].axes
     ]
     assert panels == [{(3e-4, 1e-3)}, {(3e-4, 1e-3)}, {(0.6, 0.8, 1.0)}, {(0.6, 0.8, 1.0)}]

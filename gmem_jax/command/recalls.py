@@ -108,7 +108,9 @@ def _compressions(text: str) -> list[float]:
     try:
         return [float(each) for each in text.split(",")] if text else []
     except ValueError:
-        raise InputError(f"--frames-at {text}: must be numbers from 0 to 1 with commas between, as in 0,0.5,1") from None
+        raise InputError(
+            f"--frames-at {text}: must be numbers from 0 to 1 with commas between, as in 0,0.5,1"
+        ) from None
 
 
 def demo(

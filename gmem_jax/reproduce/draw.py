@@ -144,9 +144,7 @@ def _place(row: Compared, across: str, words: Sequence[str]) -> float:
     return float(words.index(value) if words else value)
 
 
-def _curve(
-    axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str], place: int, shifted: float
-) -> None:
+def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str], place: int, shifted: float) -> None:
     """Ours, and the published points beside them; `shifted` by so many distances of markers."""
     symbol, style = SYMBOLS[place % len(SYMBOLS)], STYLES[place % len(STYLES)]
     rows = sorted(rows, key=lambda row: _place(row, across, words))
@@ -357,7 +355,12 @@ def words(
     plt = pyplot()
     columns = max(map(len, shown))
     figure, axes = plt.subplots(
-        len(recalls), columns, figsize=(1.9 * columns, 2.1 * len(recalls) + 0.5), sharex=True, sharey=True, squeeze=False
+        len(recalls),
+        columns,
+        figsize=(1.9 * columns, 2.1 * len(recalls) + 0.5),
+        sharex=True,
+        sharey=True,
+        squeeze=False,
     )
     unit = Material().modulus
     for line, (recall, configuration), chosen in zip(axes, recalls, shown, strict=True):

@@ -24,9 +24,9 @@ from gmem_jax.reproduce.compare import Compared, Conditions, Point, compare, com
 from gmem_jax.reproduce.figures import FIGURES, SHOWN_WORD, Figure, Scale, Values, packs, scale_of, shown_packs, spec_of
 from gmem_jax.reproduce.single_contact import convergence_figure, laws_figure
 from gmem_jax.reproduce.two_grains import two_grains_figure
+from gmem_jax.show import tables
 from gmem_jax.show.figures import recall_figure
 from gmem_jax.show.render import packs_figure
-from gmem_jax.show import tables
 from gmem_jax.show.tables import summary
 from gmem_jax.sweeps.executors import Executor, Processes
 from gmem_jax.sweeps.spec import PREPARE, Spec

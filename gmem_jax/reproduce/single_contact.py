@@ -157,8 +157,8 @@ def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]
     right.set_ylim(2e-7, 5e-2)  # room for the legend
     right.legend(frameon=False, fontsize=8, loc="lower left")
     caption = (
-        "How many points Q of its history law M2 needs: the force on unloading (left), its deviation from the exact one "
-        "(middle), and the root mean square of that against Q (right), for the paper's weights, with and without its "
+        "How many points Q of its history law M2 needs: the force on unloading (left), its deviation from the exact "
+        "one (middle), and the root mean square of that against Q (right), for the paper's weights, with and without its "
         "h term, and ours."
     )
     save(path, figure, also=(".svg",), caption=caption)

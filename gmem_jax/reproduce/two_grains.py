@@ -116,9 +116,9 @@ def two_grains_figure(path: Path, count: int = 96, gamma0: float = 1e-3) -> dict
     right.legend(frameon=False, fontsize=7, loc="upper left")
     right.set_ylim(top=1.45 * story.recalled.max())
     caption = (
-        "How a contact keeps the shear. Left: two grains that the compression brings together at u = $u_c$. Middle: the "
-        "friction forces of three such contacts follow the shear from then on; what is left at u = 1 is released where "
-        f"it was taken up. Right: the mean of {count} contacts on the way back is the integral of the waveform."
+        "How a contact keeps the shear. Left: two grains that the compression brings together at u = $u_c$. Middle: "
+        "the friction forces of three such contacts follow the shear from then on; what is left at u = 1 is released "
+        f"where it was taken up. Right: the mean of {count} contacts on the way back is the integral of the waveform."
     )
     save(path, figure, also=(".svg",), caption=caption)
     names = [f"force_{story.closes[contact]:.3f}_ER2" for contact in shown]

@@ -91,7 +91,7 @@ def plot(recall: Recall, what: str, experiment: Experiment | None, against: str,
 
 
 def mean_over_ringing(recall: Recall, signals: np.ndarray, t0: Any) -> np.ndarray | None:
-    """Signals [S, 256] averaged over the ringing period; None at the paper's rate, where little rings, or an unknown one.
+    """Signals [S, 256] averaged over the ringing period; None at the paper's rate, or an unknown one.
 
     Args:
         recall: whose ringing period it is.
