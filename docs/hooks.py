@@ -52,4 +52,5 @@ def on_post_build(config: Any, **_: Any) -> None:
 
 def _drawn(found: re.Match[str]) -> str:
     display = "block" if found[1] == "div" else "inline"
-    return str(convert(html.unescape(found[2]), display=display))
+    formula = str(convert(html.unescape(found[2]), display=display))
+    return f'<div class="formula">{formula}</div>' if display == "block" else formula

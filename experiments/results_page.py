@@ -116,7 +116,12 @@ def heading(name: str, scale: str) -> list[str]:
     named, *changes = scale.split("-")
     command = f"`gmem reproduce {name}" + (f" --scale {','.join([named, *changes])}`" if named else "`")
     command = JOINED.get(f"{name}-{scale}", command)
-    return [f"## {', '.join(filter(None, [what, named, *changes]))}", "", command, ""]
+    at = ""
+    if named:
+        size = scale_of(",".join([named, *changes]), weighed.SIZES if name == "choices" else SCALES)
+        grains = f"{size.sizes[0]:,} to {size.sizes[-1]:,}" if name == "fig12b" else f"{size.grains:,}"
+        at = f": {grains} grains, t0 of {RATES.get(f'{name}-{scale}', f'{size.t0:,.0f}')}"
+    return [f"## {what}{at}", "", command, ""]
 
 
 def verdicts(path: Path) -> list[str]:

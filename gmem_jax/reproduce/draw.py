@@ -385,7 +385,9 @@ def words(
         lowest.tick_params(labelbottom=True)
         lowest.set_xlabel("u")
     figure.suptitle(title, fontsize=10)
-    ringing = any(mean_over_ringing(recall, recall.p_sig, known["t0"]) is not None for recall, known in recalls)
+    ringing = any(
+        mean_over_ringing(recall, np.asarray(recall.p_sig), known["t0"]) is not None for recall, known in recalls
+    )
     drawn = f"Pale: recalled, SUB2-BL; blue: {MEAN}" if ringing else "Blue: recalled, SUB2-BL"
     caption = rf"{drawn}; red: $G E \delta_0 \gamma_0 J$. All panels have one scale."
     save(path, figure, also=VECTOR, caption=caption)

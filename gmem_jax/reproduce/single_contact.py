@@ -158,8 +158,8 @@ def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]
     right.legend(frameon=False, fontsize=8, loc="lower left")
     caption = (
         "How many points Q of its history law M2 needs: the force on unloading (left), its deviation from the exact "
-        "one (middle), and the root mean square of that against Q (right), for the paper's weights, with and without its "
-        "h term, and ours."
+        "one (middle), and the root mean square of that against Q (right), for the paper's weights, with and without "
+        "its h term, and ours."
     )
     save(path, figure, also=(".svg",), caption=caption)
     shown = {f"{form.replace(', ', ' ')} Q={count}": forces[form, count] for form in FORMS for count in (20, 100, 400)}

@@ -68,7 +68,9 @@ def recall_drawing(
     if signals:
         rows = np.asarray(signals) - 1
         title += f"; G and F are of all {len(names)} signals"
-        names, scale = [names[row] for row in rows], scale if np.ndim(scale) == 0 else np.asarray(scale)[rows]
+        names = [names[row] for row in rows]
+        if scale is not None and np.ndim(scale):
+            scale = np.asarray(scale)[rows]
         recall = replace(recall, **{name: np.asarray(getattr(recall, name))[rows] for name in ("p_sig", "J", "shear")})
     if found == "signals":
         return signals_drawing(recall, names, title, scale, t0)
