@@ -169,6 +169,24 @@ def test_a_picture_of_a_stage_shows_the_chosen_signals(
     assert "band: lowest to highest" not in text
 
 
+@pytest.mark.parametrize(("at", "words"), [("0.5,x", "numbers from 0 to 1"), ("0.5,1.5", "frames at u = 1.5")])
+def test_frames_at_no_compression_are_refused_before_anything_is_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, folder: Path, at: str, words: str
+) -> None:
+    assert gmem(monkeypatch, "recall", folder / "pack.h5", "--frames-at", at, "-o", tmp_path / "r.h5") != 0
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_frames_at_chosen_compressions_are_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, folder: Path) -> None:
+    quick = ["--t0", "75", "--rest", "0.1", "--hold", "0.1", "--store", "0.1", "--no-picture", "--frames-at", "0.5"]
+    assert gmem(monkeypatch, "recall", folder / "pack.h5", *quick, "-o", tmp_path / "r.h5") == 0
+    frames = gm.load_recall(tmp_path / "r.h5")[0].frames
+    assert frames is not None
+    assert frames.stages == ("compress", "decompress", "encode", "readout")
+    np.testing.assert_allclose(frames.u, 0.5)
+
+
 def test_chosen_signals_are_the_columns_of_their_replicas(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
     experiment, recall = recalled
     (axis,) = recall.plot("p_xy", experiment, signals=[2]).figure.axes
