@@ -1,6 +1,7 @@
 """`gmem recall`, `gmem demo`."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,6 +56,7 @@ def _run(
     target: Signals | None = None,
     frames: int = 0,
     frames_of: int = 1,
+    frames_at: Sequence[float] = (),
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
     began = time.perf_counter()
@@ -64,7 +66,7 @@ def _run(
     side_by_side = min(batch, experiment.signals.count)
     what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
     announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
-    film: Any = {"frames": frames, "frames_of": frames_of}
+    film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": list(frames_at)}
     with resumable(data, key_of_run(experiment, batch=batch, **film), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             recall = jax.block_until_ready(run(experiment, batch=batch, cache=parts, progress=progress, **film))
@@ -76,7 +78,8 @@ def _run(
     if picture is not None:
         title = tables.heading(configuration)
         with drawing(picture):
-            figures.recall_figure(picture, recall, experiment.scale, title, configuration["signals"])
+            names, t0 = configuration["signals"], configuration["t0"]
+            figures.recall_figure(picture, recall, experiment.scale, title, names, t0)
             told += f" and {picture}"
     say(told)
     row = {**tables.summary(recall, configuration), "seconds": configuration["seconds"], "output": str(data)}
@@ -95,6 +98,9 @@ def recall_command(
     ] = None,
     frames: KeptFrames = 0,
     frames_of: Annotated[int, typer.Option(min=0, help="Signal whose configurations they are; 0: no shear.")] = 1,
+    frames_at: Annotated[
+        str, typer.Option(metavar="U,U", help="Keep configurations wherever u passes these, as in 0,0.5,1.")
+    ] = "",
     restart: Restart = False,
     picture: Picture = True,
     force: Force = False,
@@ -103,12 +109,23 @@ def recall_command(
     """Store waveforms in a pack and recall them."""
     (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
     target = chosen.target(experiment.signals.count)
-    if not frames:
-        refuse_idle("without --frames, which says how many", "frames_of")
-    frame_schedule(experiment, frames, frames_of)  # refuses what cannot be before anything is begun
-    film: Any = {"frames": frames, "frames_of": frames_of}
+    at = _compressions(frames_at)
+    if not frames and not at:
+        refuse_idle("without --frames or --frames-at, which say how many", "frames_of")
+    frame_schedule(experiment, frames, frames_of, at)  # refuses what cannot be before anything is begun
+    film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": at}
     row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
     emit(as_json, row, *tables.recall_lines(row, configuration))
+
+
+def _compressions(text: str) -> list[float]:
+    """Numbers of --frames-at."""
+    try:
+        return [float(each) for each in text.split(",")] if text else []
+    except ValueError:
+        raise InputError(
+            f"--frames-at {text}: must be numbers from 0 to 1 with commas between, as in 0,0.5,1"
+        ) from None
 
 
 def demo(

@@ -23,29 +23,36 @@ def show(
     plot: Annotated[str, typer.Option(metavar="WHAT", help="Draw this into --output; list says what there is.")] = "",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture to write: .png, .svg, .pdf.")] = None,
     against: Annotated[str, typer.Option(help="What stages are drawn over: time or u.")] = "time",
+    signal: Annotated[
+        str, typer.Option(metavar="N,N", help="Signals of a recall to draw, from 1; of stages 0 too, the zero signal.")
+    ] = "",
     csv: Annotated[bool, typer.Option("--csv", help="Print the recalled signals as CSV.")] = False,
     force: Force = False,
 ) -> None:
     """What a file holds; with --plot, a picture of it.
 
-    gmem show recall.h5 --plot signals -o x.png; gmem show recall.h5 --plot Z --against u -o z.png
+    gmem show recall.h5 --plot signals -o x.png; gmem show recall.h5 --plot Z --against u -o z.png;
+    gmem show recall.h5 --plot p_xy --signal 3 -o p.png
     """
     if against not in AGAINST:
         raise InputError(f"--against {against}: must be one of {', '.join(AGAINST)}")
     if plot:
         refuse_idle("beside --plot", "csv")
     if not plot or plot == "list":
-        refuse_idle("unless something is drawn with --plot", "against", "force")
+        refuse_idle("unless something is drawn with --plot", "against", "force", "signal")
     elif plot.lower() not in _OF_STAGES:
         refuse_idle(f"with --plot {plot}: only pictures of stages ({', '.join(QUANTITIES)}) have it", "against")
     if csv:
         refuse_idle("beside --csv", "as_json")
+    chosen = _numbers(signal)
     folder = file.is_dir()
     if folder:
+        if chosen:
+            raise InputError(f"--signal {signal}: a sweep has no signals of its own; name the file of a point")
         store = sweep.there(file)
         pictures = sweep_pictures(store)
     else:
-        found = shown(file, against)
+        found = shown(file, against, chosen)
         pictures = found.pictures
     if plot:
         _draw(file, pictures, plot, output, force, as_json)
@@ -59,6 +66,14 @@ def show(
         sweep.show(store, "", as_json)
     else:
         emit(as_json, found.facts, *found.lines)
+
+
+def _numbers(text: str) -> list[int]:
+    """Numbers of --signal."""
+    try:
+        return [int(each) for each in text.split(",")] if text else []
+    except ValueError:
+        raise InputError(f"--signal {text}: must be numbers with commas between, as in 1,3") from None
 
 
 def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None, force: bool, as_json: bool) -> None:

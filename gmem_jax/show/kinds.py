@@ -1,7 +1,7 @@
 """What any file that a command writes holds: facts, lines for a person, and the pictures that can be drawn of it."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,17 +46,26 @@ class Shown(NamedTuple):
     csv: Callable[[], str] | None = None
 
 
-def shown(file: Path, against: str = "time") -> Shown:
+def shown(file: Path, against: str = "time", signals: Sequence[int] = ()) -> Shown:
     """What a file, a pack or the folder of a sweep holds.
 
     Args:
         file: its path, or the name of a pack.
         against: "time" or "u": what pictures of stages are drawn over.
+        signals: numbers of those that pictures of a recall show; default all.
 
     Raises:
+        ValueError: if signals are chosen of what is no recall.
         FileNotFoundError: if it is not there.
         FileFormatError: if it is of no kind that commands write, or damaged.
     """
+    found = _held(file, against, signals)
+    if signals and found.csv is None:
+        raise ValueError(f"{file}: holds no recall whose signals could be chosen")
+    return found
+
+
+def _held(file: Path, against: str, signals: Sequence[int]) -> Shown:
     if pack_called(str(file)):
         return _pack(file, against)
     suffix = file.suffix.lower()
@@ -72,18 +81,18 @@ def shown(file: Path, against: str = "time") -> Shown:
     if kind in (PACK.name, *PACK.before):
         return _pack(file, against)
     if kind in (RECALL.name, *RECALL.before):
-        return _recall(file, against)
+        return _recall(file, against, signals)
     known = ", ".join(schema.name for schema in (RECALL, PACK, KERNEL))
     raise FileFormatError(f"{file}: schema is {kind[:40]!r}, expected one of {known}")
 
 
-def _recall(file: Path, against: str) -> Shown:
+def _recall(file: Path, against: str, signals: Sequence[int]) -> Shown:
     stored = load_recall(file)
     recall, configuration = stored
     row = tables.summary(recall, configuration)
 
     def draw(what: str, path: Path) -> None:
-        recall_drawing(recall, what, configuration, against=against).save(path)
+        recall_drawing(recall, what, configuration, against=against, signals=signals).save(path)
 
     drawn: dict[str, Draw] = {what: functools.partial(draw, what) for what in PICTURES}
     facts = {**row, "configuration": configuration}

@@ -187,7 +187,8 @@ class Report:
         scale = np.asarray(tables.relative_scale(configuration))
         wanted = configuration.get("target")
         target = None if wanted is None else np.asarray(bin_average(signals_from(wanted)))
-        about = "errors: standard errors over the signals stored in this pack (jackknife)"
+        about = "G: gain; F: fidelity, 1 if what is recalled is the integral of what was stored; "
+        about += "errors: standard errors over the signals stored in this pack (jackknife)"
         parts = [
             _note(tables.conditions(configuration)),
             _state(row["status"]),
@@ -201,7 +202,7 @@ class Report:
         if target is not None:
             parts.append(_note(tables.target_line(row)))
         shown = f" (the first {plots.MOST} of {len(names)})" if len(names) > plots.MOST else ""
-        parts += [f"<h3>Recalled signals{shown}</h3>", self._figure(plots.recalls(recall, scale, names, target))]
+        parts += [f"<h3>Recalled signals{shown}</h3>", self._figure(plots.recalls(recall, scale, names, target, t0))]
         parts += self._stages(recall.stages, names, t0)
         parts += ["<h3>Grains</h3>", self._grains(recall, names, configuration), _configuration(configuration)]
         self.sections.append(
