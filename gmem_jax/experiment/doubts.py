@@ -56,6 +56,7 @@ def doubts(experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Array,
         Status.LARGE_WAVEFORM: waveform > LARGEST_WAVEFORM,
         Status.LARGE_FRICTION: friction > LARGEST_FRICTION,
         Status.LARGE_STIFFNESS: stiffness > LARGEST_STIFFNESS * experiment.material.normal_stiffness,
+        Status.OTHER_COMPRESSION: ~jnp.isclose(experiment.compression, experiment.pack.delta0),
     }
     bits = jnp.zeros(1, jnp.int32)
     for bit, doubtful in found.items():

@@ -32,6 +32,7 @@ class Status(enum.IntFlag):
     LARGE_WAVEFORM = 4096
     LARGE_FRICTION = 8192
     LARGE_STIFFNESS = 16384
+    OTHER_COMPRESSION = 32768
 
     @property
     def fatal(self) -> bool:
@@ -48,6 +49,7 @@ DOUBTFUL = (
     | Status.LARGE_WAVEFORM
     | Status.LARGE_FRICTION
     | Status.LARGE_STIFFNESS
+    | Status.OTHER_COMPRESSION
 )
 """The bits that warn and leave the numbers as they are; where they are set is said in `gmem_jax.experiment.doubts`."""
 
@@ -67,6 +69,7 @@ SENTENCES = {
     Status.LARGE_WAVEFORM: "a waveform exceeds 2, and gains are per gamma0; use waveforms up to 1 and a larger gamma0",
     Status.LARGE_FRICTION: "mu exceeds 10, as no material does, so that contacts hardly slide; use a smaller mu",
     Status.LARGE_STIFFNESS: "tangential springs are stiffer than a Hertz contact is; use a stiffness below 1.5 k_n",
+    Status.OTHER_COMPRESSION: "the pack was cycled with another delta0; prepare one for this delta0",
 }
 
 

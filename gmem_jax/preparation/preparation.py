@@ -31,7 +31,7 @@ from gmem_jax.experiment.protocol import Stage, preparation_cycle
 from gmem_jax.experiment.signals import BINS
 from gmem_jax.experiment.walk import Course
 from gmem_jax.files.provenance import provenance
-from gmem_jax.physics import rotation
+from gmem_jax.physics import chance, rotation
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
@@ -146,7 +146,7 @@ def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array
     sites = lattice(recipe.grains, recipe.filling)
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in sites), indexing="ij"), axis=-1).reshape(-1, 3)
     cells = cells[np.argsort(cells[:, 2], kind="stable")][: recipe.grains]  # a last layer may be incomplete
-    turn_key, velocity_key, spin_key = jax.random.split(jax.random.key(recipe.seed), 3)
+    turn_key, velocity_key, spin_key = jax.random.split(chance.key(recipe.seed), 3)
     scale, shape = recipe.gas_speed / math.sqrt(3.0), (recipe.grains, 3)
     return (
         (cells + 0.5) * spacing,
