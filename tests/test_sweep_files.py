@@ -1,6 +1,8 @@
 """What a sweep file may say, how its points become runs, and what is refused in one line."""
 
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,14 +11,17 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
+from gmem_jax.experiment.experiment import value_at
 from gmem_jax.experiment.host import silent
+from gmem_jax.experiment.recall import OtherCompressionWarning, warn_of_another_compression
 from gmem_jax.files.atomic import atomic
 from gmem_jax.sweeps.executors import Executor, Submitted, executor
 from gmem_jax.sweeps.plan import plan, point
 from gmem_jax.sweeps.spec import read_spec, spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import Conductor, _labels
-from gmem_jax.sweeps.table import rows
+from gmem_jax.sweeps.table import doubts, means, rows
+from gmem_jax.sweeps.work import run_group
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 MEMORY = 1 << 33
@@ -88,6 +93,66 @@ def test_impossible_points_are_refused_before_anything_is_computed(tmp_path: Pat
     tables, problem = UNKNOWN[name]
     with pytest.raises(ValueError, match=problem):
         conductor(tmp_path, **tables).check()
+
+
+def recipes(folder: Path, **tables: object) -> list[tuple[float, float]]:
+    """delta0 and rigidity of the walls of the packs that a sweep makes."""
+    made = conductor(folder, **tables)
+    made.check()
+    return [(job["recipe"]["delta0"], job["material"]["wall_rigidity"]) for job in made.pack_jobs()]
+
+
+def test_what_belongs_to_the_preparation_follows_into_it(tmp_path: Path) -> None:
+    prepare, both = {"grains": 16}, {"delta0": [0.03, 0.05], "mu": [0.5, 1.0]}
+    assert recipes(tmp_path, prepare=prepare, vary=both) == [(0.03, 1.0), (0.05, 1.0)]
+    assert recipes(tmp_path, prepare=prepare, experiment={"delta0": 0.04}, vary={"mu": [1.0]}) == [(0.04, 1.0)]
+    assert recipes(tmp_path, prepare=prepare, vary={"wall_rigidity": [0.5, 2.0]}) == [(0.05, 0.5), (0.05, 2.0)]
+    # Asked for by itself, a number of the preparation is what it is; and t0 and dt say how a pack is driven.
+    assert recipes(tmp_path, prepare={**prepare, "delta0": 0.05}, vary=both) == [(0.05, 1.0)]
+    assert recipes(tmp_path, prepare=prepare, vary={"t0": [900.0, 1800.0], "dt": [0.2, 0.3]}) == [(0.05, 1.0)]
+    assert recipes(tmp_path, prepare=prepare, vary=both, run={"packs_as_they_are": True}) == [(0.05, 1.0)]
+
+
+@pytest.mark.parametrize(("name", "was"), [("delta0", "0.05"), ("wall_rigidity", "1")])
+def test_a_pack_that_was_prepared_for_another_experiment_is_refused_unless_wanted(
+    tmp_path: Path, name: str, was: str
+) -> None:
+    tables = {"experiment": {"pack": "tetra-325-a"}, "vary": {name: [float(was), 0.08]}}
+    with pytest.raises(ValueError, match=rf"{name} = 0.08, and tetra-325-a was prepared with {was}: .*\[prepare\]"):
+        conductor(tmp_path, **tables).check()
+    wanted = conductor(tmp_path, **tables, run={"packs_as_they_are": True})
+    wanted.check()
+    assert [value_at(one.experiment, PATHS[name]) for one in wanted.points()] == [float(was), 0.08]
+    with pytest.raises(gm.FileFormatError, match="packs_as_they_are in .run. must be true or false, got 1"):
+        conductor(tmp_path, **tables, run={"packs_as_they_are": 1})
+
+
+PATHS = {"delta0": "delta0", "wall_rigidity": "material.wall_rigidity"}
+
+
+def test_what_is_warned_of_in_a_run_stands_in_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalled: tuple[gm.Experiment, gm.Recall]
+) -> None:
+    experiment, recall = recalled
+    other = gm.replace(experiment, delta0=0.04)
+
+    def doubtful(*_: object, **__: object) -> gm.Recall:
+        warn_of_another_compression(other)  # a bit of the status says so
+        warnings.warn("something is odd", stacklevel=1)
+        return replace(recall, status=recall.status | int(gm.Status.OTHER_COMPRESSION))
+
+    monkeypatch.setattr("gmem_jax.sweeps.work.run", doubtful)
+    store, here = Store(tmp_path), point({"delta0": 0.04}, other)
+    store.remember([here], {}, ["delta0"])
+    with pytest.warns(OtherCompressionWarning), pytest.warns(UserWarning, match="something is odd"):
+        run_group([here.key], [other], store=store)
+    (row,) = rows(store)
+    assert row["status"] & int(gm.Status.OTHER_COMPRESSION)
+    assert "cycled with another delta0" in row["why"]
+    assert row["warnings"] == "something is odd"
+    assert doubts(row) == f"{row['why']}; something is odd"
+    (mean,) = means([row, row], ["delta0"], ["delta0"])
+    assert (mean["status"], mean["warnings"]) == (row["status"], row["warnings"])
 
 
 def test_points_that_differ_in_replica_parameters_become_one_run(tmp_path: Path) -> None:

@@ -71,6 +71,7 @@ LOUD = gm.Bumps(jnp.asarray([[1.0, 0.0], [1.01 * limits.LARGEST_WAVEFORM, 0.0]])
         ({"friction.stiffness": jnp.asarray(around(STIFFEST))[jnp.asarray([1, 1, 2])]}, Status.LARGE_STIFFNESS),
         ({"gamma0": 1.01 * limits.LARGEST_SHEAR * 0.05}, Status.SHEAR_BEYOND_COMPRESSION),
         ({"signals": LOUD, "gamma0": 1e-4}, Status.LARGE_WAVEFORM),
+        ({"delta0": jnp.asarray([0.05, 0.05, 0.051])}, Status.OTHER_COMPRESSION),
     ],
 )
 def test_each_doubt_is_that_of_its_replica_alone(given: dict[str, object], bit: Status) -> None:

@@ -69,7 +69,7 @@ SENTENCES = {
     Status.LARGE_WAVEFORM: "a waveform exceeds 2, and gains are per gamma0; use waveforms up to 1 and a larger gamma0",
     Status.LARGE_FRICTION: "mu exceeds 10, as no material does, so that contacts hardly slide; use a smaller mu",
     Status.LARGE_STIFFNESS: "tangential springs are stiffer than a Hertz contact is; use a stiffness below 1.5 k_n",
-    Status.OTHER_COMPRESSION: "the pack was cycled with another delta0; prepare one for this delta0",
+    Status.OTHER_COMPRESSION: "the pack was cycled with another delta0; use one that was prepared for this delta0",
 }
 
 

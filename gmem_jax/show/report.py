@@ -35,6 +35,7 @@ from gmem_jax.show import plots, tables, view
 from gmem_jax.show.kinds import NOISE, kernel_facts
 from gmem_jax.show.scene import at_rest
 from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.table import doubts
 from gmem_jax.sweeps.table import rows as points_of
 
 LARGEST_CONFUSION = 256  # words
@@ -333,7 +334,7 @@ class Report:
             [
                 *(tables.cell(row[name]) for name in names),
                 *("" if row[name] is None else f"{row[name]:.3f}" for name in analysis.MEASURES),
-                row["why"] or ("ok" if row["state"] == "done" else row["state"]),
+                (doubts(row) or "ok") if row["state"] == "done" else row["why"] or row["state"],
             ]
             for row in rows
         ]

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from gmem_jax.files.checked import optional
 from gmem_jax.files.labelled import described
 from gmem_jax.physics.state import explain, together
 from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.work import WARNINGS
 
 FORMATS = (".csv", ".parquet", ".h5", ".nc")
 
@@ -35,12 +36,18 @@ def rows(store: Store) -> list[dict[str, Any]]:
             recall, configuration = store.load(key)
             status = together(recall.status)
             row |= {"state": "done", **{name: float(getattr(recall, name)) for name in MEASURES}}
-            row |= {"status": status, "why": explain(status) if status else "", "seconds": configuration["seconds"]}
+            row |= {"status": status, "why": explain(status) if status else ""}
+            row |= {"warnings": "; ".join(configuration.get(WARNINGS, ())), "seconds": configuration["seconds"]}
         else:
             row |= {"state": "failed" if key in failed else "open", **dict.fromkeys(MEASURES)}
-            row |= {"status": None, "why": failed.get(key, ""), "seconds": None}
+            row |= {"status": None, "why": failed.get(key, ""), "warnings": "", "seconds": None}
         found.append({**row, "key": key})
     return found
+
+
+def doubts(row: Mapping[str, Any]) -> str:
+    """Why a point that is done is doubtful, from its row: its status and what was warned of; "" if nothing is."""
+    return "; ".join(filter(None, (row["why"], row["warnings"]))) if row["state"] == "done" else ""
 
 
 def _cell(value: Any) -> Any:
@@ -60,6 +67,8 @@ def means(table: Sequence[dict[str, Any]], names: Sequence[str], over: Sequence[
         for measure in MEASURES:
             mean, deviation, error = spread([one[measure] for one in done]) if done else (None, None, None)
             row |= {measure: mean, f"{measure}_sd": deviation, f"{measure}_se": error}
+        row["status"] = together([one["status"] for one in done]) if done else None
+        row["warnings"] = "; ".join(dict.fromkeys(one["warnings"] for one in done if one["warnings"]))
         found.append(row)
     return found
 
