@@ -231,6 +231,46 @@ def test_the_last_words_of_a_scheduler_s_workers_are_found(tmp_path: Path) -> No
     assert chosen.said(Store(tmp_path)).strip() == "slurmstepd: error: out of memory"
 
 
+@pytest.mark.parametrize(("told", "threads"), [("1", "1"), ("64", "all"), (None, "all")])
+def test_a_worker_has_no_more_threads_than_it_is_told_or_has_cpus(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, threads: str
+) -> None:
+    started: list[dict[str, str]] = []
+    monkeypatch.setattr("gmem_jax.sweeps.executors.subprocess.Popen", lambda *_, env, **__: started.append(env))
+    monkeypatch.setattr("gmem_jax.sweeps.executors.cores", lambda: [0, 1, 2, 3])
+    if told is None:
+        monkeypatch.delenv("GMEM_THREADS", raising=False)
+    else:
+        monkeypatch.setenv("GMEM_THREADS", told)
+    executor("processes", 2, {}).start(Store(tmp_path), "worker-1")
+    assert started[0]["GMEM_THREADS"] == threads.replace("all", "2")
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"cpus_per_task": 2}, ["--cpus-per-task=2"]),
+        ({}, ["--cpus-per-task=1"]),
+        ({"slurm_cpus_per_task": 3, "slurm_srun_args": ["--exact"]}, ["--exact", "--cpus-per-task=3"]),
+        ({"cpus_per_task": 2, "slurm_srun_args": "--cpus-per-task=4"}, ["--cpus-per-task=4"]),
+    ],
+)
+def test_a_worker_of_slurm_gets_the_cpus_that_its_job_asks_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], told: list[str]
+) -> None:
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for name, answer in {"sbatch": "Submitted batch job 7", "scontrol": "UP", "srun": ""}.items():
+        (programs / name).write_text(f"#!/bin/sh\necho {answer}\n")
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:/usr/bin:/bin")
+    store = Store(tmp_path / "sweep")
+    executor("slurm", 1, options).start(store, "worker-0")
+    script = next((store.folder / "workers" / "submitit").glob("*.sh"))
+    (line,) = (line for line in script.read_text().splitlines() if line.startswith("srun "))
+    assert [word for word in line.split() if word in told or "cpus" in word] == told
+
+
 class Mortal(Executor):
     """Its workers get as far as they are told, one after the other, and die; the last finishes."""
 
