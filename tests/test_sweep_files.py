@@ -123,7 +123,7 @@ def test_a_pack_that_was_prepared_for_another_experiment_is_refused_unless_wante
     wanted = conductor(tmp_path, **tables, run={"packs_as_they_are": True})
     wanted.check()
     assert [value_at(one.experiment, PATHS[name]) for one in wanted.points()] == [float(was), 0.08]
-    with pytest.raises(gm.FileFormatError, match="packs_as_they_are in .run. must be true or false, got 1"):
+    with pytest.raises(gm.FileFormatError, match=r"packs_as_they_are in \[run\] must be true or false, got 1"):
         conductor(tmp_path, **tables, run={"packs_as_they_are": 1})
 
 

@@ -21,22 +21,39 @@ def show(
     plot: Annotated[str, typer.Option(metavar="WHAT", help="Draw this into --output; list says what there is.")] = "",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture to write: .png, .svg, .pdf.")] = None,
     against: Annotated[str, typer.Option(help="What stages are drawn over: time or u.")] = "time",
-    csv: Annotated[bool, typer.Option("--csv", help="Print the recalled signals as CSV.")] = False,
+    each: Annotated[bool, typer.Option("--each", help="Of a recall: G and F of each signal.")] = False,
+    x: Annotated[str, typer.Option("--x", metavar="NAME", help="Of a sweep: what is drawn along the axis.")] = "",
+    by: Annotated[str, typer.Option(metavar="NAMES", help="Of a sweep: a line for each value of these.")] = "",
+    over: Annotated[
+        str,
+        typer.Option(
+            metavar="NAMES", help="Of a sweep: means and standard errors over these; default packs and seeds."
+        ),
+    ] = "",
+    csv: Annotated[
+        bool, typer.Option("--csv", help="Print the recalled signals as CSV; with --each, a row for each.")
+    ] = False,
     force: Force = False,
 ) -> None:
     """What a file holds; with --plot, a picture of it.
 
-    gmem show recall.h5 --plot signals -o x.png; gmem show recall.h5 --plot Z --against u -o z.png
+    gmem show recall.h5 --plot signals -o x.png; gmem show recall.h5 --plot Z --against u -o z.png;
+    gmem show mu --plot fidelity --x mu --by friction --over pack -o f.png
     """
     if against not in AGAINST:
         raise InputError(f"--against {against}: must be one of {', '.join(AGAINST)}")
     folder = file.is_dir()
     if folder:
         store = sweep.there(file)
-        pictures = sweep_pictures(store)
+        chosen = {"by": sweep.names_of(by), "over": sweep.names_of(over)}
+        pictures = sweep_pictures(store, x=x, **chosen)
     else:
-        found = shown(file, against)
+        for name in (name for name, value in {"--x": x, "--by": by, "--over": over}.items() if value):
+            raise InputError(f"{file}: {name} is for the folder of a sweep")
+        found = shown(file, against, each=each)
         pictures = found.pictures
+    if each and (folder or found.csv is None):
+        raise InputError(f"{file}: --each tells of each recalled signal, and this is no recall")
     if plot:
         _draw(file, pictures, plot, output, force)
     elif output is not None:
@@ -46,7 +63,7 @@ def show(
             raise InputError(f"{file}: --csv gives recalled signals, and this is no recall")
         sys.stdout.write(found.csv())
     elif folder:
-        sweep.show(store, "", as_json)
+        sweep.show(store, over, as_json)
     else:
         emit(as_json, found.facts, *found.lines)
 

@@ -148,10 +148,15 @@ def _doubtful(table: list[dict[str, Any]]) -> list[str]:
     return [f"{count} of {len(table)} points: {reason}" for reason, count in counts.items()]
 
 
+def names_of(text: str) -> list[str]:
+    """Names separated by commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
 def show(store: Store, over: str, as_json: bool) -> None:
     """Print the points of a sweep, or means over some names, separated by commas."""
     table, names = rows(store), store.card()["names"]
-    averaged = [name for name in over.split(",") if name]
+    averaged = names_of(over)
     if unknown := sorted(set(averaged) - set(names)):
         raise InputError(f"--over {unknown[0]}: does not vary here; {', '.join(names)} do")
     if averaged:
@@ -210,10 +215,14 @@ def _bits(status: int) -> list[str]:
 def _means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
     drawn = Table()
     for name in (*names, "n", "G", "F", "F(T1)", "status"):
-        drawn.add_column(name, no_wrap=name not in (*names, "status"), min_width=14 if name in ("G", "F", "F(T1)") else None)
+        drawn.add_column(
+            name, no_wrap=name not in (*names, "status"), min_width=14 if name in ("G", "F", "F(T1)") else None
+        )
     for row in table:
         shown = [_with_error(row, name) for name in ("gain", "fidelity", "windowed_fidelity")]
-        drawn.add_row(*(cell(row[name]) for name in names), str(row["done"]), *shown, _state(row) if row["done"] else "")
+        drawn.add_row(
+            *(cell(row[name]) for name in names), str(row["done"]), *shown, _state(row) if row["done"] else ""
+        )
     drawn.caption = "; ".join(["mean and standard error", ABOUT, *_reasons(table)])
     return drawn
 

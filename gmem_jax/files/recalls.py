@@ -29,12 +29,14 @@ from gmem_jax.files.checked import (
 from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
-from gmem_jax.files.labelled import recall_csv, recall_dataset
+from gmem_jax.files.labelled import each_csv, recall_csv, recall_dataset
+from gmem_jax.files.measures import EACH, of_each
 from gmem_jax.files.schemas import RECALL
 from gmem_jax.physics.sample import Sample
 from gmem_jax.physics.state import DOUBTFUL, Status
 
 _OLDEST = "gmem-recall/1"
+_MISSING = {"gmem-recall/3": EACH, "gmem-recall/2": (*EACH, "signal"), _OLDEST: (*EACH, "signal", "shear")}
 _EVERY_BIT = int(sum(Status))
 
 
@@ -49,7 +51,8 @@ def save_recall(path: Path, recall: Recall, configuration: dict[str, Any]) -> No
         names = names.astype("S2")  # single letters are characters of one text to netCDF
     with writing(path, RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
-        write_arrays(file, _declared(np.ndim(recall.dt)), {**vars(recall), "signal": names})
+        values = {**vars(recall), **of_each(recall, configuration), "signal": names}
+        write_arrays(file, _declared(np.ndim(recall.dt)), values)
         write_samples(file.create_group("stages"), recall.stages)
         if recall.frames is not None:
             write_frames(file, recall.frames)
@@ -99,8 +102,10 @@ class StoredRecall(NamedTuple):
     def _repr_html_(self) -> str:
         return self.recall._repr_html_()
 
-    def to_csv(self) -> str:
-        """The recalled signals as CSV: u, and p_sig of every signal in E."""
+    def to_csv(self, *, each: bool = False) -> str:
+        """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F."""
+        if each:
+            return each_csv(self.names, of_each(self.recall, self.configuration))
         return recall_csv(self.recall, self.names)
 
 
@@ -124,12 +129,11 @@ def load_recall(path: Path) -> StoredRecall:
 def _recall_of(content: Content, configuration: dict[str, Any]) -> Recall:
     dt = content.datasets.get("dt")
     declared = _declared(0 if dt is None else len(dt.shape))
-    if content.schema != RECALL.name:
-        del declared["signal"]
-    if content.schema == _OLDEST:
-        del declared["shear"]
+    for name in _MISSING.get(content.schema, ()):
+        del declared[name]
     found = content.arrays(declared)
-    found.pop("signal", None)  # the configuration has them too, in all versions
+    for name in ("signal", *EACH):  # the configuration has the names too, in all versions, and the rest follows
+        found.pop(name, None)
     if content.schema == _OLDEST:
         found["shear"] = _waveforms(configuration, found["u"], found["J"])
     return Recall(**found, stages=content.samples("stages"), frames=read_frames(content))  # type: ignore[arg-type]

@@ -37,7 +37,7 @@ class Shown(NamedTuple):
         facts: as one JSON object.
         lines: tables and lines for a person.
         pictures: what writes them, by name; the first says most.
-        csv: makes the recalled signals, for a recall.
+        csv: makes the recalled signals, or a row for each, for a recall.
     """
 
     facts: dict[str, Any]
@@ -46,12 +46,13 @@ class Shown(NamedTuple):
     csv: Callable[[], str] | None = None
 
 
-def shown(file: Path, against: str = "time") -> Shown:
+def shown(file: Path, against: str = "time", *, each: bool = False) -> Shown:
     """What a file, a pack or the folder of a sweep holds.
 
     Args:
         file: its path, or the name of a pack.
         against: "time" or "u": what pictures of stages are drawn over.
+        each: whether a recall tells of each signal by itself, however many there are.
 
     Raises:
         FileNotFoundError: if it is not there.
@@ -72,12 +73,12 @@ def shown(file: Path, against: str = "time") -> Shown:
     if kind in (PACK.name, *PACK.before):
         return _pack(file, against)
     if kind in (RECALL.name, *RECALL.before):
-        return _recall(file, against)
+        return _recall(file, against, each)
     known = ", ".join(schema.name for schema in (RECALL, PACK, KERNEL))
     raise FileFormatError(f"{file}: schema is {kind[:40]!r}, expected one of {known}")
 
 
-def _recall(file: Path, against: str) -> Shown:
+def _recall(file: Path, against: str, each: bool) -> Shown:
     stored = load_recall(file)
     recall, configuration = stored
     row = tables.summary(recall, configuration)
@@ -87,7 +88,8 @@ def _recall(file: Path, against: str) -> Shown:
 
     drawn: dict[str, Draw] = {what: functools.partial(draw, what) for what in PICTURES}
     facts = {**row, "configuration": configuration}
-    return Shown(facts, tables.recall_lines(row, configuration), drawn, stored.to_csv)
+    lines = tables.recall_lines(row, configuration, each=each)
+    return Shown(facts, lines, drawn, functools.partial(stored.to_csv, each=each))
 
 
 def _pack(file: Path, against: str) -> Shown:
@@ -215,14 +217,15 @@ def _waveforms(file: Path) -> Shown:
     return Shown(facts, ["\n".join(lines)], drawn)
 
 
-def sweep_pictures(store: Store) -> dict[str, Draw]:
-    """Each measure of the points of a sweep against the first of its names that varies.
+def sweep_pictures(store: Store, **chosen: Any) -> dict[str, Draw]:
+    """Each measure of the points of a sweep; `chosen` are x, by and over of `gmem_jax.sweeps.curves.axes_of`.
 
     Raises:
         FileFormatError: if there is no sweep, or a result is damaged.
     """
 
     def draw(measure: str, path: Path) -> None:
-        pictures.sweep_drawing(table.rows(store), store.card()["names"], measure, store.folder.name).save(path)
+        names, title = store.card()["names"], store.folder.name
+        pictures.sweep_drawing(table.rows(store), names, measure, title, **chosen).save(path)
 
     return {measure: functools.partial(draw, measure) for measure in sorted(MEASURES)}

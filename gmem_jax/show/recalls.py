@@ -10,6 +10,7 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.checked import is_number
 from gmem_jax.files.configuration import resolved
+from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
@@ -49,7 +50,7 @@ def recall_drawing(
             f"{what!r} against {against!r}: pictures of a recall are {', '.join(PICTURES)}, against time or u"
         )
     if found == "signals":
-        return signals_drawing(recall, names, title, tables.relative_scale(known) if known else None)
+        return signals_drawing(recall, names, title, relative_scale(known) if known else None)
     if found == "waveforms":
         return waveforms_drawing(recall, names, title)
     if found == "all":

@@ -99,7 +99,9 @@ def cores() -> list[int]:
 def threads(cpus: int) -> str:
     """The threads of a worker with so many CPUs: one on each, or fewer if GMEM_THREADS asks for fewer."""
     told = os.environ.get(THREADS, "")
-    return told if told and not (told.isdecimal() and int(told) > cpus) else str(cpus)  # what is no number is told there
+    return (
+        told if told and not (told.isdecimal() and int(told) > cpus) else str(cpus)
+    )  # what is no number is told there
 
 
 class Processes(Executor):

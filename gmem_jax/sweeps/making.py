@@ -41,9 +41,7 @@ def recipe_of(values: Mapping[str, Any], *, follow: bool = True) -> tuple[Recipe
     material = Material(**{name: own.pop(name) for name in ("wall_rigidity",) if name in own})
     known = {field.name: field for field in fields(Recipe)}
     if unknown := sorted(set(own) - set(known)):
-        raise ValueError(
-            f"a preparation has no {unknown[0]!r}; it has {', '.join((*GRAIN, 'wall_rigidity', *known))}"
-        )
+        raise ValueError(f"a preparation has no {unknown[0]!r}; it has {', '.join((*GRAIN, 'wall_rigidity', *known))}")
     if shape["shape"] not in ("tetra", "sphere"):
         raise ValueError(f"shape must be tetra or sphere, got {shape['shape']!r}")
     return Recipe(**own), shape, material
@@ -79,7 +77,7 @@ def require_prepared(experiment: Experiment, pack: str) -> None:
 
 
 def _prepared_with(pack: Pack) -> dict[str, float]:
-    """What is known of `FOLLOW` of a pack: an imported one says nothing of its walls, older ones were made by rigid ones."""
+    """What is known of `FOLLOW` of a pack: an imported one says nothing of walls, older ones had rigid ones."""
     material = pack.info.get("material")
     walls = {} if material is None else {"wall_rigidity": float(material.get("wall_rigidity", 1.0))}
     return {"delta0": float(pack.delta0), **walls}
