@@ -20,7 +20,7 @@ from gmem_jax.sweeps.plan import plan, point
 from gmem_jax.sweeps.spec import read_spec, spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import Conductor, _labels
-from gmem_jax.sweeps.table import doubts, means, rows
+from gmem_jax.sweeps.table import doubts, export, means, rows
 from gmem_jax.sweeps.work import run_group
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
@@ -153,6 +153,36 @@ def test_what_is_warned_of_in_a_run_stands_in_the_table(
     assert doubts(row) == f"{row['why']}; something is odd"
     (mean,) = means([row, row], ["delta0"], ["delta0"])
     assert (mean["status"], mean["warnings"]) == (row["status"], row["warnings"])
+
+
+def test_signals_of_points_that_have_fewer_are_filled_up_and_counted(
+    tmp_path: Path, recalled: tuple[gm.Experiment, gm.Recall]
+) -> None:
+    xarray = pytest.importorskip("xarray")
+    experiment, two = recalled
+    one = replace(two, **{name: getattr(two, name)[1:] for name in ("p_sig", "J", "shear")})
+    configuration = gm.resolved(experiment, 1.0)
+    kept = {"a": (two, configuration), "b": (one, {**configuration, "signals": ["alone"]})}
+
+    class Kept(Store):
+        def load(self, key: str) -> Any:
+            return kept[key]
+
+    store = Kept(tmp_path / "store")
+    store.remember([], {}, ["signals"], [("a", {"signals": "two"}), ("b", {"signals": "one"}), ("c", {})])
+    for key in kept:
+        store.at(key).write_text("")
+    about = export(store, tmp_path / "table.nc")
+    assert about == "points have 1 to 2 signals, see `signal_count`; what lies beyond them is NaN"
+    with xarray.open_dataset(tmp_path / "table.nc", engine="h5netcdf") as data:
+        assert data.signal_count.values.tolist() == [2, 1, 0]
+        assert data.signals.values.tolist() == ["two", "one", ""]
+        assert data.signal_name.values.tolist() == [["0", "1"], ["alone", ""], ["", ""]]
+        np.testing.assert_array_equal(data.p_sig[0], two.p_sig)
+        np.testing.assert_array_equal(data.p_sig[1, 0], two.p_sig[1])
+        assert np.isnan(data.p_sig[1, 1]).all()
+        assert np.isnan(data.p_sig[2]).all()
+        np.testing.assert_allclose(data.signal_fidelity[1, 0], data.signal_fidelity[0, 1])
 
 
 def test_points_that_differ_in_replica_parameters_become_one_run(tmp_path: Path) -> None:

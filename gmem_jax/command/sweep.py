@@ -174,9 +174,9 @@ def _export(store: Store, output: Path | None, force: bool, as_json: bool) -> No
     if output is None or output.suffix.lower() not in FORMATS:
         raise InputError(f"gmem sweep export: name a file with -o that ends in one of {', '.join(FORMATS)}")
     claim(output, "", force=force)
-    export(store, output)
-    say(f"wrote {output}")
-    emit(as_json, {"output": str(output), "status": 0})
+    about = export(store, output)
+    say(f"wrote {output}" + (f": {about}" if about else ""))
+    emit(as_json, {"output": str(output), "about": about, "status": 0})
 
 
 def _table(table: list[dict[str, Any]], names: list[str]) -> Table:
