@@ -137,13 +137,13 @@ def _dataset(store: Store, table: Sequence[dict[str, Any]]) -> Any:
         data[name] = (("point", "signal", "u")[: array.ndim], array, described(name))
     told = {
         "units": "1",
-        "description": "signals of the point; what lies beyond them is NaN, as it is of points not done",
+        "description": "signals of the point; what lies beyond them is NaN",
     }
     data["signal_count"] = ("point", counts, told)
     data["signal_name"] = (
         ("point", "signal"),
         names.astype(str),
-        {"description": "names of the signals of each point"},
+        {"description": "names of its signals"},
     )
     return data.assign_coords(u=("u", u, described("u")))
 
