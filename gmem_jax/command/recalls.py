@@ -10,6 +10,7 @@ import typer
 from gmem_jax import native
 from gmem_jax.command.console import (
     AsJson,
+    DryRun,
     Force,
     InputError,
     KeptFrames,
@@ -19,6 +20,7 @@ from gmem_jax.command.console import (
     announce,
     claim,
     emit,
+    emit_cost,
     reporting,
     say,
 )
@@ -31,9 +33,19 @@ from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
+from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.state import together
 from gmem_jax.show import figures, tables
+
+
+def _announce(experiment: Experiment, batch: int) -> dict[str, float]:
+    """Say what a recall in batches will need."""
+    work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
+    backend = native.name(experiment.backend, experiment.friction)
+    side_by_side = min(batch, experiment.signals.count)
+    what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
+    return announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
 
 
 def _run(
@@ -50,11 +62,7 @@ def _run(
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
     began = time.perf_counter()
     batch = batch_for(experiment, data, batch, restart=restart)
-    work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
-    backend = native.name(experiment.backend, experiment.friction)
-    side_by_side = min(batch, experiment.signals.count)
-    what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
-    announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
+    _announce(experiment, batch)
     film: Any = {"frames": frames, "frames_of": frames_of}
     with resumable(data, key_of_run(experiment, batch=batch, **film), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
@@ -84,6 +92,7 @@ def recall_command(
     frames: KeptFrames = 0,
     frames_of: Annotated[int, typer.Option(min=0, help="Signal whose configurations they are; 0: no shear.")] = 1,
     restart: Restart = False,
+    dry_run: DryRun = False,
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,
@@ -92,6 +101,10 @@ def recall_command(
     (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
     target = chosen.target(experiment.signals.count)
     film_of(experiment, frames, frames_of)  # refuses what cannot be before anything is begun
+    if dry_run:
+        cost = _announce(experiment, batch_for(experiment, output, batch, restart=restart))
+        emit_cost(as_json, cost, output, recall_bytes(experiment, frames))
+        return
     film: Any = {"frames": frames, "frames_of": frames_of}
     row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
     emit(as_json, row, *tables.recall_lines(row, configuration))

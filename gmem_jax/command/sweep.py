@@ -1,19 +1,22 @@
 """`gmem sweep`."""
 
+import contextlib
 import math
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
-from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, reporting, say
+from gmem_jax.command.console import AsJson, DryRun, Force, InputError, claim, emit, reporting, say
 from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.files.atomic import FileFormatError, probe
 from gmem_jax.files.parts import locked
 from gmem_jax.physics.state import SENTENCES, Status
 from gmem_jax.show.tables import cell
+from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
 from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.spec import Spec, read_spec
@@ -38,6 +41,7 @@ def sweep_command(
     ] = None,
     over: Annotated[str, typer.Option(help="show: names to average over, separated by commas.")] = "",
     retry: Annotated[bool, typer.Option("--retry", help="Try points that failed again.")] = False,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -64,8 +68,13 @@ def sweep_command(
     count = workers or spec.run.get("workers")
     if count is not None and (not isinstance(count, int) or count < 1):
         raise InputError(f"{path}: workers must be a whole number from 1, got {count!r}")
-    chosen = executor_named(executor or str(spec.run.get("executor", "processes")), count, options)
     target = output or path.with_suffix("")
+    if dry_run:
+        with _of_file(path):
+            cost = cost_of(spec, target, workers=count or 1)
+        emit(as_json, {"folder": str(target), **cost._asdict(), "status": 0}, *cost.lines)
+        return
+    chosen = executor_named(executor or str(spec.run.get("executor", "processes")), count, options)
     if not target.parent.is_dir():
         raise InputError(f"--output {target}: folder {target.parent} does not exist")
     try:
@@ -95,12 +104,19 @@ def planned(path: Path, spec: Spec, folder: Path) -> Conductor:
     Raises:
         FileFormatError: if one cannot, or the folder holds something else.
     """
-    conductor = Conductor(spec, folder, say)
-    try:
+    with _of_file(path):
+        conductor = Conductor(spec, folder, say)
         conductor.check()  # leaves nothing behind where it refuses
+    return conductor
+
+
+@contextlib.contextmanager
+def _of_file(path: Path) -> Iterator[None]:
+    """Problems of what a sweep file asks for are told as the file's."""
+    try:
+        yield
     except (ValueError, TypeError, FileNotFoundError) as error:
         raise FileFormatError(f"{path}: {' '.join(str(error).split())}") from error
-    return conductor
 
 
 def there(folder: Path) -> Store:

@@ -23,6 +23,7 @@ from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
+from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.state import explain, together
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.making import AS_THEY_ARE, pack_job, recipe_of, require_prepared
@@ -119,6 +120,12 @@ def _label(value: Any) -> Any:
         return value.name
     scalar = isinstance(value, np.ndarray | jax.Array) and value.ndim == 0
     return float(value) if scalar or isinstance(value, numbers.Real) else type(value).__name__
+
+
+def seconds_of(jobs: Sequence[Mapping[str, Any]], cost: float = COST) -> float:
+    """How long jobs take, from their work and replicas, at a cost of a grain-step with `SIDE_BY_SIDE` replicas."""
+    blocks = sum(job["work"] * work_of_bin(job["replicas"]) / job["replicas"] for job in jobs)
+    return cost * blocks * SIDE_BY_SIDE / work_of_bin(SIDE_BY_SIDE)
 
 
 class Conductor:
@@ -275,7 +282,7 @@ class Conductor:
             self.say(f"all {kept} points are there")
 
     def points_to_come(self) -> list[dict[str, Any]]:
-        """What will be run on packs that do not exist yet: work and replicas of each point by itself."""
+        """What will be run on packs that do not exist yet: work, replicas and bytes of each point by itself."""
         found = []
         for values in self.spec.combinations():
             all_ = {**self.spec.shared, **values}
@@ -285,15 +292,14 @@ class Conductor:
                 like = self._experiment(all_, self._packs(ANY_PACK))
                 grains = recipe_of(all_)[0].grains
                 work = grains * like.timing.steps * replica_bins(like, like.signals.count)
-                found.append({"work": work, "replicas": like.replicas})
+                found.append({"work": work, "replicas": like.replicas, "bytes": recall_bytes(like)})
         return found
 
     def _announce(self, what: str, jobs: list[dict[str, Any]], executor: Executor) -> None:
         work = sum(job["work"] for job in jobs)
         widest = max(job["replicas"] for job in jobs)
         workers = min(executor.workers, len(jobs))
-        blocks = sum(job["work"] * work_of_bin(job["replicas"]) / job["replicas"] for job in jobs)
-        minutes = max(1, round(self.cost * blocks * SIDE_BY_SIDE / work_of_bin(SIDE_BY_SIDE) / 60.0))
+        minutes = max(1, round(seconds_of(jobs, self.cost) / 60.0))
         where = "here" if self.cost != COST else "of two free cores (native, law H)"
         cost = f"{work:.2g} grain-steps, some {minutes} min {where}"
         self.say(f"{what}, {widest} replicas side by side at most, workers: {workers}; {cost}")
