@@ -14,7 +14,8 @@ from jax.extend.random import define_prng_impl, threefry2x32_p
 
 def key(seed: jax.typing.ArrayLike) -> jax.Array:
     """The random key of a seed, a whole number from 0; may be traced."""
-    return jax.random.wrap_key_data(_words(jnp.asarray(seed)), impl=_GENERATOR)
+    made: jax.Array = jax.random.wrap_key_data(_words(jnp.asarray(seed)), impl=_GENERATOR)
+    return made
 
 
 def _words(number: jax.Array) -> jax.Array:
@@ -42,7 +43,7 @@ def _bits(own: jax.Array, width: int, shape: tuple[int, ...]) -> jax.Array:
     return (upper ^ lower).astype(kind)
 
 
-def _fold_in(own: jax.Array, data: jax.Array) -> jax.Array:
+def _fold_in(own: jax.Array, data: jax.typing.ArrayLike) -> jax.Array:
     upper, lower = _words(jnp.asarray(data))
     return jnp.stack(threefry2x32_p.bind(own[0], own[1], upper, lower))
 

@@ -166,8 +166,8 @@ def sweep_drawing(
         axis.set_xticks(range(len(ticks)), [cell(value)[:24] for value in ticks], rotation=30, ha="right")
     axis.set(xlabel=axes.x, ylabel=_LABELS[measure])
     counts = [len(values) for line in lines for values in line.each]
-    number = f"n = {min(counts)}" + (f" to {max(counts)}" if max(counts) > min(counts) else "")
-    several = f"mean ± SE over {', '.join(axes.over) or 'points'}, {number}" if max(counts) > 1 else ""
+    samples = f"n = {min(counts)}" + (f" to {max(counts)}" if max(counts) > min(counts) else "")
+    several = f"mean ± SE over {', '.join(axes.over) or 'points'}, {samples}" if max(counts) > 1 else ""
     drawing.title(f"{title}: {len(done)} of {len(rows)} points", several)
     if axes.by:
         where: dict[str, Any] = {"frameon": False, "fontsize": 7}

@@ -124,7 +124,7 @@ def _label(value: Any) -> Any:
 
 def seconds_of(jobs: Sequence[Mapping[str, Any]], cost: float = COST) -> float:
     """How long jobs take, from their work and replicas, at a cost of a grain-step with `SIDE_BY_SIDE` replicas."""
-    blocks = sum(job["work"] * work_of_bin(job["replicas"]) / job["replicas"] for job in jobs)
+    blocks: float = sum(job["work"] * work_of_bin(job["replicas"]) / job["replicas"] for job in jobs)
     return cost * blocks * SIDE_BY_SIDE / work_of_bin(SIDE_BY_SIDE)
 
 
