@@ -157,6 +157,7 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
     require(isinstance(experiment, dict), "its configuration has an impossible 'experiment'")
     signals, form = configuration.get("signals", []), experiment.get("signals", {})
     require(isinstance(signals, list) and isinstance(form, dict), "its configuration has impossible 'signals'")
+    require(isinstance(configuration.get("warnings", []), list), "its configuration has impossible 'warnings'")
     if "target" in configuration:
         require_fields(configuration["target"], "target", kind=title)
         signals_from(configuration["target"])

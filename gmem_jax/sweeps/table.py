@@ -40,7 +40,10 @@ def rows(store: Store) -> list[dict[str, Any]]:
             status = together(recall.status)
             row |= {"state": "done", **{name: float(getattr(recall, name)) for name in MEASURES}}
             row |= {"status": status, "why": explain(status) if status else ""}
-            row |= {"warnings": "; ".join(configuration.get(WARNINGS, ())), "seconds": configuration["seconds"]}
+            row |= {
+                "warnings": "; ".join(map(str, configuration.get(WARNINGS, ()))),
+                "seconds": configuration["seconds"],
+            }
         else:
             row |= {"state": "failed" if key in failed else "open", **dict.fromkeys(MEASURES)}
             row |= {"status": None, "why": failed.get(key, ""), "warnings": "", "seconds": None}

@@ -53,13 +53,16 @@ def run_group(
         RunFailedError: if the simulation broke down.
     """
     began = time.perf_counter()
-    with warnings.catch_warnings(record=True) as heard:
-        if len(experiments) == 1:
-            recalls = [run(experiments[0], batch=batch, keep=keep or forget, progress=progress)]
-        else:
-            recalls = run_several(experiments, keep=keep or forget, progress=progress)
-    for one in heard:  # they are of the log too, or of who called
-        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    heard: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as heard:
+            if len(experiments) == 1:
+                recalls = [run(experiments[0], batch=batch, keep=keep or forget, progress=progress)]
+            else:
+                recalls = run_several(experiments, keep=keep or forget, progress=progress)
+    finally:
+        for one in heard:  # they are of the log too, or of who called
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     told = {WARNINGS: words} if (words := warned(heard)) else {}
     seconds = (time.perf_counter() - began) / len(recalls)
     if store:
