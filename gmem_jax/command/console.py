@@ -21,6 +21,7 @@ from rich.table import Table
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checked import NAME, title
 from gmem_jax.files.results import finite
+from gmem_jax.files.sizes import in_bytes, in_time
 from gmem_jax.simulation.progress import Progress
 
 log = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
@@ -45,6 +46,11 @@ PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a pac
 
 # What was typed after the command that runs: the name on the command line of each option and argument by its own.
 GIVEN: ContextVar[Mapping[str, str]] = ContextVar("GIVEN", default=MappingProxyType({}))
+
+
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Say what it would cost in time, memory and disk, and do nothing.")
+]
 
 
 class InputError(ValueError):
@@ -139,7 +145,7 @@ def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool,
     return path
 
 
-def announce(what: str, grain_steps: float, memory: float, backend: str, replicas: int = 1) -> None:
+def announce(what: str, grain_steps: float, memory: float, backend: str, replicas: int = 1) -> dict[str, float]:
     """Say what a run will need before it begins, and refuse what cannot fit the free memory.
 
     Args:
@@ -149,6 +155,9 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
         backend: who does the steps.
         replicas: side by side: several are cheaper than one.
 
+    Returns:
+        The same as numbers: grain_steps, seconds and memory_bytes.
+
     Raises:
         InputError: saying what is needed and what there is.
     """
@@ -157,17 +166,18 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
     if not seconds < LONGEST:
         years = seconds / 3.15e7
         raise InputError(f"{what} would take {years:.0e} years; choose a larger dt, a smaller t0 or fewer grains")
-    units = (("days", 86400.0), ("hours", 3600.0), ("min", 60.0), ("s", 1.0))
-    name, unit = next(pair for pair in units if seconds >= 2.0 * pair[1] or pair[1] == 1.0)
-    takes = f"some {max(1, round(seconds / unit))} {name} on a free machine once compiled"
-    needs = f"{takes}, and {_bytes(memory)} of memory"
+    takes = f"{in_time(seconds)} on a free machine once compiled"
+    needs = f"{takes}, and {in_bytes(memory)} of memory"
     if memory > free:
-        raise InputError(f"{what} needs {needs}, and {_bytes(free)} are free")
+        raise InputError(f"{what} needs {needs}, and {in_bytes(free)} are free")
     say(f"{what}: {needs}{', in plain JAX' if backend == 'jax' else ''}")
+    return {"grain_steps": grain_steps, "seconds": seconds, "memory_bytes": memory}
 
 
-def _bytes(count: float) -> str:
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+def emit_cost(as_json: bool, cost: dict[str, float], output: Path, disk_bytes: float) -> None:
+    """The result of a dry run: what `announce` returned, and what the output takes of the disk."""
+    line = f"disk: {in_bytes(disk_bytes)} for {output}; nothing was run or written"
+    emit(as_json, {**cost, "disk_bytes": disk_bytes, "status": 0}, line)
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ import typer
 from gmem_jax import native
 from gmem_jax.command.console import (
     AsJson,
+    DryRun,
     Force,
     InputError,
     KeptFrames,
@@ -21,6 +22,7 @@ from gmem_jax.command.console import (
     claim,
     drawing,
     emit,
+    emit_cost,
     refuse_idle,
     reporting,
     say,
@@ -34,6 +36,7 @@ from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
+from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.state import together
 from gmem_jax.show import figures, tables
@@ -44,6 +47,15 @@ SHIPPED: dict[str, Any] = {
     "gain": (0.225, 0.040),
     "fidelity": (0.803, 0.096),
 }  # mean and SD of those, as `demo` runs them
+
+
+def _announce(experiment: Experiment, batch: int) -> dict[str, float]:
+    """Say what a recall in batches will need."""
+    work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
+    backend = native.name(experiment.backend, experiment.friction)
+    side_by_side = min(batch, experiment.signals.count)
+    what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
+    return announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
 
 
 def _run(
@@ -61,11 +73,7 @@ def _run(
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
     began = time.perf_counter()
     batch = batch_for(experiment, data, batch, restart=restart)
-    work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
-    backend = native.name(experiment.backend, experiment.friction)
-    side_by_side = min(batch, experiment.signals.count)
-    what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
-    announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
+    _announce(experiment, batch)
     film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": list(frames_at)}
     with resumable(data, key_of_run(experiment, batch=batch, **film), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
@@ -102,6 +110,7 @@ def recall_command(
         str, typer.Option(metavar="U,U", help="Keep configurations wherever u passes these, as in 0,0.5,1.")
     ] = "",
     restart: Restart = False,
+    dry_run: DryRun = False,
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,
@@ -113,6 +122,10 @@ def recall_command(
     if not frames and not at:
         refuse_idle("without --frames or --frames-at, which say how many", "frames_of")
     frame_schedule(experiment, frames, frames_of, at)  # refuses what cannot be before anything is begun
+    if dry_run:
+        cost = _announce(experiment, batch_for(experiment, output, batch, restart=restart))
+        emit_cost(as_json, cost, output, recall_bytes(experiment, frames))
+        return
     film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": at}
     row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
     emit(as_json, row, *tables.recall_lines(row, configuration))

@@ -26,13 +26,25 @@ def show(
     signal: Annotated[
         str, typer.Option(metavar="N,N", help="Signals of a recall to draw, from 1; of stages 0 too, the zero signal.")
     ] = "",
-    csv: Annotated[bool, typer.Option("--csv", help="Print the recalled signals as CSV.")] = False,
+    each: Annotated[bool, typer.Option("--each", help="Of a recall: G and F of each signal.")] = False,
+    x: Annotated[str, typer.Option("--x", metavar="NAME", help="Of a sweep: what is drawn along the axis.")] = "",
+    by: Annotated[str, typer.Option(metavar="NAMES", help="Of a sweep: a line for each value of these.")] = "",
+    over: Annotated[
+        str,
+        typer.Option(
+            metavar="NAMES", help="Of a sweep: means and standard errors over these; default packs and seeds."
+        ),
+    ] = "",
+    csv: Annotated[
+        bool, typer.Option("--csv", help="Print the recalled signals as CSV; with --each, a row for each.")
+    ] = False,
     force: Force = False,
 ) -> None:
     """What a file holds; with --plot, a picture of it.
 
     gmem show recall.h5 --plot signals -o x.png; gmem show recall.h5 --plot Z --against u -o z.png;
     gmem show recall.h5 --plot p_xy --signal 3 -o p.png
+    gmem show mu --plot fidelity --x mu --by friction --over pack -o f.png
     """
     if against not in AGAINST:
         raise InputError(f"--against {against}: must be one of {', '.join(AGAINST)}")
@@ -50,10 +62,14 @@ def show(
         if chosen:
             raise InputError(f"--signal {signal}: a sweep has no signals of its own; name the file of a point")
         store = sweep.there(file)
-        pictures = sweep_pictures(store)
+        pictures = sweep_pictures(store, x=x, by=sweep.names_of(by), over=sweep.names_of(over))
     else:
-        found = shown(file, against, chosen)
+        for name in (name for name, value in {"--x": x, "--by": by, "--over": over}.items() if value):
+            raise InputError(f"{file}: {name} is for the folder of a sweep")
+        found = shown(file, against, chosen, each=each)
         pictures = found.pictures
+    if each and (folder or found.csv is None):
+        raise InputError(f"{file}: --each tells of each recalled signal, and this is no recall")
     if plot:
         _draw(file, pictures, plot, output, force, as_json)
     elif output is not None:
@@ -63,7 +79,7 @@ def show(
             raise InputError(f"{file}: --csv gives recalled signals, and this is no recall")
         sys.stdout.write(found.csv())
     elif folder:
-        sweep.show(store, "", as_json)
+        sweep.show(store, over, as_json)
     else:
         emit(as_json, found.facts, *found.lines)
 

@@ -371,6 +371,10 @@ def _join(first: Any, *others: Any) -> np.ndarray:
     return np.concatenate([np.asarray(first), *(np.asarray(other)[..., 1:] for other in others)], axis=-1)
 
 
+class OtherCompressionWarning(UserWarning):
+    """A pack was cycled with another delta0: `Status.OTHER_COMPRESSION`, said before the run."""
+
+
 def warn_of_another_compression(experiment: Experiment) -> None:
     """Warn of a delta0 that the pack was not made for."""
     own = float(experiment.pack.delta0)
@@ -378,6 +382,7 @@ def warn_of_another_compression(experiment: Experiment) -> None:
         warnings.warn(
             f"{experiment.pack.name} was cycled with delta0 = {own:g}, not {experiment.delta0}: its memory of the "
             "preparation differs from the paper's; prepare a pack for this delta0",
+            OtherCompressionWarning,
             stacklevel=3,
         )
 

@@ -31,6 +31,7 @@ from gmem_jax.show.tables import summary
 from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.progress import Progress, silent
 from gmem_jax.sweeps.executors import Executor, Processes
+from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SIDE_BY_SIDE, Conductor
@@ -132,7 +133,8 @@ def weigh(
     size, folder = scale_of(scale, choices.SIZES), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     named = packs(size, size.grains, size.few)
-    spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.points(named)))
+    same = {AS_THEY_ARE: True}  # a choice is weighed on the same packs
+    spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.points(named)), run=same)
     store = _run(spec, folder, executor, progress, say).store
     done = store.done()
     rows = [row for row in store.card()["points"] if row["key"] in done]

@@ -236,13 +236,20 @@ def kernel(found: MemoryKernel, noise: float) -> tuple[Any, int]:
 
 
 def curves(
-    rows: Mapping[str, tuple[np.ndarray, np.ndarray]], x: str, y: str, *, mode: str = "lines", log: bool = False
+    rows: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    x: str,
+    y: str,
+    *,
+    mode: str = "lines",
+    log: bool = False,
+    errors: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[Any, int]:
-    """Several curves by name in one panel."""
+    """Several curves by name in one panel, with errors where there are any."""
     figure = _plotly("graph_objects").Figure()
     for number, (name, (places, values)) in enumerate(rows.items()):
         colour = COLOURS[number % len(COLOURS)]
-        figure.add_trace(_line(places, values, name, colour).update(mode=mode))
+        more = {"error_y": {"array": np.float32(errors[name])}} if errors else {}
+        figure.add_trace(_line(places, values, name, colour, **more).update(mode=mode))
     figure.update_xaxes(title_text=x, range=[0.0, 1.0] if x == U else None)
     figure.update_yaxes(title_text=y, type="log" if log else "linear")
     return figure, 380

@@ -13,6 +13,7 @@ from gmem_jax.experiment.experiment import PAPER_T0, Experiment
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.checked import is_number
 from gmem_jax.files.configuration import resolved
+from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
@@ -64,7 +65,7 @@ def recall_drawing(
         chosen = {names[number - 1] if number else "zero signal": number for number in signals}
         time = t0 if is_number(t0) else None
         return stages_drawing(recall.stages, found, title, against=against, t0=time, chosen=chosen)
-    scale = tables.relative_scale(known) if known else None
+    scale = relative_scale(known) if known else None
     if signals:
         rows = np.asarray(signals) - 1
         title += f"; G and F are of all {len(names)} signals"

@@ -5,6 +5,7 @@ An executor keeps workers alive as long as jobs are left that nobody has; the wo
 
 import itertools
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from gmem_jax.sweeps.store import Store
 POLL = 0.5  # s
 DEATHS = 3  # of workers one after the other, none of which got farther than those before, that end a sweep
 CORES = 8  # of a worker: more gain little at N = 325
+THREADS = "GMEM_THREADS"  # of the environment: threads of a process
 PATIENCE = 30.0  # s for a controller to answer
 
 
@@ -94,6 +96,14 @@ def cores() -> list[int]:
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
 
 
+def threads(cpus: int) -> str:
+    """The threads of a worker with so many CPUs: one on each, or fewer if GMEM_THREADS asks for fewer."""
+    told = os.environ.get(THREADS, "")
+    return (
+        told if told and not (told.isdecimal() and int(told) > cpus) else str(cpus)
+    )  # what is no number is told there
+
+
 class Processes(Executor):
     """Worker processes on this machine, each on CPUs of its own.
 
@@ -117,7 +127,7 @@ class Processes(Executor):
         """Start a process whose log is in the store."""
         number = int(name.rpartition("-")[2])
         mine = self._cores[number]
-        environment = {**os.environ, "GMEM_THREADS": str(len(mine))}
+        environment = {**os.environ, THREADS: threads(len(mine))}
         command = [sys.executable, "-m", work.__name__, str(store.folder), name, ",".join(map(str, mine))]
         with store.log_of(name).open("ab") as log:
             self._running[name] = subprocess.Popen(
@@ -153,6 +163,8 @@ class Submitted(Executor):
         self._submitit = optional("submitit", "slurm")
         self.workers, self._cluster = workers or 1, cluster
         self._options = {"timeout_min": 60, "cpus_per_task": 1, **(options or {})}
+        if cluster == "slurm":
+            self._options["slurm_srun_args"] = _srun(self._options)
         self._jobs: dict[str, Any] = {}
         self._executor: Any = None
         if cluster == "slurm":
@@ -201,6 +213,15 @@ class Submitted(Executor):
         for name, job in self._jobs.items():
             if name in alive:
                 job.cancel(check=False)
+
+
+def _srun(options: dict[str, Any]) -> list[str]:
+    """What srun is told: since SLURM 22.05 it does not take the CPUs of a task from its job."""
+    told = options.get("slurm_srun_args", [])
+    told = shlex.split(told) if isinstance(told, str) else list(told)
+    known = any(one.startswith(("--cpus-per-task", "-c")) for one in told)
+    cpus = options.get("slurm_cpus_per_task", options["cpus_per_task"])
+    return told if known else [*told, f"--cpus-per-task={cpus}"]
 
 
 def _require_slurm() -> None:

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import h5py
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -130,9 +131,39 @@ def test_recalled_signals_are_given_as_csv(
     assert (lines[0], len(lines)) == ("u,p_sig of 0 (E),p_sig of 1 (E)", 257)
 
 
+def test_each_signal_is_told_of_in_the_table_and_as_csv(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, folder: Path
+) -> None:
+    assert gmem(monkeypatch, "show", folder / "recall.h5") == 0  # two signals fit
+    assert "correlation with J" in capsys.readouterr().out
+    monkeypatch.setattr("gmem_jax.show.tables.FEW", 1)
+    assert gmem(monkeypatch, "show", folder / "recall.h5") == 0
+    assert "correlation with J" not in capsys.readouterr().out
+    assert gmem(monkeypatch, "show", folder / "recall.h5", "--each") == 0
+    assert "correlation with J" in capsys.readouterr().out
+    assert gmem(monkeypatch, "show", folder / "recall.h5", "--each", "--csv") == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head == "signal,gain,fidelity,windowed_fidelity,correlation"
+    with h5py.File(folder / "recall.h5") as file:
+        assert [float(row.split(",")[2]) for row in rows] == file["signal_fidelity"][:].tolist()
+
+
+def test_what_lies_along_the_axis_of_a_sweep_can_be_chosen(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, folder: Path
+) -> None:
+    picture = tmp_path / "f.svg"
+    assert gmem(monkeypatch, "show", folder / "swept", "--plot", "fidelity", "--x", "mu", "-o", picture) == 0
+    assert "<svg" in picture.read_text()
+    assert gmem(monkeypatch, "show", folder / "swept", "--over", "mu", "--json") == 0
+    assert [row["done"] for row in json.loads(capsys.readouterr().out)["means"]] == [2]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["swept", "--plot", "gain", "--x", "colour", "-o", "x.png"], "colour: does not vary here; mu do"),
+        (["recall.h5", "--x", "mu"], "--x is for the folder of a sweep"),
+        (["pack.h5", "--each"], "this is no recall"),
         (["recall.h5", "--plot", "colour", "-o", "x.png"], "there are signals, waveforms, all, pressure"),
         (["recall.h5", "--plot", "Z"], "name the picture with -o, as in -o Z.png"),
         (["recall.h5", "--plot", "Z", "-o", "x.h5"], "must end in one of .png, .svg, .pdf"),
