@@ -1,8 +1,10 @@
 """What every command says and how: logs and progress on stderr, results on stdout, outputs that destroy nothing."""
 
 import contextlib
+import errno
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -16,7 +18,8 @@ from rich.console import Console
 
 from gmem_jax.experiment.host import Progress
 from gmem_jax.files.atomic import probe
-from gmem_jax.files.checked import NAME, title
+from gmem_jax.files.checked import NAME, printable, title
+from gmem_jax.files.ours import promise
 from gmem_jax.files.results import finite
 
 log = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
@@ -43,18 +46,35 @@ class InputError(ValueError):
     """Bad input, in words for the command line."""
 
 
+class UnheardError(Exception):
+    """A result that stdout does not take, once all files are written."""
+
+
+class RunInterruptedError(Exception):
+    """Ctrl-C in a run, and how to go on; no KeyboardInterrupt, which typer makes an exit without words."""
+
+
 def say(line: str, **style: Any) -> None:
     """A line of the log."""
-    log.print(line, soft_wrap=True, markup=False, **style)
+    log.print(printable(line), soft_wrap=True, markup=False, **style)
 
 
 def emit(as_json: bool, result: Any, *tables: Any) -> None:
-    """The result: one JSON object, or tables and lines for a person."""
-    if as_json:
-        sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
-    else:
-        for table in tables:
-            out.print(table, soft_wrap=isinstance(table, str))
+    """The result: one JSON object, or tables and lines for a person.
+
+    Raises:
+        UnheardError: if stdout takes nothing.
+    """
+    try:
+        if as_json:
+            sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
+        else:
+            for table in tables:
+                out.print(printable(table) if isinstance(table, str) else table, soft_wrap=isinstance(table, str))
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still in the buffer would fail once more at the end
+        raise UnheardError(os.strerror(error.errno) if error.errno else str(error)) from error
 
 
 def require_name(name: str) -> None:
@@ -81,13 +101,18 @@ def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool,
         InputError: saying what is wrong, and what would be right.
     """
     folder = path.parent
+    try:
+        path.lstat()
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise InputError(f"{option} {path}: this name is too long for the file system; shorten it") from None
     if path.is_dir():
         raise InputError(f"{option} {path}: is a folder; name a file")
     if not folder.is_dir():
         raise InputError(f"{option} {path}: folder {folder} does not exist")
     if suffix and path.suffix.lower() != suffix:
         raise InputError(f"{option} {path}: this is a {suffix} file; name it {path.with_suffix(suffix).name}")
-    if path.exists() and not path.is_file():
+    if os.path.lexists(path) and not path.is_file():
         raise InputError(f"{option} {path}: is neither a file nor free; name a file")
     for read in inputs:
         if path.exists() and Path(read).exists() and path.samefile(read):
@@ -95,9 +120,10 @@ def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool,
     if path.exists() and not force:
         raise InputError(f"{option} {path}: exists; name another file, or allow its replacement with --force")
     try:
-        probe(folder)
+        probe(path)
     except OSError as error:
         raise InputError(f"{option} {path}: cannot write there ({error.strerror})") from error
+    promise(path, replace=force)
     return path
 
 
@@ -132,10 +158,6 @@ def _bytes(count: float) -> str:
     return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
 
 
-class RunInterruptedError(KeyboardInterrupt):
-    """Ctrl-C in a run whose finished parts are kept."""
-
-
 @contextlib.contextmanager
 def reporting(*, goes_on: bool = False) -> Iterator[Progress]:
     """Progress of a run: a bar on a terminal; elsewhere a line for every stage, and one at least every 30 s.
@@ -147,7 +169,9 @@ def reporting(*, goes_on: bool = False) -> Iterator[Progress]:
         with _reporting() as progress:
             yield progress
     except KeyboardInterrupt:
-        raise (RunInterruptedError if goes_on else KeyboardInterrupt) from None
+        if goes_on:
+            raise RunInterruptedError("the same command goes on from what is done") from None
+        raise RunInterruptedError("nothing was written, and the same command begins anew") from None
 
 
 @contextlib.contextmanager

@@ -88,6 +88,10 @@ def load_pack(source: str | Path) -> Pack:
             isinstance(isotropic, np.bool_), "incomplete file, attribute 'isotropic' is missing or not a truth value"
         )
         require(title(label) and title(shape), "its name or that of its grain is not a short line of text")
+        require(
+            path != pack_called(str(source)) or label == str(source),
+            f"it is the pack {label}, not {source}: files were exchanged; make it again with gmem prepare",
+        )
         soundness.check(found, isotropic=bool(isotropic), record=json_of(record, "record"))
         clump = Clump(
             **{key: jnp.asarray(found[f"clump/{key}"]) for key in _CLUMP}, isotropic=bool(isotropic), shape=shape

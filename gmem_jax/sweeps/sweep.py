@@ -19,6 +19,7 @@ from gmem_jax.experiment.host import Progress, RunFailedError, silent, within, w
 from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall, replica_bins
+from gmem_jax.files.atomic import FileFormatError
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts
@@ -102,7 +103,7 @@ def sweep(
         share = sum(one.experiment.replicas for one in group)
         on = within(progress, done / total, (done + share) / total)
         keys, experiments = [one.key for one in group], [one.experiment for one in group]
-        keep = Parts(store.folder / "parts" / digest(keys), {"keys": keys}) if store else None
+        keep = Parts(store.parts({"name": digest(keys)}), {"keys": keys}) if store else None
         found |= run_group(keys, experiments, store=store, keep=keep, progress=on)
         done += share
     return Results(Result(one.values, found[one.key]) for one in points)
@@ -131,14 +132,21 @@ class Conductor:
         say: told in a line what is planned, and what happened.
         cost: seconds a grain-step with `SIDE_BY_SIDE` replicas, for that.
 
-    Raises:
-        FileFormatError: if the folder holds something else.
     """
 
     def __init__(self, spec: Spec, folder: Path, say: Tell, *, cost: float = COST) -> None:
-        self.spec, self.store, self.say, self.cost = spec, Store(folder), say, cost
+        self.spec, self.folder, self.say, self.cost = spec, folder, say, cost
         self._packs, self._signals = functools.cache(load_pack), functools.cache(named_signals)
         self.impossible: list[tuple[dict[str, Any], str]] = []
+
+    @functools.cached_property
+    def store(self) -> Store:
+        """The store, made on first use: a sweep that is refused leaves nothing behind.
+
+        Raises:
+            FileFormatError: if the folder holds something else.
+        """
+        return Store(self.folder)
 
     def _recipe(self, values: Mapping[str, Any]) -> tuple[Recipe, dict[str, Any]]:
         """How a pack is to be made, and of which grain."""
@@ -209,13 +217,21 @@ class Conductor:
         Raises:
             RunFailedError: if it could not be made.
             FileNotFoundError: if there is no such pack.
+            FileFormatError: if its file is damaged, or that of another pack.
         """
         if "pack" in values:
             return self._packs(str(values["pack"]))
         name = self._pack_job(values)["name"]
         if not self.store.pack_at(name).is_file() and (reason := self.store.failed().get(name)):
             raise RunFailedError(f"its pack could not be made: {reason}")
-        return self._packs(str(self.store.pack_at(name)))
+        path = self.store.pack_at(name)
+        pack = self._packs(str(path))
+        if pack.name != name:
+            raise FileFormatError(
+                f"{path}: is the pack {pack.name}, not the one of its name: files were exchanged; "
+                "remove it, and the sweep makes it again"
+            )
+        return pack
 
     def packs(self, executor: Executor, progress: Progress) -> list[Pack]:
         """The packs of all points, in order; those that do not exist yet are made.
@@ -260,8 +276,8 @@ class Conductor:
         for key, _, reason in failed:
             self.store.fail(key, reason)
         for key in self.store.unreadable({one.key for one in points}):
-            self.say(f"{self.store.at(key)}: damaged; computed again")
-            self.store.at(key).unlink()
+            self.say(f"{self.store.at(key)}: damaged, or another point's; computed again")
+            self.store.forget(key)
         known = self.store.done() | set(self.store.failed())
         memory = psutil.virtual_memory().available // executor.workers
         begun = self.store.begun({one.key for one in points} - set(self.store.failed()))
@@ -300,4 +316,4 @@ class Conductor:
 
     def _finish(self, executor: Executor, jobs: list[dict[str, Any]], progress: Progress, what: str) -> None:
         self.store.order(jobs)
-        executor.finish(self.store, jobs, lambda fraction: progress(what, 0.0, fraction))
+        executor.finish(self.store, jobs, lambda fraction: progress(what + executor.waiting, 0.0, fraction))
