@@ -26,6 +26,12 @@ def conductor(folder: Path, **tables: object) -> Conductor:
     return Conductor(spec_of(tables), folder / "store", lambda _: None)
 
 
+def run_job(name: str, points: list[str]) -> dict[str, Any]:
+    """A job as it lies in a store, of experiments that are never made."""
+    sizes = {"work": 1.0, "replicas": 1, "batch": 1}
+    return {"kind": "run", "name": name, "points": points, "configurations": [{}] * len(points), **sizes}
+
+
 def test_combinations_are_products_of_axes_and_single_points() -> None:
     spec = spec_of(
         {
@@ -137,7 +143,7 @@ def test_a_key_stands_for_all_that_numbers_depend_on(tmp_path: Path) -> None:
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("all of it")
-    with pytest.raises(gm.FileFormatError, match=r"holds thesis\.tex and no sweep"):
+    with pytest.raises(gm.FileFormatError, match=r"holds thesis\.tex and no sweep\.json"):
         Store(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -236,8 +242,8 @@ def test_runs_that_were_begun_go_on_as_they_were(tmp_path: Path) -> None:
 
 
 def test_what_was_begun_outlives_another_figure_s_jobs(tmp_path: Path) -> None:
-    first = {"kind": "run", "name": "abc", "points": ["one", "two"], "work": 1.0}
-    other = {"kind": "pack", "name": "def", "work": 1.0}
+    first = run_job("abc", ["one", "two"])
+    other = {"kind": "pack", "name": "def", "work": 1.0, "replicas": 1, "recipe": {}, "grain": {}}
     store = Store(tmp_path)
     store.order([first])
     store.parts(first).mkdir()
@@ -276,7 +282,7 @@ def test_values_of_any_kind_have_a_label() -> None:
 
 
 def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
-    store, job = Store(tmp_path), {"kind": "run", "name": "abc", "points": ["key"], "work": 1.0}
+    store, job = Store(tmp_path), run_job("abc", ["key"])
     store.order([job])
     for name in ("abc-0", "old"):
         (tmp_path / "parts" / name).mkdir()
