@@ -19,9 +19,9 @@ from gmem_jax.files.atomic import atomic
 from gmem_jax.files.ours import Folder, sweep, temporary
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.parts import Parts, locked
+from gmem_jax.sweeps.spec import spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import Conductor
-from gmem_jax.sweeps.spec import spec_of
 from gmem_jax.sweeps.table import export, rows
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
@@ -330,7 +330,7 @@ def test_parts_that_were_exchanged_or_are_of_another_run_are_refused(tmp_path: P
         for name in ("one", "two"):
             parts(name, lambda _: np.full(3, float(seed)))  # noqa: B023
     exchange(tmp_path / "1" / "one.npz", tmp_path / "1" / "two.npz")
-    with pytest.raises(gm.FileFormatError, match="part two of run .*, not 'part one of run .*exchanged"):
+    with pytest.raises(gm.FileFormatError, match=r"part two of run .*, not 'part one of run .*exchanged"):
         Parts(tmp_path / "1", {"seed": 1})("one", lambda _: np.zeros(3))
     exchange(tmp_path / "1" / "one.npz", tmp_path / "1" / "two.npz")
     exchange(tmp_path / "1" / "one.npz", tmp_path / "2" / "one.npz")

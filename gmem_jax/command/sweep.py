@@ -42,7 +42,8 @@ def sweep_command(
 ) -> None:
     """Vary anything: packs made once, points side by side, results kept by content; resumes, and grows.
 
-    gmem sweep mu.toml; gmem sweep status mu; gmem sweep show mu --over pack; gmem sweep export mu -o mu.csv; gmem sweep stop mu
+    gmem sweep mu.toml; gmem sweep status mu; gmem sweep show mu --over pack; gmem sweep export mu -o mu.csv;
+    gmem sweep stop mu
     """
     if what in VERBS:
         if folder is None:
@@ -137,7 +138,14 @@ def _status(store: Store, as_json: bool) -> None:
     busy = [f"{one['what']}, {one['fraction']:.0%}" for one in at_work if one["fraction"] < 1.0]
     reasons = sorted({row["why"] for row in table if row["state"] == "failed"})
     waits = waiting(store)
-    emit(as_json, {**summary, "waiting": waits}, ", ".join(lines), *busy, *waits, *(f"failed: {reason}" for reason in reasons))
+    emit(
+        as_json,
+        {**summary, "waiting": waits},
+        ", ".join(lines),
+        *busy,
+        *waits,
+        *(f"failed: {reason}" for reason in reasons),
+    )
 
 
 def _stop(store: Store, as_json: bool) -> None:

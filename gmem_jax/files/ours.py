@@ -146,7 +146,7 @@ class Folder:
     def about(path: Path, marker: str, schema: str) -> dict[str, Any] | None:
         """What the marker of a folder says; None if there is none of this schema."""
         card = path / marker
-        if os.path.islink(path) or not _plain(card):  # noqa: PTH114 - which takes names of any length
+        if os.path.islink(path) or not _plain(card):
             return None
         try:
             found = json.loads(card.read_text(encoding="utf-8"))
