@@ -1,5 +1,6 @@
 """What a sweep file may say, how its points become runs, and what is refused in one line."""
 
+import csv
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from gmem_jax.sweeps.plan import plan, point
 from gmem_jax.sweeps.spec import read_spec, spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import Conductor, _labels
-from gmem_jax.sweeps.table import rows
+from gmem_jax.sweeps.table import export, rows
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 MEMORY = 1 << 33
@@ -292,3 +293,20 @@ def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
         assert [path.name for path in (tmp_path / "parts").iterdir()] == ["abc-0"]
     store.order([])
     assert not list((tmp_path / "parts").iterdir())
+
+
+def test_no_cell_of_a_table_is_a_formula(tmp_path: Path) -> None:
+    store = Store(tmp_path / "mu")
+    values = ["=HYPERLINK(1)", "+1+1", "-2", "@x", "tetra-325-a", -2.0]
+    store.remember([], {}, ["pack"], [(f"key{number}", {"pack": value}) for number, value in enumerate(values)])
+    export(store, tmp_path / "o.csv")
+    with (tmp_path / "o.csv").open() as file:
+        told = [row["pack"] for row in csv.DictReader(file)]
+    assert told == ["'=HYPERLINK(1)", "'+1+1", "'-2", "'@x", "tetra-325-a", "-2.0"]
+
+
+def test_a_sweep_that_has_no_points_yet_is_shown_and_not_exported(tmp_path: Path) -> None:
+    store = Store(tmp_path / "mu")
+    assert rows(store) == []
+    with pytest.raises(ValueError, match="has no points yet"):
+        export(store, tmp_path / "o.csv")

@@ -16,7 +16,7 @@ from typing import Any
 from gmem_jax.experiment.host import RunFailedError
 from gmem_jax.files.checked import optional
 from gmem_jax.sweeps import slurm, work
-from gmem_jax.sweeps.processes import CONDUCTOR, PATIENCE, as_interrupts, job_name, known_by, python, safe_path
+from gmem_jax.sweeps.processes import CONDUCTOR, PATIENCE, job_name, known_by, python, safe_path
 from gmem_jax.sweeps.store import Store
 
 POLL = 0.5  # s
@@ -48,7 +48,6 @@ class Executor(ABC):
     def stop(self) -> None:
         """Stop all workers."""
 
-    @as_interrupts()
     def finish(self, store: Store, jobs: list[dict[str, Any]], told: Callable[[float], None]) -> None:
         """See that jobs are done; `told` is given the fraction of their work that is.
 

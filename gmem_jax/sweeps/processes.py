@@ -3,7 +3,6 @@
 import contextlib
 import os
 import platform
-import signal
 import sys
 import threading
 from collections.abc import Iterator
@@ -49,28 +48,6 @@ def end_with_parent() -> None:
         os._exit(1)  # what is kept is whole at any moment
 
     threading.Thread(target=wait, daemon=True).start()
-
-
-@contextlib.contextmanager
-def as_interrupts() -> Iterator[None]:
-    """TERM and HUP are as Ctrl-C in the block, which so can end its workers; what is ignored, as by nohup, stays so."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    known = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
-    before = {number: signal.getsignal(number) for number in known}
-    for number, handler in before.items():
-        if handler == signal.SIG_DFL:
-            signal.signal(number, interrupt)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def known_by(number: int) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from gmem_jax.experiment.analysis import MEASURES, spread
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import optional
-from gmem_jax.files.labelled import described
+from gmem_jax.files.labelled import described, plain_cell
 from gmem_jax.physics.state import explain, together
 from gmem_jax.sweeps.store import Store
 
@@ -65,7 +65,7 @@ def means(table: Sequence[dict[str, Any]], names: Sequence[str], over: Sequence[
 
 
 def export(store: Store, path: Path) -> None:
-    """Write the table: .csv; .parquet; .h5 or .nc, which xarray reads, with every recalled signal.
+    """Write the table: .csv (see `plain_cell`); .parquet; .h5 or .nc, which xarray reads, with every recalled signal.
 
     Raises:
         ValueError: for another suffix, or if a library is missing.
@@ -73,11 +73,12 @@ def export(store: Store, path: Path) -> None:
     """
     suffix = path.suffix.lower()
     table = rows(store)
+    if not table:
+        raise ValueError(f"{store.folder}: has no points yet")
     if suffix == ".csv":
         with atomic(path) as temporary, temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(table[0]))
-            writer.writeheader()
-            writer.writerows(table)
+            writer = csv.writer(file)
+            writer.writerows([map(plain_cell, row) for row in (table[0], *(row.values() for row in table))])
     elif suffix == ".parquet":
         pyarrow, parquet = optional("pyarrow", "export"), optional("pyarrow.parquet", "export")
         with atomic(path) as temporary:

@@ -20,7 +20,7 @@ from gmem_jax.command import recalls
 from gmem_jax.files import parts
 from gmem_jax.files.parts import Parts, part_with
 from gmem_jax.sweeps import executors, processes
-from gmem_jax.sweeps.processes import as_interrupts, end, job_name, known_by, python, safe_path, stop, waiting
+from gmem_jax.sweeps.processes import end, job_name, known_by, python, safe_path, stop, waiting
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import Requeued
 
@@ -95,19 +95,6 @@ def test_children_of_a_worker_end_with_it(monkeypatch: pytest.MonkeyPatch) -> No
         (child,) = known.children()
         end(known)
     assert not child.is_running() or child.status() == psutil.STATUS_ZOMBIE
-
-
-def test_term_and_hup_end_a_sweep_as_ctrl_c_does_unless_they_are_ignored() -> None:
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with as_interrupts():
-            os.kill(os.getpid(), signal.SIGHUP)  # as under nohup
-            with pytest.raises(KeyboardInterrupt):
-                os.kill(os.getpid(), signal.SIGTERM)
-        assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
-        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 def test_processes_that_others_start_for_us_take_no_module_from_the_working_folder(tmp_path: Path) -> None:
@@ -270,7 +257,7 @@ def _workers(folder: Path, sweep: subprocess.Popen[str]) -> list[psutil.Process]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", ["killed", "hung up", "stop"])
+@pytest.mark.parametrize("how", ["killed", "hung up", "interrupted", "stop"])
 def test_no_worker_outlives_its_sweep(tmp_path: Path, how: str) -> None:
     """Nor does one import what lies in the working folder."""
     for name in ("h5py", "signal", "psutil"):
@@ -278,18 +265,17 @@ def test_no_worker_outlives_its_sweep(tmp_path: Path, how: str) -> None:
     sweep = _sweep(tmp_path)
     workers = _workers(tmp_path, sweep)
     assert len(workers) == 2
-    if how == "killed":
-        sweep.kill()
-    elif how == "hung up":
-        workers[0].suspend()
-        sweep.send_signal(signal.SIGHUP)
-    else:
+    if how == "stop":
         command = [sys.executable, "-P", "-c", ENTRY, "sweep", "stop", "mu"]
-        assert (
-            "ended conductor, process" in subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
-        )
+        told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
+        assert "ended conductor, process" in told
+    elif how == "interrupted":
+        workers[0].suspend()  # which would be waited for without end
+        sweep.send_signal(signal.SIGINT)
+    else:
+        sweep.send_signal(signal.SIGKILL if how == "killed" else signal.SIGHUP)
     _, said = sweep.communicate(timeout=60)
     assert psutil.wait_procs(workers, 20)[1] == []
-    if how != "killed":
+    if how == "interrupted":
         assert sweep.returncode == 130
         assert "interrupted; the same command goes on" in said
