@@ -103,8 +103,8 @@ def _disks(found: dict[str, Any]) -> list[str]:
 
 
 CLASSES = {
-    "deletion": "A user's files, folders and links where ours would be, some in a folder with a marker of ours. Wrong: one "
-    "was removed or changed.",
+    "deletion": "A user's files, folders and links where ours would be, some in a folder with a marker of ours. "
+    "Wrong: one was removed or changed.",
     "identity": "Two kept files were given each other's names. Wrong: they were read, or not read once they were back.",
     "concurrency": "Three runs into one output at once. Wrong: not one wrote it, or another said anything but a line.",
     "processes": "Sweeps of two workers that were sent a signal. Wrong: a worker was left after 20 s.",
