@@ -59,22 +59,33 @@ def say(line: str, **style: Any) -> None:
     log.print(printable(line), soft_wrap=True, markup=False, **style)
 
 
+@contextlib.contextmanager
+def heard() -> Iterator[None]:
+    """What is written to stdout in the block arrives there.
+
+    Raises:
+        UnheardError: if stdout takes nothing.
+    """
+    try:
+        yield
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still in the buffer would fail once more at the end
+        raise UnheardError(os.strerror(error.errno) if error.errno else str(error)) from error
+
+
 def emit(as_json: bool, result: Any, *tables: Any) -> None:
     """The result: one JSON object, or tables and lines for a person.
 
     Raises:
         UnheardError: if stdout takes nothing.
     """
-    try:
+    with heard():
         if as_json:
             sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
         else:
             for table in tables:
                 out.print(printable(table) if isinstance(table, str) else table, soft_wrap=isinstance(table, str))
-        sys.stdout.flush()
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still in the buffer would fail once more at the end
-        raise UnheardError(os.strerror(error.errno) if error.errno else str(error)) from error
 
 
 def require_name(name: str) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from gmem_jax.command import sweep
-from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, say
+from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, heard, say
 from gmem_jax.show.drawing import FORMATS
 from gmem_jax.show.kinds import Draw, shown, sweep_pictures
 from gmem_jax.show.stages import AGAINST
@@ -44,7 +44,8 @@ def show(
     elif csv:
         if folder or found.csv is None:
             raise InputError(f"{file}: --csv gives recalled signals, and this is no recall")
-        sys.stdout.write(found.csv())
+        with heard():
+            sys.stdout.write(found.csv())
     elif folder:
         sweep.show(store, "", as_json)
     else:
@@ -54,7 +55,8 @@ def show(
 def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None, force: bool) -> None:
     names = {name.lower(): name for name in pictures}
     if plot == "list":
-        sys.stdout.write("\n".join(pictures) + "\n")
+        with heard():
+            sys.stdout.write("\n".join(pictures) + "\n")
         return
     if plot.lower() not in names:
         raise InputError(f"--plot {plot}: there is no such picture of {file}; there are {', '.join(pictures)}")

@@ -90,18 +90,19 @@ class Store:
         try:
             if card is None:
                 raise ValueError("there is none")
-            found = {"shared": dict(card["shared"]), "names": list(card["names"])}
+            shared, names = dict(card["shared"]), list(card["names"])
             rows = [{"key": str(row["key"]), "values": dict(row["values"])} for row in card["points"]]
         except (ValueError, KeyError, TypeError) as error:
             raise FileFormatError(f"{self.folder}: no sweep here (no readable sweep.json)") from error
-        for name, value in [*found["shared"].items(), *(pair for row in rows for pair in row["values"].items())]:
+        values: Iterator[tuple[str, Any]] = (pair for row in card["points"] for pair in dict(row["values"]).items())
+        for name, value in [*shared.items(), *values]:
             if not title(name) or (isinstance(value, str) and not source(value)):
                 raise FileFormatError(f"{self.folder / MARKER}: {printable(name)[:NAME]} is no name with a value")
-        if not all(map(title, found["names"])):
+        if not all(map(title, names)):
             raise FileFormatError(f"{self.folder / MARKER}: a name of what varies is no line of text")
-        if odd := [row["key"] for row in rows if not re.fullmatch(_KEY, row["key"])]:
+        if odd := [str(row["key"]) for row in rows if not re.fullmatch(_KEY, str(row["key"]))]:
             raise FileFormatError(f"{self.folder / MARKER}: {printable(odd[0])[:NAME]!r} is no key of a point")
-        return {**found, "points": rows}
+        return {"shared": shared, "names": names, "points": rows}
 
     @staticmethod
     def _write(path: Path, value: Any) -> None:
@@ -302,6 +303,7 @@ def _job(path: Path, name: str) -> dict[str, Any] | None:
     if job.get("kind") == "pack":
         return job if all(isinstance(job.get(one), dict) for one in ("recipe", "grain")) else None
     points, written = job.get("points"), job.get("configurations")
-    keys = isinstance(points, list) and all(isinstance(key, str) and re.fullmatch(_KEY, key) for key in points)
-    fits = keys and isinstance(written, list) and len(written) == len(points)
-    return job if job.get("kind") == "run" and fits and whole(job.get("batch")) else None
+    fits = isinstance(points, list) and isinstance(written, list) and len(written) == len(points)
+    if job.get("kind") != "run" or not fits or not whole(job.get("batch")):
+        return None
+    return job if all(isinstance(key, str) and re.fullmatch(_KEY, key) for key in points or ()) else None
