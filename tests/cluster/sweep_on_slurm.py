@@ -53,6 +53,7 @@ def disturbed(sweep: subprocess.Popen[str], store: Path) -> int:
             subprocess.run(["scancel", *(["--signal=USR2"] if done else []), jobs[0]], check=False)
             done += 1
             print(("cancelled", "signalled")[done - 1], jobs[0], flush=True)
+        # Not two minutes later, as SLURM would.
         for job in told("squeue", "--noheader", "--states=PENDING", "--format=%A"):
             subprocess.run(
                 ["scontrol", "update", f"JobId={job}", "StartTime=now"], check=False
@@ -61,8 +62,8 @@ def disturbed(sweep: subprocess.Popen[str], store: Path) -> int:
 
 
 def waits_and_stops(folder: Path) -> None:
-    """A job that the partition does not take waits, says for what, and is ended by `gmem sweep stop`."""
-    more = "timeout_min = 10\nslurm_exclude = '" + told("hostname", "-s")[0] + "'"
+    """A job that may begin in an hour waits, says for what, and is ended by `gmem sweep stop`."""
+    more = "slurm_additional_parameters = {begin = 'now+1hour'}"
     (folder / "waits.toml").write_text(SWEEP.format(executor="slurm", workers=1, more=more))
     sweep = gmem("sweep", folder / "waits.toml")
     while not (jobs := told("squeue", "--noheader", "--format=%j|%r")):
