@@ -155,10 +155,21 @@ class Folder:
         return found if isinstance(found, dict) and found.get("schema") == schema else None
 
     def mark(self, about: dict[str, Any]) -> None:
-        """Write the marker anew."""
-        made = temporary(self.path / self._marker)
-        made.write_text(json.dumps({"schema": self._schema, **about}, indent=1), encoding="utf-8")
-        place(made, self.path / self._marker)
+        """Write the marker anew.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        made, card = None, self.path / self._marker
+        try:
+            made = temporary(card)
+            made.write_text(json.dumps({"schema": self._schema, **about}, indent=1), encoding="utf-8")
+            place(made, card)
+        except OSError as error:
+            raise OSError(f"{card}: cannot be written ({error.strerror}); whatever was there is untouched") from error
+        finally:
+            if made:
+                drop(made)
 
     def at(self, name: str) -> Path:
         """The path of a file of ours in it, or where one may be made.

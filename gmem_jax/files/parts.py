@@ -109,7 +109,7 @@ def load_part(path: Path, of: str = "") -> Any:
         if head.get("of") != of:
             raise FileFormatError(
                 f"{path}: says that it is {_short(head.get('of'))}, not {_short(of)}: files were exchanged; "
-                "put the right one there, or begin anew with --restart"
+                "remove it, or begin anew with --restart"
             )
         return _put_together(head["form"], [found[name] for name in sorted(found)])
 
