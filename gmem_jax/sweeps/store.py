@@ -145,8 +145,8 @@ class Store:
         own = found.configuration.get("key")
         if own != key:
             raise FileFormatError(
-                f"{self.at(key)}: says that it is point {printable(own)[:NAME]}, and not the one of its name: files were "
-                "exchanged; remove it, and the sweep computes it again"
+                f"{self.at(key)}: says that it is point {printable(own)[:NAME]}, not the one of its name: files "
+                "were exchanged; remove it, and the sweep computes it again"
             )
         return found
 
