@@ -1223,8 +1223,8 @@ MUTATIONS = (
     mutation(
         "half-a-file-stays",
         "files/atomic.py",
-        "temporary.unlink(missing_ok=True)",
-        "pass",
+        "            drop(made)\n",
+        "            pass\n",
         "test_a_failed_write_leaves_nothing_behind",
     ),
     mutation(
@@ -1258,9 +1258,44 @@ MUTATIONS = (
     mutation(
         "parts-of-another-run",
         "files/parts.py",
-        "if found and found.get(name) != wanted[name]]",
+        "if found.get(name) != wanted.get(name)]",
         "if False]",
         "test_parts_of_another_run_are_refused",
+    ),
+    mutation(
+        "parts-exchanged",
+        "files/parts.py",
+        'if head.get("of") != of:',
+        "if False:",
+        "test_parts_that_were_exchanged_or_are_of_another_run_are_refused",
+    ),
+    mutation(
+        "points-exchanged",
+        "sweeps/store.py",
+        "if own != key:",
+        "if False:",
+        "test_points_that_were_exchanged_give_no_numbers",
+    ),
+    mutation(
+        "removes-what-is-not-ours",
+        "files/ours.py",
+        "            if others:\n",
+        "            if False:\n",
+        "test_a_user_s_folder_with_the_name_of_parts_is_left_alone",
+    ),
+    mutation(
+        "replaces-what-came-meanwhile",
+        "files/ours.py",
+        "if path.absolute() not in _new:",
+        "if True:",
+        "test_an_output_that_appears_during_a_run_survives",
+    ),
+    mutation(
+        "worker-without-a-parent",
+        "sweeps/processes.py",
+        "        os._exit(1)  # what is kept is whole at any moment\n",
+        "",
+        "test_a_worker_ends_when_its_parent_does",
     ),
     mutation(
         "damage-unnoticed",

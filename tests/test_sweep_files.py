@@ -1,5 +1,6 @@
 """What a sweep file may say, how its points become runs, and what is refused in one line."""
 
+import csv
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,6 +30,12 @@ MEMORY = 1 << 33
 
 def conductor(folder: Path, **tables: object) -> Conductor:
     return Conductor(spec_of(tables), folder / "store", lambda _: None)
+
+
+def run_job(name: str, points: list[str]) -> dict[str, Any]:
+    """A job as it lies in a store, of experiments that are never made."""
+    sizes = {"work": 1.0, "replicas": 1, "batch": 1}
+    return {"kind": "run", "name": name, "points": points, "configurations": [{}] * len(points), **sizes}
 
 
 def test_combinations_are_products_of_axes_and_single_points() -> None:
@@ -295,7 +302,7 @@ def test_a_key_stands_for_all_that_numbers_depend_on(tmp_path: Path) -> None:
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("all of it")
-    with pytest.raises(gm.FileFormatError, match=r"holds thesis\.tex and no sweep"):
+    with pytest.raises(gm.FileFormatError, match=r"holds thesis\.tex and no sweep\.json"):
         Store(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -434,8 +441,8 @@ def test_runs_that_were_begun_go_on_as_they_were(tmp_path: Path) -> None:
 
 
 def test_what_was_begun_outlives_another_figure_s_jobs(tmp_path: Path) -> None:
-    first = {"kind": "run", "name": "abc", "points": ["one", "two"], "work": 1.0}
-    other = {"kind": "pack", "name": "def", "work": 1.0}
+    first = run_job("abc", ["one", "two"])
+    other = {"kind": "pack", "name": "def", "work": 1.0, "replicas": 1, "recipe": {}, "grain": {}}
     store = Store(tmp_path)
     store.order([first])
     store.parts(first).mkdir()
@@ -474,7 +481,7 @@ def test_values_of_any_kind_have_a_label() -> None:
 
 
 def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
-    store, job = Store(tmp_path), {"kind": "run", "name": "abc", "points": ["key"], "work": 1.0}
+    store, job = Store(tmp_path), run_job("abc", ["key"])
     store.order([job])
     for name in ("abc-0", "old"):
         (tmp_path / "parts" / name).mkdir()
@@ -484,3 +491,20 @@ def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
         assert [path.name for path in (tmp_path / "parts").iterdir()] == ["abc-0"]
     store.order([])
     assert not list((tmp_path / "parts").iterdir())
+
+
+def test_no_cell_of_a_table_is_a_formula(tmp_path: Path) -> None:
+    store = Store(tmp_path / "mu")
+    values = ["=HYPERLINK(1)", "+1+1", "-2", "@x", "tetra-325-a", -2.0]
+    store.remember([], {}, ["pack"], [(f"key{number}", {"pack": value}) for number, value in enumerate(values)])
+    export(store, tmp_path / "o.csv")
+    with (tmp_path / "o.csv").open() as file:
+        told = [row["pack"] for row in csv.DictReader(file)]
+    assert told == ["'=HYPERLINK(1)", "'+1+1", "'-2", "'@x", "tetra-325-a", "-2.0"]
+
+
+def test_a_sweep_that_has_no_points_yet_is_shown_and_not_exported(tmp_path: Path) -> None:
+    store = Store(tmp_path / "mu")
+    assert rows(store) == []
+    with pytest.raises(ValueError, match="has no points yet"):
+        export(store, tmp_path / "o.csv")

@@ -1,8 +1,10 @@
 """What every command says and how: logs and progress on stderr, results on stdout, outputs that destroy nothing."""
 
 import contextlib
+import errno
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -19,7 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 from gmem_jax.files.atomic import probe
-from gmem_jax.files.checked import NAME, title
+from gmem_jax.files.checked import NAME, printable, title
+from gmem_jax.files.ours import promise
 from gmem_jax.files.results import finite
 from gmem_jax.files.sizes import in_bytes, in_time
 from gmem_jax.simulation.progress import Progress
@@ -73,20 +76,49 @@ def refuse_idle(why: str, *names: str) -> None:
             raise InputError(f"{given[name]} does nothing {why}")
 
 
+class UnheardError(Exception):
+    """A result that stdout does not take, once all files are written."""
+
+
+class RunInterruptedError(Exception):
+    """Ctrl-C in a run, and how to go on; no KeyboardInterrupt, which typer makes an exit without words."""
+
+
 def say(line: str, **style: Any) -> None:
     """A line of the log."""
-    log.print(line, soft_wrap=True, markup=False, **style)
+    log.print(printable(line), soft_wrap=True, markup=False, **style)
+
+
+@contextlib.contextmanager
+def heard() -> Iterator[None]:
+    """What is written to stdout in the block arrives there.
+
+    Raises:
+        UnheardError: if stdout takes nothing.
+    """
+    try:
+        yield
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still in the buffer would fail once more at the end
+        raise UnheardError(os.strerror(error.errno) if error.errno else str(error)) from error
 
 
 def emit(as_json: bool, result: Any, *tables: Any) -> None:
-    """The result: one JSON object, or tables and lines for a person."""
-    if as_json:
-        sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
-    else:
-        for table in tables:
-            if isinstance(table, Table):
-                _keep_whole(table)
-            out.print(table, soft_wrap=isinstance(table, str), crop=False)
+    """The result: one JSON object, or tables and lines for a person.
+
+    Raises:
+        UnheardError: if stdout takes nothing.
+    """
+    with heard():
+        if as_json:
+            sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
+        else:
+            for table in tables:
+                if isinstance(table, Table):
+                    _keep_whole(table)
+                words = isinstance(table, str)
+                out.print(printable(table) if words else table, soft_wrap=words, crop=False)
 
 
 def _keep_whole(table: Table) -> None:
@@ -125,13 +157,18 @@ def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool,
         InputError: saying what is wrong, and what would be right.
     """
     folder = path.parent
+    try:
+        path.lstat()
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise InputError(f"{option} {path}: this name is too long for the file system; shorten it") from None
     if path.is_dir():
         raise InputError(f"{option} {path}: is a folder; name a file")
     if not folder.is_dir():
         raise InputError(f"{option} {path}: folder {folder} does not exist")
     if suffix and path.suffix.lower() != suffix:
         raise InputError(f"{option} {path}: this is a {suffix} file; name it {path.with_suffix(suffix).name}")
-    if path.exists() and not path.is_file():
+    if os.path.lexists(path) and not path.is_file():
         raise InputError(f"{option} {path}: is neither a file nor free; name a file")
     for read in inputs:
         if path.exists() and Path(read).exists() and path.samefile(read):
@@ -139,9 +176,10 @@ def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool,
     if path.exists() and not force:
         raise InputError(f"{option} {path}: exists; name another file, or allow its replacement with --force")
     try:
-        probe(folder)
+        probe(path)
     except OSError as error:
         raise InputError(f"{option} {path}: cannot write there ({error.strerror})") from error
+    promise(path, replace=force)
     return path
 
 
@@ -190,10 +228,6 @@ def drawing(picture: Path) -> Iterator[None]:
         say(f"warning: {picture}: could not be drawn ({why})", style="yellow")
 
 
-class RunInterruptedError(KeyboardInterrupt):
-    """Ctrl-C in a run whose finished parts are kept."""
-
-
 @contextlib.contextmanager
 def reporting(*, goes_on: bool = False) -> Iterator[Progress]:
     """Progress of a run: a bar on a terminal; elsewhere a line for every stage, and one at least every 30 s.
@@ -205,7 +239,9 @@ def reporting(*, goes_on: bool = False) -> Iterator[Progress]:
         with _reporting() as progress:
             yield progress
     except KeyboardInterrupt:
-        raise (RunInterruptedError if goes_on else KeyboardInterrupt) from None
+        if goes_on:
+            raise RunInterruptedError("the same command goes on from what is done") from None
+        raise RunInterruptedError("nothing was written, and the same command begins anew") from None
 
 
 @contextlib.contextmanager

@@ -73,7 +73,7 @@ def reproduce_command(
     executor_named(executor, workers, options)  # what cannot be had is refused before anything is written
     if not output.parent.is_dir():
         raise InputError(f"--output {output}: folder {output.parent} does not exist")
-    probe(output.parent)
+    probe(output)
     output.mkdir(exist_ok=True)
     outcomes, verdicts, weighed, drawn = [], [], Weighed([], [], []), []
     broken: list[str] = []

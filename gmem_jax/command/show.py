@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from gmem_jax.command import sweep
-from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, refuse_idle, say
+from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, heard, refuse_idle, say
 from gmem_jax.show.drawing import FORMATS
 from gmem_jax.show.kinds import PLOTS, Draw, shown, sweep_pictures
 from gmem_jax.show.stages import AGAINST, QUANTITIES
@@ -77,7 +77,8 @@ def show(
     elif csv:
         if folder or found.csv is None:
             raise InputError(f"{file}: --csv gives recalled signals, and this is no recall")
-        sys.stdout.write(found.csv())
+        with heard():
+            sys.stdout.write(found.csv())
     elif folder:
         sweep.show(store, over, as_json)
     else:

@@ -19,18 +19,19 @@ from gmem_jax.show.tables import cell
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
 from gmem_jax.sweeps.making import AS_THEY_ARE
+from gmem_jax.sweeps.processes import stop, waiting
 from gmem_jax.sweeps.spec import Spec, read_spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import Conductor
 from gmem_jax.sweeps.table import FORMATS, doubts, export, means, rows
 
-VERBS = ("status", "show", "export")
+VERBS = ("status", "show", "export", "stop")
 RUN = ("executor", "workers", AS_THEY_ARE)
 ABOUT = "F(T1): F after a running mean over the ringing period"
 
 
 def sweep_command(
-    what: Annotated[str, typer.Argument(help="A sweep file (.toml) to be done; or status, show, export.")],
+    what: Annotated[str, typer.Argument(help="A sweep file (.toml) to be done; or status, show, export, stop.")],
     folder: Annotated[Path | None, typer.Argument(help="With a verb: the folder of the sweep.")] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder of the sweep, default the file's name; or of export.")
@@ -47,7 +48,8 @@ def sweep_command(
 ) -> None:
     """Vary anything: packs made once, points side by side, results kept by content; resumes, and grows.
 
-    gmem sweep mu.toml; gmem sweep status mu; gmem sweep show mu --over pack; gmem sweep export mu -o mu.csv
+    gmem sweep mu.toml; gmem sweep status mu; gmem sweep show mu --over pack; gmem sweep export mu -o mu.csv;
+    gmem sweep stop mu
     """
     if what in VERBS:
         refuse_idle(f"with {what}: it runs no points", "executor", "workers", "retry")
@@ -62,6 +64,8 @@ def sweep_command(
             _export(store, output, force, as_json)
         elif what == "status":
             _status(store, as_json)
+        elif what == "stop":
+            _stop(store, as_json)
         else:
             show(store, over, as_json)
         return
@@ -87,7 +91,7 @@ def sweep_command(
     if not target.parent.is_dir():
         raise InputError(f"--output {target}: folder {target.parent} does not exist")
     try:
-        probe(target.parent)
+        probe(target)
     except OSError as error:
         raise InputError(f"--output {target}: cannot write there ({error.strerror})") from error
     with locked(target), reporting(goes_on=True) as progress:
@@ -132,13 +136,12 @@ def there(folder: Path) -> Store:
     """The sweep in a folder.
 
     Raises:
-        InputError: if there is none.
+        InputError: if there is no such folder.
+        FileFormatError: if it holds no sweep.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    if not (folder / "sweep.json").is_file():
-        raise InputError(f"{folder}: no sweep here (no sweep.json)")
-    return Store(folder)
+    return Store(folder, make=False)
 
 
 def _values(row: dict[str, Any], names: list[str]) -> str:
@@ -164,7 +167,8 @@ def _status(store: Store, as_json: bool) -> None:
     busy = [f"{one['what']}, {one['fraction']:.0%}" for one in at_work if one["fraction"] < 1.0]
     reasons = sorted({row["why"] for row in table if row["state"] == "failed"})
     problems = [*(f"failed: {reason}" for reason in reasons), *(f"warning: {line}" for line in _doubtful(table))]
-    emit(as_json, summary, ", ".join(lines), *busy, *problems)
+    waits = waiting(store)
+    emit(as_json, {**summary, "waiting": waits}, ", ".join(lines), *busy, *waits, *problems)
 
 
 def _doubtful(table: list[dict[str, Any]]) -> list[str]:
@@ -176,6 +180,17 @@ def _doubtful(table: list[dict[str, Any]]) -> list[str]:
 def names_of(text: str) -> list[str]:
     """Names separated by commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _stop(store: Store, as_json: bool) -> None:
+    """End whoever works on a sweep; what is computed stays."""
+    ended, left = stop(store)
+    for line in left:
+        say(line, style="yellow")
+    told = [f"ended {one}" for one in ended] or ["nobody is at work here"]
+    emit(as_json, {"folder": str(store.folder), "ended": ended, "left": left}, *told)
+    if left:
+        raise RunFailedError(f"{len(left)} workers cannot be ended from here")
 
 
 def show(store: Store, over: str, as_json: bool) -> None:

@@ -71,6 +71,11 @@ def recall_dataset(recall: Recall, names: list[str], configuration: Mapping[str,
     return xarray.Dataset(data, coordinates, about)
 
 
+def plain_cell(value: Any) -> Any:
+    """The value of a cell of CSV; before a text that spreadsheets would take for a formula an apostrophe is put."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@")) else value
+
+
 def recall_csv(recall: Recall, names: list[str]) -> str:
     """The recalled signals as CSV: u, and p_sig of every signal in E."""
     text = io.StringIO()

@@ -332,9 +332,7 @@ class Report:
         return self._figure(plots.curves(lines, plots.U, "I(u)"))
 
     def _sweep(self, folder: Path) -> None:
-        if not (folder / "sweep.json").is_file():
-            raise FileFormatError(f"{folder}: no sweep here (no sweep.json)")
-        store = Store(folder)
+        store = Store(folder, make=False)
         card, rows = store.card(), points_of(store)
         names = card["names"]
         cells = [

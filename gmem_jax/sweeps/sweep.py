@@ -109,7 +109,7 @@ def sweep(
         share = sum(one.experiment.replicas for one in group)
         on = within(tell, done / total, (done + share) / total)
         keys, experiments = [one.key for one in group], [one.experiment for one in group]
-        cache = Checkpoints(store.folder / "parts" / digest(keys), {"keys": keys}) if store else None
+        cache = Checkpoints(store.parts({"name": digest(keys)}), {"keys": keys}) if store else None
         found |= run_group(keys, experiments, store=store, cache=cache, progress=on)
         done += share
     return Results(Result(one.values, found[one.key]) for one in points)
@@ -159,7 +159,7 @@ class Conductor:
 
     @functools.cached_property
     def store(self) -> Store:
-        """The store, which is made when it is first asked for.
+        """The store, made on first use: a sweep that is refused leaves nothing behind.
 
         Raises:
             FileFormatError: if the folder holds something else.
@@ -224,13 +224,21 @@ class Conductor:
         Raises:
             RunFailedError: if it could not be made.
             FileNotFoundError: if there is no such pack.
+            FileFormatError: if its file is damaged, or that of another pack.
         """
         if "pack" in values:
             return self._packs(str(values["pack"]))
         name = self._pack_job(values)["name"]
         if not self.store.pack_at(name).is_file() and (reason := self.store.failed().get(name)):
             raise RunFailedError(f"its pack could not be made: {reason}")
-        return self._packs(str(self.store.pack_at(name)))
+        path = self.store.pack_at(name)
+        pack = self._packs(str(path))
+        if pack.name != name:
+            raise FileFormatError(
+                f"{path}: is the pack {pack.name}, not the one of its name: files were exchanged; "
+                "remove it, and the sweep makes it again"
+            )
+        return pack
 
     def packs(self, executor: Executor, progress: Progress) -> list[Pack]:
         """The packs of all points, in order; those that do not exist yet are made.
@@ -275,8 +283,8 @@ class Conductor:
         for key, _, reason in failed:
             self.store.fail(key, reason)
         for key in self.store.unreadable({one.key for one in points}):
-            self.say(f"{self.store.at(key)}: damaged; computed again")
-            self.store.at(key).unlink()
+            self.say(f"{self.store.at(key)}: damaged, or another point's; computed again")
+            self.store.forget(key)
         known = self.store.done() | set(self.store.failed())
         memory = psutil.virtual_memory().available // executor.workers
         begun = self.store.begun({one.key for one in points} - set(self.store.failed()))
@@ -315,4 +323,4 @@ class Conductor:
 
     def _finish(self, executor: Executor, jobs: list[dict[str, Any]], progress: Progress, what: str) -> None:
         self.store.order(jobs)
-        executor.finish(self.store, jobs, lambda fraction: progress(what, 0.0, fraction))
+        executor.finish(self.store, jobs, lambda fraction: progress(what + executor.waiting, 0.0, fraction))

@@ -11,7 +11,7 @@ import numpy as np
 from gmem_jax.experiment.analysis import MEASURES, spread
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import optional
-from gmem_jax.files.labelled import described
+from gmem_jax.files.labelled import described, plain_cell
 from gmem_jax.files.measures import EACH, of_each
 from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.state import explain, together
@@ -80,7 +80,7 @@ def means(table: Sequence[dict[str, Any]], names: Sequence[str], over: Sequence[
 
 
 def export(store: Store, path: Path) -> str:
-    """Write the table: .csv; .parquet; .h5 or .nc, which xarray reads, with every recalled signal.
+    """Write the table: .csv (see `plain_cell`); .parquet; .h5 or .nc, which xarray reads, with every recalled signal.
 
     Returns:
         What is to be known of it; "" if nothing.
@@ -91,11 +91,12 @@ def export(store: Store, path: Path) -> str:
     """
     suffix = path.suffix.lower()
     table = rows(store)
+    if not table:
+        raise ValueError(f"{store.folder}: has no points yet")
     if suffix == ".csv":
         with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(table[0]))
-            writer.writeheader()
-            writer.writerows(table)
+            writer = csv.writer(file)
+            writer.writerows([map(plain_cell, row) for row in (table[0], *(row.values() for row in table))])
     elif suffix == ".parquet":
         pyarrow, parquet = optional("pyarrow", "export"), optional("pyarrow.parquet", "export")
         with atomic(path) as temporary:

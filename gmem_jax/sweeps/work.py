@@ -1,6 +1,8 @@
 """A worker: takes jobs that nobody has, until none is left.
 
-    python -m gmem_jax.sweeps.work FOLDER NAME [CPUS]
+    python -P -m gmem_jax.sweeps.work FOLDER NAME [CPUS [attached]]
+
+An attached one ends as soon as its stdin does.
 
 Any number of workers, on any machines that see the folder, share a sweep; one that is killed loses what it did since
 its last checkpoint.
@@ -8,7 +10,9 @@ its last checkpoint.
 
 import contextlib
 import functools
+import importlib
 import os
+import signal
 import sys
 import time
 import traceback
@@ -23,7 +27,7 @@ from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import OtherCompressionWarning, Recall, run
 from gmem_jax.experiment.several import run_several
-from gmem_jax.files.checkpoints import Checkpoints
+from gmem_jax.files.checkpoints import Checkpoints, part_with
 from gmem_jax.files.configuration import experiment_from, resolved
 from gmem_jax.files.packs import load_pack, save_pack
 from gmem_jax.files.programs import keep_programs
@@ -34,8 +38,10 @@ from gmem_jax.simulation.checkpoints import no_cache
 from gmem_jax.simulation.progress import Progress, silent
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.sweeps.making import clump_of
+from gmem_jax.sweeps.processes import end_with_parent
 from gmem_jax.sweeps.store import Store
 
+ATTACHED = "attached"
 EVERY = 1.0  # s between two reports of progress
 WARNINGS = "warnings"  # in the configuration of a point: what Python warned of in its run, and the status does not say
 
@@ -118,14 +124,16 @@ class _Worker:
         parts = self._parts(job)
         stages: dict[str, Sample] = {}
         say = self.progress(job["name"])
-        made_of: Any = {"grain": clump_of(job["grain"]), "material": Material(**job["material"])}
+        made_of: Any = {"grain": clump_of(job["grain"]), "material": Material(**job["material"]), "name": job["name"]}
         pack = prepare(Recipe(**job["recipe"]), **made_of, cache=parts, progress=say, log=stages)
         save_pack(self.store.pack_at(job["name"]), pack, stages)
         parts.discard()
 
     def _experiments(self, job: dict[str, Any]) -> list[Experiment]:
-        written = job["configurations"]
-        return [experiment_from(one, self.packs(one["pack"]["source"])) for one in written]
+        try:
+            return [experiment_from(one, self.packs(one["pack"]["source"])) for one in job["configurations"]]
+        except (KeyError, TypeError, AttributeError) as error:
+            raise FileFormatError(f"a job whose experiments are none: {error}") from error
 
     def _run(self, job: dict[str, Any]) -> None:
         say, cache = self.progress(job["name"]), self._parts(job)
@@ -160,8 +168,24 @@ def work(folder: Path, name: str) -> int:
     return done
 
 
+class Requeued:
+    """A worker as submitit's job: before its time is over it keeps a checkpoint, and is put into the queue again."""
+
+    def __call__(self, arguments: list[str]) -> int:
+        """Work."""
+        if hasattr(signal, "SIGUSR2") and callable(leave := signal.getsignal(signal.SIGUSR2)):
+            signal.signal(signal.SIGUSR2, lambda *which: part_with(lambda: leave(*which)))
+        return main(arguments)
+
+    def checkpoint(self, arguments: list[str]) -> Any:
+        """The same again, for submitit."""
+        return importlib.import_module("submitit.helpers").DelayedSubmission(self, arguments)
+
+
 def main(arguments: list[str]) -> int:
     """Entry point of a worker's process; 0 if it did what it could."""
+    if ATTACHED in arguments[3:]:
+        end_with_parent()
     jax.config.update("jax_enable_x64", True)
     keep_programs()
     if len(arguments) > 2 and hasattr(os, "sched_setaffinity"):

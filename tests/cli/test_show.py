@@ -63,7 +63,7 @@ def folder(recalled: tuple[gm.Experiment, gm.Recall], tmp_path_factory: pytest.T
     points = [point({"mu": mu}, gm.replace(experiment, {"friction.mu": mu})) for mu in (0.5, 1.0)]
     store.remember(points, {}, ["mu"])
     for one in points:
-        gm.save_recall(store.at(one.key), found, configuration)
+        store.save(one.key, found, configuration)
     return folder
 
 
