@@ -19,11 +19,12 @@ from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.pack import Pack, pack_from, stack
 from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
+from gmem_jax.experiment.record import describe, to_dict
 from gmem_jax.experiment.samples import waveform_from
 from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, waveform, words
-from gmem_jax.files.configuration import experiment_from, resolved, written
+from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
-from gmem_jax.files.recalls import load_recall, save_recall
+from gmem_jax.files.recalls import load_recall, save_recall, to_csv, to_xarray
 from gmem_jax.files.waveforms import load_waveforms, save_waveforms
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
@@ -93,12 +94,13 @@ __all__ = [
     "capacity",
     "classify",
     "clump",
+    "describe",
     "design_by_kernel",
     "design_drive",
     "design_waveforms",
-    "experiment_from",
     "explain",
     "fidelity",
+    "from_dict",
     "gain",
     "jacobian",
     "list_packs",
@@ -110,7 +112,6 @@ __all__ = [
     "prepare",
     "recall",
     "replace",
-    "resolved",
     "run",
     "running_mean",
     "save_pack",
@@ -121,10 +122,12 @@ __all__ = [
     "stack",
     "sweep",
     "tetra",
+    "to_csv",
+    "to_dict",
+    "to_xarray",
     "value_and_grad",
     "view",
     "waveform",
     "waveform_from",
     "words",
-    "written",
 ]

@@ -37,7 +37,7 @@ def test_objects_are_shown_as_short_tables(recalled: tuple[gm.Experiment, gm.Rec
 
 def test_objects_are_one_line_in_a_terminal(recalled: tuple[gm.Experiment, gm.Recall], tmp_path: Path) -> None:
     experiment, recall = recalled
-    gm.save_recall(tmp_path / "r.h5", recall, gm.resolved(experiment, 0.0))
+    gm.save_recall(tmp_path / "r.h5", recall)
     for shown, words in (
         (experiment.pack, "<Pack tetra(0.6)-27-seed1: grains = 27 tetra(0.6), "),
         (experiment, "27 grains, signals = 2, bumps, friction = Hooke, mu = 1, gamma0 = 0.001, "),

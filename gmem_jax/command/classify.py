@@ -10,7 +10,7 @@ import typer
 from rich import progress
 
 from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, drawing, emit, log, say
-from gmem_jax.files.configuration import signals_from
+from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
@@ -66,7 +66,8 @@ def classify_command(
     A net depends on the length of the words and its seed, not on the recall: nets in the folder are used again, and
     those that ran out of time are trained on.
     """
-    kept, configuration = load_recall(recall)
+    kept = load_recall(recall)
+    configuration = kept.configuration
     # Here, not above: flax takes a second to load, and no other command needs it.
     from gmem_jax.reading import report, training
     from gmem_jax.reading.lessons import Lessons
@@ -74,7 +75,7 @@ def classify_command(
 
     try:
         designed = configuration.get("target")
-        stored = stored_words(kept, signals_from(designed) if designed else None)
+        stored = stored_words(kept, signals_from_dict(designed) if designed else None)
     except ValueError as error:
         raise InputError(f"{recall}: {error}; make one with gmem recall --signals words:L") from error
     claim(output, ".json", inputs=(recall,), force=force)

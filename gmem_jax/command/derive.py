@@ -31,9 +31,9 @@ from gmem_jax.design.kernel import memory_kernel, relative_error
 from gmem_jax.design.stored import save_kernel
 from gmem_jax.experiment.experiment import Experiment, value_at
 from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run, run_bytes
+from gmem_jax.experiment.record import describe, fingerprint, key_of_run, pack_fingerprint
 from gmem_jax.experiment.signals import Bumps, Spline
 from gmem_jax.files import schemas
-from gmem_jax.files.configuration import fingerprint, key_of_run, pack_fingerprint, resolved
 from gmem_jax.files.named import named_signals
 from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
@@ -109,7 +109,7 @@ def gradient_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        save_result(output, schemas.GRADIENT, {**result, "configuration": resolved(experiment, result["seconds"])})
+        save_result(output, schemas.GRADIENT, {**result, "configuration": describe(experiment, result["seconds"])})
     if drawn:
         with drawing(drawn):
             figures.gradient_figure(drawn, rows, f"{tables.cell(pack)}: F = {result['fidelity']:.4f}")
@@ -190,7 +190,7 @@ def kernel_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        save_kernel(output, kernel, resolved(experiment, time.perf_counter() - began))
+        save_kernel(output, kernel, describe(experiment, time.perf_counter() - began))
     if drawn:
         with drawing(drawn):
             figures.kernel_figure(drawn, kernel, noise / float(Material().modulus), tables.cell(pack))
@@ -370,7 +370,7 @@ def tune_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        save_result(output, schemas.TUNED, {**result, "configuration": resolved(first, result["seconds"])})
+        save_result(output, schemas.TUNED, {**result, "configuration": describe(first, result["seconds"])})
     if drawn:
         with drawing(drawn):
             figures.history_figure(drawn, {" ".join(map(tables.cell, names)): [value for _, value in found.history]})

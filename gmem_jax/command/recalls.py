@@ -1,6 +1,5 @@
 """`gmem recall`, `gmem demo`."""
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,8 +31,8 @@ from gmem_jax.command.resuming import Restart, batch_for, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import frame_schedule, replica_bins, run, run_bytes
+from gmem_jax.experiment.record import key_of_run, signals_to_dict
 from gmem_jax.experiment.signals import Signals, six_signals
-from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
 from gmem_jax.files.sizes import recall_bytes
@@ -71,17 +70,17 @@ def _run(
     frames_at: Sequence[float] = (),
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
-    began = time.perf_counter()
     batch = batch_for(experiment, data, batch, restart=restart)
     _announce(experiment, batch)
     film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": list(frames_at)}
     with resumable(data, key_of_run(experiment, batch=batch, **film), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             recall = jax.block_until_ready(run(experiment, batch=batch, cache=parts, progress=progress, **film))
-        configuration = resolved(experiment, time.perf_counter() - began)
+        configuration = recall.configuration
         if target is not None:
-            configuration["target"] = written_signals(target)
-        save_recall(data, recall, configuration)
+            configuration["target"] = signals_to_dict(target)
+        recall = recall.described(configuration)
+        save_recall(data, recall)
     told = f"wrote {data}"
     if picture is not None:
         title = tables.heading(configuration)
@@ -90,7 +89,7 @@ def _run(
             figures.recall_figure(picture, recall, experiment.scale, title, names, t0)
             told += f" and {picture}"
     say(told)
-    row = {**tables.summary(recall, configuration), "seconds": configuration["seconds"], "output": str(data)}
+    row = {**tables.summary(recall), "seconds": configuration["seconds"], "output": str(data)}
     if row["status"]:
         say(f"warning: {row['status_text']}", style="yellow")
     return row, configuration

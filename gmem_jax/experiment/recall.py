@@ -2,9 +2,11 @@
 
 import dataclasses
 import importlib
+import json
+import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,8 +17,9 @@ import numpy as np
 from gmem_jax.experiment import analysis, html
 from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
+from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
-from gmem_jax.physics.pytree import Scalar, pytree, static, traced
+from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
@@ -62,6 +65,8 @@ class Recall:
         dt: the time step used, in t_c.
         protocol: the stages that were gone through.
         frames: configurations of one replica along the run, if they were asked for.
+        record: JSON of the configuration that it belongs to: what `describe` says of the experiment. "{}" for a recall
+            of a traced experiment. A label: no part of what programs are compiled for.
     """
 
     u: jax.Array
@@ -80,6 +85,25 @@ class Recall:
     dt: Scalar
     protocol: Protocol = static()
     frames: Frames | None = None
+    record: str = label("{}")
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """`record` as a dictionary."""
+        found: dict[str, Any] = json.loads(self.record)
+        return found
+
+    @property
+    def names(self) -> list[str]:
+        """What the signals are called: words by their bits, others by their number from 1."""
+        known, count = self.configuration.get("signals"), len(self.J)
+        if isinstance(known, list) and len(known) == count:
+            return [str(name) for name in known]
+        return [f"signal {number + 1}" for number in range(count)]
+
+    def described(self, configuration: Mapping[str, Any]) -> "Recall":
+        """The same recall with this configuration."""
+        return dataclasses.replace(self, record=json.dumps(configuration))
 
     def plot(
         self,
@@ -183,7 +207,7 @@ def recall(experiment: Experiment) -> Recall:
     require_x64()
     require_double(pack=experiment.pack, signals=experiment.signals)
     found: Recall = _recall(experiment)
-    return found
+    return found if traced(experiment) else found.described(describe(experiment, 0.0))
 
 
 def fidelity(experiment: Experiment) -> jax.Array:
@@ -291,7 +315,7 @@ def run(
             there is not.
         RunFailedError: if the simulation broke down.
     """
-    tell = callback(progress)
+    began, tell = time.perf_counter(), callback(progress)
     count = experiment.signals.count
     size = count if batch is None else batch
     if size < 1:
@@ -338,6 +362,7 @@ def run(
         done += work_of(own, 1 + last - first)
     after_prefix, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
     found: Recall = finished(experiment, prefix.samples | after_prefix, jnp.asarray(status))
+    found = found.described(describe(experiment, time.perf_counter() - began))
     if not schedule.wanted:
         return found
     offsets = np.asarray(experiment.pack.clump.offsets)

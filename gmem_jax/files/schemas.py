@@ -288,7 +288,7 @@ xarray.open_dataset("recall.h5", engine="h5netcdf").p_sig.sel(signal="signal 1")
 xarray.open_dataset("recall.h5", engine="h5netcdf", group="stages/readout").pressure
 ```
 
-With it, `gm.load_recall("recall.h5").to_xarray()` is one dataset, its stages one after the other along `time`. The
+With it, `gm.to_xarray(gm.load_recall("recall.h5"))` is one dataset, its stages one after the other along `time`. The
 first 512 bytes are a SHA-256 of the rest: a file that was changed by another program is refused here. JSON files carry
 their fields' units and descriptions in `about`.
 """

@@ -15,7 +15,7 @@ from gmem_jax.experiment.signals import waveform
 from gmem_jax.files.checked import is_number, refusing
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.packs import load_pack, load_stages, pack_called
-from gmem_jax.files.recalls import load_recall
+from gmem_jax.files.recalls import load_recall, to_csv
 from gmem_jax.files.results import load_result
 from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL
 from gmem_jax.files.waveforms import load_design, load_target, load_waveforms
@@ -88,9 +88,9 @@ def _held(file: Path, against: str, signals: Sequence[int], each: bool) -> Shown
 
 
 def _recall(file: Path, against: str, signals: Sequence[int], each: bool) -> Shown:
-    stored = load_recall(file)
-    recall, configuration = stored
-    row = tables.summary(recall, configuration)
+    recall = load_recall(file)
+    configuration = recall.configuration
+    row = tables.summary(recall)
 
     def draw(what: str, path: Path) -> None:
         recall_drawing(recall, what, configuration, against=against, signals=signals).save(path)
@@ -98,7 +98,7 @@ def _recall(file: Path, against: str, signals: Sequence[int], each: bool) -> Sho
     drawn: dict[str, Draw] = {what: functools.partial(draw, what) for what in PICTURES}
     facts = {**row, "configuration": configuration}
     lines = tables.recall_lines(row, configuration, each=each)
-    return Shown(facts, lines, drawn, functools.partial(stored.to_csv, each=each))
+    return Shown(facts, lines, drawn, functools.partial(to_csv, recall, each=each))
 
 
 def _pack(file: Path, against: str) -> Shown:

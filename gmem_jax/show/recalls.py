@@ -11,10 +11,9 @@ import numpy as np
 from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.experiment import PAPER_T0, Experiment
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import describe
 from gmem_jax.files.checked import is_number
-from gmem_jax.files.configuration import resolved
 from gmem_jax.files.measures import relative_scale
-from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.show import tables
@@ -51,8 +50,8 @@ def recall_drawing(
     Raises:
         ValueError: if there is no such picture, or no such signal.
     """
-    known = dict(configuration or {})
-    names = signal_names(recall, known)
+    known = dict(configuration or recall.configuration)
+    names = recall.names
     title = tables.heading(known) if known else "recall"
     found = {name.lower(): name for name in PICTURES}.get(what.lower())
     if found is None or against not in AGAINST:
@@ -89,7 +88,7 @@ def _refuse_unknown(signals: Sequence[int], count: int, lowest: int) -> None:
 
 def plot(recall: Recall, what: str, experiment: Experiment | None, against: str, signals: Sequence[int]) -> Drawing:
     """What `Recall.plot` calls."""
-    known = None if experiment is None else resolved(experiment, 0.0)
+    known = None if experiment is None else describe(experiment, 0.0)
     return recall_drawing(recall, what, known, against=against, signals=signals)
 
 

@@ -16,9 +16,10 @@ from gmem_jax.design.stored import load_kernel
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import names_of, pack_fingerprint
 from gmem_jax.experiment.signals import Signals, bin_average, waveform
 from gmem_jax.files.checked import is_number, refusing
-from gmem_jax.files.configuration import names_of, pack_fingerprint, signals_from
+from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.measures import relative_scale
@@ -182,14 +183,14 @@ class Report:
         self.sections.append((f"Pack {pack.name}", "\n".join(parts)))
 
     def _recall(self, source: str) -> None:
-        stored = load_recall(Path(source))
-        recall, configuration = stored
-        row = tables.summary(recall, configuration)
+        recall = load_recall(Path(source))
+        configuration = recall.configuration
+        row = tables.summary(recall)
         self._recalls.append((row, configuration))
-        names, t0 = stored.names, configuration["t0"]
+        names, t0 = recall.names, configuration["t0"]
         scale = np.asarray(relative_scale(configuration))
         wanted = configuration.get("target")
-        target = None if wanted is None else np.asarray(bin_average(signals_from(wanted)))
+        target = None if wanted is None else np.asarray(bin_average(signals_from_dict(wanted)))
         about = "G: gain; F: fidelity, 1 if what is recalled is the integral of what was stored; "
         about += "errors: standard errors over the signals stored in this pack (jackknife)"
         parts = [

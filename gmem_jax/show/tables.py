@@ -16,9 +16,8 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average
-from gmem_jax.files.configuration import signals_from
+from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.measures import of_each, relative_scale
-from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain, together
 from gmem_jax.preparation.recipe import pressure_over_wanted
@@ -45,8 +44,9 @@ def _number(cell: str) -> str | float:
         return cell
 
 
-def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
+def summary(recall: Recall) -> dict[str, Any]:
     """The numbers of one recall and its resolved configuration, for JSON output and `recall_table`."""
+    configuration = recall.configuration
     readout = recall.stages[recall.protocol.reads[0]]
     pressure = np.asarray(readout.pressure)
     unit = Material().modulus
@@ -71,7 +71,7 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
         "status_text": explain(status),
         "note": note_on_size(configuration),
-        "signals": _signals(recall, configuration),
+        "signals": _signals(recall),
         **second_readout(recall, configuration),
         **of_target(recall, configuration),
     }
@@ -88,10 +88,10 @@ def note_on_size(configuration: dict[str, Any]) -> str:
     )
 
 
-def _signals(recall: Recall, configuration: dict[str, Any]) -> list[dict[str, Any]]:
+def _signals(recall: Recall) -> list[dict[str, Any]]:
     """What is said of each signal by itself."""
-    measures = of_each(recall, configuration)
-    rows = zip(signal_names(recall, configuration), *(values.tolist() for values in measures.values()), strict=True)
+    measures = of_each(recall)
+    rows = zip(recall.names, *(values.tolist() for values in measures.values()), strict=True)
     return [
         dict(zip(("signal", *(name.removeprefix("signal_") for name in measures)), row, strict=True)) for row in rows
     ]
@@ -105,7 +105,7 @@ def of_target(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
     """Gain and fidelity with respect to the J that the waveforms were designed for; {} for waveforms that were not."""
     if "target" not in configuration:
         return {}
-    wanted = bin_average(signals_from(configuration["target"]))
+    wanted = bin_average(signals_from_dict(configuration["target"]))
     match = analysis.compare(jnp.asarray(recall.p_sig), wanted, relative_scale(configuration))
     return {"target_gain": float(match.gain), "target_fidelity": float(match.fidelity)}
 
