@@ -1,7 +1,6 @@
 """What a pack gives back: an experiment run, its background subtracted, compared with the integrals (Secs. II, III)."""
 
 import dataclasses
-import importlib
 import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -80,28 +79,6 @@ class Recall:
     dt: Scalar
     protocol: Protocol = static()
     frames: Frames | None = None
-
-    def plot(
-        self,
-        what: str = "signals",
-        experiment: Experiment | None = None,
-        *,
-        against: str = "time",
-        signals: Sequence[int] = (),
-    ) -> Any:
-        """A picture of it, which a notebook shows: `.save(path)` writes it, `.figure` is matplotlib's.
-
-        Args:
-            what: "signals", "waveforms", "all"; or a quantity of the stages, like "pressure", "Z" or "phi".
-            experiment: that it is of, for the names of signals and the conditions in the title.
-            against: "time" or "u", for the stages.
-            signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
-
-        Raises:
-            ValueError: if there is no such picture, or no such signal; it names those that there are.
-        """
-        from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
-        return from_above.plot(self, what, experiment, against, signals)
 
     def _facts(self) -> html.Facts:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}

@@ -1,6 +1,5 @@
 """Recall files: what was measured, and the configuration that it belongs to."""
 
-import importlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -92,11 +91,6 @@ class StoredRecall(NamedTuple):
             ValueError: if xarray is not installed.
         """
         return recall_dataset(self.recall, self.names, self.configuration)
-
-    def plot(self, what: str = "signals", *, against: str = "time") -> Any:
-        """`Recall.plot`, with names and conditions."""
-        from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
-        return from_above.recall_drawing(self.recall, what, self.configuration, against=against)
 
     def __repr__(self) -> str:
         return repr(self.recall)
