@@ -170,7 +170,7 @@ def design_figure(design: Design, unit: float, title: str) -> Figure:
     ]
     below = [
         Panel(
-            tuple(Curve(u, PASCAL * np.asarray(values[number]), *look) for values, *look in curves),
+            tuple(Curve(u, PASCAL * np.asarray(row[number]), name, tone, style) for row, name, tone, style in curves),
             x="u",
             y="stress (Pa)",
         )

@@ -127,7 +127,7 @@ def signals_figure(
     recall: Recall,
     names: Sequence[str],
     title: str = "",
-    scale: Scalar | None = None,
+    scale: Scalar | np.ndarray | None = None,
     t0: Any = None,
     *,
     target: np.ndarray | None = None,
@@ -147,7 +147,7 @@ def signals_figure(
         target: J that designed waveforms should give, [S, 256].
         page: whether it is for a page: at most 12 panels, without the waveforms.
     """
-    pascal = Material().modulus
+    pascal = float(Material().modulus)
     u, signals, integrals, waves = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J, recall.shear))
     if scale is None:
         fitted = integrals * np.sum(integrals * signals) / np.sum(integrals * integrals)
@@ -191,7 +191,7 @@ def waveforms_figure(recall: Recall, names: Sequence[str], title: str) -> Figure
     u, curves = np.asarray(recall.u), ((recall.shear, "$I(u)$", "C2", "-"), (recall.J, "$J(u)$", "C3", "--"))
     panels = tuple(
         Panel(
-            tuple(Curve(u, np.asarray(values[number]), *look) for values, *look in curves),
+            tuple(Curve(u, np.asarray(row[number]), name, tone, style) for row, name, tone, style in curves),
             names[number],
             u_label(columns),
             zero=True,
@@ -205,11 +205,12 @@ def image_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
     """p_sig and J of all signals, however many, as a picture: a row for each."""
     count, u = len(recall.J), np.asarray(recall.u)
     pairs = (
-        (Material().modulus * np.asarray(recall.p_sig), "recalled $p_{sig}$ (Pa)"),
+        (float(Material().modulus) * np.asarray(recall.p_sig), "recalled $p_{sig}$ (Pa)"),
         (np.asarray(recall.J), "$J(u)$"),
     )
     panels = tuple(
-        Panel((Image(values, u, np.arange(count), label),), x=U, down=True, y_names=names) for values, label in pairs
+        Panel((Image(np.asarray(values), u, np.arange(count), label),), x=U, down=True, y_names=names)
+        for values, label in pairs
     )
     size = (9.6, min(9.0, 3.0 + 0.12 * count))
     return Figure(panels, 2, size, (title, _measures(recall, count, count)), shared=("y",))

@@ -98,7 +98,10 @@ def render(figure: Figure) -> Drawing:
     from matplotlib.figure import Figure as Canvas
 
     canvas = Canvas(figsize=figure.size, layout="constrained")
-    shared = {"sharex": "x" in figure.shared, "sharey": "row" if "row" in figure.shared else "y" in figure.shared}
+    shared: dict[str, Any] = {
+        "sharex": "x" in figure.shared,
+        "sharey": "row" if "row" in figure.shared else "y" in figure.shared,
+    }
     axes = canvas.subplots(figure.rows, figure.columns, squeeze=False, **shared)
     for axis in axes.flat[len(figure.panels) :]:
         axis.set_visible(False)
@@ -218,7 +221,7 @@ def _names(axis: Any, panel: Panel, figure: Figure) -> None:
         (panel.y_names, figure.size[1] / figure.rows, axis.set_yticks),
     ):
         step = -(-len(names) // int(8 * inches))
-        turned = {} if ticks == axis.set_yticks else {"rotation": 90 if panel.equal else 30}
+        turned: dict[str, Any] = {} if ticks == axis.set_yticks else {"rotation": 90 if panel.equal else 30}
         if turned and not panel.equal:
             turned["ha"] = "right"
         if names:

@@ -98,7 +98,8 @@ def _panel(drawn: Any, panel: Panel, figure: Figure, number: int, known: set[str
         elif isinstance(mark, Curve):
             drawn.add_trace(_curve(mark, shown=mark.name not in known), **at)
             known.add(mark.name)
-    x, y = ({"title_text": _text(text) if told else None} for text, told in _labels(panel, figure, number))
+    told = zip((panel.x, panel.y), figure.labelled(number), strict=True)
+    x, y = (dict[str, Any](title_text=_text(label) if shown else None) for label, shown in told)
     if panel.x_names and panel.equal:
         x["type"] = y["type"] = "category"
         y |= {"scaleanchor": f"x{number + 1}".removesuffix("x1") or "x", "constrain": "domain"}
@@ -111,10 +112,6 @@ def _panel(drawn: Any, panel: Panel, figure: Figure, number: int, known: set[str
         y["autorange"] = "reversed"
     drawn.update_xaxes(**x, range=panel.x_limits, **at)
     drawn.update_yaxes(**y, **at)
-
-
-def _labels(panel: Panel, figure: Figure, number: int) -> list[tuple[str, bool]]:
-    return list(zip((panel.x, panel.y), figure.labelled(number), strict=True))
 
 
 def _common(figure: Figure) -> list[float] | None:

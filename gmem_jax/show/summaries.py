@@ -158,7 +158,7 @@ def of_recall(
     """What is said of a recall; see `summary_of`."""
     row = tables.summary(recall, configuration)
     choice: dict[str, Any] = {"against": against, "signals": signals}
-    drawn = {what: partial(recall_figure, recall, what, configuration, **choice) for what in PICTURES}
+    drawn: dict[str, Draw] = {what: partial(recall_figure, recall, what, configuration, **choice) for what in PICTURES}
     lines = tables.recall_lines(row, configuration, each=each)
     return Summary(
         f"Recall {name}, pack {cell(configuration['pack'])}",

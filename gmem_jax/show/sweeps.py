@@ -122,7 +122,7 @@ def sweep_figure(
         marks.append(Curve(at, line.mean, _label(line), colour, "o" if ticks else "o-", errors=errors))
         if line.most > 1:
             dots = np.array([(x, y) for x, values in zip(at, line.each, strict=True) for y in values])
-            marks.append(Curve(*dots.T, "", colour, "."))
+            marks.append(Curve(dots[:, 0], dots[:, 1], "", colour, "."))
     counts = [len(values) for line in lines for values in line.each]
     samples = f"n = {min(counts)}" + (f" to {max(counts)}" if max(counts) > min(counts) else "")
     several = f"mean ± SE over {', '.join(axes.over) or 'points'}, {samples}" if max(counts) > 1 else ""
@@ -141,7 +141,8 @@ def against(x: str, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> 
     done = [row for row in rows if row["state"] == "done" and isinstance(row[x], int | float)]
     if is_sample(x) or len({row[x] for row in done}) < 2:
         return None
-    axes, marks = axes_of(done, names, x), []
+    axes = axes_of(done, names, x)
+    marks: list[Curve] = []
     for letter, measure in (("F", "fidelity"), ("G", "gain")):
         for line in lines_of(done, axes, measure):
             colour = f"C{len(marks) % 7}"

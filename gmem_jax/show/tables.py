@@ -76,7 +76,8 @@ def errors_table(recall: Recall, configuration: Mapping[str, Any]) -> Table:
         curves = [jnp.asarray(curve) for curve in (recall.p_sig, recall.J)]
         if smooth is not None:
             curves = [analysis.running_mean(curve, smooth) for curve in curves]
-        errors = analysis.errors_over_signals(*map(np.asarray, curves), scale)
+        signal, integral = map(np.asarray, curves)
+        errors = analysis.errors_over_signals(signal, integral, scale)
         pairs = zip(values, errors, strict=True)
         table.add_row(name, *(f"{float(value):.3f} ± {error:.3f}" for value, error in pairs))
     return table

@@ -62,7 +62,7 @@ class Sample:
     u: jax.Array = measured("1", "compression variable at the end of the bin", ())
     pressure: jax.Array = measured(
         "E",
-        "p_x, p_y, p_z: mean of the two opposite walls at their instantaneous area, averaged over the steps of the bin",
+        "p_x, p_y, p_z, mean of two opposite walls, averaged over the steps of the bin",
         _VECTOR,
         plot="pressure",
         label="pressure",
@@ -109,7 +109,7 @@ class Sample:
     )
     inertial_number: jax.Array = measured(
         "1",
-        "I = (strain rate of the x axis) sqrt(m / (D p)), p the mean of p_x and p_y; 0 without pressure",
+        "I = strain rate of x times sqrt(m / (D p)), p = (p_x + p_y) / 2; 0 without pressure",
         plot="inertial",
         label="inertial number I",
         log=True,
