@@ -34,7 +34,7 @@ from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import linear_decoder, nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
-from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save
 from gmem_jax.show.tables import published
 
 TABLE = "words.csv"

@@ -31,7 +31,7 @@ from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
 from gmem_jax.reproduce.figures import SHOWN_WORD
-from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save
 from gmem_jax.show.tables import published
 
 SHOWN_OF = 10  # bits of the word that the paper shows

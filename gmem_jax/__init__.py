@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from gmem_jax.design.drive import TunedDrive, design_drive
     from gmem_jax.design.waveforms import Design, design_waveforms
     from gmem_jax.reading import capacity, classify
+    from gmem_jax.show.recalls import plot
     from gmem_jax.show.view import view
     from gmem_jax.simulation.progress import ProgressBar
     from gmem_jax.sweeps.sweep import sweep
@@ -55,6 +56,7 @@ _LATER = {  # what loads flax or optax, or is seldom asked for, or stands above 
     "classify": "gmem_jax.reading.classify",
     "ProgressBar": "gmem_jax.simulation.progress",
     "sweep": "gmem_jax.sweeps.sweep",
+    "plot": "gmem_jax.show.recalls",
     "view": "gmem_jax.show.view",
 }
 
@@ -109,6 +111,7 @@ __all__ = [
     "load_waveforms",
     "memory_kernel",
     "pack_from",
+    "plot",
     "prepare",
     "recall",
     "replace",

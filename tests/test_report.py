@@ -20,7 +20,8 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.command import app
 from gmem_jax.experiment import analysis
-from gmem_jax.show import plots
+from gmem_jax.show import render_plotly
+from gmem_jax.show.recalls import signals_figure
 from gmem_jax.show.report import Report, table
 from gmem_jax.show.scene import Quantity, at_rest, links, packed, quantities
 from gmem_jax.simulation.frames import Frames
@@ -224,7 +225,7 @@ def test_errors_over_signals_are_those_of_leaving_each_out() -> None:
 
 def test_no_curve_of_the_recalled_signals_is_cut_off() -> None:
     pytest.importorskip("plotly")
-    figure, _ = plots.recalls(made_up(), EXPERIMENT.scale, ["one", "two"])
+    figure = render_plotly.render(signals_figure(made_up(), ["one", "two"], scale=EXPERIMENT.scale, page=True))
     lowest, highest = min(line.y.min() for line in figure.data), max(line.y.max() for line in figure.data)
     for axis in figure.select_yaxes():
         assert axis.range[0] < lowest < highest < axis.range[1]
@@ -265,7 +266,7 @@ def test_what_files_say_is_text_and_no_html(page: Path) -> None:
 
 
 def test_a_view_of_a_notebook_is_a_page_in_a_frame() -> None:
-    shown = PACK.view()._repr_html_()
+    shown = gm.view(PACK)._repr_html_()
     assert shown.startswith("<iframe srcdoc=")
     assert shown.count("<") == 2  # its own tags; all of the page is escaped
 

@@ -15,7 +15,8 @@ from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
 from gmem_jax.physics.state import explain, together
-from gmem_jax.show import figures, tables
+from gmem_jax.show import summaries
+from gmem_jax.show.render_matplotlib import render
 
 if TYPE_CHECKING:
     from gmem_jax.reading import training
@@ -71,7 +72,7 @@ def classify_command(
     # Here, not above: flax takes a second to load, and no other command needs it.
     from gmem_jax.reading import report, training
     from gmem_jax.reading.lessons import Lessons
-    from gmem_jax.reading.readers import confusion, stored_words
+    from gmem_jax.reading.readers import stored_words
 
     try:
         designed = configuration.get("target")
@@ -101,17 +102,14 @@ def classify_command(
     seconds = time.perf_counter() - began
     result = {"recall": str(recall), "pack": configuration["pack"], "status": status, "seconds": seconds, **result}
     save_result(output, READING, result)
+    summary = summaries.of_reading(result)
     told = f"wrote {output}"
     if drawn:
-        net = result["readers"]["net"]
-        title = (
-            f"{tables.cell(configuration['pack'])}, {stored.bits} bits: accuracy {net['accuracy']:.3f} ({seeds} nets)"
-        )
         with drawing(drawn):
-            figures.confusion_figure(drawn, confusion(net["read"], len(stored.signals)), title)
+            render(summary.figures["confusion"]()).save(drawn)
             told += f" and {drawn}"
     say(told)
-    emit(as_json, result, *tables.reading_tables(result))
+    emit(as_json, result, *summary.lines)
 
 
 COMMANDS = {"classify": classify_command}

@@ -1,7 +1,6 @@
 """What a pack gives back: an experiment run, its background subtracted, compared with the integrals (Secs. II, III)."""
 
 import dataclasses
-import importlib
 import json
 import time
 import warnings
@@ -104,28 +103,6 @@ class Recall:
     def described(self, configuration: Mapping[str, Any]) -> "Recall":
         """The same recall with this configuration."""
         return dataclasses.replace(self, record=json.dumps(configuration))
-
-    def plot(
-        self,
-        what: str = "signals",
-        experiment: Experiment | None = None,
-        *,
-        against: str = "time",
-        signals: Sequence[int] = (),
-    ) -> Any:
-        """A picture of it, which a notebook shows: `.save(path)` writes it, `.figure` is matplotlib's.
-
-        Args:
-            what: "signals", "waveforms", "all"; or a quantity of the stages, like "pressure", "Z" or "phi".
-            experiment: that it is of, for the names of signals and the conditions in the title.
-            against: "time" or "u", for the stages.
-            signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
-
-        Raises:
-            ValueError: if there is no such picture, or no such signal; it names those that there are.
-        """
-        from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
-        return from_above.plot(self, what, experiment, against, signals)
 
     def _facts(self) -> html.Facts:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}

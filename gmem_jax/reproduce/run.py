@@ -24,9 +24,9 @@ from gmem_jax.reproduce.compare import Compared, Conditions, Point, compare, com
 from gmem_jax.reproduce.figures import FIGURES, SHOWN_WORD, Figure, Scale, Values, packs, scale_of, shown_packs, spec_of
 from gmem_jax.reproduce.single_contact import convergence_figure, laws_figure
 from gmem_jax.reproduce.two_grains import two_grains_figure
-from gmem_jax.show import tables
-from gmem_jax.show.figures import recall_figure
+from gmem_jax.show.recalls import recall_figure
 from gmem_jax.show.render import packs_figure
+from gmem_jax.show.render_matplotlib import render
 from gmem_jax.show.tables import summary
 from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.progress import Progress, silent
@@ -269,10 +269,9 @@ def _draw(
     if name == "fig04":
         draw.through_time(target, recall, 5, title)
     elif name == "fig06":
-        scale = float(configuration["delta0"]) * float(configuration["gamma0"])
+        drawn = render(recall_figure(recall, "signals", configuration))
         for suffix in (".png", ".svg"):
-            heading, t0 = tables.heading(configuration), configuration["t0"]
-            recall_figure(target.with_suffix(suffix), recall, scale, heading, configuration["signals"], t0)
+            drawn.save(target.with_suffix(suffix))
     else:
         kept = [store.load(point.key) for point in points]
         draw.words(

@@ -2,9 +2,10 @@
 
 import csv
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,10 +22,65 @@ from gmem_jax.files.measures import of_each, relative_scale
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain, together
 from gmem_jax.preparation.recipe import pressure_over_wanted
+from gmem_jax.simulation.protocol import BINS
 
 LARGE_FOR_SPHERES = 3000  # grains: see `note_on_size`
 FEW = 8  # signals that are told of one by one unasked
 SLOW_ENOUGH = 1.8e3  # t0, in t_c: G and F agree with those at ten times slower drives where nothing rings
+
+
+class Fact(NamedTuple):
+    """A number for a person.
+
+    Attributes:
+        name: what it is called.
+        value: a number, or a text.
+        unit: of the value.
+        words: what it means.
+    """
+
+    name: str
+    value: Any
+    unit: str = ""
+    words: str = ""
+
+    @property
+    def text(self) -> str:
+        """The value with its unit."""
+        number = f"{self.value:.3f}" if isinstance(self.value, float) else str(self.value)
+        return f"{number} {self.unit}".rstrip()
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.text}" + (f"  ({self.words})" if self.words else "")
+
+
+def history_table(names: Iterable[str], history: Sequence[Mapping[str, float]]) -> Table:
+    """Values and the mean fidelity after every iteration."""
+    table = Table("iteration", *names, "mean F")
+    for number, one in enumerate(history):
+        table.add_row(str(number), *(f"{one[name]:.4g}" for name in names), f"{one['fidelity']:.4f}")
+    return table
+
+
+def errors_table(recall: Recall) -> Table:
+    """G and F with their standard errors over signals, as they are and averaged over the ringing period."""
+    configuration, window = recall.configuration, float(recall.window)
+    scale = np.asarray(relative_scale(configuration))
+    bins = window * BINS / float(np.max(configuration["t0"]))
+    told = "G: gain; F: fidelity, 1 if what is recalled is the integral of what was stored; errors: standard errors "
+    table = Table("", "G", "F", caption=f"{told}over the signals stored in this pack (jackknife)")
+    for name, values, smooth in (
+        ("as recalled", (recall.gain, recall.fidelity), None),
+        (f"averaged over T1 = {window:.0f} t_c", (recall.windowed_gain, recall.windowed_fidelity), bins),
+    ):
+        curves = [jnp.asarray(curve) for curve in (recall.p_sig, recall.J)]
+        if smooth is not None:
+            curves = [analysis.running_mean(curve, smooth) for curve in curves]
+        signal, integral = map(np.asarray, curves)
+        errors = analysis.errors_over_signals(signal, integral, scale)
+        pairs = zip(values, errors, strict=True)
+        table.add_row(name, *(f"{float(value):.3f} ± {error:.3f}" for value, error in pairs))
+    return table
 
 
 def published(file: str = "six_signals.csv", **conditions: str | float) -> list[dict[str, Any]]:
@@ -291,32 +347,30 @@ def pack_table(pack: Pack) -> Table:
     unit = Material().modulus
     rest = pack.info.get("at_rest", {})
     recipe = pack.info.get("recipe", {})
-    table = Table(title=f"Pack {pack.name}", show_header=False)
-    rows: list[tuple[str, str]] = [
-        ("grains", f"{pack.grains} {pack.clump.shape}"),
-        ("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)) + " R"),
-        ("cycled with delta0", f"{float(pack.delta0):g}"),
-        ("ringing period T1", f"{float(pack.ringing_period):.1f} t_c"),
-        ("candidate contacts", f"{int(np.asarray(pack.pairs.valid).sum())}"),
+    rows = [
+        Fact("grains", f"{pack.grains} {pack.clump.shape}"),
+        Fact("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)), "R"),
+        Fact("cycled with delta0", f"{float(pack.delta0):g}"),
+        Fact("ringing period T1", f"{float(pack.ringing_period):.1f}", "t_c"),
+        Fact("candidate contacts", int(np.asarray(pack.pairs.valid).sum())),
     ]
     if rest:
         pressures = ", ".join(f"{p * unit / 1e3:.2f}" for p in rest["pressure"])
         rows += [
-            ("filling phi", f"{rest['filling']:.4f}"),
-            ("coordination Z (grain pairs)", f"{rest['coordination']:.2f}"),
-            ("sphere contacts, times two, per grain", f"{rest['contacts']:.2f}"),
-            *(
-                [("contacts per grain, with walls", f"{0.5 * rest['contacts'] + rest['wall_contacts']:.2f}")]
-                if "wall_contacts" in rest
-                else []
-            ),
-            ("p_x, p_y, p_z", f"{pressures} kPa"),
-            ("largest speed", f"{rest['largest_speed']:.1e} R/t_c"),
+            Fact("filling phi", f"{rest['filling']:.4f}"),
+            Fact("coordination Z (grain pairs)", f"{rest['coordination']:.2f}"),
+            Fact("sphere contacts, times two, per grain", f"{rest['contacts']:.2f}"),
         ]
+        if "wall_contacts" in rest:
+            with_walls = 0.5 * rest["contacts"] + rest["wall_contacts"]
+            rows.append(Fact("contacts per grain, with walls", f"{with_walls:.2f}"))
+        rows.append(Fact("p_x, p_y, p_z", pressures, "kPa"))
+        rows.append(Fact("largest speed", f"{rest['largest_speed']:.1e}", "R/t_c"))
         if (met := pressure_over_wanted(pack.info)) is not None:
-            rows.append(("p_z over the wanted one", f"{met:.2f}"))
+            rows.append(Fact("p_z over the wanted one", f"{met:.2f}"))
     if recipe:
-        rows.append(("seed", str(recipe["seed"])))
-    for key, value in rows:
-        table.add_row(key, value)
+        rows.append(Fact("seed", recipe["seed"]))
+    table = Table(title=f"Pack {pack.name}", show_header=False)
+    for fact in rows:
+        table.add_row(fact.name, fact.text)
     return table
