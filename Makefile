@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo test test-slow check docs mutations reliability wheel install clean
+.PHONY: demo test test-slow check docs mutations reliability cluster wheel install clean
 
 demo: install
 	$(REBUILD)
@@ -28,6 +28,11 @@ mutations: install-dev
 reliability: install-dev
 	$(REBUILD)
 	$(BIN)/python tests/reliability/run.py
+
+# Sweeps on a SLURM of this one machine: a worker is killed, one requeued, one waits. Needs root, slurm-wlm and munge.
+cluster: install-dev
+	$(REBUILD)
+	tests/cluster/one_node.sh $(abspath $(BIN))/python tests/cluster/sweep_on_slurm.py
 
 check: install-dev
 	$(BIN)/ruff check .

@@ -33,6 +33,7 @@ from gmem_jax.reading import training
 from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import linear_decoder, nearest_template
+from gmem_jax.reproduce.draw import OURS, THEIRS
 from gmem_jax.show.figures import pyplot, save
 from gmem_jax.show.tables import published
 
@@ -138,20 +139,24 @@ def draw(table: Path, path: Path) -> None:
     rows = list(csv.DictReader(table.open()))
     sizes = sorted({gm.load_pack(row["pack"]).grains for row in rows})
     for axis, column, theirs in ((axes[0], "F", "fidelity_sub0"), (axes[1], "net", "classifier_accuracy")):
-        for colour, grains in enumerate(sizes):
+        place = 0
+        for grains, symbol in zip(sizes, "osD", strict=False):
             own = [row for row in rows if gm.load_pack(row["pack"]).grains == grains]
-            for when, style in (("untouched", "o--"), ("designed", "s-")):
+            for when, style, face in (("untouched", "--", "white"), ("designed", "-", OURS)):
                 lengths, means, deviations = over_packs(own, "bits", f"{column} {when}")
-                label = f"{when}, N = {grains:,}"
-                axis.errorbar(
-                    lengths, means, deviations, fmt=style, color=f"C{colour}", mfc="none", capsize=2, label=label
-                )
-        stars = [(row["word_bits"], row[theirs]) for row in published("binary_words.csv")]
-        axis.plot(*zip(*stars, strict=True), "k*", ms=9, label="published, untouched, N = 10,240")
+                at = np.array(lengths) + 0.06 * (place - 1.5)
+                label, fmt = f"{when}, N = {grains:,}", f"{symbol}{style}"
+                axis.errorbar(at, means, deviations, fmt=fmt, color=OURS, mfc=face, capsize=2, label=label)
+                place += 1
+        points = [(row["word_bits"], row[theirs]) for row in published("binary_words.csv")]
+        label = "published, untouched, N = 10,240"
+        axis.plot(*zip(*points, strict=True), "^", color=THEIRS, mfc="white", ms=6, label=label)
         axis.set(xlabel="bits of a word, L", ylim=(0.0, 1.05))
     axes[0].set_ylabel("F (SUB0)")
     axes[1].set_ylabel("words read right by the net")
-    axes[0].legend(fontsize=8, frameon=False)
+    axes[0].set_ylim(top=1.2)  # room for the legend
+    axes[0].legend(fontsize=7, frameon=False, loc="upper left", ncols=2)
+    figure.suptitle("Words as they come and designed; mean and SD over packs", fontsize=10)
     save(path, figure)
 
 

@@ -30,6 +30,7 @@ from gmem_jax.reading import training
 from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import nearest_template
+from gmem_jax.reproduce.draw import OURS, THEIRS
 from gmem_jax.reproduce.figures import SHOWN_WORD
 from gmem_jax.show.figures import pyplot, save
 from gmem_jax.show.tables import published
@@ -124,25 +125,32 @@ def write(path: Path, rows: list[Row]) -> None:
 
 def draw(rows: list[Row], path: Path) -> None:
     """F by three backgrounds, and accuracies, against L, beside the published."""
-    lengths = [int(row["bits"]) for row in rows]
+    lengths = np.array([int(row["bits"]) for row in rows])
     theirs = published("binary_words.csv")
     figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 4.2))
-    for colour, name in enumerate(analysis.BACKGROUNDS):
+    for place, (name, symbol) in enumerate(zip(analysis.BACKGROUNDS, "osD", strict=True)):
         values, errors = ([float(row[f"F {name}{kind}"]) for row in rows] for kind in ("", " error"))
-        left.errorbar(lengths, values, errors, fmt="o", color=f"C{colour}", mfc="none", capsize=2, label=name.upper())
-        stars = [(row["word_bits"], row[f"fidelity_{name.replace('-', '_')}"]) for row in theirs]
-        left.plot(*zip(*stars, strict=True), "*:", color=f"C{colour}", ms=8, label=f"{name.upper()}, published")
-    for reader, style in (("net", "C0o"), ("template", "C1s")):
+        at, label = lengths + 0.2 * (place - 1), f"{name.upper()}, "
+        left.errorbar(at, values, errors, fmt=symbol, color=OURS, capsize=2, label=f"{label}gmem_jax")
+        points = [(row["word_bits"], row[f"fidelity_{name.replace('-', '_')}"]) for row in theirs]
+        left.plot(*zip(*points, strict=True), f"{symbol}:", color=THEIRS, mfc="white", ms=5, label=f"{label}published")
+    for place, (reader, symbol) in enumerate((("net", "o"), ("template", "s"))):
         share = np.array([float(row[reader]) for row in rows])
         error = np.sqrt(share * (1.0 - share) / [int(row["words"]) for row in rows])
-        right.errorbar(lengths, share, error, fmt=style, mfc="none", capsize=2, label=reader)
-    stars = [(row["word_bits"], row["classifier_accuracy"]) for row in theirs]
-    right.plot(*zip(*stars, strict=True), "k*:", ms=8, label="net, published")
+        at, label = lengths + 0.1 * (2 * place - 1), f"{reader}, gmem_jax"
+        right.errorbar(at, share, error, fmt=symbol, color=OURS, capsize=2, label=label)
+    points = [(row["word_bits"], row["classifier_accuracy"]) for row in theirs]
+    right.plot(*zip(*points, strict=True), "o:", color=THEIRS, mfc="white", ms=5, label="net, published")
     for axis, words in ((left, "F"), (right, "words read right")):
         axis.set(xlabel="length of words L (bits)", ylabel=words, ylim=(0.0, 1.05))
-        axis.legend(fontsize=8, frameon=False)
+        axis.legend(fontsize=8, frameon=False, loc="lower left")
     counts = ", ".join(f"{row['words']} of {row['bits']} bits" for row in rows)
-    figure.suptitle(f"Drawn words ({counts}), {rows[0]['pack']}, t$_0$ = {float(rows[0]['t0']):,.0f} t$_c$")
+    size = int(str(rows[0]["pack"]).split("-")[1])
+    figure.suptitle(
+        f"Drawn words ({counts}) of one pack, N = {size:,}, $t_0$ = {float(rows[0]['t0']):,.0f} $t_c$, mean ± SE over "
+        "words; published: all words, N = 10,240",
+        fontsize=10,
+    )
     save(path, figure)
 
 

@@ -8,13 +8,10 @@ and what was run at several rates says so (`--rates "1,800 to 18,000"`).
 """
 
 import argparse
-import csv
-import math
 from pathlib import Path
-from typing import Any, get_type_hints
 
 from gmem_jax.reproduce import draw
-from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, write_csv
+from gmem_jax.reproduce.compare import Compared, Conditions, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES, scale_of
 
 
@@ -29,35 +26,17 @@ def main() -> None:
     arguments = parser.parse_args()
     named, *changes = arguments.output.name.removeprefix(f"{arguments.figure}-").split("-")
     scale = ",".join([named, *changes])
-    figure, t0 = FIGURES[arguments.figure], arguments.rates or f"{scale_of(scale).t0:g}"
+    figure, t0 = FIGURES[arguments.figure], arguments.rates or f"{scale_of(scale).t0:,.0f}"
     name, _, value = arguments.only.partition("=")
     rows: dict[tuple[Conditions, str], Compared] = {}
     for part in arguments.parts:
-        with part.open() as file:
-            for row in (compared(line) for line in csv.DictReader(file) if not name or line[name] == value):
+        for row in read_csv(part):
+            if not name or getattr(row.conditions, name) == type(getattr(row.conditions, name))(value):
                 rows.setdefault((row.conditions, row.measure), row)
     ordered = sorted(rows.values(), key=lambda row: [getattr(row.conditions, name) for name in figure.across])
     target = arguments.output.parent / f"{arguments.output.name}.png"
     write_csv(target.with_name(f"{arguments.output.name}.csv"), ordered)
-    draw.against(target, ordered, figure.across, f"{figure.title} ({scale}: t$_0$ = {t0} t$_c$)")
-
-
-def compared(line: dict[str, str]) -> Compared:
-    """A line of a table that `write_csv` wrote."""
-
-    def number(name: str) -> float:
-        return float(line[name] or math.nan)
-
-    conditions: dict[str, Any] = {name: kind(line[name]) for name, kind in get_type_hints(Conditions).items()}
-    theirs = Estimate(number("published_mean"), number("published_sd"), int(line["published_packs"]))
-    return Compared(
-        Conditions(**conditions),
-        line["measure"],
-        Estimate(number("mean"), number("sd"), int(line["packs"])),
-        theirs if theirs.packs else None,
-        int(line["published_grains"]),
-        int(line["status"]),
-    )
+    draw.against(target, ordered, figure.across, f"{figure.title}\n{draw.said_of(ordered, t0)}")
 
 
 if __name__ == "__main__":

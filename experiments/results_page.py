@@ -1,14 +1,28 @@
 """The tables of docs/results/figures.md, as `gmem reproduce` wrote them, and of docs/remember_more.md, of words.
 
-python experiments/results_page.py
+python experiments/results_page.py [--redraw]
+
+What is published beside each point is looked up anew. With --redraw pictures are drawn anew too, those that show no
+more than their table holds and those that need no run; those of recalls (figs. 3, 4, 6 and 13) stay as they are.
 """
 
+import argparse
 import csv
 import json
+import math
 from pathlib import Path
 
+import design_words
+import drawn_words
+import jax
 from packs import over_packs
 
+from gmem_jax.reproduce import choices as weighed
+from gmem_jax.reproduce import draw
+from gmem_jax.reproduce.choices import CHOICES, Effect
+from gmem_jax.reproduce.compare import Estimate, read_csv, write_csv
+from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
+from gmem_jax.reproduce.run import PICTURES
 from gmem_jax.show.tables import published
 
 HERE = Path(__file__).parent.parent / "docs" / "results"
@@ -16,6 +30,8 @@ JOINED = {  # figures that no one command makes
     "fig12b-paper": "Fig. 6 of this scale, figs. 8 and 12b of smaller ones, "
     "`--scale workstation,sizes=31680,few=1` and `experiments/large_pack.py`, put together by `experiments/joined.py`",
 }
+TITLES = {"fig03": "packs at rest, by size and by shape", "choices": "what the paper leaves open, each tried otherwise"}
+RATES = {"fig12b-paper": "1,800 to 18,000"}  # of figures whose points are of several
 BEGIN, END = "<!-- made by experiments/results_page.py -->", "<!-- end -->"
 
 
@@ -100,7 +116,12 @@ def heading(name: str, scale: str) -> list[str]:
     named, *changes = scale.split("-")
     command = f"`gmem reproduce {name}" + (f" --scale {','.join([named, *changes])}`" if named else "`")
     command = JOINED.get(f"{name}-{scale}", command)
-    return [f"## {', '.join(filter(None, [what, named, *changes]))}", "", command, ""]
+    at = ""
+    if named:
+        size = scale_of(",".join([named, *changes]), weighed.SIZES if name == "choices" else SCALES)
+        grains = f"{size.sizes[0]:,} to {size.sizes[-1]:,}" if name == "fig12b" else f"{size.grains:,}"
+        at = f": {grains} grains, t0 of {RATES.get(f'{name}-{scale}', f'{size.t0:,.0f}')}"
+    return [f"## {what}{at}", "", command, ""]
 
 
 def verdicts(path: Path) -> list[str]:
@@ -112,16 +133,69 @@ def verdicts(path: Path) -> list[str]:
 
 
 def figure(picture: Path) -> list[str]:
-    """A picture and its numbers, if it has any."""
+    """A picture, what it shows, and its numbers, if it has any."""
     numbers = picture.with_suffix(".csv")
-    lines = [f"![{picture.stem}]({picture.relative_to(HERE)})", ""]
+    name = picture.stem.partition("-")[0]
+    shows = (FIGURES | PICTURES)[name].title if name in FIGURES | PICTURES else TITLES[name]
+    lines = [f"![{shows}]({picture.relative_to(HERE)})", "", f"{shows[0].upper()}{shows[1:]}.", ""]
     if not numbers.is_file():
         return lines
     return [*lines, *(choices if picture.stem.startswith("choices") else table)(numbers), ""]
 
 
+def effects(path: Path) -> list[Effect]:
+    """The rows that `choices.write_csv` wrote."""
+    found, known = [], {choice.name: choice for choice in CHOICES}
+    with path.open() as file:
+        for row in csv.DictReader(file):
+            choice = known[row["choice"]]
+            value = next(one for one in choice.values if str(one) == row["value"])
+            numbers = [
+                Estimate(float(row[name]), float(row[f"{name}_sd"] or math.nan), int(row["packs"]))
+                for name in ("G", "F", "dG_over_G", "dF")
+            ]
+            found.append(Effect(choice, value, *numbers, int(row["status"])))
+    return found
+
+
+def anew(path: Path) -> None:
+    """Write a figure's table with what is published now, and draw it."""
+    name, _, scale = path.stem.partition("-")
+    size = scale_of(scale.replace("-", ","), weighed.SIZES if name == "choices" else SCALES)
+    picture = path.with_suffix(".png")
+    if name == "choices":
+        found = effects(path)
+        weighed.draw(picture, found, weighed.title(size, found[0].gain.packs))
+    elif across := FIGURES[name].across:
+        rows = read_csv(path)
+        rate = RATES.get(path.stem, f"{size.t0:,.0f}")
+        draw.against(picture, rows, across, f"{FIGURES[name].title}\n{draw.said_of(rows, rate)}")
+    picture.with_suffix(".svg").unlink(missing_ok=True)
+
+
+def redraw() -> None:
+    """Every picture that needs no run."""
+    jax.config.update("jax_enable_x64", True)
+    for name, picture in PICTURES.items():
+        picture.draw(target := HERE / "laptop" / f"{name}.png")
+        for suffix in (".svg", ".csv"):
+            target.with_suffix(suffix).unlink(missing_ok=True)
+    for path in sorted(HERE.glob("*/*-*.csv")):
+        if path.parent.name != "designs":
+            anew(path)
+    drawn_words.draw(drawn_words.read_rows(HERE / "drawn_words.csv"), HERE / "drawn_words.png")
+    design_words.draw(HERE / "designed_words.csv", HERE / "designed_words.png")
+
+
 def main() -> None:
     """Put all of them between the marks of their pages: figure by figure, the largest scale first."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--redraw", action="store_true", help="draw pictures anew")
+    arguments = parser.parse_args()
+    for path in HERE.glob("*/fig*.csv"):
+        write_csv(path, read_csv(path))
+    if arguments.redraw:
+        redraw()
     shown = []
     for place, folder in enumerate(("paper", "workstation", "laptop")):
         for path in (HERE / folder).iterdir():

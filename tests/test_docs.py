@@ -1,9 +1,11 @@
 """The pages: links, commands, names and examples are right. Whether the site builds is for `make docs` to say."""
 
 import ast
+import importlib.util
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -43,6 +45,46 @@ def test_links_between_files_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\(([^)#\s]+)", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL))
     gone = [link for link in links if ":" not in link and not (page.parent / link).exists()]
     assert not gone
+
+
+def hooks() -> Any:
+    """What the site does beyond mkdocs."""
+    for needed in ("mkdocs", "latex2mathml"):
+        pytest.importorskip(needed)
+    spec = importlib.util.spec_from_file_location("hooks", DOCS / "hooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_formulas_of_the_notebook_are_drawn_and_its_code_is_left_alone() -> None:
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="first_recall.ipynb"))
+    text = '<p>beside $G E \\delta_0$</p><pre>set(ylabel="$p_x$ (Pa)", title="$I$")</pre><p>$t_c$</p>'
+    drawn = hooks().on_page_content(text, page=page)
+    assert drawn.count("<math") == 2
+    assert '<pre>set(ylabel="$p_x$ (Pa)", title="$I$")</pre>' in drawn
+    assert "\\delta" not in drawn
+
+
+def test_the_search_finds_its_index_in_pages_that_are_files(tmp_path: Path) -> None:
+    (tmp_path / "search").mkdir()
+    (tmp_path / "search" / "search_index.json").write_text('{"docs": []}')
+    hooks().on_post_build(SimpleNamespace(site_dir=tmp_path))
+    assert (tmp_path / "search" / "search_index.js").read_text() == 'var __index = {"docs": []}'
+    assert re.search(r"polyfills: \[(.*)\]", (ROOT / "mkdocs.yml").read_text())[1] == "javascripts/search_from_files.js"  # type: ignore[index]
+
+
+def test_no_page_stands_twice_in_the_site() -> None:
+    nav = (ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2]
+    pages = re.findall(r": (\S+\.(?:md|ipynb))$", nav, re.MULTILINE)
+    assert len(pages) == len(set(pages)) > 30
+
+
+def test_no_formula_has_a_root_over_a_fraction() -> None:
+    """Browsers without a font for formulas do not stretch it."""
+    assert not [page for page in PAGES if r"\sqrt{\frac" in page.read_text()]
 
 
 @pytest.mark.parametrize("source", ["gmem_jax", "tests", "experiments", "benchmarks", "Makefile"])

@@ -61,6 +61,29 @@ def test_too_few_frames_and_more_than_bins_are_refused(count: int) -> None:
         preparation_schedule(gm.Recipe(), count)
 
 
+def test_frames_are_kept_wherever_the_run_passes_a_chosen_compression() -> None:
+    frames = frames_of(gm.run(EXPERIMENT, frames_of=2, frames_at=(0.25, 1.0)))
+    moments = list(zip(frames.stages, frames.u.round(12).tolist(), strict=True))
+    way = {"compress": [0.25, 1.0], "hold": [1.0], "decompress": [0.25]}
+    back = {"encode": [0.25, 1.0], "store": [1.0], "readout": [0.25]}
+    assert moments == [(stage, u) for stage, all_of_it in (way | back).items() for u in all_of_it]
+    assert frames.signal == 2
+
+
+def test_chosen_compressions_come_beside_a_number_of_frames() -> None:
+    both = frame_schedule(EXPERIMENT, 5, 1, (0.0, 0.5)).wanted
+    alone = frame_schedule(EXPERIMENT, 5, 1).wanted
+    assert all(set(bins) <= set(both[name]) for name, bins in alone.items())
+    assert both["encode"] == [128, 256]
+    assert both["readout"] == [128, 256]
+
+
+@pytest.mark.parametrize("u", [-0.1, 1.5, float("nan")])
+def test_compressions_that_there_are_not_are_refused(u: float) -> None:
+    with pytest.raises(ValueError, match="u goes from 0, not compressed, to 1"):
+        frame_schedule(EXPERIMENT, 0, 1, (u,))
+
+
 def test_frames_of_a_signal_that_there_is_not_are_refused() -> None:
     with pytest.raises(ValueError, match="signals 1 to 2"):
         frame_schedule(EXPERIMENT, 5, 3)

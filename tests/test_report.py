@@ -352,12 +352,17 @@ def test_a_browser_draws_it_all_and_fetches_nothing(browser: Any) -> None:
     assert 0.05 < drawn < 0.9  # of the picture: grains before a light background
 
 
+def test_frames_are_opened_at_the_last(browser: Any) -> None:
+    said = browser.execute_script("return document.querySelector('.view .when').textContent")
+    assert said == "encode, u = 1.000, t = 300 t_c"
+
+
 def test_the_controls_change_the_picture(browser: Any) -> None:
     pictures = {browser.execute_script(PICTURE)[1]}
-    controls = (("frame", 3), ("colour", "coordination"), ("show", "both"), ("show", "forces"), ("cut", 0.5))
+    controls = (("frame", 2), ("colour", "coordination"), ("show", "both"), ("show", "forces"), ("cut", 0.5))
     for number, (control, value) in enumerate(controls, 2):
         said = browser.execute_script(SET, control, value)
-        assert said == "encode, u = 1.000, t = 300 t_c"
+        assert said != "encode, u = 1.000, t = 300 t_c"  # the last
         pictures.add(browser.execute_script(PICTURE)[1])
         assert len(pictures) == number, control
     assert browser.get_log("browser") == []

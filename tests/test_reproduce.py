@@ -14,9 +14,10 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.reproduce import claims, draw, figures
 from gmem_jax.reproduce import run as reproducing
-from gmem_jax.reproduce.compare import Conditions, Estimate, Point, compare, compared
+from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, Point, compare, compared, read_csv, write_csv
 from gmem_jax.reproduce.draw import power
 from gmem_jax.reproduce.figures import FIGURES, SCALES, Figure, packs, scale_of, spec_of
+from gmem_jax.show.tables import published
 from gmem_jax.simulation.progress import silent
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.store import Store
@@ -180,12 +181,108 @@ def test_each_condition_that_is_varied_has_its_line_of_panels(monkeypatch: pytes
     monkeypatch.setattr(draw, "save", lambda path, figure, also: drawn.append(figure))
     draw.against(tmp_path / "fig11.png", rows, ("gamma0", "overlap"), "title")
     panels = [
-        {tuple(line.get_xdata()) for line in axis.get_lines() if line.get_linestyle() == "-"} for axis in drawn[0].axes
+        {
+            tuple(line.get_xdata())
+            for line in axis.get_lines()
+            if line.get_linestyle() != "None" and len(line.get_xdata())
+        }
+        for axis in drawn[0].axes
     ]
     assert panels == [{(3e-4, 1e-3)}, {(3e-4, 1e-3)}, {(0.6, 0.8, 1.0)}, {(0.6, 0.8, 1.0)}]
-    assert [len(axis.get_legend().get_texts()) for axis in drawn[0].axes] == [3, 3, 2, 2]  # and the published points
+    said = [[text.get_text() for text in axis.get_legend().get_texts()] for axis in drawn[0].axes]
+    whose = ["gmem_jax, N = 10,240", "published, N = 10,240"]
+    assert said == [[*whose, "$\\delta_0$ = 0.02", "$\\delta_0$ = 0.05"]] * 2 + [whose] * 2
     draw.against(tmp_path / "fig08.png", rows[:2], ("mu",), "one point")
     assert len(drawn[1].axes) == 2
+
+
+def _axes(monkeypatch: pytest.MonkeyPatch, rows: list[Compared], across: str) -> list[Any]:
+    drawn: list[Any] = []
+    monkeypatch.setattr(draw, "save", lambda path, figure, also: drawn.append(figure))
+    draw.against(Path("x.png"), rows, (across,), "title")
+    return list(drawn[0].axes)
+
+
+def test_ours_and_published_have_two_colours_and_no_point_is_cut_or_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    at = [replace(STANDARD, mu=mu) for mu in (0.2, 0.6, 1.0)]
+    rows = [compared(each, "G", [0.3, 0.4], 0) for each in at]
+    (axis,) = _axes(monkeypatch, rows, "mu")
+    points = [line for line in axis.get_lines() if len(line.get_xdata()) == 3 and line.get_marker() == "o"]
+    assert {line.get_color() for line in points} == {draw.OURS, draw.THEIRS}
+    axis.figure.canvas.draw()
+    ours, theirs = (line.get_transform().transform(line.get_xydata()) for line in points)
+    assert np.all(np.abs(ours - theirs)[:, 0] > 0.8 * draw.APART / 72.0 * axis.figure.dpi)
+    low, high = axis.transData.transform([[axis.get_xlim()[k], axis.get_ylim()[k]] for k in (0, 1)])
+    legend = axis.get_legend().get_window_extent()
+    for found in (ours, theirs):
+        assert np.all((found > low + 3.0) & (found < high - 3.0))
+        assert np.all(found[:, 1] < legend.y0)
+
+
+def test_published_points_of_the_same_n_are_full_and_others_say_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [compared(replace(STANDARD, grains=3267, mu=mu), "F", [0.3, 0.4], 0) for mu in (0.6, 1.0)]
+    (axis,) = _axes(monkeypatch, rows, "mu")
+    faces = {
+        text.get_text(): handle.get_markerfacecolor()
+        for handle, text in zip(axis.get_legend().legend_handles, axis.get_legend().get_texts(), strict=True)
+    }
+    assert faces["published, N = 3,267"] == draw.THEIRS
+    assert faces["published, N = 10,240"] == "white"
+    assert "gmem_jax, N = 3,267" in faces
+
+
+def test_a_gain_without_friction_is_said_and_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [compared(replace(STANDARD, mu=mu), "G", [gain], 0) for mu, gain in ((0.0, -7.0), (0.2, 0.4), (1.0, 0.35))]
+    (axis,) = _axes(monkeypatch, rows, "mu")
+    assert axis.get_ylim()[0] == 0.0
+    assert axis.get_ylim()[1] < 0.6
+    assert "gmem_jax -7.00, published 0.43 ± 0.24" in axis.texts[0].get_text()
+
+
+def test_titles_are_said_in_words() -> None:
+    rows = [compared(replace(STANDARD, grains=325), "G", [0.3, 0.4], 0)]
+    assert draw.said_of(rows, "1,800") == "gmem_jax: N = 325, $t_0$ = 1,800 $t_c$, mean ± SE over 2 packs"
+
+
+def test_a_table_is_read_beside_what_is_published_now(tmp_path: Path) -> None:
+    rows = [compared(replace(STANDARD, grains=31_680), "G", [0.393], 1024), compared(STANDARD, "F", [0.9, 0.91], 0)]
+    write_csv(tmp_path / "x.csv", [rows[0]._replace(theirs=None, grains=0), rows[1]])
+    one, other = read_csv(tmp_path / "x.csv")
+    assert one.theirs == Estimate(0.3671, 0.0033, 7)
+    assert (one.grains, one.status, one.ours.packs) == (31_680, 1024, 1)
+    assert other.ours.sd == pytest.approx(rows[1].ours.sd, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changed", "measure", "mean", "grains"),
+    [
+        ({"grains": 1024}, "G", 0.2830, 1024),
+        ({"grains": 100_450}, "F", 0.9090, 100_450),
+        ({"overlap": 0.9}, "G", 0.924, 10_240),
+        ({"gamma0": 0.1}, "G", 3.0059, 10_240),
+        ({"bits": 9, "background": "sub0"}, "F", 0.46, 10_240),
+    ],
+)
+def test_all_published_points_are_known(changed: dict[str, Any], measure: str, mean: float, grains: int) -> None:
+    found = compared(replace(STANDARD, **changed), measure, [0.3], 0)
+    assert found.theirs is not None
+    assert found.theirs.mean == pytest.approx(mean, abs=6e-4)
+    assert found.grains == grains
+    assert len(published("six_signals.csv")) == 55
+
+
+def test_recalled_words_have_one_scale(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(draw, "save", lambda path, figure, also, caption: drawn.append((figure, caption)))
+    pack, both = gm.load_pack(PACK), []
+    for bits in (1, 2):
+        experiment = gm.Experiment(pack, gm.words(bits), t0=75.0, store=0.1, rest=0.1, hold=0.1, background="sub2-bl")
+        both.append((gm.run(experiment), gm.resolved(experiment, 1.0)))
+    draw.words(tmp_path / "fig13.png", both, [[0, 1], [0, 1, 2]], "title")
+    figure, caption = drawn[0]
+    assert len({axis.get_ylim() for axis in figure.axes}) == 1
+    assert [len(axis.lines) for axis in figure.axes if axis.get_visible()] == [4] * 5  # zero, recalled, mean, integral
+    assert "mean over the ringing period" in caption
 
 
 @pytest.mark.parametrize("name", ["fig04", "fig13", "fig14"])

@@ -1,6 +1,9 @@
 """What a sweep file may say, how its points become runs, and what is refused in one line."""
 
+import csv
+import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +12,8 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
+from gmem_jax.experiment.experiment import value_at
+from gmem_jax.experiment.recall import OtherCompressionWarning, warn_of_another_compression
 from gmem_jax.files.atomic import atomic
 from gmem_jax.simulation.progress import silent
 from gmem_jax.sweeps.executors import Executor, Submitted, executor
@@ -16,7 +21,8 @@ from gmem_jax.sweeps.plan import plan, point
 from gmem_jax.sweeps.spec import read_spec, spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import Conductor, _labels
-from gmem_jax.sweeps.table import rows
+from gmem_jax.sweeps.table import doubts, export, means, rows
+from gmem_jax.sweeps.work import run_group
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 MEMORY = 1 << 33
@@ -24,6 +30,12 @@ MEMORY = 1 << 33
 
 def conductor(folder: Path, **tables: object) -> Conductor:
     return Conductor(spec_of(tables), folder / "store", lambda _: None)
+
+
+def run_job(name: str, points: list[str]) -> dict[str, Any]:
+    """A job as it lies in a store, of experiments that are never made."""
+    sizes = {"work": 1.0, "replicas": 1, "batch": 1}
+    return {"kind": "run", "name": name, "points": points, "configurations": [{}] * len(points), **sizes}
 
 
 def test_combinations_are_products_of_axes_and_single_points() -> None:
@@ -153,6 +165,96 @@ def test_what_is_no_number_is_refused_in_a_written_experiment(part: str, name: s
         gm.experiment_from(form, pack)
 
 
+def recipes(folder: Path, **tables: object) -> list[tuple[float, float]]:
+    """delta0 and rigidity of the walls of the packs that a sweep makes."""
+    made = conductor(folder, **tables)
+    made.check()
+    return [(job["recipe"]["delta0"], job["material"]["wall_rigidity"]) for job in made.pack_jobs()]
+
+
+def test_what_belongs_to_the_preparation_follows_into_it(tmp_path: Path) -> None:
+    prepare, both = {"grains": 16}, {"delta0": [0.03, 0.05], "mu": [0.5, 1.0]}
+    assert recipes(tmp_path, prepare=prepare, vary=both) == [(0.03, 1.0), (0.05, 1.0)]
+    assert recipes(tmp_path, prepare=prepare, experiment={"delta0": 0.04}, vary={"mu": [1.0]}) == [(0.04, 1.0)]
+    assert recipes(tmp_path, prepare=prepare, vary={"wall_rigidity": [0.5, 2.0]}) == [(0.05, 0.5), (0.05, 2.0)]
+    # Asked for by itself, a number of the preparation is what it is; and t0 and dt say how a pack is driven.
+    assert recipes(tmp_path, prepare={**prepare, "delta0": 0.05}, vary=both) == [(0.05, 1.0)]
+    assert recipes(tmp_path, prepare=prepare, vary={"t0": [900.0, 1800.0], "dt": [0.2, 0.3]}) == [(0.05, 1.0)]
+    assert recipes(tmp_path, prepare=prepare, vary=both, run={"packs_as_they_are": True}) == [(0.05, 1.0)]
+
+
+@pytest.mark.parametrize(("name", "was"), [("delta0", "0.05"), ("wall_rigidity", "1")])
+def test_a_pack_that_was_prepared_for_another_experiment_is_refused_unless_wanted(
+    tmp_path: Path, name: str, was: str
+) -> None:
+    tables = {"experiment": {"pack": "tetra-325-a"}, "vary": {name: [float(was), 0.08]}}
+    with pytest.raises(ValueError, match=rf"{name} = 0.08, and tetra-325-a was prepared with {was}: .*\[prepare\]"):
+        conductor(tmp_path, **tables).check()
+    wanted = conductor(tmp_path, **tables, run={"packs_as_they_are": True})
+    wanted.check()
+    assert [value_at(one.experiment, PATHS[name]) for one in wanted.points()] == [float(was), 0.08]
+    with pytest.raises(gm.FileFormatError, match=r"packs_as_they_are in \[run\] must be true or false, got 1"):
+        conductor(tmp_path, **tables, run={"packs_as_they_are": 1})
+
+
+PATHS = {"delta0": "delta0", "wall_rigidity": "material.wall_rigidity"}
+
+
+def test_what_is_warned_of_in_a_run_stands_in_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalled: tuple[gm.Experiment, gm.Recall]
+) -> None:
+    experiment, recall = recalled
+    other = gm.replace(experiment, delta0=0.04)
+
+    def doubtful(*_: object, **__: object) -> gm.Recall:
+        warn_of_another_compression(other)  # a bit of the status says so
+        warnings.warn("something is odd", stacklevel=1)
+        return replace(recall, status=recall.status | int(gm.Status.OTHER_COMPRESSION))
+
+    monkeypatch.setattr("gmem_jax.sweeps.work.run", doubtful)
+    store, here = Store(tmp_path), point({"delta0": 0.04}, other)
+    store.remember([here], {}, ["delta0"])
+    with pytest.warns(OtherCompressionWarning), pytest.warns(UserWarning, match="something is odd"):
+        run_group([here.key], [other], store=store)
+    (row,) = rows(store)
+    assert row["status"] & int(gm.Status.OTHER_COMPRESSION)
+    assert "cycled with another delta0" in row["why"]
+    assert row["warnings"] == "something is odd"
+    assert doubts(row) == f"{row['why']}; something is odd"
+    (mean,) = means([row, row], ["delta0"], ["delta0"])
+    assert (mean["status"], mean["warnings"]) == (row["status"], row["warnings"])
+
+
+def test_signals_of_points_that_have_fewer_are_filled_up_and_counted(
+    tmp_path: Path, recalled: tuple[gm.Experiment, gm.Recall]
+) -> None:
+    xarray = pytest.importorskip("xarray")
+    experiment, two = recalled
+    one = replace(two, **{name: getattr(two, name)[1:] for name in ("p_sig", "J", "shear")})
+    configuration = gm.resolved(experiment, 1.0)
+    kept = {"a": (two, configuration), "b": (one, {**configuration, "signals": ["alone"]})}
+
+    class Kept(Store):
+        def load(self, key: str) -> Any:
+            return kept[key]
+
+    store = Kept(tmp_path / "store")
+    store.remember([], {}, ["signals"], [("a", {"signals": "two"}), ("b", {"signals": "one"}), ("c", {})])
+    for key in kept:
+        store.at(key).write_text("")
+    about = export(store, tmp_path / "table.nc")
+    assert about == "points have 1 to 2 signals, see `signal_count`; what lies beyond them is NaN"
+    with xarray.open_dataset(tmp_path / "table.nc", engine="h5netcdf") as data:
+        assert data.signal_count.values.tolist() == [2, 1, 0]
+        assert data.signals.values.tolist() == ["two", "one", ""]
+        assert data.signal_name.values.tolist() == [["0", "1"], ["alone", ""], ["", ""]]
+        np.testing.assert_array_equal(data.p_sig[0], two.p_sig)
+        np.testing.assert_array_equal(data.p_sig[1, 0], two.p_sig[1])
+        assert np.isnan(data.p_sig[1, 1]).all()
+        assert np.isnan(data.p_sig[2]).all()
+        np.testing.assert_allclose(data.signal_fidelity[1, 0], data.signal_fidelity[0, 1])
+
+
 def test_points_that_differ_in_replica_parameters_become_one_run(tmp_path: Path) -> None:
     made = conductor(
         tmp_path,
@@ -200,7 +302,7 @@ def test_a_key_stands_for_all_that_numbers_depend_on(tmp_path: Path) -> None:
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("all of it")
-    with pytest.raises(gm.FileFormatError, match=r"holds thesis\.tex and no sweep"):
+    with pytest.raises(gm.FileFormatError, match=r"holds thesis\.tex and no sweep\.json"):
         Store(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -227,6 +329,46 @@ def test_the_last_words_of_a_scheduler_s_workers_are_found(tmp_path: Path) -> No
     job = SimpleNamespace(stdout=lambda: None, stderr=lambda: "slurmstepd: error: out of memory\n")
     chosen._jobs = {"worker-0": job}
     assert chosen.said(Store(tmp_path)).strip() == "slurmstepd: error: out of memory"
+
+
+@pytest.mark.parametrize(("told", "threads"), [("1", "1"), ("64", "all"), (None, "all")])
+def test_a_worker_has_no_more_threads_than_it_is_told_or_has_cpus(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, threads: str
+) -> None:
+    started: list[dict[str, str]] = []
+    monkeypatch.setattr("gmem_jax.sweeps.executors.subprocess.Popen", lambda *_, env, **__: started.append(env))
+    monkeypatch.setattr("gmem_jax.sweeps.executors.cores", lambda: [0, 1, 2, 3])
+    if told is None:
+        monkeypatch.delenv("GMEM_THREADS", raising=False)
+    else:
+        monkeypatch.setenv("GMEM_THREADS", told)
+    executor("processes", 2, {}).start(Store(tmp_path), "worker-1")
+    assert started[0]["GMEM_THREADS"] == threads.replace("all", "2")
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"cpus_per_task": 2}, ["--cpus-per-task=2"]),
+        ({}, ["--cpus-per-task=1"]),
+        ({"slurm_cpus_per_task": 3, "slurm_srun_args": ["--exact"]}, ["--exact", "--cpus-per-task=3"]),
+        ({"cpus_per_task": 2, "slurm_srun_args": "--cpus-per-task=4"}, ["--cpus-per-task=4"]),
+    ],
+)
+def test_a_worker_of_slurm_gets_the_cpus_that_its_job_asks_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], told: list[str]
+) -> None:
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for name, answer in {"sbatch": "Submitted batch job 7", "scontrol": "UP", "srun": ""}.items():
+        (programs / name).write_text(f"#!/bin/sh\necho {answer}\n")
+        (programs / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:/usr/bin:/bin")
+    store = Store(tmp_path / "sweep")
+    executor("slurm", 1, options).start(store, "worker-0")
+    script = next((store.folder / "workers" / "submitit").glob("*.sh"))
+    (line,) = (line for line in script.read_text().splitlines() if line.startswith("srun "))
+    assert [word for word in line.split() if word in told or "cpus" in word] == told
 
 
 class Mortal(Executor):
@@ -299,8 +441,8 @@ def test_runs_that_were_begun_go_on_as_they_were(tmp_path: Path) -> None:
 
 
 def test_what_was_begun_outlives_another_figure_s_jobs(tmp_path: Path) -> None:
-    first = {"kind": "run", "name": "abc", "points": ["one", "two"], "work": 1.0}
-    other = {"kind": "pack", "name": "def", "work": 1.0}
+    first = run_job("abc", ["one", "two"])
+    other = {"kind": "pack", "name": "def", "work": 1.0, "replicas": 1, "recipe": {}, "grain": {}}
     store = Store(tmp_path)
     store.order([first])
     store.parts(first).mkdir()
@@ -339,7 +481,7 @@ def test_values_of_any_kind_have_a_label() -> None:
 
 
 def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
-    store, job = Store(tmp_path), {"kind": "run", "name": "abc", "points": ["key"], "work": 1.0}
+    store, job = Store(tmp_path), run_job("abc", ["key"])
     store.order([job])
     for name in ("abc-0", "old"):
         (tmp_path / "parts" / name).mkdir()
@@ -349,3 +491,20 @@ def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
         assert [path.name for path in (tmp_path / "parts").iterdir()] == ["abc-0"]
     store.order([])
     assert not list((tmp_path / "parts").iterdir())
+
+
+def test_no_cell_of_a_table_is_a_formula(tmp_path: Path) -> None:
+    store = Store(tmp_path / "mu")
+    values = ["=HYPERLINK(1)", "+1+1", "-2", "@x", "tetra-325-a", -2.0]
+    store.remember([], {}, ["pack"], [(f"key{number}", {"pack": value}) for number, value in enumerate(values)])
+    export(store, tmp_path / "o.csv")
+    with (tmp_path / "o.csv").open() as file:
+        told = [row["pack"] for row in csv.DictReader(file)]
+    assert told == ["'=HYPERLINK(1)", "'+1+1", "'-2", "'@x", "tetra-325-a", "-2.0"]
+
+
+def test_a_sweep_that_has_no_points_yet_is_shown_and_not_exported(tmp_path: Path) -> None:
+    store = Store(tmp_path / "mu")
+    assert rows(store) == []
+    with pytest.raises(ValueError, match="has no points yet"):
+        export(store, tmp_path / "o.csv")

@@ -91,6 +91,7 @@ LOUD = gm.Bumps(jnp.asarray([[1.0, 0.0], [1.01 * limits.LARGEST_WAVEFORM, 0.0]])
         ({"noise": around(limits.LARGEST_NOISE)[1:]}, Status.ROUNDED),
         ({"noise": [0.0, np.inf]}, Status.ROUNDED),
         ({"unloaded": [1.0, 1e-9, 0.0]}, Status.UNLOADED),
+        ({"delta0": jnp.asarray([0.05, 0.05, 0.051])}, Status.OTHER_COMPRESSION),
     ],
 )
 def test_each_doubt_is_that_of_its_replica_alone(given: dict[str, object], bit: Status) -> None:

@@ -1,5 +1,6 @@
 """The `gmem` command. Exit code 0: done; 2: bad input, said in one line; 1: the run failed; 130: interrupted."""
 
+import os
 import sys
 import warnings
 from typing import Annotated, Any
@@ -10,13 +11,14 @@ from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from gmem_jax.command import benchmark, classify, derive, exchange, packs, recalls, report, reproduce, show, sweep
-from gmem_jax.command.console import GIVEN, RunInterruptedError, emit, say
+from gmem_jax.command.console import GIVEN, RunInterruptedError, UnheardError, emit, say
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.programs import keep_programs
 from gmem_jax.files.provenance import versions
 from gmem_jax.physics.rules import StartError, usual_rules, why_not_started
 from gmem_jax.simulation.progress import no_further_bar
 
+INTERRUPTED = 130
 _ELSEWHERE = {  # what is not a command and near none, and how it is done
     "view": "gm.view shows a pack or a recall in a notebook, gmem report FILE as a page for a browser",
     "run": "gmem recall runs an experiment, gmem sweep many",
@@ -93,8 +95,20 @@ def _of_jax(error: Exception) -> str:
     return why_not_started()
 
 
+def _open_streams() -> None:
+    """Give closed standard streams a place to write to, which no file that is opened later may become."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+    sys.stdout = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
+
+
 def main() -> None:
     """The `gmem` command, once all is imported; see `gmem_start`."""
+    _open_streams()
     jax.config.update("jax_enable_x64", True)
     keep_programs()
     warnings.showwarning = _one_line
@@ -103,6 +117,8 @@ def main() -> None:
     try:
         with no_further_bar(), usual_rules():
             code = app(args=sys.argv[1:] or ["--help"], prog_name="gmem", standalone_mode=False)
+        if code == INTERRUPTED:  # typer's word for Ctrl-C outside of a run
+            raise KeyboardInterrupt
         sys.exit(code if isinstance(code, int) else 0)
     except TyperException as error:
         problem = error.format_message()
@@ -111,12 +127,14 @@ def main() -> None:
     except RunFailedError as error:
         say(f"gmem: the run failed: {error}", style="red")
         sys.exit(1)
-    except RunInterruptedError:
-        say("gmem: interrupted; the same command goes on from the finished parts")
-        sys.exit(130)
+    except RunInterruptedError as error:
+        say(f"gmem: interrupted; {error}")
+        sys.exit(INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
         say("gmem: interrupted; nothing was written, and the same command begins anew")
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
+    except UnheardError as error:
+        problem = f"stdout takes no result ({error}); files that were to be written are complete"
     except MemoryError:
         problem = _OUT_OF_MEMORY
     except Exception as error:

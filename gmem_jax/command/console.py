@@ -1,8 +1,10 @@
 """What every command says and how: logs and progress on stderr, results on stdout, outputs that destroy nothing."""
 
 import contextlib
+import errno
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -19,8 +21,10 @@ from rich.console import Console
 from rich.table import Table
 
 from gmem_jax.files.atomic import probe
-from gmem_jax.files.checked import NAME, title
+from gmem_jax.files.checked import NAME, printable, title
+from gmem_jax.files.ours import promise
 from gmem_jax.files.results import finite
+from gmem_jax.files.sizes import in_bytes, in_time
 from gmem_jax.simulation.progress import Progress
 
 log = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
@@ -47,6 +51,11 @@ PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a pac
 GIVEN: ContextVar[Mapping[str, str]] = ContextVar("GIVEN", default=MappingProxyType({}))
 
 
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Say what it would cost in time, memory and disk, and do nothing.")
+]
+
+
 class InputError(ValueError):
     """Bad input, in words for the command line."""
 
@@ -67,20 +76,49 @@ def refuse_idle(why: str, *names: str) -> None:
             raise InputError(f"{given[name]} does nothing {why}")
 
 
+class UnheardError(Exception):
+    """A result that stdout does not take, once all files are written."""
+
+
+class RunInterruptedError(Exception):
+    """Ctrl-C in a run, and how to go on; no KeyboardInterrupt, which typer makes an exit without words."""
+
+
 def say(line: str, **style: Any) -> None:
     """A line of the log."""
-    log.print(line, soft_wrap=True, markup=False, **style)
+    log.print(printable(line), soft_wrap=True, markup=False, **style)
+
+
+@contextlib.contextmanager
+def heard() -> Iterator[None]:
+    """What is written to stdout in the block arrives there.
+
+    Raises:
+        UnheardError: if stdout takes nothing.
+    """
+    try:
+        yield
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still in the buffer would fail once more at the end
+        raise UnheardError(os.strerror(error.errno) if error.errno else str(error)) from error
 
 
 def emit(as_json: bool, result: Any, *tables: Any) -> None:
-    """The result: one JSON object, or tables and lines for a person."""
-    if as_json:
-        sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
-    else:
-        for table in tables:
-            if isinstance(table, Table):
-                _keep_whole(table)
-            out.print(table, soft_wrap=isinstance(table, str), crop=False)
+    """The result: one JSON object, or tables and lines for a person.
+
+    Raises:
+        UnheardError: if stdout takes nothing.
+    """
+    with heard():
+        if as_json:
+            sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
+        else:
+            for table in tables:
+                if isinstance(table, Table):
+                    _keep_whole(table)
+                words = isinstance(table, str)
+                out.print(printable(table) if words else table, soft_wrap=words, crop=False)
 
 
 def _keep_whole(table: Table) -> None:
@@ -119,13 +157,18 @@ def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool,
         InputError: saying what is wrong, and what would be right.
     """
     folder = path.parent
+    try:
+        path.lstat()
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise InputError(f"{option} {path}: this name is too long for the file system; shorten it") from None
     if path.is_dir():
         raise InputError(f"{option} {path}: is a folder; name a file")
     if not folder.is_dir():
         raise InputError(f"{option} {path}: folder {folder} does not exist")
     if suffix and path.suffix.lower() != suffix:
         raise InputError(f"{option} {path}: this is a {suffix} file; name it {path.with_suffix(suffix).name}")
-    if path.exists() and not path.is_file():
+    if os.path.lexists(path) and not path.is_file():
         raise InputError(f"{option} {path}: is neither a file nor free; name a file")
     for read in inputs:
         if path.exists() and Path(read).exists() and path.samefile(read):
@@ -133,13 +176,14 @@ def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool,
     if path.exists() and not force:
         raise InputError(f"{option} {path}: exists; name another file, or allow its replacement with --force")
     try:
-        probe(folder)
+        probe(path)
     except OSError as error:
         raise InputError(f"{option} {path}: cannot write there ({error.strerror})") from error
+    promise(path, replace=force)
     return path
 
 
-def announce(what: str, grain_steps: float, memory: float, backend: str, replicas: int = 1) -> None:
+def announce(what: str, grain_steps: float, memory: float, backend: str, replicas: int = 1) -> dict[str, float]:
     """Say what a run will need before it begins, and refuse what cannot fit the free memory.
 
     Args:
@@ -149,6 +193,9 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
         backend: who does the steps.
         replicas: side by side: several are cheaper than one.
 
+    Returns:
+        The same as numbers: grain_steps, seconds and memory_bytes.
+
     Raises:
         InputError: saying what is needed and what there is.
     """
@@ -157,17 +204,18 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
     if not seconds < LONGEST:
         years = seconds / 3.15e7
         raise InputError(f"{what} would take {years:.0e} years; choose a larger dt, a smaller t0 or fewer grains")
-    units = (("days", 86400.0), ("hours", 3600.0), ("min", 60.0), ("s", 1.0))
-    name, unit = next(pair for pair in units if seconds >= 2.0 * pair[1] or pair[1] == 1.0)
-    takes = f"some {max(1, round(seconds / unit))} {name} on a free machine once compiled"
-    needs = f"{takes}, and {_bytes(memory)} of memory"
+    takes = f"{in_time(seconds)} on a free machine once compiled"
+    needs = f"{takes}, and {in_bytes(memory)} of memory"
     if memory > free:
-        raise InputError(f"{what} needs {needs}, and {_bytes(free)} are free")
+        raise InputError(f"{what} needs {needs}, and {in_bytes(free)} are free")
     say(f"{what}: {needs}{', in plain JAX' if backend == 'jax' else ''}")
+    return {"grain_steps": grain_steps, "seconds": seconds, "memory_bytes": memory}
 
 
-def _bytes(count: float) -> str:
-    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.0f} MB"
+def emit_cost(as_json: bool, cost: dict[str, float], output: Path, disk_bytes: float) -> None:
+    """The result of a dry run: what `announce` returned, and what the output takes of the disk."""
+    line = f"disk: {in_bytes(disk_bytes)} for {output}; nothing was run or written"
+    emit(as_json, {**cost, "disk_bytes": disk_bytes, "status": 0}, line)
 
 
 @contextlib.contextmanager
@@ -178,10 +226,6 @@ def drawing(picture: Path) -> Iterator[None]:
     except Exception as error:  # matplotlib's, by the user's fonts and settings
         why = " ".join(str(error).split()) or type(error).__name__
         say(f"warning: {picture}: could not be drawn ({why})", style="yellow")
-
-
-class RunInterruptedError(KeyboardInterrupt):
-    """Ctrl-C in a run whose finished parts are kept."""
 
 
 @contextlib.contextmanager
@@ -195,7 +239,9 @@ def reporting(*, goes_on: bool = False) -> Iterator[Progress]:
         with _reporting() as progress:
             yield progress
     except KeyboardInterrupt:
-        raise (RunInterruptedError if goes_on else KeyboardInterrupt) from None
+        if goes_on:
+            raise RunInterruptedError("the same command goes on from what is done") from None
+        raise RunInterruptedError("nothing was written, and the same command begins anew") from None
 
 
 @contextlib.contextmanager

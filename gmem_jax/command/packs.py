@@ -11,12 +11,14 @@ import typer
 from gmem_jax import native
 from gmem_jax.command.console import (
     AsJson,
+    DryRun,
     Force,
     InputError,
     KeptFrames,
     announce,
     claim,
     emit,
+    emit_cost,
     refuse_idle,
     reporting,
     require_name,
@@ -29,6 +31,7 @@ from gmem_jax.files.configuration import fingerprint
 from gmem_jax.files.home import kept_pack
 from gmem_jax.files.packs import STANDARD, list_packs, save_pack
 from gmem_jax.files.provenance import provenance, sources
+from gmem_jax.files.sizes import pack_bytes
 from gmem_jax.files.spheres import load_clump
 from gmem_jax.physics import grain
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -112,6 +115,7 @@ def prepare_command(
     backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",
     frames: KeptFrames = 0,
     restart: Restart = False,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -138,7 +142,10 @@ def prepare_command(
     frame_schedule(recipe, frames)  # refuses what cannot be before anything is begun
     claim(output, ".h5", force=force)
     backend = native.name(backend, Frictionless())
-    announce(f"{recipe.grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * recipe.grains, backend)
+    cost = announce(f"{recipe.grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * recipe.grains, backend)
+    if dry_run:
+        emit_cost(as_json, cost, output, pack_bytes(recipe.grains, frames))
+        return
     began = time.perf_counter()
     stages: dict[str, Sample] = {}
     film: list[Frames] = []

@@ -1,6 +1,7 @@
 """`gmem recall`, `gmem demo`."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +11,7 @@ import typer
 from gmem_jax import native
 from gmem_jax.command.console import (
     AsJson,
+    DryRun,
     Force,
     InputError,
     KeptFrames,
@@ -20,6 +22,7 @@ from gmem_jax.command.console import (
     claim,
     drawing,
     emit,
+    emit_cost,
     refuse_idle,
     reporting,
     say,
@@ -33,6 +36,7 @@ from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
+from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.state import together
 from gmem_jax.show import figures, tables
@@ -45,6 +49,15 @@ SHIPPED: dict[str, Any] = {
 }  # mean and SD of those, as `demo` runs them
 
 
+def _announce(experiment: Experiment, batch: int) -> dict[str, float]:
+    """Say what a recall in batches will need."""
+    work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
+    backend = native.name(experiment.backend, experiment.friction)
+    side_by_side = min(batch, experiment.signals.count)
+    what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
+    return announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
+
+
 def _run(
     experiment: Experiment,
     data: Path,
@@ -55,16 +68,13 @@ def _run(
     target: Signals | None = None,
     frames: int = 0,
     frames_of: int = 1,
+    frames_at: Sequence[float] = (),
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
     began = time.perf_counter()
     batch = batch_for(experiment, data, batch, restart=restart)
-    work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
-    backend = native.name(experiment.backend, experiment.friction)
-    side_by_side = min(batch, experiment.signals.count)
-    what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
-    announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
-    film: Any = {"frames": frames, "frames_of": frames_of}
+    _announce(experiment, batch)
+    film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": list(frames_at)}
     with resumable(data, key_of_run(experiment, batch=batch, **film), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             recall = jax.block_until_ready(run(experiment, batch=batch, cache=parts, progress=progress, **film))
@@ -76,7 +86,8 @@ def _run(
     if picture is not None:
         title = tables.heading(configuration)
         with drawing(picture):
-            figures.recall_figure(picture, recall, experiment.scale, title, configuration["signals"])
+            names, t0 = configuration["signals"], configuration["t0"]
+            figures.recall_figure(picture, recall, experiment.scale, title, names, t0)
             told += f" and {picture}"
     say(told)
     row = {**tables.summary(recall, configuration), "seconds": configuration["seconds"], "output": str(data)}
@@ -95,7 +106,11 @@ def recall_command(
     ] = None,
     frames: KeptFrames = 0,
     frames_of: Annotated[int, typer.Option(min=0, help="Signal whose configurations they are; 0: no shear.")] = 1,
+    frames_at: Annotated[
+        str, typer.Option(metavar="U,U", help="Keep configurations wherever u passes these, as in 0,0.5,1.")
+    ] = "",
     restart: Restart = False,
+    dry_run: DryRun = False,
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,
@@ -103,12 +118,27 @@ def recall_command(
     """Store waveforms in a pack and recall them."""
     (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
     target = chosen.target(experiment.signals.count)
-    if not frames:
-        refuse_idle("without --frames, which says how many", "frames_of")
-    frame_schedule(experiment, frames, frames_of)  # refuses what cannot be before anything is begun
-    film: Any = {"frames": frames, "frames_of": frames_of}
+    at = _compressions(frames_at)
+    if not frames and not at:
+        refuse_idle("without --frames or --frames-at, which say how many", "frames_of")
+    frame_schedule(experiment, frames, frames_of, at)  # refuses what cannot be before anything is begun
+    if dry_run:
+        cost = _announce(experiment, batch_for(experiment, output, batch, restart=restart))
+        emit_cost(as_json, cost, output, recall_bytes(experiment, frames))
+        return
+    film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": at}
     row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
     emit(as_json, row, *tables.recall_lines(row, configuration))
+
+
+def _compressions(text: str) -> list[float]:
+    """Numbers of --frames-at."""
+    try:
+        return [float(each) for each in text.split(",")] if text else []
+    except ValueError:
+        raise InputError(
+            f"--frames-at {text}: must be numbers from 0 to 1 with commas between, as in 0,0.5,1"
+        ) from None
 
 
 def demo(

@@ -9,12 +9,13 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from gmem_jax.command.console import AsJson, InputError, emit, reporting, say
+from gmem_jax.command.console import AsJson, DryRun, InputError, emit, reporting, say
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import Effect
+from gmem_jax.reproduce.cost import spec_of_all
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import (
     GALLERY,
@@ -29,6 +30,7 @@ from gmem_jax.reproduce.run import (
     weigh,
 )
 from gmem_jax.simulation.progress import Progress
+from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
 from gmem_jax.sweeps.store import Store
 
@@ -50,6 +52,7 @@ def reproduce_command(
         list[str] | None, typer.Option(help="Of submitit, NAME=VALUE, again for each: timeout_min=240.")
     ] = None,
     retry: Annotated[bool, typer.Option("--retry", help="Try points and packs that failed again.")] = False,
+    dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:
     """Run a figure of the paper again, beside the published points.
@@ -63,11 +66,14 @@ def reproduce_command(
         scale_of(scale)
     except ValueError as error:
         raise InputError(f"--scale {scale}: {error}") from None
+    if dry_run:
+        _say_cost(what, scale, output, workers or 1, as_json)
+        return
     options = _options(option or [])
     executor_named(executor, workers, options)  # what cannot be had is refused before anything is written
     if not output.parent.is_dir():
         raise InputError(f"--output {output}: folder {output.parent} does not exist")
-    probe(output.parent)
+    probe(output)
     output.mkdir(exist_ok=True)
     outcomes, verdicts, weighed, drawn = [], [], Weighed([], [], []), []
     broken: list[str] = []
@@ -114,6 +120,18 @@ def reproduce_command(
     broken += weighed.failed + [reason for outcome in outcomes for reason in outcome.failed]
     if broken:
         raise RunFailedError(f"{len(broken)} points or packs; --retry tries them again")
+
+
+def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) -> None:
+    """What is not there of the points that are needed, and how long nets are trained at most."""
+    size, names = scale_of(scale), [name for name in (*FIGURES, GALLERY, "claims", "choices") if what in (name, "all")]
+    facts, lines = {}, ["seconds: no experiment is run"]
+    if names:
+        cost = cost_of(spec_of_all(names, scale), output / RUNS, workers=workers, only_packs=names == [GALLERY])
+        facts, lines = cost._asdict(), cost.lines
+    training = size.nets * len(size.lengths) * size.budget if "fig14" in names else 0.0
+    lines += [f"nets: trained for {training / 60.0:.0f} min at most"] if training else []
+    emit(as_json, {**facts, "training_seconds": training, "status": 0}, *lines)
 
 
 @contextlib.contextmanager

@@ -1,5 +1,6 @@
 """Runs that go on where they were interrupted: parts beside the output, and a lock on it."""
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,11 +9,11 @@ from typing import Annotated, Any
 import psutil
 import typer
 
-from gmem_jax.command.console import say
+from gmem_jax.command.console import InputError, RunInterruptedError, say
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import default_batch
-from gmem_jax.files.atomic import sweep
 from gmem_jax.files.checkpoints import Checkpoints, locked
+from gmem_jax.files.ours import sweep
 
 Restart = Annotated[bool, typer.Option("--restart", help="Discard what an interrupted run left, and begin anew.")]
 
@@ -40,7 +41,13 @@ def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[C
 
     Raises:
         FileFormatError: if there are parts of another run, or another process writes the output now.
+        RunInterruptedError: at Ctrl-C, saying how to go on.
     """
+    try:
+        folder_of(output).lstat()
+    except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            raise InputError(f"{output}: this name leaves no room for that of its parts; shorten it") from None
     with locked(output):
         sweep(output.parent, output.name)
         parts = Checkpoints(folder_of(output), key, restart=restart)
@@ -51,6 +58,10 @@ def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[C
         try:
             yield parts
             done = True
+        except (KeyboardInterrupt, RunInterruptedError):
+            if parts.finished() or parts.begun():
+                raise RunInterruptedError(f"the same command goes on from {parts.folder}") from None
+            raise RunInterruptedError("nothing was kept yet; the same command begins anew") from None
         finally:
             if done or not (parts.finished() or parts.begun()):
                 parts.discard()

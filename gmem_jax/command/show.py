@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from gmem_jax.command import sweep
-from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, refuse_idle, say
+from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, heard, refuse_idle, say
 from gmem_jax.show.drawing import FORMATS
 from gmem_jax.show.kinds import PLOTS, Draw, shown, sweep_pictures
 from gmem_jax.show.stages import AGAINST, QUANTITIES
@@ -23,30 +23,53 @@ def show(
     plot: Annotated[str, typer.Option(metavar="WHAT", help="Draw this into --output; list says what there is.")] = "",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture to write: .png, .svg, .pdf.")] = None,
     against: Annotated[str, typer.Option(help="What stages are drawn over: time or u.")] = "time",
-    csv: Annotated[bool, typer.Option("--csv", help="Print the recalled signals as CSV.")] = False,
+    signal: Annotated[
+        str, typer.Option(metavar="N,N", help="Signals of a recall to draw, from 1; of stages 0 too, the zero signal.")
+    ] = "",
+    each: Annotated[bool, typer.Option("--each", help="Of a recall: G and F of each signal.")] = False,
+    x: Annotated[str, typer.Option("--x", metavar="NAME", help="Of a sweep: what is drawn along the axis.")] = "",
+    by: Annotated[str, typer.Option(metavar="NAMES", help="Of a sweep: a line for each value of these.")] = "",
+    over: Annotated[
+        str,
+        typer.Option(
+            metavar="NAMES", help="Of a sweep: means and standard errors over these; default packs and seeds."
+        ),
+    ] = "",
+    csv: Annotated[
+        bool, typer.Option("--csv", help="Print the recalled signals as CSV; with --each, a row for each.")
+    ] = False,
     force: Force = False,
 ) -> None:
     """What a file holds; with --plot, a picture of it.
 
-    gmem show recall.h5 --plot signals -o x.png; gmem show recall.h5 --plot Z --against u -o z.png
+    gmem show recall.h5 --plot signals -o x.png; gmem show recall.h5 --plot Z --against u -o z.png;
+    gmem show recall.h5 --plot p_xy --signal 3 -o p.png
+    gmem show mu --plot fidelity --x mu --by friction --over pack -o f.png
     """
     if against not in AGAINST:
         raise InputError(f"--against {against}: must be one of {', '.join(AGAINST)}")
     if plot:
         refuse_idle("beside --plot", "csv")
     if not plot or plot == "list":
-        refuse_idle("unless something is drawn with --plot", "against", "force")
+        refuse_idle("unless something is drawn with --plot", "against", "force", "signal")
     elif plot.lower() not in _OF_STAGES:
         refuse_idle(f"with --plot {plot}: only pictures of stages ({', '.join(QUANTITIES)}) have it", "against")
     if csv:
         refuse_idle("beside --csv", "as_json")
+    chosen = _numbers(signal)
     folder = file.is_dir()
     if folder:
+        if chosen:
+            raise InputError(f"--signal {signal}: a sweep has no signals of its own; name the file of a point")
         store = sweep.there(file)
-        pictures = sweep_pictures(store)
+        pictures = sweep_pictures(store, x=x, by=sweep.names_of(by), over=sweep.names_of(over))
     else:
-        found = shown(file, against)
+        for name in (name for name, value in {"--x": x, "--by": by, "--over": over}.items() if value):
+            raise InputError(f"{file}: {name} is for the folder of a sweep")
+        found = shown(file, against, chosen, each=each)
         pictures = found.pictures
+    if each and (folder or found.csv is None):
+        raise InputError(f"{file}: --each tells of each recalled signal, and this is no recall")
     if plot:
         _draw(file, pictures, plot, output, force, as_json)
     elif output is not None:
@@ -54,11 +77,20 @@ def show(
     elif csv:
         if folder or found.csv is None:
             raise InputError(f"{file}: --csv gives recalled signals, and this is no recall")
-        sys.stdout.write(found.csv())
+        with heard():
+            sys.stdout.write(found.csv())
     elif folder:
-        sweep.show(store, "", as_json)
+        sweep.show(store, over, as_json)
     else:
         emit(as_json, found.facts, *found.lines)
+
+
+def _numbers(text: str) -> list[int]:
+    """Numbers of --signal."""
+    try:
+        return [int(each) for each in text.split(",")] if text else []
+    except ValueError:
+        raise InputError(f"--signal {text}: must be numbers with commas between, as in 1,3") from None
 
 
 def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None, force: bool, as_json: bool) -> None:

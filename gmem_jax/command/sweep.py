@@ -1,31 +1,37 @@
 """`gmem sweep`."""
 
+import contextlib
 import math
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.table import Table
 
-from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, refuse_idle, reporting, say
+from gmem_jax.command.console import AsJson, DryRun, Force, InputError, claim, emit, refuse_idle, reporting, say
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
 from gmem_jax.physics.state import SENTENCES, Status
 from gmem_jax.show.tables import cell
+from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
+from gmem_jax.sweeps.making import AS_THEY_ARE
+from gmem_jax.sweeps.processes import stop, waiting
 from gmem_jax.sweeps.spec import Spec, read_spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import Conductor
-from gmem_jax.sweeps.table import FORMATS, export, means, rows
+from gmem_jax.sweeps.table import FORMATS, doubts, export, means, rows
 
-VERBS = ("status", "show", "export")
-RUN = ("executor", "workers")
+VERBS = ("status", "show", "export", "stop")
+RUN = ("executor", "workers", AS_THEY_ARE)
 ABOUT = "F(T1): F after a running mean over the ringing period"
 
 
 def sweep_command(
-    what: Annotated[str, typer.Argument(help="A sweep file (.toml) to be done; or status, show, export.")],
+    what: Annotated[str, typer.Argument(help="A sweep file (.toml) to be done; or status, show, export, stop.")],
     folder: Annotated[Path | None, typer.Argument(help="With a verb: the folder of the sweep.")] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder of the sweep, default the file's name; or of export.")
@@ -36,12 +42,14 @@ def sweep_command(
     ] = None,
     over: Annotated[str, typer.Option(help="show: names to average over, separated by commas.")] = "",
     retry: Annotated[bool, typer.Option("--retry", help="Try points that failed again.")] = False,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Vary anything: packs made once, points side by side, results kept by content; resumes, and grows.
 
-    gmem sweep mu.toml; gmem sweep status mu; gmem sweep show mu --over pack; gmem sweep export mu -o mu.csv
+    gmem sweep mu.toml; gmem sweep status mu; gmem sweep show mu --over pack; gmem sweep export mu -o mu.csv;
+    gmem sweep stop mu
     """
     if what in VERBS:
         refuse_idle(f"with {what}: it runs no points", "executor", "workers", "retry")
@@ -56,6 +64,8 @@ def sweep_command(
             _export(store, output, force, as_json)
         elif what == "status":
             _status(store, as_json)
+        elif what == "stop":
+            _stop(store, as_json)
         else:
             show(store, over, as_json)
         return
@@ -71,12 +81,17 @@ def sweep_command(
     count = workers or spec.run.get("workers")
     if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
         raise InputError(f"{path}: workers must be a whole number from 1, got {count!r}")
-    chosen = executor_named(executor or str(spec.run.get("executor", "processes")), count, options)
     target = output or path.with_suffix("")
+    if dry_run:
+        with _of_file(path):
+            cost = cost_of(spec, target, workers=count or 1)
+        emit(as_json, {"folder": str(target), **cost._asdict(), "status": 0}, *cost.lines)
+        return
+    chosen = executor_named(executor or str(spec.run.get("executor", "processes")), count, options)
     if not target.parent.is_dir():
         raise InputError(f"--output {target}: folder {target.parent} does not exist")
     try:
-        probe(target.parent)
+        probe(target)
     except OSError as error:
         raise InputError(f"--output {target}: cannot write there ({error.strerror})") from error
     with locked(target), reporting(goes_on=True) as progress:
@@ -88,6 +103,8 @@ def sweep_command(
     failed = [row for row in table if row["state"] == "failed"]
     for row in failed[:3]:
         say(f"failed: {_values(row, spec.names)}: {row['why']}", style="yellow")
+    for line in _doubtful(table):
+        say(f"warning: {line}", style="yellow")
     say(f"{len(table) - len(failed)} of {len(table)} points in {target}; gmem sweep show {target}")
     emit(as_json, _summary(conductor.store, table), _table(table, spec.names))
     if failed:
@@ -100,25 +117,31 @@ def planned(path: Path, spec: Spec, folder: Path) -> Conductor:
     Raises:
         FileFormatError: if one cannot, or the folder holds something else.
     """
-    conductor = Conductor(spec, folder, say)
+    with _of_file(path):
+        conductor = Conductor(spec, folder, say)
+        conductor.check()  # leaves nothing behind where it refuses
+    return conductor
+
+
+@contextlib.contextmanager
+def _of_file(path: Path) -> Iterator[None]:
+    """Problems of what a sweep file asks for are told as the file's."""
     try:
-        conductor.check()
+        yield
     except (ValueError, TypeError, FileNotFoundError) as error:
         raise FileFormatError(f"{path}: {' '.join(str(error).split())}") from error
-    return conductor
 
 
 def there(folder: Path) -> Store:
     """The sweep in a folder.
 
     Raises:
-        InputError: if there is none.
+        InputError: if there is no such folder.
+        FileFormatError: if it holds no sweep.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    if not (folder / "sweep.json").is_file():
-        raise InputError(f"{folder}: no sweep here (no sweep.json)")
-    return Store(folder)
+    return Store(folder, make=False)
 
 
 def _values(row: dict[str, Any], names: list[str]) -> str:
@@ -143,13 +166,37 @@ def _status(store: Store, as_json: bool) -> None:
     at_work = [one for one in store.told() if one["job"].partition("-")[0] in taken]
     busy = [f"{one['what']}, {one['fraction']:.0%}" for one in at_work if one["fraction"] < 1.0]
     reasons = sorted({row["why"] for row in table if row["state"] == "failed"})
-    emit(as_json, summary, ", ".join(lines), *busy, *(f"failed: {reason}" for reason in reasons))
+    problems = [*(f"failed: {reason}" for reason in reasons), *(f"warning: {line}" for line in _doubtful(table))]
+    waits = waiting(store)
+    emit(as_json, {**summary, "waiting": waits}, ", ".join(lines), *busy, *waits, *problems)
+
+
+def _doubtful(table: list[dict[str, Any]]) -> list[str]:
+    """How many points are doubtful, and why: a line for each reason."""
+    counts = Counter(reason for row in table if (reason := doubts(row)))
+    return [f"{count} of {len(table)} points: {reason}" for reason, count in counts.items()]
+
+
+def names_of(text: str) -> list[str]:
+    """Names separated by commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _stop(store: Store, as_json: bool) -> None:
+    """End whoever works on a sweep; what is computed stays."""
+    ended, left = stop(store)
+    for line in left:
+        say(line, style="yellow")
+    told = [f"ended {one}" for one in ended] or ["nobody is at work here"]
+    emit(as_json, {"folder": str(store.folder), "ended": ended, "left": left}, *told)
+    if left:
+        raise RunFailedError(f"{len(left)} workers cannot be ended from here")
 
 
 def show(store: Store, over: str, as_json: bool) -> None:
     """Print the points of a sweep, or means over some names, separated by commas."""
     table, names = rows(store), store.card()["names"]
-    averaged = [name for name in over.split(",") if name]
+    averaged = names_of(over)
     if unknown := sorted(set(averaged) - set(names)):
         raise InputError(f"--over {unknown[0]}: does not vary here; {', '.join(names)} do")
     if averaged:
@@ -167,9 +214,9 @@ def _export(store: Store, output: Path | None, force: bool, as_json: bool) -> No
     if output is None or output.suffix.lower() not in FORMATS:
         raise InputError(f"gmem sweep export: name a file with -o that ends in one of {', '.join(FORMATS)}")
     claim(output, "", force=force)
-    export(store, output)
-    say(f"wrote {output}")
-    emit(as_json, {"output": str(output), "status": 0})
+    about = export(store, output)
+    say(f"wrote {output}" + (f": {about}" if about else ""))
+    emit(as_json, {"output": str(output), "about": about, "status": 0})
 
 
 def _table(table: list[dict[str, Any]], names: list[str]) -> Table:
@@ -177,13 +224,24 @@ def _table(table: list[dict[str, Any]], names: list[str]) -> Table:
     for name in (*names, "G", "F", "F(T1)", "status"):
         drawn.add_column(name, no_wrap=name != "status")
     for row in table:
-        state = ", ".join(_bits(row["status"])) if row["state"] == "done" else row["state"]
+        state = _state(row) if row["state"] == "done" else row["state"]
         numbers = [row[name] for name in ("gain", "fidelity", "windowed_fidelity")]
         measured = ("" if number is None else f"{number:.3f}" for number in numbers)
-        drawn.add_row(*(cell(row[name]) for name in names), *measured, state or "ok")
-    reasons = {bit for row in table if row["state"] == "done" for bit in Status if row["status"] & bit}
-    drawn.caption = "; ".join([ABOUT, *(f"{_word(bit)}: {SENTENCES[bit]}" for bit in sorted(reasons))])
+        drawn.add_row(*(cell(row[name]) for name in names), *measured, state)
+    drawn.caption = "; ".join([ABOUT, *_reasons(table)])
     return drawn
+
+
+def _state(row: dict[str, Any]) -> str:
+    """The status of a point, or of several, in words."""
+    return ", ".join([*_bits(row["status"] or 0), *(["warned"] if row["warnings"] else [])]) or "ok"
+
+
+def _reasons(table: list[dict[str, Any]]) -> list[str]:
+    """What the words of `_state` mean in a table."""
+    bits = {bit for row in table for bit in Status if (row["status"] or 0) & bit}
+    told = dict.fromkeys(f"warned: {row['warnings']}" for row in table if row["warnings"])
+    return [*(f"{_word(bit)}: {SENTENCES[bit]}" for bit in sorted(bits)), *told]
 
 
 def _word(bit: Status) -> str:
@@ -196,12 +254,16 @@ def _bits(status: int) -> list[str]:
 
 def _means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
     drawn = Table()
-    for name in (*names, "n", "G", "F", "F(T1)"):
-        drawn.add_column(name, no_wrap=name not in names, min_width=14 if name in ("G", "F", "F(T1)") else None)
+    for name in (*names, "n", "G", "F", "F(T1)", "status"):
+        drawn.add_column(
+            name, no_wrap=name not in (*names, "status"), min_width=14 if name in ("G", "F", "F(T1)") else None
+        )
     for row in table:
         shown = [_with_error(row, name) for name in ("gain", "fidelity", "windowed_fidelity")]
-        drawn.add_row(*(cell(row[name]) for name in names), str(row["done"]), *shown)
-    drawn.caption = f"mean and standard error; {ABOUT}"
+        drawn.add_row(
+            *(cell(row[name]) for name in names), str(row["done"]), *shown, _state(row) if row["done"] else ""
+        )
+    drawn.caption = "; ".join(["mean and standard error", ABOUT, *_reasons(table)])
     return drawn
 
 

@@ -76,6 +76,22 @@ def compare(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scala
     return Match(gain, 1.0 - jnp.sqrt(miss / jnp.sum(signal * signal)))
 
 
+def each(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None) -> Match:
+    """Gain and fidelity of each signal by itself, [S]: each has a gain of its own. NaN where p_sig or J is zero.
+
+    Args:
+        signal: p_sig, [S, bins], in E.
+        integral: J, [S, bins].
+        scale: delta0 gamma0; scalar or [S, 1].
+        window: of `compare`.
+    """
+
+    def alone(p_sig: jax.Array, own: jax.Array, scale: jax.Array) -> Match:
+        return compare(p_sig[None], own[None], scale, window)
+
+    return jax.vmap(alone)(signal, integral, jnp.broadcast_to(scale, (len(signal), 1)))
+
+
 def errors_over_signals(signal: np.ndarray, integral: np.ndarray, scale: np.ndarray | float) -> tuple[float, float]:
     """Standard errors of gain and fidelity from their spread over the S signals of a set (jackknife); NaN for one.
 

@@ -21,7 +21,7 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.compiled import Compiled, require_x64
-from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, concatenate, places
+from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, concatenate, places, places_at
 from gmem_jax.simulation.loop import rollout
 from gmem_jax.simulation.observers import CHUNK
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, work_of
@@ -81,19 +81,27 @@ class Recall:
     protocol: Protocol = static()
     frames: Frames | None = None
 
-    def plot(self, what: str = "signals", experiment: Experiment | None = None, *, against: str = "time") -> Any:
+    def plot(
+        self,
+        what: str = "signals",
+        experiment: Experiment | None = None,
+        *,
+        against: str = "time",
+        signals: Sequence[int] = (),
+    ) -> Any:
         """A picture of it, which a notebook shows: `.save(path)` writes it, `.figure` is matplotlib's.
 
         Args:
             what: "signals", "waveforms", "all"; or a quantity of the stages, like "pressure", "Z" or "phi".
             experiment: that it is of, for the names of signals and the conditions in the title.
             against: "time" or "u", for the stages.
+            signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
 
         Raises:
-            ValueError: if there is no such picture; it names those that there are.
+            ValueError: if there is no such picture, or no such signal; it names those that there are.
         """
         from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
-        return from_above.plot(self, what, experiment, against)
+        return from_above.plot(self, what, experiment, against, signals)
 
     def _facts(self) -> html.Facts:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}
@@ -257,6 +265,7 @@ def run(
     devices: Sequence[jax.Device] | None = None,
     frames: int = 0,
     frames_of: int = 1,
+    frames_at: Sequence[float] = (),
     cache: ResultCache = no_cache,
     progress: ProgressChoice = None,
 ) -> Recall:
@@ -271,12 +280,15 @@ def run(
         devices: that share out the replicas; default all that JAX sees, also those of other processes.
         frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
         frames_of: the signal whose they are, from 1; 0 for the zero signal.
+        frames_at: compressions u, 0 to 1, at which more are kept, each time that the run passes them, to the next of
+            256 bins: u = 0.5 gives one of every compression and decompression.
         cache: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
         ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
-            for too many or too few frames, frames of a prefix that was run before, or a signal that there is not.
+            for too many or too few frames, a u beyond 0 and 1, frames of a prefix that was run before, or a signal that
+            there is not.
         RunFailedError: if the simulation broke down.
     """
     tell = callback(progress)
@@ -286,14 +298,14 @@ def run(
         raise ValueError(f"batch must be at least 1, got {batch}")
     if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
         raise ValueError("parameters with a value for each replica need all signals in one batch")
-    if prefix and frames:
+    schedule = frame_schedule(experiment, frames, frames_of, frames_at)
+    if prefix and schedule.wanted:
         raise ValueError("frames begin with the prefix: run it in the same call")
-    schedule = frame_schedule(experiment, frames, frames_of)
     warn_of_another_compression(experiment)
     common, own = experiment.phases
     firsts = range(0, count, size)
     work = sum(work_of(own, 1 + min(size, count - first)) for first in firsts)
-    recorders = [FrameRecorder(schedule)] if frames else []
+    recorders = [FrameRecorder(schedule)] if schedule.wanted else []
     if prefix is None:
         runner = runner_of(experiment, progress=tell, observers=tuple(recorders))
         runner.total_work = work_of(common, runner.state.replicas) + work
@@ -307,7 +319,7 @@ def run(
     for number, first in enumerate(firsts):
         last = min(first + size, count)
         few = experiment if size >= count else with_part(experiment, first, last)
-        wanted = bool(frames) and (first < frames_of <= last or frames_of == first == 0)
+        wanted = bool(recorders) and (first < frames_of <= last or frames_of == first == 0)
         recorder = FrameRecorder(FrameSchedule(schedule.wanted if wanted else {}, max(0, frames_of - first)))
         recorder.restore(recorded)
         on = runner.fork(work=done, observers=(recorder,))
@@ -326,21 +338,25 @@ def run(
         done += work_of(own, 1 + last - first)
     after_prefix, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
     found: Recall = finished(experiment, prefix.samples | after_prefix, jnp.asarray(status))
-    if not frames:
+    if not schedule.wanted:
         return found
     offsets = np.asarray(experiment.pack.clump.offsets)
     return dataclasses.replace(found, frames=concatenate(recorded, offsets, frames_of))
 
 
-def frame_schedule(experiment: Experiment, frames: int, of: int) -> FrameSchedule:
-    """What is to be recorded of a run: `frames` configurations of the replica of a signal.
+def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[float] = ()) -> FrameSchedule:
+    """What is to be recorded of a run: `frames` configurations of the replica of a signal, and those `at` compressions.
 
     Raises:
-        ValueError: for too many or too few, or a signal that there is not.
+        ValueError: for too many or too few, a u beyond 0 and 1, or a signal that there is not.
     """
     if not 0 <= of <= experiment.signals.count:
         raise ValueError(f"frames of signal {of}: there are signals 1 to {experiment.signals.count}, and 0 for none")
-    return FrameSchedule(places(experiment.protocol.stages, frames, CHUNK), of) if frames else FrameSchedule()
+    stages = experiment.protocol.stages
+    along = [places(stages, frames, CHUNK)] if frames else []
+    wanted = [*along, places_at(stages, at)]
+    both = {stage.name: sorted({bins for each in wanted for bins in each.get(stage.name, ())}) for stage in stages}
+    return FrameSchedule({name: found for name, found in both.items() if found}, of)
 
 
 def replica_bins(experiment: Experiment, batch: int) -> int:
@@ -355,6 +371,10 @@ def _join(first: Any, *others: Any) -> np.ndarray:
     return np.concatenate([np.asarray(first), *(np.asarray(other)[..., 1:] for other in others)], axis=-1)
 
 
+class OtherCompressionWarning(UserWarning):
+    """A pack was cycled with another delta0: `Status.OTHER_COMPRESSION`, said before the run."""
+
+
 def warn_of_another_compression(experiment: Experiment) -> None:
     """Warn of a delta0 that the pack was not made for."""
     own = float(experiment.pack.delta0)
@@ -362,6 +382,7 @@ def warn_of_another_compression(experiment: Experiment) -> None:
         warnings.warn(
             f"{experiment.pack.name} was cycled with delta0 = {own:g}, not {experiment.delta0}: its memory of the "
             "preparation differs from the paper's; prepare a pack for this delta0",
+            OtherCompressionWarning,
             stacklevel=3,
         )
 

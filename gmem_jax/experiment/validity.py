@@ -74,6 +74,7 @@ def validity(
         | (jnp.asarray(experiment.drag) * experiment.timing.dt > 1.0),
         Status.ROUNDED: jnp.concatenate([jnp.zeros(1, bool), noise >= LARGEST_NOISE]),
         Status.UNLOADED: least <= 0.0,
+        Status.OTHER_COMPRESSION: ~jnp.isclose(jnp.asarray(experiment.compression), experiment.pack.delta0),
     }
     bits = jnp.zeros(1, jnp.int32)
     for bit, doubtful in found.items():

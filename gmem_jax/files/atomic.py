@@ -1,41 +1,42 @@
-"""Files that are whole or not there: written under a temporary name, flushed to disk, and renamed."""
+"""Files that are whole or not there: written under a temporary name, flushed to disk, and put in their place."""
 
 import contextlib
 import errno
 import os
 import re
-import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from gmem_jax.files.ours import FileFormatError as FileFormatError
+from gmem_jax.files.ours import drop, place, temporary
+
 _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
 
-class FileFormatError(ValueError):
-    """A file that is not what it should be; the message names the file, what is wrong and what would be right."""
-
-
 @contextmanager
-def atomic(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place, fsynced, if the block succeeds, and vanishes if it fails.
+def atomic(path: Path, *, flush: bool = True) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place if the block succeeds, and vanishes if it fails.
+
+    Args:
+        path: of the file. One that a command claimed as new does not replace what came there since; see `ours`.
+        flush: to the disk, so that it outlives the machine's failure.
 
     Raises:
+        FileExistsError: if there is something where a new file was promised.
         OSError: if the folder cannot be written.
     """
-    path = Path(path)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    os.close(handle)
-    temporary = Path(name)
+    path, made = Path(path), None
     try:
-        yield temporary
-        temporary.chmod(0o644)
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        made = temporary(path)
+        yield made
+        if flush:
+            with made.open("rb") as file:
+                os.fsync(file.fileno())
+        place(made, path)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
+        if made:
+            drop(made)
         if isinstance(error, OSError) and (reason := _of_the_disk(error)):
             raise OSError(f"{path}: cannot be written ({reason}); whatever was there is untouched") from error
         raise
@@ -48,26 +49,12 @@ def _of_the_disk(error: OSError) -> str:
     return os.strerror(number) if number in _DISK else ""
 
 
-def probe(folder: Path) -> None:
-    """Make sure that a folder can be written.
+def probe(path: Path) -> None:
+    """Make sure that a file of this name can be written.
 
     Raises:
         OSError: if it cannot.
     """
-    handle, name = tempfile.mkstemp(dir=folder, prefix=".gmem-", suffix=".tmp")
-    os.close(handle)
-    Path(name).unlink()
-
-
-def sweep(folder: Path, name: str = "", *, age: float = 0.0) -> None:
-    """Remove what killed writers left behind: temporary files of the files in a folder (or of one of them).
-
-    Args:
-        folder: where they are.
-        name: of the one file; default all.
-        age: in s: younger ones may be those of living writers.
-    """
-    for left in Path(folder).glob(f".{name}.*.tmp" if name else ".*.tmp"):
-        with contextlib.suppress(OSError):
-            if time.time() - left.stat().st_mtime >= age:
-                left.unlink()
+    with contextlib.suppress(FileNotFoundError):
+        path.lstat()  # which a file system refuses whose names are shorter
+    drop(temporary(path))

@@ -4,10 +4,14 @@ A part is a sealed .npz file: its arrays, and how they make up a pytree (JSON). 
 """
 
 import contextlib
+import errno
+import hashlib
 import json
 import os
-import shutil
+import re
+import stat
 import time
+import warnings
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -19,14 +23,20 @@ import jax
 import numpy as np
 
 from gmem_jax.errors import FileFormatError, RunFailedError
-from gmem_jax.files.atomic import atomic, sweep
+from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import json_of, read_npy, refusing, require
+from gmem_jax.files.ours import Folder, release, sweep
 from gmem_jax.files.seal import BLOCK, seal, sealed
 from gmem_jax.physics.pytree import KINDS
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 
-PART_SCHEMA = "gmem-part/2"
-EVERY = 120.0  # s between checkpoints of an unfinished part: doing it again must cost more than writing them
+PART_SCHEMA = "gmem-part/3"
+PARTS_SCHEMA = "gmem-parts/1"
+MARKER = "run.json"
+OWN = r"[\w.+-]+\.(?:npz|now|before)|(?:run|job)\.json"
+"""Names of files in a folder of parts; a sweep puts the job there that they belong to."""
+FIRST = 5.0  # s before the first checkpoint of an unfinished part; each next one takes twice as long to come
+EVERY = 120.0  # s between checkpoints at most: doing it again must cost more than writing them
 AT_MILESTONES = 20.0  # s likewise, where a stage has just ended
 
 
@@ -60,15 +70,20 @@ def _put_together(form: Any, arrays: list[np.ndarray]) -> Any:
     return KINDS[form["kind"]](**{name: _put_together(item, arrays) for name, item in form["fields"].items()})
 
 
-def save_part(path: Path, tree: Any) -> None:
+def save_part(path: Path, tree: Any, of: str = "") -> None:
     """Write a tree of arrays.
+
+    Args:
+        path: of the file.
+        tree: what it holds.
+        of: what it is: of which run, and which part of that.
 
     Raises:
         TypeError: if it holds something else.
         OSError: if the path cannot be written.
     """
     arrays: list[np.ndarray] = []
-    head = json.dumps({"schema": PART_SCHEMA, "form": _taken_apart(tree, arrays)}).encode()
+    head = json.dumps({"schema": PART_SCHEMA, "of": of, "form": _taken_apart(tree, arrays)}).encode()
     named = {f"array_{number:03d}": array for number, array in enumerate(arrays)}
     with atomic(path) as temporary:
         with temporary.open("wb") as file:
@@ -77,12 +92,12 @@ def save_part(path: Path, tree: Any) -> None:
         seal(temporary)
 
 
-def load_part(path: Path) -> Any:
+def load_part(path: Path, of: str = "") -> Any:
     """Read what `save_part` wrote, arrays as numpy arrays.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if the file is damaged, or none of this schema.
+        FileFormatError: if the file is damaged, none of this schema, or something else than `of`.
     """
     with refusing(path, "part of a run"), path.open("rb") as opened:
         if not sealed(opened, path):
@@ -92,6 +107,11 @@ def load_part(path: Path) -> Any:
         head = json_of(found.pop("head", np.zeros(0, np.uint8)).tobytes(), "head")
         if head.get("schema") != PART_SCHEMA:
             raise FileFormatError(f"{path}: schema is {head.get('schema')!r}, expected {PART_SCHEMA!r}")
+        if head.get("of") != of:
+            raise FileFormatError(
+                f"{path}: says that it is {_short(head.get('of'))}, not {_short(of)}: files were exchanged; "
+                "remove it, or begin anew with --restart"
+            )
         return _put_together(head["form"], [found[name] for name in sorted(found)])
 
 
@@ -113,38 +133,52 @@ def _members(archive: zipfile.ZipFile, size: int) -> dict[str, np.ndarray]:
 class _StoredCheckpoint(Checkpoint):
     """How far a part is, in two generations: whenever a writer dies, one of them is whole."""
 
-    def __init__(self, stem: Path) -> None:
-        self._now, self._before = stem.with_name(f"{stem.name}.now"), stem.with_name(f"{stem.name}.before")
-        self._last, self._keeps = time.monotonic(), True
+    def __init__(self, own: Folder, name: str, of: str) -> None:
+        self._own, self._names, self._of = own, (f"{name}.now", f"{name}.before"), f"{of}, unfinished"
+        self._last, self._wait, self._keeps = time.monotonic(), min(FIRST, EVERY), True
 
     def restore(self) -> Any:
-        for path in (self._now, self._before):
+        for name in self._names:
             with contextlib.suppress(FileFormatError, FileNotFoundError):
-                return load_part(path)
+                return load_part(self._own.at(name), self._of)
         return None
 
     def maybe_save(self, state: Callable[[], Any], *, milestone: bool = False) -> None:
-        passed = time.monotonic() - self._last
-        if not self._keeps or passed < (AT_MILESTONES if milestone else EVERY):
-            return
-        if self._now.exists():
-            self._now.replace(self._before)
+        wait = min(self._wait, AT_MILESTONES) if milestone else self._wait
+        if self._keeps and (time.monotonic() - self._last >= wait or _parting):
+            self._save(state)
+        while _parting:
+            _parting.pop()()
+
+    def _save(self, state: Callable[[], Any]) -> None:
+        now, before = self._names
+        if self._own.at(now).exists():
+            self._own.move(now, before)
         try:
-            save_part(self._now, state())
+            save_part(self._own.at(now), state(), self._of)
         except TypeError:  # a law of the user's may remember in classes of its own: there is nothing to go on from
             self._keeps = False
-        self._last = time.monotonic()
+        self._last, self._wait = time.monotonic(), min(EVERY, 2.0 * self._wait)
 
     def discard(self) -> None:
         """Remove both."""
-        for path in (self._now, self._before):
-            path.unlink(missing_ok=True)
+        for name in self._names:
+            self._own.remove(name)
+
+
+_parting: list[Callable[[], None]] = []
+
+
+def part_with(leave: Callable[[], None]) -> None:
+    """Have `leave` called as soon as the next checkpoint is kept, which is not waited for: for handlers of signals."""
+    _parting.append(leave)
 
 
 class Checkpoints(ResultCache):
-    """Checkpoints of a long run, in a folder beside its output: what `gm.run` and others take as `cache`.
+    """Parts of a long run, in a folder beside its output: what `gm.run` and others take as `cache`.
 
-    What is finished is kept as it is, what is not as a checkpoint of every few minutes.
+    What is finished is kept as it is, what is not as a checkpoint of every few minutes. Each file says of which run
+    and which part it is.
 
     Args:
         folder: made if it is not there.
@@ -152,64 +186,66 @@ class Checkpoints(ResultCache):
         restart: discard what is there.
 
     Raises:
-        FileFormatError: if the folder holds finished parts of another run.
+        FileFormatError: if the folder holds finished parts of another run, or is not one of parts.
         OSError: if it cannot be written.
     """
 
     def __init__(self, folder: Path, key: dict[str, Any], *, restart: bool = False) -> None:
         self.folder = Path(folder)
+        wanted = json.loads(json.dumps(key))
+        self._run = hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:20]
+        self._own = Folder(self.folder, MARKER, PARTS_SCHEMA, re.compile(OWN), {"key": wanted})
         if restart or not (self.finished() or self.begun()):
-            shutil.rmtree(self.folder, ignore_errors=True)  # a folder without parts is worth nothing
-        found, wanted = self.key_of(self.folder), json.loads(json.dumps(key))
-        other = [name for name in wanted if found and found.get(name) != wanted[name]]
-        if other:
-            raise FileFormatError(
-                f"{self.folder}: holds parts of an interrupted run with another {other[0]} "
-                f"({_short(found.get(other[0]))}, now {_short(wanted[other[0]])}); begin anew with "
-                "--restart, or choose another output"
-            )
-        self.folder.mkdir(exist_ok=True)
+            self._own.clear(keep=True)
+        elif found := self.key_of(self.folder):
+            other = [name for name in {**found, **wanted} if found.get(name) != wanted.get(name)]
+            if other:
+                raise FileFormatError(
+                    f"{self.folder}: holds parts of an interrupted run with another {other[0]} "
+                    f"({_short(found.get(other[0]))}, now {_short(wanted.get(other[0]))}); begin anew with "
+                    "--restart, or choose another output"
+                )
         sweep(self.folder)
-        with atomic(self.folder / "run.json") as temporary:
-            temporary.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
+        self._own.mark({"key": wanted})
 
     @staticmethod
     def key_of(folder: Path) -> dict[str, Any]:
         """The key stored in a folder of parts; empty if there is none that can be read."""
-        card = Path(folder) / "run.json"
-        try:
-            key = json.loads(card.read_text(encoding="utf-8")) if card.is_file() else {}
-        except (ValueError, OSError):
-            key = {}
+        key = (Folder.about(Path(folder), MARKER, PARTS_SCHEMA) or {}).get("key")
         return key if isinstance(key, dict) else {}
 
     def __call__(self, name: str, run: Callable[[Checkpoint], Any]) -> Any:
-        """The part of that name, its arrays as numpy arrays: read if it is there, else run from its checkpoint on."""
-        path = self.folder / f"{name}.npz"
+        """The part of that name, its arrays as numpy arrays: read if it is there, else run from its checkpoint on.
+
+        Raises:
+            FileFormatError: if the file of that name is damaged, or another part, or of another run.
+        """
+        path, of = self._own.at(f"{name}.npz"), f"part {name} of run {self._run}"
         if path.is_file():
-            return load_part(path)
-        checkpoint = _StoredCheckpoint(self.folder / name)
+            return load_part(path, of)
+        checkpoint = _StoredCheckpoint(self._own, name, of)
         try:
             result = jax.tree.map(np.asarray, run(checkpoint))
         except RunFailedError:
             checkpoint.discard()  # whoever tries again changes something
             raise
         with contextlib.suppress(TypeError):  # see `_StoredCheckpoint`
-            save_part(path, result)
+            save_part(path, result, of)
         checkpoint.discard()
         return result
 
     def finished(self) -> int:
         """Number of parts there are."""
-        return len(list(self.folder.glob("*.npz")))
+        return sum(path.suffix == ".npz" for path in self._own.files())
 
     def begun(self) -> int:
         """Number of parts that are not finished, but have a checkpoint."""
-        return len({path.stem for pattern in ("*.now", "*.before") for path in self.folder.glob(pattern)})
+        return len({path.stem for path in self._own.files() if path.suffix in (".now", ".before")})
 
     def discard(self) -> None:
-        """Remove the folder."""
-        shutil.rmtree(self.folder)
+        """Remove the folder; of one that holds other files too, only what is ours."""
+        if left := self._own.clear():
+            warnings.warn(f"{self.folder}: left there, since it holds {left[0]}, which is not ours", stacklevel=2)
 
 
 def _short(value: Any) -> str:
@@ -224,18 +260,50 @@ def locked(output: Path) -> Iterator[None]:
     Raises:
         FileFormatError: if another process holds it.
     """
-    import fcntl  # where there is none, as on Windows, there is no lock either
-
-    lock = output.with_name(f".{output.name}.lock")
-    with lock.open("a+", encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.fstat(file.fileno()).st_ino != lock.stat().st_ino:
-                raise OSError  # who had it before us has removed it, and somebody else may have made another
-        except OSError:
-            raise FileFormatError(f"{output}: another run is writing it; name another output") from None
+    lock = lock_of(output)
+    try:
+        handle = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise FileFormatError(f"{lock}: is a link where a lock should be; move it away") from None
+        raise
+    try:
+        known = os.fstat(handle)
+        if not stat.S_ISREG(known.st_mode) or known.st_size:
+            raise FileFormatError(f"{lock}: is in the place of a lock, and none of ours; move it away")
+        if not _lock(handle) or not lock.exists() or known.st_ino != lock.stat().st_ino:
+            # who had it before us has removed it, and somebody else may have made another
+            raise FileFormatError(f"{output}: another run is writing it; name another output")
         try:
             yield
         finally:
-            with contextlib.suppress(OSError):
-                os.unlink(lock)
+            release(lock, known.st_ino)
+    finally:
+        os.close(handle)
+
+
+def lock_of(output: Path) -> Path:
+    """The file by which an output is locked."""
+    return output.with_name(f".{output.name}.lock")
+
+
+def _lock(handle: int) -> bool:
+    import fcntl  # where there is none, as on Windows, there is no lock either
+
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def is_locked(output: Path) -> bool:
+    """Whether a living process has an output to itself; nothing is made or changed."""
+    try:
+        handle = os.open(lock_of(output), os.O_RDONLY | os.O_NONBLOCK | getattr(os, "O_NOFOLLOW", 0))
+    except OSError:
+        return False
+    try:
+        return not _lock(handle)
+    finally:
+        os.close(handle)

@@ -10,6 +10,7 @@ import numpy as np
 
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.checked import optional
+from gmem_jax.files.measures import of_each
 from gmem_jax.files.schemas import RECALL, STAGE
 from gmem_jax.simulation.protocol import BINS
 
@@ -49,9 +50,10 @@ def recall_dataset(recall: Recall, names: list[str], configuration: Mapping[str,
         own = (np.asarray(getattr(sample, name)) for sample in stages.values())
         wide = [np.broadcast_to(values, (*values.shape[:-1], replicas)) for values in own]
         data[name] = (array.shape, np.concatenate(wide), about)
+    derived = of_each(recall, configuration)
     for name, array in RECALL.arrays.items():
         if name not in ("u", "signal"):
-            values = np.asarray(getattr(recall, name))
+            values = derived[name] if name in derived else np.asarray(getattr(recall, name))
             data[name] = (array.shape if values.ndim == len(array.shape) else ("replica",), values, described(name))
     coordinates = {
         "signal": ("signal", names, described("signal")),
@@ -69,10 +71,26 @@ def recall_dataset(recall: Recall, names: list[str], configuration: Mapping[str,
     return xarray.Dataset(data, coordinates, about)
 
 
+def plain_cell(value: Any) -> Any:
+    """The value of a cell of CSV; before a text that spreadsheets would take for a formula an apostrophe is put."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@")) else value
+
+
 def recall_csv(recall: Recall, names: list[str]) -> str:
     """The recalled signals as CSV: u, and p_sig of every signal in E."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["u", *(f"p_sig of {name} (E)" for name in names)])
     writer.writerows(np.column_stack([recall.u, np.asarray(recall.p_sig).T]).tolist())
+    return text.getvalue()
+
+
+def each_csv(names: list[str], measures: Mapping[str, np.ndarray]) -> str:
+    """What is said of each signal by itself (`of_each`) as CSV, a row for each."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["signal", *(name.removeprefix("signal_") for name in measures)])
+    writer.writerows(
+        [name, *row] for name, row in zip(names, np.column_stack([*measures.values()]).tolist(), strict=True)
+    )
     return text.getvalue()

@@ -114,6 +114,10 @@ def load_pack(source: str | Path) -> Pack:
             label, record, shape = content.text("name"), content.text("record"), content.text("shape", "clump")
             isotropic = content.attributes["clump"].get("isotropic")
         _check(found, isotropic, label, shape, record)
+        require(
+            path != pack_called(str(source)) or label == str(source),
+            f"it is the pack {label}, not {source}: files were exchanged; make it again with gmem prepare",
+        )
         clump = Clump(
             **{key: jnp.asarray(found[f"clump/{key}"]) for key in _CLUMP}, isotropic=bool(isotropic), shape=shape
         )

@@ -26,7 +26,8 @@ from gmem_jax.files.checked import (
 from gmem_jax.files.configuration import signals_from
 from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
-from gmem_jax.files.labelled import recall_csv, recall_dataset
+from gmem_jax.files.labelled import each_csv, recall_csv, recall_dataset
+from gmem_jax.files.measures import EACH, of_each
 from gmem_jax.files.schemas import RECALL
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import DOUBTFUL, Status
@@ -49,7 +50,8 @@ def save_recall(path: str | Path, recall: Recall, configuration: dict[str, Any])
     with writing(Path(path), RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
         file.attrs["protocol"] = json.dumps(recall.protocol.to_list())
-        write_arrays(file, _declared(np.ndim(recall.dt)), {**vars(recall), "signal": names})
+        values = {**vars(recall), **of_each(recall, configuration), "signal": names}
+        write_arrays(file, _declared(np.ndim(recall.dt)), values)
         write_samples(file.create_group("stages"), recall.stages)
         if recall.frames is not None:
             write_frames(file, recall.frames)
@@ -102,8 +104,10 @@ class StoredRecall(NamedTuple):
     def _repr_html_(self) -> str:
         return self.recall._repr_html_()
 
-    def to_csv(self) -> str:
-        """The recalled signals as CSV: u, and p_sig of every signal in E."""
+    def to_csv(self, *, each: bool = False) -> str:
+        """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F."""
+        if each:
+            return each_csv(self.names, of_each(self.recall, self.configuration))
         return recall_csv(self.recall, self.names)
 
 
@@ -129,7 +133,8 @@ def load_recall(path: str | Path) -> StoredRecall:
 def _recall_of(content: Content) -> Recall:
     dt = content.datasets.get("dt")
     found = content.arrays(_declared(0 if dt is None else len(dt.shape)))
-    found.pop("signal")  # the configuration has them too
+    for name in ("signal", *EACH):  # the configuration has the names too, and the rest follows
+        found.pop(name)
     protocol = Protocol.from_list(json.loads(content.text("protocol")))
     return Recall(**found, stages=content.samples("stages"), protocol=protocol, frames=read_frames(content))  # type: ignore[arg-type]
 
@@ -144,6 +149,7 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
     require(isinstance(experiment, dict), "its configuration has an impossible 'experiment'")
     signals, form = configuration.get("signals", []), experiment.get("signals", {})
     require(isinstance(signals, list) and isinstance(form, dict), "its configuration has impossible 'signals'")
+    require(isinstance(configuration.get("warnings", []), list), "its configuration has impossible 'warnings'")
     if "target" in configuration:
         require_fields(configuration["target"], "target", kind=title)
         signals_from(configuration["target"])

@@ -124,12 +124,20 @@ RECALL = Schema(
         "windowed_gain": Array("real", (), "1", "G after a running mean over the ringing period"),
         "windowed_fidelity": Array("real", (), "1", "F after a running mean over the ringing period"),
         "window": Array("real", (), "t_c", "T1, that period"),
+        "signal_gain": Array("real", ("signal",), "1", "G of each signal by itself; NaN of silence"),
+        "signal_fidelity": Array("real", ("signal",), "1", "F of each signal by itself, with that gain"),
+        "signal_windowed_fidelity": Array("real", ("signal",), "1", "the same after a running mean over T1"),
+        "signal_correlation": Array("real", ("signal",), "1", "correlation of each p_sig with its J"),
         "residual_speed": Array("real", ("replica",), "1", "largest grain speed before the readout, over the walls'"),
         "status": Array("whole", ("replica",), "1", "bits of gm.Status; 0 is sound"),
         "dt": Array("real", (), "t_c", "time step; [replica] where t0 differs between replicas"),
     },
     _CONFIGURATION,
-    {"gmem-recall/2": "without names, time and u of the stages", "gmem-recall/1": f"{_UNSEALED} and I(u)"},
+    {
+        "gmem-recall/3": "without G and F of each signal",
+        "gmem-recall/2": "without names, time and u of the stages",
+        "gmem-recall/1": f"{_UNSEALED} and I(u)",
+    },
 )
 
 KERNEL = Schema(

@@ -35,6 +35,7 @@ class Status(enum.IntFlag):
     RESTLESS = 32768
     ROUNDED = 65536
     UNLOADED = 131072
+    OTHER_COMPRESSION = 262144
 
     @property
     def fatal(self) -> bool:
@@ -54,6 +55,7 @@ DOUBTFUL = (
     | Status.RESTLESS
     | Status.ROUNDED
     | Status.UNLOADED
+    | Status.OTHER_COMPRESSION
 )
 """The bits that warn and leave the numbers as they are; see `gmem_jax.experiment.validity`."""
 
@@ -76,6 +78,7 @@ SENTENCES = {
     Status.RESTLESS: "grains move far faster than the walls, as in unstable steps; use a smaller dt or hold_drag",
     Status.ROUNDED: "round-off is 1 % of p_sig or more; use a larger gamma0, or precision double if it was mixed",
     Status.UNLOADED: "the walls carried nothing during a whole bin, and lost the pack; use a larger t0",
+    Status.OTHER_COMPRESSION: "the pack was cycled with another delta0; use one that was prepared for this delta0",
 }
 
 

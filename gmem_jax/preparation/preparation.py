@@ -14,7 +14,7 @@ from gmem_jax import native
 from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.files.provenance import provenance
-from gmem_jax.physics import rotation
+from gmem_jax.physics import chance, rotation
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
@@ -71,7 +71,7 @@ def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array
     sites, spacing = sites_of(recipe, clump)
     cells = np.stack(np.meshgrid(*(np.arange(n) for n in sites), indexing="ij"), axis=-1).reshape(-1, 3)
     cells = cells[np.argsort(cells[:, 2], kind="stable")][: recipe.grains]  # a last layer may be incomplete
-    turn_key, velocity_key, spin_key = jax.random.split(jax.random.key(recipe.seed), 3)
+    turn_key, velocity_key, spin_key = jax.random.split(chance.key(recipe.seed), 3)
     scale, shape = recipe.gas_speed / math.sqrt(3.0), (recipe.grains, 3)
     return (
         (cells + 0.5) * spacing,

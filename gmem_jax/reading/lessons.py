@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from gmem_jax.experiment.signals import bin_average, bit_width, words
+from gmem_jax.physics import chance
 from gmem_jax.simulation.protocol import BINS
 
 RATIOS = 64  # of noise to signal at which the size of a set is calculated, and joined by straight lines: right to 1e-5
@@ -137,7 +138,7 @@ def _deviation(lessons: Lessons, draw: jax.Array) -> jax.Array:
 
 def examples(lessons: Lessons, seed: jax.typing.ArrayLike) -> Examples:
     """The training and validation set of a seed."""
-    shuffle, noise = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1))
+    shuffle, noise = jax.random.split(jax.random.fold_in(chance.key(seed), 1))
     order = jax.random.permutation(shuffle, lessons.combinations)
     table = _table(lessons)
     return Examples(table=table, level=_level(lessons, table), order=order, noise=noise, lessons=lessons)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from flax import linen as nn
 
+from gmem_jax.physics import chance
 from gmem_jax.reading.lessons import Lessons
 from gmem_jax.simulation.protocol import BINS
 
@@ -50,7 +51,7 @@ class Net:
 
 def initial(lessons: Lessons, seed: jax.typing.ArrayLike) -> Net:
     """The untrained net of a seed."""
-    key = jax.random.fold_in(jax.random.key(seed), 0)
+    key = jax.random.fold_in(chance.key(seed), 0)
     module = Perceptron(lessons.classes, lessons.hidden)
     return Net(module.init(key, jnp.zeros((1, BINS), jnp.float32))["params"], lessons)
 

@@ -29,6 +29,7 @@ from gmem_jax.files.checked import (
     whole,
 )
 from gmem_jax.files.seal import BLOCK, seal, sealed
+from gmem_jax.physics import chance
 from gmem_jax.reading.lessons import Examples, Lessons, examples
 from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
 from gmem_jax.simulation.protocol import BINS
@@ -50,7 +51,7 @@ def learn(
     A step depends on its number and the seed alone, so that training can be broken off and taken up anywhere.
     """
     optimiser = optax.sgd(net.lessons.rate)  # plain: its state is empty
-    key = jax.random.fold_in(jax.random.key(seed), 2)
+    key = jax.random.fold_in(chance.key(seed), 2)
 
     def step(net: Net, number: Any) -> tuple[Net, jax.Array]:
         inputs, word = data.training(jax.random.fold_in(key, number))

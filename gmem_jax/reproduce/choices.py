@@ -178,6 +178,12 @@ def draw(path: Path, found: Sequence[Effect], title: str) -> None:
     save(path, figure, also=(".svg",))
 
 
+def title(scale: Scale, packs: int) -> str:
+    """What stands over the picture of some packs."""
+    of = "one pack" if packs == 1 else f"mean ± SE over {packs} packs"
+    return f"What the paper leaves open\nN = {scale.grains:,}, $t_0$ = {scale.t0:,.0f} $t_c$, {of}"
+
+
 def _label(effect: Effect) -> str:
     default = effect.choice.values[0]
     shown = [f"{value:g}" if isinstance(value, float) else str(value) for value in (effect.value, default)]

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.files.atomic import atomic
@@ -165,8 +165,12 @@ def compare(points: Iterable[Point], t0: float) -> list[Compared]:
 def compared(conditions: Conditions, measure: str, values: Sequence[float], status: int) -> Compared:
     """The mean of a measure over packs, beside what is published of it."""
     mean, deviation, _ = spread(values)
+    return _beside(conditions, measure, Estimate(mean, deviation, len(values)), status)
+
+
+def _beside(conditions: Conditions, measure: str, ours: Estimate, status: int) -> Compared:
     theirs, grains = _published(conditions, measure)
-    return Compared(conditions, measure, Estimate(mean, deviation, len(values)), theirs, grains, status)
+    return Compared(conditions, measure, ours, theirs, grains, status)
 
 
 def _published(at: Conditions, measure: str) -> tuple[Estimate | None, int]:
@@ -217,6 +221,22 @@ def write_csv(path: Path, rows: Sequence[Compared]) -> None:
         writer.writeheader()
         for line in lines:
             writer.writerow({name: _cell(value) for name, value in line.items()})
+
+
+def read_csv(path: Path) -> list[Compared]:
+    """Ours of a table that `write_csv` wrote, beside the points that are published as far as is known now.
+
+    Raises:
+        OSError: if it cannot be read.
+        KeyError: if it is no such table.
+    """
+    kinds, found = get_type_hints(Conditions), []
+    with path.open(newline="") as file:
+        for line in csv.DictReader(file):
+            conditions = Conditions(**{name: kind(line[name]) for name, kind in kinds.items()})
+            ours = Estimate(float(line["mean"]), float(line["sd"] or math.nan), int(line["packs"]))
+            found.append(_beside(conditions, line["measure"], ours, int(line["status"])))
+    return found
 
 
 def _cell(value: Any) -> Any:

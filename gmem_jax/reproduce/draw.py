@@ -1,7 +1,7 @@
-"""The figures as pictures: ours with error bars, the published points as stars."""
+"""The figures as pictures: ours and the published points in two colours."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from gmem_jax.physics.material import Material
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, counted
 from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.recalls import MEAN, PALE, mean_over_ringing
 from gmem_jax.simulation.sample import Sample
 
 LABELS = {
@@ -31,28 +32,47 @@ LABELS = {
 PANELS = {"F": "fidelity F", "G": "gain G", "accuracy": "part of the words read right"}
 LOGARITHMIC = ("gamma0", "grains")
 SYMBOLS = "osD^v<>pPX"
+STYLES = ("-", "--", ":", "-.")
 VECTOR = (".svg",)
-TINT = 0.3  # of the stars of the same N; those of another are empty
+OURS, THEIRS, EITHER = "#1f5fa8", "#d1491b", "0.35"
+APART = 6.0  # printer's points between markers of one place: none lies under another
+LINE = 0.062  # of the height of a panel, that a line of its legend takes
 
 
 def _panel(measure: str) -> str:
     return PANELS[measure.split()[0]]
 
 
-def _written(value: str) -> str:
-    return value.upper() if value in BACKGROUNDS else value
+def _written(name: str, value: Any) -> str:
+    if not isinstance(value, float | int):
+        return str(value).upper() if value in BACKGROUNDS else str(value)
+    symbol = LABELS[name].split()[-1] if name in ("mu", "delta0", "gamma0") else LABELS.get(name, name)
+    return f"{symbol} = {value:g}"
 
 
 def _series(row: Compared, varied: Sequence[str]) -> str:
     """What tells a row's curve from the others."""
     at = asdict(row.conditions)
-    shown = [f"{name} = {at[name]:g}" if isinstance(at[name], float | int) else _written(at[name]) for name in varied]
-    reader = [" ".join(row.measure.split()[1:])]
-    return ", ".join(filter(None, [*shown, *reader])) or "gmem_jax"
+    reader = row.measure.partition(" ")[2]
+    return ", ".join(filter(None, [*(_written(name, at[name]) for name in varied), reader]))
+
+
+def _sizes(sizes: Iterable[int]) -> str:
+    return "N = " + ", ".join(f"{size:,}" for size in sorted(set(sizes)))
+
+
+def said_of(rows: Sequence[Compared], rate: str) -> str:
+    """The line under a title: our sizes, rate (t0 in t_c) and packs, and what error bars are."""
+    counts = sorted({row.ours.packs for row in rows})
+    over = f"{counts[0]} to {counts[-1]} packs" if len(counts) > 1 else f"{counts[0]} packs"
+    own = "one pack" if counts == [1] else f"mean ± SE over {over}"
+    sizes = sorted({row.conditions.grains for row in rows})
+    size = _sizes(sizes) if len(sizes) < 3 else f"N = {sizes[0]:,} to {sizes[-1]:,}"
+    return f"gmem_jax: {size}, $t_0$ = {rate} $t_c$, {own}"
 
 
 def against(path: Path, rows: Sequence[Compared], across: Sequence[str], title: str) -> None:
-    """G and F against a condition, with the published points; a curve for each combination of the others that vary.
+    """G and F against a condition, ours and the published points in two colours; a symbol for each curve.
 
     Args:
         path: file to write.
@@ -67,11 +87,12 @@ def against(path: Path, rows: Sequence[Compared], across: Sequence[str], title: 
     lines = {name: found for name, found in lines.items() if found} or {across[0]: rows}
     panels = list(dict.fromkeys(_panel(row.measure) for row in rows))
     shape = len(lines), len(panels)
-    figure, axes = pyplot().subplots(*shape, figsize=(5.2 * shape[1], 4.0 * shape[0]), squeeze=False)
+    figure, axes = pyplot().subplots(*shape, figsize=(5.2 * shape[1], 4.3 * shape[0]), squeeze=False)
     for line, (name, shown) in zip(axes, lines.items(), strict=True):
         for axis, panel in zip(line, panels, strict=True):
             _curves(axis, [row for row in shown if _panel(row.measure) == panel], name, panel)
-    figure.suptitle(title, fontsize=10)
+    beside = "; published: mean ± SE" if any(row.theirs for row in rows) else ""
+    figure.suptitle(title + beside, fontsize=10)
     save(path, figure, also=VECTOR)
 
 
@@ -90,19 +111,32 @@ def _varying(rows: Sequence[Compared], across: str) -> list[Compared]:
 
 
 def _curves(axis: Any, rows: Sequence[Compared], across: str, panel: str) -> None:
+    if panel == PANELS["G"] and across == "mu":
+        rows = _with_friction(axis, rows)
     at = [asdict(row.conditions) for row in rows]
     varied = [name for name in _others(across) if len({one[name] for one in at}) > 1]
     words = sorted({one[across] for one in at}) if across == "law" else []
     curves: dict[str, list[Compared]] = {}
     for row in rows:
         curves.setdefault(_series(row, varied), []).append(row)
-    for place, (label, members) in enumerate(curves.items()):
-        _curve(axis, members, across, words, label, place)
-    _say_published(axis, rows, across)
+    for place, members in enumerate(curves.values()):
+        _curve(axis, members, across, words, place, 2.0 * place - len(curves) + 0.5)
     _axis(axis, across, words, panel)
     if across == "grains" and panel == PANELS["G"]:
         _power_law(axis, rows)
-    axis.legend(fontsize=7, frameon=False)
+    _legend(axis, rows, across, [label for label in curves if label])
+
+
+def _with_friction(axis: Any, rows: Sequence[Compared]) -> Sequence[Compared]:
+    """The rows that have friction, if there are others too: those are said in words, for any G may come out of them."""
+    kept = [row for row in rows if row.conditions.mu]
+    without = [row for row in rows if not row.conditions.mu]
+    if not kept or not without:
+        return rows
+    told = [("gmem_jax", without[0].ours)] + ([("published", theirs)] if (theirs := without[0].theirs) else [])
+    said = ", ".join(f"{whose} {one.mean:.2f}{'' if one.packs < 2 else f' ± {one.error:.2f}'}" for whose, one in told)
+    axis.text(0.02, 0.03, f"not drawn: $\\mu$ = 0, {said}", transform=axis.transAxes, fontsize=7, color=EITHER)
+    return kept
 
 
 def _place(row: Compared, across: str, words: Sequence[str]) -> float:
@@ -110,59 +144,73 @@ def _place(row: Compared, across: str, words: Sequence[str]) -> float:
     return float(words.index(value) if words else value)
 
 
-def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str], label: str, place: int) -> None:
-    colour, symbol = f"C{place % 10}", SYMBOLS[place % len(SYMBOLS)]
+def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str], place: int, shifted: float) -> None:
+    """Ours, and the published points beside them; `shifted` by so many distances of markers."""
+    symbol, style = SYMBOLS[place % len(SYMBOLS)], STYLES[place % len(STYLES)]
     rows = sorted(rows, key=lambda row: _place(row, across, words))
-    x = [_place(row, across, words) for row in rows]
-    y, error = [row.ours.mean for row in rows], [np.nan_to_num(row.ours.error) for row in rows]
-    joined = "-" if len(rows) > 1 and not words else "none"
-    axis.errorbar(
-        x, y, error, color=colour, marker=symbol, markersize=4, capsize=3, linewidth=1, ls=joined, label=label
-    )
-    for grains, theirs in _published(rows, across).items():
-        axis.errorbar(
-            [row.grains if across == "grains" else _place(row, across, words) for row, _ in theirs],
-            [estimate.mean for _, estimate in theirs],
-            [np.nan_to_num(estimate.error) for _, estimate in theirs],
-            color=colour,
-            marker="*",
-            markersize=10,
-            markeredgecolor=colour,
-            markerfacecolor=(colour, TINT) if _same_size(grains, theirs) else "none",
-            capsize=2,
-            ls="none",
-            zorder=1.9,  # ours over it
-        )
+    ours = [(_place(row, across, words), row.ours) for row in rows]
+    joined = style if len(rows) > 1 and not words else "none"
+    _points(axis, ours, shifted, color=OURS, marker=symbol, ls=joined)
+    for (_, own), theirs in _published(rows, across).items():
+        places = [(row.grains if across == "grains" else _place(row, across, words), one) for row, one in theirs]
+        _points(axis, places, shifted + 1.0, color=THEIRS, marker=symbol, ls="none", mfc=THEIRS if own else "white")
 
 
-def _say_published(axis: Any, rows: Sequence[Compared], across: str) -> None:
-    """One line of the legend for the stars of all curves, whatever their colour."""
-    for grains, theirs in _published(rows, across).items():
-        face = ("0.4", TINT) if _same_size(grains, theirs) else "none"
-        said = f"published, N = {grains:,} (mean ± SE)" if grains else "published (mean ± SE)"
-        axis.plot([], [], "*", color="0.4", markersize=10, markeredgecolor="0.4", markerfacecolor=face, label=said)
+def _points(axis: Any, points: Sequence[tuple[float, Estimate]], shifted: float, **style: Any) -> None:
+    from matplotlib.transforms import ScaledTranslation
+
+    aside = ScaledTranslation(shifted * APART / 72.0, 0.0, axis.figure.dpi_scale_trans)
+    x, estimates = [place for place, _ in points], [estimate for _, estimate in points]
+    y, error = [one.mean for one in estimates], [np.nan_to_num(one.error) for one in estimates]
+    fixed = {"markersize": 5, "capsize": 2, "linewidth": 1}
+    axis.errorbar(x, y, error, transform=axis.transData + aside, **fixed, **style)
+    low, high = np.subtract(y, error), np.add(y, error)
+    axis.update_datalim(np.column_stack([[*x, *x], [*low, *high]]))  # which moved points do not do by themselves
+    axis.autoscale_view()
 
 
-def _same_size(grains: int, theirs: Sequence[tuple[Compared, Estimate]]) -> bool:
-    return not grains or all(row.conditions.grains == grains for row, _ in theirs)
+def _legend(axis: Any, rows: Sequence[Compared], across: str, labels: Sequence[str]) -> None:
+    """Whose the colours are and at which N, and what the symbols are; in room of its own over all points."""
+    on_axis = across == "grains"
+    size = "" if on_axis else f", {_sizes(row.conditions.grains for row in rows)}"
+    axis.plot([], [], "s", color=OURS, label=f"gmem_jax{size}")
+    for grains, own in _published(rows, across):
+        face = THEIRS if own else "white"
+        said = "published" if on_axis or not grains else f"published, N = {grains:,}"
+        axis.plot([], [], "s", color=THEIRS, mfc=face, label=said)
+    for place, label in enumerate(labels):
+        style = STYLES[place % len(STYLES)]
+        axis.plot([], [], SYMBOLS[place % len(SYMBOLS)], ls=style, color=EITHER, mfc="white", ms=5, lw=1, label=label)
+    count = len(axis.get_legend_handles_labels()[1])
+    room = LINE * -(-count // 2) + 0.03
+    low, high = axis.get_ylim()
+    if axis.get_yscale() == "log":
+        axis.set_ylim(low, low * (high / low) ** (1.0 / (1.0 - room)))
+    else:
+        axis.set_ylim(low, low + (high - low) / (1.0 - room))
+    axis.legend(fontsize=7, frameon=False, loc="upper left", ncols=2)
 
 
-def _published(rows: Sequence[Compared], across: str) -> dict[int, list[tuple[Compared, Estimate]]]:
-    """The published points of a curve by their N; where N is the axis, each once, under 0."""
+def _published(rows: Sequence[Compared], across: str) -> dict[tuple[int, bool], list[tuple[Compared, Estimate]]]:
+    """The published points of a curve by their N, and whether it is ours; where N is the axis, each once, under 0."""
     known = [(row, row.theirs) for row in rows if row.theirs]
     if across == "grains":
-        return {0: list({row.grains: (row, theirs) for row, theirs in known}.values())} if known else {}
-    sizes = sorted({row.grains for row, _ in known})
-    return {grains: [pair for pair in known if pair[0].grains == grains] for grains in sizes}
+        return {(0, True): list({row.grains: (row, theirs) for row, theirs in known}.values())} if known else {}
+    found: dict[tuple[int, bool], list[tuple[Compared, Estimate]]] = {}
+    for row, theirs in known:
+        found.setdefault((row.grains, row.grains == row.conditions.grains), []).append((row, theirs))
+    return dict(sorted(found.items()))
 
 
 def _axis(axis: Any, across: str, words: Sequence[str], label: str) -> None:
     axis.set_xlabel(LABELS[across])
     axis.set_ylabel(label)
+    axis.margins(x=0.1)
     if label != PANELS["G"]:
         axis.set_ylim(0.0, 1.03)
+        axis.set_yticks(np.linspace(0.0, 1.0, 6))
     elif across != "grains" and axis.get_ylim()[0] > 0.0:  # a gain without friction has either sign
-        axis.set_ylim(0.0, 1.08 * axis.get_ylim()[1])
+        axis.set_ylim(0.0, 1.04 * axis.get_ylim()[1])
     if words:
         axis.set_xticks(range(len(words)), words)
         axis.margins(x=0.2)
@@ -280,13 +328,20 @@ def waveforms(path: Path, bits: int = 5) -> None:
         line[0].legend(fontsize=7, frameon=False)
     for axis in axes[-1]:
         axis.set_xlabel("u")
-    save(path, figure, also=VECTOR)
+    caption = (
+        "What is stored and what is remembered. Solid: the waveform I(u), the shear while the pack is compressed from "
+        f"u = 0 to 1; dashed: its integral J(u), scaled. Above the six signals, below six of the {1 << bits} words of "
+        f"{bits} bits."
+    )
+    save(path, figure, also=VECTOR, caption=caption)
 
 
 def words(
     path: Path, recalls: Sequence[tuple[Recall, dict[str, Any]]], shown: Sequence[Sequence[int]], title: str
 ) -> None:
     """Recalled words (SUB2-BL) beside their scaled integrals, a line of panels for each length, like Fig. 13.
+
+    Where the drive rings, what counts is drawn over it: the running mean over the ringing period.
 
     Args:
         path: file to write.
@@ -300,25 +355,39 @@ def words(
     plt = pyplot()
     columns = max(map(len, shown))
     figure, axes = plt.subplots(
-        len(recalls), columns, figsize=(1.9 * columns, 2.1 * len(recalls) + 0.5), sharex=True, squeeze=False
+        len(recalls),
+        columns,
+        figsize=(1.9 * columns, 2.1 * len(recalls) + 0.5),
+        sharex=True,
+        sharey=True,
+        squeeze=False,
     )
     unit = Material().modulus
     for line, (recall, configuration), chosen in zip(axes, recalls, shown, strict=True):
         stored = stored_words(recall)
         gain, fidelity = (float(getattr(recall, name)) for name in counted(configuration["t0"]))
         scale = unit * gain * configuration["delta0"] * configuration["gamma0"]
+        smooth = mean_over_ringing(recall, np.asarray(stored.signals), configuration["t0"])
         for axis, word in zip(line, chosen, strict=False):
             axis.axhline(0.0, color="0.8", linewidth=0.8)
-            axis.plot(recall.u, unit * stored.signals[word], linewidth=1.0, label="recalled, SUB2-BL")
-            axis.plot(
-                recall.u, scale * stored.templates[word], "C3--", linewidth=1.0, label=r"$G E \delta_0 \gamma_0 J$"
-            )
+            strong = stored.signals if smooth is None else smooth
+            if smooth is not None:
+                axis.plot(recall.u, unit * stored.signals[word], color=PALE, linewidth=0.8)
+            axis.plot(recall.u, unit * strong[word], color=OURS, linewidth=1.1)
+            axis.plot(recall.u, scale * stored.templates[word], "--", color=THEIRS, linewidth=1.1)
             axis.set_title(f"{word:0{stored.bits}b}", fontsize=8)
         for axis in line[len(chosen) :]:
             axis.set_visible(False)
         line[0].set_ylabel(f"L = {stored.bits}\nF = {fidelity:.2f}\nstress (Pa)", fontsize=8)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=7, frameon=False, loc="upper right", ncols=2)
-    for axis in axes[-1]:
-        axis.set_xlabel("u")
+        line[0].tick_params(labelleft=True)
+    for column in axes.T:
+        lowest = [axis for axis in column if axis.get_visible()][-1]
+        lowest.tick_params(labelbottom=True)
+        lowest.set_xlabel("u")
     figure.suptitle(title, fontsize=10)
-    save(path, figure, also=VECTOR)
+    ringing = any(
+        mean_over_ringing(recall, np.asarray(recall.p_sig), known["t0"]) is not None for recall, known in recalls
+    )
+    drawn = f"Pale: recalled, SUB2-BL; blue: {MEAN}" if ringing else "Blue: recalled, SUB2-BL"
+    caption = rf"{drawn}; red: $G E \delta_0 \gamma_0 J$. All panels have one scale."
+    save(path, figure, also=VECTOR, caption=caption)

@@ -24,12 +24,14 @@ from gmem_jax.reproduce.compare import Compared, Conditions, Point, compare, com
 from gmem_jax.reproduce.figures import FIGURES, SHOWN_WORD, Figure, Scale, Values, packs, scale_of, shown_packs, spec_of
 from gmem_jax.reproduce.single_contact import convergence_figure, laws_figure
 from gmem_jax.reproduce.two_grains import two_grains_figure
+from gmem_jax.show import tables
 from gmem_jax.show.figures import recall_figure
 from gmem_jax.show.render import packs_figure
 from gmem_jax.show.tables import summary
 from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.progress import Progress, silent
 from gmem_jax.sweeps.executors import Executor, Processes
+from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SIDE_BY_SIDE, Conductor
@@ -131,7 +133,8 @@ def weigh(
     size, folder = scale_of(scale, choices.SIZES), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     named = packs(size, size.grains, size.few)
-    spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.points(named)))
+    same = {AS_THEY_ARE: True}  # a choice is weighed on the same packs
+    spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.points(named)), run=same)
     store = _run(spec, folder, executor, progress, say).store
     done = store.done()
     rows = [row for row in store.card()["points"] if row["key"] in done]
@@ -140,8 +143,7 @@ def weigh(
     if not found:
         return Weighed([], [], _failed(store))
     choices.write_csv(target.with_suffix(".csv"), found)
-    what = f"{scale}: {size.grains:,} grains, t$_0$ = {size.t0:g} t$_c$, packs: {found[0].gain.packs}"
-    choices.draw(target, found, f"What the paper leaves open ({what})")
+    choices.draw(target, found, choices.title(size, found[0].gain.packs))
     return Weighed(found, [target, target.with_suffix(".svg"), target.with_suffix(".csv")], _failed(store))
 
 
@@ -244,7 +246,7 @@ def reproduce(
     if name == "fig14":
         rows += read_words(folder, store, points, size, say)
     write_csv(target.with_suffix(".csv"), rows)
-    title = f"{FIGURES[name].title} ({scale}: t$_0$ = {size.t0:g} t$_c$)"
+    title = f"{FIGURES[name].title}\n{draw.said_of(rows, f'{size.t0:,.0f}')}"
     _draw(FIGURES[name], name, target, rows, points, store, title)
     files = [target, target.with_suffix(".svg"), target.with_suffix(".csv")]
     return Outcome(name, rows, files, failed)
@@ -264,11 +266,12 @@ def _draw(
         return
     recall, configuration = store.load(points[0].key)
     if name == "fig04":
-        draw.through_time(target, recall, 5, f"{configuration['pack']}: {title}")
+        draw.through_time(target, recall, 5, title)
     elif name == "fig06":
         scale = float(configuration["delta0"]) * float(configuration["gamma0"])
         for suffix in (".png", ".svg"):
-            recall_figure(target.with_suffix(suffix), recall, scale, str(points[0].numbers["pack"]))
+            heading, t0 = tables.heading(configuration), configuration["t0"]
+            recall_figure(target.with_suffix(suffix), recall, scale, heading, configuration["signals"], t0)
     else:
         kept = [store.load(point.key) for point in points]
         draw.words(target, kept, [_shown(point.conditions.bits) for point in points], title)

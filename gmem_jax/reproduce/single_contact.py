@@ -84,9 +84,15 @@ def laws_figure(path: Path, points: int = 200) -> dict[str, float]:
     unit = "$f_e / k$  (H: $R$;  M1, M2: $R^{3/2}$)"
     middle.set(xlabel="position on the path (corner number)", ylabel=unit, title="along the path")
     right.set(xlabel="overlap $p$ ($R$)", ylabel=unit, title="unloading, 4 to 5")
+    middle.set_ylim(top=1.4)  # room for the legend
     middle.legend(frameon=False, fontsize=7, loc="upper left")
     right.legend(frameon=False, fontsize=8)
-    save(path, figure, also=(".svg",))
+    caption = (
+        "One contact, led along a path of overlap and tangential displacement (left): the friction force of every law "
+        "along it (middle), and on unloading beside the closed forms (right). M2 remembers at which overlap it was "
+        "displaced."
+    )
+    save(path, figure, also=(".svg",), caption=caption)
     names = [f"force_{name.replace(', ', '_').replace(' ', '_')}_k" for name in forces]
     write_columns(path.with_suffix(".csv"), ["p_R", "sigma_R", *names], [overlap, displacement, *forces.values()])
     inside = slice(last.start, -1)  # at p = 0 there is no contact any more
@@ -148,9 +154,14 @@ def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]
     right.set(xlabel="number of points Q", ylabel=r"rms deviation / $k_M$  ($R^{3/2}$)", title="convergence")
     right.set_xticks(COUNTS, [str(count) for count in COUNTS])
     right.minorticks_off()
-    right.set_ylim(5e-6, 5e-2)
+    right.set_ylim(2e-7, 5e-2)  # room for the legend
     right.legend(frameon=False, fontsize=8, loc="lower left")
-    save(path, figure, also=(".svg",))
+    caption = (
+        "How many points Q of its history law M2 needs: the force on unloading (left), its deviation from the exact "
+        "one (middle), and the root mean square of that against Q (right), for the paper's weights, with and without "
+        "its h term, and ours."
+    )
+    save(path, figure, also=(".svg",), caption=caption)
     shown = {f"{form.replace(', ', ' ')} Q={count}": forces[form, count] for form in FORMS for count in (20, 100, 400)}
     write_columns(path.with_suffix(".csv"), ["p_R", "exact_kM", *shown], [overlap, exact, *shown.values()])
     return errors

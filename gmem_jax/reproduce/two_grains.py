@@ -107,6 +107,7 @@ def two_grains_figure(path: Path, count: int = 96, gamma0: float = 1e-3) -> dict
     for edge in (1.0, 1.0 + STORE):
         middle.axvline(edge, color="0.7", linewidth=0.7)
     middle.set(xlabel="time ($t_0$): compression, storage, decompression", ylabel="friction force ($E R^2$)")
+    middle.set_ylim(top=1.5 * middle.get_ylim()[1])  # room for the legend
     middle.legend(frameon=False, fontsize=7)
     right.plot(u, story.recalled, label=f"mean force in {count} contacts, reversed")
     right.plot(u, float(match.gain) * integral[0], "C3--", label=r"$\propto J(u)$, the integral of the shear")
@@ -115,7 +116,12 @@ def two_grains_figure(path: Path, count: int = 96, gamma0: float = 1e-3) -> dict
     right.set_title(f"decompression: F = {float(match.fidelity):.3f}", fontsize=9)
     right.legend(frameon=False, fontsize=7, loc="upper left")
     right.set_ylim(top=1.45 * story.recalled.max())
-    save(path, figure, also=(".svg",))
+    caption = (
+        "How a contact keeps the shear. Left: two grains that the compression brings together at u = $u_c$. Middle: "
+        "the friction forces of three such contacts follow the shear from then on; what is left at u = 1 is released "
+        f"where it was taken up. Right: the mean of {count} contacts on the way back is the integral of the waveform."
+    )
+    save(path, figure, also=(".svg",), caption=caption)
     names = [f"force_{story.closes[contact]:.3f}_ER2" for contact in shown]
     columns = [story.time, story.u, story.shear, *story.force[:, shown].T]
     write_columns(path.with_suffix(".csv"), ["time_t0", "u", "gamma", *names], columns)

@@ -1,5 +1,6 @@
 """Pictures. Matplotlib is imported on first use, and without a display."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,25 +27,32 @@ def pyplot() -> Any:
     return plt
 
 
-def save(path: Path, figure: Any, *, also: Sequence[str] = ()) -> None:
+def save(path: Path, figure: Any, *, also: Sequence[str] = (), caption: str = "") -> None:
     """Write a figure whole, and close it.
 
     Args:
         path: in the format of its suffix.
         figure: of matplotlib.
         also: further suffixes to write it under.
+        caption: what is seen, in words under it.
 
     Raises:
         OSError: if it cannot be written.
     """
-    figure.tight_layout()
+    lines = textwrap.wrap(caption, int(14 * figure.get_figwidth()))
+    below = 0.2 * len(lines) / figure.get_figheight()
+    figure.tight_layout(rect=(0.0, below, 1.0, 1.0))
+    if lines:
+        figure.text(0.02, 0.3 * below / len(lines), "\n".join(lines), va="bottom", fontsize=9)
     for target in (path, *(path.with_suffix(suffix) for suffix in also)):
         with atomic(target) as temporary:
             figure.savefig(temporary, format=target.suffix.removeprefix("."), dpi=130)
     pyplot().close(figure)
 
 
-def recall_figure(path: Path, recall: Recall, scale: Scalar, title: str, names: Sequence[str] | None = None) -> None:
+def recall_figure(
+    path: Path, recall: Recall, scale: Scalar, title: str, names: Sequence[str] | None = None, t0: Any = None
+) -> None:
     """p_sig of every signal, its scaled integral G E delta0 gamma0 J, and I(u), like the paper's Fig. 6.
 
     Args:
@@ -53,12 +61,13 @@ def recall_figure(path: Path, recall: Recall, scale: Scalar, title: str, names: 
         scale: delta0 gamma0, scalar or [S, 1].
         title: over the picture.
         names: of the signals; default their numbers.
+        t0: duration of one compression in t_c: see `signals_drawing`.
 
     Raises:
         OSError: if the path cannot be written.
     """
     called = names or [f"signal {number + 1}" for number in range(len(recall.J))]
-    signals_drawing(recall, called, title, scale).save(path)
+    signals_drawing(recall, called, title, scale, t0).save(path)
 
 
 def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:

@@ -1,7 +1,7 @@
 """What any file that a command writes holds: facts, lines for a person, and the pictures that can be drawn of it."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +37,7 @@ class Shown(NamedTuple):
         facts: as one JSON object.
         lines: tables and lines for a person.
         pictures: what writes them, by name; the first says most.
-        csv: makes the recalled signals, for a recall.
+        csv: makes the recalled signals, or a row for each, for a recall.
     """
 
     facts: dict[str, Any]
@@ -46,17 +46,27 @@ class Shown(NamedTuple):
     csv: Callable[[], str] | None = None
 
 
-def shown(file: Path, against: str = "time") -> Shown:
+def shown(file: Path, against: str = "time", signals: Sequence[int] = (), *, each: bool = False) -> Shown:
     """What a file, a pack or the folder of a sweep holds.
 
     Args:
         file: its path, or the name of a pack.
         against: "time" or "u": what pictures of stages are drawn over.
+        signals: numbers of those that pictures of a recall show; default all.
+        each: whether a recall tells of each signal by itself, however many there are.
 
     Raises:
+        ValueError: if signals are chosen of what is no recall.
         FileNotFoundError: if it is not there.
         FileFormatError: if it is of no kind that commands write, or damaged.
     """
+    found = _held(file, against, signals, each)
+    if signals and found.csv is None:
+        raise ValueError(f"{file}: holds no recall whose signals could be chosen")
+    return found
+
+
+def _held(file: Path, against: str, signals: Sequence[int], each: bool) -> Shown:
     if pack_called(str(file)):
         return _pack(file, against)
     suffix = file.suffix.lower()
@@ -72,22 +82,23 @@ def shown(file: Path, against: str = "time") -> Shown:
     if kind in (PACK.name, *PACK.before):
         return _pack(file, against)
     if kind in (RECALL.name, *RECALL.before):
-        return _recall(file, against)
+        return _recall(file, against, signals, each)
     known = ", ".join(schema.name for schema in (RECALL, PACK, KERNEL))
     raise FileFormatError(f"{file}: schema is {kind[:40]!r}, expected one of {known}")
 
 
-def _recall(file: Path, against: str) -> Shown:
+def _recall(file: Path, against: str, signals: Sequence[int], each: bool) -> Shown:
     stored = load_recall(file)
     recall, configuration = stored
     row = tables.summary(recall, configuration)
 
     def draw(what: str, path: Path) -> None:
-        recall_drawing(recall, what, configuration, against=against).save(path)
+        recall_drawing(recall, what, configuration, against=against, signals=signals).save(path)
 
     drawn: dict[str, Draw] = {what: functools.partial(draw, what) for what in PICTURES}
     facts = {**row, "configuration": configuration}
-    return Shown(facts, tables.recall_lines(row, configuration), drawn, stored.to_csv)
+    lines = tables.recall_lines(row, configuration, each=each)
+    return Shown(facts, lines, drawn, functools.partial(stored.to_csv, each=each))
 
 
 def _pack(file: Path, against: str) -> Shown:
@@ -254,14 +265,15 @@ def _waveforms(file: Path) -> Shown:
     return Shown(facts, ["\n".join(lines)], drawn)
 
 
-def sweep_pictures(store: Store) -> dict[str, Draw]:
-    """Each measure of the points of a sweep against the first of its names that varies.
+def sweep_pictures(store: Store, **chosen: Any) -> dict[str, Draw]:
+    """Each measure of the points of a sweep; `chosen` are x, by and over of `gmem_jax.sweeps.curves.axes_of`.
 
     Raises:
         FileFormatError: if there is no sweep, or a result is damaged.
     """
 
     def draw(measure: str, path: Path) -> None:
-        pictures.sweep_drawing(table.rows(store), store.card()["names"], measure, store.folder.name).save(path)
+        names, title = store.card()["names"], store.folder.name
+        pictures.sweep_drawing(table.rows(store), names, measure, title, **chosen).save(path)
 
     return {measure: functools.partial(draw, measure) for measure in sorted(MEASURES)}

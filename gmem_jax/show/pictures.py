@@ -9,12 +9,15 @@ import numpy as np
 from gmem_jax.design.kernel import MemoryKernel
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import Signals
+from gmem_jax.files.checked import is_number
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.state import Grains
 from gmem_jax.show.drawing import Drawing, blank
 from gmem_jax.show.tables import cell
+from gmem_jax.sweeps.curves import axes_of, lines_of
 
+FEW_LINES = 6  # whose names fit inside the axes
 _LABELS = {
     "gain": "gain G",
     "fidelity": "fidelity F",
@@ -124,21 +127,49 @@ def waves_drawing(signals: Signals, target: Signals | None, title: str) -> Drawi
     return drawing
 
 
-def sweep_drawing(rows: Sequence[Mapping[str, Any]], names: Sequence[str], measure: str, title: str) -> Drawing:
-    """A measure of every point against the first number that varies, else the first name that does; means at each."""
+def sweep_drawing(
+    rows: Sequence[Mapping[str, Any]], names: Sequence[str], measure: str, title: str, **chosen: Any
+) -> Drawing:
+    """A measure of the points of a sweep; several at one place as dots, their mean and its standard error.
+
+    Args:
+        rows: of the points (`gmem_jax.sweeps.table.rows`).
+        names: that vary.
+        measure: one of `MEASURES`.
+        title: of the picture.
+        **chosen: `x`, `by` and `over` of `axes_of`.
+
+    Raises:
+        ValueError: if no point is done, or the choice cannot be (see `axes_of`).
+    """
+    from matplotlib import colormaps
+
     done = [row for row in rows if row["state"] == "done"]
-    varying = [name for name in names if len({row[name] for row in done}) > 1] or list(names[:1])
-    counted = [name for name in varying if all(isinstance(row[name], int | float) for row in done)]
-    along, numbers = (counted or varying)[0], bool(counted)
-    values = sorted({row[along] for row in done}, key=lambda value: value if numbers else str(value))
-    place = {value: value if numbers else number for number, value in enumerate(values)}
-    drawing, ((axis,),) = blank(size=(6.4, 4.0))
-    axis.plot([place[row[along]] for row in done], [row[measure] for row in done], "o", color="C0", alpha=0.5)
-    means = [np.mean([row[measure] for row in done if row[along] == value]) for value in values]
-    axis.plot([place[value] for value in values], means, "-", color="C0", label="mean of the points there")
-    if not numbers:
-        axis.set_xticks(range(len(values)), [cell(value)[:24] for value in values], rotation=30, ha="right")
-    axis.set(xlabel=along, ylabel=_LABELS[measure])
-    axis.set_title(f"{title}: {len(done)} of {len(rows)} points", fontsize=10)
-    axis.legend(fontsize=7, frameon=False)
+    if not done:
+        raise ValueError(f"{title}: no point is done, so there is nothing to draw")
+    axes = axes_of(done, names, **chosen)
+    lines = lines_of(done, axes, measure)
+    places = {value for line in lines for value in line.x}
+    ticks = [] if all(map(is_number, places)) else sorted(places, key=str)
+    few = len(lines) <= FEW_LINES
+    drawing, ((axis,),) = blank(size=(6.4 if few else 8.6, 4.0))
+    for number, line in enumerate(lines):
+        colour: Any = f"C{number}" if len(lines) <= 10 else colormaps["viridis"](number / len(lines))
+        label = ", ".join(f"{name} = {cell(value)}" for name, value in line.values.items())
+        at = [ticks.index(value) if ticks else value for value in line.x]
+        look = {"fmt": "o" if ticks else "o-", "color": colour, "markersize": 4, "capsize": 3}
+        axis.errorbar(at, line.mean, line.error if line.most > 1 else None, **look, label=label)
+        if line.most > 1:
+            dots = [(place, value) for place, values in zip(at, line.each, strict=True) for value in values]
+            axis.plot(*np.transpose(dots), ".", color=colour, alpha=0.35, markersize=5)
+    if ticks:
+        axis.set_xticks(range(len(ticks)), [cell(value)[:24] for value in ticks], rotation=30, ha="right")
+    axis.set(xlabel=axes.x, ylabel=_LABELS[measure])
+    counts = [len(values) for line in lines for values in line.each]
+    samples = f"n = {min(counts)}" + (f" to {max(counts)}" if max(counts) > min(counts) else "")
+    several = f"mean ± SE over {', '.join(axes.over) or 'points'}, {samples}" if max(counts) > 1 else ""
+    drawing.title(f"{title}: {len(done)} of {len(rows)} points", several)
+    if axes.by:
+        where: dict[str, Any] = {"frameon": False, "fontsize": 7}
+        axis.legend(**where) if few else drawing.figure.legend(loc="outside right", **where)
     return drawing

@@ -9,6 +9,7 @@ from gmem_jax.design.kernel import MemoryKernel
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.checked import optional
 from gmem_jax.physics.material import Material
+from gmem_jax.show.recalls import PALE, mean_over_ringing
 from gmem_jax.simulation.protocol import BINS
 from gmem_jax.simulation.sample import Sample
 
@@ -63,15 +64,18 @@ def _panels(count: int, columns: int, titles: Sequence[str], **more: Any) -> Any
 
 
 def recalls(
-    recall: Recall, scale: np.ndarray, names: Sequence[str], target: np.ndarray | None = None
+    recall: Recall, scale: np.ndarray, names: Sequence[str], target: np.ndarray | None = None, t0: Any = None
 ) -> tuple[Any, int]:
     """p_sig of the first signals beside G E delta0 gamma0 J, like the paper's Fig. 6; the figure and its height.
+
+    Its mean over the ringing period too, where `mean_over_ringing` has one.
 
     Args:
         recall: what to draw.
         scale: delta0 gamma0, scalar or [S, 1].
         names: of the signals.
         target: J that designed waveforms should give, [S, 256].
+        t0: duration of a compression in t_c, if it is known and the same for all.
     """
     unit = Material().modulus
     shown = min(len(names), MOST)
@@ -82,6 +86,9 @@ def recalls(
         ("recalled p<sub>sig</sub>", np.asarray(recall.p_sig), COLOURS[0], {}),
         ("G E δ<sub>0</sub> γ<sub>0</sub> J", integrals, COLOURS[1], {"dash": "dash"}),  # noqa: RUF001
     ]
+    if (smooth := mean_over_ringing(recall, np.asarray(recall.p_sig), t0)) is not None:
+        curves[0] = (*curves[0][:2], PALE, {})
+        curves.insert(1, ("its mean over the ringing period", smooth, COLOURS[0], {}))
     if target is not None:
         p_sig, wanted = np.asarray(recall.p_sig), scale * target
         gain = np.sum(wanted * p_sig) / np.sum(wanted * wanted)
@@ -229,13 +236,20 @@ def kernel(found: MemoryKernel, noise: float) -> tuple[Any, int]:
 
 
 def curves(
-    rows: Mapping[str, tuple[np.ndarray, np.ndarray]], x: str, y: str, *, mode: str = "lines", log: bool = False
+    rows: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    x: str,
+    y: str,
+    *,
+    mode: str = "lines",
+    log: bool = False,
+    errors: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[Any, int]:
-    """Several curves by name in one panel."""
+    """Several curves by name in one panel, with errors where there are any."""
     figure = _plotly("graph_objects").Figure()
     for number, (name, (places, values)) in enumerate(rows.items()):
         colour = COLOURS[number % len(COLOURS)]
-        figure.add_trace(_line(places, values, name, colour).update(mode=mode))
+        more = {"error_y": {"array": np.float32(errors[name])}} if errors else {}
+        figure.add_trace(_line(places, values, name, colour, **more).update(mode=mode))
     figure.update_xaxes(title_text=x, range=[0.0, 1.0] if x == U else None)
     figure.update_yaxes(title_text=y, type="log" if log else "linear")
     return figure, 380

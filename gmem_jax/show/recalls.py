@@ -2,14 +2,18 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.analysis import running_mean
+from gmem_jax.experiment.experiment import PAPER_T0, Experiment
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.checked import is_number
 from gmem_jax.files.configuration import resolved
+from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
@@ -18,6 +22,7 @@ from gmem_jax.show.drawing import Drawing, blank
 from gmem_jax.show.stages import AGAINST, QUANTITIES, stages_drawing
 
 MOST = 64  # panels of one picture
+MEAN, PALE = "its mean over the ringing period $T_1$", "#a9c6e6"
 
 
 PICTURES = ("signals", "waveforms", "all", *QUANTITIES)
@@ -25,7 +30,12 @@ PICTURES = ("signals", "waveforms", "all", *QUANTITIES)
 
 
 def recall_drawing(
-    recall: Recall, what: str = "signals", configuration: Mapping[str, Any] | None = None, *, against: str = "time"
+    recall: Recall,
+    what: str = "signals",
+    configuration: Mapping[str, Any] | None = None,
+    *,
+    against: str = "time",
+    signals: Sequence[int] = (),
 ) -> Drawing:
     """A picture of a recall.
 
@@ -36,9 +46,10 @@ def recall_drawing(
             "inertial".
         configuration: the resolved one, for names, conditions and t0.
         against: "time" or "u", for the stages.
+        signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
 
     Raises:
-        ValueError: if there is no such picture.
+        ValueError: if there is no such picture, or no such signal.
     """
     known = dict(configuration or {})
     names = signal_names(recall, known)
@@ -48,23 +59,59 @@ def recall_drawing(
         raise ValueError(
             f"{what!r} against {against!r}: pictures of a recall are {', '.join(PICTURES)}, against time or u"
         )
+    _refuse_unknown(signals, len(names), lowest=0 if found in QUANTITIES else 1)
+    t0 = known.get("t0")
+    if found in QUANTITIES:
+        chosen = {names[number - 1] if number else "zero signal": number for number in signals}
+        time = t0 if is_number(t0) else None
+        return stages_drawing(recall.stages, found, title, against=against, t0=time, chosen=chosen)
+    scale = relative_scale(known) if known else None
+    if signals:
+        rows = np.asarray(signals) - 1
+        title += f"; G and F are of all {len(names)} signals"
+        names = [names[row] for row in rows]
+        if scale is not None and np.ndim(scale):
+            scale = np.asarray(scale)[rows]
+        recall = replace(recall, **{name: np.asarray(getattr(recall, name))[rows] for name in ("p_sig", "J", "shear")})
     if found == "signals":
-        return signals_drawing(recall, names, title, tables.relative_scale(known) if known else None)
+        return signals_drawing(recall, names, title, scale, t0)
     if found == "waveforms":
         return waveforms_drawing(recall, names, title)
-    if found == "all":
-        return image_drawing(recall, names, title)
-    t0 = known.get("t0")
-    return stages_drawing(recall.stages, found, title, against=against, t0=t0 if is_number(t0) else None)
+    return image_drawing(recall, names, title)
 
 
-def plot(recall: Recall, what: str, experiment: Experiment | None, against: str) -> Drawing:
+def _refuse_unknown(signals: Sequence[int], count: int, lowest: int) -> None:
+    for number in signals:
+        if not lowest <= number <= count:
+            more = ", and 0, the zero signal" if lowest == 0 else ""
+            raise ValueError(f"signal {number}: this picture can show 1 to {count}{more}")
+
+
+def plot(recall: Recall, what: str, experiment: Experiment | None, against: str, signals: Sequence[int]) -> Drawing:
     """What `Recall.plot` calls."""
-    return recall_drawing(recall, what, None if experiment is None else resolved(experiment, 0.0), against=against)
+    known = None if experiment is None else resolved(experiment, 0.0)
+    return recall_drawing(recall, what, known, against=against, signals=signals)
 
 
-def signals_drawing(recall: Recall, names: Sequence[str], title: str, scale: Scalar | None = None) -> Drawing:
+def mean_over_ringing(recall: Recall, signals: np.ndarray, t0: Any) -> np.ndarray | None:
+    """Signals [S, 256] averaged over the ringing period; None at the paper's rate, or an unknown one.
+
+    Args:
+        recall: whose ringing period it is.
+        signals: p_sig, by any background.
+        t0: duration of one compression, in t_c.
+    """
+    if not is_number(t0) or t0 >= PAPER_T0 or not np.isfinite(recall.window):
+        return None
+    return np.asarray(running_mean(jnp.asarray(signals), float(recall.window) / t0 * signals.shape[-1]))
+
+
+def signals_drawing(
+    recall: Recall, names: Sequence[str], title: str, scale: Scalar | None = None, t0: Any = None
+) -> Drawing:
     """p_sig of every signal, its scaled integral, and the waveform, like the paper's Fig. 6; at most 64 panels.
+
+    Faster than the paper's rate the drive rings: the mean over the ringing period is drawn over what was recalled.
 
     Args:
         recall: what to draw.
@@ -72,6 +119,7 @@ def signals_drawing(recall: Recall, names: Sequence[str], title: str, scale: Sca
         title: over the picture.
         scale: delta0 gamma0, scalar or [S, 1]; without it the integral that comes nearest is drawn, which is the same
             where all signals have one scale.
+        t0: duration of one compression in t_c, if it is known and the same for all.
     """
     pascal = Material().modulus
     u, signals, integrals, waves = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J, recall.shear))
@@ -79,6 +127,7 @@ def signals_drawing(recall: Recall, names: Sequence[str], title: str, scale: Sca
         fitted = integrals * np.sum(integrals * signals) / np.sum(integrals * integrals)
     else:
         fitted = float(recall.gain) * np.asarray(scale) * integrals
+    smooth = mean_over_ringing(recall, signals, t0)
     shown = min(len(signals), MOST)
     drawing, axes = _panels(shown)
     rights = []
@@ -89,7 +138,10 @@ def signals_drawing(recall: Recall, names: Sequence[str], title: str, scale: Sca
         axis.set_zorder(right.get_zorder() + 1)
         axis.patch.set_visible(False)
         axis.axhline(0.0, color="0.8", linewidth=0.6)
-        (recalled,) = axis.plot(u, pascal * signals[number], color="C0", linewidth=1.2)
+        colour = "C0" if smooth is None else PALE
+        curves = [axis.plot(u, pascal * signals[number], color=colour, linewidth=1.2)[0]]
+        if smooth is not None:
+            curves += axis.plot(u, pascal * smooth[number], color="C0", linewidth=1.2)
         (scaled,) = axis.plot(u, pascal * fitted[number], color="C3", linewidth=1.2, linestyle="--")
         axis.set_title(names[number], fontsize=9 if shown <= 16 else 7, pad=3)
     highest = 1.05 * max(float(np.nanmax(np.abs(waves[:shown]), initial=0.0)), 1e-12)
@@ -104,9 +156,10 @@ def signals_drawing(recall: Recall, names: Sequence[str], title: str, scale: Sca
     _u_below(axes, shown)
     for right in {*rights[axes.shape[1] - 1 :: axes.shape[1]], rights[-1]}:
         right.set_ylabel(r"$I(u) = \gamma / \gamma_0$", fontsize=8, color="0.5")
-    handles = [recalled, scaled, wave]
-    labels = ["recalled $p_{sig}$", r"$G E \delta_0 \gamma_0 J$", "waveform $I(u)$"]
-    drawing.figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    handles = [*curves, scaled, wave]
+    said = ["recalled $p_{sig}$", MEAN][: len(curves)]
+    labels = [*said, r"$G E \delta_0 \gamma_0 J$", "waveform $I(u)$"]
+    drawing.figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8, frameon=False)
     drawing.title(title, _measures(recall, shown, len(signals)))
     return drawing
 

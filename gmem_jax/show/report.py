@@ -21,6 +21,7 @@ from gmem_jax.files.checked import is_number, refusing
 from gmem_jax.files.configuration import names_of, pack_fingerprint, signals_from
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
+from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.packs import load_pack, load_stages, pack_called
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import load_result
@@ -35,7 +36,9 @@ from gmem_jax.show.scene import at_rest
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.protocol import BINS
 from gmem_jax.simulation.sample import Sample
+from gmem_jax.sweeps.curves import axes_of, is_sample, lines_of
 from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.table import doubts
 from gmem_jax.sweeps.table import rows as points_of
 
 LARGEST_CONFUSION = 256  # words
@@ -184,10 +187,11 @@ class Report:
         row = tables.summary(recall, configuration)
         self._recalls.append((row, configuration))
         names, t0 = stored.names, configuration["t0"]
-        scale = np.asarray(tables.relative_scale(configuration))
+        scale = np.asarray(relative_scale(configuration))
         wanted = configuration.get("target")
         target = None if wanted is None else np.asarray(bin_average(signals_from(wanted)))
-        about = "errors: standard errors over the signals stored in this pack (jackknife)"
+        about = "G: gain; F: fidelity, 1 if what is recalled is the integral of what was stored; "
+        about += "errors: standard errors over the signals stored in this pack (jackknife)"
         parts = [
             _note(tables.conditions(configuration)),
             _state(row["status"]),
@@ -196,12 +200,15 @@ class Report:
         beside = tables.recall_table([row], configuration)
         if beside.row_count > 1:  # a published point
             parts.append(of_rich(beside))
+        if len(names) > 1:
+            few, own = len(names) <= tables.FEW, of_rich(tables.signals_table(row))
+            parts.append(own if few else f"<details><summary>each of {len(names)} signals</summary>{own}</details>")
         if "backgrounds" in row:
             parts += [of_rich(tables.backgrounds_table(row)), _note(tables.second_readout_lines(row))]
         if target is not None:
             parts.append(_note(tables.target_line(row)))
         shown = f" (the first {plots.MOST} of {len(names)})" if len(names) > plots.MOST else ""
-        parts += [f"<h3>Recalled signals{shown}</h3>", self._figure(plots.recalls(recall, scale, names, target))]
+        parts += [f"<h3>Recalled signals{shown}</h3>", self._figure(plots.recalls(recall, scale, names, target, t0))]
         parts += self._stages(recall.stages, names, t0)
         parts += ["<h3>Grains</h3>", self._grains(recall, names, configuration), _configuration(configuration)]
         self.sections.append(
@@ -325,16 +332,14 @@ class Report:
         return self._figure(plots.curves(lines, plots.U, "I(u)"))
 
     def _sweep(self, folder: Path) -> None:
-        if not (folder / "sweep.json").is_file():
-            raise FileFormatError(f"{folder}: no sweep here (no sweep.json)")
-        store = Store(folder)
+        store = Store(folder, make=False)
         card, rows = store.card(), points_of(store)
         names = card["names"]
         cells = [
             [
                 *(tables.cell(row[name]) for name in names),
                 *("" if row[name] is None else f"{row[name]:.3f}" for name in analysis.MEASURES),
-                row["why"] or ("ok" if row["state"] == "done" else row["state"]),
+                (doubts(row) or "ok") if row["state"] == "done" else row["why"] or row["state"],
             ]
             for row in rows
         ]
@@ -346,20 +351,19 @@ class Report:
 
 
 def _against(x: str, done: Sequence[Mapping[str, Any]], names: Sequence[str]) -> tuple[Any, int] | None:
-    """F and G of a sweep against a number that varies, a line for each set of the other values; None if it is none."""
-    rows = sorted((row for row in done if isinstance(row[x], int | float)), key=lambda row: row[x])
-    if len({row[x] for row in rows}) < 2:
+    """F and G of a sweep against a number that varies and is no sample; None if it is none."""
+    rows = [row for row in done if isinstance(row[x], int | float)]
+    if is_sample(x) or len({row[x] for row in rows}) < 2:
         return None
-    others = [name for name in names if name != x and len({row[name] for row in rows}) > 1]
-    groups: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(", ".join(f"{name} = {tables.cell(row[name])}" for name in others), []).append(row)
-    lines = {
-        f"{letter} {name}": (np.array([row[x] for row in group]), np.array([row[measure] for row in group]))
-        for name, group in groups.items()
-        for letter, measure in (("F", "fidelity"), ("G", "gain"))
-    }
-    return plots.curves(lines, x, "F, G", mode="lines+markers")
+    axes, lines, errors = axes_of(rows, names, x), {}, {}
+    for letter, measure in (("F", "fidelity"), ("G", "gain")):
+        for line in lines_of(rows, axes, measure):
+            name = " ".join(
+                [letter, ", ".join(f"{name} = {tables.cell(value)}" for name, value in line.values.items())]
+            )
+            lines[name], errors[name] = (np.array(line.x), line.mean), line.error
+    y = f"F, G (mean ± SE over {', '.join(axes.over)})" if axes.over else "F, G"
+    return plots.curves(lines, x, y, mode="lines+markers", errors=errors)
 
 
 def _measures(recall: Recall, scale: np.ndarray, t0: float | list[float]) -> list[list[str]]:

@@ -1,5 +1,6 @@
 """Pictures of what was recorded in the stages of a recall or a preparation, against time or u."""
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from gmem_jax.simulation.protocol import BINS
 from gmem_jax.simulation.sample import Sample
 
 AGAINST = ("time", "u")
+NO_CHOICE: Mapping[str, int] = {}
 _KPA = float(Material().modulus) / 1e3
 
 
@@ -61,9 +63,17 @@ QUANTITIES = {
 
 
 def stages_drawing(
-    stages: Mapping[str, Sample], what: str, title: str, *, against: str = "time", t0: float | None = None
+    stages: Mapping[str, Sample],
+    what: str,
+    title: str,
+    *,
+    against: str = "time",
+    t0: float | None = None,
+    chosen: Mapping[str, int] = NO_CHOICE,
 ) -> Drawing:
     """A quantity of every stage: a line for the first replica, the zero signal; a band from the lowest to the highest.
+
+    Of chosen signals a line each, and no band.
 
     Args:
         stages: samples by name, in order.
@@ -71,14 +81,17 @@ def stages_drawing(
         title: over the picture.
         against: "time", or "u" for the stages in which it changes.
         t0: duration of a compression in t_c, which time is given in; in t0 without it.
+        chosen: numbers of the signals to draw, 0 for the zero signal, by what they are called.
     """
     quantity = QUANTITIES[what]
+    if chosen:
+        quantity = quantity._replace(curves=functools.partial(_of_signals, quantity.curves, chosen))
     drawing, ((axis,),) = blank(size=(9.6, 4.2))
     if against == "u":
         _against_u(axis, stages, quantity)
     else:
         _against_time(axis, stages, quantity, t0)
-    many = any(np.shape(sample.filling)[-1] > 1 for sample in stages.values())
+    many = not chosen and any(np.shape(sample.filling)[-1] > 1 for sample in stages.values())
     drawing.title(title, "line: zero signal, band: lowest to highest of all replicas" if many else "")
     axis.set_ylabel(quantity.label)
     if quantity.log:
@@ -86,6 +99,17 @@ def stages_drawing(
     if axis.get_legend_handles_labels()[1]:
         drawing.figure.legend(loc="outside right upper", fontsize=7, frameon=False)
     return drawing
+
+
+def _of_signals(
+    curves: Callable[[Sample], dict[str, np.ndarray]], chosen: Mapping[str, int], sample: Sample
+) -> dict[str, np.ndarray]:
+    """The curves of some signals, [bins, 1] each; before they part, all are the zero signal's."""
+    return {
+        f"{name} {label}".strip(): values[:, [min(number, values.shape[1] - 1)]]
+        for label, values in curves(sample).items()
+        for name, number in chosen.items()
+    }
 
 
 def _curve(axis: Any, at: np.ndarray, values: np.ndarray, **style: Any) -> None:

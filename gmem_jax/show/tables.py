@@ -6,7 +6,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.table import Table
@@ -18,11 +17,14 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.configuration import signals_from
+from gmem_jax.files.measures import of_each, relative_scale
+from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain, together
 from gmem_jax.preparation.recipe import pressure_over_wanted
 
 LARGE_FOR_SPHERES = 3000  # grains: see `note_on_size`
+FEW = 8  # signals that are told of one by one unasked
 SLOW_ENOUGH = 1.8e3  # t0, in t_c: G and F agree with those at ten times slower drives where nothing rings
 
 
@@ -69,6 +71,7 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
         "status_text": explain(status),
         "note": note_on_size(configuration),
+        "signals": _signals(recall, configuration),
         **second_readout(recall, configuration),
         **of_target(recall, configuration),
     }
@@ -85,14 +88,17 @@ def note_on_size(configuration: dict[str, Any]) -> str:
     )
 
 
+def _signals(recall: Recall, configuration: dict[str, Any]) -> list[dict[str, Any]]:
+    """What is said of each signal by itself."""
+    measures = of_each(recall, configuration)
+    rows = zip(signal_names(recall, configuration), *(values.tolist() for values in measures.values()), strict=True)
+    return [
+        dict(zip(("signal", *(name.removeprefix("signal_") for name in measures)), row, strict=True)) for row in rows
+    ]
+
+
 def _known(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def relative_scale(configuration: dict[str, Any]) -> jax.Array:
-    """delta0 gamma0; scalar, or [S, 1] where it differs between signals."""
-    numbers = np.multiply(configuration["delta0"], configuration["gamma0"])
-    return jnp.asarray(numbers if np.ndim(numbers) == 0 else numbers[1:, None])
 
 
 def of_target(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
@@ -131,9 +137,9 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
     return {"backgrounds": rows, "second_readout": rest}
 
 
-def recall_lines(row: dict[str, Any], configuration: dict[str, Any]) -> list[Any]:
-    """What to print of one recall, from its `summary`."""
-    more: list[Any] = []
+def recall_lines(row: dict[str, Any], configuration: dict[str, Any], *, each: bool = False) -> list[Any]:
+    """What to print of one recall, from its `summary`: each of more than a few signals only if that is asked for."""
+    more: list[Any] = [signals_table(row)] if each or 1 < len(row["signals"]) <= FEW else []
     if "backgrounds" in row:
         more += [backgrounds_table(row), second_readout_lines(row)]
     if "target_fidelity" in row:
@@ -141,6 +147,17 @@ def recall_lines(row: dict[str, Any], configuration: dict[str, Any]) -> list[Any
     if row["note"]:
         more += [f"note: {row['note']}"]
     return [recall_table([row], configuration), *more]
+
+
+def signals_table(row: dict[str, Any]) -> Table:
+    """Gain and fidelity of each signal by itself, from the `summary` of a recall."""
+    table = Table(title="By signal", caption="each with a gain of its own")
+    for column in ("signal", "G", "F", "F over T1", "correlation with J"):
+        table.add_column(column, justify="left" if column == "signal" else "right")
+    for own in row["signals"]:
+        values = (own[name] for name in ("gain", "fidelity", "windowed_fidelity", "correlation"))
+        table.add_row(own["signal"], *("" if math.isnan(value) else f"{value:.3f}" for value in values))
+    return table
 
 
 def backgrounds_table(row: dict[str, Any]) -> Table:

@@ -225,6 +225,32 @@ def places(stages: Sequence[Stage], count: int, every: int) -> dict[str, list[in
     return found
 
 
+def places_at(stages: Sequence[Stage], compressions: Sequence[float]) -> dict[str, list[int]]:
+    """The moments at which a run passes chosen compressions, to the next bin: once in every stage that changes u.
+
+    Args:
+        stages: with names of their own.
+        compressions: u, each 0 to 1.
+
+    Returns:
+        Finished bins by the stage's name, as of `places`; the beginning of a stage is the end of the one before.
+
+    Raises:
+        ValueError: if one is not within 0 and 1.
+    """
+    found: dict[str, set[int]] = {}
+    for u in compressions:
+        if not 0.0 <= u <= 1.0:
+            raise ValueError(f"frames at u = {u:g}: u goes from 0, not compressed, to 1, fully compressed")
+        for number, stage in enumerate(stages):
+            if stage.start == stage.stop:
+                continue
+            bins = round(stage.bins * (u - stage.start) / (stage.stop - stage.start))
+            at, bins = (stage, bins) if bins or not number else (stages[number - 1], stages[number - 1].bins)
+            found.setdefault(at.name, set()).add(bins)
+    return {stage.name: sorted(found[stage.name]) for stage in stages if stage.name in found}
+
+
 @jax.jit
 def _contacts(system: System, state: State) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Of every candidate: whether it touches, its normal force and its friction, [P, 1, B] and [P, 3, B]."""

@@ -5,9 +5,8 @@ An executor keeps workers alive as long as jobs are left that nobody has; the wo
 
 import itertools
 import os
-import shutil
+import shlex
 import subprocess
-import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -16,19 +15,23 @@ from typing import Any
 
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.checked import optional
-from gmem_jax.sweeps import work
+from gmem_jax.sweeps import slurm, work
+from gmem_jax.sweeps.processes import CONDUCTOR, PATIENCE, job_name, known_by, python, safe_path
 from gmem_jax.sweeps.store import Store
 
 POLL = 0.5  # s
 DEATHS = 3  # of workers one after the other, none of which got farther than those before, that end a sweep
 CORES = 8  # of a worker: more gain little at N = 325
-PATIENCE = 30.0  # s for a controller to answer
+THREADS = "GMEM_THREADS"  # of the environment: threads of a process
+TIMEOUTS = 1000  # of a job that is put into the queue again each time
 
 
 class Executor(ABC):
     """Workers on a store."""
 
     workers: int
+    waiting: str = ""
+    """What workers that have not begun wait for, in brackets."""
 
     @abstractmethod
     def start(self, store: Store, name: str) -> None:
@@ -57,6 +60,7 @@ class Executor(ABC):
         total = sum(job["work"] for job in jobs) or 1.0
         deaths, furthest, open_ = 0, -1.0, jobs
         try:
+            store.record(CONDUCTOR, known_by(os.getpid()))
             while True:
                 open_ = [job for job in open_ if not store.finished(job)]
                 now = total - sum(job["work"] for job in open_)
@@ -79,6 +83,8 @@ class Executor(ABC):
                 time.sleep(POLL)
         finally:
             self.stop()
+            for name in (CONDUCTOR, *names):
+                store.erase(name)
 
     def said(self, store: Store) -> str:
         """What the workers said."""
@@ -92,6 +98,14 @@ class Executor(ABC):
 def cores() -> list[int]:
     """The CPUs that this process may use."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+
+
+def threads(cpus: int) -> str:
+    """The threads of a worker with so many CPUs: one on each, or fewer if GMEM_THREADS asks for fewer."""
+    told = os.environ.get(THREADS, "")
+    return (
+        told if told and not (told.isdecimal() and int(told) > cpus) else str(cpus)
+    )  # what is no number is told there
 
 
 class Processes(Executor):
@@ -117,24 +131,33 @@ class Processes(Executor):
         """Start a process whose log is in the store."""
         number = int(name.rpartition("-")[2])
         mine = self._cores[number]
-        environment = {**os.environ, "GMEM_THREADS": str(len(mine))}
-        command = [sys.executable, "-m", work.__name__, str(store.folder), name, ",".join(map(str, mine))]
+        environment = {**os.environ, THREADS: threads(len(mine))}
+        cpus = ",".join(map(str, mine))
+        command = python("-m", work.__name__, str(store.folder), name, cpus, work.ATTACHED)
+        streams: Any = {"stdin": subprocess.PIPE, "stderr": subprocess.STDOUT}
         with store.log_of(name).open("ab") as log:
-            self._running[name] = subprocess.Popen(
-                command, stdout=log, stderr=log, env=environment, start_new_session=True
-            )
+            started = subprocess.Popen(command, stdout=log, env=environment, start_new_session=True, **streams)
+        self._running[name] = started
+        store.record(name, known_by(started.pid))
 
     def alive(self) -> set[str]:
         """The names of those that have not ended."""
         return {name for name, process in self._running.items() if process.poll() is None}
 
     def stop(self) -> None:
-        """End them all; their checkpoints stay."""
+        """End them all, also those that do not listen; their checkpoints stay."""
         for process in self._running.values():
             if process.poll() is None:
                 process.terminate()
+        last = time.monotonic() + PATIENCE
         for process in self._running.values():
-            process.wait()
+            try:
+                process.wait(max(0.0, last - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdin:
+                process.stdin.close()
 
 
 class Submitted(Executor):
@@ -152,11 +175,14 @@ class Submitted(Executor):
     def __init__(self, cluster: str, workers: int | None = None, options: dict[str, Any] | None = None) -> None:
         self._submitit = optional("submitit", "slurm")
         self.workers, self._cluster = workers or 1, cluster
-        self._options = {"timeout_min": 60, "cpus_per_task": 1, **(options or {})}
+        given = {"timeout_min": 60, "cpus_per_task": 1, **(options or {})}
+        self._options = {"slurm_signal_delay_s": _warning(given), **given}
+        if cluster == "slurm":
+            self._options["slurm_srun_args"] = _srun(self._options)
         self._jobs: dict[str, Any] = {}
         self._executor: Any = None
         if cluster == "slurm":
-            _require_slurm()
+            slurm.require_slurm()
         try:
             self._submitting(Path())
         except (NameError, AssertionError) as error:
@@ -164,7 +190,8 @@ class Submitted(Executor):
 
     def _submitting(self, logs: Path) -> Any:
         """Submitit's executor; NameError or AssertionError if an option is none of its, or cannot be."""
-        made = self._submitit.AutoExecutor(logs, cluster=self._cluster)
+        safe = {"slurm_python": " ".join(map(shlex.quote, python())), "slurm_max_num_timeout": TIMEOUTS}
+        made = self._submitit.AutoExecutor(logs, cluster=self._cluster, local_max_num_timeout=TIMEOUTS, **safe)
         made.update_parameters(**self._options)
         return made
 
@@ -173,9 +200,15 @@ class Submitted(Executor):
         try:
             if self._executor is None:
                 self._executor = self._submitting(store.folder / "workers" / "submitit")
-            self._jobs[name] = self._executor.submit(work.main, [str(store.folder), name])
+            if "name" not in self._options:
+                self._executor.update_parameters(name=job_name(store, name))
+            with safe_path():
+                job = self._executor.submit(work.Requeued(), [str(store.folder.absolute()), name])
         except (self._submitit.core.utils.FailedJobError, subprocess.SubprocessError, FileNotFoundError) as error:
             raise OSError(f"the scheduler takes no job: {' '.join(str(error).split())[-300:]}") from error
+        self._jobs[name] = job
+        here = self._cluster != "slurm"
+        store.record(name, known_by(int(job.job_id)) if here else {"slurm": job.job_id, "name": job_name(store, name)})
 
     def said(self, store: Store) -> str:
         """What the workers said, as far as submitit finds it."""
@@ -185,15 +218,12 @@ class Submitted(Executor):
         """The names of those that have not ended."""
         if self._cluster != "slurm" or not self._jobs:
             return {name for name, job in self._jobs.items() if not job.done(force_check=True)}
-        # Asked of the queue: sacct, which submitit asks, needs a data base that small clusters do not have.
-        numbers = ",".join(str(job.job_id) for job in self._jobs.values())
-        queue = subprocess.run(
-            ["squeue", "--noheader", "--format=%A", f"--jobs={numbers}"], capture_output=True, text=True
-        )
-        if queue.returncode != 0 and "Invalid job id" not in queue.stderr:
-            return set(self._jobs)  # nobody to ask: jobs outlive their controller's absence
-        left = set(queue.stdout.split())  # none if it knows none of them any more
-        return {name for name, job in self._jobs.items() if str(job.job_id) in left}
+        queued = slurm.queue([str(job.job_id) for job in self._jobs.values()])
+        if queued is None:
+            return set(self._jobs)
+        reasons = {one.reason for one in queued.values() if one.state == "PENDING"}
+        self.waiting = f" (waiting: {', '.join(sorted(reasons))})" if reasons else ""
+        return {name for name, job in self._jobs.items() if str(job.job_id) in queued}
 
     def stop(self) -> None:
         """End them all; their checkpoints stay."""
@@ -203,23 +233,21 @@ class Submitted(Executor):
                 job.cancel(check=False)
 
 
-def _require_slurm() -> None:
-    """Raise if jobs cannot be submitted from here; sbatch itself would print its own lines, or wait for minutes.
+def _srun(options: dict[str, Any]) -> list[str]:
+    """What srun is told: since SLURM 22.05 it does not take the CPUs of a task from its job."""
+    told = options.get("slurm_srun_args", [])
+    told = shlex.split(told) if isinstance(told, str) else list(told)
+    known = any(one.startswith(("--cpus-per-task", "-c")) for one in told)
+    cpus = options.get("slurm_cpus_per_task", options["cpus_per_task"])
+    return told if known else [*told, f"--cpus-per-task={cpus}"]
 
-    Raises:
-        ValueError: if there is no SLURM, or its controller does not answer.
-    """
-    elsewhere = "run the sweep where it does, or with --executor processes"
-    if not all(map(shutil.which, ("sbatch", "scontrol"))):
-        raise ValueError(f"no SLURM here, sbatch is not on the path; {elsewhere.replace('does', 'is')}")
+
+def _warning(options: dict[str, Any]) -> int:
+    """Seconds before the end of its time at which a job is told to keep what it has; SLURM may be a minute early."""
     try:
-        asked = subprocess.run(["scontrol", "ping"], capture_output=True, text=True, timeout=PATIENCE)
-        if asked.returncode == 0:
-            return
-        answer = (asked.stdout.strip() or asked.stderr.strip() or "no reason given").splitlines()[0]
-    except subprocess.TimeoutExpired:
-        answer = f"scontrol waited {PATIENCE:.0f} s"
-    raise ValueError(f"SLURM's controller does not answer ({answer}); {elsewhere}")
+        return int(max(5.0, min(90.0, 60.0 * float(options.get("slurm_time", options["timeout_min"])) / 4.0)))
+    except (TypeError, ValueError):
+        return 90
 
 
 def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executor:

@@ -1,64 +1,66 @@
 """The folder of a sweep: its points, their results by content, what failed and why, who is at work.
 
-    sweep.json         the points: their values and keys, in order
+    sweep.json         the points: their values and keys, in order; the marker of the folder, see `gmem_jax.files.ours`
     jobs/              what is to be computed, one file a job
-    points/<key>.h5    recalls, as `gmem recall` writes them
+    points/<key>.h5    recalls, as `gmem recall` writes them; each names its key
     failed/<key>.json  reasons
     packs/<key>.h5     packs made for this sweep
     parts/<job>/       unfinished jobs; those that are not put up now with their file
-    workers/           what each worker is doing, and what it said
+    workers/           what each worker is doing, what it said, and which process or job it is
 
 A point's key stands for everything that its numbers depend on; what is there need not be computed again.
 """
 
 import contextlib
 import json
-import os
-import shutil
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.atomic import atomic, sweep
-from gmem_jax.files.checkpoints import locked
+from gmem_jax.files.atomic import atomic
+from gmem_jax.files.checked import NAME, is_number, printable, source, title, whole
+from gmem_jax.files.checkpoints import OWN, is_locked, locked
+from gmem_jax.files.ours import Folder, sweep
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.sweeps.plan import Point
 
 SWEEP_SCHEMA = "gmem-sweep/1"
+MARKER = "sweep.json"
 ROOM = 1 << 20  # bytes that must be left on the disk: some points of a small pack
 WRITTEN = 3600.0  # s in which a file is surely written: workers write while others look
 JOB = "job.json"  # beside the parts of one that was put aside for others
 FOLDERS = ("jobs", "points", "failed", "packs", "parts", "workers")
+_KEY = r"[0-9a-z]{1,40}"
+_JOB = rf"{_KEY}(?:-[0-9]{{1,6}})*"
+_OWN = re.compile(
+    rf"sweep\.json|trial|jobs/[0-9]{{5}}-{_JOB}\.json|jobs/{_JOB}|(?:points|packs)/{_KEY}\.h5|failed/{_KEY}\.json"
+    rf"|parts/{_JOB}/(?:{OWN})|workers/[a-z]+(?:-[0-9]+)?\.(?:json|log|run)"
+)
 
 
 class Store:
     """The folder of a sweep.
 
     Args:
-        folder: made if it is not there.
+        folder: of the sweep.
+        make: it if it is not there; else nothing in it is touched.
 
     Raises:
-        FileFormatError: if it is there and holds something else.
+        FileFormatError: if it is there and holds something else, or nothing and is not to be made.
         OSError: if it cannot be written.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, make: bool = True) -> None:
         self.folder = Path(folder)
-        if self.folder.exists() and not self.folder.is_dir():
-            raise FileFormatError(f"{folder}: is a file; a sweep needs a folder of its own")
-        if self.folder.is_dir() and any(self.folder.iterdir()) and not self._card.is_file():
-            others = [entry.name for entry in self.folder.iterdir() if entry.name not in FOLDERS]
-            if others:
-                raise FileFormatError(f"{folder}: holds {others[0]} and no sweep; name a folder of its own")
-        for name in FOLDERS:
-            (self.folder / name).mkdir(parents=True, exist_ok=True)
+        if not (make or Folder.about(self.folder, MARKER, SWEEP_SCHEMA)):
+            raise FileFormatError(f"{folder}: no sweep here (no sweep.json of {SWEEP_SCHEMA}, or behind a link)")
+        self._own = Folder(self.folder, MARKER, SWEEP_SCHEMA, _OWN, {"shared": {}, "names": [], "points": []})
+        for name in FOLDERS if make else ():
+            self._own.make(name)
             sweep(self.folder / name, age=WRITTEN)
-
-    @property
-    def _card(self) -> Path:
-        return self.folder / "sweep.json"
 
     def remember(
         self,
@@ -77,7 +79,7 @@ class Store:
         """
         rows = [{"key": one.key, "values": one.values} for one in points]
         rows += [{"key": key, "values": values} for key, values in impossible]
-        self._write(self._card, {"schema": SWEEP_SCHEMA, "shared": shared, "names": list(names), "points": rows})
+        self._own.mark({"shared": shared, "names": list(names), "points": rows})
 
     def card(self) -> dict[str, Any]:
         """What `remember` wrote.
@@ -85,17 +87,23 @@ class Store:
         Raises:
             FileFormatError: if there is nothing of the kind.
         """
+        card = Folder.about(self.folder, MARKER, SWEEP_SCHEMA)
         try:
-            card = json.loads(self._card.read_text(encoding="utf-8"))
-            if card["schema"] != SWEEP_SCHEMA:
-                raise FileFormatError(f"{self._card}: schema is {card['schema']!r}, expected {SWEEP_SCHEMA!r}")
-            found = {"shared": dict(card["shared"]), "names": [str(name) for name in card["names"]]}
+            if card is None:
+                raise ValueError("there is none")
+            shared, names = dict(card["shared"]), list(card["names"])
             rows = [{"key": str(row["key"]), "values": dict(row["values"])} for row in card["points"]]
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            if isinstance(error, FileFormatError):
-                raise
+        except (ValueError, KeyError, TypeError) as error:
             raise FileFormatError(f"{self.folder}: no sweep here (no readable sweep.json)") from error
-        return {**found, "points": rows}
+        values: Iterator[tuple[str, Any]] = (pair for row in card["points"] for pair in dict(row["values"]).items())
+        for name, value in [*shared.items(), *values]:
+            if not title(name) or (isinstance(value, str) and not source(value)):
+                raise FileFormatError(f"{self.folder / MARKER}: {printable(name)[:NAME]} is no name with a value")
+        if not all(map(title, names)):
+            raise FileFormatError(f"{self.folder / MARKER}: a name of what varies is no line of text")
+        if odd := [str(row["key"]) for row in rows if not re.fullmatch(_KEY, str(row["key"]))]:
+            raise FileFormatError(f"{self.folder / MARKER}: {printable(odd[0])[:NAME]!r} is no key of a point")
+        return {"shared": shared, "names": names, "points": rows}
 
     @staticmethod
     def _write(path: Path, value: Any) -> None:
@@ -104,36 +112,44 @@ class Store:
 
     def at(self, key: str) -> Path:
         """The file of a point's recall."""
-        return self.folder / "points" / f"{key}.h5"
+        return self._own.at(f"points/{key}.h5")
 
     def pack_at(self, key: str) -> Path:
         """The file of a pack made for this sweep."""
-        return self.folder / "packs" / f"{key}.h5"
+        return self._own.at(f"packs/{key}.h5")
 
     def done(self) -> set[str]:
         """Keys of the points that are computed."""
-        return {path.stem for path in (self.folder / "points").glob("*.h5")}
+        return {path.stem for path in self._own.files("points")}
 
     def failed(self) -> dict[str, str]:
         """Keys of the points that failed, and why."""
         found = {}
-        for path in (self.folder / "failed").glob("*.json"):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                found[path.stem] = str(json.loads(path.read_text(encoding="utf-8"))["reason"])
+        for path in self._own.files("failed"):
+            told = _json(path)
+            if told.get("key") == path.stem:
+                found[path.stem] = printable(told.get("reason"))
         return found
 
     def save(self, key: str, recall: Recall, configuration: dict[str, Any]) -> None:
-        """Keep the recall of a point."""
-        save_recall(self.at(key), recall, configuration)
+        """Keep the recall of a point, which says whose it is."""
+        save_recall(self.at(key), recall, {**configuration, "key": key})
 
     def load(self, key: str) -> tuple[Recall, dict[str, Any]]:
         """The recall of a point, and its configuration.
 
         Raises:
             FileNotFoundError: if it is not computed.
-            FileFormatError: if its file is damaged.
+            FileFormatError: if its file is damaged, or that of another point.
         """
-        return load_recall(self.at(key))
+        found = load_recall(self.at(key))
+        own = found.configuration.get("key")
+        if own != key:
+            raise FileFormatError(
+                f"{self.at(key)}: says that it is point {printable(own)[:NAME]}, not the one of its name: files "
+                "were exchanged; remove it, and the sweep computes it again"
+            )
+        return found
 
     def unreadable(self, keys: set[str]) -> list[str]:
         """Those of some points that are computed whose files cannot be read."""
@@ -151,50 +167,55 @@ class Store:
         Raises:
             OSError: if it does not.
         """
-        trial = self.folder / "trial"
         try:
-            with atomic(trial) as temporary:
+            with atomic(self._own.at("trial")) as temporary:
                 temporary.write_bytes(bytes(ROOM))
         finally:
-            trial.unlink(missing_ok=True)
+            self._own.remove("trial")
 
     def fail(self, key: str, reason: str) -> None:
         """Write down why a point has no result."""
-        self._write(self.folder / "failed" / f"{key}.json", {"reason": reason})
+        self._write(self._failed(key), {"key": key, "reason": reason})
+
+    def forget(self, key: str) -> None:
+        """Remove the recall of a point."""
+        self._own.remove(f"points/{key}.h5")
 
     def forgive(self) -> int:
         """Forget all failures, so that they are tried again; how many there were."""
-        failed = list((self.folder / "failed").glob("*.json"))
+        failed = self._own.files("failed")
         for path in failed:
-            path.unlink()
+            self._own.remove(f"failed/{path.name}")
         return len(failed)
 
     def order(self, jobs: Sequence[dict[str, Any]]) -> None:
         """Put up jobs in the place of those that were there. Of others what was begun stays, to be gone on with."""
         wanted = {f"{number:05d}-{job['name']}.json": job for number, job in enumerate(jobs)}
-        for path in (self.folder / "jobs").glob("*.json"):
-            if path.name not in wanted:
-                begun = self.folder / "parts" / path.stem.partition("-")[2]
-                path.replace(begun / JOB) if begun.is_dir() else path.unlink()
+        for path in self._own.files("jobs"):
+            if path.suffix == ".json" and path.name not in wanted:
+                name = path.stem.partition("-")[2]
+                if (self.folder / "parts" / name).is_dir():
+                    self._own.move(f"jobs/{path.name}", f"parts/{name}/{JOB}")
+                else:
+                    self._own.remove(f"jobs/{path.name}")
         for name, job in wanted.items():
-            self._write(self.folder / "jobs" / name, job)
+            self._write(self._own.at(f"jobs/{name}"), job)
         names = {job["name"] for job in (*jobs, *self._interrupted()) if not self.finished(job)}
         for path in (self.folder / "parts").iterdir():
             name = path.name.partition("-")[0]  # points of a job that broke are run by themselves, numbered
-            if path.is_dir() and name not in names and not self.taken({"name": name}):
-                shutil.rmtree(path, ignore_errors=True)
+            if re.fullmatch(_JOB, path.name) and name not in names and not self.taken({"name": name}):
+                self._own.clear(f"parts/{path.name}")
 
     def _interrupted(self) -> list[dict[str, Any]]:
         """Jobs of which there are parts, and which are not put up."""
-        found = []
-        for path in (self.folder / "parts").glob(f"*/{JOB}"):
-            with contextlib.suppress(OSError, ValueError):
-                found.append(json.loads(path.read_text(encoding="utf-8")))
-        return found
+        folders = (path for path in (self.folder / "parts").glob("*") if re.fullmatch(_JOB, path.name))
+        found = (_job(self._own.at(f"parts/{path.name}/{JOB}"), path.name) for path in folders if not path.is_symlink())
+        return [job for job in found if job]
 
     def jobs(self) -> list[dict[str, Any]]:
-        """The jobs that were put up, in order."""
-        return [json.loads(path.read_text(encoding="utf-8")) for path in sorted((self.folder / "jobs").glob("*.json"))]
+        """The jobs that were put up, in order; what is none is passed over."""
+        found = (_job(path, path.stem.partition("-")[2]) for path in self._own.files("jobs"))
+        return [job for job in found if job]
 
     def begun(self, keys: set[str]) -> list[dict[str, Any]]:
         """Unfinished runs of some points that a worker is at, or was: they go on as they were begun."""
@@ -205,13 +226,15 @@ class Store:
     def finished(self, job: dict[str, Any]) -> bool:
         """Whether nothing is left to do of a job."""
         if job["kind"] == "pack":
-            return self.pack_at(job["name"]).is_file() or (self.folder / "failed" / f"{job['name']}.json").is_file()
-        failed = self.folder / "failed"
-        return all(self.at(key).is_file() or (failed / f"{key}.json").is_file() for key in job["points"])
+            return self.pack_at(job["name"]).is_file() or self._failed(job["name"]).is_file()
+        return all(self.at(key).is_file() or self._failed(key).is_file() for key in job["points"])
+
+    def _failed(self, key: str) -> Path:
+        return self._own.at(f"failed/{key}.json")
 
     def parts(self, job: dict[str, Any]) -> Path:
         """Where the unfinished parts of a job are kept."""
-        return self.folder / "parts" / str(job["name"])
+        return self._own.at(f"parts/{job['name']}/{JOB}").parent
 
     @contextlib.contextmanager
     def mine(self, job: dict[str, Any]) -> Iterator[None]:
@@ -220,41 +243,69 @@ class Store:
         Raises:
             FileFormatError: if another living process has it.
         """
-        with locked(self.folder / "jobs" / str(job["name"])):
+        with locked(self._own.at(f"jobs/{job['name']}")):
             yield
 
     def taken(self, job: dict[str, Any]) -> bool:
         """Whether a living process has a job."""
-        try:
-            with self.mine(job):
-                return False
-        except FileFormatError:
-            return True
+        return is_locked(self._own.at(f"jobs/{job['name']}"))
 
     def tell(self, worker: str, job: str, fraction: float, what: str) -> None:
         """Say what a worker is doing."""
         # Not flushed to the disk: it is said again within seconds.
-        path = self.folder / "workers" / f"{worker}.json"
-        temporary = path.with_suffix(f".{os.getpid()}")
-        temporary.write_text(json.dumps({"job": job, "fraction": fraction, "what": what}), encoding="utf-8")
-        temporary.replace(path)
+        with atomic(self._own.at(f"workers/{worker}.json"), flush=False) as temporary:
+            temporary.write_text(json.dumps({"job": job, "fraction": fraction, "what": what}), encoding="utf-8")
 
     def told(self) -> list[dict[str, Any]]:
-        """What the workers said last."""
-        found = []
-        for path in (self.folder / "workers").glob("*.json"):
-            with contextlib.suppress(OSError, ValueError):
-                found.append(json.loads(path.read_text(encoding="utf-8")))
-        return found
+        """What the workers said last; what is no such record is passed over."""
+        said = (_json(path) for path in self._own.files("workers") if path.suffix == ".json")
+        fits = {"job": title, "fraction": is_number, "what": title}
+        return [one for one in said if all(name in one and fit(one[name]) for name, fit in fits.items())]
+
+    def record(self, worker: str, who: dict[str, Any]) -> None:
+        """Write down which process or job a worker is, so that it can be ended."""
+        self._write(self._own.at(f"workers/{worker}.run"), who)
+
+    def records(self) -> dict[str, dict[str, Any]]:
+        """What `record` wrote, by worker."""
+        return {path.stem: _json(path) for path in self._own.files("workers") if path.suffix == ".run"}
+
+    def erase(self, worker: str) -> None:
+        """Remove what `record` wrote of a worker that has ended."""
+        self._own.remove(f"workers/{worker}.run")
 
     def log_of(self, worker: str) -> Path:
         """The file of what a worker says."""
-        return self.folder / "workers" / f"{worker}.log"
+        return self._own.at(f"workers/{worker}.log")
 
     def said(self) -> str:
         """What the workers with such files said, who said something last at the end."""
-        logs = (self.folder / "workers").glob("*.log")
+        logs = [path for path in self._own.files("workers") if path.suffix == ".log"]
         return "\n".join(
             path.read_text(encoding="utf-8", errors="replace")
             for path in sorted(logs, key=lambda path: path.stat().st_mtime)
         )
+
+
+def _json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file; an empty one if there is none."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _job(path: Path, name: str) -> dict[str, Any] | None:
+    """The job of that name in a file; None if it is none."""
+    job = _json(path)
+    sizes = all(is_number(job.get(one)) for one in ("work", "replicas"))
+    if job.get("name") != name or not sizes:
+        return None
+    if job.get("kind") == "pack":
+        return job if all(isinstance(job.get(one), dict) for one in ("recipe", "grain")) else None
+    points, written = job.get("points"), job.get("configurations")
+    fits = isinstance(points, list) and isinstance(written, list) and len(written) == len(points)
+    if job.get("kind") != "run" or not fits or not whole(job.get("batch")):
+        return None
+    return job if all(isinstance(key, str) and re.fullmatch(_KEY, key) for key in points or ()) else None

@@ -5,7 +5,7 @@ import functools
 import itertools
 import numbers
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import psutil
 
-from gmem_jax.errors import RunFailedError
+from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.arguments import require_values
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
@@ -24,22 +24,21 @@ from gmem_jax.files.checked import require_kinds
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
-from gmem_jax.files.provenance import sources
+from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import explain, together
-from gmem_jax.preparation.recipe import Recipe, grain_steps
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within, work_of_bin
 from gmem_jax.sweeps.executors import Executor
+from gmem_jax.sweeps.making import AS_THEY_ARE, pack_job, recipe_of, require_prepared
 from gmem_jax.sweeps.plan import ABREAST, Point, digest, groups, plan, point
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.work import clump_of, run_group
+from gmem_jax.sweeps.work import run_group
 
 COST = 8e-8  # s a grain-step on two cores, of SIDE_BY_SIDE replicas; see docs/scaling.md
 SIDE_BY_SIDE = 8  # replicas: a block
 CHECKED = 50  # values of a name that are tried before a sweep begins
 ANY_PACK = "tetra-325-a"
-GRAIN = {"shape": "tetra", "overlap": 0.6}  # of packs to be made, where nothing else is said
 Tell = Callable[[str], None]
 
 
@@ -110,7 +109,7 @@ def sweep(
         share = sum(one.experiment.replicas for one in group)
         on = within(tell, done / total, (done + share) / total)
         keys, experiments = [one.key for one in group], [one.experiment for one in group]
-        cache = Checkpoints(store.folder / "parts" / digest(keys), {"keys": keys}) if store else None
+        cache = Checkpoints(store.parts({"name": digest(keys)}), {"keys": keys}) if store else None
         found |= run_group(keys, experiments, store=store, cache=cache, progress=on)
         done += share
     return Results(Result(one.values, found[one.key]) for one in points)
@@ -130,6 +129,12 @@ def _label(value: Any) -> Any:
     return float(value) if scalar or isinstance(value, numbers.Real) else type(value).__name__
 
 
+def seconds_of(jobs: Sequence[Mapping[str, Any]], cost: float = COST) -> float:
+    """How long jobs take, from their work and replicas, at a cost of a grain-step with `SIDE_BY_SIDE` replicas."""
+    blocks: float = sum(job["work"] * work_of_bin(job["replicas"]) / job["replicas"] for job in jobs)
+    return cost * blocks * SIDE_BY_SIDE / work_of_bin(SIDE_BY_SIDE)
+
+
 class Conductor:
     """A sweep as a file asks for it, done by workers on a store.
 
@@ -140,34 +145,29 @@ class Conductor:
         cost: seconds a grain-step with `SIDE_BY_SIDE` replicas, for that.
 
     Raises:
-        FileFormatError: if the folder holds something else.
+        FileFormatError: if what is asked for of packs is neither true nor false.
     """
 
     def __init__(self, spec: Spec, folder: Path, say: Tell, *, cost: float = COST) -> None:
-        self.spec, self.store, self.say, self.cost = spec, Store(folder), say, cost
+        self.spec, self.folder, self.say, self.cost = spec, folder, say, cost
         self._packs = functools.cache(load_pack)
         self._signals = functools.cache(functools.partial(named_signals, told=say))
         self.impossible: list[tuple[dict[str, Any], str]] = []
+        self.as_they_are = spec.run.get(AS_THEY_ARE, False)
+        if not isinstance(self.as_they_are, bool):
+            raise FileFormatError(f"{AS_THEY_ARE} in [run] must be true or false, got {self.as_they_are!r}")
 
-    def _recipe(self, values: Mapping[str, Any]) -> tuple[Recipe, dict[str, Any]]:
-        """How a pack is to be made, and of which grain."""
-        own = {name.removeprefix(PREPARE): value for name, value in values.items() if name.startswith(PREPARE)}
-        if own.get("shape") == "sphere" and "overlap" in own:
-            raise ValueError("prepare.overlap does nothing with prepare.shape = 'sphere'; it is of tetra grains")
-        shape = {name: own.pop(name, default) for name, default in GRAIN.items()}
-        known = {field.name: field for field in fields(Recipe)}
-        if unknown := sorted(set(own) - set(known)):
-            raise ValueError(f"a preparation has no {unknown[0]!r}; it has {', '.join((*GRAIN, *known))}")
-        if shape["shape"] not in ("tetra", "sphere"):
-            raise ValueError(f"shape must be tetra or sphere, got {shape['shape']!r}")
-        return Recipe(**own), shape
+    @functools.cached_property
+    def store(self) -> Store:
+        """The store, made on first use: a sweep that is refused leaves nothing behind.
+
+        Raises:
+            FileFormatError: if the folder holds something else.
+        """
+        return Store(self.folder)
 
     def _pack_job(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        recipe, shape = self._recipe(values)
-        clump = clump_of(shape)
-        made = {"recipe": asdict(recipe), "grain": shape}
-        job = {"kind": "pack", "name": digest({**made, **sources()}), "work": grain_steps(recipe, clump), "replicas": 1}
-        return {**job, **made}
+        return pack_job(values, follow=not self.as_they_are)
 
     def pack_jobs(self) -> list[dict[str, Any]]:
         """The packs that must be made first.
@@ -210,7 +210,10 @@ class Conductor:
         own = {name: value for name, value in values.items() if name != "pack" and not name.startswith(PREPARE)}
         if "pack" in values and (odd := [name for name in values if name.startswith(PREPARE)]):
             raise ValueError(f"a point has a pack and {odd[0]!r} of one to be made; give one of them")
-        return named_experiment(pack, own, self._signals(*waveforms_of(own)))
+        found = named_experiment(pack, own, self._signals(*waveforms_of(own)))
+        if "pack" in values and not self.as_they_are:
+            require_prepared(found, str(values["pack"]))
+        return found
 
     def pack_of(self, values: Mapping[str, Any]) -> Pack:
         """The pack of a point, if it is made.
@@ -221,13 +224,21 @@ class Conductor:
         Raises:
             RunFailedError: if it could not be made.
             FileNotFoundError: if there is no such pack.
+            FileFormatError: if its file is damaged, or that of another pack.
         """
         if "pack" in values:
             return self._packs(str(values["pack"]))
         name = self._pack_job(values)["name"]
         if not self.store.pack_at(name).is_file() and (reason := self.store.failed().get(name)):
             raise RunFailedError(f"its pack could not be made: {reason}")
-        return self._packs(str(self.store.pack_at(name)))
+        path = self.store.pack_at(name)
+        pack = self._packs(str(path))
+        if pack.name != name:
+            raise FileFormatError(
+                f"{path}: is the pack {pack.name}, not the one of its name: files were exchanged; "
+                "remove it, and the sweep makes it again"
+            )
+        return pack
 
     def packs(self, executor: Executor, progress: Progress) -> list[Pack]:
         """The packs of all points, in order; those that do not exist yet are made.
@@ -272,8 +283,8 @@ class Conductor:
         for key, _, reason in failed:
             self.store.fail(key, reason)
         for key in self.store.unreadable({one.key for one in points}):
-            self.say(f"{self.store.at(key)}: damaged; computed again")
-            self.store.at(key).unlink()
+            self.say(f"{self.store.at(key)}: damaged, or another point's; computed again")
+            self.store.forget(key)
         known = self.store.done() | set(self.store.failed())
         memory = psutil.virtual_memory().available // executor.workers
         begun = self.store.begun({one.key for one in points} - set(self.store.failed()))
@@ -288,7 +299,7 @@ class Conductor:
             self.say(f"all {kept} points are there")
 
     def points_to_come(self) -> list[dict[str, Any]]:
-        """What will be run on packs that do not exist yet: work and replicas of each point by itself."""
+        """What will be run on packs that do not exist yet: work, replicas and bytes of each point by itself."""
         found = []
         for values in self.spec.combinations():
             all_ = {**self.spec.shared, **values}
@@ -296,20 +307,20 @@ class Conductor:
                 continue
             with contextlib.suppress(ValueError, FileNotFoundError):  # an impossible point is told of in its turn
                 like = self._experiment(all_, self._packs(ANY_PACK))
-                work = self._recipe(all_)[0].grains * like.timing.steps * replica_bins(like, like.signals.count)
-                found.append({"work": work, "replicas": like.replicas})
+                grains = recipe_of(all_)[0].grains
+                work = grains * like.timing.steps * replica_bins(like, like.signals.count)
+                found.append({"work": work, "replicas": like.replicas, "bytes": recall_bytes(like)})
         return found
 
     def _announce(self, what: str, jobs: list[dict[str, Any]], executor: Executor) -> None:
         work = sum(job["work"] for job in jobs)
         widest = max(job["replicas"] for job in jobs)
         workers = min(executor.workers, len(jobs))
-        blocks = sum(job["work"] * work_of_bin(job["replicas"]) / job["replicas"] for job in jobs)
-        minutes = max(1, round(self.cost * blocks * SIDE_BY_SIDE / work_of_bin(SIDE_BY_SIDE) / 60.0))
+        minutes = max(1, round(seconds_of(jobs, self.cost) / 60.0))
         where = "here" if self.cost != COST else "of two free cores (native, law H)"
         cost = f"{work:.2g} grain-steps, some {minutes} min {where}"
         self.say(f"{what}, {widest} replicas side by side at most, workers: {workers}; {cost}")
 
     def _finish(self, executor: Executor, jobs: list[dict[str, Any]], progress: Progress, what: str) -> None:
         self.store.order(jobs)
-        executor.finish(self.store, jobs, lambda fraction: progress(what, 0.0, fraction))
+        executor.finish(self.store, jobs, lambda fraction: progress(what + executor.waiting, 0.0, fraction))

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,14 @@ import numpy as np
 from gmem_jax.experiment.analysis import MEASURES, spread
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import optional
-from gmem_jax.files.labelled import described
+from gmem_jax.files.labelled import described, plain_cell
+from gmem_jax.files.measures import EACH, of_each
+from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.state import explain, together
 from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.work import WARNINGS
 
+TABLE_SCHEMA = "gmem-sweep-table/2"
 FORMATS = (".csv", ".parquet", ".h5", ".nc")
 
 
@@ -35,12 +39,21 @@ def rows(store: Store) -> list[dict[str, Any]]:
             recall, configuration = store.load(key)
             status = together(recall.status)
             row |= {"state": "done", **{name: float(getattr(recall, name)) for name in MEASURES}}
-            row |= {"status": status, "why": explain(status) if status else "", "seconds": configuration["seconds"]}
+            row |= {"status": status, "why": explain(status) if status else ""}
+            row |= {
+                "warnings": "; ".join(map(str, configuration.get(WARNINGS, ()))),
+                "seconds": configuration["seconds"],
+            }
         else:
             row |= {"state": "failed" if key in failed else "open", **dict.fromkeys(MEASURES)}
-            row |= {"status": None, "why": failed.get(key, ""), "seconds": None}
+            row |= {"status": None, "why": failed.get(key, ""), "warnings": "", "seconds": None}
         found.append({**row, "key": key})
     return found
+
+
+def doubts(row: Mapping[str, Any]) -> str:
+    """Why a point that is done is doubtful, from its row: its status and what was warned of; "" if nothing is."""
+    return "; ".join(filter(None, (row["why"], row["warnings"]))) if row["state"] == "done" else ""
 
 
 def _cell(value: Any) -> Any:
@@ -60,12 +73,17 @@ def means(table: Sequence[dict[str, Any]], names: Sequence[str], over: Sequence[
         for measure in MEASURES:
             mean, deviation, error = spread([one[measure] for one in done]) if done else (None, None, None)
             row |= {measure: mean, f"{measure}_sd": deviation, f"{measure}_se": error}
+        row["status"] = together([one["status"] for one in done]) if done else None
+        row["warnings"] = "; ".join(dict.fromkeys(one["warnings"] for one in done if one["warnings"]))
         found.append(row)
     return found
 
 
-def export(store: Store, path: Path) -> None:
-    """Write the table: .csv; .parquet; .h5 or .nc, which xarray reads, with every recalled signal.
+def export(store: Store, path: Path) -> str:
+    """Write the table: .csv (see `plain_cell`); .parquet; .h5 or .nc, which xarray reads, with every recalled signal.
+
+    Returns:
+        What is to be known of it; "" if nothing.
 
     Raises:
         ValueError: for another suffix, or if a library is missing.
@@ -73,41 +91,65 @@ def export(store: Store, path: Path) -> None:
     """
     suffix = path.suffix.lower()
     table = rows(store)
+    if not table:
+        raise ValueError(f"{store.folder}: has no points yet")
     if suffix == ".csv":
         with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(table[0]))
-            writer.writeheader()
-            writer.writerows(table)
+            writer = csv.writer(file)
+            writer.writerows([map(plain_cell, row) for row in (table[0], *(row.values() for row in table))])
     elif suffix == ".parquet":
         pyarrow, parquet = optional("pyarrow", "export"), optional("pyarrow.parquet", "export")
         with atomic(path) as temporary:
             parquet.write_table(pyarrow.Table.from_pylist(table), temporary)
     elif suffix in (".h5", ".nc"):
+        data = _dataset(store, table)
         with atomic(path) as temporary:
-            _dataset(store, table).to_netcdf(temporary, engine="h5netcdf")
+            data.to_netcdf(temporary, engine="h5netcdf")
+        counts = sorted({int(count) for count in data.get("signal_count", ()) if count})
+        if len(counts) > 1:
+            return f"points have {counts[0]} to {counts[-1]} signals, see `signal_count`; what lies beyond them is NaN"
     else:
         raise ValueError(f"{path}: must end in one of {', '.join(FORMATS)}")
+    return ""
 
 
 def _dataset(store: Store, table: Sequence[dict[str, Any]]) -> Any:
-    """The table as an xarray.Dataset over points; signals where all points have as many."""
+    """The table as an xarray.Dataset over points, with the signals of each; NaN where a point has fewer than others."""
     xarray = optional("xarray", "export")
     optional("h5netcdf", "export")
     card = store.card()
     columns = {name: ("point", _column([row[name] for row in table])) for name in table[0]}
-    data = xarray.Dataset(columns, attrs={"schema": "gmem-sweep-table/1", "shared": json.dumps(card["shared"])})
-    recalls = {row["key"]: store.load(row["key"])[0] for row in table if row["state"] == "done"}
-    shapes = {np.shape(recall.p_sig) for recall in recalls.values()}
-    if len(shapes) == 1:
-        (shape,) = shapes
-        blank = np.full(shape, np.nan)
-        for name in ("p_sig", "J", "shear"):
-            stacked = [
-                np.asarray(getattr(recalls[row["key"]], name)) if row["key"] in recalls else blank for row in table
-            ]
-            data[name] = (("point", "signal", "u"), np.stack(stacked), described(name))
-        data = data.assign_coords(u=("u", np.asarray(next(iter(recalls.values())).u), described("u")))
-    return data
+    about = {"schema": TABLE_SCHEMA, "shared": json.dumps(card["shared"])}
+    data = xarray.Dataset(columns, attrs=about)
+    loaded = {place: store.load(row["key"]) for place, row in enumerate(table) if row["state"] == "done"}
+    if not loaded:
+        return data
+    counts = np.zeros(len(table), int)
+    for place, (recall, _) in loaded.items():
+        counts[place] = len(recall.J)
+    u = np.asarray(next(iter(loaded.values()))[0].u)
+    blank = (len(table), counts.max())
+    names = np.full(blank, "", object)
+    values = {name: np.full((*blank, len(u)), np.nan) for name in ("p_sig", "J", "shear")}
+    values |= {name: np.full(blank, np.nan) for name in EACH}
+    for place, (recall, configuration) in loaded.items():
+        own = {**vars(recall), **of_each(recall, configuration)}
+        names[place, : counts[place]] = signal_names(recall, configuration)
+        for name, array in values.items():
+            array[place, : counts[place]] = own[name]
+    for name, array in values.items():
+        data[name] = (("point", "signal", "u")[: array.ndim], array, described(name))
+    told = {
+        "units": "1",
+        "description": "signals of the point; what lies beyond them is NaN",
+    }
+    data["signal_count"] = ("point", counts, told)
+    data["signal_name"] = (
+        ("point", "signal"),
+        names.astype(str),
+        {"description": "names of its signals"},
+    )
+    return data.assign_coords(u=("u", u, described("u")))
 
 
 def _column(values: list[Any]) -> np.ndarray:

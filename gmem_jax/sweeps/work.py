@@ -1,6 +1,8 @@
 """A worker: takes jobs that nobody has, until none is left.
 
-    python -m gmem_jax.sweeps.work FOLDER NAME [CPUS]
+    python -P -m gmem_jax.sweeps.work FOLDER NAME [CPUS [attached]]
+
+An attached one ends as soon as its stdin does.
 
 Any number of workers, on any machines that see the folder, share a sweep; one that is killed loses what it did since
 its last checkpoint.
@@ -8,11 +10,14 @@ its last checkpoint.
 
 import contextlib
 import functools
+import importlib
 import os
+import signal
 import sys
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +25,25 @@ import jax
 
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.recall import Recall, run
+from gmem_jax.experiment.recall import OtherCompressionWarning, Recall, run
 from gmem_jax.experiment.several import run_several
-from gmem_jax.files.checkpoints import Checkpoints
+from gmem_jax.files.checkpoints import Checkpoints, part_with
 from gmem_jax.files.configuration import experiment_from, resolved
 from gmem_jax.files.packs import load_pack, save_pack
 from gmem_jax.files.programs import keep_programs
-from gmem_jax.physics import grain
+from gmem_jax.physics.material import Material
 from gmem_jax.preparation.preparation import prepare
 from gmem_jax.preparation.recipe import Recipe
 from gmem_jax.simulation.checkpoints import no_cache
 from gmem_jax.simulation.progress import Progress, silent
 from gmem_jax.simulation.sample import Sample
+from gmem_jax.sweeps.making import clump_of
+from gmem_jax.sweeps.processes import end_with_parent
 from gmem_jax.sweeps.store import Store
 
+ATTACHED = "attached"
 EVERY = 1.0  # s between two reports of progress
-
-
-def clump_of(shape: Mapping[str, Any]) -> grain.Clump:
-    """A grain from its shape and overlap."""
-    return grain.sphere() if shape["shape"] == "sphere" else grain.tetra(float(shape["overlap"]))
+WARNINGS = "warnings"  # in the configuration of a point: what Python warned of in its run, and the status does not say
 
 
 def run_group(
@@ -57,17 +61,30 @@ def run_group(
         RunFailedError: if the simulation broke down.
     """
     began = time.perf_counter()
-    if len(experiments) == 1:
-        recalls = [run(experiments[0], batch=batch, cache=cache or no_cache, progress=progress)]
-    else:
-        recalls = run_several(experiments, cache=cache or no_cache, progress=progress)
+    heard: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as heard:
+            if len(experiments) == 1:
+                recalls = [run(experiments[0], batch=batch, cache=cache or no_cache, progress=progress)]
+            else:
+                recalls = run_several(experiments, cache=cache or no_cache, progress=progress)
+    finally:
+        for one in heard:  # they are of the log too, or of who called
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    told = {WARNINGS: words} if (words := warned(heard)) else {}
     seconds = (time.perf_counter() - began) / len(recalls)
     if store:
         for key, experiment, recall in zip(keys, experiments, recalls, strict=True):
-            store.save(key, jax.block_until_ready(recall), resolved(experiment, seconds))
+            store.save(key, jax.block_until_ready(recall), {**resolved(experiment, seconds), **told})
     if cache:
         cache.discard()
     return dict(zip(keys, recalls, strict=True))
+
+
+def warned(heard: Sequence[warnings.WarningMessage]) -> list[str]:
+    """The texts of warnings, each once, but for what a bit of the status says of each point."""
+    texts = [" ".join(str(one.message).split()) for one in heard if one.category is not OtherCompressionWarning]
+    return list(dict.fromkeys(texts))
 
 
 class _Worker:
@@ -107,13 +124,16 @@ class _Worker:
         parts = self._parts(job)
         stages: dict[str, Sample] = {}
         say = self.progress(job["name"])
-        pack = prepare(Recipe(**job["recipe"]), clump_of(job["grain"]), cache=parts, progress=say, log=stages)
+        made_of: Any = {"grain": clump_of(job["grain"]), "material": Material(**job["material"]), "name": job["name"]}
+        pack = prepare(Recipe(**job["recipe"]), **made_of, cache=parts, progress=say, log=stages)
         save_pack(self.store.pack_at(job["name"]), pack, stages)
         parts.discard()
 
     def _experiments(self, job: dict[str, Any]) -> list[Experiment]:
-        written = job["configurations"]
-        return [experiment_from(one, self.packs(one["pack"]["source"])) for one in written]
+        try:
+            return [experiment_from(one, self.packs(one["pack"]["source"])) for one in job["configurations"]]
+        except (KeyError, TypeError, AttributeError) as error:
+            raise FileFormatError(f"a job whose experiments are none: {error}") from error
 
     def _run(self, job: dict[str, Any]) -> None:
         say, cache = self.progress(job["name"]), self._parts(job)
@@ -148,8 +168,24 @@ def work(folder: Path, name: str) -> int:
     return done
 
 
+class Requeued:
+    """A worker as submitit's job: before its time is over it keeps a checkpoint, and is put into the queue again."""
+
+    def __call__(self, arguments: list[str]) -> int:
+        """Work."""
+        if hasattr(signal, "SIGUSR2") and callable(leave := signal.getsignal(signal.SIGUSR2)):
+            signal.signal(signal.SIGUSR2, lambda *which: part_with(lambda: leave(*which)))
+        return main(arguments)
+
+    def checkpoint(self, arguments: list[str]) -> Any:
+        """The same again, for submitit."""
+        return importlib.import_module("submitit.helpers").DelayedSubmission(self, arguments)
+
+
 def main(arguments: list[str]) -> int:
     """Entry point of a worker's process; 0 if it did what it could."""
+    if ATTACHED in arguments[3:]:
+        end_with_parent()
     jax.config.update("jax_enable_x64", True)
     keep_programs()
     if len(arguments) > 2 and hasattr(os, "sched_setaffinity"):

@@ -246,7 +246,7 @@ BAD = [
         "--signals words:13: words need a length from 1 to 12",
     ),
     (["recall", "{pack}", "--signals", "words", "-o", "{out}"], "words need a length from 1 to 12, as in words:3"),
-    (["classify", "{pack}", "-o", "{json}"], "schema is 'gmem-pack/2', expected 'gmem-recall/3'"),
+    (["classify", "{pack}", "-o", "{json}"], "schema is 'gmem-pack/2', expected 'gmem-recall/4'"),
     (["classify", "{truncated.h5}", "-o", "{json}"], "its checksum does not fit its content"),
     (["classify", "nothing.h5", "-o", "{json}"], "nothing.h5: no such file"),
     (["classify", "nothing.h5", "--seeds", "0", "-o", "{out}"], "'--seeds'"),

@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+import h5py
+import matplotlib as mpl
 import numpy as np
 import pytest
 from test_cli import gmem
@@ -61,7 +63,7 @@ def folder(recalled: tuple[gm.Experiment, gm.Recall], tmp_path_factory: pytest.T
     points = [point({"mu": mu}, gm.replace(experiment, {"friction.mu": mu})) for mu in (0.5, 1.0)]
     store.remember(points, {}, ["mu"])
     for one in points:
-        gm.save_recall(store.at(one.key), found, configuration)
+        store.save(one.key, found, configuration)
     return folder
 
 
@@ -129,9 +131,39 @@ def test_recalled_signals_are_given_as_csv(
     assert (lines[0], len(lines)) == ("u,p_sig of 0 (E),p_sig of 1 (E)", 257)
 
 
+def test_each_signal_is_told_of_in_the_table_and_as_csv(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, folder: Path
+) -> None:
+    assert gmem(monkeypatch, "show", folder / "recall.h5") == 0  # two signals fit
+    assert "correlation with J" in capsys.readouterr().out
+    monkeypatch.setattr("gmem_jax.show.tables.FEW", 1)
+    assert gmem(monkeypatch, "show", folder / "recall.h5") == 0
+    assert "correlation with J" not in capsys.readouterr().out
+    assert gmem(monkeypatch, "show", folder / "recall.h5", "--each") == 0
+    assert "correlation with J" in capsys.readouterr().out
+    assert gmem(monkeypatch, "show", folder / "recall.h5", "--each", "--csv") == 0
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert head == "signal,gain,fidelity,windowed_fidelity,correlation"
+    with h5py.File(folder / "recall.h5") as file:
+        assert [float(row.split(",")[2]) for row in rows] == file["signal_fidelity"][:].tolist()
+
+
+def test_what_lies_along_the_axis_of_a_sweep_can_be_chosen(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, folder: Path
+) -> None:
+    picture = tmp_path / "f.svg"
+    assert gmem(monkeypatch, "show", folder / "swept", "--plot", "fidelity", "--x", "mu", "-o", picture) == 0
+    assert "<svg" in picture.read_text()
+    assert gmem(monkeypatch, "show", folder / "swept", "--over", "mu", "--json") == 0
+    assert [row["done"] for row in json.loads(capsys.readouterr().out)["means"]] == [2]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
+        (["swept", "--plot", "gain", "--x", "colour", "-o", "x.png"], "colour: does not vary here; mu do"),
+        (["recall.h5", "--x", "mu"], "--x is for the folder of a sweep"),
+        (["pack.h5", "--each"], "this is no recall"),
         (["recall.h5", "--plot", "colour", "-o", "x.png"], "there are signals, waveforms, all, pressure"),
         (["recall.h5", "--plot", "Z"], "name the picture with -o, as in -o Z.png"),
         (["recall.h5", "--plot", "Z", "-o", "x.h5"], "must end in one of .png, .svg, .pdf"),
@@ -159,6 +191,83 @@ def test_pictures_that_are_there_are_kept(
     assert gmem(monkeypatch, "show", folder / "recall.h5", "--plot", "Z", "-o", tmp_path / "x.png") == 2
     assert "exists" in capsys.readouterr().err
     assert (tmp_path / "x.png").read_text() == "precious"
+
+
+def test_a_picture_of_a_stage_shows_the_chosen_signals(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, folder: Path
+) -> None:
+    drawn = tmp_path / "p.svg"
+    monkeypatch.setitem(mpl.rcParams, "svg.fonttype", "none")
+    assert gmem(monkeypatch, "show", folder / "recall.h5", "--plot", "p_xy", "--signal", "0,2", "-o", drawn) == 0
+    text = drawn.read_text()
+    assert ">zero signal<" in text
+    assert ">1<" in text  # the second word
+    assert "band: lowest to highest" not in text
+
+
+@pytest.mark.parametrize(("at", "words"), [("0.5,x", "numbers from 0 to 1"), ("0.5,1.5", "frames at u = 1.5")])
+def test_frames_at_no_compression_are_refused_before_anything_is_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, folder: Path, at: str, words: str
+) -> None:
+    assert gmem(monkeypatch, "recall", folder / "pack.h5", "--frames-at", at, "-o", tmp_path / "r.h5") != 0
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_frames_at_chosen_compressions_are_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, folder: Path) -> None:
+    quick = ["--t0", "75", "--rest", "0.1", "--hold", "0.1", "--store", "0.1", "--no-picture", "--frames-at", "0.5"]
+    assert gmem(monkeypatch, "recall", folder / "pack.h5", *quick, "-o", tmp_path / "r.h5") == 0
+    frames = gm.load_recall(tmp_path / "r.h5")[0].frames
+    assert frames is not None
+    assert frames.stages == ("compress", "decompress", "encode", "readout")
+    np.testing.assert_allclose(frames.u, 0.5)
+
+
+def test_chosen_signals_are_the_columns_of_their_replicas(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
+    experiment, recall = recalled
+    (axis,) = recall.plot("p_xy", experiment, signals=[2]).figure.axes
+    pressure = np.asarray(recall.stages["readout"].pressure)[:, :, 2]
+    lines = [line for line in axis.lines if len(line.get_xdata()) > 2]
+    np.testing.assert_allclose(lines[-1].get_ydata() / (pressure[:, 0] - pressure[:, 1]), gm.Material().modulus)
+    figure = recall.plot("signals", experiment, signals=[2]).figure
+    assert [axis.get_title() for axis in figure.axes if axis.get_title()] == ["1"]
+    np.testing.assert_allclose(figure.axes[0].lines[1].get_ydata(), gm.Material().modulus * recall.p_sig[1])
+    assert "of all 2 signals" in " ".join(figure._suptitle.get_text().split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["recall.h5", "--plot", "Z", "--signal", "3", "-o", "x.png"], "can show 1 to 2, and 0, the zero signal"),
+        (["recall.h5", "--plot", "signals", "--signal", "0", "-o", "x.png"], "signal 0: this picture can show 1 to 2"),
+        (["recall.h5", "--plot", "Z", "--signal", "one", "-o", "x.png"], "numbers with commas between"),
+        (["recall.h5", "--signal", "1"], "say what with --plot"),
+        (["pack.h5", "--plot", "phi", "--signal", "1", "-o", "x.png"], "holds no recall"),
+        (["swept", "--plot", "gain", "--signal", "1", "-o", "x.png"], "name the file of a point"),
+    ],
+)
+def test_a_choice_of_signals_that_cannot_be_is_refused_in_a_line(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+    tmp_path: Path,
+    folder: Path,
+    arguments: list[str],
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert gmem(monkeypatch, "show", folder / arguments[0], *arguments[1:]) != 0
+    said = capsys.readouterr().err
+    assert words in " ".join(said.split())
+    assert not (tmp_path / "x.png").exists()
+
+
+def test_where_a_drive_rings_the_mean_over_the_ringing_is_drawn(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
+    experiment, recall = recalled
+    labels = [text.get_text() for text in recall.plot("signals", experiment).figure.legends[0].get_texts()]
+    assert recalls.MEAN in labels
+    slow = dict(gm.resolved(experiment, 0.0), t0=1.8e4)
+    labels = [text.get_text() for text in recalls.recall_drawing(recall, "signals", slow).figure.legends[0].get_texts()]
+    assert recalls.MEAN not in labels
 
 
 def test_more_signals_than_fit_are_said_to_be_more(

@@ -137,6 +137,34 @@ def test_workers_that_are_killed_are_replaced_and_change_no_bit(swept: Path, tmp
     assert len(list((tmp_path / "mu" / "points").iterdir())) == 4
 
 
+@pytest.mark.parametrize(
+    ("command", "known"),
+    [
+        (["sweep", "mu.toml"], {"points": 4, "packs": 2, "there": 0, "runs": 4}),
+        (["recall", PACK, "--t0", "75", "-o", "r.h5"], {}),
+        (["prepare", "--grains", "27", "-o", "p.h5"], {}),
+        (["reproduce", "fig09"], {"points": 8, "packs": 0, "there": 0}),
+        (["reproduce", "fig03", "--scale", "workstation"], {"points": 0, "packs": 4, "runs": 0}),
+        (["reproduce", "fig07"], {"training_seconds": 0.0}),
+    ],
+    ids=["sweep", "recall", "prepare", "figure", "packs", "drawing"],
+)
+def test_a_dry_run_tells_the_cost_and_does_nothing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, command: list, known: dict
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mu.toml").write_text('[prepare]\ngrains = 27\n[vary]\nmu = [0.5, 1.0]\n"prepare.seed" = [1, 2]\n')
+    assert gmem(monkeypatch, *command, "--dry-run", "--json") == 0
+    cost = said(capsys)
+    assert known.items() <= cost.items()
+    if "fig07" not in command:
+        assert cost["seconds"] > 0.0
+        assert cost["disk_bytes"] > 1e5
+        assert gmem(monkeypatch, *command, "--dry-run") == 0
+        assert "nothing was run or written" in capsys.readouterr().out
+    assert [path.name for path in tmp_path.iterdir()] == ["mu.toml"]
+
+
 REFUSED = {
     "no such file": ["sweep", "nowhere.toml"],
     "no sweep": ["sweep", "status", "."],

@@ -1,6 +1,6 @@
-"""A sweep on SLURM whose workers are cancelled twice on the way: the same points, bit for bit, as without SLURM.
+"""A sweep on SLURM, one worker of which is cancelled on the way and one told that its time is over: it is requeued.
 
-tests/cluster/one_node.sh python tests/cluster/sweep_on_slurm.py
+The same points, bit for bit, as without SLURM; then a sweep that cannot begin says why, and is stopped: `make cluster`.
 """
 
 import subprocess
@@ -17,7 +17,7 @@ PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
 ENTRY = "from gmem_jax.command.app import main; main()"
 SWEEP = f"""[experiment]
 pack = "{PACK}"
-t0 = 360
+t0 = 36000
 [vary]
 mu = [0.2, 0.5, 1.0]
 friction = ["H", "M1"]
@@ -33,14 +33,55 @@ def gmem(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-c", ENTRY, *map(str, arguments)], stderr=subprocess.PIPE, text=True)
 
 
+def told(*command: str) -> list[str]:
+    """What one of SLURM's commands says, in words."""
+    return subprocess.run(command, capture_output=True, text=True).stdout.split()
+
+
 def running() -> list[str]:
     """Numbers of the jobs that run now."""
-    told = subprocess.run(["squeue", "--noheader", "--states=RUNNING", "--format=%A"], capture_output=True, text=True)
-    return told.stdout.split()
+    return told("squeue", "--noheader", "--states=RUNNING", "--format=%A")
+
+
+def disturbed(sweep: subprocess.Popen[str], store: Path) -> int:
+    """Cancel a worker that has left a checkpoint, then send one the signal that its time is over; how often."""
+    done = 0
+    while sweep.poll() is None:
+        time.sleep(0.5)
+        begun = [path for path in store.glob("parts/*/*") if path.suffix in (".now", ".npz")]
+        if done < 2 and len(begun) > done and (jobs := running()):
+            subprocess.run(["scancel", *(["--signal=USR2"] if done else []), jobs[0]], check=False)
+            done += 1
+            print(("cancelled", "signalled")[done - 1], jobs[0], flush=True)
+        # Not two minutes later, as SLURM would.
+        for job in told("squeue", "--noheader", "--states=PENDING", "--format=%A"):
+            subprocess.run(
+                ["scontrol", "update", f"JobId={job}", "StartTime=now"], check=False
+            )  # not two minutes later
+    return done
+
+
+def waits_and_stops(folder: Path) -> None:
+    """A job that may begin in an hour waits, says for what, and is ended by `gmem sweep stop`."""
+    more = "slurm_additional_parameters = {begin = 'now+1hour'}"
+    (folder / "waits.toml").write_text(SWEEP.format(executor="slurm", workers=1, more=more))
+    sweep = gmem("sweep", folder / "waits.toml")
+    while not (jobs := told("squeue", "--noheader", "--format=%j|%r")):
+        assert sweep.poll() is None, sweep.communicate()[1]
+        time.sleep(0.5)
+    assert jobs[0].startswith("gmem-waits-worker-0|"), jobs
+    sweep.kill()  # what it began outlives it
+    command = [sys.executable, "-c", ENTRY, "sweep"]
+    said = subprocess.run([*command, "status", str(folder / "waits")], capture_output=True, text=True).stdout
+    assert "worker-0 waits (" in said, said
+    said = subprocess.run([*command, "stop", str(folder / "waits")], capture_output=True, text=True).stdout
+    assert "ended worker-0, job" in said, said
+    time.sleep(2.0)
+    assert not told("squeue", "--noheader", "--format=%A")
 
 
 def main() -> None:
-    """Run it on SLURM with two cancellations, without SLURM, and compare."""
+    """Run it on SLURM with two disturbances, without SLURM, and compare."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         settings = {"slurm": ("slurm", 2, "timeout_min = 10\nmem_gb = 2"), "here": ("processes", 1, "")}
@@ -48,15 +89,11 @@ def main() -> None:
             text = SWEEP.format(executor=executor, workers=workers, more=more)
             (folder / f"{file}.toml").write_text(text)
         sweep = gmem("sweep", folder / "slurm.toml")
-        cancelled = 0
-        while sweep.poll() is None:
-            time.sleep(1.0)
-            if cancelled < 2 and len(list((folder / "slurm" / "parts").glob("*/*"))) > cancelled and running():
-                subprocess.run(["scancel", running()[0]], check=False)
-                cancelled += 1
-                print(f"cancelled a worker ({cancelled})", flush=True)
+        done = disturbed(sweep, folder / "slurm")
         assert sweep.returncode == 0, sweep.communicate()[1]
-        assert cancelled == 2, "the sweep was done before a worker could be cancelled"
+        assert done == 2, "the sweep was done before its workers could be disturbed"
+        logs = "".join(path.read_text() for path in (folder / "slurm" / "workers" / "submitit").glob("*_log.*"))
+        assert logs.count("Requeued job") == 1, logs
         other = gmem("sweep", folder / "here.toml")
         assert other.wait() == 0
         points = sorted(path.name for path in (folder / "here" / "points").glob("*.h5"))
@@ -64,7 +101,9 @@ def main() -> None:
         for point in points:
             one, two = (gm.load_recall(folder / store / "points" / point)[0] for store in ("slurm", "here"))
             np.testing.assert_array_equal(one.p_sig, two.p_sig)
-    print("six points, the same bits")
+        print("six points, the same bits", flush=True)
+        waits_and_stops(folder)
+    print("a job that waited said why, and was stopped")
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
     others = [
         script(HERE / "fuzz.py", "fuzz", max(200, round(10_000 * scale)), "--seed", int(time.time()) % 100_000),
         script(HERE / "disks.py", "disks"),
+        script(HERE / "ours.py", "ours", "--tries", max(80, round(800 * scale)), "--runs", max(4, round(16 * scale))),
         ("sanitizers", sanitizers),
         script(ROOT / "benchmarks/trust.py", "trust", "--folder", folder / "trust", "--studies", *studies),
     ]
@@ -101,6 +102,27 @@ def _disks(found: dict[str, Any]) -> list[str]:
     return [f"{len(found)} cases (seven commands; 0, 40 and 150 kB left, and read-only): {ends}: {told}."]
 
 
+CLASSES = {
+    "deletion": "A user's files, folders and links where ours would be, some in a folder with a marker of ours. "
+    "Wrong: one was removed or changed.",
+    "identity": "Two kept files were given each other's names. Wrong: they were read, or not read once they were back.",
+    "concurrency": "Three runs into one output at once. Wrong: not one wrote it, or another said anything but a line.",
+    "processes": "Sweeps of two workers that were sent a signal. Wrong: a worker was left after 20 s.",
+}
+
+
+def _ours(found: dict[str, Any]) -> list[str]:
+    lines = []
+    for kind, about in CLASSES.items():
+        counts = found.get(kind, {})
+        lines += [f"**{kind.capitalize()}.** {about}", "", "| what | tried | refused | wrong |", "|---|---|---|---|"]
+        for name in sorted(name.partition(" ")[2] for name in counts if name.startswith("tried ")):
+            cells = [counts.get(f"{word} {name}", 0) for word in ("tried", "refused", "wrong")]
+            lines.append(f"| {name} | {' | '.join(map(str, cells))} |")
+        lines.append("")
+    return lines[:-1]
+
+
 def _trust(found: list[dict[str, Any]]) -> list[str]:
     lines = ["| varied | value | pack | G | F | p_sig differs by |", "|---|---|---|---|---|---|"]
     for row in found:
@@ -118,6 +140,7 @@ def page(found: dict[str, dict[str, Any]], minutes: float) -> str:
         "Killed": _kills(found["killed"]["found"]),
         "Hostile input": _inputs(found["fuzz"]["found"]),
         "Full and read-only disks": _disks(found["disks"]["found"]),
+        "What is not ours, and what is not itself": _ours(found["ours"]["found"]),
         "Native library under sanitizers": [f"ASan, UBSan and TSan over tests/reliability/drive.cc: {sound}."],
         "Numerical trust": _trust(found["trust"]["found"]),
     }

@@ -146,6 +146,7 @@ class View {
     const { scene } = this, at = this.find("frame");
     for (const { label } of scene.quantities) this.find("colour").add(new Option(label));
     at.max = scene.captions.length - 1;
+    at.value = at.max; // begins with what came out
     this.find("time").hidden = scene.captions.length < 2;
     for (const name of ["show", "colour", "axis-of-cut", "cut", "frame"]) this.find(name).addEventListener("input", () => this.fill());
     this.find("home").addEventListener("click", () => this.home());
@@ -162,11 +163,12 @@ class View {
   }
 
   home() {
-    const { lower, upper } = this.scene.arrays;
+    const { lower, upper } = this.scene.arrays; // of the first frame: no frame moves the eye
     const middle = [0, 1, 2].map((k) => 0.5 * (lower[k] + upper[k]));
     const radius = 0.5 * Math.hypot(...[0, 1, 2].map((k) => upper[k] - lower[k]));
+    const { clientWidth, clientHeight } = this.find("stage"), narrow = Math.min(1, clientWidth / clientHeight || 1);
     this.controls.target.set(...middle);
-    this.camera.position.set(...middle).addScaledVector(new THREE.Vector3(0.72, 0.6, 0.42).normalize(), 3.9 * radius);
+    this.camera.position.set(...middle).addScaledVector(new THREE.Vector3(0.72, 0.6, 0.42).normalize(), 3.9 * radius / narrow);
     this.camera.near = 0.05 * radius;
     this.camera.far = 60 * radius;
     this.camera.updateProjectionMatrix();
@@ -259,7 +261,8 @@ class View {
     this.root.querySelectorAll(".axis").forEach((label, axis) => {
       const edge = pixel(edges[axis]), at = edge.clone().sub(middle).setLength(38).add(edge); // outside the box
       label.textContent = `${"xyz"[axis]}: ${(high[axis] - low[axis]).toFixed(2)} R`;
-      label.style.transform = `translate(-50%, -50%) translate(${at.x}px, ${at.y}px)`;
+      const x = Math.min(Math.max(at.x, 40), clientWidth - 40); // half a label, that none is cut
+      label.style.transform = `translate(-50%, -50%) translate(${x}px, ${at.y}px)`;
     });
   }
 

@@ -1,0 +1,28 @@
+"""What is said of each signal by itself: it follows from a recall and its configuration, and stands in files."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment import analysis
+from gmem_jax.experiment.recall import Recall
+
+EACH = ("signal_gain", "signal_fidelity", "signal_windowed_fidelity", "signal_correlation")
+
+
+def relative_scale(configuration: Mapping[str, Any]) -> jax.Array:
+    """delta0 gamma0, what gains are measured in; scalar, or [S, 1] where it differs between signals; NaN if unknown."""
+    numbers = np.multiply(*(configuration.get(name, np.nan) for name in ("delta0", "gamma0")))
+    return jnp.asarray(numbers if np.ndim(numbers) == 0 else numbers[1:, None])
+
+
+def of_each(recall: Recall, configuration: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """`EACH` of every signal, [S]: G and F with a gain of its own, F over T1, correlation with J; NaN of silence."""
+    p_sig, integral, scale = jnp.asarray(recall.p_sig), jnp.asarray(recall.J), relative_scale(configuration)
+    window = recall.window / np.max(configuration.get("t0", np.nan))
+    own, smooth = (analysis.each(p_sig, integral, scale, over) for over in (None, window))
+    values = (own.gain, own.fidelity, smooth.fidelity, analysis.correlation(p_sig, integral))
+    return dict(zip(EACH, map(np.asarray, values), strict=True))

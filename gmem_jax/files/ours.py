@@ -1,0 +1,248 @@
+"""The one rule of removing: nothing is removed, renamed or replaced that was not proven ours.
+
+A folder of ours holds a marker, written when the folder was made. What lies in it is ours if it is a plain file whose
+name fits the pattern of the names that we make. Links are not followed. A new output takes a place that is free.
+Whatever in this package removes, renames or replaces files does it here.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import secrets
+import stat
+import time
+from pathlib import Path
+from typing import Any
+
+_TEMPORARY = re.compile(r"\.gmem-([0-9a-f]{12})-[0-9a-f]{12}\.tmp")
+_new: set[Path] = set()  # outputs that were free when a command claimed them
+
+
+class FileFormatError(ValueError):
+    """A file that is not what it should be; the message names the file, what is wrong and what would be right."""
+
+
+def _tag(name: str) -> str:
+    return hashlib.sha256(os.fsencode(name)).hexdigest()[:12]
+
+
+def temporary(path: Path) -> Path:
+    """A new file beside `path`, whose name says whose it is, and fits wherever a name does; its mode is the umask's.
+
+    Raises:
+        OSError: if the folder cannot be written.
+    """
+    beside = path.with_name(f".gmem-{_tag(path.name)}-{secrets.token_hex(6)}.tmp")
+    os.close(os.open(beside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    return beside
+
+
+def drop(made: Path) -> None:
+    """Remove what `temporary` made, if it is still there."""
+    assert _TEMPORARY.fullmatch(made.name)
+    made.unlink(missing_ok=True)
+
+
+def sweep(folder: Path, name: str = "", *, age: float = 0.0) -> None:
+    """Remove what killed writers left behind: temporary files of the files in a folder (or of one of them).
+
+    Args:
+        folder: where they are.
+        name: of the one file; default all.
+        age: in s: younger ones may be those of living writers.
+    """
+    for left in Path(folder).glob(".gmem-*.tmp"):
+        known = _TEMPORARY.fullmatch(left.name)
+        if known and (not name or known[1] == _tag(name)):
+            with contextlib.suppress(OSError):
+                if _plain(left) and time.time() - left.stat().st_mtime >= age:
+                    drop(left)
+
+
+def promise(path: Path, *, replace: bool) -> None:
+    """Whether `place` may replace what it finds at an output of this process."""
+    (_new.discard if replace else _new.add)(path.absolute())
+
+
+def place(made: Path, path: Path) -> None:
+    """Move what `temporary` made to its path; a file that came there after the path was promised as new survives.
+
+    Raises:
+        FileExistsError: if there is one.
+        OSError: if the folder cannot be written.
+    """
+    if path.absolute() not in _new:
+        os.replace(made, path)
+        return
+    try:
+        try:
+            os.link(made, path)  # which never replaces
+        except FileExistsError:
+            raise
+        except OSError:  # there are no hard links here
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            os.replace(made, path)
+    except FileExistsError:
+        raise FileExistsError(
+            f"{path}: was made by somebody else since this command began, and is untouched; "
+            "move it away, or allow its replacement with --force"
+        ) from None
+    _new.discard(path.absolute())
+    drop(made)
+
+
+def release(lock: Path, number: int) -> None:
+    """Remove a lock, an empty file, if it still is the one of this inode number."""
+    with contextlib.suppress(OSError):
+        found = lock.lstat()
+        if (found.st_ino, found.st_size) == (number, 0):
+            lock.unlink()
+
+
+def _plain(path: Path) -> bool:
+    """Whether it is a file, and no link to one."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except OSError:
+        return False
+
+
+class Folder:
+    """A folder of ours: made with its marker, or proven by it.
+
+    Args:
+        path: of the folder.
+        marker: name of its marker.
+        schema: of the marker.
+        names: pattern of all paths in it that we make, from the folder on.
+        about: what a new marker says beside its schema.
+
+    Raises:
+        FileFormatError: if it is there and is not ours; nothing in it was touched.
+        OSError: if it cannot be written.
+    """
+
+    def __init__(self, path: Path, marker: str, schema: str, names: re.Pattern[str], about: dict[str, Any]) -> None:
+        self.path, self._marker, self._schema, self._names = path, marker, schema, names
+        if path.is_symlink():
+            raise FileFormatError(f"{path}: is a link, which is not followed; name a folder itself")
+        if path.exists() and not path.is_dir():
+            raise FileFormatError(f"{path}: is a file, and a folder is needed; name another")
+        if self.about(path, marker, schema) is not None:
+            return
+        if path.is_dir():
+            others = sorted(entry.name for entry in path.iterdir() if not _TEMPORARY.fullmatch(entry.name))
+            if others:
+                raise FileFormatError(
+                    f"{path}: holds {others[0]} and no {marker} of {schema}, so it is not ours and was left alone; "
+                    "move it away, or name another output"
+                )
+        path.mkdir(exist_ok=True)
+        self.mark(about)
+
+    @staticmethod
+    def about(path: Path, marker: str, schema: str) -> dict[str, Any] | None:
+        """What the marker of a folder says; None if there is none of this schema."""
+        card = path / marker
+        if os.path.islink(path) or not _plain(card):
+            return None
+        try:
+            found = json.loads(card.read_text(encoding="utf-8"))
+        except (ValueError, OSError, RecursionError):
+            return None
+        return found if isinstance(found, dict) and found.get("schema") == schema else None
+
+    def mark(self, about: dict[str, Any]) -> None:
+        """Write the marker anew.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        made, card = None, self.path / self._marker
+        try:
+            made = temporary(card)
+            made.write_text(json.dumps({"schema": self._schema, **about}, indent=1), encoding="utf-8")
+            place(made, card)
+        except OSError as error:
+            raise OSError(f"{card}: cannot be written ({error.strerror}); whatever was there is untouched") from error
+        finally:
+            if made:
+                drop(made)
+
+    def at(self, name: str) -> Path:
+        """The path of a file of ours in it, or where one may be made.
+
+        Raises:
+            FileFormatError: if we make no such name, or a link is on the way.
+        """
+        if not self._names.fullmatch(name):
+            raise FileFormatError(f"{self.path}: {name!r} is no name of a file that belongs there; it was left alone")
+        path = self.path / name
+        for step in (path, *path.parents):
+            if step == self.path:
+                break
+            if step.is_symlink():
+                raise FileFormatError(f"{step}: is a link, which is not followed; nothing was touched")
+        return path
+
+    def files(self, inner: str = "") -> list[Path]:
+        """The files of ours in it, or in a folder in it, in order."""
+        top = self.path / inner
+        if top.is_symlink() or not top.is_dir():
+            return []
+        found = sorted(entry for entry in top.iterdir() if _plain(entry))
+        return [entry for entry in found if self._names.fullmatch(entry.relative_to(self.path).as_posix())]
+
+    def make(self, inner: str) -> None:
+        """Make a folder in it.
+
+        Raises:
+            FileFormatError: if a link or a file has its name.
+        """
+        path = self.path / inner
+        if path.is_symlink() or (path.exists() and not path.is_dir()):
+            raise FileFormatError(f"{path}: is no folder, or a link to one, which is not followed; move it away")
+        path.mkdir(exist_ok=True)
+
+    def remove(self, name: str) -> None:
+        """Remove a file of ours, if it is there.
+
+        Raises:
+            FileFormatError: see `at`.
+        """
+        path = self.at(name)
+        if _plain(path):
+            path.unlink(missing_ok=True)
+
+    def move(self, name: str, to: str) -> None:
+        """Give a file of ours another name of ours.
+
+        Raises:
+            FileFormatError: see `at`.
+        """
+        os.replace(self.at(name), self.at(to))
+
+    def clear(self, inner: str = "", *, keep: bool = False) -> list[str]:
+        """Remove what is ours in it (or in a folder in it), and the folder if nothing else is left.
+
+        Args:
+            inner: the folder in it.
+            keep: keep the folder and its marker.
+
+        Returns:
+            The names of what was left, since it is not ours.
+        """
+        top, marker = self.path / inner, "" if inner else self._marker
+        for path in self.files(inner):
+            if path.name != marker:
+                path.unlink(missing_ok=True)
+        sweep(top)
+        left = sorted(entry.name for entry in top.iterdir() if entry.name != marker) if top.is_dir() else []
+        if not (left or keep or top.is_symlink()):
+            if marker:
+                (top / marker).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                top.rmdir()
+        return left

@@ -1,0 +1,34 @@
+"""What runs take of time and disk, before they are done, and such amounts in words."""
+
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.files.schemas import STAGE
+from gmem_jax.simulation.protocol import BINS
+
+FIXED_BYTES = 1.0e5  # of a file: names, units, scales; measured 1.0e5 on recalls, 1.4e5 on packs with their stages
+PACK_BYTES = 425.0  # of a grain and its candidates, on packs of 325 to 10,240
+FRAME_BYTES = 460.0  # of a grain in a configuration, with its ten contacts
+_SAMPLE = 8 * sum(3 if "axis" in array.shape else 1 for array in STAGE.values())  # of a replica in a bin
+
+
+def recall_bytes(experiment: Experiment, frames: int = 0) -> float:
+    """Of the file of a recall with so many configurations, about."""
+    before, after = (sum(stage.bins for stage in stages) for stages in experiment.phases)
+    curves, samples = 3 * 8 * BINS * experiment.signals.count, _SAMPLE * (before + after * experiment.replicas)
+    return FIXED_BYTES + curves + samples + FRAME_BYTES * experiment.pack.grains * frames
+
+
+def pack_bytes(grains: int, frames: int = 0) -> float:
+    """Of the file of a pack with so many configurations of its preparation, about."""
+    return 1.4 * FIXED_BYTES + (PACK_BYTES + FRAME_BYTES * frames) * grains
+
+
+def in_bytes(count: float) -> str:
+    """Bytes in words."""
+    return f"{count / 1e9:.1f} GB" if count >= 1e9 else f"{count / 1e6:.1f} MB"
+
+
+def in_time(seconds: float) -> str:
+    """A duration in words: "some 3 min"."""
+    units = (("days", 86400.0), ("hours", 3600.0), ("min", 60.0), ("s", 1.0))
+    name, unit = next(pair for pair in units if seconds >= 2.0 * pair[1] or pair[1] == 1.0)
+    return f"some {max(1, round(seconds / unit))} {name}"

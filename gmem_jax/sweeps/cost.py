@@ -1,0 +1,79 @@
+"""What a sweep would cost, said without doing anything of it."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import psutil
+
+from gmem_jax.files.sizes import in_bytes, in_time, pack_bytes, recall_bytes
+from gmem_jax.sweeps.plan import plan
+from gmem_jax.sweeps.spec import Spec
+from gmem_jax.sweeps.sweep import Conductor, seconds_of
+
+
+class Cost(NamedTuple):
+    """What there is to do of a sweep.
+
+    Attributes:
+        points: that are asked for, each once.
+        there: of these, results that are there.
+        failed: that failed before, or cannot be.
+        packs: to be made first.
+        runs: of what is missing; points on packs to be made count by themselves.
+        grain_steps: of all that.
+        seconds: that it takes two free cores, with the native backend and law H.
+        disk_bytes: that its results take.
+    """
+
+    points: int
+    there: int
+    failed: int
+    packs: int
+    runs: int
+    grain_steps: float
+    seconds: float
+    disk_bytes: float
+
+    @property
+    def lines(self) -> list[str]:
+        """In words."""
+        counts = [f"{self.there} there", *([f"{self.failed} failed or impossible"] if self.failed else [])]
+        return [
+            f"points: {self.points}, {', '.join(counts)}; {self.runs} runs at most",
+            f"packs to be made: {self.packs}",
+            f"time: {self.grain_steps:.2g} grain-steps, {in_time(self.seconds)} of two free cores (native, law H)",
+            f"disk: {in_bytes(self.disk_bytes)}; nothing was run or written",
+        ]
+
+
+def cost_of(spec: Spec, folder: Path, *, workers: int = 1, only_packs: bool = False) -> Cost:
+    """What is to be done of a sweep, or for its packs alone, in a folder, which need not be there and is not made.
+
+    Raises:
+        FileFormatError: if the folder holds something else.
+        ValueError: if a point cannot be (see `Conductor.check`).
+        FileNotFoundError: if there is no such pack.
+    """
+    with TemporaryDirectory() as nowhere:
+        conductor = Conductor(spec, folder if folder.exists() else Path(nowhere) / "sweep", lambda _: None)
+        conductor.check()
+        makes = conductor.pack_jobs()
+        later, points = ([], []) if only_packs else (conductor.points_to_come(), conductor.points())
+        known, failed = conductor.store.done(), set(conductor.store.failed())
+    asked = {one.key: one for one in points}
+    missing = [one for key, one in asked.items() if key not in known | failed]
+    memory = psutil.virtual_memory().available // workers
+    jobs = [job.asdict() for job in plan(missing, set(), memory, workers=workers)]
+    work = [*makes, *later, *jobs]
+    disk = sum(pack_bytes(job["recipe"]["grains"]) for job in makes) + sum(one["bytes"] for one in later)
+    return Cost(
+        points=len(asked) + len(conductor.impossible),
+        there=len(asked.keys() & known),
+        failed=len(asked.keys() & failed) + len(conductor.impossible) - len(later),
+        packs=len(makes),
+        runs=len(jobs) + len(later),
+        grain_steps=float(sum(job["work"] for job in work)),
+        seconds=seconds_of(work),
+        disk_bytes=disk + sum(recall_bytes(one.experiment) for one in missing),
+    )

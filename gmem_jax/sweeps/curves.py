@@ -1,0 +1,111 @@
+"""A measure of a sweep against one name: a line for each set of others, means and standard errors over the rest."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gmem_jax.experiment.analysis import spread
+from gmem_jax.files.checked import is_number
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+class Axes(NamedTuple):
+    """What the names of a sweep are in a picture.
+
+    Attributes:
+        x: the horizontal axis.
+        by: a line for each set of their values.
+        over: means and standard errors are over these.
+    """
+
+    x: str
+    by: tuple[str, ...]
+    over: tuple[str, ...]
+
+
+class Line(NamedTuple):
+    """A line of a picture.
+
+    Attributes:
+        values: of the names that it stands for.
+        x: where its points are, in order.
+        each: the measures there.
+    """
+
+    values: dict[str, Any]
+    x: list[Any]
+    each: list[list[float]]
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Of the measures at each x."""
+        return np.asarray([spread(values)[0] for values in self.each])
+
+    @property
+    def error(self) -> np.ndarray:
+        """Their standard errors; NaN of single ones."""
+        return np.asarray([spread(values)[2] for values in self.each])
+
+    @property
+    def most(self) -> int:
+        """The largest number of them at an x."""
+        return max(map(len, self.each))
+
+
+def is_sample(name: str) -> bool:
+    """Whether a name only tells samples of one thing apart, as packs and seeds do."""
+    return name == "pack" or name.rpartition(".")[2] == "seed"
+
+
+def axes_of(rows: Rows, names: Sequence[str], x: str = "", by: Sequence[str] = (), over: Sequence[str] = ()) -> Axes:
+    """What every name is, where some are chosen. Parameters are averaged into one another only if that is asked for.
+
+    Args:
+        rows: of the points that are done.
+        names: that the sweep varies.
+        x: default the first number that is no sample, else the first name that is none, else the first sample.
+        by: default all that vary and are nothing else, and do not follow from x.
+        over: default the samples (`is_sample`).
+
+    Raises:
+        ValueError: for a name that does not vary, or is two things, or nothing though others are chosen.
+    """
+    chosen = [*([x] if x else []), *by, *over]
+    varying = [name for name in names if len({row[name] for row in rows}) > 1]
+    for name in chosen:
+        if name not in names:
+            raise ValueError(f"{name}: does not vary here; {', '.join(names)} do")
+        if chosen.count(name) > 1:
+            raise ValueError(f"{name}: is to be two of --x, --by and --over; choose one")
+    free = [name for name in varying if name not in chosen]
+    if not x:
+        numbers = [name for name in free if all(is_number(row[name]) for row in rows)]
+        known = [name for some in (numbers, free) for name in some if not is_sample(name)]
+        x = next(iter([*known, *free, *[name for name in names if name not in chosen], *names]))
+        free = [name for name in free if name != x]
+    if not over:
+        over = [name for name in free if is_sample(name)]
+    left = [name for name in free if name not in over and not _follows(rows, name, x)]
+    if by and left:
+        raise ValueError(f"{left[0]}: varies too; name it in --by for a line each, or in --over for a mean")
+    return Axes(x, tuple(by) or tuple(left), tuple(over))
+
+
+def _follows(rows: Rows, name: str, x: str) -> bool:
+    """Whether each value of x has one of another name, as in a [[zip]]."""
+    return len({(row[x], row[name]) for row in rows}) == len({row[x] for row in rows})
+
+
+def lines_of(rows: Rows, axes: Axes, measure: str) -> list[Line]:
+    """The lines of a picture, each in the order of x; points without x are in none."""
+    there = [row for row in rows if row[axes.x] is not None]
+    numbers = all(is_number(row[axes.x]) for row in there)
+    found: dict[tuple[Any, ...], dict[Any, list[float]]] = {}
+    for row in sorted(there, key=lambda row: row[axes.x] if numbers else str(row[axes.x])):
+        line = found.setdefault(tuple(row[name] for name in axes.by), {})
+        line.setdefault(row[axes.x], []).append(float(row[measure]))
+    lines = [Line(dict(zip(axes.by, own, strict=True)), list(at), list(at.values())) for own, at in found.items()]
+    order = {value: place for place, value in enumerate(tuple(row[name] for name in axes.by) for row in there)}
+    return sorted(lines, key=lambda line: order[tuple(line.values.values())])
