@@ -1,4 +1,4 @@
-"""The tables of docs/results/README.md, as `gmem reproduce` wrote them, and of docs/remember_more.md, of words.
+"""The tables of docs/results/figures.md, as `gmem reproduce` wrote them, and of docs/remember_more.md, of words.
 
 python experiments/results_page.py [--redraw]
 
@@ -205,7 +205,7 @@ def main() -> None:
     lines = []
     for (_, name, _, scale), path in sorted(shown):
         lines += [*heading(name, scale), *([*verdicts(path), ""] if name == "claims" else figure(path))]
-    put(lines, HERE / "README.md")
+    put(lines, HERE / "figures.md")
     put([*designed_words(HERE / "designed_words.csv"), "", ""], HERE.parent / "remember_more.md")
 
 
