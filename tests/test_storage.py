@@ -47,7 +47,7 @@ def test_a_pack_survives_the_file_bit_for_bit(tmp_path: Path) -> None:
         (lambda pack: replace(pack, record="[]"), "its record is not a JSON object"),
         (lambda pack: replace(pack, position=2.0 * pack.position), "a grain lies outside the box"),
         (lambda pack: replace(pack, quaternion=1.1 * pack.quaternion), "a quaternion is not of length 1"),
-        (lambda pack: replace(pack, ringing_period=pack.ringing_period * -1.0), "its ringing period is not positive"),
+        (lambda pack: replace(pack, ringing_period=pack.ringing_period * -1.0), "its ringing period is -19.6"),
         (lambda pack: stack([pack, pack]), r"'position' has shape \[2, 27, 3\]"),
         (lambda pack: replace(pack, position=pack.position.astype("float32")), "its numbers are in single precision"),
     ],
@@ -99,13 +99,13 @@ def test_another_schema_is_refused_and_named(tmp_path: Path) -> None:
     other = tmp_path / "other.h5"
     with writing(other, "gmem-pack/99"):
         pass
-    with pytest.raises(gm.FileFormatError, match="'gmem-pack/99', expected 'gmem-pack/2'"):
+    with pytest.raises(gm.FileFormatError, match=r"'gmem-pack/99', expected 'gmem-pack/0\.1'"):
         gm.load_pack(other)
 
 
 def test_a_file_without_its_data_is_refused(tmp_path: Path) -> None:
     empty = tmp_path / "empty.h5"
-    with writing(empty, "gmem-pack/2"):
+    with writing(empty, "gmem-pack/0.1"):
         pass
     with pytest.raises(gm.FileFormatError, match="incomplete"):
         gm.load_pack(empty)

@@ -79,9 +79,9 @@ def _held(file: Path, against: str, signals: Sequence[int], each: bool) -> Shown
     kind = schema_of(file)
     if kind == KERNEL.name:
         return _kernel(file)
-    if kind in (PACK.name, *PACK.before):
+    if kind == PACK.name:
         return _pack(file, against)
-    if kind in (RECALL.name, *RECALL.before):
+    if kind == RECALL.name:
         return _recall(file, against, signals, each)
     known = ", ".join(schema.name for schema in (RECALL, PACK, KERNEL))
     raise FileFormatError(f"{file}: schema is {kind[:40]!r}, expected one of {known}")

@@ -25,7 +25,7 @@ from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.packs import load_pack, load_stages, pack_called
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import load_result
-from gmem_jax.files.schemas import GRADIENT, READING, TUNED
+from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL, TUNED
 from gmem_jax.files.waveforms import load_design, load_target, load_waveforms
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain
@@ -131,11 +131,11 @@ class Report:
         elif pack_called(source):
             self._pack(source)
         else:
-            kinds = {"gmem-pack": self._pack, "gmem-recall": self._recall, "gmem-kernel": self._kernel}
+            kinds = {PACK.name: self._pack, RECALL.name: self._recall, KERNEL.name: self._kernel}
             schema = schema_of(path)
-            if (kind := schema.partition("/")[0]) not in kinds:
+            if schema not in kinds:
                 raise FileFormatError(f"{source}: schema is {schema[:40]!r}, expected one of {', '.join(kinds)}")
-            kinds[kind](source)
+            kinds[schema](source)
 
     def page(self, title: str) -> str:
         """The whole page."""
