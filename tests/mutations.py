@@ -470,7 +470,7 @@ MUTATIONS = (
         "dual.h",
         "differ(a.value, b.value) | differ(a.slope, b.slope)",
         "differ(a.value, b.value)",
-        "test_unit_tests_in_cpp[runs]",
+        "test_unit_tests_in_cpp[segments]",
     ),
     mutation(
         "tangent-of-a-product",
