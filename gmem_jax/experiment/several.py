@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, replace, replica_parameters, value_at
+from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, replace, replica_parameters, value_at
 from gmem_jax.experiment.recall import PREFIX, Recall, finished, runner_of, warn_of_another_compression
 from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import pytree
@@ -82,7 +82,7 @@ class _Side:
         # All names of any of them: what one leaves to its default may be a number in another.
         self.names = list(dict.fromkeys(name for each in experiments for name in replica_parameters(each)))
         values = [tuple(float(value_at(each, name)) for name in self.names) for each in experiments]
-        acting = [name.split(".")[0] not in AFTER_PREFIX for name in self.names]
+        acting = [acts_on_prefix(name) for name in self.names]
         own = [tuple(value for value, acts in zip(row, acting, strict=True) if acts) for row in values]
         kinds = list(dict.fromkeys(own))
         self.prefix = np.asarray([kinds.index(row) for row in own])
