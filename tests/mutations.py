@@ -1045,8 +1045,8 @@ MUTATIONS = (
     ),
     mutation(
         "prefix-not-differentiated",
-        "derivatives/gradient.py",
-        'any(name.split(".")[0] not in AFTER_PREFIX for name in names)',
+        "experiment/experiment.py",
+        'not any(entry.name == first and entry.metadata.get("after_prefix") for entry in fields(Experiment))',
         "False",
         "test_what_acts_on_the_prefix_is_recognised",
     ),

@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import serialization
 
 from gmem_jax.errors import FileFormatError
@@ -48,14 +47,12 @@ def learn(
 
     A step depends on its number and the seed alone, so that training can be broken off and taken up anywhere.
     """
-    optimiser = optax.sgd(net.lessons.rate)  # plain: its state is empty
     key = jax.random.fold_in(chance.key(seed), 2)
 
     def step(net: Net, number: Any) -> tuple[Net, jax.Array]:
         inputs, word = data.training(jax.random.fold_in(key, number))
         loss, slope = jax.value_and_grad(loss_of)(net, inputs, word)
-        change, _ = optimiser.update(slope, optimiser.init(net))
-        return optax.apply_updates(net, change), loss
+        return jax.tree.map(lambda weight, uphill: weight - net.lessons.rate * uphill, net, slope), loss
 
     net, losses = jax.lax.scan(step, net, first + jnp.arange(count))
     return net, jnp.mean(losses)
