@@ -22,7 +22,6 @@ from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain, together
 from gmem_jax.preparation.recipe import pressure_over_wanted
-from gmem_jax.simulation.frames import sphere_places
 
 LARGE_FOR_SPHERES = 3000  # grains: see `note_on_size`
 FEW = 8  # signals that are told of one by one unasked
@@ -287,12 +286,6 @@ def _tetra(shape: str) -> tuple[str, float]:
     return kind, float(rest.rstrip(")")) if kind == "tetra" else math.nan
 
 
-def _on_walls(pack: Pack) -> float:
-    """Spheres that touch a wall, per grain."""
-    spheres = sphere_places(*map(np.asarray, (pack.position, pack.quaternion, pack.clump.offsets)))
-    return float(np.sum((spheres - pack.lower < 1.0) * 1 + (pack.upper - spheres < 1.0))) / pack.grains
-
-
 def pack_table(pack: Pack) -> Table:
     """What a pack file holds."""
     unit = Material().modulus
@@ -312,7 +305,7 @@ def pack_table(pack: Pack) -> Table:
             ("filling phi", f"{rest['filling']:.4f}"),
             ("coordination Z (grain pairs)", f"{rest['coordination']:.2f}"),
             ("sphere contacts, times two, per grain", f"{rest['contacts']:.2f}"),
-            ("contacts per grain, with walls", f"{0.5 * rest['contacts'] + _on_walls(pack):.2f}"),
+            ("contacts per grain, with walls", f"{0.5 * rest['contacts'] + rest['wall_contacts']:.2f}"),
             ("p_x, p_y, p_z", f"{pressures} kPa"),
             ("largest speed", f"{rest['largest_speed']:.1e} R/t_c"),
         ]
