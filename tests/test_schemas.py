@@ -21,7 +21,7 @@ PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 @pytest.fixture(scope="module")
 def stored(recalled: tuple[gm.Experiment, gm.Recall], tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("recall") / "recall.h5"
-    gm.save_recall(file, recalled[1], gm.resolved(recalled[0], 1.0))
+    gm.save_recall(file, recalled[1])
     return file
 
 
@@ -70,7 +70,7 @@ def test_xarray_opens_the_files_without_us(files: list[Path], recalled: tuple[gm
 
 
 def test_the_recorded_u_is_that_of_the_protocol(stored: Path, recalled: tuple[gm.Experiment, gm.Recall]) -> None:
-    for found in (recalled[1], gm.load_recall(stored).recall):
+    for found in (recalled[1], gm.load_recall(stored)):
         assert found.protocol == recalled[0].protocol
         for stage in found.protocol:
             passed = np.arange(1, stage.bins + 1)[:, None] / stage.bins
@@ -85,7 +85,7 @@ def test_a_recall_is_an_xarray_with_all_stages_in_a_row(
 ) -> None:
     pytest.importorskip("xarray")
     experiment, found = recalled
-    data = gm.load_recall(stored).to_xarray()
+    data = gm.to_xarray(gm.load_recall(stored))
     assert list(data.signal.values) == ["0", "1"]
     readout = data.sel(time=data.stage == "readout")
     np.testing.assert_array_equal(readout.pressure, found.stages["readout"].pressure)
@@ -100,7 +100,7 @@ def test_a_recall_is_an_xarray_with_all_stages_in_a_row(
 def test_the_csv_of_a_recall_has_a_column_for_each_signal(
     stored: Path, recalled: tuple[gm.Experiment, gm.Recall]
 ) -> None:
-    head, *rows = gm.load_recall(stored).to_csv().splitlines()
+    head, *rows = gm.to_csv(gm.load_recall(stored)).splitlines()
     assert head == "u,p_sig of 0 (E),p_sig of 1 (E)"
     np.testing.assert_array_equal(np.loadtxt(rows, delimiter=",")[:, 1:].T, recalled[1].p_sig)
 

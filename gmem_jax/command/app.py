@@ -13,8 +13,8 @@ from typer.exceptions import TyperException
 from gmem_jax.command import benchmark, classify, derive, exchange, packs, recalls, report, reproduce, show, sweep
 from gmem_jax.command.console import GIVEN, RunInterruptedError, UnheardError, emit, say
 from gmem_jax.errors import RunFailedError
+from gmem_jax.experiment.provenance import versions
 from gmem_jax.files.programs import keep_programs
-from gmem_jax.files.provenance import versions
 from gmem_jax.physics.rules import StartError, usual_rules, why_not_started
 from gmem_jax.simulation.progress import no_further_bar
 

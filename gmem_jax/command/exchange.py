@@ -32,7 +32,8 @@ def export(
         mass, found = float(pack.clump.mass), load_frames(file) if frames else frames_of_pack(pack, material)
         command = "prepare"
     else:
-        recall, configuration = load_recall(file)
+        recall = load_recall(file)
+        configuration = recall.configuration
         material = material_from(configuration.get("experiment", {}).get("material", {}))
         mass, found, command, frames = configuration["grain"]["mass"], recall.frames, "recall", True
     if found is None:

@@ -27,10 +27,10 @@ from gmem_jax.command.console import (
 from gmem_jax.command.options import with_recipe
 from gmem_jax.command.resuming import Restart, resumable
 from gmem_jax.experiment.experiment import PAPER_T0
-from gmem_jax.files.configuration import fingerprint
+from gmem_jax.experiment.provenance import provenance, sources
+from gmem_jax.experiment.record import fingerprint
 from gmem_jax.files.home import kept_pack
 from gmem_jax.files.packs import STANDARD, list_packs, save_pack
-from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.files.sizes import pack_bytes
 from gmem_jax.files.spheres import load_clump
 from gmem_jax.physics import grain

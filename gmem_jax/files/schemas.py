@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from gmem_jax.files.checked import FIXED, Array
+from gmem_jax.simulation.sample import MEASURED
 
 DIMENSIONS = {  # names of lengths, and what the scales of those say that no array of a file is a scale of
     "u": "bin of the compression variable",
@@ -52,17 +53,7 @@ _UNSEALED = "without a checksum"
 
 STAGE = {  # of a recall or a preparation, in stages/NAME; `common` is the last dimension where there is one run for all
     "time": Array("real", ("time",), "t0", "end of the bin, since the first stage in the file began"),
-    "u": Array("real", ("time",), "1", "compression variable at the end of the bin"),
-    "pressure": Array("real", ("time", "axis", "replica"), "E", "p_x, p_y, p_z on the walls, averaged over the bin"),
-    "lengths": Array("real", ("time", "axis", "replica"), "R", "edges of the box at the end of the bin"),
-    "kinetic_energy": Array("real", ("time", "replica"), "E R^3", "translation and rotation, at the end of the bin"),
-    "largest_speed": Array("real", ("time", "replica"), "R/t_c", "of a grain, at the end of the bin"),
-    "coordination": Array("real", ("time", "replica"), "1", "Z, touching grains per grain, rattlers included"),
-    "contacts": Array("real", ("time", "replica"), "1", "touching spheres per grain, times two"),
-    "wall_contacts": Array("real", ("time", "replica"), "1", "spheres touching a wall per grain"),
-    "filling": Array("real", ("time", "replica"), "1", "phi, volume of the grains over that of the box"),
-    "largest_overlap": Array("real", ("time", "replica"), "R", "deepest contact at the end of the bin"),
-    "inertial_number": Array("real", ("time", "replica"), "1", "I of the compression; 0 without pressure"),
+    **{name: Array("real", ("time", *each.dimensions), *each[:2]) for name, each in MEASURED.items()},
 }
 
 FRAMES = {  # configurations along the run that made a recall or a pack, in frames
@@ -288,7 +279,7 @@ xarray.open_dataset("recall.h5", engine="h5netcdf").p_sig.sel(signal="signal 1")
 xarray.open_dataset("recall.h5", engine="h5netcdf", group="stages/readout").pressure
 ```
 
-With it, `gm.load_recall("recall.h5").to_xarray()` is one dataset, its stages one after the other along `time`. The
+With it, `gm.to_xarray(gm.load_recall("recall.h5"))` is one dataset, its stages one after the other along `time`. The
 first 512 bytes are a SHA-256 of the rest: a file that was changed by another program is refused here. JSON files carry
 their fields' units and descriptions in `about`.
 """

@@ -123,8 +123,9 @@ def points_of(store: Store) -> list[Point]:
     done = store.done()
     for row in store.card()["points"]:
         if row["key"] in done:
-            recall, configuration = store.load(row["key"])
-            found.append(Point(conditions_of(configuration), summary(recall, configuration), row["key"]))
+            recall = store.load(row["key"])
+            configuration = recall.configuration
+            found.append(Point(conditions_of(configuration), summary(recall), row["key"]))
     return found
 
 

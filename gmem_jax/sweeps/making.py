@@ -8,7 +8,7 @@ import numpy as np
 
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.files.provenance import sources
+from gmem_jax.experiment.provenance import sources
 from gmem_jax.physics import grain
 from gmem_jax.physics.material import Material
 from gmem_jax.preparation.recipe import Recipe, grain_steps

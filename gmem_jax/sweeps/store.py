@@ -131,12 +131,12 @@ class Store:
                 found[path.stem] = printable(told.get("reason"))
         return found
 
-    def save(self, key: str, recall: Recall, configuration: dict[str, Any]) -> None:
+    def save(self, key: str, recall: Recall) -> None:
         """Keep the recall of a point, which says whose it is."""
-        save_recall(self.at(key), recall, {**configuration, "key": key})
+        save_recall(self.at(key), recall.described({**recall.configuration, "key": key}))
 
-    def load(self, key: str) -> tuple[Recall, dict[str, Any]]:
-        """The recall of a point, and its configuration.
+    def load(self, key: str) -> Recall:
+        """The recall of a point.
 
         Raises:
             FileNotFoundError: if it is not computed.

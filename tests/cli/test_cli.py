@@ -82,7 +82,8 @@ def test_a_recall_writes_data_and_picture_and_prints_json(
     said = json.loads(capsys.readouterr().out)
     assert {"gain", "fidelity", "status", "seconds"} <= set(said)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["recall.h5", "recall.png"]
-    recall, configuration = gm.load_recall(target)
+    recall = gm.load_recall(target)
+    configuration = recall.configuration
     assert float(recall.fidelity) == said["fidelity"]
     assert configuration["t0"] == 75.0
     assert configuration["backend"] in ("jax", "native")
@@ -100,7 +101,7 @@ def test_a_users_waveform_is_recalled(
     arguments = ["--signals", tmp_path / "wave.csv", "-o", tmp_path / "out.h5", "--no-picture", "--json", *SHORT]
     assert gmem(monkeypatch, "recall", PACK, *arguments) == 0
     assert np.isfinite(json.loads(capsys.readouterr().out)["gain"])
-    recall, _ = gm.load_recall(tmp_path / "out.h5")
+    recall = gm.load_recall(tmp_path / "out.h5")
     assert np.asarray(recall.p_sig).shape == (1, 256)
 
 
@@ -110,7 +111,7 @@ def test_the_same_command_gives_the_same_numbers_bit_for_bit(
     recalls = []
     for name in ("one.h5", "two.h5"):
         assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / name, "--no-picture", *SHORT) == 0
-        recalls.append(gm.load_recall(tmp_path / name)[0])
+        recalls.append(gm.load_recall(tmp_path / name))
     np.testing.assert_array_equal(recalls[0].p_sig, recalls[1].p_sig)
 
 
@@ -127,7 +128,7 @@ def one_bit(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("words") / "words.h5"
     run = {"t0": 75.0, "store": 0.1, "rest": 0.1, "hold": 0.1}
     experiment = gm.Experiment(gm.load_pack(PACK), gm.words(1), background="sub2-bl", **run)
-    gm.save_recall(file, gm.run(experiment), gm.resolved(experiment, 1.0))
+    gm.save_recall(file, gm.run(experiment))
     return file
 
 
@@ -161,7 +162,7 @@ def test_recalled_words_are_classified_and_the_nets_are_used_again(
     assert stored == said
     assert (said["bits"], said["background"]) == (1, "sub2-bl")
     # A drive as fast as this is doubtful, and so is what is read from it.
-    assert said["status"] == np.bitwise_or.reduce(gm.load_recall(one_bit)[0].status) != 0
+    assert said["status"] == np.bitwise_or.reduce(gm.load_recall(one_bit).status) != 0
     assert gm.explain(said["status"]) in " ".join(spoken.err.split())
     assert [net["finished"] for net in said["nets"]] == [True, True]
     assert set(said["readers"]) == {"net", "nearest template", "linear decoder"}

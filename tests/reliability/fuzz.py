@@ -95,7 +95,7 @@ def make_samples(folder: Path) -> None:
     _unsealed(PACK, old, "gmem-pack/1")
     pack = gm.load_pack(PACK)
     experiment = gm.Experiment(pack, gm.Bumps(np.ones((2, 1)), np.full((2, 1), 0.5), 0.2))
-    gm.save_recall(folder / "recall.h5", _recall(experiment), gm.resolved(experiment, 1.0))
+    gm.save_recall(folder / "recall.h5", _recall(experiment).described(gm.describe(experiment, 1.0)))
     _unsealed(folder / "recall.h5", folder / "old-recall.h5", "gmem-recall/1")
     save_part(folder / "part.npz", (OrderedDict(rest=_sample(4, 3)), np.arange(5)))
     from gmem_jax.reading import lessons, net, training
