@@ -174,10 +174,10 @@ def test_the_forward_mode_has_the_shape_of_the_grain_too(whole: gm.Experiment) -
 
 
 def test_offsets_are_differentiated_by_when_they_are_named_and_not_otherwise(experiment: gm.Experiment) -> None:
-    course = experiment.course(sheared=True)
+    simulation = experiment.simulation(sheared=True)
     for names, asked in ((["pack.clump"], True), ([BY_SHAPE], True), (["pack.clump.mass", "gamma0"], False)):
         assert gradient._needs_offsets(names) == asked
-        shapes = [number.shape for number in gradient._numbers(course, gradient._needs_offsets(names))]
+        shapes = [number.shape for number in gradient._numbers(simulation, gradient._needs_offsets(names))]
         assert ((4, 3) in shapes) == asked
 
 
@@ -188,7 +188,7 @@ def test_names_that_cannot_be_differentiated_by_are_refused(experiment: gm.Exper
         gm.value_and_grad(experiment, ["pack"])
     with pytest.raises(ValueError, match=r"friction.mu is part of friction; name one of them"):
         gm.value_and_grad(experiment, ["friction", "friction.mu"])
-    with pytest.raises(ValueError, match="background is 'sub0', which has no derivative"):
+    with pytest.raises(ValueError, match="background is fixed when a program is compiled and has no derivative"):
         gm.value_and_grad(experiment, ["background"])
     with pytest.raises(ValueError, match="steps is None, which has no derivative"):
         gm.value_and_grad(experiment, ["steps"])

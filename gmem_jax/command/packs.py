@@ -88,7 +88,7 @@ def grain_of(shape: str, overlap: float | None) -> Clump:
     if shape == "tetra":
         return grain.tetra(OVERLAP if overlap is None else overlap)
     if overlap is not None:
-        raise InputError(f"--overlap is that of a tetra grain; leave it away with --shape {shape}")
+        raise InputError(f"--overlap does nothing with --shape {shape}: it is that of a tetra grain")
     if shape == "sphere":
         return grain.sphere()
     if "." not in shape and not Path(shape).is_file():

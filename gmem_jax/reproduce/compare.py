@@ -232,7 +232,7 @@ def read_csv(path: Path) -> list[Compared]:
         KeyError: if it is no such table.
     """
     kinds, found = get_type_hints(Conditions), []
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
             conditions = Conditions(**{name: kind(line[name]) for name, kind in kinds.items()})
             ours = Estimate(float(line["mean"]), float(line["sd"] or math.nan), int(line["packs"]))
