@@ -61,7 +61,7 @@ struct Signature {
 
 // Arguments of the three tasks are those of the steps themselves, then, for derivatives, a number for each of the
 // results' or arguments' own; see `Task`.
-// gmem_jax/native/calls.py: _library, _of_results, _of_arrays
+// gmem_jax/native/primitives.py: _library, _of_results, _of_arrays
 Signature signature(Task task, Law law) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
                       {"validities", "P", ffi::PRED},   {"reference centres", "S3"},

@@ -16,6 +16,7 @@
 #endif
 
 #define GMEM_INLINE inline __attribute__((always_inline))
+#define GMEM_LAMBDA __attribute__((always_inline))  // after the parameters of a lambda
 
 namespace gmem {
 namespace GMEM_ISA {
