@@ -1,6 +1,6 @@
 """The friction laws by name: the one table for the command line, files, benchmarks and the native backend."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
@@ -45,7 +45,7 @@ class Entry(NamedTuple):
         """The number of the variant of a law of this kind; 0 if there is one only."""
         return self.variants.index(law.variant) if self.variants else 0
 
-    def with_numbers(self, law: Any, values: Sequence[Any]) -> Any:
+    def with_numbers(self, law: Any, values: Iterable[Any]) -> Any:
         """A law of this kind with other `numbers`, the first of `values`."""
         own = dict(zip(self.numbers, values, strict=False))
         if "spacing" in own:  # which the law has from its largest overlap

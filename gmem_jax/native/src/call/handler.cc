@@ -85,7 +85,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   problem.variant = static_cast<Variant>(variant);
   problem.isotropic = isotropic != 0;
   problem.mixed = mixed != 0;
-  require(!problem.mixed || (task == Task::forward && problem.law != Law::mindlin),
+  require(!problem.mixed || (task == Task::forward && !is_layered(problem.law)),
           "there is no mixed precision for derivatives and the Mindlin law");
   const Signature wanted = signature(task, problem.law);
   require(static_cast<std::size_t>(leaves) == histories(problem.law).size() && args.size() == wanted.arguments.size() &&

@@ -1,5 +1,5 @@
-// What both modes do alike with the candidates: which of them are looked at, and how their histories come from the
-// arrays of a call and go back.
+// What both modes do alike with the candidates: which of them are looked at, and how their histories come from
+// the arrays of a call and go back.
 
 #pragma once
 
@@ -32,32 +32,17 @@ struct Marks {
     rings = arena.take<int>(Law::kLayered ? count : 0);
   }
 
-  // Goes through the candidates from `first` to `end` that may touch. `touches(c, n)` says whether candidate c does, and
-  // may write down at place n of a batch what it found; `compute(candidates, count)` is called for each batch of kBatch,
-  // and for what is left. `fetch(c)` is called for the candidate that comes kAhead later.
-  template <int kBatch, int kAhead, class Fetch, class Touches, class Compute>
-  GMEM_INLINE void for_touching(int first, int end, double travel, const Fetch& fetch, const Touches& touches,
-                                const Compute& compute) const {
-    constexpr int kLook = 256;
-    int near[kLook + 1], touching[kBatch];
-    int count = 0;
-    for (int look = first; look < end; look += kLook) {
-      const int look_end = look + kLook < end ? look + kLook : end;
-      int found = 0;
-      for (int c = look; c < look_end; ++c) {
-        near[found] = c;
-        found += !(next_check[c] > travel);  // also where it is not a number
-      }
-      for (int n = 0; n < found; ++n) {
-        if (n + kAhead < found) fetch(near[n + kAhead]);
-        if (!touches(near[n], count)) continue;
-        touching[count++] = near[n];
-        if (count < kBatch) continue;
-        compute(touching, count);
-        count = 0;
-      }
+  static constexpr int kLook = 256;  // candidates looked at at once
+
+  // Of these, from `first` on and before `end`, those that may touch go to `near`; returns how many.
+  GMEM_INLINE int find_near(int first, int end, double travel, int (&near)[kLook + 1]) const {
+    const int look_end = first + kLook < end ? first + kLook : end;
+    int found = 0;
+    for (int c = first; c < look_end; ++c) {
+      near[found] = c;
+      found += !(next_check[c] > travel);  // also where it is not a number
     }
-    compute(touching, count);
+    return found;
   }
 };
 

@@ -94,7 +94,9 @@ struct Packed : PackedLayout<Law> {
   }
 
   std::ptrdiff_t segment_stride() const { return plan.candidates + 1; }
-  StoredSegments<double, RowOfSegment> segments_of(std::size_t c) const { return {segment + c, segment_stride(), marks.segments + c, problem.points}; }
+  StoredSegments<double, RowOfSegment> segments_of(std::size_t c) const {
+    return {segment + c, segment_stride(), marks.segments + c, problem.points};
+  }
   // Number q of the history of a contact.
   double& remembered(std::size_t c, int q) const { return reinterpret_cast<double*>(history + c * kHistoryRows)[q]; }
   double outermost(std::size_t c, const LawParameters<V>& law) const {
@@ -212,16 +214,30 @@ struct Packed : PackedLayout<Law> {
   };
 
   void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel) {
-    // Large packs are in no cache: ask in time for what does not lie in a row with what others want.
-    const auto fetch = [&](std::size_t later) GMEM_LAMBDA {
-      const GrainRows* other = grain + plan.candidate[later].grain_other;
-      __builtin_prefetch(sphere + plan.candidate[later].other);
-      if constexpr (kHistoryRows > 0) __builtin_prefetch(history + later * kHistoryRows);
-      if (marks.touched[later]) __builtin_prefetch(other), __builtin_prefetch(&other->spin), __builtin_prefetch(&other->torque);
-    };
-    marks.template for_touching<kTogether * W, 8>(
-        first, end, travel, fetch, [&](int c, int) GMEM_LAMBDA { return marks.touched[c] || touches(c, travel); },
-        [&](const int* touching, int count) GMEM_LAMBDA { compute(touching, count, parameter, law); });
+    constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether * W, kAhead = 8;
+    int near[kLook + 1], touching[kBatch];
+    int count = 0;
+    for (int look = first; look < end; look += kLook) {
+      const int found = marks.find_near(look, end, travel, near);
+      for (int n = 0; n < found; ++n) {
+        const int c = near[n];
+        // Large packs are in no cache: ask in time for what does not lie in a row with what others want.
+        if (n + kAhead < found) {
+          const std::size_t later = near[n + kAhead];
+          const GrainRows* other = grain + plan.candidate[later].grain_other;
+          __builtin_prefetch(sphere + plan.candidate[later].other);
+          if constexpr (kHistoryRows > 0) __builtin_prefetch(history + later * kHistoryRows);
+          if (marks.touched[later])
+            __builtin_prefetch(other), __builtin_prefetch(&other->spin), __builtin_prefetch(&other->torque);
+        }
+        if (!marks.touched[c] && !touches(c, travel)) continue;
+        touching[count++] = c;
+        if (count < kBatch) continue;
+        compute(touching, count, parameter, law);
+        count = 0;
+      }
+    }
+    compute(touching, count, parameter, law);
   }
 
   // Whether a candidate that did not touch at the last step does now, by the same arithmetic as in vectors.

@@ -118,7 +118,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   // Number `row` of an array in every lane; a short block repeats its last replica.
   template <class Pointer>
   Real gather(const Lane* lanes, const Pointer& pointer, std::ptrdiff_t row, int first = 0) const {
-    Real a;
+    Real a{};
     for (int l = 0; l < W; ++l)
       a[l] = pointer(lanes[first + l < block.count ? first + l : block.count - 1])[row * problem.stride];
     return a;
@@ -179,8 +179,10 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   }
 
   StoredSegments<V> segments_of(std::size_t c) const {
-    if (!trace.touched) return {segment + c, plan.candidates, marks.segments + c, problem.points};
-    return {segment + c, plan.candidates, marks.segments + c, problem.points, trace.segment + c * problem.points, trace.segments + c};
+    int* const stored = marks.segments + c;
+    if (!trace.touched) return {segment + c, plan.candidates, stored, problem.points};
+    Segment<V>* const seen = trace.segment + c * problem.points;
+    return {segment + c, plan.candidates, stored, problem.points, seen, trace.segments + c};
   }
   V outermost(std::size_t c, const LawParameters<V>& law) const {
     return Reach<V, Law::variant>(history[c * Law::kHistory + kLastOverlap], law, problem.points).outer;
@@ -260,37 +262,47 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   }
 
   void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel) {
+    constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether, kAhead = 6;
     const V contact_square = splat<V>(4.0);
-    Contact<C> contact[kTogether];
-    // Large packs are in no cache: ask in time for what does not lie in a row with what others want.
-    const auto fetch = [&](std::size_t later) GMEM_LAMBDA {
-      const char* centre = reinterpret_cast<const char*>(sphere + 3 * static_cast<std::size_t>(plan.candidate[later].other));
-      const char* remembered = reinterpret_cast<const char*>(history + later * Law::kHistory);
-      for (std::size_t at = 0; at < 3 * sizeof(V); at += 64) __builtin_prefetch(centre + at);
-      if (marks.touched[later])
-        for (std::size_t at = 0; at < Law::kHistory * sizeof(C); at += 64) __builtin_prefetch(remembered + at);
-    };
-    // Whether a candidate touches in any lane; then its motion comes to place n of the batch.
-    const auto touches = [&](int c, int n) GMEM_LAMBDA {
-      const Candidate& pair = plan.candidate[c];
-      const Vec<V> one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
-      const Vec<V> other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
-      const V square = dot(other - one, other - one);
-      if (!bits_less(square, contact_square)) {
-        if (marks.touched[c]) forget(c, pair);
-        marks.next_check[c] = next_check(travel, smallest(square));
-        return false;
+    int near[kLook + 1], touching[kBatch];
+    Contact<C> contact[kBatch];
+    int count = 0;
+    for (int look = first; look < end; look += kLook) {
+      const int found = marks.find_near(look, end, travel, near);
+      for (int n = 0; n < found; ++n) {
+        const int c = near[n];
+        const Candidate& pair = plan.candidate[c];
+        // Large packs are in no cache: ask in time for what does not lie in a row with what others want. (In a function of
+        // its own GCC takes this for nothing.)
+        if (n + kAhead < found) {
+          const std::size_t later = near[n + kAhead];
+          const V* of_sphere = sphere + 3 * static_cast<std::size_t>(plan.candidate[later].other);
+          const char* centre = reinterpret_cast<const char*>(of_sphere);
+          const char* remembered = reinterpret_cast<const char*>(history + later * Law::kHistory);
+          for (std::size_t at = 0; at < 3 * sizeof(V); at += 64) __builtin_prefetch(centre + at);
+          if (marks.touched[later])
+            for (std::size_t at = 0; at < Law::kHistory * sizeof(C); at += 64) __builtin_prefetch(remembered + at);
+        }
+        const Vec<V> one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
+        const Vec<V> other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
+        const V square = dot(other - one, other - one);
+        if (!bits_less(square, contact_square)) {
+          if (marks.touched[c]) forget(c, pair);
+          marks.next_check[c] = next_check(travel, smallest(square));
+          continue;
+        }
+        marks.touched[c] = true;
+        if (trace.touched) remember(c);
+        relative_motion(contact_input(pair, one, other), convert<C>(square), contact[count]);
+        if constexpr (kMixed) contact[count].before = convert<C>(contact_square - square);
+        contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
+        touching[count++] = c;
+        if (count < kBatch) continue;
+        compute(touching, count, contact, parameter, law);
+        count = 0;
       }
-      marks.touched[c] = true;
-      if (trace.touched) remember(c);
-      relative_motion(contact_input(pair, one, other), convert<C>(square), contact[n]);
-      if constexpr (kMixed) contact[n].before = convert<C>(contact_square - square);
-      contact[n].history = history + static_cast<std::size_t>(c) * Law::kHistory;
-      return true;
-    };
-    marks.template for_touching<kTogether, 6>(first, end, travel, fetch, touches, [&](const int* touching, int count) GMEM_LAMBDA {
-      compute(touching, count, contact, parameter, law);
-    });
+    }
+    compute(touching, count, contact, parameter, law);
   }
 
   void compute(const int* touching, int count, Contact<C>* contact, const C* parameter, const LawParameters<C>& law) {

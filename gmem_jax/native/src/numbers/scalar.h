@@ -16,7 +16,6 @@
 #endif
 
 #define GMEM_INLINE inline __attribute__((always_inline))
-#define GMEM_LAMBDA __attribute__((always_inline))  // after the parameters of a lambda
 
 namespace gmem {
 namespace GMEM_ISA {
