@@ -15,7 +15,7 @@ pytest.importorskip("flatbuffers", reason="pip install 'gmem_jax[aot]'")
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
 # What the page on exporting says: the library's calls are allowed by name, for JAX promises nothing about them.
-CALLS = [jax.export.DisabledSafetyCheck.custom_call(name) for name in gm.native.calls.TARGETS]
+CALLS = [jax.export.DisabledSafetyCheck.custom_call(name) for name in gm.native.TARGETS]
 
 ELSEWHERE = """
 import sys

@@ -21,7 +21,9 @@ from scenes import scene
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import build, calls, gpu
+from gmem_jax.native import build, cuda, library, primitives
+from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of
+from gmem_jax.native.primitives import Arrays, Call, Fixed, Results
 from gmem_jax.physics.grain import sphere
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import System, start
@@ -33,7 +35,7 @@ pytestmark = [
     pytest.mark.xdist_group("gpu"),  # the emulation is compiled once
     pytest.mark.skipif(not BUILT, reason=REASON),  # without a C++ compiler there is nothing to compile it with
 ]
-needs_nvrtc = pytest.mark.skipif(bool(gpu.missing()), reason=gpu.missing())
+needs_nvrtc = pytest.mark.skipif(bool(cuda.missing()), reason=cuda.missing())
 
 PACK = gm.load_pack("tetra-325-a")
 LAWS: dict[str, Any] = {
@@ -44,7 +46,7 @@ LAWS: dict[str, Any] = {
 }
 REPLICAS = 3
 QUICKLY = {"xla_backend_optimization_level": 0}  # for programs that run once
-Scene = tuple[calls.Call, calls.Fixed, calls.Arrays, Callable[..., Any]]
+Scene = tuple[Call, Fixed, Arrays, Callable[..., Any]]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -81,13 +83,13 @@ def thrown(system: System, state: Any, lower: Any, upper: Any) -> Scene:
         system = replace(system, friction=replace(system.friction, mu=0.3 * spread))
     system = replace(system, clump=replace(system.clump, mass=system.clump.mass * spread))
     numbers = 0.3 * spread, 0.01 * (1.0 - spread)
-    call, fixed = native._call(system, state.history), native._fixed(system)
-    arrays = native._arrays(system, grains, state.history, walls(0, lower, upper), numbers)
+    call, fixed = call_of(system), fixed_of(system)
+    arrays = arrays_of(system, grains, state.history, walls(0, lower, upper), numbers)
     for begun in (10, 20, 30, 40):
         moved = emulate(call, fixed, arrays)[0]
-        arrays = native._arrays(system, grains, state.history, walls(begun, lower, upper), numbers)
+        arrays = arrays_of(system, grains, state.history, walls(begun, lower, upper), numbers)
         arrays = arrays._replace(fields=moved.fields, history=moved.history)
-    return call, fixed, arrays, native._Definition.of(system, state.history)
+    return call, fixed, arrays, PlainDefinition.of(system, state.history)
 
 
 @functools.cache
@@ -120,18 +122,18 @@ def spheres() -> Scene:
 
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
-def emulate(call: calls.Call, fixed: calls.Fixed, arrays: calls.Arrays) -> tuple[calls.Results, list[jax.Array]]:
+def emulate(call: Call, fixed: Fixed, arrays: Arrays) -> tuple[Results, list[jax.Array]]:
     """What a GPU would give, and what it had between steps."""
-    shapes = calls._of_results((fixed, arrays))
-    found = gpu.run("gmem_emulated_advance", call, True, (fixed, arrays), shapes)
-    return calls._results(arrays, found[: len(shapes)]), list(found[len(shapes) :])
+    shapes = primitives._of_results((fixed, arrays))
+    found = cuda.run("gmem_emulated_advance", call, True, (fixed, arrays), shapes)
+    return primitives._results(arrays, found[: len(shapes)]), list(found[len(shapes) :])
 
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
-def emulate_tangent(call: calls.Call, fixed: calls.Fixed, arrays: calls.Arrays, along: calls.Arrays) -> calls.Results:
-    shapes = calls._of_results((fixed, arrays))
-    found = gpu.run("gmem_emulated_tangent", call, False, (fixed, arrays, along), shapes)
-    return calls._results(arrays, found[: len(shapes)])
+def emulate_tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> Results:
+    shapes = primitives._of_results((fixed, arrays))
+    found = cuda.run("gmem_emulated_tangent", call, False, (fixed, arrays, along), shapes)
+    return primitives._results(arrays, found[: len(shapes)])
 
 
 def assert_close(found: Any, expected: Any, tolerance: float) -> None:
@@ -170,7 +172,7 @@ def test_the_kernels_give_the_values_and_tangents_of_the_definition(name: str) -
 def test_both_sides_of_a_contact_remember_the_same_bits(law: str) -> None:
     call, fixed, arrays, _ = packed(law)
     between = emulate(call, fixed, arrays)[1]
-    sides, sound = gpu.sides_of(fixed, len(fixed.offsets))
+    sides, sound = cuda.sides_of(fixed, len(fixed.offsets))
     assert bool(sound)
     rows = np.asarray(sides.side)[: int(sides.start[-1]), 2]
     pair = np.argsort(rows, kind="stable").reshape(-1, 2)
@@ -268,14 +270,14 @@ print(failed, said.value.decode())
 
 
 def compile_alone(nvrtc: str, cache: Path, architecture: str) -> str:
-    paths = [str(native._path()), nvrtc, str(build.SOURCES), str(cache), architecture]
+    paths = [str(library.path()), nvrtc, str(build.SOURCES), str(cache), architecture]
     return subprocess.run([sys.executable, "-c", ALONE, *paths], capture_output=True, text=True, check=True).stdout
 
 
 @needs_nvrtc
 def test_compiled_kernels_are_kept_as_whole_files(tmp_path: Path) -> None:
     folder = tmp_path / "not" / "there"
-    assert compile_alone(gpu._packaged() or "libnvrtc.so", folder, "sm_90").startswith("0 ")
+    assert compile_alone(cuda._packaged() or "libnvrtc.so", folder, "sm_90").startswith("0 ")
     (kept,) = folder.iterdir()
     assert re.fullmatch(rf"{build.source_hash()}-sm_90-nvrtc\d+\.\d+-law10\.cubin", kept.name)
     assert kept.read_bytes().startswith(b"\x7fELF")
@@ -283,7 +285,7 @@ def test_compiled_kernels_are_kept_as_whole_files(tmp_path: Path) -> None:
 
 @needs_nvrtc
 def test_an_unknown_architecture_is_one_line(tmp_path: Path) -> None:
-    said = compile_alone(gpu._packaged() or "libnvrtc.so", tmp_path, "sm_1")
+    said = compile_alone(cuda._packaged() or "libnvrtc.so", tmp_path, "sm_1")
     assert said.startswith("1 NVRTC does not compile the kernels for sm_1: ")
     assert said.count("\n") == 1
     assert not list(tmp_path.iterdir())
@@ -295,12 +297,12 @@ def test_without_nvrtc_what_would_help_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_bin_of_an_experiment_on_a_gpu_is_one_call_and_waits_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gpu, "missing", lambda: "")
+    monkeypatch.setattr(cuda, "missing", lambda: "")
     signals = gm.Bumps(jnp.asarray([[1.0], [-1.0]]), jnp.full((2, 1), 0.5), 0.8)
     experiment = gm.Experiment(PACK, signals, LAWS["H"], t0=300.0)
     simulation, state = experiment.simulation(sheared=True), replicate(experiment.begin(), REPLICAS)
     program = jax.jit(functools.partial(rollout_chunk, most=4))
-    allowed = [export.DisabledSafetyCheck.custom_call(target) for target in gpu.TARGETS]
+    allowed = [export.DisabledSafetyCheck.custom_call(target) for target in cuda.TARGETS]
     row = Stage("encode", 0.0, 1.0, 1.0, "write", sheared=True).bin(0)
     text = export.export(program, platforms=["cuda"], disabled_checks=allowed)(simulation, state, row, 4).mlir_module()
     assert text.count("custom_call @gmem_advance") == 1

@@ -15,7 +15,9 @@ from jax import export
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import calls, gpu
+from gmem_jax.native import cuda, library, primitives
+from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of, warn_once
+from gmem_jax.native.primitives import Arrays, Results
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import System, start
@@ -64,13 +66,13 @@ def derivatives(march: native.March, system: System = SYSTEM) -> Callable[..., A
 
 @pytest.fixture
 def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(native, "_load", lambda: ("", "it was not built"))
-    native._warn_once.cache_clear()
+    monkeypatch.setattr(library, "load", lambda: ("", "it was not built"))
+    warn_once.cache_clear()
     yield
-    native._warn_once.cache_clear()
+    warn_once.cache_clear()
 
 
-CALLS_ALLOWED = [export.DisabledSafetyCheck.custom_call(target) for target in calls.TARGETS]
+CALLS_ALLOWED = [export.DisabledSafetyCheck.custom_call(target) for target in primitives.TARGETS]
 
 
 def lowered(march: native.March, platform: str) -> str:
@@ -81,10 +83,10 @@ def lowered(march: native.March, platform: str) -> str:
 
 @needs_library
 def test_auto_is_the_library_where_it_runs_and_the_definition_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gpu, "missing", lambda: "")
+    monkeypatch.setattr(cuda, "missing", lambda: "")
     auto = native.marcher("auto")
     found = {
-        platform: {target for target in calls.TARGETS if f"custom_call @{target}" in lowered(auto, platform)}
+        platform: {target for target in primitives.TARGETS if f"custom_call @{target}" in lowered(auto, platform)}
         for platform in ("cpu", "cuda", "tpu")
     }
     # Reverse mode on GPUs is that of the definition.
@@ -94,15 +96,15 @@ def test_auto_is_the_library_where_it_runs_and_the_definition_elsewhere(monkeypa
 
 @needs_library
 def test_a_gpu_without_nvrtc_runs_plain_jax_and_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gpu, "missing", lambda: "NVRTC was not found")
-    gpu.warn_once.cache_clear()
+    monkeypatch.setattr(cuda, "missing", lambda: "NVRTC was not found")
+    cuda.warn_once.cache_clear()
     with pytest.warns(UserWarning, match=r"plain JAX runs on the GPU.*NVRTC"):
         program = lowered(native.marcher("auto"), "cuda")
     assert "custom_call @gmem" not in program
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         lowered(native.marcher("auto"), "cuda")
-    gpu.warn_once.cache_clear()
+    cuda.warn_once.cache_clear()
     with pytest.raises(NotImplementedError, match="NVRTC was not found"):
         lowered(native.march, "cuda")
 
@@ -124,25 +126,25 @@ def test_the_definition_of_a_call_is_what_the_library_computes(law: Any, isotrop
     system = System(clump, law, PACK.pairs)
     history = law.init(PACK.pairs.capacity, REPLICAS, np.dtype(float))
     call, fixed, definition = (
-        native._call(system, history),
-        native._fixed(system),
-        native._Definition.of(system, history),
+        call_of(system),
+        fixed_of(system),
+        PlainDefinition.of(system, history),
     )
 
-    def arrays(speed: jax.Array) -> calls.Arrays:
+    def arrays(speed: jax.Array) -> Arrays:
         numbers = jnp.asarray(0.3), jnp.asarray(0.01)
         grains = replace(STATE.grains, spin=speed + STATE.grains.spin)
-        return native._arrays(system, grains, history, squeeze(RATES * (1.0 + speed)), numbers)
+        return arrays_of(system, grains, history, squeeze(RATES * (1.0 + speed)), numbers)
 
-    def both(use: Callable[[calls.Arrays], calls.Results]) -> Any:
+    def both(use: Callable[[Arrays], Results]) -> Any:
         def value(speed: jax.Array) -> Any:
             return jax.tree.map(lambda leaf: jnp.sum(leaf**2), use(arrays(speed)))
 
         return jax.jit(jax.vmap(value))(jnp.asarray([0.0, 0.02]))
 
-    library = both(lambda arrays: calls.forward(call, definition, fixed, arrays))
+    fast = both(lambda arrays: primitives.forward(call, definition, fixed, arrays))
     plain = both(lambda arrays: definition(fixed, arrays))
-    for one, other in zip(jax.tree.leaves(library), jax.tree.leaves(plain), strict=True):
+    for one, other in zip(jax.tree.leaves(fast), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-18)
 
 
@@ -151,12 +153,12 @@ def test_the_definition_of_a_call_is_what_the_library_computes(law: Any, isotrop
 def test_other_platforms_have_the_derivatives_of_a_sweep() -> None:
     """Their rules, run here: on shared arguments, with leading axes of size one."""
     system, law = SYSTEM, SYSTEM.friction
-    call, fixed = native._call(system, STATE.history), native._fixed(system)
-    definition = native._Definition.of(system, STATE.history)
+    call, fixed = call_of(system), fixed_of(system)
+    definition = PlainDefinition.of(system, STATE.history)
 
-    def arrays(mu: jax.Array, rates: jax.Array) -> calls.Arrays:
+    def arrays(mu: jax.Array, rates: jax.Array) -> Arrays:
         chosen = replace(system, friction=replace(law, mu=mu))
-        return native._arrays(chosen, STATE.grains, STATE.history, squeeze(rates), (jnp.asarray(0.3), jnp.asarray(0.0)))
+        return arrays_of(chosen, STATE.grains, STATE.history, squeeze(rates), (jnp.asarray(0.3), jnp.asarray(0.0)))
 
     def outer(tree: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[None], tree)
@@ -165,16 +167,20 @@ def test_other_platforms_have_the_derivatives_of_a_sweep() -> None:
     several = jnp.stack([arrays(mu, RATES).parameters for mu in MUS])
     values = shared._replace(parameters=several)
 
-    def known(slopes: calls.Arrays) -> calls.Arrays:
+    def known(slopes: Arrays) -> Arrays:
         """Without what the definition has no derivatives by: the material, and histories of contacts apart."""
         blank = jax.tree.map(jnp.zeros_like, slopes.history)
         return slopes._replace(parameters=slopes.parameters.at[:, 6:9].set(0.0), history=blank)
 
     along = known(jax.tree.map(jnp.ones_like, values))
-    found = calls.tangent(call, definition, outer(fixed), values, along)
-    plain = calls._over(functools.partial(calls._plain_tangent, definition), (2,))(outer(fixed), values, along)
-    back = calls._bind(calls._adjoint_p, call, definition, outer(fixed), values, found)
-    plain_back = calls._over(functools.partial(calls._plain_adjoint, definition), (2,))(outer(fixed), values, found)
+    found = primitives.tangent(call, definition, outer(fixed), values, along)
+    plain = primitives._over(functools.partial(primitives._plain_tangent, definition), (2,))(
+        outer(fixed), values, along
+    )
+    back = primitives._bind(primitives._adjoint_p, call, definition, outer(fixed), values, found)
+    plain_back = primitives._over(functools.partial(primitives._plain_adjoint, definition), (2,))(
+        outer(fixed), values, found
+    )
     ours, theirs = (found, known(jax.tree.unflatten(jax.tree.structure(plain_back), back))), (plain, known(plain_back))
     for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         assert one.shape == other.shape
@@ -236,3 +242,26 @@ def test_numbers_that_do_not_fit_the_replicas_are_named(backend: str) -> None:
     if backend == "native":  # parameters of a user's law may have any shape
         with pytest.raises(ValueError, match="mu must be a number"):
             march(replace(SYSTEM, friction=gm.Hooke(mu=wrong)), STATE, walls, 0.3, 0.0)
+
+
+@needs_library
+def test_a_backend_is_resolved_once_for_a_law_whatever_its_parameters() -> None:
+    found = native.resolve("auto", "double", gm.Hooke())
+    assert (found.name, found.precision, found.why) == ("native", "double", REASON)
+    assert native.resolve("auto", "double", gm.Hooke(mu=0.2)) is found
+    assert native.resolve("native", "double", gm.Hooke()).march is native.march
+    assert native.resolve("jax", "double", gm.Hooke()).march is dynamics.march
+    with pytest.raises(ValueError, match="auto, jax, native; got 'fortran'"):
+        native.resolve("fortran", "double", gm.Hooke())
+
+
+def test_a_resolved_backend_says_why_plain_jax_runs(no_library: None) -> None:
+    found = native.resolve("auto", "double", gm.Hooke())
+    assert (found.name, found.why) == ("jax", "it was not built")
+    assert native.resolve("jax", "double", gm.Hooke()).why == "it was asked for"
+
+
+@needs_library
+def test_a_law_of_ones_own_is_named_where_it_keeps_the_library_out() -> None:
+    found = native.resolve("auto", "double", Own())
+    assert (found.name, found.why) == ("jax", "the native backend does not know the friction law Own")

@@ -12,7 +12,9 @@ import pytest
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import build, calls, gpu
+from gmem_jax.native import build, cuda, library, primitives
+from gmem_jax.native.march import arrays_of, call_of, fixed_of
+from gmem_jax.native.primitives import Arrays, Call, Fixed, Results
 from gmem_jax.physics.state import replicate
 from gmem_jax.physics.step import System, start
 
@@ -30,20 +32,22 @@ def arguments(law: Any) -> Arguments:
     state = replicate(start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box), 2)
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, 3, 2)), PACK.box)
     numbers = (jnp.asarray(0.3), jnp.asarray(0.0))
-    fixed = native._fixed(system)
-    arrays = native._arrays(system, state.grains, state.history, boxes, numbers)
-    return {"call": native._call(system, state.history), **fixed._asdict(), **arrays._asdict()}
+    fixed = fixed_of(system)
+    arrays = arrays_of(system, state.grains, state.history, boxes, numbers)
+    return {"call": call_of(system), **fixed._asdict(), **arrays._asdict()}
 
 
-def parts(given: Arguments) -> tuple[calls.Call, calls.Fixed, calls.Arrays]:
-    fixed, arrays = ({name: given[name] for name in kind._fields} for kind in (calls.Fixed, calls.Arrays))
-    return given["call"], calls.Fixed(**fixed), calls.Arrays(**arrays)
+def parts(given: Arguments) -> tuple[Call, Fixed, Arrays]:
+    fixed, arrays = ({name: given[name] for name in kind._fields} for kind in (Fixed, Arrays))
+    return given["call"], Fixed(**fixed), Arrays(**arrays)
 
 
 def run(given: Arguments) -> Any:
     """Past JAX's own look at the shapes: the library must not depend on it."""
     call, fixed, arrays = parts(given)
-    return jax.block_until_ready(calls._library("gmem_advance", calls._of_results, call, False, (fixed, arrays)))
+    return jax.block_until_ready(
+        primitives._library("gmem_advance", primitives._of_results, call, False, (fixed, arrays))
+    )
 
 
 def changed(name: str, change: Callable[[Any], Any]) -> Callable[[Arguments], Arguments]:
@@ -115,9 +119,11 @@ def test_want_of_memory_is_an_error_and_leaves_the_library_working() -> None:
         "history": [jnp.zeros((1, points, 2, 1)), jnp.zeros((1, 3, 1)), jnp.zeros((1, 1, 1))],
     }
     call, fixed, arrays = parts({**called(points=points)(given), **alone})
-    bars = calls.Results(arrays.fields, jnp.zeros((3, 1)), arrays.history)
+    bars = Results(arrays.fields, jnp.zeros((3, 1)), arrays.history)
     with pytest.raises(jax.errors.JaxRuntimeError, match="gmem_jax native: out of memory"):
-        jax.block_until_ready(calls._library("gmem_adjoint", calls._of_arrays, call, False, (fixed, arrays, bars)))
+        jax.block_until_ready(
+            primitives._library("gmem_adjoint", primitives._of_arrays, call, False, (fixed, arrays, bars))
+        )
     run(given)
 
 
@@ -125,10 +131,10 @@ def test_want_of_memory_is_an_error_and_leaves_the_library_working() -> None:
 def test_a_library_older_than_its_sources_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     shutil.copytree(build.SOURCES, tmp_path / "src")
     monkeypatch.setattr(build, "SOURCES", tmp_path / "src")
-    monkeypatch.setattr(gpu, "register", lambda *_: None)  # the process keeps the sources that it has
-    assert native._load.__wrapped__()[1] == ""
+    monkeypatch.setattr(cuda, "register", lambda *_: None)  # the process keeps the sources that it has
+    assert library.load.__wrapped__()[1] == ""
     with (tmp_path / "src" / "physics" / "laws.h").open("a") as file:
         file.write("// new\n")
-    assert "older than its sources; rebuild it: python -m gmem_jax.native.build" in native._load.__wrapped__()[1]
+    assert "older than its sources; rebuild it: python -m gmem_jax.native.build" in library.load.__wrapped__()[1]
     shutil.rmtree(tmp_path / "src")  # a library alone is what it is
-    assert native._load.__wrapped__()[1] == ""
+    assert library.load.__wrapped__()[1] == ""

@@ -7,11 +7,13 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import jax
 import pytest
 
 import gmem_jax
 from gmem_jax import native
 from gmem_jax.native import build
+from gmem_jax.physics.contact.laws import LAWS
 
 ROOT = Path(gmem_jax.__file__).parent.parent
 HERE = Path(__file__).parent / "native"
@@ -98,3 +100,22 @@ def test_what_the_sources_mirror_is_there() -> None:
                 targets = node.targets if isinstance(node, ast.Assign) else [node.target]
                 known |= {target.id for target in targets if isinstance(target, ast.Name)}
         assert set(names.split(", ")) <= known, (file, names)
+
+
+def test_the_table_of_laws_says_what_the_sources_say() -> None:
+    text = (build.SOURCES / "physics" / "parameters.h").read_text()
+
+    def enum(name: str) -> dict[str, int]:
+        (body,) = re.findall(rf"enum class {name} {{(.*?)}}", text)
+        return {word: int(number) for word, number in re.findall(r"(\w+) = (\d+)", body)}
+
+    assert sorted(entry.native for entry in LAWS) == sorted(enum("Law").values())
+    leaves = re.findall(r"kLeaves\[kMaxHistory\] = {(.*)};", text)  # in the order of the numbers
+    for entry in LAWS:
+        assert tuple(re.findall(r'"[a-z ]+", "(\w+)"', leaves[entry.native])) == entry.history
+        law = entry.kind()
+        sizes = {"P": 7, "Q": entry.points(law), "B": 2}
+        shapes = [leaf.shape for leaf in jax.tree.leaves(law.init(7, 2, float))]
+        assert shapes == [tuple(sizes.get(axis) or int(axis) for axis in axes) for axes in entry.history]
+        assert not entry.variants or dict(zip(entry.variants, range(3), strict=True)) == enum("Variant")
+    assert f"kLawParameters = {max(len(entry.numbers) for entry in LAWS)};" in text

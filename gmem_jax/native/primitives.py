@@ -4,7 +4,7 @@ The tangent is a primitive of JAX with a rule for its transpose, so that `jax.jv
 their compositions with `jax.vmap` and `jax.checkpoint` all come out of the two calls. Forward mode runs the steps in
 numbers that carry a derivative; reverse mode redoes them, remembers each step, and goes back (src/cpu/adjoint.h).
 
-Which code runs is settled when a program is lowered: the library on CPUs and, forwards, on CUDA GPUs (see `gpu`); the
+Which code runs is settled when a program is lowered: the library on CPUs and, forwards, on CUDA GPUs (see `cuda`); the
 definition in plain JAX elsewhere.
 Replicas know nothing of each other, so a call on arrays that are sharded by replicas runs on each device by itself.
 """
@@ -24,7 +24,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jax.sharding import NamedSharding, PartitionSpec
 
-from gmem_jax.native import gpu
+from gmem_jax.native import cuda
 from gmem_jax.physics.step import together
 
 TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint")
@@ -273,7 +273,7 @@ def _primitive(
             parts = jax.tree.unflatten(tree, leaves)
             if on_gpu:
                 shapes = outputs(parts)
-                return gpu.run(target, call, in_place, parts, shapes)[: len(shapes)]
+                return cuda.run(target, call, in_place, parts, shapes)[: len(shapes)]
             return _library(target, outputs, call, in_place, parts)
 
         def shared_out(*leaves: jax.Array) -> Any:
@@ -292,12 +292,12 @@ def _primitive(
     def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
         if static["call"].mixed:
             raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
-        if target in gpu.TARGETS and not gpu.missing():
+        if target in cuda.TARGETS and not cuda.missing():
             return library(context, *values, on_gpu=True, **static)
-        if target in gpu.TARGETS and not definition.anywhere:
-            raise NotImplementedError(f"the native backend does not run on this GPU: {gpu.missing()}")
-        if target in gpu.TARGETS:
-            gpu.warn_once(gpu.missing())
+        if target in cuda.TARGETS and not definition.anywhere:
+            raise NotImplementedError(f"the native backend does not run on this GPU: {cuda.missing()}")
+        if target in cuda.TARGETS:
+            cuda.warn_once(cuda.missing())
         return in_plain_jax(context, *values, definition=definition, **static)
 
     def on_others(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:

@@ -92,7 +92,7 @@ def needs(
 
     Args:
         library: the native library.
-        law: its number, as of `gmem_jax.native.calls.Call`.
+        law: its number, as of `gmem_jax.native.primitives.Call`.
         variant: alike.
         architecture: as "sm_90".
         tangent: of numbers that carry derivatives.
@@ -175,9 +175,9 @@ def run(target: str, call: Any, in_place: bool, parts: Any, shapes: Sequence[Any
 
     Args:
         target: what XLA knows it by.
-        call: its attributes, `gmem_jax.native.calls.Call`.
+        call: its attributes, `gmem_jax.native.primitives.Call`.
         in_place: whether histories may take the place of those that were given.
-        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`, and the tangent's `Arrays`.
+        parts: `Fixed` and `Arrays` of `gmem_jax.native.primitives`, and the tangent's `Arrays`.
         shapes: of the results.
     """
     outer = shapes[0].shape[:-3]
