@@ -18,7 +18,7 @@ from gmem_jax.command import recalls
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.files.hdf5 import writing
 
-PACK = Path(__file__).parent.parent / "data" / "tetra-27.h5"
+PACK = TETRA_27
 SHORT = ["--t0", "75", "--store", "0.1", "--rest", "0.1", "--hold", "0.1"]
 
 

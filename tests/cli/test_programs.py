@@ -9,7 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
-PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
+PACK = TETRA_27
 ENTRY = "from gmem_jax.command.app import main; main()"
 SHORT = ["--t0", "75", "--store", "0.2", "--no-picture", "--json"]
 

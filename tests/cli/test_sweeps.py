@@ -16,7 +16,7 @@ from test_cli import gmem
 
 import gmem_jax as gm
 
-PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
+PACK = TETRA_27
 ENTRY = "from gmem_jax.command.app import main; main()"
 SWEEP = f"""[experiment]
 pack = "{PACK}"
