@@ -2,12 +2,12 @@
 
 import json
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import ROOT, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -133,7 +133,7 @@ def test_what_was_measured_is_kept_at_once(pack: gm.Pack) -> None:
 
 
 def test_the_page_on_speed_holds_the_table_that_was_measured() -> None:
-    root = Path(__file__).parents[1]
+    root = ROOT
     page = (root / "docs" / "speed.md").read_text()
     stored = json.loads((root / "benchmarks" / "bench.json").read_text())
     assert page == table.into(page, table.short(stored))

@@ -11,6 +11,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.command import app as cli

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+from scenes import TETRA_27
 from test_cli import gmem
 
 from gmem_jax.command import recalls

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 PACK = TETRA_27
 ENTRY = "from gmem_jax.command.app import main; main()"

@@ -1,14 +1,13 @@
 """Derivatives through whole, shortened experiments on 27 grains, and at the corners of the contact laws."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import with_skin
+from scenes import TETRA_27, with_skin
 
 import gmem_jax as gm
 from gmem_jax.derivatives import gradient, jacobian
@@ -214,10 +213,21 @@ CORNERS = {
     "sliding": ([1.9, 0.0, 0.0], [0.0, 10.0, 0.0]),
     "separating so fast that the dashpot would pull": ([1.9, 0.0, 0.0], [10.0, 0.0, 0.0]),
 }
+# Ten seconds each, nearly all of it compiling: M2 has its own corners, where contacts begin and where they slide.
+SLOW_CORNERS = [
+    ("M1", "overlap zero"),
+    *(("M2", corner) for corner in CORNERS if corner not in ("first touch", "sliding")),
+]
 
 
-@pytest.mark.parametrize("law", [gm.Hooke(), gm.MindlinRescaled(), gm.Mindlin(points=5)], ids=["H", "M1", "M2"])
-@pytest.mark.parametrize("corner", CORNERS)
+@pytest.mark.parametrize(
+    ("law", "corner"),
+    [
+        pytest.param(law, corner, id=f"{corner}-{name}", marks=[pytest.mark.slow] * ((name, corner) in SLOW_CORNERS))
+        for name, law in {"H": gm.Hooke(), "M1": gm.MindlinRescaled(), "M2": gm.Mindlin(points=5)}.items()
+        for corner in CORNERS
+    ],
+)
 def test_derivatives_are_finite_at_the_corners_of_the_laws(law: Any, corner: str) -> None:
     separation, velocity = (jnp.asarray(v).reshape(1, 3, 1) for v in CORNERS[corner])
     history = law.init(1, 1, jnp.float64)
@@ -277,7 +287,14 @@ def test_the_classifier_is_differentiated_through_the_recall_to_the_waveform(exp
     np.testing.assert_allclose(jnp.vdot(toss, slope), difference, rtol=0.01, atol=5e-4)
 
 
-@pytest.mark.parametrize("law", [gm.Hooke(), gm.MindlinRescaled(), gm.Mindlin(points=6)], ids=["H", "M1", "M2"])
+@pytest.mark.parametrize(
+    "law",
+    [
+        pytest.param(gm.Hooke(), id="H"),
+        pytest.param(gm.MindlinRescaled(), id="M1", marks=pytest.mark.slow),
+        pytest.param(gm.Mindlin(points=6), id="M2", marks=pytest.mark.slow),
+    ],
+)
 def test_every_law_and_the_places_of_bumps_and_delta0_have_derivatives(experiment: gm.Experiment, law: Any) -> None:
     short = gm.replace(experiment, friction=law, delta0=0.05, rest=0.02, hold=0.02, store=0.02)
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.design import by_kernel, drive, waveforms

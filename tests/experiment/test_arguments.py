@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import TESTS, TETRA_27
 
 import gmem_jax as gm
 
@@ -95,7 +96,7 @@ def test_the_package_lists_its_own_names_those_loaded_later_too_and_nothing_fore
 @pytest.mark.skipif(importlib.util.find_spec("mypy") is None, reason="needs mypy")
 def test_a_program_of_a_user_is_typed_throughout_and_its_mistakes_are_found(tmp_path: Path) -> None:
     root = Path(gm.__file__).parent.parent
-    good = (Path(__file__).parent / "data" / "program.py").read_text()
+    good = (TESTS / "data" / "program.py").read_text()
     (tmp_path / "good.py").write_text(good)
     (tmp_path / "bad.py").write_text(
         good.replace('backend="native"', 'backend="nativ"').replace("pack, gm.", '"a", gm.')

@@ -4,13 +4,13 @@ import json
 import subprocess
 import sys
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any, get_type_hints
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment import recall as recalls

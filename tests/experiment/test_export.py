@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 

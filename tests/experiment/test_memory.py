@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment.recall import COPIES, GRAIN_BYTES, apply_waveforms, default_batch, runner_of

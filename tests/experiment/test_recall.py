@@ -1,13 +1,12 @@
 """What is made of the samples of a run: gain and fidelity, raw and over a window, and the bits that doubt them."""
 
 from functools import cache
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import SPHERE, scene
+from scenes import SPHERE, TETRA_27, scene
 
 import gmem_jax as gm
 from gmem_jax.experiment.recall import Recall, finish

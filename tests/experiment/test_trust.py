@@ -3,7 +3,6 @@
 from collections import OrderedDict
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from budget import Budget
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment import validity as limits
@@ -215,7 +215,9 @@ def test_a_waveform_ten_times_too_large_is_doubted() -> None:
     assert [bool(bits & int(Status.LARGE_WAVEFORM)) for bits in np.asarray(found.status)] == [False, True]
 
 
-@pytest.mark.parametrize("friction", [gm.Hooke(), gm.MindlinRescaled(), gm.Mindlin(points=8)])
+@pytest.mark.parametrize(
+    "friction", [gm.Hooke(), gm.MindlinRescaled(), pytest.param(gm.Mindlin(points=8), marks=pytest.mark.slow)]
+)
 def test_a_run_as_in_the_paper_is_not_doubted(friction: FrictionLaw) -> None:
     found = gm.run(gm.Experiment(LARGER, two_bumps(1.0, -0.6), friction, t0=900.0, **SHORT))
     assert gm.explain(int(np.bitwise_or.reduce(np.asarray(found.status)))) == "ok"

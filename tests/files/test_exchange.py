@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import orientations
+from scenes import TETRA_27, orientations
 
 import gmem_jax as gm
 from gmem_jax.bench import lammps

@@ -11,6 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from scenes import TESTS, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.command.exchange import export
@@ -19,7 +20,7 @@ from gmem_jax.files.checkpoints import load_part, save_part
 from gmem_jax.files.seal import BLOCK, seal
 
 PACK = TETRA_27
-FUZZ = Path(__file__).parent / "reliability" / "fuzz.py"
+FUZZ = TESTS / "reliability" / "fuzz.py"
 
 
 def changed(tmp_path: Path, change: Callable[[h5py.File], None]) -> Path:

@@ -6,6 +6,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from scenes import ROOT, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.design.kernel import MemoryKernel
@@ -155,5 +156,5 @@ def test_a_designed_file_says_how_its_design_went(tmp_path: Path) -> None:
 
 
 def test_the_page_of_the_files_is_that_of_the_tables() -> None:
-    page = Path(__file__).parent.parent / "docs" / "files.md"
+    page = ROOT / "docs" / "files.md"
     assert page.read_text() == schemas.page(), "python experiments/files_page.py"

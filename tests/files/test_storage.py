@@ -10,6 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment.pack import stack

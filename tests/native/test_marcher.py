@@ -4,7 +4,6 @@ import functools
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import export
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native

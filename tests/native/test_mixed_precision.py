@@ -1,13 +1,12 @@
 """Contacts in single precision, all else in double: close to double precision, the same bits in any company."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import SPHERE, Motion, advance_by, scene
+from scenes import SPHERE, TETRA_27, Motion, advance_by, scene
 
 import gmem_jax as gm
 from gmem_jax import native

@@ -1,13 +1,12 @@
 """The native backend gives the numbers of the definition, for every law, alone or in a batch."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import Motion, advance_by
+from scenes import TETRA_27, Motion, advance_by
 
 import gmem_jax as gm
 from gmem_jax import native

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native

@@ -36,7 +36,9 @@ LAWS: dict[str, Any] = {
 DT = 0.3
 STEPS = 40
 REPLICAS = 9  # a whole vector of the CPU and one more, whatever its width
-every_law = pytest.mark.parametrize("law", LAWS)
+every_law = pytest.mark.parametrize(
+    "law", [pytest.param(law, marks=[pytest.mark.slow] * (law == "narrow rings")) for law in LAWS]
+)
 
 
 def walls(begun: int, count: int) -> Box:
@@ -120,7 +122,7 @@ def random_like(tree: Any, seed: int) -> Any:
 
 
 # One history of each kind, and new runs of several rings; what crosses is the same for all.
-@pytest.mark.parametrize("law", ["H", "M2", "narrow rings"])
+@pytest.mark.parametrize("law", ["H", *(pytest.param(law, marks=pytest.mark.slow) for law in ("M2", "narrow rings"))])
 def test_both_modes_of_derivatives_cross_the_domains_as_defined(law: str) -> None:
     system, _ = thrown(law)
     state = first(as_defined(law)[0], 2)

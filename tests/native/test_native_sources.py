@@ -14,7 +14,7 @@ from gmem_jax import native
 from gmem_jax.native import build
 
 ROOT = Path(gmem_jax.__file__).parent.parent
-HERE = Path(__file__).parent / "native"
+HERE = Path(__file__).parent
 COMPILERS = ["g++", *(f"g++-{n}" for n in range(11, 16)), "clang++", *(f"clang++-{n}" for n in range(14, 23))]
 THREADS = ("cpu/team.cc", "cpu/cache.cc", "cpu/blocks.cc", "cpu/plan.cc")
 MIRROR = re.compile(r"^// (gmem_jax/\S+\.py): (\w[\w.]*(?:, \w[\w.]*)*)", re.MULTILINE)

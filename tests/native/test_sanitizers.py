@@ -8,10 +8,11 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from scenes import TESTS
 
 from gmem_jax.native import build
 
-DRIVER = Path(__file__).parent / "reliability" / "drive.cc"
+DRIVER = TESTS / "reliability" / "drive.cc"
 # Not all of UBSan: its checks for null and for the sizes of objects quadruple the time to compile.
 UNDEFINED = "signed-integer-overflow,bounds,alignment,float-cast-overflow,shift,integer-divide-by-zero,bool,enum,return"
 SANITIZERS = {

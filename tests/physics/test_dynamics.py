@@ -81,7 +81,7 @@ def assert_same_replicas(one, other):
         np.testing.assert_allclose(leaf, expected, rtol=1e-12, atol=3e-10 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("chosen", [(1,), (3,)])
+@pytest.mark.parametrize("chosen", [(1,), pytest.param((3,), marks=pytest.mark.slow)])
 def test_a_replica_does_not_depend_on_its_neighbours_in_the_batch(five, chosen):
     few = sheared_cluster([AMPLITUDES[k] for k in chosen])
     assert_same_replicas(few, replica(five, np.array([0, *(k + 1 for k in chosen)])))

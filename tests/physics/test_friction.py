@@ -4,7 +4,6 @@ import functools
 import importlib.util
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +56,7 @@ def work_along(displacement, force):
 @pytest.fixture(scope="module")
 def own_law(tmp_path_factory):
     """The module of the law in docs/own_law.md, as a user's own file."""
-    page = (Path(__file__).parents[1] / "docs" / "own_law.md").read_text()
+    page = (scenes.ROOT / "docs" / "own_law.md").read_text()
     file = tmp_path_factory.mktemp("user") / "plain_mindlin.py"
     file.write_text(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[0])
     spec = importlib.util.spec_from_file_location("plain_mindlin", file)

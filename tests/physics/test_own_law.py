@@ -1,12 +1,12 @@
 """A friction law of one's own is tried before a run: what it must return, and what it must leave alone."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 

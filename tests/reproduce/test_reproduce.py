@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.reproduce import claims, draw, figures
@@ -285,7 +286,7 @@ def test_recalled_words_have_one_scale(monkeypatch: pytest.MonkeyPatch, tmp_path
     assert "mean over the ringing period" in caption
 
 
-@pytest.mark.parametrize("name", ["fig04", "fig13", "fig14"])
+@pytest.mark.parametrize("name", ["fig04", "fig13", pytest.param("fig14", marks=pytest.mark.slow)])
 def test_pictures_of_recalls_and_words(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
     values = {"pack": PACK, "signals": "words:1", "background": "sub2-bl"} if name != "fig04" else {"pack": PACK}
     monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(points=lambda scale: [values]))

@@ -1,7 +1,7 @@
 """What `test_devices` runs in processes of its own: experiments whose replicas lie on several devices.
 
-XLA_FLAGS=--xla_force_host_platform_device_count=8 python tests/several_devices.py alone native out.npz
-python tests/several_devices.py ADDRESS native out.npz 2 0    # the first of two processes
+XLA_FLAGS=--xla_force_host_platform_device_count=8 python tests/simulation/several_devices.py alone native out.npz
+python tests/simulation/several_devices.py ADDRESS native out.npz 2 0    # the first of two processes
 """
 
 import sys
@@ -13,7 +13,7 @@ import numpy as np
 import gmem_jax as gm
 from gmem_jax.experiment.several import run_several
 
-PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
 SHORT = {"t0": 75.0, "rest": 0.02, "hold": 0.02, "store": 0.02}  # one step a bin
 
 

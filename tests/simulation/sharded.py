@@ -1,6 +1,6 @@
 """What `test_sharding` runs in a process of its own, in which the CPU is split into eight devices.
 
-    XLA_FLAGS=--xla_force_host_platform_device_count=8 python tests/sharded.py native
+    XLA_FLAGS=--xla_force_host_platform_device_count=8 python tests/simulation/sharded.py native
 
 It prints one JSON object: what was checked, and "" or what was wrong.
 """
@@ -27,7 +27,7 @@ from gmem_jax.physics.step import System, start, together
 REPLICAS, STEPS, BINS = 8, 5, 2
 jax.config.update("jax_enable_x64", True)  # before the first array
 
-PACK = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
+PACK = gm.load_pack(Path(__file__).parents[1] / "data" / "tetra-27.h5")
 MUS = jnp.linspace(0.2, 0.9, 8)
 RATES = jnp.linspace(0.7, 1.3, REPLICAS)
 WEIGHTS = jnp.asarray([[1e3], [2e3], [-1e3]])

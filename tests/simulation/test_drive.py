@@ -1,12 +1,11 @@
 """Prescribed walls: lengths, velocities and centring of the box, and the stages of the experiment."""
 
 import itertools
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import Motion
+from scenes import TETRA_27, Motion
 
 import gmem_jax as gm
 from gmem_jax.experiment.protocols import cycle, memory_protocol

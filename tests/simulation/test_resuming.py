@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import with_skin
+from scenes import TETRA_27, with_skin
 
 import gmem_jax as gm
 from gmem_jax.derivatives.gradient import value_and_grad
@@ -67,7 +67,10 @@ def _same(run: Callable[[ResultCache], Any], folder: Path, deaths: list[int]) ->
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("law", [gm.Hooke(), gm.Mindlin(points=20)], ids=["H", "M2"])
+@pytest.mark.parametrize(
+    "law",
+    [pytest.param(gm.Hooke(), id="H"), pytest.param(gm.Mindlin(points=20), id="M2", marks=pytest.mark.slow)],
+)
 def test_a_run_goes_on_with_the_lists_it_had(law: Any, tmp_path: Path) -> None:
     pack = with_skin(gm.load_pack(PACK), 0.02)  # its lists are made anew on the way
     experiment = gm.Experiment(pack, ONE, law, **SHORT)

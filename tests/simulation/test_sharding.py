@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from sharded import CHECKS
+from sharded import CHECKS, sweep
 
 from gmem_jax import native
 
@@ -29,9 +29,13 @@ def found(backend: str) -> dict[str, str]:
 
 def cases() -> list[object]:
     built = pytest.mark.skipif(not BUILT, reason=REASON)
-    marks = {"native": [built], "jax": [pytest.mark.slow]}
     return [
-        pytest.param(backend, check.__name__, marks=marks[backend], id=f"{backend}-{check.__name__}")
+        pytest.param(
+            backend,
+            check.__name__,
+            marks=[built] * (backend == "native") + [pytest.mark.slow] * (backend == "jax" or check is sweep),
+            id=f"{backend}-{check.__name__}",
+        )
         for backend, checks in CHECKS.items()
         for check in checks
     ]
