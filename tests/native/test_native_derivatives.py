@@ -32,7 +32,10 @@ LAWS: dict[str, Any] = {
     **{f"M2-{variant}": gm.Mindlin(mu=0.5, points=8, variant=variant) for variant in ("exact", "averaged", "paper")},
 }
 # Ten seconds each, nearly all of it compiling, that say of others what "H" with isotropic grains says.
-ALIKE = [*((name, True) for name in LAWS if name != "H"), ("H", False)]
+ALIKE = [
+    pytest.param(name, isotropic, marks=pytest.mark.slow)
+    for name, isotropic in [*((name, True) for name in LAWS if name != "H"), ("H", False)]
+]
 HEIGHTS = jnp.asarray([[1.0], [-0.4]])
 # Both are exact derivatives of one program over 20 steps. Round-off is some 1e-14 of the largest, and is magnified
 # where a force is carried along whose normal part nearly cancels (by 1e3 seen in one of 11,000 numbers).
