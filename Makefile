@@ -5,20 +5,27 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo test test-slow check docs mutations reliability cluster wheel install clean
+.PHONY: demo quick test test-slow check docs mutations reliability cluster wheel install clean
 
 demo: install
 	$(REBUILD)
 	$(BIN)/gmem demo --force
 
+# Units and physics, in under two minutes on two cores: what to run after every change.
+QUICK := $(addprefix tests/,physics experiment/test_analysis.py experiment/test_samples.py experiment/test_signals.py \
+  files/test_columns.py reading/test_capacity.py reading/test_readers.py simulation/test_drive.py simulation/test_protocol.py)
+quick: install-dev
+	$(REBUILD)
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow" $(QUICK)
+
 test: install-dev
 	$(REBUILD)
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow" $(TESTS)
 
-# What takes minutes for one statement: sanitizers, plain JAX on several devices.
+# Cases of ten seconds and more that say of others what a quicker one says, and what takes minutes for one statement.
 test-slow: install-dev
 	$(REBUILD)
-	$(BIN)/pytest -n 2 --dist loadgroup -m slow
+	$(BIN)/pytest -n 2 --dist loadgroup -m slow $(TESTS)
 
 # Wrong code that the tests must notice; an hour or two. Names of mutations: make mutations NAMES="step-* native-*"
 mutations: install-dev
