@@ -110,35 +110,35 @@ MUTATIONS = (
     ),
     mutation(
         "energy-of-isotropic-grains",
-        "physics/sample.py",
+        "simulation/sample.py",
         "jnp.sum(clump.inertia[:, None] * body_spin**2, axis=1)",
         "clump.inertia[0] * jnp.sum(body_spin**2, axis=1)",
         "test_the_kinetic_energy_of_a_turned_anisotropic_grain_is_that_of_its_own_tensor",
     ),
     mutation(
         "energy-in-the-wrong-frame",
-        "physics/sample.py",
+        "simulation/sample.py",
         "body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)\n    energy",
         "body_spin = grains.spin\n    energy",
         "test_the_kinetic_energy_of_a_turned_anisotropic_grain_is_that_of_its_own_tensor",
     ),
     mutation(
         "coordination-of-spheres",
-        "physics/sample.py",
+        "simulation/sample.py",
         "jax.ops.segment_max(touching",
         "jax.ops.segment_sum(touching",
         "test_observables_are_those_counted_by_hand",
     ),
     mutation(
         "status-forgotten",
-        "physics/sample.py",
-        ").astype(jnp.int32)\n    return replace(state, status=state.status | bits)\n\n\ndef observe",
-        ").astype(jnp.int32)\n    return replace(state, status=bits)\n\n\ndef observe",
+        "simulation/sample.py",
+        "int(Status.NOT_FINITE))\n    ).astype(jnp.int32)\n    return replace(state, status=state.status | bits)",
+        "int(Status.NOT_FINITE))\n    ).astype(jnp.int32)\n    return replace(state, status=bits)",
         "test_status_bits_are_sticky",
     ),
     mutation(
         "doubt-of-the-last-stage-alone",
-        "experiment/doubts.py",
+        "experiment/validity.py",
         "largest = jnp.maximum(largest, jnp.max(value, axis=0))",
         "largest = jnp.max(value, axis=0)",
         "test_each_doubt_is_that_of_its_replica_alone",
@@ -152,28 +152,28 @@ MUTATIONS = (
     ),
     mutation(
         "stale-too-late",
-        "physics/sample.py",
+        "simulation/sample.py",
         "slack(system.pairs, spheres, box) <= 0.0",
         "slack(system.pairs, spheres, box) <= -0.01",
         "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
     ),
     mutation(
         "stale-too-early",
-        "physics/sample.py",
+        "simulation/sample.py",
         "slack(system.pairs, spheres, box) <= 0.0",
         "slack(system.pairs, spheres, box) <= 0.01",
         "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
     ),
     mutation(
         "box-margin-below",
-        "physics/sample.py",
+        "simulation/sample.py",
         "(spheres < box.lower)",
         "(spheres < box.lower - 0.1)",
         "test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall",
     ),
     mutation(
         "box-margin-above",
-        "physics/sample.py",
+        "simulation/sample.py",
         "(spheres > box.upper)",
         "(spheres > box.upper - 0.01)",
         "test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall",
@@ -252,7 +252,7 @@ MUTATIONS = (
     ),
     mutation(
         "walls-not-counted",
-        "physics/sample.py",
+        "simulation/sample.py",
         "0.5 * self.contacts + self.wall_contacts",
         "0.5 * self.contacts",
         "test_observables_are_those_counted_by_hand",
@@ -338,8 +338,8 @@ MUTATIONS = (
     mutation(
         "packed-guest-torque-times-five",
         "packed.h",
-        "t[l] += guest[2 * static_cast<std::size_t>(n) + 1];",
-        "t[l] += 5.0 * guest[2 * static_cast<std::size_t>(n) + 1];",
+        "t[l] += remote[2 * static_cast<std::size_t>(n) + 1];",
+        "t[l] += 5.0 * remote[2 * static_cast<std::size_t>(n) + 1];",
         f"{DOMAINS}[1-M1]",
     ),
     mutation(
@@ -373,15 +373,15 @@ MUTATIONS = (
     mutation(
         "replicas-guest-torque-lost",
         "replicas.h",
-        "torque = torque + convert<V>(load_vec(guest + 6 * static_cast<std::size_t>(n) + 3));",
+        "torque = torque + convert<V>(load_vec(remote + 6 * static_cast<std::size_t>(n) + 3));",
         "",
         f"{DOMAINS}[9-H]",
     ),
     mutation(
         "replicas-guests-not-forgotten",
         "replicas.h",
-        "for (int q = 0; q < 6; ++q) guest[6",
-        "for (int q = 0; q < 3; ++q) guest[6",
+        "for (int q = 0; q < 6; ++q) remote[6",
+        "for (int q = 0; q < 3; ++q) remote[6",
         f"{DOMAINS}[9-H]",
     ),
     mutation(
@@ -442,7 +442,7 @@ MUTATIONS = (
     ),
     mutation(
         "native-runs-grow-by-one",
-        "runs.h",
+        "segments.h",
         "(last <= before) & (before + one < outer)",
         "(last <= before) & (before + one < before)",
         "test_unit_tests_in_cpp[runs]",
@@ -450,7 +450,7 @@ MUTATIONS = (
     ),
     mutation(
         "native-new-rings-like-the-last",
-        "runs.h",
+        "segments.h",
         "zero_unless(stays | former, select(",
         "zero_unless(there, select(",
         "test_unit_tests_in_cpp[runs]",
@@ -458,7 +458,7 @@ MUTATIONS = (
     ),
     mutation(
         "native-common-part-of-other-lanes",
-        "runs.h",
+        "segments.h",
         "zero_unless(differs, layers.common)",
         "layers.common",
         "test_unit_tests_in_cpp[runs]",
@@ -481,15 +481,15 @@ MUTATIONS = (
     mutation(
         "adjoint-guest-spin",
         "adjoint.h",
-        "store_vec(to + kGuestSpin, bar.spin);",
-        "store_vec(to + kGuestSpin, bar.velocity);",
+        "store_vec(to + kRemoteSpin, bar.spin);",
+        "store_vec(to + kRemoteSpin, bar.velocity);",
         f"{ACROSS}[H]",
     ),
     mutation(
         "adjoint-guest-centre-lost",
         "adjoint.h",
-        "store_vec(to + kGuestCentre, bar.centre);",
-        "store_vec(to + kGuestCentre, Vec{V{}, V{}, V{}});",
+        "store_vec(to + kRemoteCentre, bar.centre);",
+        "store_vec(to + kRemoteCentre, Vec{V{}, V{}, V{}});",
         f"{ACROSS}[H]",
     ),
     mutation(
@@ -679,127 +679,127 @@ MUTATIONS = (
     # ---------------------------------------------------------------- the experiment: stages, walls, walks
     mutation(
         "hold-for-rest",
-        "experiment/protocol.py",
-        'Stage("rest-2", 0.0, 0.0, rest)',
-        'Stage("rest-2", 0.0, 0.0, hold)',
+        "experiment/protocols.py",
+        'Stage("rest-2", 0.0, 0.0, rest, "hold")',
+        'Stage("rest-2", 0.0, 0.0, hold, "hold")',
         "test_rest_hold_and_storage_have_lengths_of_their_own",
     ),
     mutation(
         "rest-for-hold",
-        "experiment/protocol.py",
-        'Stage("hold", 1.0, 1.0, hold)',
-        'Stage("hold", 1.0, 1.0, rest)',
+        "experiment/protocols.py",
+        'Stage("hold", 1.0, 1.0, hold, "hold")',
+        'Stage("hold", 1.0, 1.0, rest, "hold")',
         "test_rest_hold_and_storage_have_lengths_of_their_own",
     ),
     mutation(
         "bins-rounded-down",
-        "experiment/protocol.py",
+        "simulation/protocol.py",
         "math.ceil(self.length * BINS - 1e-9)",
         "math.floor(self.length * BINS + 1e-9)",
         "test_a_hold_is_rounded_up_to_whole_bins",
     ),
     mutation(
         "store-sheared",
-        "experiment/protocol.py",
-        'Stage("store", 1.0, 1.0, store)',
-        'Stage("store", 1.0, 1.0, store, sheared=True)',
+        "experiment/protocols.py",
+        'Stage("store", 1.0, 1.0, store, "hold")',
+        'Stage("store", 1.0, 1.0, store, "hold", sheared=True)',
         "test_the_table_lists_the_bins_of_all_stages_in_order",
     ),
     mutation(
         "readout-sheared",
-        "experiment/protocol.py",
-        'Stage("readout", 1.0, 0.0, 1.0)',
-        'Stage("readout", 1.0, 0.0, 1.0, sheared=True)',
+        "experiment/protocols.py",
+        'Stage("readout", 1.0, 0.0, 1.0, "read")',
+        'Stage("readout", 1.0, 0.0, 1.0, "read", sheared=True)',
         "test_only_encoding_moves_the_walls_with_shear",
     ),
     mutation(
         "gamma-on-each-axis",
-        "experiment/drive.py",
+        "simulation/strain.py",
         "share: Scalar = 0.5",
         "share: Scalar = 1.0",
         "test_half_of_gamma_goes_to_each_axis_with_opposite_signs",
     ),
     mutation(
         "compression-of-each-axis",
-        "experiment/drive.py",
+        "simulation/strain.py",
         "squeeze = 1.0 - (1.0 - jnp.sqrt(1.0 - self.delta0)) * u",
         "squeeze = 1.0 - self.delta0 * u",
         "test_full_compression_takes_delta0_of_the_area_and_nothing_of_the_height",
     ),
     mutation(
         "walls-a-step-late",
-        "experiment/walk.py",
+        "simulation/loop.py",
         "row.number * steps + 1 + jnp.arange(steps)",
         "row.number * steps + jnp.arange(steps)",
         "test_the_samples_of_a_run_follow_the_table",
     ),
     mutation(
         "drag-under-moving-walls",
-        "experiment/walk.py",
-        "jnp.where(still, course.drag, 0.0)",
-        "jnp.asarray(course.drag)",
+        "simulation/loop.py",
+        "jnp.where(still, simulation.drag, 0.0)",
+        "jnp.asarray(simulation.drag)",
         "test_only_while_the_walls_stand_still_is_there_a_drag",
     ),
     mutation(
         "pulse-at-one-u",
-        "experiment/drive.py",
+        "simulation/strain.py",
         "jnp.where(row.start == row.stop, passed, u)",
         "u",
         "test_where_u_stands_still_the_waveform_runs_in_time",
     ),
     mutation(
         "pulse-and-encoding-sheared",
-        "experiment/protocol.py",
-        "sheared=not before)",
+        "experiment/protocols.py",
+        "sheared=not pulsed)",
         "sheared=True)",
         "test_a_pulse_before_the_compression_takes_the_shear_from_it",
     ),
     mutation(
         "chunk-redone-on-the-stale-list",
-        "experiment/host.py",
-        "self.renew(self._box_before(first))",
+        "simulation/runner.py",
+        "self.renew(self.simulation.box_before(chunk.row))",
         "pass",
         "test_a_list_that_goes_stale_is_rebuilt_and_its_chunk_redone_with_the_same_result",
     ),
     mutation(
         "list-foreseen-too-late",
-        "experiment/host.py",
+        "simulation/runner.py",
         "(1.0 + count / self._lasted) > self.skin",
         "1.0 > self.skin",
-        "test_a_walk_that_foresees_throws_no_chunk_away",
+        "test_a_runner_that_foresees_throws_no_chunk_away",
     ),
     mutation(
         "stale-chunk-stands",
-        "experiment/host.py",
-        "                continue\n            refuse(status, stage.name, self.course)",
-        "            refuse(status & ~int(Status.STALE_PAIRS), stage.name)",
+        "simulation/runner.py",
+        "            self._renew_stale(chunk)\n            return\n        raise_if_fatal(status,",
+        "            pass\n        raise_if_fatal(status & ~int(Status.STALE_PAIRS),",
         "test_a_list_that_goes_stale_is_rebuilt_and_its_chunk_redone_with_the_same_result",
     ),
     mutation(
         "histories-forgotten-at-renewal",
-        "experiment/host.py",
+        "simulation/runner.py",
         "history=move(self.state.history, blank)",
         "history=blank",
         "test_a_list_that_goes_stale_is_rebuilt_and_its_chunk_redone_with_the_same_result",
     ),
     mutation(
         "progress-of-bins",
-        "experiment/host.py",
+        "simulation/runner.py",
         "self.work += bins * work_of_bin(self.state.replicas)",
         "self.work += bins",
         "test_the_samples_of_a_run_follow_the_table",
     ),
     mutation(
         "list-not-resumed",
-        "experiment/host.py",
-        'self.course.with_pairs(kept["pairs"])\n        self.put_on',
-        "self.course\n        self.put_on",
+        "simulation/runner.py",
+        'self.simulation.with_pairs(snapshot["pairs"])\n        self.place_on',
+        "self.simulation\n        self.place_on",
         "test_a_run_goes_on_with_the_lists_it_had",
     ),
     mutation(
         "bins-done-again",
-        "experiment/host.py",
-        'played.update((name, [sample]) for name, sample in begun["played"].items())',
+        "simulation/runner.py",
+        'samples.restore(saved["samples"])',
         "pass",
         "test_a_run_goes_on_with_the_lists_it_had",
     ),
@@ -812,8 +812,8 @@ MUTATIONS = (
     ),
     mutation(
         "checkpoint-of-a-failure",
-        "files/parts.py",
-        "            standing.discard()  # whoever tries again changes something\n",
+        "files/checkpoints.py",
+        "            checkpoint.discard()  # whoever tries again changes something\n",
         "",
         "test_a_run_that_failed_leaves_nothing_to_go_on_from",
     ),
@@ -903,7 +903,7 @@ MUTATIONS = (
     ),
     mutation(
         "padding-of-zero",
-        "experiment/devices.py",
+        "simulation/sharding.py",
         "more = np.repeat(leaf[..., :1], self.padded",
         "more = np.nan * np.repeat(leaf[..., :1], self.padded",
         "test_eight_devices_give_the_numbers_of_one",
@@ -918,27 +918,27 @@ MUTATIONS = (
     mutation(
         "at-rest-when-storage-begins",
         "experiment/recall.py",
-        'stages["store"].largest_speed[-1]',
-        'stages["store"].largest_speed[0]',
+        "largest_speed[-1] / compression_speed",
+        "largest_speed[0] / compression_speed",
         "test_a_pack_is_at_rest_below_one_percent_of_the_speed_of_its_walls",
     ),
     mutation(
         "speed-of-both-walls",
-        "experiment/doubts.py",
+        "experiment/validity.py",
         "return 0.5 * (pack.upper - pack.lower)",
         "return 1.0 * (pack.upper - pack.lower)",
         "test_a_pack_is_at_rest_below_one_percent_of_the_speed_of_its_walls",
     ),
     mutation(
         "unrest-of-a-moment",
-        "experiment/doubts.py",
+        "experiment/validity.py",
         "jnp.median(sample.largest_speed, axis=0)",
         "jnp.max(sample.largest_speed, axis=0)",
         "test_one_fast_moment_is_not_unrest",
     ),
     mutation(
         "no-signal-is-no-noise",
-        "experiment/doubts.py",
+        "experiment/validity.py",
         "noise >= LARGEST_NOISE",
         "(noise >= LARGEST_NOISE) & jnp.isfinite(noise)",
         "test_each_doubt_is_that_of_its_replica_alone",
@@ -966,14 +966,14 @@ MUTATIONS = (
     ),
     mutation(
         "overlap-range-too-wide",
-        "physics/sample.py",
+        "simulation/sample.py",
         "sample.largest_overlap > largest_overlap(",
         "sample.largest_overlap > 1.01 * largest_overlap(",
         "test_an_overlap_beyond_the_law_is_flagged_in_its_replica_and_no_other",
     ),
     mutation(
         "overlap-range-too-narrow",
-        "physics/sample.py",
+        "simulation/sample.py",
         "sample.largest_overlap > largest_overlap(",
         "sample.largest_overlap > 0.99 * largest_overlap(",
         "test_an_overlap_beyond_the_law_is_flagged_in_its_replica_and_no_other",
@@ -1038,8 +1038,8 @@ MUTATIONS = (
     mutation(
         "second-readout-not-pulled",
         "derivatives/gradient.py",
-        "self.readouts.get(stage.name)",
-        'self.readouts.get(stage.name.replace("readout-2", ""))',
+        "self.reads.get(chunk.stage.name)",
+        'self.reads.get(chunk.stage.name.replace("readout-2", ""))',
         "test_a_second_readout_as_background_is_differentiated_too",
     ),
     mutation(
@@ -1236,9 +1236,9 @@ MUTATIONS = (
     ),
     mutation(
         "waveforms-by-rows",
-        "files/waveforms.py",
-        'delimiter=",", ndmin=2).T',
-        'delimiter=",", ndmin=2)',
+        "files/columns.py",
+        "delimiter=separator, ndmin=2, quotechar='\"').T",
+        "delimiter=separator, ndmin=2, quotechar='\"')",
         "test_waveforms_are_read_from_csv_with_or_without_header_and_from_npy",
     ),
     mutation(
@@ -1250,21 +1250,21 @@ MUTATIONS = (
     ),
     mutation(
         "parts-run-again",
-        "files/parts.py",
+        "files/checkpoints.py",
         "if path.is_file():\n            return load_part",
         "if False:\n            return load_part",
         "test_a_part_that_is_kept_is_not_run_again",
     ),
     mutation(
         "parts-of-another-run",
-        "files/parts.py",
+        "files/checkpoints.py",
         "if found.get(name) != wanted.get(name)]",
         "if False]",
         "test_parts_of_another_run_are_refused",
     ),
     mutation(
         "parts-exchanged",
-        "files/parts.py",
+        "files/checkpoints.py",
         'if head.get("of") != of:',
         "if False:",
         "test_parts_that_were_exchanged_or_are_of_another_run_are_refused",
@@ -1341,7 +1341,7 @@ MUTATIONS = (
     ),
     mutation(
         "stages-in-any-order",
-        "files/parts.py",
+        "files/checkpoints.py",
         'for name, item in form["ordered"])',
         'for name, item in sorted(form["ordered"]))',
         "test_a_part_is_a_table_of_arrays",
@@ -1506,14 +1506,31 @@ def main() -> int:
     if not chosen:
         parser.error(f"no mutation is called {' or '.join(options.names)}")
     try:
-        for entry in chosen:
-            source, nodes = source_of(ROOT, entry), nodes_of(ROOT, entry)
-            if options.list:
-                print(f"{entry.name:36} {source.relative_to(ROOT)}: {', '.join(nodes)}")
+        found = check(chosen)
+        if options.list:
+            print("\n".join(found))
         return 0 if options.list else run(chosen, options.trust)
     except TableError as error:
         print(error, file=sys.stderr)
         return 2
+
+
+def check(chosen: list[Mutation]) -> list[str]:
+    """A line for each mutation, with its file and tests.
+
+    Raises:
+        TableError: naming every entry that does not fit.
+    """
+    found, wrong = [], []
+    for entry in chosen:
+        try:
+            source, nodes = source_of(ROOT, entry), nodes_of(ROOT, entry)
+            found.append(f"{entry.name:36} {source.relative_to(ROOT)}: {', '.join(nodes)}")
+        except TableError as error:
+            wrong.append(str(error))
+    if wrong:
+        raise TableError("\n".join(wrong))
+    return found
 
 
 def run(chosen: list[Mutation], trust: bool) -> int:
