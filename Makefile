@@ -12,8 +12,9 @@ demo: install
 	$(BIN)/gmem demo --force
 
 # Units and physics, in under two minutes on two cores: what to run after every change.
-QUICK := $(addprefix tests/,physics experiment/test_analysis.py experiment/test_samples.py experiment/test_signals.py \
-  files/test_columns.py reading/test_capacity.py reading/test_readers.py simulation/test_drive.py simulation/test_protocol.py)
+QUICK := tests/physics tests/simulation/test_drive.py tests/simulation/test_protocol.py tests/experiment/test_analysis.py \
+  tests/experiment/test_samples.py tests/experiment/test_signals.py tests/files/test_columns.py tests/reading/test_readers.py \
+  tests/reading/test_capacity.py
 quick: install-dev
 	$(REBUILD)
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow" $(QUICK)

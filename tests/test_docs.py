@@ -95,6 +95,12 @@ def test_pages_that_the_code_names_are_there(source: str) -> None:
     assert not [page for page in named if not (ROOT / page).is_file()]
 
 
+@pytest.mark.parametrize("file", [*map(name, PAGES), "Makefile", "pyproject.toml", ".ci/run"])
+def test_tests_that_are_named_are_there(file: str) -> None:
+    named = re.findall(r"\btests/[\w/]+(?:\.\w+)?", (ROOT / file).read_text())
+    assert not [one for one in named if not (ROOT / one).exists()]
+
+
 ROOT_COMMAND: Any = typer.main.get_command(app)
 COMMANDS = ROOT_COMMAND.commands
 
