@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import pkgutil
 import re
 import shlex
 from pathlib import Path
@@ -161,6 +162,7 @@ def test_every_public_name_is_in_the_reference() -> None:
     shown = set(re.findall(r"^::: gmem_jax\.(\w+)$", page, re.MULTILINE))
     assert shown == set(gm.__all__) - {"capacity", "classify"}
     assert all(f"::: gmem_jax.reading.{name}" in page for name in ("capacity", "classify"))
+    assert all(pkgutil.resolve_name(shown) for shown in re.findall(r"^::: (\S+)$", page, re.MULTILINE))
 
 
 def test_every_record_is_in_the_table_of_contents() -> None:
