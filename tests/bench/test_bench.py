@@ -133,9 +133,8 @@ def test_what_was_measured_is_kept_at_once(pack: gm.Pack) -> None:
 
 
 def test_the_page_on_speed_holds_the_table_that_was_measured() -> None:
-    root = ROOT
-    page = (root / "docs" / "speed.md").read_text()
-    stored = json.loads((root / "benchmarks" / "bench.json").read_text())
+    page = (ROOT / "docs" / "speed.md").read_text()
+    stored = json.loads((ROOT / "benchmarks" / "bench.json").read_text())
     assert page == table.into(page, table.short(stored))
 
 
