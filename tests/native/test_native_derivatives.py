@@ -98,9 +98,7 @@ def assert_close(one: Any, other: Any) -> None:
         np.testing.assert_allclose(a, b, atol=TOLERANCE * scale, rtol=0.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "isotropic"), [("H", True), *(pytest.param(*case, marks=pytest.mark.slow) for case in ALIKE)]
-)
+@pytest.mark.parametrize(("name", "isotropic"), [("H", True), *ALIKE])
 def test_both_modes_agree_with_plain_jax(name: str, isotropic: bool) -> None:
     system, state = squeezed(LAWS[name])
     moments = system.clump.inertia * (1.0 if isotropic else jnp.asarray([0.8, 1.0, 1.3]))
