@@ -11,7 +11,7 @@ demo: install
 	$(REBUILD)
 	$(BIN)/gmem demo --force
 
-# Units and physics, in under two minutes on two cores: what to run after every change.
+# Units and physics: what to run after every change. Its budget is two minutes on two quiet cores.
 QUICK := tests/physics tests/simulation/test_drive.py tests/simulation/test_protocol.py tests/experiment/test_analysis.py \
   tests/experiment/test_samples.py tests/experiment/test_signals.py tests/files/test_columns.py tests/reading/test_readers.py \
   tests/reading/test_capacity.py
