@@ -42,13 +42,11 @@ cluster: install-dev
 	$(REBUILD)
 	tests/cluster/one_node.sh $(abspath $(BIN))/python tests/cluster/sweep_on_slurm.py
 
-# Style, types, and that the table of mutations fits the code.
 check: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/python tests/mutations.py --list > /dev/null
 	$(BIN)/mypy
-	$(BIN)/mypy experiments
+	$(BIN)/mypy experiments docs/make
 
 # dist/: the sources, and made of them a wheel for machines like this one. .github/workflows/release.yml makes those for all.
 wheel: $(BIN)/python

@@ -19,7 +19,7 @@ jax.config.update("jax_enable_x64", True)
 
 import gmem_jax as gm  # noqa: E402
 from gmem_jax.bench.measure import ENCODE, LAWS, encode, processor  # noqa: E402
-from gmem_jax.files.provenance import provenance  # noqa: E402
+from gmem_jax.experiment.provenance import provenance  # noqa: E402
 from gmem_jax.simulation.observers import forward  # noqa: E402
 
 PRECISIONS = ("double", "mixed")

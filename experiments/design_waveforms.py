@@ -16,6 +16,7 @@ from console import say
 
 import gmem_jax as gm
 from gmem_jax.show.figures import design_figure, history_figure
+from gmem_jax.show.render_matplotlib import render
 
 
 def main() -> None:
@@ -45,9 +46,9 @@ def main() -> None:
             + " ".join(f"{value:.3f}" for value in each),
             flush=True,
         )
-        design_figure(arguments.output / f"{name}.png", design, unit, name)
+        render(design_figure(design, unit, name)).save(arguments.output / f"{name}.png")
         histories[name] = design.history
-    history_figure(arguments.output / "history.png", histories)
+    render(history_figure(histories)).save(arguments.output / "history.png")
 
 
 if __name__ == "__main__":

@@ -26,15 +26,15 @@ from packs import over_packs
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import BUMPS, WIDTH
 from gmem_jax.experiment.recall import LARGEST_BATCH
+from gmem_jax.experiment.record import key_of_run
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.checkpoints import Checkpoints
-from gmem_jax.files.configuration import key_of_run
 from gmem_jax.reading import training
 from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import linear_decoder, nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
-from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save
 from gmem_jax.show.tables import published
 
 TABLE = "words.csv"

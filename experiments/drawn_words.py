@@ -11,7 +11,6 @@ Resumes; recalls are kept. A pack and rate have one table, to which lengths may 
 
 import argparse
 import csv
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,16 +22,16 @@ from design_words import drawn
 
 import gmem_jax as gm
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.record import key_of_run
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.checkpoints import Checkpoints
-from gmem_jax.files.configuration import key_of_run
 from gmem_jax.reading import training
 from gmem_jax.reading.lessons import Lessons
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
 from gmem_jax.reproduce.figures import SHOWN_WORD
-from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save
 from gmem_jax.show.tables import published
 
 SHOWN_OF = 10  # bits of the word that the paper shows
@@ -63,7 +62,7 @@ def main() -> None:
         file = folder / f"{pack.name}-{bits}-{len(number)}-t0-{arguments.t0:g}.h5"
         if not file.exists():
             run(experiment, file)
-        recall, _ = gm.load_recall(file)
+        recall = gm.load_recall(file)
         net = training.train(
             Lessons(bits), 0, budget=arguments.budget, checkpoint=folder / f"words-{bits}-seed-0.msgpack"
         ).net
@@ -84,9 +83,8 @@ def chosen(bits: int, most: int) -> np.ndarray:
 def run(experiment: gm.Experiment, file: Path) -> None:
     """Run what is not there yet, and keep it."""
     parts = Checkpoints(file.with_suffix(".parts"), key_of_run(experiment))
-    began = time.perf_counter()
     recall = gm.run(experiment, cache=parts, progress=say)
-    gm.save_recall(file, recall, gm.resolved(experiment, time.perf_counter() - began))
+    gm.save_recall(file, recall)
     parts.discard()
 
 

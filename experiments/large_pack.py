@@ -21,8 +21,8 @@ from drawn_words import run
 
 import gmem_jax as gm
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.provenance import sources
 from gmem_jax.files.checkpoints import Checkpoints
-from gmem_jax.files.provenance import sources
 from gmem_jax.physics.state import together
 from gmem_jax.preparation.recipe import Recipe
 
@@ -61,7 +61,7 @@ def main() -> None:
         file = folder / f"{'-'.join(map(str, [*row.values(), ran]))}.h5"
         if not file.exists():
             run(experiment, file)
-        recall, _ = gm.load_recall(file)
+        recall = gm.load_recall(file)
         found = [
             {**row, "waveforms": " ".join(map(str, those)), **measured(experiment, recall, wanted, those)}
             for those in dict.fromkeys((tuple(wanted), *((one,) for one in wanted)))

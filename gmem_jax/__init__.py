@@ -19,11 +19,12 @@ from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.pack import Pack, pack_from, stack
 from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
+from gmem_jax.experiment.record import describe, to_dict
 from gmem_jax.experiment.samples import waveform_from
 from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, waveform, words
-from gmem_jax.files.configuration import experiment_from, resolved, written
+from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
-from gmem_jax.files.recalls import load_recall, save_recall
+from gmem_jax.files.recalls import load_recall, save_recall, to_csv, to_xarray
 from gmem_jax.files.waveforms import load_waveforms, save_waveforms
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from gmem_jax.design.drive import TunedDrive, design_drive
     from gmem_jax.design.waveforms import Design, design_waveforms
     from gmem_jax.reading import capacity, classify
+    from gmem_jax.show.recalls import plot
     from gmem_jax.show.view import view
     from gmem_jax.simulation.progress import ProgressBar
     from gmem_jax.sweeps.sweep import sweep
@@ -54,6 +56,7 @@ _LATER = {  # what loads flax or optax, or is seldom asked for, or stands above 
     "classify": "gmem_jax.reading.classify",
     "ProgressBar": "gmem_jax.simulation.progress",
     "sweep": "gmem_jax.sweeps.sweep",
+    "plot": "gmem_jax.show.recalls",
     "view": "gmem_jax.show.view",
 }
 
@@ -93,12 +96,13 @@ __all__ = [
     "capacity",
     "classify",
     "clump",
+    "describe",
     "design_by_kernel",
     "design_drive",
     "design_waveforms",
-    "experiment_from",
     "explain",
     "fidelity",
+    "from_dict",
     "gain",
     "jacobian",
     "list_packs",
@@ -107,10 +111,10 @@ __all__ = [
     "load_waveforms",
     "memory_kernel",
     "pack_from",
+    "plot",
     "prepare",
     "recall",
     "replace",
-    "resolved",
     "run",
     "running_mean",
     "save_pack",
@@ -121,10 +125,12 @@ __all__ = [
     "stack",
     "sweep",
     "tetra",
+    "to_csv",
+    "to_dict",
+    "to_xarray",
     "value_and_grad",
     "view",
     "waveform",
     "waveform_from",
     "words",
-    "written",
 ]

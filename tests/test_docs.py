@@ -203,7 +203,7 @@ def test_examples_run(
     """All blocks of a page, one after the other, on a pack of 27 grains and a short experiment."""
     pytest.importorskip("xarray")
     monkeypatch.chdir(tmp_path)
-    gm.save_recall(Path("recall.h5"), recalled[1], {})  # a page on files reads what `gmem recall` wrote
+    gm.save_recall(Path("recall.h5"), recalled[1])  # a page on files reads what `gmem recall` wrote
     small, experiment, train = gm.load_pack(SMALL), gm.Experiment, gm.classify.train
     monkeypatch.setattr(gm, "load_pack", lambda _: small)
     monkeypatch.setattr(gm, "prepare", lambda **_: small)

@@ -12,7 +12,7 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.bench import measure
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.files.provenance import provenance
+from gmem_jax.experiment.provenance import provenance
 from gmem_jax.native import gpu
 from gmem_jax.native.gpu import Needs
 from gmem_jax.physics.contact.friction import FrictionLaw

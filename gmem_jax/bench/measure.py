@@ -30,9 +30,9 @@ from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.provenance import provenance
 from gmem_jax.experiment.recall import run as gmem_run
 from gmem_jax.experiment.signals import Bumps
-from gmem_jax.files.provenance import provenance
 from gmem_jax.physics.contact import laws
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless

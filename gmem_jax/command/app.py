@@ -13,8 +13,8 @@ from typer.exceptions import TyperException
 from gmem_jax.command import benchmark, classify, derive, exchange, packs, recalls, report, reproduce, show, sweep
 from gmem_jax.command.console import GIVEN, RunInterruptedError, UnheardError, emit, say
 from gmem_jax.errors import RunFailedError
+from gmem_jax.experiment.provenance import versions
 from gmem_jax.files.programs import keep_programs
-from gmem_jax.files.provenance import versions
 from gmem_jax.physics.rules import StartError, usual_rules, why_not_started
 from gmem_jax.simulation.progress import no_further_bar
 
@@ -102,8 +102,8 @@ def _open_streams() -> None:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
-    sys.stdout = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
-    sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
+    sys.stdout = sys.stdout or open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    sys.stderr = sys.stderr or open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
 
 
 def main() -> None:

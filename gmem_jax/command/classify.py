@@ -10,12 +10,13 @@ import typer
 from rich import progress
 
 from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, drawing, emit, log, say
-from gmem_jax.files.configuration import signals_from
+from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
 from gmem_jax.physics.state import explain, together
-from gmem_jax.show import figures, tables
+from gmem_jax.show import summaries
+from gmem_jax.show.render_matplotlib import render
 
 if TYPE_CHECKING:
     from gmem_jax.reading import training
@@ -66,15 +67,16 @@ def classify_command(
     A net depends on the length of the words and its seed, not on the recall: nets in the folder are used again, and
     those that ran out of time are trained on.
     """
-    kept, configuration = load_recall(recall)
+    kept = load_recall(recall)
+    configuration = kept.configuration
     # Here, not above: flax takes a second to load, and no other command needs it.
     from gmem_jax.reading import report, training
     from gmem_jax.reading.lessons import Lessons
-    from gmem_jax.reading.readers import confusion, stored_words
+    from gmem_jax.reading.readers import stored_words
 
     try:
         designed = configuration.get("target")
-        stored = stored_words(kept, signals_from(designed) if designed else None)
+        stored = stored_words(kept, signals_from_dict(designed) if designed else None)
     except ValueError as error:
         raise InputError(f"{recall}: {error}; make one with gmem recall --signals words:L") from error
     claim(output, ".json", inputs=(recall,), force=force)
@@ -100,17 +102,14 @@ def classify_command(
     seconds = time.perf_counter() - began
     result = {"recall": str(recall), "pack": configuration["pack"], "status": status, "seconds": seconds, **result}
     save_result(output, READING, result)
+    summary = summaries.of_reading(result)
     told = f"wrote {output}"
     if drawn:
-        net = result["readers"]["net"]
-        title = (
-            f"{tables.cell(configuration['pack'])}, {stored.bits} bits: accuracy {net['accuracy']:.3f} ({seeds} nets)"
-        )
         with drawing(drawn):
-            figures.confusion_figure(drawn, confusion(net["read"], len(stored.signals)), title)
+            render(summary.figures["confusion"]()).save(drawn)
             told += f" and {drawn}"
     say(told)
-    emit(as_json, result, *tables.reading_tables(result))
+    emit(as_json, result, *summary.lines)
 
 
 COMMANDS = {"classify": classify_command}

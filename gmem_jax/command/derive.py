@@ -31,15 +31,16 @@ from gmem_jax.design.kernel import memory_kernel, relative_error
 from gmem_jax.design.stored import save_kernel
 from gmem_jax.experiment.experiment import Experiment, value_at
 from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run, run_bytes
+from gmem_jax.experiment.record import describe, fingerprint, key_of_run, pack_fingerprint
 from gmem_jax.experiment.signals import Bumps, Spline
 from gmem_jax.files import schemas
-from gmem_jax.files.configuration import fingerprint, key_of_run, pack_fingerprint, resolved
 from gmem_jax.files.named import named_signals
 from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
-from gmem_jax.physics.material import Material
-from gmem_jax.show import figures, tables
-from gmem_jax.show.kinds import kernel_facts, kernel_lines
+from gmem_jax.show import summaries
+from gmem_jax.show.figures import design_figure, history_figure
+from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.tables import cell
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 from gmem_jax.simulation.observers import CHUNK
 from gmem_jax.simulation.progress import within
@@ -109,15 +110,12 @@ def gradient_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        save_result(output, schemas.GRADIENT, {**result, "configuration": resolved(experiment, result["seconds"])})
+        save_result(output, schemas.GRADIENT, {**result, "configuration": describe(experiment, result["seconds"])})
+    summary = summaries.of_gradient(result)
     if drawn:
         with drawing(drawn):
-            figures.gradient_figure(drawn, rows, f"{tables.cell(pack)}: F = {result['fidelity']:.4f}")
-    lines = [f"F = {result['fidelity']:.4f}"]
-    lines += [f"dF/d{name} = {gradient[name]:.5g}" for name in gradient if name != "waveform"]
-    for number, row in enumerate(gradient["waveform"]):
-        lines.append(f"dF/da of signal {number + 1}: " + " ".join(f"{value:.4g}" for value in row))
-    emit(as_json, result, "\n".join(lines))
+            render(summary.figures["waveforms"]()).save(drawn)
+    emit(as_json, result, *summary.lines)
 
 
 def _of_waveforms(
@@ -177,26 +175,23 @@ def kernel_command(
             kernel = memory_kernel(experiment, n, width, prefix=prefix, cache=parts, progress=most)
             rest = within(progress, 0.05 + 0.95 * runs / (1.0 + runs), 1.0)
             p_sig = run(experiment, prefix=prefix, cache=parts.scoped("check"), progress=rest).p_sig
-        signals = experiment.signals
+        signals, configuration = experiment.signals, describe(experiment, time.perf_counter() - began)
+        summary = summaries.of_kernel(kernel, configuration, noise)
         result = {
+            **summary.facts,
             "pack": pack,
-            "noise_pa": noise,
-            "n": n,
-            "width": width,
-            **kernel_facts(kernel, noise),
             "prediction_error": relative_error(kernel.predict(signals), p_sig).tolist(),
             "prediction_error_linear": relative_error(kernel.predict(signals, even=False), p_sig).tolist(),
             "output": str(output),
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        save_kernel(output, kernel, resolved(experiment, time.perf_counter() - began))
+        save_kernel(output, kernel, configuration)
     if drawn:
         with drawing(drawn):
-            figures.kernel_figure(drawn, kernel, noise / float(Material().modulus), tables.cell(pack))
-    lines = kernel_lines(result, noise, n)
-    lines.append("superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"]))
-    emit(as_json, result, "\n".join(lines))
+            render(summary.figures["kernel"]()).save(drawn)
+    error = "superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"])
+    emit(as_json, result, *summary.lines, error)
 
 
 def _needs_sub0(experiment: Experiment) -> None:
@@ -298,8 +293,8 @@ def design_command(
         save_waveforms(output, found.signals, experiment.signals, design=way)
     if drawn:
         with drawing(drawn):
-            figures.design_figure(drawn, found, float(experiment.scale), tables.cell(pack))
-            figures.history_figure(history, {tables.cell(pack): found.history})
+            render(design_figure(found, float(experiment.scale), cell(pack))).save(drawn)
+            render(history_figure({cell(pack): found.history})).save(history)
     result = {
         "pack": pack,
         "before": found.before,
@@ -370,12 +365,12 @@ def tune_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        save_result(output, schemas.TUNED, {**result, "configuration": resolved(first, result["seconds"])})
+        save_result(output, schemas.TUNED, {**result, "configuration": describe(first, result["seconds"])})
+    summary = summaries.of_tuned(result)
     if drawn:
         with drawing(drawn):
-            figures.history_figure(drawn, {" ".join(map(tables.cell, names)): [value for _, value in found.history]})
-    values = ", ".join(f"{name} = {value:.4g}" for name, value in found.values.items())
-    emit(as_json, result, f"mean F {found.before:.4f} -> {found.fidelity:.4f} with {values}; wrote {output}")
+            render(summary.figures["history"]()).save(drawn)
+    emit(as_json, result, *summary.lines, f"wrote {output}")
 
 
 COMMANDS = {

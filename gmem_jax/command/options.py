@@ -3,17 +3,17 @@
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import Field, fields
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import typer
 
 from gmem_jax.command.console import claim, refuse_idle, say
 from gmem_jax.errors import FileFormatError
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.signals import Signals
-from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
+from gmem_jax.files.named import OF_LAW, OF_MATERIAL, named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.waveforms import load_target
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -22,52 +22,44 @@ from gmem_jax.physics.contact.laws import LAWS, law_named
 from gmem_jax.preparation.recipe import Recipe, words_of
 
 _NAMES = ", ".join(entry.name for entry in LAWS)
+_Options = Mapping[str, tuple[Any, Any, str, tuple[str, ...]]]  # default, type, help and flags by name
 
-
-class _Option(NamedTuple):
-    kind: Any
-    words: str
-    flags: tuple[str, ...] = ()
-
-
-_FIELDS = {  # of an experiment
-    "gamma0": _Option(float, "Shear amplitude."),
-    "shear_share": _Option(float, "Part of gamma by which L_x shrinks and L_y grows."),
-    "delta0": _Option(float | None, "Areal compression; default the pack's own."),
-    "t0": _Option(float, "Duration of one compression, t_c (the paper's is 18000)."),
-    "dt": _Option(float, "Largest time step, t_c."),
-    "rest": _Option(float, "Rests at u = 0, in t0."),
-    "hold": _Option(float, "Holds at u = 1, in t0."),
-    "store": _Option(float, "Storage, in t0."),
-    "hold_drag": _Option(float | None, "Drag in holds, 1/t_c; default 0.05 if t0 < 18000."),
-    "background": _Option(str, "sub0, sub2 or sub2-bl."),
-    "shear": _Option(str, "during the compression, or before it (in time, at u = 0)."),
-    "backend": _Option(str, "auto, jax or native."),
-    "precision": _Option(str, "double; or mixed, contacts in single precision (native)."),
-}
-_OF_LAW = {  # of its friction law
-    "mu": _Option(float, "Friction coefficient."),
-    "stiffness": _Option(float | None, "k_H in E R, or k_M in E R^0.5; default the law's."),
-    "damping_time": _Option(float | None, "Tangential damping over stiffness, t_c; default the law's."),
-    "spinning": _Option(float | None, "1: the history turns with a contact about its normal; 0: not."),
-    "p_max": _Option(float | None, "m2: largest overlap of its history, R."),
-    "points": _Option(int | None, "m2: points of its history."),
-    "variant": _Option(str | None, "m2: averaged, exact or paper."),
-}
-_OTHERS = {
-    "signals": _Option(
-        str, "six; words:L, all words of L bits; or a .npy or .csv file (a column per signal, one may be time)."
+_OTHERS: _Options = {
+    "signals": (
+        "six",
+        str,
+        "six; words:L, all words of L bits; or a .npy or .csv file (a column per signal, one may be time).",
+        (),
     ),
-    "word_pad": _Option(float | None, "words: bits left free at either end; default 2."),
-    "word_width": _Option(float | None, "words: width of bumps, in bits; default 1."),
-    "smooth": _Option(float | None, "Samples in a file: width in u over which they are averaged."),
-    "taper": _Option(
-        float | None, "Samples in a file: width in u at either end within which they are brought to zero."
+    "word_pad": (None, float | None, "words: bits left free at either end; default 2.", ()),
+    "word_width": (None, float | None, "words: width of bumps, in bits; default 1.", ()),
+    "smooth": (None, float | None, "Samples in a file: width in u over which they are averaged.", ()),
+    "taper": (
+        None,
+        float | None,
+        "Samples in a file: width in u at either end within which they are brought to zero.",
+        (),
     ),
-    "scale": _Option(bool | None, "Samples in a file: divide them by the largest.", ("--scale",)),
-    "wall_rigidity": _Option(float | None, "Stiffness of walls over that of rigid ones; default 1."),
-    "friction": _Option(str, f"Friction law: {_NAMES}, or the paper's H, M1, M2."),
+    "scale": (None, bool | None, "Samples in a file: divide them by the largest.", ("--scale",)),
+    "friction": ("hooke", str, f"Friction law: {_NAMES}, or the paper's H, M1, M2.", ()),
 }
+
+
+def _options(entries: Mapping[str, Field[Any]], **defaults: Any) -> _Options:
+    """Options of fields with `words`: those of numbers of an experiment, of laws and of materials.
+
+    Args:
+        entries: the fields.
+        defaults: in the place of their own.
+    """
+    found = {}
+    for name, entry in entries.items():
+        default, unit = defaults.get(name, entry.default), entry.metadata["unit"]
+        kind = type(entry.default) if entry.default is not None else float
+        words = f"{entry.metadata['words']}{unit and ', ' + unit}."
+        if not entry.metadata.get("no_option"):
+            found[name] = (default, kind if default is not None else kind | None, words, ())
+    return found
 
 
 class Chosen:
@@ -125,19 +117,11 @@ class Chosen:
         return named_signals(*waveforms_of(self._values), told=say)
 
 
-def _default(name: str) -> Any:
-    if name in _FIELDS:
-        return next(entry.default for entry in fields(Experiment) if entry.name == name)
-    return {"signals": "six", "friction": "hooke", "mu": Hooke().mu}.get(name)
-
-
 def with_experiment(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command all options of an experiment; it gets what they chose as `chosen`."""
-    options = {
-        name: (_default(name), option.kind, option.words, option.flags)
-        for name, option in {**_OTHERS, **_OF_LAW, **_FIELDS}.items()
-    }
-    return _with(command, "chosen", Chosen, options)
+    of_law = _options(OF_LAW, **{**dict.fromkeys(OF_LAW), "mu": Hooke().mu})  # what is not given is the law's
+    of_material = _options(OF_MATERIAL, **dict.fromkeys(OF_MATERIAL))
+    return _with(command, "chosen", Chosen, {**_OTHERS, **of_law, **of_material, **_options(NUMBERS)})
 
 
 def with_recipe(command: Callable[..., None]) -> Callable[..., None]:
@@ -150,7 +134,7 @@ def _with(
     command: Callable[..., None],
     name: str,
     make: Callable[[dict[str, Any]], Any],
-    options: Mapping[str, tuple[Any, Any, str, tuple[str, ...]]],
+    options: _Options,
 ) -> Callable[..., None]:
     """A command with more options (default, type, help, flags); it gets what `make` makes of their values as `name`."""
     signature = inspect.signature(command)

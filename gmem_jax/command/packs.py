@@ -27,10 +27,10 @@ from gmem_jax.command.console import (
 from gmem_jax.command.options import with_recipe
 from gmem_jax.command.resuming import Restart, resumable
 from gmem_jax.experiment.experiment import PAPER_T0
-from gmem_jax.files.configuration import fingerprint
+from gmem_jax.experiment.provenance import provenance, sources
+from gmem_jax.experiment.record import fingerprint
 from gmem_jax.files.home import kept_pack
 from gmem_jax.files.packs import STANDARD, list_packs, save_pack
-from gmem_jax.files.provenance import provenance, sources
 from gmem_jax.files.sizes import pack_bytes
 from gmem_jax.files.spheres import load_clump
 from gmem_jax.physics import grain
@@ -88,7 +88,7 @@ def grain_of(shape: str, overlap: float | None) -> Clump:
     if shape == "tetra":
         return grain.tetra(OVERLAP if overlap is None else overlap)
     if overlap is not None:
-        raise InputError(f"--overlap is that of a tetra grain; leave it away with --shape {shape}")
+        raise InputError(f"--overlap does nothing with --shape {shape}: it is that of a tetra grain")
     if shape == "sphere":
         return grain.sphere()
     if "." not in shape and not Path(shape).is_file():

@@ -1,7 +1,7 @@
 """`gmem recall`, `gmem demo`."""
 
-import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,14 +32,16 @@ from gmem_jax.command.resuming import Restart, batch_for, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import frame_schedule, replica_bins, run, run_bytes
+from gmem_jax.experiment.record import key_of_run, signals_to_dict
 from gmem_jax.experiment.signals import Signals, six_signals
-from gmem_jax.files.configuration import key_of_run, resolved, written_signals
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
 from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.state import together
-from gmem_jax.show import figures, tables
+from gmem_jax.show import tables
+from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.summaries import Summary, of_recall
 
 TYPICAL = "tetra-325-e"  # of the five shipped packs of 325 that with the median F
 SHIPPED: dict[str, Any] = {
@@ -69,31 +71,29 @@ def _run(
     frames: int = 0,
     frames_of: int = 1,
     frames_at: Sequence[float] = (),
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Run one recall with a progress bar and write it; its summary and its resolved configuration."""
-    began = time.perf_counter()
+) -> Summary:
+    """Run one recall with a progress bar and write it; its summary."""
     batch = batch_for(experiment, data, batch, restart=restart)
     _announce(experiment, batch)
     film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": list(frames_at)}
     with resumable(data, key_of_run(experiment, batch=batch, **film), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             recall = jax.block_until_ready(run(experiment, batch=batch, cache=parts, progress=progress, **film))
-        configuration = resolved(experiment, time.perf_counter() - began)
+        configuration = recall.configuration
         if target is not None:
-            configuration["target"] = written_signals(target)
-        save_recall(data, recall, configuration)
-    told = f"wrote {data}"
+            configuration["target"] = signals_to_dict(target)
+        recall = recall.described(configuration)
+        save_recall(data, recall)
+    told, summary = f"wrote {data}", of_recall(recall)
     if picture is not None:
-        title = tables.heading(configuration)
         with drawing(picture):
-            names, t0 = configuration["signals"], configuration["t0"]
-            figures.recall_figure(picture, recall, experiment.scale, title, names, t0)
+            render(summary.figures["signals"]()).save(picture)
             told += f" and {picture}"
     say(told)
-    row = {**tables.summary(recall, configuration), "seconds": configuration["seconds"], "output": str(data)}
+    row = {**summary.facts, "seconds": configuration["seconds"], "output": str(data)}
     if row["status"]:
         say(f"warning: {row['status_text']}", style="yellow")
-    return row, configuration
+    return replace(summary, facts=row)
 
 
 @with_experiment
@@ -127,8 +127,8 @@ def recall_command(
         emit_cost(as_json, cost, output, recall_bytes(experiment, frames))
         return
     film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": at}
-    row, configuration = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
-    emit(as_json, row, *tables.recall_lines(row, configuration))
+    summary = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
+    emit(as_json, summary.facts, *summary.lines)
 
 
 def _compressions(text: str) -> list[float]:
@@ -168,13 +168,12 @@ def demo(
     for name, data in zip(names, stems, strict=True):
         say(f"pack {name}")
         experiment = Experiment(load_pack(name), six_signals(), law)
-        row, configuration = _run(experiment, data, data.with_suffix(".png"))
-        rows.append(row)
+        rows.append(_run(experiment, data, data.with_suffix(".png")).facts)
     means = {key: spread([row[key] for row in rows])[0] for key in ("gain", "fidelity")}
     bits = together([row["status"] for row in rows])
     total = {"status": bits, "seconds": sum(row["seconds"] for row in rows)}
     result: dict[str, Any] = {**means, **total, "packs": rows}
-    lines: list[Any] = [tables.recall_table(rows, configuration)]
+    lines: list[Any] = [tables.recall_table(rows, rows[-1]["configuration"])]
     if law == Hooke() and set(names) < set(default):
         result["shipped"] = SHIPPED
         (gain, gain_sd), (fidelity, fidelity_sd) = SHIPPED["gain"], SHIPPED["fidelity"]

@@ -19,12 +19,12 @@ def report_command(
     files: Files, output: Output = Path("report.html"), force: Force = False, as_json: AsJson = False
 ) -> None:
     """One page of all that files hold, to be looked at in a browser: figures, tables and the pack in 3D; no network."""
-    from gmem_jax.show import plots
+    from gmem_jax.show.render_plotly import script
     from gmem_jax.show.report import Report
 
     claim(output, ".html", inputs=tuple(files), force=force)
     began = time.perf_counter()
-    plots.script()  # refuses at once where there is no plotly
+    script()  # refuses at once where there is no plotly
     report = Report()
     for file in files:
         report.add(file)

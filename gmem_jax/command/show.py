@@ -8,9 +8,9 @@ import typer
 
 from gmem_jax.command import sweep
 from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, heard, refuse_idle, say
-from gmem_jax.show.drawing import FORMATS
-from gmem_jax.show.kinds import PLOTS, Draw, shown, sweep_pictures
+from gmem_jax.show.render_matplotlib import FORMATS, render
 from gmem_jax.show.stages import AGAINST, QUANTITIES
+from gmem_jax.show.summaries import PLOTS, Draw, summary_of
 
 _OF_STAGES = {name.lower() for name in QUANTITIES}
 
@@ -51,36 +51,35 @@ def show(
     if plot:
         refuse_idle("beside --plot", "csv")
     if not plot or plot == "list":
-        refuse_idle("unless something is drawn with --plot", "against", "force", "signal")
+        refuse_idle("unless something is drawn with --plot", "against", "force")
     elif plot.lower() not in _OF_STAGES:
         refuse_idle(f"with --plot {plot}: only pictures of stages ({', '.join(QUANTITIES)}) have it", "against")
     if csv:
         refuse_idle("beside --csv", "as_json")
     chosen = _numbers(signal)
-    folder = file.is_dir()
-    if folder:
+    if chosen and (not plot or plot == "list"):
+        raise InputError(f"--signal {signal}: chooses what is drawn; say what with --plot")
+    axes = {"x": x, "by": sweep.names_of(by), "over": sweep.names_of(over)}
+    if file.is_dir():
         if chosen:
             raise InputError(f"--signal {signal}: a sweep has no signals of its own; name the file of a point")
-        store = sweep.there(file)
-        pictures = sweep_pictures(store, x=x, by=sweep.names_of(by), over=sweep.names_of(over))
+        if over and not plot:
+            return sweep.show(sweep.there(file), over, as_json)
     else:
-        for name in (name for name, value in {"--x": x, "--by": by, "--over": over}.items() if value):
-            raise InputError(f"{file}: {name} is for the folder of a sweep")
-        found = shown(file, against, chosen, each=each)
-        pictures = found.pictures
-    if each and (folder or found.csv is None):
+        for name in (name for name, value in axes.items() if value):
+            raise InputError(f"{file}: --{name} is for the folder of a sweep")
+    found = summary_of(file, against, chosen, each=each, **axes)
+    if each and found.csv is None:
         raise InputError(f"{file}: --each tells of each recalled signal, and this is no recall")
     if plot:
-        _draw(file, pictures, plot, output, force, as_json)
+        _draw(file, found.figures, plot, output, force, as_json)
     elif output is not None:
-        raise InputError(f"--output {output}: say what to draw with --plot, one of {', '.join(pictures)}")
+        raise InputError(f"--output {output}: say what to draw with --plot, one of {', '.join(found.figures)}")
     elif csv:
-        if folder or found.csv is None:
+        if found.csv is None:
             raise InputError(f"{file}: --csv gives recalled signals, and this is no recall")
         with heard():
-            sys.stdout.write(found.csv())
-    elif folder:
-        sweep.show(store, over, as_json)
+            sys.stdout.write(found.csv(each=each))
     else:
         emit(as_json, found.facts, *found.lines)
 
@@ -105,7 +104,8 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
         raise InputError(f"--plot {plot}: name the picture with -o, as in -o {names[plot.lower()]}.png")
     if output.suffix.lower() not in FORMATS:
         raise InputError(f"--output {output}: must end in one of {', '.join(FORMATS)}")
-    pictures[names[plot.lower()]](claim(output, "", inputs=(file,), force=force))
+    drawn = render(pictures[names[plot.lower()]]())
+    drawn.save(claim(output, "", inputs=(file,), force=force))
     say(f"wrote {output}")
     emit(as_json, {"output": str(output), "status": 0})
 

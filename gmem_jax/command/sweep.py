@@ -1,21 +1,18 @@
 """`gmem sweep`."""
 
 import contextlib
-import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from gmem_jax.command.console import AsJson, DryRun, Force, InputError, claim, emit, refuse_idle, reporting, say
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
-from gmem_jax.physics.state import SENTENCES, Status
-from gmem_jax.show.tables import cell
+from gmem_jax.show.sweeps import means_table, points_table, sweep_facts
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
 from gmem_jax.sweeps.making import AS_THEY_ARE
@@ -27,7 +24,6 @@ from gmem_jax.sweeps.table import FORMATS, doubts, export, means, rows
 
 VERBS = ("status", "show", "export", "stop")
 RUN = ("executor", "workers", AS_THEY_ARE)
-ABOUT = "F(T1): F after a running mean over the ringing period"
 
 
 def sweep_command(
@@ -106,7 +102,7 @@ def sweep_command(
     for line in _doubtful(table):
         say(f"warning: {line}", style="yellow")
     say(f"{len(table) - len(failed)} of {len(table)} points in {target}; gmem sweep show {target}")
-    emit(as_json, _summary(conductor.store, table), _table(table, spec.names))
+    emit(as_json, sweep_facts(conductor.store, table), points_table(table, spec.names))
     if failed:
         raise RunFailedError(f"{len(failed)} of {len(table)} points; again with --retry")
 
@@ -148,19 +144,9 @@ def _values(row: dict[str, Any], names: list[str]) -> str:
     return ", ".join(f"{name} = {row[name]}" for name in names)
 
 
-def _summary(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
-    states = {state: sum(row["state"] == state for row in table) for state in ("done", "failed", "open")}
-    done = [row for row in table if row["state"] == "done"]
-    status = 0
-    for row in done:
-        status |= row["status"]
-    seconds = sum(row["seconds"] for row in done)
-    return {"folder": str(store.folder), **states, "status": status, "seconds": seconds, "points": table}
-
-
 def _status(store: Store, as_json: bool) -> None:
     table = rows(store)
-    summary = _summary(store, table)
+    summary = sweep_facts(store, table)
     lines = [f"{summary[state]} {state}" for state in ("done", "failed", "open")]
     taken = {job["name"] for job in store.jobs() if store.taken(job)}
     at_work = [one for one in store.told() if one["job"].partition("-")[0] in taken]
@@ -204,10 +190,10 @@ def show(store: Store, over: str, as_json: bool) -> None:
         emit(
             as_json,
             {"folder": str(store.folder), "means": found},
-            _means_table(found, [name for name in names if name not in averaged]),
+            means_table(found, [name for name in names if name not in averaged]),
         )
     else:
-        emit(as_json, _summary(store, table), _table(table, names))
+        emit(as_json, sweep_facts(store, table), points_table(table, names))
 
 
 def _export(store: Store, output: Path | None, force: bool, as_json: bool) -> None:
@@ -217,61 +203,6 @@ def _export(store: Store, output: Path | None, force: bool, as_json: bool) -> No
     about = export(store, output)
     say(f"wrote {output}" + (f": {about}" if about else ""))
     emit(as_json, {"output": str(output), "about": about, "status": 0})
-
-
-def _table(table: list[dict[str, Any]], names: list[str]) -> Table:
-    drawn = Table()
-    for name in (*names, "G", "F", "F(T1)", "status"):
-        drawn.add_column(name, no_wrap=name != "status")
-    for row in table:
-        state = _state(row) if row["state"] == "done" else row["state"]
-        numbers = [row[name] for name in ("gain", "fidelity", "windowed_fidelity")]
-        measured = ("" if number is None else f"{number:.3f}" for number in numbers)
-        drawn.add_row(*(cell(row[name]) for name in names), *measured, state)
-    drawn.caption = "; ".join([ABOUT, *_reasons(table)])
-    return drawn
-
-
-def _state(row: dict[str, Any]) -> str:
-    """The status of a point, or of several, in words."""
-    return ", ".join([*_bits(row["status"] or 0), *(["warned"] if row["warnings"] else [])]) or "ok"
-
-
-def _reasons(table: list[dict[str, Any]]) -> list[str]:
-    """What the words of `_state` mean in a table."""
-    bits = {bit for row in table for bit in Status if (row["status"] or 0) & bit}
-    told = dict.fromkeys(f"warned: {row['warnings']}" for row in table if row["warnings"])
-    return [*(f"{_word(bit)}: {SENTENCES[bit]}" for bit in sorted(bits)), *told]
-
-
-def _word(bit: Status) -> str:
-    return str(bit.name).lower().replace("_", " ")
-
-
-def _bits(status: int) -> list[str]:
-    return [_word(bit) for bit in Status if status & bit]
-
-
-def _means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
-    drawn = Table()
-    for name in (*names, "n", "G", "F", "F(T1)", "status"):
-        drawn.add_column(
-            name, no_wrap=name not in (*names, "status"), min_width=14 if name in ("G", "F", "F(T1)") else None
-        )
-    for row in table:
-        shown = [_with_error(row, name) for name in ("gain", "fidelity", "windowed_fidelity")]
-        drawn.add_row(
-            *(cell(row[name]) for name in names), str(row["done"]), *shown, _state(row) if row["done"] else ""
-        )
-    drawn.caption = "; ".join(["mean and standard error", ABOUT, *_reasons(table)])
-    return drawn
-
-
-def _with_error(row: dict[str, Any], measure: str) -> str:
-    if row[measure] is None:
-        return ""
-    error = row[f"{measure}_se"]
-    return f"{row[measure]:.3f}" + (f" +- {error:.3f}" if math.isfinite(error) else "")
 
 
 COMMANDS = {"sweep": sweep_command}

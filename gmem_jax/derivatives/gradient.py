@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_names
-from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, value_at
+from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, value_at
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.recall import apply_waveforms, runner_of
 from gmem_jax.physics.pytree import comparable
@@ -41,11 +41,6 @@ Moving = tuple[Any, Any]  # grains and history: what of a state can be different
 def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
     """F of the set: a `Loss`."""
     return experiment.compare(p_sig).fidelity
-
-
-def gain_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
-    """G of the set: a `Loss`."""
-    return experiment.compare(p_sig).gain
 
 
 _OFFSETS = "pack.clump.offsets"
@@ -194,11 +189,6 @@ class _Remembering(Observer):
         self.tape.append(_Piece(lambda slope: (slope[0], pull(slope[1])[0])))
 
 
-def acts_on_prefix(names: Sequence[str]) -> bool:
-    """Whether any of the named parameters acts before the first shear."""
-    return any(name.split(".")[0] not in AFTER_PREFIX for name in names)
-
-
 @dataclass(frozen=True)
 class Pushed:
     """A run and its tangent.
@@ -240,7 +230,7 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
     on.total_work = _work(experiment, on)
     wide = on.state.replicas > 1
     slope: Moving | None = None
-    if acts_on_prefix(list(theta)):
+    if any(map(acts_on_prefix, theta)):
         slope = jax.jvp(lambda theta: _moving(along(theta).begin()), (theta,), (tangent,))[1]
     pushing = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope, _needs_offsets(theta))
     on.observers = (pushing,)
@@ -352,7 +342,7 @@ def value_and_grad(
     on.total_work = _work(experiment, on)
     offsets = _needs_offsets(by)
     prefix, rest = _Remembering(offsets), _Remembering(offsets)
-    on.observers = (prefix,) if acts_on_prefix(by) else ()
+    on.observers = (prefix,) if any(map(acts_on_prefix, by)) else ()
     _, pull_begin = jax.vjp(lambda theta: _moving(along(theta).begin()), theta)
     on.run_stages(*common)
     fan_out = jax.linear_transpose(_fan_out(experiment), _moving(on.state))
@@ -381,7 +371,7 @@ def value_and_grad(
     way = _Backwards(within(tell, FORWARDS, 1.0), (rest, prefix), checkpoint)
     back = way.through(rest, back)
     slope = jax.tree.map(jnp.add, slope, pull_numbers(True, rest.numbers))
-    if acts_on_prefix(by):
+    if any(map(acts_on_prefix, by)):
         back = way.through(prefix, fan_out(back)[0])
         slope = jax.tree.map(jnp.add, slope, pull_numbers(False, prefix.numbers))
         slope = jax.tree.map(jnp.add, slope, pull_begin(back)[0])

@@ -5,7 +5,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,6 @@ PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
 MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
 LARGEST_STEP = 0.5  # t_c; the stiffest mode has a period near 10 t_c
-AFTER_PREFIX = ("signals", "gamma0", "shear_share")  # fields that the shear-free prefix does not depend on
 
 
 class Timing(NamedTuple):
@@ -84,23 +83,27 @@ class Experiment:
     """
 
     pack: Pack
-    signals: Signals
+    signals: Signals = dataclasses.field(metadata={"after_prefix": True})
     friction: FrictionLaw = Hooke()
     material: Material = Material()
-    gamma0: Scalar = parameter(1e-3, "(0, 0.5)")
-    shear_share: Scalar = parameter(0.5, "(0, 1]")
-    delta0: Scalar | None = parameter(None, "(0, 0.5)")
-    t0: Scalar = parameter(1.8e3, "(0, inf)")
-    hold_drag: Scalar | None = parameter(None, "[0, inf)")
-    dt: float = static(0.3)
-    steps: int | None = static(None)
-    rest: float = static(0.2)
-    hold: float = static(0.2)
-    store: float = static(2.0)
-    background: Background = static("sub0")
-    shear: Shear = static("during")
-    backend: Backend = static("auto")
-    precision: Precision = static("double")
+    gamma0: Scalar = parameter(1e-3, "(0, 0.5)", "Shear amplitude", varies=True, after_prefix=True)
+    shear_share: Scalar = parameter(
+        0.5, "(0, 1]", "Part of gamma by which L_x shrinks and L_y grows", varies=True, after_prefix=True
+    )
+    delta0: Scalar | None = parameter(None, "(0, 0.5)", "Areal compression; default the pack's own", varies=True)
+    t0: Scalar = parameter(1.8e3, "(0, inf)", "Duration of one compression (the paper's is 18000)", "t_c", varies=True)
+    hold_drag: Scalar | None = parameter(
+        None, "[0, inf)", "Viscous drag in holds; default 0.05 if t0 < 18000", "1/t_c", varies=True
+    )
+    dt: float = static(0.3, "Largest time step", "t_c")
+    steps: int | None = static(None, "Steps in a bin of t0 / 256, in the place of dt", no_option=True)
+    rest: float = static(0.2, "Rests at u = 0", "t0")
+    hold: float = static(0.2, "Holds at u = 1", "t0")
+    store: float = static(2.0, "Storage", "t0")
+    background: Background = static("sub0", "sub0, sub2 or sub2-bl")
+    shear: Shear = static("during", "Waveforms are applied during the compression, or before it (in time, at u = 0)")
+    backend: Backend = static("auto", "auto, jax or native")
+    precision: Precision = static("double", "double; or mixed, contacts in single precision (native)")
     steps_per_bin: int = dataclasses.field(init=False, default=1, metadata={"static": True})
 
     @usual_rules()
@@ -234,8 +237,8 @@ class Experiment:
 
     def begin(self) -> State:
         """The pack at rest with friction switched on: one replica, or all where parameters differ in the prefix."""
-        before = {name: value for name, value in replica_parameters(self).items() if name not in AFTER_PREFIX}
-        wide = self.replicas if any(jnp.ndim(value) for value in before.values()) else 1
+        before = (value for name, value in replica_parameters(self).items() if acts_on_prefix(name))
+        wide = self.replicas if any(jnp.ndim(value) for value in before) else 1
         turned = unit(self.pack.quaternion[..., None])
         position, quaternion = replicate((self.pack.position[..., None], turned), wide)
         state = start(self.simulation(sheared=False).system, position, quaternion, self.pack.box)
@@ -316,42 +319,29 @@ def _static_number(name: str, value: Any) -> float:
     return number
 
 
+NUMBERS = {entry.name: entry for entry in fields(Experiment) if entry.metadata.get("words")}
+"""The numbers and choices of an experiment by name, each with what is to be known of it in its metadata: `words`,
+`unit` and `interval`; whether it `varies` between replicas; whether it acts only `after_prefix`. Options, the names in
+sweeps and files, checks and the table of the documentation are made from it."""
+
+
+def acts_on_prefix(name: str) -> bool:
+    """Whether the shear-free prefix depends on what has this dotted name."""
+    first = name.split(".")[0]
+    return not any(entry.name == first and entry.metadata.get("after_prefix") for entry in fields(Experiment))
+
+
 def replica_parameters(experiment: Experiment) -> dict[str, Any]:
     """The parameters that may differ between replicas, by name."""
-    own = {name: getattr(experiment, name) for name in ("gamma0", "shear_share", "delta0", "t0", "hold_drag")}
+    own = {name: getattr(experiment, name) for name, entry in NUMBERS.items() if entry.metadata.get("varies")}
     law: Any = experiment.friction
     of_law = {f"friction.{field.name}": getattr(law, field.name) for field in fields(law)} if is_dataclass(law) else {}
     numbers = {**own, **of_law}
     return {name: value for name, value in numbers.items() if isinstance(value, float | jax.Array)}
 
 
-class Changes(TypedDict, total=False):
-    """The fields of an `Experiment`, as keywords."""
-
-    pack: Pack
-    signals: Signals
-    friction: FrictionLaw
-    material: Material
-    gamma0: Scalar
-    shear_share: Scalar
-    delta0: Scalar | None
-    t0: Scalar
-    hold_drag: Scalar | None
-    dt: float
-    steps: int | None
-    rest: float
-    hold: float
-    store: float
-    background: Background
-    shear: Shear
-    backend: Backend
-    precision: Precision
-
-
 @usual_rules()
-def replace(
-    experiment: Experiment, values: Mapping[str, Any] | None = None, /, **changes: Unpack[Changes]
-) -> Experiment:
+def replace(experiment: Experiment, values: Mapping[str, Any] | None = None, /, **changes: Any) -> Experiment:
     """The same experiment with other fields.
 
     A traced t0 keeps the number of steps that the experiment has; a concrete one has it chosen anew unless it was

@@ -1,6 +1,5 @@
 """A prepared pack: what the memory experiment starts from."""
 
-import importlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -87,10 +86,6 @@ class Pack:
 
     def _repr_html_(self) -> str:
         return facts(*self._facts())
-
-    def view(self) -> Any:
-        """The pack in 3D, for notebooks; `gmem_jax.show.view` stands floors above, and is loaded when asked for."""
-        return importlib.import_module("gmem_jax.show.view").view(self)
 
 
 def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: Box, delta0: float) -> Pairs:

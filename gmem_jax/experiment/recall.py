@@ -1,10 +1,11 @@
 """What a pack gives back: an experiment run, its background subtracted, compared with the integrals (Secs. II, III)."""
 
 import dataclasses
-import importlib
+import json
+import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -15,8 +16,9 @@ import numpy as np
 from gmem_jax.experiment import analysis, html
 from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
+from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
-from gmem_jax.physics.pytree import Scalar, pytree, static, traced
+from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
@@ -62,6 +64,8 @@ class Recall:
         dt: the time step used, in t_c.
         protocol: the stages that were gone through.
         frames: configurations of one replica along the run, if they were asked for.
+        record: JSON of the configuration that it belongs to: what `describe` says of the experiment. "{}" for a recall
+            of a traced experiment. A label: no part of what programs are compiled for.
     """
 
     u: jax.Array
@@ -80,28 +84,25 @@ class Recall:
     dt: Scalar
     protocol: Protocol = static()
     frames: Frames | None = None
+    record: str = label("{}")
 
-    def plot(
-        self,
-        what: str = "signals",
-        experiment: Experiment | None = None,
-        *,
-        against: str = "time",
-        signals: Sequence[int] = (),
-    ) -> Any:
-        """A picture of it, which a notebook shows: `.save(path)` writes it, `.figure` is matplotlib's.
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """`record` as a dictionary."""
+        found: dict[str, Any] = json.loads(self.record)
+        return found
 
-        Args:
-            what: "signals", "waveforms", "all"; or a quantity of the stages, like "pressure", "Z" or "phi".
-            experiment: that it is of, for the names of signals and the conditions in the title.
-            against: "time" or "u", for the stages.
-            signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
+    @property
+    def names(self) -> list[str]:
+        """What the signals are called: words by their bits, others by their number from 1."""
+        known, count = self.configuration.get("signals"), len(self.J)
+        if isinstance(known, list) and len(known) == count:
+            return [str(name) for name in known]
+        return [f"signal {number + 1}" for number in range(count)]
 
-        Raises:
-            ValueError: if there is no such picture, or no such signal; it names those that there are.
-        """
-        from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
-        return from_above.plot(self, what, experiment, against, signals)
+    def described(self, configuration: Mapping[str, Any]) -> "Recall":
+        """The same recall with this configuration."""
+        return dataclasses.replace(self, record=json.dumps(configuration))
 
     def _facts(self) -> html.Facts:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}
@@ -183,7 +184,7 @@ def recall(experiment: Experiment) -> Recall:
     require_x64()
     require_double(pack=experiment.pack, signals=experiment.signals)
     found: Recall = _recall(experiment)
-    return found
+    return found if traced(experiment) else found.described(describe(experiment, 0.0))
 
 
 def fidelity(experiment: Experiment) -> jax.Array:
@@ -291,7 +292,7 @@ def run(
             there is not.
         RunFailedError: if the simulation broke down.
     """
-    tell = callback(progress)
+    began, tell = time.perf_counter(), callback(progress)
     count = experiment.signals.count
     size = count if batch is None else batch
     if size < 1:
@@ -338,6 +339,7 @@ def run(
         done += work_of(own, 1 + last - first)
     after_prefix, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
     found: Recall = finished(experiment, prefix.samples | after_prefix, jnp.asarray(status))
+    found = found.described(describe(experiment, time.perf_counter() - began))
     if not schedule.wanted:
         return found
     offsets = np.asarray(experiment.pack.clump.offsets)

@@ -5,6 +5,7 @@ experiment and its zero signal. The numbers are those of the experiments run one
 """
 
 import dataclasses
+import time
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.experiment import AFTER_PREFIX, Experiment, replace, replica_parameters, value_at
+from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, replace, replica_parameters, value_at
 from gmem_jax.experiment.recall import PREFIX, Recall, finished, runner_of, warn_of_another_compression
+from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import pytree
 from gmem_jax.physics.rules import usual_rules
@@ -82,7 +84,7 @@ class _Side:
         # All names of any of them: what one leaves to its default may be a number in another.
         self.names = list(dict.fromkeys(name for each in experiments for name in replica_parameters(each)))
         values = [tuple(float(value_at(each, name)) for name in self.names) for each in experiments]
-        acting = [name.split(".")[0] not in AFTER_PREFIX for name in self.names]
+        acting = [acts_on_prefix(name) for name in self.names]
         own = [tuple(value for value, acts in zip(row, acting, strict=True) if acts) for row in values]
         kinds = list(dict.fromkeys(own))
         self.prefix = np.asarray([kinds.index(row) for row in own])
@@ -132,7 +134,7 @@ def run_several(
     """
     if not experiments or not all(match(experiments[0], each) for each in experiments):
         raise ValueError("experiments side by side must differ only in what may differ between replicas")
-    side = _Side(experiments)
+    began, side = time.perf_counter(), _Side(experiments)
     common, own = experiments[0].phases
     for each in experiments:
         warn_of_another_compression(each)
@@ -168,5 +170,6 @@ def run_several(
             [(name, jax.tree.map(lambda leaf, at=alone: leaf[..., at : at + 1], before[name])) for name in before]
             + [(name, jax.tree.map(lambda leaf, a=begun, b=ended: leaf[..., a:b], after[name])) for name in after]
         )
-        found.append(finished(each, samples, jnp.asarray(status)[begun:ended]))
+        recall: Recall = finished(each, samples, jnp.asarray(status)[begun:ended])
+        found.append(recall.described(describe(each, (time.perf_counter() - began) / len(experiments))))
     return found

@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,18 +20,16 @@ def described(name: str) -> dict[str, str]:
     return {"units": array.units, "description": array.words}
 
 
-def recall_dataset(recall: Recall, names: list[str], configuration: Mapping[str, Any]) -> Any:
+def recall_dataset(recall: Recall) -> Any:
     """A recall as an xarray.Dataset: its arrays, and the samples of all stages one after the other along `time`.
 
     Args:
         recall: the recall; stages that were run once for all replicas are repeated for each.
-        names: of its S signals.
-        configuration: the resolved one, for its attributes; may be empty.
 
     Raises:
         ValueError: if xarray is not installed.
     """
-    xarray = optional("xarray", "export")
+    xarray, configuration = optional("xarray", "export"), recall.configuration
     stages, replicas = recall.stages, len(recall.status)
     bins = {name: len(sample.filling) for name, sample in stages.items()}
     joined: dict[str, Any] = {
@@ -50,23 +47,21 @@ def recall_dataset(recall: Recall, names: list[str], configuration: Mapping[str,
         own = (np.asarray(getattr(sample, name)) for sample in stages.values())
         wide = [np.broadcast_to(values, (*values.shape[:-1], replicas)) for values in own]
         data[name] = (array.shape, np.concatenate(wide), about)
-    derived = of_each(recall, configuration)
+    derived = of_each(recall)
     for name, array in RECALL.arrays.items():
         if name not in ("u", "signal"):
             values = derived[name] if name in derived else np.asarray(getattr(recall, name))
             data[name] = (array.shape if values.ndim == len(array.shape) else ("replica",), values, described(name))
     coordinates = {
-        "signal": ("signal", names, described("signal")),
+        "signal": ("signal", recall.names, described("signal")),
         "u": ("u", np.asarray(recall.u), described("u")),
         "replica": np.arange(replicas),
         "axis": ["x", "y", "z"],
         **joined,
         "stage": ("time", joined["stage"]),
     }
-    facts = {
-        name: configuration[name] for name in ("pack", "grains", "friction", "background") if name in configuration
-    }
-    facts |= {name: configuration[name] for name in ("mu", "gamma0", "delta0", "t0") if name in configuration}
+    told = ("pack", "grains", "friction", "background", "mu", "gamma0", "delta0", "t0")
+    facts = {name: configuration[name] for name in told if name in configuration}
     about = {"schema": RECALL.name, "units": "R = E = rho = 1", **facts, "configuration": json.dumps(configuration)}
     return xarray.Dataset(data, coordinates, about)
 
@@ -76,21 +71,21 @@ def plain_cell(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@")) else value
 
 
-def recall_csv(recall: Recall, names: list[str]) -> str:
+def recall_csv(recall: Recall) -> str:
     """The recalled signals as CSV: u, and p_sig of every signal in E."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["u", *(f"p_sig of {name} (E)" for name in names)])
+    writer.writerow(["u", *(f"p_sig of {name} (E)" for name in recall.names)])
     writer.writerows(np.column_stack([recall.u, np.asarray(recall.p_sig).T]).tolist())
     return text.getvalue()
 
 
-def each_csv(names: list[str], measures: Mapping[str, np.ndarray]) -> str:
+def each_csv(recall: Recall) -> str:
     """What is said of each signal by itself (`of_each`) as CSV, a row for each."""
-    text = io.StringIO()
+    text, measures = io.StringIO(), of_each(recall)
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["signal", *(name.removeprefix("signal_") for name in measures)])
     writer.writerows(
-        [name, *row] for name, row in zip(names, np.column_stack([*measures.values()]).tolist(), strict=True)
+        [name, *row] for name, row in zip(recall.names, np.column_stack([*measures.values()]).tolist(), strict=True)
     )
     return text.getvalue()

@@ -19,8 +19,9 @@ def relative_scale(configuration: Mapping[str, Any]) -> jax.Array:
     return jnp.asarray(numbers if np.ndim(numbers) == 0 else numbers[1:, None])
 
 
-def of_each(recall: Recall, configuration: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def of_each(recall: Recall) -> dict[str, np.ndarray]:
     """`EACH` of every signal, [S]: G and F with a gain of its own, F over T1, correlation with J; NaN of silence."""
+    configuration = recall.configuration
     p_sig, integral, scale = jnp.asarray(recall.p_sig), jnp.asarray(recall.J), relative_scale(configuration)
     window = recall.window / np.max(configuration.get("t0", np.nan))
     own, smooth = (analysis.each(p_sig, integral, scale, over) for over in (None, window))

@@ -5,7 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.samples import Told, untold
 from gmem_jax.experiment.signals import LONGEST_WORD, Signals, six_signals, waveform, words
@@ -14,26 +14,11 @@ from gmem_jax.files.waveforms import load_waveforms
 from gmem_jax.physics.contact.laws import LAWS, law_named
 from gmem_jax.physics.material import Material
 
-FIELDS = (
-    "gamma0",
-    "shear_share",
-    "delta0",
-    "t0",
-    "rest",
-    "hold",
-    "store",
-    "hold_drag",
-    "dt",
-    "steps",
-    "background",
-    "shear",
-    "backend",
-    "precision",
-)
-OF_LAW = tuple(dict.fromkeys(field.name for entry in LAWS for field in fields(entry.kind)))
+OF_LAW = {entry.name: entry for law in reversed(LAWS) for entry in fields(law.kind)}
+OF_MATERIAL = {entry.name: entry for entry in fields(Material) if entry.metadata.get("option")}
 OF_WORDS = ("word_pad", "word_width")
 OF_SAMPLES = ("smooth", "taper", "scale")
-NAMES = ("signals", *OF_WORDS, *OF_SAMPLES, "friction", *OF_LAW, "wall_rigidity", *FIELDS)
+NAMES = ("signals", *OF_WORDS, *OF_SAMPLES, "friction", *OF_LAW, *OF_MATERIAL, *NUMBERS)
 
 
 def named_signals(
@@ -101,10 +86,10 @@ def named_experiment(pack: Pack, values: Mapping[str, Any], signals: Signals | N
         raise ValueError(f"an experiment has no {unknown[0]!r}; it has {', '.join(NAMES)}")
     of_law = {name: given[name] for name in OF_LAW if name in given}
     law = law_named(str(given.get("friction", "hooke")), **of_law)
-    own = {name: given[name] for name in FIELDS if name in given}
+    own = {name: given[name] for name in NUMBERS if name in given}
     if {"steps", "dt"} <= set(own):
         raise ValueError("steps and dt: steps in a bin say what the time step is, so that dt does nothing; give one")
-    material = Material(**{name: given[name] for name in ("wall_rigidity",) if name in given})
+    material = Material(**{name: given[name] for name in OF_MATERIAL if name in given})
     return Experiment(pack, signals or named_signals(*waveforms_of(given)), law, material, **own)
 
 

@@ -1,10 +1,8 @@
 """Recall files: what was measured, and the configuration that it belongs to."""
 
-import importlib
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +21,7 @@ from gmem_jax.files.checked import (
     title,
     whole,
 )
-from gmem_jax.files.configuration import signals_from
+from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
 from gmem_jax.files.labelled import each_csv, recall_csv, recall_dataset
@@ -38,30 +36,30 @@ _EVERY_BIT = int(sum(Status))
 
 
 @usual_rules()
-def save_recall(path: str | Path, recall: Recall, configuration: dict[str, Any]) -> None:
-    """Write a recall with its resolved configuration.
+def save_recall(path: str | Path, recall: Recall) -> None:
+    """Write a recall with its configuration.
 
     Raises:
+        ValueError: if the recall does not say what it is of.
         OSError: if the path cannot be written.
     """
-    names = np.asarray([name.encode() for name in signal_names(recall, configuration)])
+    configuration = recall.configuration
+    if not configuration:
+        raise ValueError(
+            "a recall of a traced experiment does not say what it is of: save "
+            "recall.described(gm.describe(experiment, 0.0))"
+        )
+    names = np.asarray([name.encode() for name in recall.names])
     if names.dtype.itemsize == 1:
         names = names.astype("S2")  # single letters are characters of one text to netCDF
     with writing(Path(path), RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
         file.attrs["protocol"] = json.dumps(recall.protocol.to_list())
-        values = {**vars(recall), **of_each(recall, configuration), "signal": names}
+        values = {**vars(recall), **of_each(recall), "signal": names}
         write_arrays(file, _declared(np.ndim(recall.dt)), values)
         write_samples(file.create_group("stages"), recall.stages)
         if recall.frames is not None:
             write_frames(file, recall.frames)
-
-
-def signal_names(recall: Recall, configuration: Mapping[str, Any]) -> list[str]:
-    """What the signals are called: words by their bits, others by their number from 1."""
-    names = configuration.get("signals")
-    fit = isinstance(names, list) and len(names) == len(recall.J) and all(map(title, names))
-    return list(names) if fit and names else [f"signal {number + 1}" for number in range(len(recall.J))]
 
 
 def _declared(dt_dimensions: int) -> dict[str, Array]:
@@ -69,51 +67,23 @@ def _declared(dt_dimensions: int) -> dict[str, Array]:
     return {**RECALL.arrays, "dt": dt._replace(shape=("replica",) if dt_dimensions else ())}
 
 
-class StoredRecall(NamedTuple):
-    """A recall that was read from a file, and what it belongs to.
+def to_xarray(recall: Recall) -> Any:
+    """An xarray.Dataset with names, units and descriptions; the samples of all stages are joined along `time`.
 
-    Attributes:
-        recall: the recall.
-        configuration: the resolved configuration that made it.
+    Raises:
+        ValueError: if xarray is not installed.
     """
+    return recall_dataset(recall)
 
-    recall: Recall
-    configuration: dict[str, Any]
 
-    @property
-    def names(self) -> list[str]:
-        """What the signals are called: words by their bits, others by their number from 1."""
-        return signal_names(self.recall, self.configuration)
-
-    def to_xarray(self) -> Any:
-        """An xarray.Dataset with names, units and descriptions; the samples of all stages are joined along `time`.
-
-        Raises:
-            ValueError: if xarray is not installed.
-        """
-        return recall_dataset(self.recall, self.names, self.configuration)
-
-    def plot(self, what: str = "signals", *, against: str = "time") -> Any:
-        """`Recall.plot`, with names and conditions."""
-        from_above = importlib.import_module("gmem_jax.show.recalls")  # what draws stands on a floor above
-        return from_above.recall_drawing(self.recall, what, self.configuration, against=against)
-
-    def __repr__(self) -> str:
-        return repr(self.recall)
-
-    def _repr_html_(self) -> str:
-        return self.recall._repr_html_()
-
-    def to_csv(self, *, each: bool = False) -> str:
-        """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F."""
-        if each:
-            return each_csv(self.names, of_each(self.recall, self.configuration))
-        return recall_csv(self.recall, self.names)
+def to_csv(recall: Recall, *, each: bool = False) -> str:
+    """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F."""
+    return each_csv(recall) if each else recall_csv(recall)
 
 
 @usual_rules()
-def load_recall(path: str | Path) -> StoredRecall:
-    """Read a recall and its configuration, which the result can be unpacked into.
+def load_recall(path: str | Path) -> Recall:
+    """Read a recall, and the configuration that it belongs to.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -127,7 +97,7 @@ def load_recall(path: str | Path) -> StoredRecall:
             _check_configuration(configuration)
             recall = _recall_of(content)
         _check(recall)
-        return StoredRecall(recall, configuration)
+        return recall.described(configuration)
 
 
 def _recall_of(content: Content) -> Recall:
@@ -152,7 +122,7 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
     require(isinstance(configuration.get("warnings", []), list), "its configuration has impossible 'warnings'")
     if "target" in configuration:
         require_fields(configuration["target"], "target", kind=title)
-        signals_from(configuration["target"])
+        signals_from_dict(configuration["target"])
 
 
 def _check(recall: Recall) -> None:

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
+from gmem_jax.experiment.record import signals_to_dict
 from gmem_jax.experiment.samples import Told, require_gentle, untold, waveform_from
 from gmem_jax.experiment.signals import Signals, Spline
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import json_of, numbers, read_npy, refusing, require_fields, title
 from gmem_jax.files.columns import Columns, read_columns
-from gmem_jax.files.configuration import signals_from, written_signals
+from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.physics.rules import usual_rules
 
 _LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB
@@ -89,7 +90,7 @@ def load_target(path: Path) -> Signals | None:
     path = Path(path)
     with refusing(path, "table of numbers"):
         found = _comment(path, _TARGET)
-        return signals_from(found) if found else None
+        return signals_from_dict(found) if found else None
 
 
 def load_design(path: Path) -> dict[str, Any]:
@@ -147,6 +148,6 @@ def save_waveforms(
     if design is not None:
         header = f"{_DESIGN}{json.dumps(design)}\n{header}"
     if target is not None:
-        header = f"{_TARGET}{json.dumps(written_signals(target))}\n{header}"
+        header = f"{_TARGET}{json.dumps(signals_to_dict(target))}\n{header}"
     with atomic(Path(path)) as temporary:
         np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g", encoding="utf-8")

@@ -33,7 +33,9 @@ class Material:
     density: Scalar = parameter(1200.0, "(0, inf)")
     poisson: Scalar = parameter(0.49, "(-1, 0.5]")
     normal_damping: Scalar = parameter(0.23, "[0, inf)")
-    wall_rigidity: Scalar = parameter(1.0, "(0, inf)")
+    wall_rigidity: Scalar = parameter(
+        1.0, "(0, inf)", "Stiffness of walls over that of rigid ones; default 1", option=True
+    )
 
     def __post_init__(self) -> None:
         settle(self)

@@ -42,14 +42,22 @@ def interval(words: str) -> Interval:
     return Interval(words, float(low), float(high))
 
 
-def parameter(default: Any, within: str = "(-inf, inf)") -> Any:
-    """A data field that is a float: one number, or one for each replica [B]; `within` is an interval."""
-    return field(default=default, metadata={"interval": interval(within)})
+def parameter(default: Any, within: str = "(-inf, inf)", words: str = "", unit: str = "", **more: bool) -> Any:
+    """A data field that is a float: one number, or one for each replica [B].
+
+    Args:
+        default: its default; None where it follows from others.
+        within: an interval, like "[0, inf)".
+        words: what it is, for `--help` and the tables of the documentation.
+        unit: its unit, "" for a pure number.
+        more: what else is to be known of it (`gmem_jax.experiment.experiment.NUMBERS`).
+    """
+    return field(default=default, metadata={"interval": interval(within), "words": words, "unit": unit, **more})
 
 
-def static(default: Any = MISSING) -> Any:
-    """A field that programs are compiled for: hashable, and no array."""
-    return field(default=default, metadata={"static": True})
+def static(default: Any = MISSING, words: str = "", unit: str = "", **more: bool) -> Any:
+    """A field that programs are compiled for: hashable, and no array; arguments are those of `parameter`."""
+    return field(default=default, metadata={"static": True, "words": words, "unit": unit, **more})
 
 
 def label(default: str) -> Any:

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.pack import Pack, find_pairs
+from gmem_jax.experiment.provenance import provenance
 from gmem_jax.files.checked import require
 from gmem_jax.files.foreign import Spheres, load_spheres
 from gmem_jax.files.lammpsdata import SAME
 from gmem_jax.files.packs import check_pack
-from gmem_jax.files.provenance import provenance
 from gmem_jax.files.soundness import pairs_within
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke

@@ -13,7 +13,7 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.pack import Pack, find_pairs
-from gmem_jax.files.provenance import provenance
+from gmem_jax.experiment.provenance import provenance
 from gmem_jax.physics import chance, rotation
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless

@@ -10,7 +10,7 @@ from gmem_jax.experiment.analysis import spread
 from gmem_jax.files.atomic import atomic
 from gmem_jax.reproduce.compare import Estimate, counted
 from gmem_jax.reproduce.figures import SCALES, Scale, Values, crossed
-from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save
 
 _NOTHING: Values = {}
 

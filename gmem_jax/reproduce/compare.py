@@ -123,8 +123,9 @@ def points_of(store: Store) -> list[Point]:
     done = store.done()
     for row in store.card()["points"]:
         if row["key"] in done:
-            recall, configuration = store.load(row["key"])
-            found.append(Point(conditions_of(configuration), summary(recall, configuration), row["key"]))
+            recall = store.load(row["key"])
+            configuration = recall.configuration
+            found.append(Point(conditions_of(configuration), summary(recall), row["key"]))
     return found
 
 
@@ -231,7 +232,7 @@ def read_csv(path: Path) -> list[Compared]:
         KeyError: if it is no such table.
     """
     kinds, found = get_type_hints(Conditions), []
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
             conditions = Conditions(**{name: kind(line[name]) for name, kind in kinds.items()})
             ours = Estimate(float(line["mean"]), float(line["sd"] or math.nan), int(line["packs"]))

@@ -16,8 +16,8 @@ from gmem_jax.experiment.signals import words as all_words
 from gmem_jax.physics.material import Material
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, counted
-from gmem_jax.show.figures import pyplot, save
 from gmem_jax.show.recalls import MEAN, PALE, mean_over_ringing
+from gmem_jax.show.render_matplotlib import pyplot, save
 from gmem_jax.simulation.sample import Sample
 
 LABELS = {

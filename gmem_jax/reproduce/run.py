@@ -24,9 +24,9 @@ from gmem_jax.reproduce.compare import Compared, Conditions, Point, compare, com
 from gmem_jax.reproduce.figures import FIGURES, SHOWN_WORD, Figure, Scale, Values, packs, scale_of, shown_packs, spec_of
 from gmem_jax.reproduce.single_contact import convergence_figure, laws_figure
 from gmem_jax.reproduce.two_grains import two_grains_figure
-from gmem_jax.show import tables
-from gmem_jax.show.figures import recall_figure
+from gmem_jax.show.recalls import recall_figure
 from gmem_jax.show.render import packs_figure
+from gmem_jax.show.render_matplotlib import render
 from gmem_jax.show.tables import summary
 from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.progress import Progress, silent
@@ -138,7 +138,7 @@ def weigh(
     store = _run(spec, folder, executor, progress, say).store
     done = store.done()
     rows = [row for row in store.card()["points"] if row["key"] in done]
-    runs = [(row["values"], summary(*store.load(row["key"]))) for row in rows]
+    runs = [(row["values"], summary(store.load(row["key"]))) for row in rows]
     found, target = choices.effects(named, runs, size.t0), _target(folder, "choices", scale)
     if not found:
         return Weighed([], [], _failed(store))
@@ -167,7 +167,7 @@ def judge(
     store = conductor.store
     if failed := _failed(store):
         raise RunFailedError(failed[0])
-    runs = [(row["values"], store.load(row["key"])[0]) for row in store.card()["points"]]
+    runs = [(row["values"], store.load(row["key"])) for row in store.card()["points"]]
     tetra, sphere = (conductor.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
     found = claims.verdicts(tetra, size.t0, runs[:-1], {"sphere": sphere})
     with atomic(_target(folder, "claims", scale, ".json")) as path:
@@ -264,17 +264,22 @@ def _draw(
     if figure.across:
         draw.against(target, rows, figure.across, title)
         return
-    recall, configuration = store.load(points[0].key)
+    recall = store.load(points[0].key)
+    configuration = recall.configuration
     if name == "fig04":
         draw.through_time(target, recall, 5, title)
     elif name == "fig06":
-        scale = float(configuration["delta0"]) * float(configuration["gamma0"])
+        drawn = render(recall_figure(recall, "signals", configuration))
         for suffix in (".png", ".svg"):
-            heading, t0 = tables.heading(configuration), configuration["t0"]
-            recall_figure(target.with_suffix(suffix), recall, scale, heading, configuration["signals"], t0)
+            drawn.save(target.with_suffix(suffix))
     else:
         kept = [store.load(point.key) for point in points]
-        draw.words(target, kept, [_shown(point.conditions.bits) for point in points], title)
+        draw.words(
+            target,
+            [(recall, recall.configuration) for recall in kept],
+            [_shown(point.conditions.bits) for point in points],
+            title,
+        )
 
 
 def read_words(folder: Path, store: Store, points: Sequence[Point], scale: Scale, say: Tell) -> list[Compared]:
@@ -295,7 +300,7 @@ def read_words(folder: Path, store: Store, points: Sequence[Point], scale: Scale
             say(f"net {seed} for {length} bits: {nets[-1].step} steps, held-out accuracy {nets[-1].validation:.4f}")
         for point in points:
             if point.conditions.bits == length:
-                read = reading(stored_words(store.load(point.key)[0]), nets)["readers"]
+                read = reading(stored_words(store.load(point.key)), nets)["readers"]
                 for reader, row in read.items():
                     found.setdefault((point.conditions, f"accuracy {reader}"), []).append(row["accuracy"])
     return [compared(conditions, measure, values, 0) for (conditions, measure), values in found.items()]

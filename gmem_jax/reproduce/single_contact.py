@@ -15,7 +15,7 @@ from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.contact.path import contact_path, polyline
 from gmem_jax.physics.pytree import pytree
-from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save
 
 CORNERS = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0)])  # (p, sigma), in R
 FREE: dict[str, Any] = {

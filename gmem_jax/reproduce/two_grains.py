@@ -20,7 +20,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.path import contact_path
 from gmem_jax.reproduce.single_contact import write_columns
-from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save
 from gmem_jax.simulation.protocol import BINS
 
 DELTA0 = 0.05

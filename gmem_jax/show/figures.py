@@ -1,181 +1,180 @@
-"""Pictures. Matplotlib is imported on first use, and without a display."""
+"""Figures of packs, kernels, gradients, designs, nets and tuned drives."""
 
-import textwrap
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.design.kernel import MemoryKernel
 from gmem_jax.design.waveforms import Design
-from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.atomic import atomic
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.record import names_of
+from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pytree import Scalar
-from gmem_jax.show.recalls import signals_drawing
+from gmem_jax.physics.pairs import sphere_centres
+from gmem_jax.physics.state import Grains
+from gmem_jax.show.figure import Curve, Discs, Figure, Image, Panel, U, grid, part, ramp, u_label
+from gmem_jax.show.recalls import MOST_OF_PAGE, SHEAR
+from gmem_jax.simulation.protocol import BINS
+
+PASCAL = float(Material().modulus)
 
 
-def pyplot() -> Any:
-    """Matplotlib's pyplot, drawing to files."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams["text.usetex"] = False
-    return plt
-
-
-def save(path: Path, figure: Any, *, also: Sequence[str] = (), caption: str = "") -> None:
-    """Write a figure whole, and close it.
+def lines_figure(
+    lines: Mapping[str, tuple[Any, Any]], x: str, y: str, title: str = "", *, style: str = "o-", **more: Any
+) -> Figure:
+    """Several curves by name in one panel.
 
     Args:
-        path: in the format of its suffix.
-        figure: of matplotlib.
-        also: further suffixes to write it under.
-        caption: what is seen, in words under it.
-
-    Raises:
-        OSError: if it cannot be written.
+        lines: places and values by name.
+        x: label of the axis.
+        y: label of the axis.
+        title: over it.
+        style: of the curves.
+        more: of the `Panel`.
     """
-    lines = textwrap.wrap(caption, int(14 * figure.get_figwidth()))
-    below = 0.2 * len(lines) / figure.get_figheight()
-    figure.tight_layout(rect=(0.0, below, 1.0, 1.0))
-    if lines:
-        figure.text(0.02, 0.3 * below / len(lines), "\n".join(lines), va="bottom", fontsize=9)
-    for target in (path, *(path.with_suffix(suffix) for suffix in also)):
-        with atomic(target) as temporary:
-            figure.savefig(temporary, format=target.suffix.removeprefix("."), dpi=130)
-    pyplot().close(figure)
+    curves = tuple(
+        Curve(np.asarray(place, float), np.asarray(values, float), name, f"C{number % 10}", style)
+        for number, (name, (place, values)) in enumerate(lines.items())
+    )
+    return Figure((Panel(curves, title, x, y, **more),), legend="panel")
 
 
-def recall_figure(
-    path: Path, recall: Recall, scale: Scalar, title: str, names: Sequence[str] | None = None, t0: Any = None
-) -> None:
-    """p_sig of every signal, its scaled integral G E delta0 gamma0 J, and I(u), like the paper's Fig. 6.
-
-    Args:
-        path: file to write.
-        recall: what to draw.
-        scale: delta0 gamma0, scalar or [S, 1].
-        title: over the picture.
-        names: of the signals; default their numbers.
-        t0: duration of one compression in t_c: see `signals_drawing`.
-
-    Raises:
-        OSError: if the path cannot be written.
-    """
-    called = names or [f"signal {number + 1}" for number in range(len(recall.J))]
-    signals_drawing(recall, called, title, scale, t0).save(path)
+def grains_figure(pack: Pack) -> Figure:
+    """The spheres of all grains, seen along z; the higher, the brighter."""
+    still = jnp.zeros((*pack.position.shape, 1))
+    grains = Grains(pack.position[..., None], pack.quaternion[..., None], still, still, still, still)
+    centres = np.asarray(sphere_centres(grains, pack.clump))[..., 0]
+    centres = centres[np.argsort(centres[:, 2])]
+    (left, right), (front, back) = zip(*(np.asarray(each)[:2] for each in (pack.lower, pack.upper)), strict=True)
+    limits = {"x_limits": (left, right), "y_limits": (front, back), "equal": True}
+    discs = Discs(centres[:, :2], centres[:, 2], "z ($R$)")
+    title = f"{pack.name}: {pack.grains} {pack.clump.shape}"
+    return Figure((Panel((discs,), title, "x ($R$)", "y ($R$)", **limits),), size=(6.4, 5.4))  # type: ignore[arg-type]
 
 
-def confusion_figure(path: Path, table: np.ndarray, title: str) -> None:
-    """A confusion matrix [S, S]: word stored down, word read across, rows normalised.
+def kernel_figure(kernel: MemoryKernel, noise: float, title: str = "") -> Figure:
+    """M(u, v), and its singular values beside the noise, in Pa."""
+    diagonal = Curve(np.array([0.0, 1.0]), np.array([0.0, 1.0]), colour="0.3", width=0.8)
+    image = Image(kernel.kernel() / kernel.delta0, kernel.centres, kernel.u, r"$M(u, v) / E \delta_0$")
+    left = Panel((image, diagonal), title, "v (where the shear acts)", "u (where it is read)")
+    singular = kernel.singular_values() * PASCAL
+    number = np.arange(1, singular.size + 1)
+    values = Curve(number, singular, "singular values", style="o-")
+    floor = Curve(number[[0, -1]], np.full(2, noise), "noise", "C3", "--", 0.8)
+    labels = ("recall of the n-th best waveform", "number n", "singular value (Pa)")
+    return Figure((left, Panel((values, floor), *labels, log=True)), 2, (9.6, 3.9), legend="below")
 
-    Raises:
-        OSError: if the path cannot be written.
-    """
-    plt = pyplot()
-    count = len(table)
-    bits = count.bit_length() - 1
-    figure, axes = plt.subplots(figsize=(5.6, 5.0))
-    share = table / table.sum(axis=1, keepdims=True)
-    image = axes.imshow(share, cmap="Blues", vmin=0.0, vmax=1.0, interpolation="nearest")
-    if count <= 32:
+
+def bumps_figure(kernel: MemoryKernel, title: str) -> Figure:
+    """Odd and even part of the recall of every bump."""
+    colours = ramp(len(kernel.centres))
+    parts = {"odd part": kernel.odd, "even part, 0 for a linear memory": kernel.even}
+    panels = []
+    for name, values in parts.items():
+        rows = zip(values, kernel.centres, colours, strict=True)
+        curves = [Curve(kernel.u, PASCAL * row, f"{centre:.2g}", tone, width=0.9) for row, centre, tone in rows]
+        panels.append(Panel(tuple(curves), name, U, "recall of a bump (Pa)"))
+    over = (f"{title}, gamma0 = {kernel.gamma0:g}",)
+    return Figure(tuple(panels), 2, (9.6, 3.9), over, "right", legend_title="v", shared=("y",))
+
+
+def confusion_figure(counts: Mapping[str, np.ndarray]) -> Figure:
+    """Words read for words stored, by what stands over it; counts [S, S], the word stored down, as parts of rows."""
+    panels = []
+    for title, table in counts.items():
+        count = len(table)
+        places, bits = np.arange(count), count.bit_length() - 1
+        share = table / table.sum(axis=1, keepdims=True)
+        image = Image(share, places, places, "part of the readings", (0.0, 1.0), "Blues", written=count <= 16)
         names = [f"{word:0{bits}b}" for word in range(count)]
-        size = 9 if count <= 8 else 6
-        axes.set_xticks(range(count), names, rotation=90, fontsize=size)
-        axes.set_yticks(range(count), names, fontsize=size)
-    if count <= 16:
-        for row, column in np.argwhere(share > 0.0):
-            tone = "white" if share[row, column] > 0.5 else "black"
-            axes.text(column, row, f"{share[row, column]:.2g}", ha="center", va="center", fontsize=7, color=tone)
-    axes.set_xlabel("word read")
-    axes.set_ylabel("word stored")
-    axes.set_title(title, fontsize=10)
-    figure.colorbar(image, label="part of the readings", shrink=0.8)
-    save(path, figure)
+        axes = {"down": True, "equal": True, "x_names": names, "y_names": names}
+        panels.append(Panel((image,), title, "word read", "word stored", **axes))  # type: ignore[arg-type]
+    return Figure(tuple(panels), len(panels), (5.6 * len(panels), 5.0))
 
 
-def gradient_figure(path: Path, rows: Sequence[tuple[np.ndarray, np.ndarray]], title: str) -> None:
-    """dF / da of every signal's heights against where in u they act; a pair (places, slopes) for each signal.
-
-    Raises:
-        OSError: if the path cannot be written.
-    """
-    figure, axis = pyplot().subplots(figsize=(6.4, 3.6))
-    for number, (place, slope) in enumerate(rows):
-        axis.plot(place, slope, "o-", markersize=4, linewidth=0.8, label=f"signal {number + 1}")
-    axis.axhline(0.0, color="0.8", linewidth=0.8)
-    axis.set(xlabel="compression variable u", ylabel="dF / d amplitude", title=title)
-    axis.legend(fontsize=7, frameon=False)
-    save(path, figure)
+def bits_figure(readers: Mapping[str, Any], title: str) -> Figure:
+    """Error rate of each bit by each reader."""
+    lines = {
+        f"{name}: accuracy {row['accuracy']:.3f}": (range(len(row["bit_errors"])), row["bit_errors"])
+        for name, row in readers.items()
+    }
+    return lines_figure(lines, "bit, the first at small u", "error rate", title, whole=True)
 
 
-def kernel_figure(path: Path, kernel: MemoryKernel, noise: float, title: str) -> None:
-    """M(u, v), and its singular values beside the noise.
-
-    Raises:
-        OSError: if the path cannot be written.
-    """
-    figure, (left, right) = pyplot().subplots(1, 2, figsize=(9.6, 3.9))
-    values = kernel.kernel() / kernel.delta0
-    limit = float(np.abs(values).max())
-    image = left.pcolormesh(kernel.centres, kernel.u, values, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="nearest")
-    figure.colorbar(image, ax=left, label=r"$M(u, v) / E \delta_0$")
-    left.plot([0, 1], [0, 1], color="0.3", linewidth=0.8)
-    left.set(xlabel="v (where the shear acts)", ylabel="u (where it is read)", title=title)
-    singular = kernel.singular_values() * Material().modulus
-    right.semilogy(np.arange(1, singular.size + 1), singular, "o-", markersize=4)
-    right.axhline(noise * Material().modulus, color="C3", linestyle="--", linewidth=0.8, label="noise")
-    right.set(xlabel="number", ylabel="singular value (Pa)", title="recall of the n-th best waveform")
-    right.legend(frameon=False, fontsize=8)
-    save(path, figure)
+def gradient_figure(places: Sequence[Sequence[float]], slopes: Sequence[Sequence[float]], title: str = "") -> Figure:
+    """dF / da of every signal's heights against where in u they act: places and slopes of each signal."""
+    rows = enumerate(zip(places, slopes, strict=True), 1)
+    lines = {f"signal {number}": row for number, row in rows}
+    return lines_figure(lines, U, "dF / d amplitude", title, zero=True)
 
 
-def history_figure(path: Path, histories: Mapping[str, Sequence[float]]) -> None:
-    """1 - F against iterations.
-
-    Raises:
-        OSError: if the path cannot be written.
-    """
-    figure, axis = pyplot().subplots(figsize=(5.2, 3.6))
-    for name, history in histories.items():
-        axis.semilogy(range(len(history)), 1.0 - np.asarray(history), "o-", markersize=4, label=name)
-    axis.set(xlabel="iteration", ylabel="1 - F")
-    axis.xaxis.get_major_locator().set_params(integer=True)
-    axis.legend(frameon=False, fontsize=8)
-    save(path, figure)
+def history_figure(histories: Mapping[str, Sequence[float]]) -> Figure:
+    """1 - F against iterations."""
+    lines = {name: (range(len(way)), 1.0 - np.asarray(way)) for name, way in histories.items()}
+    return lines_figure(lines, "iteration", "1 - F", log=True, whole=True)
 
 
-def design_figure(path: Path, design: Design, unit: float, title: str) -> None:
+def values_figure(history: Sequence[Mapping[str, float]], title: str) -> Figure:
+    """The values of a tuned drive after every iteration, in parts of the first."""
+    lines = {
+        f"{name}: {first:.3g} to {history[-1][name]:.3g}": (range(len(history)), [one[name] / first for one in history])
+        for name, first in history[0].items()
+        if name != "fidelity"
+    }
+    return lines_figure(lines, "iteration", "over the first value", title, whole=True)
+
+
+def weights_figure(weights: np.ndarray, title: str) -> Figure:
+    """Weights of the first layer of a net, [256, hidden]."""
+    u, units = ((np.arange(count) + 0.5) for count in weights.shape)
+    image = Image(weights, units, u / len(u), "weight of the first layer")
+    return Figure((Panel((image,), title, "hidden unit", U, down=True),), size=(8.0, 4.0))
+
+
+def waves_figure(signals: Signals, target: Signals | None, title: str = "") -> Figure:
+    """I(u) of waveforms, and of those whose recall they imitate."""
+    u = np.linspace(0.0, 1.0, 2 * BINS + 1)
+    names, waves = names_of(signals), np.asarray(signals.shear(jnp.asarray(u))).T
+    wanted = None if target is None else np.asarray(target.shear(jnp.asarray(u))).T
+    shown = min(len(waves), MOST_OF_PAGE)
+    columns, size = grid(shown)
+    panels = []
+    for number in range(shown):
+        curves = [] if wanted is None else [Curve(u, wanted[number], "target $I(u)$", "0.5", "--", 1.0)]
+        curves.append(Curve(u, waves[number], "$I(u)$", "C2"))
+        panels.append(Panel(tuple(curves), names[number], u_label(columns), SHEAR, zero=True))
+    over = (f"{title}{part(shown, len(waves))}",)
+    return Figure(tuple(panels), columns, size, over, "panel", shared=("x", "y"))
+
+
+def design_figure(design: Design, unit: float, title: str) -> Figure:
     """Designed waveforms, and their recall beside the targets and what the untouched waveforms gave.
 
     Args:
-        path: file to write.
         design: the design, of S signals.
         unit: delta0 gamma0.
         title: over the picture.
-
-    Raises:
-        OSError: if the path cannot be written.
     """
-    shown = min(len(design.target), 6)
-    u = (np.arange(design.target.shape[1]) + 0.5) / design.target.shape[1]
-    pascal = Material().modulus
-    figure, axes = pyplot().subplots(2, shown, figsize=(2.6 * shown, 4.8), sharex=True, sharey="row", squeeze=False)
-    nodes = np.linspace(0.0, 1.0, design.signals.nodes.shape[1])
-    for number in range(shown):
-        axes[0, number].plot(nodes, np.asarray(design.signals.nodes[number]), color="C2")
-        axes[0, number].set_title(f"signal {number + 1}", fontsize=9)
-        low = axes[1, number]
-        low.plot(u, pascal * design.untouched[number], color="0.7", label="recall, untouched")
-        low.plot(u, pascal * design.p_sig[number], color="C0", label="recall, designed")
-        low.plot(u, pascal * design.gain * unit * design.target[number], "--", color="C3", label="target")
-        low.set_xlabel("u")
-    axes[0, 0].set_ylabel("designed I(u)")
-    axes[1, 0].set_ylabel("stress (Pa)")
-    axes[1, 0].legend(fontsize=6, frameon=False)
-    figure.suptitle(f"{title}: F {design.before:.3f} -> {design.fidelity:.3f}", fontsize=10)
-    save(path, figure)
+    shown, bins = min(len(design.target), 6), design.target.shape[1]
+    u, nodes = (np.arange(bins) + 0.5) / bins, np.linspace(0.0, 1.0, design.signals.nodes.shape[1])
+    curves = (
+        (design.untouched, "recall, untouched", "0.7", "-"),
+        (design.p_sig, "recall, designed", "C0", "-"),
+        (design.gain * unit * design.target, "target", "C3", "--"),
+    )
+    above = [
+        Panel((Curve(nodes, np.asarray(row), colour="C2"),), f"signal {number + 1}", "", "designed I(u)")
+        for number, row in enumerate(design.signals.nodes[:shown])
+    ]
+    below = [
+        Panel(
+            tuple(Curve(u, PASCAL * np.asarray(row[number]), name, tone, style) for row, name, tone, style in curves),
+            x="u",
+            y="stress (Pa)",
+        )
+        for number in range(shown)
+    ]
+    over = (f"{title}: F {design.before:.3f} -> {design.fidelity:.3f}",)
+    return Figure((*above, *below), shown, (max(2.6 * shown, 4.0), 4.8), over, "below", shared=("x", "row"))

@@ -1,6 +1,5 @@
-"""Pictures of recalled signals."""
+"""Figures of recalled signals, and `gm.plot`."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,48 +10,72 @@ import numpy as np
 from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.experiment import PAPER_T0, Experiment
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import describe
 from gmem_jax.files.checked import is_number
-from gmem_jax.files.configuration import resolved
 from gmem_jax.files.measures import relative_scale
-from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.show import tables
-from gmem_jax.show.drawing import Drawing, blank
-from gmem_jax.show.stages import AGAINST, QUANTITIES, stages_drawing
+from gmem_jax.show.figure import Curve, Figure, Image, Panel, U, grid, part, u_label
+from gmem_jax.show.render_matplotlib import Drawing, render
+from gmem_jax.show.stages import AGAINST, QUANTITIES, ZERO, stages_figure
 
 MOST = 64  # panels of one picture
+MOST_OF_PAGE = 12  # panels of a page
 MEAN, PALE = "its mean over the ringing period $T_1$", "#a9c6e6"
-
+SHEAR = r"$I(u) = \gamma / \gamma_0$"
 
 PICTURES = ("signals", "waveforms", "all", *QUANTITIES)
 """What can be drawn of a recall."""
 
 
-def recall_drawing(
+def plot(
+    recall: Recall,
+    what: str = "signals",
+    experiment: Experiment | None = None,
+    *,
+    against: str = "time",
+    signals: Sequence[int] = (),
+) -> Drawing:
+    """A picture of a recall, which a notebook shows: `.save(path)` writes it, `.figure` is matplotlib's.
+
+    Args:
+        recall: the recall.
+        what: "signals", recalled; "waveforms", stored; "all", an image of all; or a quantity of the stages, like
+            "pressure", "p_xy", "Z" or "phi".
+        experiment: that it is of, for names, conditions and t0, if the recall does not say them itself.
+        against: "time" or "u", for the stages.
+        signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
+
+    Raises:
+        ValueError: if there is no such picture, or no such signal; it names those that there are.
+    """
+    known = None if experiment is None else describe(experiment, 0.0)
+    return render(recall_figure(recall, what, known, against=against, signals=signals))
+
+
+def recall_figure(
     recall: Recall,
     what: str = "signals",
     configuration: Mapping[str, Any] | None = None,
     *,
     against: str = "time",
     signals: Sequence[int] = (),
-) -> Drawing:
-    """A picture of a recall.
+) -> Figure:
+    """A figure of a recall; see `plot`.
 
     Args:
         recall: the recall.
-        what: one of `PICTURES`: "signals", recalled; "waveforms", stored; "all", an image of all; or a quantity of the
-            stages: "pressure", "p_x", "p_y", "p_z", "p_xy", "Z", "contacts", "phi", "energy", "speed", "overlap",
-            "inertial".
-        configuration: the resolved one, for names, conditions and t0.
+        what: one of `PICTURES`.
+        configuration: for names, conditions and t0; default the recall's own.
         against: "time" or "u", for the stages.
-        signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
+        signals: numbers of those to draw.
 
     Raises:
         ValueError: if there is no such picture, or no such signal.
     """
-    known = dict(configuration or {})
-    names = signal_names(recall, known)
+    known = dict(configuration or recall.configuration)
+    names = recall.names
     title = tables.heading(known) if known else "recall"
     found = {name.lower(): name for name in PICTURES}.get(what.lower())
     if found is None or against not in AGAINST:
@@ -62,9 +85,8 @@ def recall_drawing(
     _refuse_unknown(signals, len(names), lowest=0 if found in QUANTITIES else 1)
     t0 = known.get("t0")
     if found in QUANTITIES:
-        chosen = {names[number - 1] if number else "zero signal": number for number in signals}
-        time = t0 if is_number(t0) else None
-        return stages_drawing(recall.stages, found, title, against=against, t0=time, chosen=chosen)
+        chosen = {names[number - 1] if number else ZERO: number for number in signals}
+        return stages_figure(recall.stages, found, title, against=against, t0=t0, chosen=chosen)
     scale = relative_scale(known) if known else None
     if signals:
         rows = np.asarray(signals) - 1
@@ -74,10 +96,8 @@ def recall_drawing(
             scale = np.asarray(scale)[rows]
         recall = replace(recall, **{name: np.asarray(getattr(recall, name))[rows] for name in ("p_sig", "J", "shear")})
     if found == "signals":
-        return signals_drawing(recall, names, title, scale, t0)
-    if found == "waveforms":
-        return waveforms_drawing(recall, names, title)
-    return image_drawing(recall, names, title)
+        return signals_figure(recall, names, title, scale, t0)
+    return waveforms_figure(recall, names, title) if found == "waveforms" else image_figure(recall, names, title)
 
 
 def _refuse_unknown(signals: Sequence[int], count: int, lowest: int) -> None:
@@ -85,12 +105,6 @@ def _refuse_unknown(signals: Sequence[int], count: int, lowest: int) -> None:
         if not lowest <= number <= count:
             more = ", and 0, the zero signal" if lowest == 0 else ""
             raise ValueError(f"signal {number}: this picture can show 1 to {count}{more}")
-
-
-def plot(recall: Recall, what: str, experiment: Experiment | None, against: str, signals: Sequence[int]) -> Drawing:
-    """What `Recall.plot` calls."""
-    known = None if experiment is None else resolved(experiment, 0.0)
-    return recall_drawing(recall, what, known, against=against, signals=signals)
 
 
 def mean_over_ringing(recall: Recall, signals: np.ndarray, t0: Any) -> np.ndarray | None:
@@ -106,9 +120,16 @@ def mean_over_ringing(recall: Recall, signals: np.ndarray, t0: Any) -> np.ndarra
     return np.asarray(running_mean(jnp.asarray(signals), float(recall.window) / t0 * signals.shape[-1]))
 
 
-def signals_drawing(
-    recall: Recall, names: Sequence[str], title: str, scale: Scalar | None = None, t0: Any = None
-) -> Drawing:
+def signals_figure(
+    recall: Recall,
+    names: Sequence[str],
+    title: str = "",
+    scale: Scalar | np.ndarray | None = None,
+    t0: Any = None,
+    *,
+    target: np.ndarray | None = None,
+    page: bool = False,
+) -> Figure:
     """p_sig of every signal, its scaled integral, and the waveform, like the paper's Fig. 6; at most 64 panels.
 
     Faster than the paper's rate the drive rings: the mean over the ringing period is drawn over what was recalled.
@@ -120,115 +141,77 @@ def signals_drawing(
         scale: delta0 gamma0, scalar or [S, 1]; without it the integral that comes nearest is drawn, which is the same
             where all signals have one scale.
         t0: duration of one compression in t_c, if it is known and the same for all.
+        target: J that designed waveforms should give, [S, 256].
+        page: whether it is for a page: at most 12 panels, without the waveforms.
     """
-    pascal = Material().modulus
+    pascal = float(Material().modulus)
     u, signals, integrals, waves = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J, recall.shear))
     if scale is None:
         fitted = integrals * np.sum(integrals * signals) / np.sum(integrals * integrals)
     else:
         fitted = float(recall.gain) * np.asarray(scale) * integrals
     smooth = mean_over_ringing(recall, signals, t0)
-    shown = min(len(signals), MOST)
-    drawing, axes = _panels(shown)
-    rights = []
-    for number, axis in enumerate(axes.flat[:shown]):
-        right = axis.twinx()
-        rights.append(right)
-        wave = right.fill_between(u, waves[number], color="0.88", linewidth=0)
-        axis.set_zorder(right.get_zorder() + 1)
-        axis.patch.set_visible(False)
-        axis.axhline(0.0, color="0.8", linewidth=0.6)
-        colour = "C0" if smooth is None else PALE
-        curves = [axis.plot(u, pascal * signals[number], color=colour, linewidth=1.2)[0]]
-        if smooth is not None:
-            curves += axis.plot(u, pascal * smooth[number], color="C0", linewidth=1.2)
-        (scaled,) = axis.plot(u, pascal * fitted[number], color="C3", linewidth=1.2, linestyle="--")
-        axis.set_title(names[number], fontsize=9 if shown <= 16 else 7, pad=3)
-    highest = 1.05 * max(float(np.nanmax(np.abs(waves[:shown]), initial=0.0)), 1e-12)
-    largest = 1.05 * pascal * float(np.nanmax(np.abs([signals[:shown], fitted[:shown]]), initial=0.0))
-    axes[0, 0].set_ylim(-(largest or 1.0), largest or 1.0)  # both zeros lie in the middle
-    for number, right in enumerate(rights):
-        right.set_ylim(-highest, highest)
-        last = (number + 1) % axes.shape[1] == 0 or number == shown - 1
-        right.tick_params(labelright=last, labelsize=7, colors="0.5")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("stress (Pa)", fontsize=9)
-    _u_below(axes, shown)
-    for right in {*rights[axes.shape[1] - 1 :: axes.shape[1]], rights[-1]}:
-        right.set_ylabel(r"$I(u) = \gamma / \gamma_0$", fontsize=8, color="0.5")
-    handles = [*curves, scaled, wave]
-    said = ["recalled $p_{sig}$", MEAN][: len(curves)]
-    labels = [*said, r"$G E \delta_0 \gamma_0 J$", "waveform $I(u)$"]
-    drawing.figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8, frameon=False)
-    drawing.title(title, _measures(recall, shown, len(signals)))
-    return drawing
+    curves = [("recalled $p_{sig}$", signals, "C0" if smooth is None else PALE, "-")]
+    curves += [] if smooth is None else [(MEAN, smooth, "C0", "-")]
+    curves.append((r"$G E \delta_0 \gamma_0 J$", fitted, "C3", "--"))
+    if target is not None:
+        wanted = np.asarray(1.0 if scale is None else scale) * target
+        gain = np.sum(wanted * signals) / np.sum(wanted * wanted)
+        curves.append(("the same of the target", gain * wanted, "C2", ":"))
+    shown = min(len(signals), MOST_OF_PAGE if page else MOST)
+    columns, size = grid(shown)
+    largest = 1.05 * pascal * max(float(np.nanmax(np.abs(each[:shown]), initial=0.0)) for _, each, *_ in curves) or 1.0
+    area: dict[str, Any] = {"behind_label": SHEAR}
+    area["behind_limit"] = 1.05 * max(float(np.nanmax(np.abs(waves[:shown]), initial=0.0)), 1e-12)
+    panels = tuple(
+        Panel(
+            tuple(Curve(u, pascal * each[number], label, colour, style) for label, each, colour, style in curves),
+            names[number],
+            u_label(columns),
+            "stress (Pa)",
+            (0.0, 1.0),
+            (-largest, largest),  # both zeros lie in the middle
+            zero=True,
+            behind=None if page else Curve(u, waves[number], "waveform $I(u)$", "0.88"),
+            **area,
+        )
+        for number in range(shown)
+    )
+    lines = () if page else (title, _measures(recall, shown, len(signals)))
+    return Figure(panels, columns, size, lines, "below", shared=("x", "y"))
 
 
-def waveforms_drawing(recall: Recall, names: Sequence[str], title: str) -> Drawing:
+def waveforms_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
     """I(u) as applied, and J(u), of every signal; at most 64 panels."""
     shown = min(len(recall.J), MOST)
-    drawing, axes = _panels(shown)
-    for number, axis in enumerate(axes.flat[:shown]):
-        axis.axhline(0.0, color="0.8", linewidth=0.6)
-        axis.plot(recall.u, recall.shear[number], color="C2", linewidth=1.2, label="$I(u)$")
-        axis.plot(recall.u, recall.J[number], color="C3", linewidth=1.2, linestyle="--", label="$J(u)$")
-        axis.set_title(names[number], fontsize=9 if shown <= 16 else 7, pad=3)
-    _u_below(axes, shown)
-    axes[0, 0].legend(fontsize=7, frameon=False)
-    drawing.title(f"{title}{_part(shown, len(recall.J))}")
-    return drawing
-
-
-def image_drawing(recall: Recall, names: Sequence[str], title: str) -> Drawing:
-    """p_sig and J of all signals, however many, as a picture: a row for each."""
-    count = len(recall.J)
-    drawing, ((left, right),) = blank(1, 2, size=(9.6, min(9.0, 3.0 + 0.12 * count)), sharey=True)
-    pairs = (
-        (left, Material().modulus * np.asarray(recall.p_sig), "recalled $p_{sig}$ (Pa)"),
-        (right, np.asarray(recall.J), "$J(u)$"),
-    )
-    for axis, values, label in pairs:
-        limit = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
-        image = axis.imshow(
-            values,
-            cmap="RdBu_r",
-            vmin=-limit,
-            vmax=limit,
-            aspect="auto",
-            interpolation="nearest",
-            extent=(0.0, 1.0, count - 0.5, -0.5),
+    columns, size = grid(shown)
+    u, curves = np.asarray(recall.u), ((recall.shear, "$I(u)$", "C2", "-"), (recall.J, "$J(u)$", "C3", "--"))
+    panels = tuple(
+        Panel(
+            tuple(Curve(u, np.asarray(row[number]), name, tone, style) for row, name, tone, style in curves),
+            names[number],
+            u_label(columns),
+            zero=True,
         )
-        drawing.figure.colorbar(image, ax=axis, label=label)
-        axis.set_xlabel("compression variable u")
-    step = -(-count // 64)
-    left.set_yticks(range(0, count, step), list(names)[::step], fontsize=8 if count <= 16 else 6)
-    drawing.title(title, _measures(recall, count, count))
-    return drawing
+        for number in range(shown)
+    )
+    return Figure(panels, columns, size, (f"{title}{part(shown, len(recall.J))}",), "panel", shared=("x", "y"))
 
 
-def _panels(count: int) -> tuple[Drawing, Any]:
-    columns = min(count, 3) if count <= 12 else min(8, math.ceil(math.sqrt(count)))
-    rows = -(-count // columns)
-    width, height = (3.4, 2.4) if count <= 12 else (2.1, 1.7)
-    size = (max(width * columns, 5.0) + 0.4, height * rows + 0.9)
-    drawing, axes = blank(rows, columns, size=size, sharex=True, sharey=True)
-    for axis in axes.flat[count:]:
-        axis.set_visible(False)
-    return drawing, axes
-
-
-def _u_below(axes: Any, shown: int) -> None:
-    """Label u under the lowest panel of each column."""
-    columns = axes.shape[1]
-    for number in range(max(0, shown - columns), shown):
-        axis = axes[number // columns, number % columns]
-        axis.tick_params(labelbottom=True)
-        axis.set_xlabel("compression variable u" if columns <= 3 else "u", fontsize=9)
+def image_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
+    """p_sig and J of all signals, however many, as a picture: a row for each."""
+    count, u = len(recall.J), np.asarray(recall.u)
+    pairs = (
+        (float(Material().modulus) * np.asarray(recall.p_sig), "recalled $p_{sig}$ (Pa)"),
+        (np.asarray(recall.J), "$J(u)$"),
+    )
+    panels = tuple(
+        Panel((Image(np.asarray(values), u, np.arange(count), label),), x=U, down=True, y_names=names)
+        for values, label in pairs
+    )
+    size = (9.6, min(9.0, 3.0 + 0.12 * count))
+    return Figure(panels, 2, size, (title, _measures(recall, count, count)), shared=("y",))
 
 
 def _measures(recall: Recall, shown: int, count: int) -> str:
-    return f"G = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}{_part(shown, count)}"
-
-
-def _part(shown: int, count: int) -> str:
-    return f" (the first {shown} of {count} signals are shown)" if shown < count else ""
+    return f"G = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}{part(shown, count)}"

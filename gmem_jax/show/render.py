@@ -7,7 +7,7 @@ import numpy as np
 
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.physics.pairs import sphere_offsets
-from gmem_jax.show.figures import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save
 
 VIEW = (np.deg2rad(-35.0), np.deg2rad(25.0))  # azimuth and elevation of the eye
 LIGHT = np.array([-0.4, 0.5, 0.77])  # where it comes from: right, up, towards the eye

@@ -1,19 +1,21 @@
-"""Pictures of what was recorded in the stages of a recall or a preparation, against time or u."""
+"""Figures of what was recorded in the stages of a recall or a preparation, against time or u."""
 
-import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from gmem_jax.files.checked import is_number
 from gmem_jax.physics.material import Material
-from gmem_jax.show.drawing import Drawing, blank
+from gmem_jax.show.figure import CYCLE, GREY, Curve, Figure, Panel, U
 from gmem_jax.simulation.protocol import BINS
-from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.sample import MEASURED, Measured, Sample
 
 AGAINST = ("time", "u")
+ZERO = "zero signal"
+LINES = 7  # replicas of a page: the zero signal and six others
 NO_CHOICE: Mapping[str, int] = {}
-_KPA = float(Material().modulus) / 1e3
+_STYLES = ("-", "--", ":", "-.")
 
 
 class Quantity(NamedTuple):
@@ -30,47 +32,55 @@ class Quantity(NamedTuple):
     log: bool = False
 
 
-def _wall(*axes: int) -> Callable[[Sample], dict[str, np.ndarray]]:
-    def curves(sample: Sample) -> dict[str, np.ndarray]:
-        pressure: np.ndarray = np.asarray(sample.pressure) * _KPA
-        return {f"$p_{'xyz'[axis]}$": pressure[:, axis] for axis in axes}
+def _of(field: str, of: Measured) -> dict[str, Quantity]:
+    """What can be drawn of a field: of vectors all components, and each."""
+    unit = of.plot_unit or {"1": ""}.get(of.unit, f"${of.unit.replace(' ', chr(92) + ',')}$")
+    in_unit = f" ({unit})" if unit else ""
 
-    return curves
+    def values(sample: Sample) -> np.ndarray:
+        return of.plot_factor * np.asarray(getattr(sample, field))
+
+    if not of.symbol:
+        return {of.plot: Quantity(of.label + in_unit, lambda sample: {"": values(sample)}, of.log)}
+    names = [f"{of.symbol}_{axis}" for axis in "xyz"]
+    found = {of.plot: Quantity(of.label + in_unit, lambda sample: _components(values(sample), names), of.log)}
+    for axis, name in enumerate(names):
+        found[name] = Quantity(f"${name}${in_unit}", lambda sample, axis=axis: {"": values(sample)[:, axis]})  # type: ignore[misc]
+    return found
 
 
-def _field(name: str) -> Callable[[Sample], dict[str, np.ndarray]]:
-    return lambda sample: {"": np.asarray(getattr(sample, name))}
+def _components(values: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
+    return {f"${name}$": values[:, axis] for axis, name in enumerate(names)}
 
 
-QUANTITIES = {
-    "pressure": Quantity("pressure (kPa)", _wall(0, 1, 2)),
-    "p_x": Quantity("$p_x$ (kPa)", _wall(0)),
-    "p_y": Quantity("$p_y$ (kPa)", _wall(1)),
-    "p_z": Quantity("$p_z$ (kPa)", _wall(2)),
-    "p_xy": Quantity(
-        "$p_x - p_y$ (Pa)",
-        lambda sample: {"": 1e3 * _KPA * (np.asarray(sample.pressure)[:, 0] - np.asarray(sample.pressure)[:, 1])},
+def _shear_stress(sample: Sample) -> dict[str, np.ndarray]:
+    pressure = float(Material().modulus) * np.asarray(sample.pressure)
+    return {"": pressure[:, 0] - pressure[:, 1]}
+
+
+QUANTITIES: dict[str, Quantity] = {}
+"""What can be drawn, by name: the fields of a `Sample`, and what follows from them."""
+for _field, _measured in MEASURED.items():
+    QUANTITIES |= _of(_field, _measured) if _measured.plot else {}
+QUANTITIES |= {
+    "p_xy": Quantity("$p_x - p_y$ (Pa)", _shear_stress),
+    "per_grain": Quantity(
+        "contacts per grain, those with walls too", lambda sample: {"": np.asarray(sample.contacts_per_grain)}
     ),
-    "Z": Quantity("coordination Z", _field("coordination")),
-    "per_grain": Quantity("contacts per grain, those with walls too", _field("contacts_per_grain")),
-    "contacts": Quantity("touching spheres per grain, times two", _field("contacts")),
-    "phi": Quantity(r"filling $\phi$", _field("filling")),
-    "energy": Quantity("kinetic energy ($E R^3$)", _field("kinetic_energy"), log=True),
-    "speed": Quantity("largest speed of a grain ($R/t_c$)", _field("largest_speed"), log=True),
-    "overlap": Quantity("largest overlap ($R$)", _field("largest_overlap")),
-    "inertial": Quantity("inertial number I", _field("inertial_number"), log=True),
 }
 
+PAGE = ("p_x", "p_y", "p_z", "p_xy", "Z", "phi")  # of QUANTITIES
 
-def stages_drawing(
+
+def stages_figure(
     stages: Mapping[str, Sample],
     what: str,
     title: str,
     *,
     against: str = "time",
-    t0: float | None = None,
+    t0: Any = None,
     chosen: Mapping[str, int] = NO_CHOICE,
-) -> Drawing:
+) -> Figure:
     """A quantity of every stage: a line for the first replica, the zero signal; a band from the lowest to the highest.
 
     Of chosen signals a line each, and no band.
@@ -83,68 +93,82 @@ def stages_drawing(
         t0: duration of a compression in t_c, which time is given in; in t0 without it.
         chosen: numbers of the signals to draw, 0 for the zero signal, by what they are called.
     """
-    quantity = QUANTITIES[what]
-    if chosen:
-        quantity = quantity._replace(curves=functools.partial(_of_signals, quantity.curves, chosen))
-    drawing, ((axis,),) = blank(size=(9.6, 4.2))
-    if against == "u":
-        _against_u(axis, stages, quantity)
-    else:
-        _against_time(axis, stages, quantity, t0)
+    quantity, marks = QUANTITIES[what], []
+    time, spans = _times(stages, t0)
+    moving = [name for name, sample in stages.items() if np.ptp(np.asarray(sample.u)[:, 0]) > 0.0]
+    for name in stages if against == "time" else moving:
+        sample, place = stages[name], moving.index(name) if name in moving else 0
+        curves = _of_signals(quantity.curves(sample), chosen)
+        for number, (label, values) in enumerate(curves.items()):
+            band = np.stack([values.min(axis=1), values.max(axis=1)]) if values.shape[1] > 1 else None
+            x, called, colour, style = time[name], label, number, "-"
+            if against == "u":
+                x, called, style = np.asarray(sample.u)[:, 0], f"{name} {label}".strip(), _STYLES[place % 4]
+                colour = number if len(curves) > 1 else place
+            marks.append(Curve(x, values[:, 0], called, f"C{colour % 10}", style, 1.1, band))
     many = not chosen and any(np.shape(sample.filling)[-1] > 1 for sample in stages.values())
-    drawing.title(title, "line: zero signal, band: lowest to highest of all replicas" if many else "")
-    axis.set_ylabel(quantity.label)
-    if quantity.log:
-        axis.set_yscale("log", nonpositive="mask")
-    if axis.get_legend_handles_labels()[1]:
-        drawing.figure.legend(loc="outside right upper", fontsize=7, frameon=False)
-    return drawing
+    told = "line: zero signal, band: lowest to highest of all replicas" if many else ""
+    axis: dict[str, Any] = {"x": U, "x_limits": (0.0, 1.0)}
+    if against == "time":
+        axis = {"x": _time_label(t0), "spans": spans}
+    panel = Panel(tuple(marks), y=quantity.label, log=quantity.log, **axis)
+    return Figure((panel,), size=(9.6, 4.2), title=(title, told), legend="right")
 
 
-def _of_signals(
-    curves: Callable[[Sample], dict[str, np.ndarray]], chosen: Mapping[str, int], sample: Sample
-) -> dict[str, np.ndarray]:
+def _of_signals(curves: Mapping[str, np.ndarray], chosen: Mapping[str, int]) -> dict[str, np.ndarray]:
     """The curves of some signals, [bins, 1] each; before they part, all are the zero signal's."""
+    if not chosen:
+        return dict(curves)
     return {
         f"{name} {label}".strip(): values[:, [min(number, values.shape[1] - 1)]]
-        for label, values in curves(sample).items()
+        for label, values in curves.items()
         for name, number in chosen.items()
     }
 
 
-def _curve(axis: Any, at: np.ndarray, values: np.ndarray, **style: Any) -> None:
-    axis.plot(at, values[:, 0], linewidth=1.1, **style)
-    if values.shape[1] > 1:
-        axis.fill_between(at, values.min(axis=1), values.max(axis=1), color=style["color"], alpha=0.25, linewidth=0)
-
-
-_STYLES = ("-", "--", ":", "-.")
-
-
-def _against_time(axis: Any, stages: Mapping[str, Sample], quantity: Quantity, t0: float | None) -> None:
-    unit = 1.0 if t0 is None else t0
-    passed, first = 0, True
+def _times(stages: Mapping[str, Sample], t0: Any) -> tuple[dict[str, np.ndarray], tuple[tuple[float, float, str], ...]]:
+    """The ends of the bins of each stage, and where each begins and ends."""
+    tick, passed, times, spans = (t0 if is_number(t0) else 1.0) / BINS, 0, {}, []
     for name, sample in stages.items():
         bins = len(sample.filling)
-        at = unit * (passed + np.arange(1, bins + 1)) / BINS
-        for number, (label, values) in enumerate(quantity.curves(sample).items()):
-            _curve(axis, at, values, color=f"C{number}", label=label if first and label else None)
-        axis.axvline(unit * passed / BINS, color="0.85", linewidth=0.7, zorder=0)
-        middle = unit * (passed + 0.5 * bins) / BINS
-        axis.annotate(
-            name, (middle, 0.01), xycoords=("data", "axes fraction"), rotation=90, fontsize=6, color="0.45", ha="center"
-        )
-        passed, first = passed + bins, False
-    axis.margins(x=0.0)
-    axis.set_xlabel("time ($t_0$)" if t0 is None else "time ($t_c$)")
+        times[name] = tick * (passed + np.arange(1, bins + 1))
+        spans.append((tick * passed, tick * (passed + bins), name))
+        passed += bins
+    return times, tuple(spans)
 
 
-def _against_u(axis: Any, stages: Mapping[str, Sample], quantity: Quantity) -> None:
-    moving = {name: u for name, sample in stages.items() if np.ptp(u := np.asarray(sample.u)[:, 0]) > 0.0}
-    for place, (name, u) in enumerate(moving.items()):
-        curves = quantity.curves(stages[name])
-        for number, (label, values) in enumerate(curves.items()):
-            color = f"C{number if len(curves) > 1 else place}"
-            _curve(axis, u, values, color=color, linestyle=_STYLES[place % 4], label=f"{name} {label}".strip())
-    axis.set_xlim(0.0, 1.0)
-    axis.set_xlabel("compression variable u")
+def _time_label(t0: Any) -> str:
+    return "time ($t_c$)" if is_number(t0) else "time ($t_0$)"
+
+
+def series_figures(stages: Mapping[str, Sample], names: Sequence[str], t0: Any) -> dict[str, Figure]:
+    """Pressures, coordination and filling along a run as one line, of the zero signal and the first six others.
+
+    Args:
+        stages: samples by name, in order.
+        names: of the signals; none for a preparation.
+        t0: duration of a compression in t_c; what is no number where it differs between replicas.
+
+    Returns:
+        The figure against time and that against u, by what a button says.
+    """
+    time, spans = _times(stages, t0)
+    u = [np.asarray(sample.u)[:, 0] for sample in stages.values()]
+    called = {ZERO if names else "preparation": 0} | {name: number for number, name in enumerate(names[: LINES - 1], 1)}
+    ways = {"time": (time.values(), _time_label(t0), spans), "u": (u, U, ())}
+
+    def panel(what: str, parts: Any, label: str, spans: Any) -> Panel:
+        quantity = QUANTITIES[what]
+        pieces = [_of_signals(quantity.curves(sample), called) for sample in stages.values()]
+        colours = (GREY, *CYCLE)
+        x = np.concatenate(list(parts))
+        marks = [
+            Curve(x, np.concatenate([piece[name][:, 0] for piece in pieces]), name, colours[number], width=1.0)
+            for name, number in called.items()
+        ]
+        return Panel(tuple(marks), quantity.label, label, spans=spans)
+
+    return {
+        f"against {way}": Figure(tuple(panel(what, *of) for what in PAGE), 2, shared=("x",), legend="panel")
+        for way, of in ways.items()
+    }

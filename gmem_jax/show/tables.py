@@ -2,9 +2,10 @@
 
 import csv
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,16 +17,70 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average
-from gmem_jax.files.configuration import signals_from
+from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.measures import of_each, relative_scale
-from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain, together
 from gmem_jax.preparation.recipe import pressure_over_wanted
+from gmem_jax.simulation.protocol import BINS
 
 LARGE_FOR_SPHERES = 3000  # grains: see `note_on_size`
 FEW = 8  # signals that are told of one by one unasked
 SLOW_ENOUGH = 1.8e3  # t0, in t_c: G and F agree with those at ten times slower drives where nothing rings
+
+
+class Fact(NamedTuple):
+    """A number for a person.
+
+    Attributes:
+        name: what it is called.
+        value: a number, or a text.
+        unit: of the value.
+        words: what it means.
+    """
+
+    name: str
+    value: Any
+    unit: str = ""
+    words: str = ""
+
+    @property
+    def text(self) -> str:
+        """The value with its unit."""
+        number = f"{self.value:.3f}" if isinstance(self.value, float) else str(self.value)
+        return f"{number} {self.unit}".rstrip()
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.text}" + (f"  ({self.words})" if self.words else "")
+
+
+def history_table(names: Iterable[str], history: Sequence[Mapping[str, float]]) -> Table:
+    """Values and the mean fidelity after every iteration."""
+    table = Table("iteration", *names, "mean F")
+    for number, one in enumerate(history):
+        table.add_row(str(number), *(f"{one[name]:.4g}" for name in names), f"{one['fidelity']:.4f}")
+    return table
+
+
+def errors_table(recall: Recall) -> Table:
+    """G and F with their standard errors over signals, as they are and averaged over the ringing period."""
+    configuration, window = recall.configuration, float(recall.window)
+    scale = np.asarray(relative_scale(configuration))
+    bins = window * BINS / float(np.max(configuration["t0"]))
+    told = "G: gain; F: fidelity, 1 if what is recalled is the integral of what was stored; errors: standard errors "
+    table = Table("", "G", "F", caption=f"{told}over the signals stored in this pack (jackknife)")
+    for name, values, smooth in (
+        ("as recalled", (recall.gain, recall.fidelity), None),
+        (f"averaged over T1 = {window:.0f} t_c", (recall.windowed_gain, recall.windowed_fidelity), bins),
+    ):
+        curves = [jnp.asarray(curve) for curve in (recall.p_sig, recall.J)]
+        if smooth is not None:
+            curves = [analysis.running_mean(curve, smooth) for curve in curves]
+        signal, integral = map(np.asarray, curves)
+        errors = analysis.errors_over_signals(signal, integral, scale)
+        pairs = zip(values, errors, strict=True)
+        table.add_row(name, *(f"{float(value):.3f} ± {error:.3f}" for value, error in pairs))
+    return table
 
 
 def published(file: str = "six_signals.csv", **conditions: str | float) -> list[dict[str, Any]]:
@@ -45,8 +100,9 @@ def _number(cell: str) -> str | float:
         return cell
 
 
-def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
+def summary(recall: Recall) -> dict[str, Any]:
     """The numbers of one recall and its resolved configuration, for JSON output and `recall_table`."""
+    configuration = recall.configuration
     readout = recall.stages[recall.protocol.reads[0]]
     pressure = np.asarray(readout.pressure)
     unit = Material().modulus
@@ -71,7 +127,7 @@ def summary(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
         "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
         "status_text": explain(status),
         "note": note_on_size(configuration),
-        "signals": _signals(recall, configuration),
+        "signals": _signals(recall),
         **second_readout(recall, configuration),
         **of_target(recall, configuration),
     }
@@ -88,10 +144,10 @@ def note_on_size(configuration: dict[str, Any]) -> str:
     )
 
 
-def _signals(recall: Recall, configuration: dict[str, Any]) -> list[dict[str, Any]]:
+def _signals(recall: Recall) -> list[dict[str, Any]]:
     """What is said of each signal by itself."""
-    measures = of_each(recall, configuration)
-    rows = zip(signal_names(recall, configuration), *(values.tolist() for values in measures.values()), strict=True)
+    measures = of_each(recall)
+    rows = zip(recall.names, *(values.tolist() for values in measures.values()), strict=True)
     return [
         dict(zip(("signal", *(name.removeprefix("signal_") for name in measures)), row, strict=True)) for row in rows
     ]
@@ -105,7 +161,7 @@ def of_target(recall: Recall, configuration: dict[str, Any]) -> dict[str, Any]:
     """Gain and fidelity with respect to the J that the waveforms were designed for; {} for waveforms that were not."""
     if "target" not in configuration:
         return {}
-    wanted = bin_average(signals_from(configuration["target"]))
+    wanted = bin_average(signals_from_dict(configuration["target"]))
     match = analysis.compare(jnp.asarray(recall.p_sig), wanted, relative_scale(configuration))
     return {"target_gain": float(match.gain), "target_fidelity": float(match.fidelity)}
 
@@ -291,32 +347,29 @@ def pack_table(pack: Pack) -> Table:
     unit = Material().modulus
     rest = pack.info.get("at_rest", {})
     recipe = pack.info.get("recipe", {})
-    table = Table(title=f"Pack {pack.name}", show_header=False)
-    rows: list[tuple[str, str]] = [
-        ("grains", f"{pack.grains} {pack.clump.shape}"),
-        ("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)) + " R"),
-        ("cycled with delta0", f"{float(pack.delta0):g}"),
-        ("ringing period T1", f"{float(pack.ringing_period):.1f} t_c"),
-        ("candidate contacts", f"{int(np.asarray(pack.pairs.valid).sum())}"),
+    rows = [
+        Fact("grains", f"{pack.grains} {pack.clump.shape}"),
+        Fact("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)), "R"),
+        Fact("cycled with delta0", f"{float(pack.delta0):g}"),
+        Fact("ringing period T1", f"{float(pack.ringing_period):.1f}", "t_c"),
+        Fact("candidate contacts", int(np.asarray(pack.pairs.valid).sum())),
     ]
     if rest:
         pressures = ", ".join(f"{p * unit / 1e3:.2f}" for p in rest["pressure"])
         rows += [
-            ("filling phi", f"{rest['filling']:.4f}"),
-            ("coordination Z (grain pairs)", f"{rest['coordination']:.2f}"),
-            ("sphere contacts, times two, per grain", f"{rest['contacts']:.2f}"),
-            *(
-                [("contacts per grain, with walls", f"{0.5 * rest['contacts'] + rest['wall_contacts']:.2f}")]
-                if "wall_contacts" in rest
-                else []
-            ),
-            ("p_x, p_y, p_z", f"{pressures} kPa"),
-            ("largest speed", f"{rest['largest_speed']:.1e} R/t_c"),
+            Fact("filling phi", f"{rest['filling']:.4f}"),
+            Fact("coordination Z (grain pairs)", f"{rest['coordination']:.2f}"),
+            Fact("sphere contacts, times two, per grain", f"{rest['contacts']:.2f}"),
         ]
+        with_walls = 0.5 * rest["contacts"] + rest["wall_contacts"]
+        rows.append(Fact("contacts per grain, with walls", f"{with_walls:.2f}"))
+        rows.append(Fact("p_x, p_y, p_z", pressures, "kPa"))
+        rows.append(Fact("largest speed", f"{rest['largest_speed']:.1e}", "R/t_c"))
         if (met := pressure_over_wanted(pack.info)) is not None:
-            rows.append(("p_z over the wanted one", f"{met:.2f}"))
+            rows.append(Fact("p_z over the wanted one", f"{met:.2f}"))
     if recipe:
-        rows.append(("seed", str(recipe["seed"])))
-    for key, value in rows:
-        table.add_row(key, value)
+        rows.append(Fact("seed", recipe["seed"]))
+    table = Table(title=f"Pack {pack.name}", show_header=False)
+    for fact in rows:
+        table.add_row(fact.name, fact.text)
     return table

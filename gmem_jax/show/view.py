@@ -1,4 +1,4 @@
-"""A pack in three dimensions, in a page of its own: `pack.view()` in a notebook, and figures of a report."""
+"""A pack in three dimensions, in a page of its own: `gm.view(pack)` in a notebook, and figures of a report."""
 
 import base64
 import html

@@ -1,12 +1,14 @@
 """What is recorded of every bin, and what is checked at its end."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from gmem_jax.physics.contact.friction import largest_overlap
+from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import slack, sphere_centres
 from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import dot, matrix
@@ -14,37 +16,104 @@ from gmem_jax.physics.state import Box, State, Status
 from gmem_jax.physics.step import System
 
 
+class Measured(NamedTuple):
+    """What files, pictures, pages and docs/files.md say of a field of a `Sample`.
+
+    Attributes:
+        unit: of the values.
+        description: what it is.
+        dimensions: of the values in one bin.
+        plot: what a picture of it is called; "" for none.
+        label: of its axis in pictures.
+        plot_unit: of the values in pictures.
+        plot_factor: from the values to those in pictures.
+        log: whether the axis is logarithmic.
+        symbol: of one component, for vectors.
+    """
+
+    unit: str
+    description: str
+    dimensions: tuple[str, ...] = ("replica",)
+    plot: str = ""
+    label: str = ""
+    plot_unit: str = ""
+    plot_factor: float = 1.0
+    log: bool = False
+    symbol: str = ""
+
+
+def measured(unit: str, description: str, *more: Any, **named: Any) -> Any:
+    """A field of a `Sample`; the arguments are those of `Measured`."""
+    return field(metadata={"measured": Measured(unit, description, *more, **named)})
+
+
+_VECTOR = ("axis", "replica")
+_KPA = float(Material().modulus) / 1e3
+
+
 @pytree
 @dataclass(frozen=True)
 class Sample:
-    """What is recorded of one bin of steps; a rollout adds a leading axis of bins.
+    """What is recorded of one bin of steps: arrays [B], or [3, B] of vectors; a rollout adds a leading axis of bins.
 
-    Attributes:
-        u: compression variable at the end of the bin, [B].
-        pressure: (p_x, p_y, p_z), mean of the two opposite walls at their instantaneous area, averaged over the
-            steps of the bin, [3, B], in E.
-        lengths: box edges at the end of the bin, [3, B], in R.
-        kinetic_energy: at the end of the bin, translation and rotation, [B], in E R^3.
-        largest_speed: at the end of the bin, [B], in R / t_c.
-        coordination: Z, touching grain pairs per grain times two, rattlers included, walls not, [B].
-        contacts: touching sphere pairs per grain times two, [B].
-        wall_contacts: spheres touching a wall per grain, once for each wall, [B].
-        filling: phi, volume of the grains over that of the box, [B].
-        largest_overlap: deepest sphere-sphere contact at the end of the bin, [B], in R.
-        inertial_number: I = (strain rate of the x axis) sqrt(m / (D p)), p the mean of p_x and p_y, [B]; 0 without p.
+    The fields and their units are in docs/files.md, which is made of their `measured`, as are files and pictures.
     """
 
-    u: jax.Array
-    pressure: jax.Array
-    lengths: jax.Array
-    kinetic_energy: jax.Array
-    largest_speed: jax.Array
-    coordination: jax.Array
-    contacts: jax.Array
-    wall_contacts: jax.Array
-    filling: jax.Array
-    largest_overlap: jax.Array
-    inertial_number: jax.Array
+    u: jax.Array = measured("1", "compression variable at the end of the bin", ())
+    pressure: jax.Array = measured(
+        "E",
+        "p_x, p_y, p_z, mean of two opposite walls, averaged over the steps of the bin",
+        _VECTOR,
+        plot="pressure",
+        label="pressure",
+        plot_unit="kPa",
+        plot_factor=_KPA,
+        symbol="p",
+    )
+    lengths: jax.Array = measured(
+        "R", "edges of the box at the end of the bin", _VECTOR, plot="box", label="edge of the box", symbol="L"
+    )
+    kinetic_energy: jax.Array = measured(
+        "E R^3",
+        "translation and rotation, at the end of the bin",
+        plot="energy",
+        label="kinetic energy",
+        log=True,
+    )
+    largest_speed: jax.Array = measured(
+        "R/t_c", "of a grain, at the end of the bin", plot="speed", label="largest speed of a grain", log=True
+    )
+    coordination: jax.Array = measured(
+        "1",
+        "Z, touching grain pairs per grain times two, rattlers included, walls not",
+        plot="Z",
+        label="coordination Z",
+    )
+    contacts: jax.Array = measured(
+        "1",
+        "touching sphere pairs per grain times two",
+        plot="contacts",
+        label="touching spheres per grain, times two",
+    )
+    wall_contacts: jax.Array = measured(
+        "1",
+        "spheres touching a wall per grain, once for each wall",
+        plot="wall_contacts",
+        label="spheres at walls per grain",
+    )
+    filling: jax.Array = measured(
+        "1", "phi, volume of the grains over that of the box", plot="phi", label=r"filling $\phi$"
+    )
+    largest_overlap: jax.Array = measured(
+        "R", "deepest sphere-sphere contact at the end of the bin", plot="overlap", label="largest overlap"
+    )
+    inertial_number: jax.Array = measured(
+        "1",
+        "I = strain rate of x times sqrt(m / (D p)), p = (p_x + p_y) / 2; 0 without pressure",
+        plot="inertial",
+        label="inertial number I",
+        log=True,
+    )
 
     @property
     def contacts_per_grain(self) -> jax.Array:
@@ -54,6 +123,10 @@ class Sample:
         `coordination` half as much (docs/physics.md).
         """
         return 0.5 * self.contacts + self.wall_contacts
+
+
+MEASURED: dict[str, Measured] = {entry.name: entry.metadata["measured"] for entry in fields(Sample)}
+"""What is said of the fields of a `Sample`, by name."""
 
 
 def check(system: System, state: State, box: Box) -> State:

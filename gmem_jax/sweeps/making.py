@@ -8,7 +8,7 @@ import numpy as np
 
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.files.provenance import sources
+from gmem_jax.experiment.provenance import sources
 from gmem_jax.physics import grain
 from gmem_jax.physics.material import Material
 from gmem_jax.preparation.recipe import Recipe, grain_steps
@@ -79,7 +79,7 @@ def require_prepared(experiment: Experiment, pack: str) -> None:
 
 
 def _prepared_with(pack: Pack) -> dict[str, float]:
-    """What is known of `FOLLOW` of a pack: an imported one says nothing of walls, older ones had rigid ones."""
+    """What is known of `FOLLOW` of a pack: an imported one says nothing of walls."""
     material = pack.info.get("material")
-    walls = {} if material is None else {"wall_rigidity": float(material.get("wall_rigidity", 1.0))}
+    walls = {} if material is None else {"wall_rigidity": float(material["wall_rigidity"])}
     return {"delta0": float(pack.delta0), **walls}

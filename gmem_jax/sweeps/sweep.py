@@ -101,7 +101,7 @@ def sweep(
     store = None if folder is None else Store(Path(folder))
     if store:
         store.remember([replace(one, values=_labels(one.values)) for one in points], {}, list(vary))
-    found = {one.key: store.load(one.key)[0] for one in points if store and store.at(one.key).is_file()}
+    found = {one.key: store.load(one.key) for one in points if store and store.at(one.key).is_file()}
     missing = list({one.key: one for one in points if one.key not in found}.values())
     jobs = list(groups(missing, ABREAST, psutil.virtual_memory().available))
     total, done = sum(one.experiment.replicas for one in missing) or 1, 0

@@ -13,12 +13,11 @@ from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import optional
 from gmem_jax.files.labelled import described, plain_cell
 from gmem_jax.files.measures import EACH, of_each
-from gmem_jax.files.recalls import signal_names
 from gmem_jax.physics.state import explain, together
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import WARNINGS
 
-TABLE_SCHEMA = "gmem-sweep-table/2"
+TABLE_SCHEMA = "gmem-sweep-table/0.1"
 FORMATS = (".csv", ".parquet", ".h5", ".nc")
 
 
@@ -36,7 +35,8 @@ def rows(store: Store) -> list[dict[str, Any]]:
         key = point["key"]
         row: dict[str, Any] = {name: _cell(point["values"].get(name)) for name in card["names"]}
         if store.at(key).is_file():
-            recall, configuration = store.load(key)
+            recall = store.load(key)
+            configuration = recall.configuration
             status = together(recall.status)
             row |= {"state": "done", **{name: float(getattr(recall, name)) for name in MEASURES}}
             row |= {"status": status, "why": explain(status) if status else ""}
@@ -125,16 +125,16 @@ def _dataset(store: Store, table: Sequence[dict[str, Any]]) -> Any:
     if not loaded:
         return data
     counts = np.zeros(len(table), int)
-    for place, (recall, _) in loaded.items():
+    for place, recall in loaded.items():
         counts[place] = len(recall.J)
-    u = np.asarray(next(iter(loaded.values()))[0].u)
+    u = np.asarray(next(iter(loaded.values())).u)
     blank = (len(table), counts.max())
     names = np.full(blank, "", object)
     values = {name: np.full((*blank, len(u)), np.nan) for name in ("p_sig", "J", "shear")}
     values |= {name: np.full(blank, np.nan) for name in EACH}
-    for place, (recall, configuration) in loaded.items():
-        own = {**vars(recall), **of_each(recall, configuration)}
-        names[place, : counts[place]] = signal_names(recall, configuration)
+    for place, recall in loaded.items():
+        own = {**vars(recall), **of_each(recall)}
+        names[place, : counts[place]] = recall.names
         for name, array in values.items():
             array[place, : counts[place]] = own[name]
     for name, array in values.items():

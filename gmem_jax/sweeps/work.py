@@ -28,7 +28,7 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import OtherCompressionWarning, Recall, run
 from gmem_jax.experiment.several import run_several
 from gmem_jax.files.checkpoints import Checkpoints, part_with
-from gmem_jax.files.configuration import experiment_from, resolved
+from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.packs import load_pack, save_pack
 from gmem_jax.files.programs import keep_programs
 from gmem_jax.physics.material import Material
@@ -60,7 +60,6 @@ def run_group(
     Raises:
         RunFailedError: if the simulation broke down.
     """
-    began = time.perf_counter()
     heard: list[warnings.WarningMessage] = []
     try:
         with warnings.catch_warnings(record=True) as heard:
@@ -72,10 +71,9 @@ def run_group(
         for one in heard:  # they are of the log too, or of who called
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     told = {WARNINGS: words} if (words := warned(heard)) else {}
-    seconds = (time.perf_counter() - began) / len(recalls)
     if store:
-        for key, experiment, recall in zip(keys, experiments, recalls, strict=True):
-            store.save(key, jax.block_until_ready(recall), {**resolved(experiment, seconds), **told})
+        for key, recall in zip(keys, recalls, strict=True):
+            store.save(key, recall.described({**recall.configuration, **told}))
     if cache:
         cache.discard()
     return dict(zip(keys, recalls, strict=True))
@@ -131,7 +129,7 @@ class _Worker:
 
     def _experiments(self, job: dict[str, Any]) -> list[Experiment]:
         try:
-            return [experiment_from(one, self.packs(one["pack"]["source"])) for one in job["configurations"]]
+            return [from_dict(one, self.packs(one["pack"]["source"])) for one in job["configurations"]]
         except (KeyError, TypeError, AttributeError) as error:
             raise FileFormatError(f"a job whose experiments are none: {error}") from error
 

@@ -83,7 +83,8 @@ def test_a_recall_writes_data_and_picture_and_prints_json(
     said = json.loads(capsys.readouterr().out)
     assert {"gain", "fidelity", "status", "seconds"} <= set(said)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["recall.h5", "recall.png"]
-    recall, configuration = gm.load_recall(target)
+    recall = gm.load_recall(target)
+    configuration = recall.configuration
     assert float(recall.fidelity) == said["fidelity"]
     assert configuration["t0"] == 75.0
     assert configuration["backend"] in ("jax", "native")
@@ -101,7 +102,7 @@ def test_a_users_waveform_is_recalled(
     arguments = ["--signals", tmp_path / "wave.csv", "-o", tmp_path / "out.h5", "--no-picture", "--json", *SHORT]
     assert gmem(monkeypatch, "recall", PACK, *arguments) == 0
     assert np.isfinite(json.loads(capsys.readouterr().out)["gain"])
-    recall, _ = gm.load_recall(tmp_path / "out.h5")
+    recall = gm.load_recall(tmp_path / "out.h5")
     assert np.asarray(recall.p_sig).shape == (1, 256)
 
 
@@ -111,7 +112,7 @@ def test_the_same_command_gives_the_same_numbers_bit_for_bit(
     recalls = []
     for name in ("one.h5", "two.h5"):
         assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / name, "--no-picture", *SHORT) == 0
-        recalls.append(gm.load_recall(tmp_path / name)[0])
+        recalls.append(gm.load_recall(tmp_path / name))
     np.testing.assert_array_equal(recalls[0].p_sig, recalls[1].p_sig)
 
 
@@ -128,7 +129,7 @@ def one_bit(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("words") / "words.h5"
     run = {"t0": 75.0, "store": 0.1, "rest": 0.1, "hold": 0.1}
     experiment = gm.Experiment(gm.load_pack(PACK), gm.words(1), background="sub2-bl", **run)
-    gm.save_recall(file, gm.run(experiment), gm.resolved(experiment, 1.0))
+    gm.save_recall(file, gm.run(experiment))
     return file
 
 
@@ -157,12 +158,12 @@ def test_recalled_words_are_classified_and_the_nets_are_used_again(
     spoken = capsys.readouterr()
     said = json.loads(spoken.out)
     stored = json.loads(target.read_text())
-    assert stored.pop("schema") == "gmem-reading/1"
+    assert stored.pop("schema") == "gmem-reading/0.1"
     assert set(stored.pop("about")) == set(said)
     assert stored == said
     assert (said["bits"], said["background"]) == (1, "sub2-bl")
     # A drive as fast as this is doubtful, and so is what is read from it.
-    assert said["status"] == np.bitwise_or.reduce(gm.load_recall(one_bit)[0].status) != 0
+    assert said["status"] == np.bitwise_or.reduce(gm.load_recall(one_bit).status) != 0
     assert gm.explain(said["status"]) in " ".join(spoken.err.split())
     assert [net["finished"] for net in said["nets"]] == [True, True]
     assert set(said["readers"]) == {"net", "nearest template", "linear decoder"}
@@ -237,7 +238,7 @@ BAD = [
     (["recall", "{pack}", "--signals", "{short.csv}", "-o", "{out}"], "at least 2 samples"),
     (["recall", "{pack}", "--friction", "glue", "-o", "{out}"], "friction must be one of frictionless, hooke, m1, m2"),
     (["recall", "{truncated.h5}", "-o", "{out}"], "its checksum does not fit its content"),
-    (["recall", "{schema.h5}", "-o", "{out}"], "schema is 'gmem-pack/99', expected 'gmem-pack/2'"),
+    (["recall", "{schema.h5}", "-o", "{out}"], "schema is 'gmem-pack/99', expected 'gmem-pack/0.1'"),
     (["recall", "no-such-pack", "-o", "{out}"], "neither a file nor a shipped pack"),
     (["recall", "{pack}", "-o", "/proc/recall.h5"], "cannot write there"),
     (["demo", "--packs", "tetra-7"], "no such shipped pack"),
@@ -247,7 +248,7 @@ BAD = [
         "--signals words:13: words need a length from 1 to 12",
     ),
     (["recall", "{pack}", "--signals", "words", "-o", "{out}"], "words need a length from 1 to 12, as in words:3"),
-    (["classify", "{pack}", "-o", "{json}"], "schema is 'gmem-pack/2', expected 'gmem-recall/4'"),
+    (["classify", "{pack}", "-o", "{json}"], "schema is 'gmem-pack/0.1', expected 'gmem-recall/0.1'"),
     (["classify", "{truncated.h5}", "-o", "{json}"], "its checksum does not fit its content"),
     (["classify", "nothing.h5", "-o", "{json}"], "nothing.h5: no such file"),
     (["classify", "nothing.h5", "--seeds", "0", "-o", "{out}"], "'--seeds'"),

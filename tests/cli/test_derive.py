@@ -115,7 +115,8 @@ def test_a_recall_of_designed_waveforms_is_compared_with_their_target_too(
     gm.save_waveforms(waves, own, gm.six_signals())
     assert gmem(monkeypatch, "recall", PACK, "-o", out, "--signals", waves, "--no-picture", "--json", *SHORT) == 0
     said = json.loads(capsys.readouterr().out)
-    recall, configuration = gm.load_recall(out)
+    recall = gm.load_recall(out)
+    configuration = recall.configuration
     experiment = gm.Experiment(gm.load_pack(PACK), gm.six_signals())
     match = experiment.compare(recall.p_sig)
     assert said["target_fidelity"] == pytest.approx(float(match.fidelity), rel=1e-12)

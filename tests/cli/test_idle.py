@@ -67,5 +67,5 @@ def test_samples_of_an_instrument_are_recalled_on_request_in_one_line(
     assert len(told) == 1
     for words in ("time (s) from 0 to 0.99 is u from 0 to 1", "smoothed", "brought to zero", "divided by"):
         assert words in told[0]
-    kept, _ = gm.load_recall(tmp_path / "x.h5")
+    kept = gm.load_recall(tmp_path / "x.h5")
     assert float(abs(kept.shear).max()) == pytest.approx(1.0, abs=1e-3)

@@ -112,9 +112,9 @@ def test_names_of_the_paper_are_accepted_in_any_case(
     options = ["--friction", "M1", "--background", "SUB2", "--no-picture", "--json", "-o", tmp_path / "out.h5"]
     assert gmem(monkeypatch, "recall", PACK, *options, *SHORT) == 0
     capsys.readouterr()
-    _, configuration = gm.load_recall(tmp_path / "out.h5")
+    configuration = gm.load_recall(tmp_path / "out.h5").configuration
     assert (configuration["friction"], configuration["background"]) == ("m1", "sub2")
-    again = gm.experiment_from(configuration["experiment"])
+    again = gm.from_dict(configuration["experiment"])
     assert isinstance(again.friction, gm.MindlinRescaled)
 
 
@@ -123,7 +123,7 @@ def test_published_points_stand_only_beside_what_they_were_measured_on() -> None
 
     def points(**changes: object) -> int:
         experiment = gm.replace(gm.Experiment(pack, gm.six_signals()), changes)
-        return len(tables._comparable(gm.resolved(experiment, 1.0)))
+        return len(tables._comparable(gm.describe(experiment, 1.0)))
 
     assert points() == 1
     assert points(signals=gm.words(3)) == 0

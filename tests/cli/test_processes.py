@@ -173,7 +173,7 @@ def test_first_checkpoints_come_soon_and_later_ones_seldom(tmp_path: Path, monke
     def run(checkpoint: Any) -> np.ndarray:
         for second in range(1000):
             now[0] = float(second)
-            checkpoint.reached(lambda: kept.append(now[0]) or np.zeros(1))
+            checkpoint.maybe_save(lambda: kept.append(now[0]) or np.zeros(1))
         return np.zeros(1)
 
     Checkpoints(tmp_path / "parts", {})("one", run)
@@ -185,10 +185,10 @@ def test_who_must_leave_keeps_a_checkpoint_first(tmp_path: Path) -> None:
     kept = Checkpoints(tmp_path / "parts", {})
 
     def run(checkpoint: Any) -> None:
-        checkpoint.reached(lambda: np.zeros(3))
+        checkpoint.maybe_save(lambda: np.zeros(3))
         assert kept.begun() == 0
         part_with(lambda: sys.exit(7))
-        checkpoint.reached(lambda: np.ones(3))
+        checkpoint.maybe_save(lambda: np.ones(3))
 
     with pytest.raises(SystemExit, match="7"):
         kept("one", run)
@@ -204,9 +204,9 @@ def test_who_must_leave_keeps_a_checkpoint_first(tmp_path: Path) -> None:
 def test_ctrl_c_says_how_to_go_on(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, keeps: bool
 ) -> None:
-    def run(*_: Any, keep: Checkpoints, **__: Any) -> None:
+    def run(*_: Any, cache: Checkpoints, **__: Any) -> None:
         if keeps:
-            keep("batch-0000", lambda _: np.zeros(1))
+            cache("batch-0000", lambda _: np.zeros(1))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(recalls, "run", run)
@@ -224,7 +224,7 @@ def test_ctrl_c_before_a_run_says_that_nothing_was_written(
     def interrupt(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(recalls, "film_of", interrupt)
+    monkeypatch.setattr(recalls, "batch_for", interrupt)
     assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "o.h5") == 130
     assert "interrupted; nothing was written" in capsys.readouterr().err
 

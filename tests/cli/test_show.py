@@ -16,7 +16,8 @@ from gmem_jax.files import schemas
 from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.show import recalls
-from gmem_jax.show.kinds import PLOTS
+from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.summaries import PLOTS
 from gmem_jax.sweeps.plan import point
 from gmem_jax.sweeps.store import Store
 
@@ -27,8 +28,8 @@ RUN = {"seconds": 1.0, "status": 0, "configuration": {}}
 def folder(recalled: tuple[gm.Experiment, gm.Recall], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file of every kind."""
     folder, (experiment, found) = tmp_path_factory.mktemp("files"), recalled
-    configuration = gm.resolved(experiment, 1.0)
-    gm.save_recall(folder / "recall.h5", found, configuration)
+    configuration = gm.describe(experiment, 1.0)
+    gm.save_recall(folder / "recall.h5", found)
     gm.save_pack(folder / "pack.h5", experiment.pack, {"cycle 1: compress": found.stages["compress"]})
     bumps = np.random.default_rng(0).normal(size=(2, 5, 256))
     kernel = MemoryKernel(np.asarray(found.u), np.linspace(0.1, 0.9, 5), 0.2, *bumps, 1e-3, 0.05)
@@ -63,7 +64,7 @@ def folder(recalled: tuple[gm.Experiment, gm.Recall], tmp_path_factory: pytest.T
     points = [point({"mu": mu}, gm.replace(experiment, {"friction.mu": mu})) for mu in (0.5, 1.0)]
     store.remember(points, {}, ["mu"])
     for one in points:
-        store.save(one.key, found, configuration)
+        store.save(one.key, found)
     return folder
 
 
@@ -217,7 +218,7 @@ def test_frames_at_no_compression_are_refused_before_anything_is_run(
 def test_frames_at_chosen_compressions_are_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, folder: Path) -> None:
     quick = ["--t0", "75", "--rest", "0.1", "--hold", "0.1", "--store", "0.1", "--no-picture", "--frames-at", "0.5"]
     assert gmem(monkeypatch, "recall", folder / "pack.h5", *quick, "-o", tmp_path / "r.h5") == 0
-    frames = gm.load_recall(tmp_path / "r.h5")[0].frames
+    frames = gm.load_recall(tmp_path / "r.h5").frames
     assert frames is not None
     assert frames.stages == ("compress", "decompress", "encode", "readout")
     np.testing.assert_allclose(frames.u, 0.5)
@@ -225,11 +226,11 @@ def test_frames_at_chosen_compressions_are_kept(monkeypatch: pytest.MonkeyPatch,
 
 def test_chosen_signals_are_the_columns_of_their_replicas(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
     experiment, recall = recalled
-    (axis,) = recall.plot("p_xy", experiment, signals=[2]).figure.axes
+    (axis,) = gm.plot(recall, "p_xy", experiment, signals=[2]).figure.axes
     pressure = np.asarray(recall.stages["readout"].pressure)[:, :, 2]
     lines = [line for line in axis.lines if len(line.get_xdata()) > 2]
     np.testing.assert_allclose(lines[-1].get_ydata() / (pressure[:, 0] - pressure[:, 1]), gm.Material().modulus)
-    figure = recall.plot("signals", experiment, signals=[2]).figure
+    figure = gm.plot(recall, "signals", experiment, signals=[2]).figure
     assert [axis.get_title() for axis in figure.axes if axis.get_title()] == ["1"]
     np.testing.assert_allclose(figure.axes[0].lines[1].get_ydata(), gm.Material().modulus * recall.p_sig[1])
     assert "of all 2 signals" in " ".join(figure._suptitle.get_text().split())
@@ -241,7 +242,7 @@ def test_chosen_signals_are_the_columns_of_their_replicas(recalled: tuple[gm.Exp
         (["recall.h5", "--plot", "Z", "--signal", "3", "-o", "x.png"], "can show 1 to 2, and 0, the zero signal"),
         (["recall.h5", "--plot", "signals", "--signal", "0", "-o", "x.png"], "signal 0: this picture can show 1 to 2"),
         (["recall.h5", "--plot", "Z", "--signal", "one", "-o", "x.png"], "numbers with commas between"),
-        (["recall.h5", "--signal", "1"], "say what with --plot"),
+        (["recall.h5", "--signal", "1"], "does nothing unless something is drawn with --plot"),
         (["pack.h5", "--plot", "phi", "--signal", "1", "-o", "x.png"], "holds no recall"),
         (["swept", "--plot", "gain", "--signal", "1", "-o", "x.png"], "name the file of a point"),
     ],
@@ -263,10 +264,12 @@ def test_a_choice_of_signals_that_cannot_be_is_refused_in_a_line(
 
 def test_where_a_drive_rings_the_mean_over_the_ringing_is_drawn(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
     experiment, recall = recalled
-    labels = [text.get_text() for text in recall.plot("signals", experiment).figure.legends[0].get_texts()]
+    labels = [text.get_text() for text in gm.plot(recall, "signals", experiment).figure.legends[0].get_texts()]
     assert recalls.MEAN in labels
-    slow = dict(gm.resolved(experiment, 0.0), t0=1.8e4)
-    labels = [text.get_text() for text in recalls.recall_drawing(recall, "signals", slow).figure.legends[0].get_texts()]
+    slow = dict(gm.describe(experiment, 0.0), t0=1.8e4)
+    labels = [
+        text.get_text() for text in render(recalls.recall_figure(recall, "signals", slow)).figure.legends[0].get_texts()
+    ]
     assert recalls.MEAN not in labels
 
 
@@ -276,7 +279,7 @@ def test_more_signals_than_fit_are_said_to_be_more(
     monkeypatch.setattr(recalls, "MOST", 4)
     many = {name: np.tile(getattr(recalled[1], name), (40, 1)) for name in ("J", "shear", "p_sig")}
     recall = type(recalled[1])(**{**vars(recalled[1]), **many})
-    figure = recalls.signals_drawing(recall, [f"{number:07b}" for number in range(80)], "a pack").figure
+    figure = render(recalls.signals_figure(recall, [f"{number:07b}" for number in range(80)], "a pack")).figure
     assert "the first 4 of 80 signals are shown" in " ".join(figure._suptitle.get_text().split())
     assert [axis.get_title() for axis in figure.axes[:3]] == ["0000000", "0000001", "0000010"]
 

@@ -16,8 +16,9 @@ import gmem_jax as gm
 from gmem_jax.errors import FileFormatError
 from gmem_jax.files.home import kept, kept_pack
 from gmem_jax.physics.rules import StartError
-from gmem_jax.show import figures
-from gmem_jax.show.drawing import blank
+from gmem_jax.show import summaries
+from gmem_jax.show.figure import Curve, Figure, Panel
+from gmem_jax.show.render_matplotlib import pyplot, render, save
 
 ENTRY = [sys.executable, "-c", "import sys; sys.argv[0] = 'gmem'; from gmem_start import main; main()"]
 
@@ -108,12 +109,13 @@ def test_a_fault_of_jax_is_not_called_one_of_the_file(monkeypatch: pytest.Monkey
 
 def test_pictures_need_no_latex_whatever_the_settings_of_matplotlib(tmp_path: Path) -> None:
     with matplotlib.rc_context({"text.usetex": True}):
-        drawing, axes = blank(size=(3.0, 2.0))
-        axes[0, 0].plot([0.0, 1.0], label="50 % & more")
-        axes[0, 0].legend()
-        drawing.save(tmp_path / "drawing.png")
+        curve = Curve(np.arange(2.0), np.arange(2.0), "50 % & more")
+        render(Figure((Panel((curve,)),), legend="panel")).save(tmp_path / "drawing.png")
     with matplotlib.rc_context({"text.usetex": True}):
-        figures.gradient_figure(tmp_path / "pyplot.png", [(np.arange(3), np.arange(3))], "a_b")
+        figure, axis = pyplot().subplots()
+        axis.plot([0.0, 1.0])
+        axis.set_title("a_b")
+        save(tmp_path / "pyplot.png", figure)
     assert {path.name for path in tmp_path.iterdir()} == {"drawing.png", "pyplot.png"}
 
 
@@ -123,7 +125,7 @@ def test_a_picture_that_cannot_be_drawn_loses_no_table(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("latex could not be found")
 
-    monkeypatch.setattr(figures, "recall_figure", broken)
+    monkeypatch.setattr(summaries, "recall_figure", broken)
     assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "x.h5", *SHORT) == 0
     captured = capsys.readouterr()
     assert f"warning: {tmp_path / 'x.png'}: could not be drawn (latex could not be found)" in captured.err

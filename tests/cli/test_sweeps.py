@@ -61,9 +61,10 @@ def test_points_are_what_recalls_of_them_are(swept: Path) -> None:
     for row in card["points"][:4]:
         values = {"friction.mu": row["values"]["mu"], "background": row["values"]["background"]}
         alone = gm.run(gm.replace(gm.Experiment(pack, gm.six_signals(), t0=150.0, store=0.2), values))
-        kept, configuration = gm.load_recall(swept / "points" / f"{row['key']}.h5")
+        kept = gm.load_recall(swept / "points" / f"{row['key']}.h5")
+        configuration = kept.configuration
         np.testing.assert_array_equal(kept.p_sig, alone.p_sig)
-        again = gm.experiment_from(configuration["experiment"])
+        again = gm.from_dict(configuration["experiment"])
         assert (again.friction.mu, again.background) == tuple(values.values())
 
 
@@ -93,7 +94,7 @@ def test_status_show_and_export_tell_the_same(
     assert pyarrow.parquet.read_table(tmp_path / "table.parquet").column("fidelity").to_pylist()[0] == two[0]
     with xarray.open_dataset(tmp_path / "table.nc", engine="h5netcdf") as data:
         assert dict(data.sizes) == {"point": 5, "signal": 6, "u": 256}
-        kept, _ = gm.load_recall(swept / "points" / f"{data.key.values[0]}.h5")
+        kept = gm.load_recall(swept / "points" / f"{data.key.values[0]}.h5")
         np.testing.assert_array_equal(data.p_sig[0], kept.p_sig)
         assert float(data.fidelity[0]) == two[0]
     assert gmem(monkeypatch, "sweep", "export", swept, "-o", tmp_path / "table.csv") == 2
@@ -133,7 +134,7 @@ def test_workers_that_are_killed_are_replaced_and_change_no_bit(swept: Path, tmp
     assert killed
     assert sweep.returncode == 0, (tmp_path / "log").read_text()
     for path in (tmp_path / "mu" / "points").iterdir():
-        one, other = (gm.load_recall(folder / "points" / path.name)[0] for folder in (tmp_path / "mu", swept))
+        one, other = (gm.load_recall(folder / "points" / path.name) for folder in (tmp_path / "mu", swept))
         np.testing.assert_array_equal(one.p_sig, other.p_sig)
     assert len(list((tmp_path / "mu" / "points").iterdir())) == 4
 

@@ -99,7 +99,7 @@ def main() -> None:
         points = sorted(path.name for path in (folder / "here" / "points").glob("*.h5"))
         assert len(points) == 6
         for point in points:
-            one, two = (gm.load_recall(folder / store / "points" / point)[0] for store in ("slurm", "here"))
+            one, two = (gm.load_recall(folder / store / "points" / point) for store in ("slurm", "here"))
             np.testing.assert_array_equal(one.p_sig, two.p_sig)
         print("six points, the same bits", flush=True)
         waits_and_stops(folder)

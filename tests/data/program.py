@@ -40,8 +40,9 @@ def main(folder: Path) -> float:
     pack = gm.load_pack(names[0])
     experiment = experiment_on(pack, 0.6)
     recall: gm.Recall = gm.run(experiment, batch=3, frames=4, progress=watch)
-    gm.save_recall(folder / "recall.h5", recall, gm.resolved(experiment, seconds=0.0))
-    stored, configuration = gm.load_recall(str(folder / "recall.h5"))
+    gm.save_recall(folder / "recall.h5", recall)
+    stored = gm.load_recall(str(folder / "recall.h5"))
+    configuration = stored.configuration
     gradient = gm.value_and_grad(experiment, ["gamma0", "friction.mu"], loss=power, progress=False)
     slope: float = float(gradient.slope["friction.mu"])
     kernel = gm.memory_kernel(gm.replace(experiment, {"friction.mu": 0.3}, background="sub2"), n=9)

@@ -245,7 +245,7 @@ def test_a_broken_run_has_no_gradient_either() -> None:
     ids=["bumps", "all fields", "m2", "m1", "replicas", "six", "words", "samples", "shipped"],
 )
 def test_the_written_form_reads_back_to_the_same_experiment(experiment: gm.Experiment) -> None:
-    again = gm.experiment_from(json.loads(json.dumps(gm.written(experiment))))
+    again = gm.from_dict(json.loads(json.dumps(gm.to_dict(experiment))))
     assert jax.tree.structure(again) == jax.tree.structure(experiment)
     for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(experiment), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -253,14 +253,14 @@ def test_the_written_form_reads_back_to_the_same_experiment(experiment: gm.Exper
 
 
 def test_a_written_form_of_another_pack_is_refused() -> None:
-    form = gm.written(make())
+    form = gm.to_dict(make())
     moved = gm.pack_from(PACK, position=PACK.position * 0.999, quaternion=PACK.quaternion)
     with pytest.raises(gm.FileFormatError, match="its content has changed"):
-        gm.experiment_from(form, moved)
+        gm.from_dict(form, moved)
     with pytest.raises(gm.FileFormatError, match="no field 'gama0'"):
-        gm.experiment_from({**form, "gama0": 1.0}, PACK)
+        gm.from_dict({**form, "gama0": 1.0}, PACK)
     with pytest.raises(gm.FileFormatError, match="'t0' is missing"):
-        gm.experiment_from({name: value for name, value in form.items() if name != "t0"}, PACK)
+        gm.from_dict({name: value for name, value in form.items() if name != "t0"}, PACK)
 
 
 def test_replace_knows_every_field_by_keyword_and_by_name() -> None:

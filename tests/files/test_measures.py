@@ -11,9 +11,8 @@ from gmem_jax.show.tables import summary
 
 
 def test_each_signal_has_measures_of_its_own(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
-    experiment, recall = recalled
-    configuration = gm.resolved(experiment, 1.0)
-    found = of_each(recall, configuration)
+    _, recall = recalled
+    found = of_each(recall)
     for number, (p_sig, integral) in enumerate(zip(recall.p_sig, recall.J, strict=True)):
         template = 0.05 * 1e-3 * integral
         gain = (template @ p_sig) / (template @ template)
@@ -23,7 +22,7 @@ def test_each_signal_has_measures_of_its_own(recalled: tuple[gm.Experiment, gm.R
             found["signal_fidelity"][number], 1.0 - np.sqrt((miss @ miss) / (p_sig @ p_sig)), rtol=1e-9
         )
         assert abs(found["signal_correlation"][number]) <= 1.0
-    rows = summary(recall, configuration)["signals"]
+    rows = summary(recall)["signals"]
     assert [row["signal"] for row in rows] == ["0", "1"]
     assert rows[1]["fidelity"] == found["signal_fidelity"][1]
 
@@ -32,7 +31,7 @@ def test_files_take_about_the_bytes_that_were_foreseen(
     tmp_path: Path, recalled: tuple[gm.Experiment, gm.Recall]
 ) -> None:
     experiment, recall = recalled
-    gm.save_recall(tmp_path / "recall.h5", recall, gm.resolved(experiment, 1.0))
+    gm.save_recall(tmp_path / "recall.h5", recall)
     assert 0.8 < recall_bytes(experiment) / (tmp_path / "recall.h5").stat().st_size < 1.25
     for name in ("tetra-325-b", "tetra-3267-d"):
         size = (Path(gm.__file__).parent / "packs" / f"{name}.h5").stat().st_size

@@ -4,7 +4,7 @@ import subprocess
 import sys
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import jax
@@ -14,17 +14,20 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment.pack import stack
+from gmem_jax.experiment.record import to_dict
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import Checkpoints, load_part, locked, save_part
-from gmem_jax.files.configuration import experiment_from, written
+from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.exported import frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import writing
+from gmem_jax.files.packs import load_stages
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.state import Grains, State
 from gmem_jax.simulation.sample import Sample
 
 PACK = TETRA_27
+CYCLE = ("rest", "compress", "hold", "decompress")
 
 
 def test_a_pack_survives_the_file_bit_for_bit(tmp_path: Path) -> None:
@@ -48,7 +51,7 @@ def test_a_pack_survives_the_file_bit_for_bit(tmp_path: Path) -> None:
         (lambda pack: replace(pack, record="[]"), "its record is not a JSON object"),
         (lambda pack: replace(pack, position=2.0 * pack.position), "a grain lies outside the box"),
         (lambda pack: replace(pack, quaternion=1.1 * pack.quaternion), "a quaternion is not of length 1"),
-        (lambda pack: replace(pack, ringing_period=pack.ringing_period * -1.0), "its ringing period is not positive"),
+        (lambda pack: replace(pack, ringing_period=pack.ringing_period * -1.0), "its ringing period is -19.6"),
         (lambda pack: stack([pack, pack]), r"'position' has shape \[2, 27, 3\]"),
         (lambda pack: replace(pack, position=pack.position.astype("float32")), "its numbers are in single precision"),
     ],
@@ -73,7 +76,7 @@ def test_frames_and_stages_that_could_not_be_read_are_not_written(tmp_path: Path
         with pytest.raises(gm.FileFormatError, match=reason):
             gm.save_pack(tmp_path / "a.h5", pack, frames=wrong)
     with pytest.raises(gm.FileFormatError, match="'gas/1' is no name of a stage"):
-        gm.save_pack(tmp_path / "a.h5", pack, {"gas/1": Sample(*[np.zeros(1)] * 10)})
+        gm.save_pack(tmp_path / "a.h5", pack, {"gas/1": Sample(*[np.zeros(1)] * len(fields(Sample)))})
     assert not list(tmp_path.iterdir())
     gm.save_pack(tmp_path / "a.h5", pack, frames=frames)
     assert load_frames(tmp_path / "a.h5").count == 1
@@ -81,11 +84,11 @@ def test_frames_and_stages_that_could_not_be_read_are_not_written(tmp_path: Path
 
 def test_a_pack_with_another_ringing_period_is_another_pack() -> None:
     pack = gm.load_pack(PACK)
-    experiment = written(gm.Experiment(pack, gm.six_signals()))
+    experiment = to_dict(gm.Experiment(pack, gm.six_signals()))
     other = replace(pack, ringing_period=1.1 * pack.ringing_period)  # F over T1 would be another
-    assert experiment_from(experiment, pack).pack is pack
+    assert from_dict(experiment, pack).pack is pack
     with pytest.raises(gm.FileFormatError, match="not the pack that this was made with"):
-        experiment_from(experiment, other)
+        from_dict(experiment, other)
 
 
 def test_a_truncated_file_is_refused(tmp_path: Path) -> None:
@@ -100,13 +103,13 @@ def test_another_schema_is_refused_and_named(tmp_path: Path) -> None:
     other = tmp_path / "other.h5"
     with writing(other, "gmem-pack/99"):
         pass
-    with pytest.raises(gm.FileFormatError, match="'gmem-pack/99', expected 'gmem-pack/2'"):
+    with pytest.raises(gm.FileFormatError, match=r"'gmem-pack/99', expected 'gmem-pack/0\.1'"):
         gm.load_pack(other)
 
 
 def test_a_file_without_its_data_is_refused(tmp_path: Path) -> None:
     empty = tmp_path / "empty.h5"
-    with writing(empty, "gmem-pack/2"):
+    with writing(empty, "gmem-pack/0.1"):
         pass
     with pytest.raises(gm.FileFormatError, match="incomplete"):
         gm.load_pack(empty)
@@ -224,10 +227,19 @@ def test_a_bad_waveform_file_is_refused(tmp_path: Path, text: str, words: str) -
         gm.load_waveforms(tmp_path / "bad.csv")
 
 
-@pytest.mark.parametrize("name", [f"tetra-325-{letter}" for letter in "abcde"])
+@pytest.mark.parametrize("name", gm.list_packs())
 def test_every_shipped_pack_is_at_rest_and_says_how_it_was_made(name: str) -> None:
-    pack = gm.load_pack(name)
-    assert pack.grains == 325
-    assert pack.info["recipe"]["seed"] == "abcde".index(name[-1]) + 1
+    pack, (_, grains, letter) = gm.load_pack(name), name.split("-")
+    assert (pack.name, pack.grains) == (name, int(grains))
+    assert pack.info["recipe"]["seed"] == "abcde".index(letter) + 1
     assert pack.info["at_rest"]["largest_speed"] <= pack.info["recipe"]["quiet"]
-    assert 20.0 < float(pack.ringing_period) < 60.0
+    assert 20.0 < float(pack.ringing_period) < 200.0
+    assert set(pack.info["material"]) == {entry.name for entry in fields(gm.Material)}
+
+
+@pytest.mark.parametrize("name", ["tetra-325-a", "tetra-1024-b"])
+def test_shipped_packs_keep_the_stages_of_their_preparation(name: str) -> None:
+    stages = load_stages(name)
+    assert list(stages) == [*(f"cycle {number}: {kind}" for number in (1, 2) for kind in CYCLE), "rest"]
+    for kind, ends in {"compress": (1 / 256, 1.0), "hold": (1.0, 1.0), "decompress": (255 / 256, 0.0)}.items():
+        np.testing.assert_array_equal(stages[f"cycle 2: {kind}"].u[[0, -1], 0], ends)

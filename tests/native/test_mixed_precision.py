@@ -10,7 +10,8 @@ from scenes import SPHERE, TETRA_27, Motion, advance_by, scene
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.files.configuration import experiment_from, key_of_run, written
+from gmem_jax.experiment.record import key_of_run, to_dict
+from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.named import named_experiment
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.state import State, replicate
@@ -111,9 +112,9 @@ def test_results_say_their_precision_and_are_kept_apart() -> None:
     mixed = named_experiment(PACK, {"precision": "mixed"})
     assert (double.precision, mixed.precision) == ("double", "mixed")
     assert key_of_run(mixed) != key_of_run(double)
-    assert experiment_from(written(mixed), PACK).precision == "mixed"
-    older = {name: value for name, value in written(double).items() if name != "precision"}
-    assert experiment_from(older, PACK).precision == "double"
+    assert from_dict(to_dict(mixed), PACK).precision == "mixed"
+    older = {name: value for name, value in to_dict(double).items() if name != "precision"}
+    assert from_dict(older, PACK).precision == "double"
 
 
 def test_a_recall_in_mixed_precision_is_that_in_double() -> None:

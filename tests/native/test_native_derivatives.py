@@ -104,7 +104,7 @@ def test_both_modes_agree_with_plain_jax(name: str, isotropic: bool) -> None:
     moments = system.clump.inertia * (1.0 if isotropic else jnp.asarray([0.8, 1.0, 1.3]))
     system = replace(system, clump=replace(system.clump, isotropic=isotropic, inertia=moments))
     theta = arguments(system, state)
-    touching = measure(system, state, motion().box_at(180.0), jnp.ones((3, 3))).contacts
+    touching = measure(system, state, motion().box_at(180.0), jnp.ones((3, 3)), 0.5).contacts
     assert np.all(np.asarray(touching) > 5.0)
 
     def both(march: native.March) -> Callable[..., Any]:

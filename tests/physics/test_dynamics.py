@@ -307,7 +307,7 @@ def test_observables_are_those_counted_by_hand():
     grain = cached_tetra()
     velocity, spin = np.array([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]]), np.array([[0, 0.1, 0], [0.2, 0, 0], [0, 0, 0]])
     system, state, box = scene(grain, [[0, 0, 0], [1.9, 0, 0], [0, 8, 0]], orientations(3), velocity, spin)
-    sample = OBSERVE(system, state, box, jnp.zeros((3, 1)))
+    sample = OBSERVE(system, state, box, jnp.zeros((3, 1)), 0.0)
     spheres = np.asarray(sphere_centres(state.grains, grain))[..., 0].reshape(3, 4, 3)
     overlaps = 2.0 - np.linalg.norm(spheres[0][:, None] - spheres[1], axis=-1)
     assert (overlaps > 0.0).sum() > 1
@@ -318,7 +318,7 @@ def test_observables_are_those_counted_by_hand():
     on_walls = int((near < -1.3 + 1.0).sum() + (near > np.array([3.2, 9.3, 1.3]) - 1.0).sum())
     assert on_walls > 3
     once = (int((overlaps > 0.0).sum()) + on_walls) / 3.0
-    within = OBSERVE(system, state, tight, jnp.zeros((3, 1)))
+    within = OBSERVE(system, state, tight, jnp.zeros((3, 1)), 0.0)
     assert float(within.contacts_per_grain[0]) == pytest.approx(once, rel=1e-15)
     assert float(sample.largest_overlap[0]) == pytest.approx(overlaps.max(), rel=1e-12)
     mass, inertia = float(grain.mass), float(grain.inertia[0])
@@ -338,7 +338,7 @@ def test_the_kinetic_energy_of_a_turned_anisotropic_grain_is_that_of_its_own_ten
     rotation = np.asarray(matrix(state.grains.quaternion))[..., 0]
     tensor = np.einsum("nij,j,nkj->nik", rotation, moments, rotation)
     energy = 0.5 * float(grain.mass) * (velocity**2).sum() + 0.5 * np.einsum("ni,nij,nj->", spin, tensor, spin)
-    sample = OBSERVE(system, state, box, jnp.zeros((3, 1)))
+    sample = OBSERVE(system, state, box, jnp.zeros((3, 1)), 0.0)
     assert float(sample.kinetic_energy[0]) == pytest.approx(energy, rel=1e-12)
 
 

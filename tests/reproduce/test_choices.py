@@ -9,8 +9,9 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
+from gmem_jax.experiment.record import fingerprint, signals_to_dict, to_dict
 from gmem_jax.experiment.signals import bit_width, words
-from gmem_jax.files.configuration import experiment_from, fingerprint, signals_from, written, written_signals
+from gmem_jax.files.configuration import from_dict, signals_from_dict
 from gmem_jax.files.named import named_experiment, named_signals
 from gmem_jax.physics.contact.kinematics import transport
 from gmem_jax.physics.contact.path import led_contact
@@ -26,9 +27,9 @@ def test_defaults_are_those_that_the_table_of_choices_names() -> None:
     for choice in CHOICES:
         name, value = choice.name, choice.values[0]
         plain = named_experiment(PACK, choice.shared)
-        assert written(named_experiment(PACK, {**choice.shared, name: value})) == written(plain), name
+        assert to_dict(named_experiment(PACK, {**choice.shared, name: value})) == to_dict(plain), name
         for other in choice.values[1:]:
-            assert written(named_experiment(PACK, {**choice.shared, name: other})) != written(plain), name
+            assert to_dict(named_experiment(PACK, {**choice.shared, name: other})) != to_dict(plain), name
 
 
 @pytest.mark.parametrize("share", [0.25, 1.0])
@@ -71,9 +72,9 @@ def test_a_history_without_spinning_does_not_turn_about_the_normal() -> None:
 @pytest.mark.parametrize(("pad", "width"), [(3.0, 1.0), (1.5, 0.75), (1.0, 2.0)])
 def test_words_of_other_pads_and_widths_are_written_by_them(pad: float, width: float) -> None:
     signals = named_signals("words:3", pad, width)
-    form = written_signals(signals)
+    form = signals_to_dict(signals)
     assert form == {"kind": "words", "bits": 3, "pad": pad, "width": width}
-    assert fingerprint(signals_from(form)) == fingerprint(signals)
+    assert fingerprint(signals_from_dict(form)) == fingerprint(signals)
     u_b = bit_width(3, pad)
     assert u_b == 1.0 / (3.0 + 2.0 * pad)
     free = np.asarray(signals.shear(jnp.asarray([0.0, 0.999 * (pad - 0.5 * width) * u_b])))
@@ -93,11 +94,11 @@ def test_words_that_do_not_fit_and_pads_of_other_signals_are_refused() -> None:
 
 def test_files_from_before_the_choices_read_as_the_defaults() -> None:
     experiment = gm.Experiment(PACK, words(2), t0=150.0)
-    older = written(experiment)
+    older = to_dict(experiment)
     del older["shear_share"], older["friction"]["spinning"], older["material"]["wall_rigidity"]
     older["signals"] = {"kind": "words", "bits": 2}
     older["material"]["tangential_damping"] = 0.069
-    assert written(experiment_from(older, PACK)) == written(experiment)
+    assert to_dict(from_dict(older, PACK)) == to_dict(experiment)
 
 
 def test_every_value_is_tried_once_on_every_pack() -> None:

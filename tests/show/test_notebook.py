@@ -14,6 +14,7 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.experiment.html import listing
 from gmem_jax.show import recalls
+from gmem_jax.show.render_matplotlib import render
 from gmem_jax.simulation.progress import ProgressChoice, callback, no_further_bar, shows_progress
 from gmem_jax.sweeps.sweep import Result, Results
 
@@ -37,9 +38,9 @@ def test_objects_are_shown_as_short_tables(recalled: tuple[gm.Experiment, gm.Rec
 
 def test_objects_are_one_line_in_a_terminal(recalled: tuple[gm.Experiment, gm.Recall], tmp_path: Path) -> None:
     experiment, recall = recalled
-    gm.save_recall(tmp_path / "r.h5", recall, gm.resolved(experiment, 0.0))
+    gm.save_recall(tmp_path / "r.h5", recall)
     for shown, words in (
-        (experiment.pack, "<Pack tetra(0.6)-27-seed1: grains = 27 tetra(0.6), "),
+        (experiment.pack, "<Pack tetra-27: grains = 27 tetra(0.6), "),
         (experiment, "27 grains, signals = 2, bumps, friction = Hooke, mu = 1, gamma0 = 0.001, "),
         (recall, f"<Recall of 2 signals: G = {float(recall.gain):.4g}, "),
         (gm.load_recall(tmp_path / "r.h5"), "<Recall of 2 signals: "),
@@ -74,22 +75,22 @@ def test_a_long_table_says_how_much_is_left_out_and_names_cannot_break_it() -> N
 
 def test_a_recall_draws_itself(recalled: tuple[gm.Experiment, gm.Recall], tmp_path: Path) -> None:
     experiment, recall = recalled
-    drawn = recall.plot("signals", experiment)
+    drawn = gm.plot(recall, "signals", experiment)
     assert drawn._repr_png_().startswith(b"\x89PNG")
     title = " ".join(drawn.figure._suptitle.get_text().split())
     assert all(word in title for word in ("mu = 1", "gamma0 = 0.001", "t0 = 75 t_c", "all 2 words"))
     stress, wave = drawn.figure.axes[0], drawn.figure.axes[2]
     assert (stress.get_title(), wave.get_ylabel(), stress.get_ylabel()) == ("0", "", "stress (Pa)")
     np.testing.assert_allclose(stress.lines[1].get_ydata() * 1e-10, 0.0, atol=1e-3)
-    (axis,) = recall.plot("z", experiment).figure.axes
+    (axis,) = gm.plot(recall, "z", experiment).figure.axes
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("time ($t_c$)", "coordination Z")
     total = sum(len(line.get_xdata()) for line in axis.lines if len(line.get_xdata()) > 2)
     assert total == experiment.protocol.bins
-    (axis,) = recall.plot("p_x", against="u").figure.axes
+    (axis,) = gm.plot(recall, "p_x", against="u").figure.axes
     assert axis.get_xlabel() == "compression variable u"
     assert [label.get_text() for label in axis.figure.legends[0].get_texts()][-1].startswith("readout")
     with pytest.raises(ValueError, match="pictures of a recall are signals, waveforms"):
-        recall.plot("colour")
+        gm.plot(recall, "colour")
 
 
 def test_the_scaled_integral_without_an_experiment_is_that_with_it(
@@ -97,7 +98,7 @@ def test_the_scaled_integral_without_an_experiment_is_that_with_it(
 ) -> None:
     experiment, recall = recalled
     one, other = (
-        recalls.signals_drawing(recall, ["0", "1"], "", scale).figure.axes[0].lines[2].get_ydata()
+        render(recalls.signals_figure(recall, ["0", "1"], "", scale)).figure.axes[0].lines[2].get_ydata()
         for scale in (None, experiment.scale)
     )
     np.testing.assert_allclose(one, other, rtol=1e-12)

@@ -21,7 +21,8 @@ from scenes import TETRA_27
 import gmem_jax as gm
 from gmem_jax.command import app
 from gmem_jax.experiment import analysis
-from gmem_jax.show import plots
+from gmem_jax.show import render_plotly
+from gmem_jax.show.recalls import signals_figure
 from gmem_jax.show.report import Report, table
 from gmem_jax.show.scene import Quantity, at_rest, links, packed, quantities
 from gmem_jax.simulation.frames import Frames
@@ -31,14 +32,15 @@ PACK_FILE = TETRA_27
 PACK = gm.load_pack(PACK_FILE)
 TWO = gm.Bumps(jnp.asarray([[1.0, -0.6], [0.3, 1.0]]), jnp.asarray([[0.3, 0.7]] * 2), 0.3)
 EXPERIMENT = gm.Experiment(PACK, TWO, gm.Hooke(mu=0.3), t0=75.0, rest=0.05, hold=0.05, store=0.1)
+RECORD = json.dumps(gm.describe(EXPERIMENT, 1.0))
 HOSTILE = "<script>alert(1)</script>"
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made, recall = tmp_path_factory.mktemp("report"), made_up()
-    gm.save_recall(made / "recall.h5", recall, gm.resolved(EXPERIMENT, 1.0))
-    gm.save_recall(made / "without.h5", replace(recall, frames=None), gm.resolved(EXPERIMENT, 1.0))
+    gm.save_recall(made / "recall.h5", recall)
+    gm.save_recall(made / "without.h5", replace(recall, frames=None))
     gm.save_pack(made / "hostile.h5", replace(PACK, name=HOSTILE))
     return made
 
@@ -110,20 +112,28 @@ def made_up() -> gm.Recall:
         wide = 3 if stage.sheared else wide
         slope = np.linspace(1.0, 2.0, stage.bins)[:, None] * np.linspace(1.0, 1.01, wide)
         vectors = {name: 1e-3 * np.repeat(slope[:, None], 3, axis=1) for name in ("pressure", "lengths")}
-        u = np.broadcast_to(np.linspace(stage.start, stage.stop, stage.bins)[:, None], slope.shape)
-        stages[stage.name] = Sample(**{entry.name: slope for entry in fields(Sample)} | vectors | {"u": u})
+        at = np.broadcast_to(np.linspace(stage.start, stage.stop, stage.bins)[:, None], slope.shape)
+        stages[stage.name] = Sample(**{entry.name: slope for entry in fields(Sample)} | vectors | {"u": at})
     numbers: dict[str, Any] = {name: np.asarray(0.3) for name in ("gain", "fidelity", "dt")}
     numbers |= {"windowed_gain": np.asarray(0.31), "windowed_fidelity": np.asarray(0.35), "window": np.asarray(40.0)}
     per_replica = {"residual_speed": np.full(3, 1e-4), "status": np.array([0, 0, int(gm.Status.RINGING)])}
     curves = {"u": u, "shear": integral, "J": integral, "p_sig": p_sig, "rounding": np.full(2, 1e-16)}
-    return gm.Recall(**numbers, **per_replica, **curves, stages=stages, protocol=EXPERIMENT.protocol, frames=squeezed())
+    return gm.Recall(
+        **numbers,
+        **per_replica,
+        **curves,
+        stages=stages,
+        protocol=EXPERIMENT.protocol,
+        frames=squeezed(),
+        record=RECORD,
+    )
 
 
 def test_packs_stand_in_one_table_only_if_nothing_else_differs(folder: Path, tmp_path: Path) -> None:
     recall, other = replace(made_up(), frames=None), replace(PACK, position=PACK.position + 1e-6)
     for name, changes in {"pack": {}, "law": {"friction.stiffness": 0.2}, "rests": {"rest": 0.1}}.items():
         experiment = gm.replace(EXPERIMENT, {"pack": other, **changes})
-        gm.save_recall(tmp_path / f"{name}.h5", recall, gm.resolved(experiment, 1.0))
+        gm.save_recall(tmp_path / f"{name}.h5", recall.described(gm.describe(experiment, 1.0)))
 
     def together(*paths: Path) -> bool:
         report = Report()
@@ -216,7 +226,7 @@ def test_errors_over_signals_are_those_of_leaving_each_out() -> None:
 
 def test_no_curve_of_the_recalled_signals_is_cut_off() -> None:
     pytest.importorskip("plotly")
-    figure, _ = plots.recalls(made_up(), EXPERIMENT.scale, ["one", "two"])
+    figure = render_plotly.render(signals_figure(made_up(), ["one", "two"], scale=EXPERIMENT.scale, page=True))
     lowest, highest = min(line.y.min() for line in figure.data), max(line.y.max() for line in figure.data)
     for axis in figure.select_yaxes():
         assert axis.range[0] < lowest < highest < axis.range[1]
@@ -257,7 +267,7 @@ def test_what_files_say_is_text_and_no_html(page: Path) -> None:
 
 
 def test_a_view_of_a_notebook_is_a_page_in_a_frame() -> None:
-    shown = PACK.view()._repr_html_()
+    shown = gm.view(PACK)._repr_html_()
     assert shown.startswith("<iframe srcdoc=")
     assert shown.count("<") == 2  # its own tags; all of the page is escaped
 

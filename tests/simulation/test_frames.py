@@ -161,12 +161,12 @@ def test_the_forces_of_a_frame_are_those_on_the_spheres() -> None:
 
 
 def test_a_file_gives_frames_back(filmed: gm.Recall, tmp_path: Path) -> None:
-    gm.save_recall(tmp_path / "recall.h5", filmed, gm.resolved(EXPERIMENT, 1.0))
-    for found in (gm.load_recall(tmp_path / "recall.h5")[0].frames, load_frames(tmp_path / "recall.h5")):
+    gm.save_recall(tmp_path / "recall.h5", filmed)
+    for found in (gm.load_recall(tmp_path / "recall.h5").frames, load_frames(tmp_path / "recall.h5")):
         assert found is not None
         same(found, filmed.frames)
         assert (found.stages, found.signal) == (frames_of(filmed).stages, 2)
-    gm.save_recall(tmp_path / "none.h5", replace(filmed, frames=None), gm.resolved(EXPERIMENT, 1.0))
+    gm.save_recall(tmp_path / "none.h5", replace(filmed, frames=None))
     assert load_frames(tmp_path / "none.h5") is None
 
 

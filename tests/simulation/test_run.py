@@ -145,9 +145,9 @@ def test_a_run_that_broke_names_the_number_that_made_its_steps_unstable(name: st
 
 def test_a_run_in_sound_steps_has_no_cause() -> None:
     for law in (gm.Hooke(), gm.Mindlin(), gm.Frictionless()):
-        assert stability.cause(gm.Experiment(PACK, gm.words(1), law, dt=0.5).course(sheared=True)) == ""
+        assert stability.cause(gm.Experiment(PACK, gm.words(1), law, dt=0.5).simulation(sheared=True)) == ""
     for by, numbers in {"stiffness": {"stiffness": 1e9}, "damping_time": {"damping_time": 1e9}}.items():
-        course = gm.Experiment(PACK, gm.words(1), gm.Hooke(**numbers)).course(sheared=True)
+        course = gm.Experiment(PACK, gm.words(1), gm.Hooke(**numbers)).simulation(sheared=True)
         assert stability.cause(course).startswith(f"friction.{by} = 1e+09 makes steps")
 
 

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gmem_jax.show.pictures import sweep_drawing
-from gmem_jax.show.report import _against
+from gmem_jax.show import render_plotly
+from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.sweeps import against, sweep_figure
 from gmem_jax.sweeps.curves import Axes, axes_of, lines_of
 
 NAMES = ["prepare.seed", "mu", "gamma0", "pack"]
@@ -57,28 +58,29 @@ def test_errors_are_standard_errors_over_the_samples() -> None:
 
 
 def test_a_picture_has_a_line_with_bars_for_each_value_and_says_over_what() -> None:
-    figure = sweep_drawing(ROWS, NAMES, "fidelity", "swept").figure
+    figure = render(sweep_figure(ROWS, NAMES, "fidelity", "swept")).figure
     (axis,) = figure.axes
     assert [text.get_text() for text in axis.get_legend().get_texts()] == ["gamma0 = 0.001", "gamma0 = 0.002"]
     bars = [bar.get_segments() for bar in axis.collections]
     np.testing.assert_allclose([np.ptp(bar[0][:, 1]) for bar in bars], 0.2 / np.sqrt(3.0))
     assert "mean ± SE over prepare.seed, n = 3" in figure.get_suptitle()
     with pytest.raises(ValueError, match="no point is done"):
-        sweep_drawing([{**ROWS[0], "state": "open"}], NAMES, "fidelity", "swept")
+        sweep_figure([{**ROWS[0], "state": "open"}], NAMES, "fidelity", "swept")
 
 
 def test_names_stand_on_the_axis_as_words_and_make_no_line() -> None:
     rows = [{**row, "friction": law, "hold_drag": drag} for row in ROWS for law in "HM" for drag in (0.1, "none")]
     for x, ticks in {"friction": ["H", "M"], "hold_drag": ["0.1", "none"]}.items():
-        (axis,) = sweep_drawing(rows, [*NAMES, "friction", "hold_drag"], "fidelity", "s", x=x).figure.axes
+        (axis,) = render(sweep_figure(rows, [*NAMES, "friction", "hold_drag"], "fidelity", "s", x=x)).figure.axes
         assert [label.get_text() for label in axis.get_xticklabels()] == ticks
 
 
 def test_a_report_draws_no_seed_as_an_axis() -> None:
     pytest.importorskip("plotly")
-    assert _against("prepare.seed", ROWS, NAMES) is None
-    drawn = _against("mu", ROWS, NAMES)
-    assert drawn is not None
-    assert [trace.name for trace in drawn[0].data][:2] == ["F gamma0 = 0.001", "F gamma0 = 0.002"]
-    np.testing.assert_allclose(drawn[0].data[0].error_y.array, 0.1 / np.sqrt(3.0), rtol=1e-6)
-    assert "mean ± SE over prepare.seed" in drawn[0].layout.yaxis.title.text
+    assert against("prepare.seed", ROWS, NAMES) is None
+    found = against("mu", ROWS, NAMES)
+    assert found is not None
+    drawn = render_plotly.render(found)
+    assert [trace.name for trace in drawn.data][:2] == ["F gamma0 = 0.001", "F gamma0 = 0.002"]
+    np.testing.assert_allclose(drawn.data[0].error_y.array, 0.1 / np.sqrt(3.0), rtol=1e-6)
+    assert "mean ± SE over prepare.seed" in drawn.layout.yaxis.title.text

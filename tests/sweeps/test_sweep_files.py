@@ -158,12 +158,12 @@ def test_a_value_shared_by_the_grid_and_used_by_single_points_is_no_contradictio
 )
 def test_what_is_no_number_is_refused_in_a_written_experiment(part: str, name: str, value: object) -> None:
     pack = gm.load_pack(PACK)
-    form = gm.written(gm.Experiment(pack, gm.Bumps(np.ones((1, 1)), np.full((1, 1), 0.4), 0.2)))
+    form = gm.to_dict(gm.Experiment(pack, gm.Bumps(np.ones((1, 1)), np.full((1, 1), 0.4), 0.2)))
     if part == "words":
         form["signals"], part = {"kind": "words", "bits": 2}, "signals"
     (form[part] if part else form)[name] = value
     with pytest.raises(ValueError, match=rf"^{name} must be a (number|text), got "):
-        gm.experiment_from(form, pack)
+        gm.from_dict(form, pack)
 
 
 def recipes(folder: Path, **tables: object) -> list[tuple[float, float]]:
@@ -230,10 +230,9 @@ def test_signals_of_points_that_have_fewer_are_filled_up_and_counted(
     tmp_path: Path, recalled: tuple[gm.Experiment, gm.Recall]
 ) -> None:
     xarray = pytest.importorskip("xarray")
-    experiment, two = recalled
+    _, two = recalled
     one = replace(two, **{name: getattr(two, name)[1:] for name in ("p_sig", "J", "shear")})
-    configuration = gm.resolved(experiment, 1.0)
-    kept = {"a": (two, configuration), "b": (one, {**configuration, "signals": ["alone"]})}
+    kept = {"a": two, "b": one.described({**two.configuration, "signals": ["alone"]})}
 
     class Kept(Store):
         def load(self, key: str) -> Any:

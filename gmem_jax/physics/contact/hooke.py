@@ -26,10 +26,12 @@ class Hooke:
             only tumbles it); scalar or [B].
     """
 
-    mu: Scalar = parameter(1.0, "[0, inf)")
-    stiffness: Scalar = parameter(0.13, "(0, inf)")
-    damping_time: Scalar = parameter(TANGENTIAL_DAMPING, "[0, inf)")
-    spinning: Scalar = parameter(1.0, "[0, 1]")
+    mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")
+    stiffness: Scalar = parameter(0.13, "(0, inf)", "k_H in E R, or k_M in E R^0.5; default the law's")
+    damping_time: Scalar = parameter(
+        TANGENTIAL_DAMPING, "[0, inf)", "Tangential damping over stiffness; default the law's", "t_c"
+    )
+    spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
 
     def __post_init__(self) -> None:
         settle(self)

@@ -72,13 +72,15 @@ class Mindlin:
         ValueError: if `points` or `variant` is none of these.
     """
 
-    mu: Scalar = parameter(1.0, "[0, inf)")
-    stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)")
-    damping_time: Scalar = parameter(TANGENTIAL_DAMPING, "[0, inf)")
-    spinning: Scalar = parameter(1.0, "[0, 1]")
-    p_max: Scalar = parameter(0.2, "(0, inf)")
-    points: int = static(100)
-    variant: Literal["averaged", "exact", "paper"] = static("averaged")
+    mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")
+    stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)", "k_M", "E R^0.5")
+    damping_time: Scalar = parameter(
+        TANGENTIAL_DAMPING, "[0, inf)", "Tangential damping over stiffness; default the law's", "t_c"
+    )
+    spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
+    p_max: Scalar = parameter(0.2, "(0, inf)", "m2: largest overlap of its history", "R")
+    points: int = static(100, "m2: points of its history")
+    variant: Literal["averaged", "exact", "paper"] = static("averaged", "m2: averaged, exact or paper")
 
     def __post_init__(self) -> None:
         settle(self)

@@ -43,10 +43,12 @@ class MindlinRescaled:
         spinning: see `gmem_jax.physics.contact.hooke.Hooke`.
     """
 
-    mu: Scalar = parameter(1.0, "[0, inf)")
-    stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)")
-    damping_time: Scalar = parameter(TANGENTIAL_DAMPING, "[0, inf)")
-    spinning: Scalar = parameter(1.0, "[0, 1]")
+    mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")
+    stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)", "k_M", "E R^0.5")
+    damping_time: Scalar = parameter(
+        TANGENTIAL_DAMPING, "[0, inf)", "Tangential damping over stiffness; default the law's", "t_c"
+    )
+    spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
 
     def __post_init__(self) -> None:
         settle(self)

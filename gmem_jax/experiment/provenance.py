@@ -49,7 +49,7 @@ def sources() -> dict[str, Any]:
     """What numbers depend on beside a configuration: a hash of the code that makes them, and versions of libraries."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
-    for folder in ("physics", "native", "experiment", "preparation"):
+    for folder in ("physics", "native", "simulation", "experiment", "preparation"):
         for path in sorted((root / folder).rglob("*")):
             if path.suffix in (".py", ".h", ".cc", ".cu"):
                 digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())

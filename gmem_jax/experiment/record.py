@@ -1,0 +1,157 @@
+"""The written form of an experiment: what files and keys say of it, down to where and by which code it was run."""
+
+import hashlib
+from dataclasses import fields
+from typing import Any
+
+import jax
+import numpy as np
+
+from gmem_jax import native
+from gmem_jax.experiment.experiment import NUMBERS, Experiment, value_at
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.provenance import provenance, sources
+from gmem_jax.experiment.signals import (
+    LONGEST_WORD,
+    Bumps,
+    Signals,
+    Spline,
+    bit_width,
+    six_signals,
+    word_bits,
+    words,
+)
+from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
+from gmem_jax.physics.contact.laws import entry_of
+from gmem_jax.physics.material import Material
+from gmem_jax.physics.rules import usual_rules
+
+SIGNALS = {"bumps": Bumps, "spline": Spline}
+PARTS = ("pack", "signals", "friction", "material")
+DIGITS = 9  # of the pad and width of words
+
+
+def fingerprint(tree: Any) -> str:
+    """SHA-256 of the arrays of a pytree, shapes and types included."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        array = np.asarray(leaf)
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def pack_fingerprint(pack: Pack) -> str:
+    """SHA-256 of what makes a pack: grain, centres, orientations, box, T1; not of its list of candidates."""
+    at = (pack.position, pack.quaternion, pack.lower, pack.upper)
+    return fingerprint((pack.clump, *at, pack.delta0, pack.ringing_period))
+
+
+def plain(value: Any) -> Any:
+    """Numbers and lists of a parameter, which JSON can hold exactly."""
+    return value if isinstance(value, float | int | str | None) else np.asarray(value).tolist()
+
+
+def _equal(one: Signals, other: Signals) -> bool:
+    return fingerprint(one) == fingerprint(other) if type(one) is type(other) else False
+
+
+def signals_to_dict(signals: Signals) -> dict[str, Any]:
+    """Waveforms as JSON: by name where they have one, else by their numbers."""
+    if _equal(signals, six_signals()):
+        return {"kind": "six"}
+    if form := _as_words(signals):
+        return {"kind": "words", **form}
+    for kind, known in SIGNALS.items():
+        if isinstance(signals, known):
+            return {"kind": kind, **{entry.name: plain(getattr(signals, entry.name)) for entry in fields(known)}}
+    return {"kind": type(signals).__name__, "sha256": fingerprint(signals)}
+
+
+def _as_words(signals: Signals) -> dict[str, Any]:
+    """The arguments of `words` that give these waveforms; {} if none do."""
+    bits = signals.count.bit_length() - 1
+    if not isinstance(signals, Bumps) or signals.count != 1 << bits or not 1 <= bits <= LONGEST_WORD:
+        return {}
+    first = float(signals.centres[0, 0])  # pad / (bits + 2 pad)
+    if np.ndim(signals.width) != 0 or not 0.0 < first < 0.5:
+        return {}
+    pad = round(bits * first / (1.0 - 2.0 * first), DIGITS)
+    form: dict[str, Any] = {
+        "bits": bits,
+        "pad": pad,
+        "width": round(float(signals.width) / bit_width(bits, pad), DIGITS),
+    }
+    try:
+        return form if _equal(signals, words(**form)) else {}
+    except ValueError:
+        return {}
+
+
+def names_of(signals: Signals) -> list[str]:
+    """What the signals are called: words by their bits, others by their number from 1."""
+    form = signals_to_dict(signals)
+    if form["kind"] == "words":
+        return ["".join(map(str, row)) for row in word_bits(form["bits"])]
+    return [f"signal {number + 1}" for number in range(signals.count)]
+
+
+def law_to_dict(law: FrictionLaw) -> dict[str, Any]:
+    """A friction law as JSON: its name and parameters."""
+    entry = entry_of(law)
+    if entry is None:
+        return {"law": repr(law)}
+    return {"law": entry.name, **{item.name: plain(getattr(law, item.name)) for item in fields(entry.kind)}}
+
+
+@usual_rules()
+def to_dict(experiment: Experiment) -> dict[str, Any]:
+    """An experiment as JSON: every field, the pack by its source and content.
+
+    `files.configuration.from_dict` makes the same experiment of it.
+    """
+    pack = experiment.pack
+    numbers = [entry.name for entry in fields(Experiment) if entry.init and entry.name not in PARTS]
+    material = experiment.material
+    return {
+        "pack": {"source": pack.source or pack.name, "name": pack.name, "sha256": pack_fingerprint(pack)},
+        "signals": signals_to_dict(experiment.signals),
+        "friction": law_to_dict(experiment.friction),
+        "material": {entry.name: plain(getattr(material, entry.name)) for entry in fields(Material)},
+        **{name: plain(getattr(experiment, name)) for name in numbers},
+    }
+
+
+def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
+    """What the numbers of a run depend on, and no more: for parts of it that may be used again.
+
+    Args:
+        experiment: what is run.
+        **more: what else they depend on, like the batch.
+    """
+    own = {**to_dict(experiment), "pack": pack_fingerprint(experiment.pack)}
+    return {**own, **more, "backend": native.name(experiment.backend, experiment.friction), **sources()}
+
+
+@usual_rules()
+def describe(experiment: Experiment, seconds: float) -> dict[str, Any]:
+    """All that is to be known of a result: the experiment as written, what its defaults came to, and where it ran."""
+    pack, law, entry = experiment.pack, experiment.friction, entry_of(experiment.friction)
+    dt, steps = experiment.timing
+    clump = pack.clump
+    return {
+        "experiment": to_dict(experiment),
+        "pack": pack.source or pack.name,
+        "grains": pack.grains,
+        "grain": {"shape": clump.shape, "mass": float(clump.mass), "diameter": float(clump.diameter)},
+        "pack_record": pack.info,
+        "signals": names_of(experiment.signals),
+        "friction": entry.name if entry else type(law).__name__,
+        "mu": plain(law.mu) if isinstance(law, CoulombLaw) else 0.0,
+        **{name: plain(value_at(experiment, name)) for name in NUMBERS},
+        "dt": plain(dt),
+        "steps": steps,
+        "seconds": seconds,
+        **provenance(),
+        "backend": native.name(experiment.backend, experiment.friction),
+    }

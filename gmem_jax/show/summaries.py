@@ -1,0 +1,411 @@
+"""What any file that a command writes holds, told once for commands, `gmem show` and pages: facts, lines, figures."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.table import Table
+
+from gmem_jax.design.kernel import MemoryKernel
+from gmem_jax.design.stored import load_kernel
+from gmem_jax.errors import FileFormatError
+from gmem_jax.experiment.analysis import MEASURES
+from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import pack_fingerprint
+from gmem_jax.experiment.signals import bin_average, waveform
+from gmem_jax.files.checked import is_number, refusing
+from gmem_jax.files.configuration import signals_from_dict
+from gmem_jax.files.frames import load_frames
+from gmem_jax.files.hdf5 import schema_of
+from gmem_jax.files.measures import relative_scale
+from gmem_jax.files.packs import load_pack, load_stages, pack_called
+from gmem_jax.files.recalls import load_recall, to_csv
+from gmem_jax.files.results import load_result
+from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL, TUNED
+from gmem_jax.files.waveforms import load_design, load_target, load_waveforms
+from gmem_jax.physics.material import Material
+from gmem_jax.reading.readers import confusion
+from gmem_jax.show import figures, sweeps, tables
+from gmem_jax.show.figure import Figure
+from gmem_jax.show.recalls import MOST_OF_PAGE, PICTURES, recall_figure, signals_figure
+from gmem_jax.show.scene import at_rest
+from gmem_jax.show.stages import QUANTITIES, series_figures, stages_figure
+from gmem_jax.show.tables import Fact, cell
+from gmem_jax.simulation.frames import Frames
+from gmem_jax.simulation.sample import Sample
+from gmem_jax.sweeps import table
+from gmem_jax.sweeps.store import Store
+
+NOISE = 1.0  # Pa RMS, that values of a kernel are compared with; as `gmem kernel` does
+LARGEST_CONFUSION = 256  # words
+_ASYMMETRY = "of the recalls of a waveform and its negative: 0 for a linear memory"
+_RESOLUTION = "width in v of a point of the waveform that is read back"
+Draw = Callable[[], Figure]
+
+
+class Grains(NamedTuple):
+    """A 3D view of a page.
+
+    Attributes:
+        frames: what is seen.
+        material: of the grains, for forces in mN.
+        pack: fingerprint of the pack whose state at rest it is, which a page shows once; "" for frames of a run.
+    """
+
+    frames: Callable[[], Frames]
+    material: Material
+    pack: str = ""
+
+
+class Part(NamedTuple):
+    """What a page shows.
+
+    Attributes:
+        content: a text, a table, a figure, several that are alike but for their x, or grains.
+        heading: over it.
+        folded: whether it is opened by a click on the heading.
+    """
+
+    content: str | Table | Figure | Mapping[str, Figure] | Grains
+    heading: str = ""
+    folded: bool = False
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a file holds.
+
+    Attributes:
+        title: what it is.
+        facts: as one JSON object.
+        lines: tables and lines for a person.
+        figures: what makes them, by name; the first says most.
+        parts: what else a page shows, in order.
+        configuration: every parameter, for a page.
+        csv: makes the recalled signals, or a row for each (`each=True`), for a recall.
+    """
+
+    title: str
+    facts: dict[str, Any]
+    lines: list[str | Table]
+    figures: dict[str, Draw]
+    parts: Callable[[], Iterator[Part]] = field(default=lambda: iter(()))
+    configuration: Mapping[str, Any] = field(default_factory=dict)
+    csv: Callable[..., str] | None = None
+
+
+def summary_of(
+    source: str | Path, against: str = "time", signals: Sequence[int] = (), *, each: bool = False, **chosen: Any
+) -> Summary:
+    """What a file, a pack or the folder of a sweep holds.
+
+    Args:
+        source: its path, or the name of a pack.
+        against: "time" or "u": what pictures of stages are drawn over.
+        signals: numbers of those that pictures of a recall show; default all.
+        each: whether a recall tells of each signal by itself, however many there are.
+        **chosen: x, by and over of the picture of a sweep (`gmem_jax.sweeps.curves.axes_of`).
+
+    Raises:
+        ValueError: if signals are chosen of what is no recall.
+        FileNotFoundError: if it is not there.
+        FileFormatError: if it is of no kind that commands write, or damaged.
+    """
+    found = _summary_of(Path(source), against, signals, each, chosen)
+    if signals and found.csv is None:
+        raise ValueError(f"{source}: holds no recall whose signals could be chosen")
+    return found
+
+
+def _summary_of(file: Path, against: str, signals: Sequence[int], each: bool, chosen: dict[str, Any]) -> Summary:
+    if file.is_dir():
+        return of_sweep(Store(file, make=False), **chosen)
+    if pack_called(str(file)):
+        return _stored_pack(file, against)
+    suffix = file.suffix.lower()
+    if suffix == ".json":
+        schema, found = load_result(file)
+        with refusing(file, schema.title):
+            kind = {READING.name: of_reading, GRADIENT.name: of_gradient, TUNED.name: of_tuned}[schema.name]
+            return kind({name: value for name, value in found.items() if name != "about"}, file.name)
+    if suffix == ".msgpack":
+        return _net(file)
+    if suffix in (".csv", ".npy"):
+        return _waveforms(file)
+    schema_name = schema_of(file)
+    if schema_name == KERNEL.name:
+        return of_kernel(*load_kernel(file), name=file.name)
+    if schema_name == PACK.name:
+        return _stored_pack(file, against)
+    if schema_name == RECALL.name:
+        return of_recall(load_recall(file), file.name, against=against, signals=signals, each=each)
+    known = ", ".join(schema.name for schema in (RECALL, PACK, KERNEL))
+    raise FileFormatError(f"{file}: schema is {schema_name[:40]!r}, expected one of {known}")
+
+
+def of_recall(
+    recall: Recall,
+    name: str = "",
+    *,
+    against: str = "time",
+    signals: Sequence[int] = (),
+    each: bool = False,
+) -> Summary:
+    """What is said of a recall; see `summary_of`."""
+    configuration, row = recall.configuration, tables.summary(recall)
+    choice: dict[str, Any] = {"against": against, "signals": signals}
+    drawn: dict[str, Draw] = {what: partial(recall_figure, recall, what, configuration, **choice) for what in PICTURES}
+    lines = tables.recall_lines(row, configuration, each=each)
+    return Summary(
+        f"Recall {name}, pack {cell(configuration['pack'])}",
+        {**row, "configuration": configuration},
+        lines,
+        drawn,
+        partial(_parts_of_recall, recall, row),
+        configuration,
+        partial(to_csv, recall),
+    )
+
+
+def _parts_of_recall(recall: Recall, row: dict[str, Any]) -> Iterator[Part]:
+    configuration = recall.configuration
+    names, t0 = recall.names, configuration["t0"]
+    yield Part(tables.errors_table(recall))
+    if len(names) > tables.FEW:
+        yield Part(tables.signals_table(row), f"each of {len(names)} signals", folded=True)
+    scale, wanted = np.asarray(relative_scale(configuration)), configuration.get("target")
+    target = None if wanted is None else np.asarray(bin_average(signals_from_dict(wanted)))
+    shown = f" (the first {MOST_OF_PAGE} of {len(names)})" if len(names) > MOST_OF_PAGE else ""
+    figure = signals_figure(recall, names, "", scale, t0, target=target, page=True)
+    yield Part(figure, f"Recalled signals{shown}")
+    yield from _series(recall.stages, names, t0, "Along the run")
+    yield from _grains(recall, names, configuration.get("experiment", {}))
+
+
+def _series(stages: Mapping[str, Sample], names: Sequence[str], t0: Any, heading: str) -> Iterator[Part]:
+    yield Part(series_figures(stages, names, t0), heading)
+    yield Part(f"Stages, white and grey in turn: {', '.join(stages)}.")
+
+
+def _grains(recall: Recall, names: Sequence[str], written: Mapping[str, Any]) -> Iterator[Part]:
+    """The frames of a recall, or its pack at rest if it is there."""
+    material = Material(**written.get("material", {}))
+    if (frames := recall.frames) is not None:
+        whose = f"the run of {names[frames.signal - 1]}" if frames.signal else "the run without shear"
+        yield Part(f"{frames.count} moments of {whose}; displacements are since the first.", "Grains")
+        yield Part(Grains(lambda: frames, material))
+        return
+    yield Part("No frames in this file: gmem recall --frames 10 keeps some.", "Grains")
+    of_pack = written.get("pack", {})
+
+    def rest() -> Frames:
+        pack = load_pack(of_pack["source"])
+        if pack_fingerprint(pack) != of_pack["sha256"]:
+            raise ValueError("another pack has this name now")
+        return at_rest(pack)
+
+    yield Part(Grains(rest, material, str(of_pack.get("sha256"))))
+
+
+def of_pack(
+    pack: Pack, stages: Mapping[str, Sample] | None = None, frames: Frames | None = None, against: str = "time"
+) -> Summary:
+    """What is said of a pack, the stages of its preparation and frames of it, where they were kept."""
+    kept, t0 = dict(stages or {}), pack.info.get("recipe", {}).get("t0")
+    drawn: dict[str, Draw] = {"grains": partial(figures.grains_figure, pack)}
+    title = f"{pack.name}: preparation"
+    drawn |= {what: partial(stages_figure, kept, what, title, against=against, t0=t0) for what in QUANTITIES if kept}
+
+    def parts() -> Iterator[Part]:
+        yield Part(Grains(lambda: at_rest(pack), Material(), pack_fingerprint(pack)))
+        if kept:
+            yield from _series(kept, [], t0, "Its preparation")
+        if frames is not None:
+            yield Part(Grains(lambda: frames, Material()))
+
+    facts = {"pack": pack.name, "grains": pack.grains, "ringing_period": float(pack.ringing_period), **pack.info}
+    return Summary(f"Pack {pack.name}", facts, [tables.pack_table(pack)], drawn, parts, pack.info)
+
+
+def _stored_pack(file: Path, against: str) -> Summary:
+    return of_pack(load_pack(file), load_stages(file), load_frames(pack_called(str(file)) or file), against)
+
+
+def of_kernel(kernel: MemoryKernel, configuration: Mapping[str, Any], noise: float = NOISE, name: str = "") -> Summary:
+    """What is said of a memory kernel; `noise` in Pa RMS."""
+    modulus, count = float(Material().modulus), len(kernel.centres)
+    pack = cell(configuration.get("pack", name))
+    capacity = kernel.capacity(noise / modulus)
+    told = [
+        Fact("gain", kernel.gain(), words="G of the perfect integral that comes nearest"),
+        Fact("distance", kernel.distance(), words="from that integral: 0 none, 1 nothing of it"),
+        Fact("asymmetry", kernel.asymmetry(), words=_ASYMMETRY),
+        Fact("resolution", kernel.resolution(noise / modulus), words=_RESOLUTION),
+        Fact(f"values above {noise:g} Pa", f"{capacity} of {count}", words="independent ones, told from this noise"),
+    ]
+    facts = {
+        "pack": pack,
+        "n": count,
+        "width": kernel.width,
+        "gamma0": kernel.gamma0,
+        "noise_pa": noise,
+        **{fact.name: fact.value for fact in told[:-1]},
+        "capacity": capacity,
+        "singular_values_pa": (kernel.singular_values() * modulus).tolist(),
+        "configuration": configuration,
+    }
+    title = f"memory kernel of {pack}: {count} bumps of width {kernel.width:g}, gamma0 = {kernel.gamma0:g}"
+    drawn: dict[str, Draw] = {
+        "kernel": partial(figures.kernel_figure, kernel, noise, pack),
+        "recalls": partial(figures.bumps_figure, kernel, pack),
+    }
+
+    def parts() -> Iterator[Part]:
+        bumps = {**configuration, "signals": (), "experiment": {}}  # no signals were stored
+        yield Part(tables.heading(bumps))
+        yield Part(drawn["kernel"]())
+
+    return Summary(f"Kernel {name}", facts, ["\n".join([title, *map(str, told)])], drawn, parts, configuration)
+
+
+def of_reading(facts: dict[str, Any], name: str = "") -> Summary:
+    """What is said of a classification, from its result."""
+    words, readers = facts["words"], facts["readers"]
+    title, net = f"{cell(facts['pack'])}, {facts['bits']} bits", readers["net"]
+    nets = len(np.asarray(net["read"]).reshape(-1, words))
+    right = f"{title}: accuracy {net['accuracy']:.3f} ({nets} nets)"
+    drawn: dict[str, Draw] = {
+        "confusion": lambda: figures.confusion_figure({right: confusion(net["read"], words)}),
+        "bits": partial(figures.bits_figure, readers, title),
+    }
+
+    def parts() -> Iterator[Part]:
+        yield Part(f"of {facts['recall']}, pack {cell(facts['pack'])}")
+        if words <= LARGEST_CONFUSION:
+            yield Part(figures.confusion_figure({key: confusion(row["read"], words) for key, row in readers.items()}))
+
+    found = facts.get("configuration", {})
+    return Summary(f"Classification {name}", facts, [*tables.reading_tables(facts)], drawn, parts, found)
+
+
+def of_gradient(facts: dict[str, Any], name: str = "") -> Summary:
+    """What is said of the derivatives of a fidelity, from their result."""
+    slopes, configuration = facts["gradient"], facts.get("configuration", {})
+    title = f"{cell(facts['pack'])}: F = {facts['fidelity']:.4f}"
+    units = {"stiffness": " per E R" if configuration.get("friction") == "hooke" else " per E R^0.5"}
+    lines = [title]
+    lines += [f"dF/d{key} = {value:.5g}{units.get(key, '')}" for key, value in slopes.items() if is_number(value)]
+    rows = enumerate(slopes["waveform"], 1)
+    lines += [f"dF/da of signal {number}: " + " ".join(f"{value:.4g}" for value in row) for number, row in rows]
+    drawn: dict[str, Draw] = {"waveforms": partial(figures.gradient_figure, facts["places"], slopes["waveform"], title)}
+
+    def parts() -> Iterator[Part]:
+        if configuration:
+            yield Part(tables.heading(configuration))
+        yield Part(drawn["waveforms"]())
+
+    return Summary(f"Gradient {name}", facts, ["\n".join(lines)], drawn, parts, configuration)
+
+
+def of_tuned(facts: dict[str, Any], name: str = "") -> Summary:
+    """What is said of a tuned drive, from its result."""
+    packs, history = " ".join(map(cell, facts["packs"])), facts["history"]
+    values = ", ".join(f"{key} = {value:.4g}" for key, value in facts["values"].items())
+    line = f"{packs}: mean F {facts['before']:.4f} -> {facts['fidelity']:.4f} with {values}"
+    fidelities = [float(one["fidelity"]) for one in history]
+    drawn: dict[str, Draw] = {
+        "history": partial(figures.history_figure, {packs: fidelities}),
+        "values": partial(figures.values_figure, history, packs),
+    }
+
+    def parts() -> Iterator[Part]:
+        yield Part(tables.history_table(facts["values"], history))
+        yield Part(drawn["history"]())
+
+    return Summary(f"Tuned drive {name}", facts, [line], drawn, parts, facts.get("configuration", {}))
+
+
+def _net(file: Path) -> Summary:
+    from gmem_jax.reading import training  # loads flax
+
+    found = training.load(file)
+    lessons = found.net.lessons
+    names = ("seed", "step", "loss", "validation", "examples", "finished", "seconds")
+    facts: dict[str, Any] = {"bits": lessons.bits, "hidden": list(lessons.hidden)}
+    facts |= {name: getattr(found, name) for name in names}
+    state = "trained" if found.finished else "not finished"
+    line = (
+        f"net for words of {lessons.bits} bits, seed {found.seed}: {state}, {found.step} steps, "
+        f"held-out accuracy {found.validation:.4f}, loss {found.loss:.3g} nats"
+    )
+    weights = np.asarray(found.net.parameters["Dense_0"]["kernel"])
+    drawn: dict[str, Draw] = {"weights": partial(figures.weights_figure, weights, line.split(":")[0])}
+    return Summary(f"Net {file.name}", facts, [line], drawn, lambda: _all(drawn))
+
+
+def _waveforms(file: Path) -> Summary:
+    commented = file.suffix.lower() == ".csv"
+    target, design = (load_target(file), load_design(file)) if commented else (None, {})
+    samples = load_waveforms(file)
+    facts: dict[str, Any] = {"signals": len(samples), "samples": samples.shape[1], **design}
+    lines = [f"{len(samples)} waveforms of {samples.shape[1]} samples" + (", designed" if target is not None else "")]
+    drawn: dict[str, Draw] = {"waveforms": partial(figures.waves_figure, waveform(samples), target, file.name)}
+    if design:
+        pack = cell(design["pack"])
+        way = f"F {design['before']:.4f} -> {design['fidelity']:.4f}, gain {design['gain']:.3f}"
+        lines.append(f"{pack}: {way} of the recall with respect to the target")
+        drawn["history"] = partial(figures.history_figure, {pack: design["history"]})
+    return Summary(f"Waveforms {file.name}", facts, ["\n".join(lines)], drawn, lambda: _all(drawn))
+
+
+def _all(drawn: Mapping[str, Draw]) -> Iterator[Part]:
+    return (Part(draw()) for draw in drawn.values())
+
+
+def of_sweep(store: Store, **chosen: Any) -> Summary:
+    """What is said of a sweep; `chosen` are x, by and over of `gmem_jax.sweeps.curves.axes_of`.
+
+    Raises:
+        FileFormatError: if there is no sweep, or a result is damaged.
+    """
+    card, rows = store.card(), table.rows(store)
+    names, name = card["names"], store.folder.name
+    drawn: dict[str, Draw] = {
+        measure: partial(sweeps.sweep_figure, rows, names, measure, name, **chosen) for measure in sorted(MEASURES)
+    }
+
+    def parts() -> Iterator[Part]:
+        return (Part(figure) for x in names if (figure := sweeps.against(x, rows, names)) is not None)
+
+    lines: list[str | Table] = [sweeps.points_table(rows, names)]
+    return Summary(f"Sweep {name}", sweeps.sweep_facts(store, rows), lines, drawn, parts, card["shared"])
+
+
+def _plain(label: str) -> str:
+    """The label of an axis without the marks of formulas."""
+    return label.replace("$", "").replace("\\,", " ").replace("\\", "")
+
+
+PLOTS = {
+    "signals": "recalled signals beside the integral J",
+    "waveforms": "what was stored: waveforms I, or slopes by them",
+    "all": "an image of all signals, a row each",
+    "grains": "the grains in their box",
+    "kernel": "M(u, v) and its singular values",
+    "recalls": "recalls of the kernel's bumps",
+    "confusion": "words stored against words read",
+    "bits": "error rate of each bit, by reader",
+    "history": "F by iteration",
+    "values": "parameters by iteration",
+    "weights": "a net's weights by u",
+    "gain": "G of the points",
+    "fidelity": "F of the points",
+    "windowed_gain": "G after a running mean over the ringing period",
+    "windowed_fidelity": "F after the same",
+    **{name: f"{_plain(quantity.label)}, over the stages" for name, quantity in QUANTITIES.items()},
+}
+"""What every picture shows, in words."""

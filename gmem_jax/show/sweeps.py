@@ -1,0 +1,153 @@
+"""Tables and figures of sweeps."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from gmem_jax.files.checked import is_number
+from gmem_jax.physics.state import SENTENCES, Status
+from gmem_jax.show.figure import Curve, Figure, Panel, ramp
+from gmem_jax.show.tables import cell
+from gmem_jax.sweeps.curves import Line, axes_of, is_sample, lines_of
+from gmem_jax.sweeps.store import Store
+
+ABOUT = "F(T1): F after a running mean over the ringing period"
+FEW_LINES = 6  # whose names fit inside the axes
+_LABELS = {
+    "gain": "gain G",
+    "fidelity": "fidelity F",
+    "windowed_gain": "G after a mean over T1",
+    "windowed_fidelity": "F after a mean over T1",
+}
+
+
+def sweep_facts(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
+    """What is said of a sweep, and its points."""
+    states = {state: sum(row["state"] == state for row in table) for state in ("done", "failed", "open")}
+    done = [row for row in table if row["state"] == "done"]
+    status = 0
+    for row in done:
+        status |= row["status"]
+    seconds = sum(row["seconds"] for row in done)
+    return {"folder": str(store.folder), **states, "status": status, "seconds": seconds, "points": table}
+
+
+def points_table(table: list[dict[str, Any]], names: list[str]) -> Table:
+    """The points of a sweep: what varies, G, F and the status, from `gmem_jax.sweeps.table.rows`."""
+    drawn = Table()
+    for name in (*names, "G", "F", "F(T1)", "status"):
+        drawn.add_column(name, no_wrap=name != "status")
+    for row in table:
+        state = _state(row) if row["state"] == "done" else row["state"]
+        numbers = [row[name] for name in ("gain", "fidelity", "windowed_fidelity")]
+        measured = ("" if number is None else f"{number:.3f}" for number in numbers)
+        drawn.add_row(*(cell(row[name]) for name in names), *measured, state)
+    drawn.caption = "; ".join([ABOUT, *_reasons(table)])
+    return drawn
+
+
+def _state(row: dict[str, Any]) -> str:
+    """The status of a point, or of several, in words."""
+    return ", ".join([*_bits(row["status"] or 0), *(["warned"] if row["warnings"] else [])]) or "ok"
+
+
+def _reasons(table: list[dict[str, Any]]) -> list[str]:
+    """What the words of `_state` mean in a table."""
+    bits = {bit for row in table for bit in Status if (row["status"] or 0) & bit}
+    told = dict.fromkeys(f"warned: {row['warnings']}" for row in table if row["warnings"])
+    return [*(f"{_word(bit)}: {SENTENCES[bit]}" for bit in sorted(bits)), *told]
+
+
+def _word(bit: Status) -> str:
+    return str(bit.name).lower().replace("_", " ")
+
+
+def _bits(status: int) -> list[str]:
+    return [_word(bit) for bit in Status if status & bit]
+
+
+def means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
+    """Means over points, from `gmem_jax.sweeps.table.means`."""
+    drawn = Table()
+    for name in (*names, "n", "G", "F", "F(T1)", "status"):
+        drawn.add_column(
+            name, no_wrap=name not in (*names, "status"), min_width=14 if name in ("G", "F", "F(T1)") else None
+        )
+    for row in table:
+        shown = [_with_error(row, name) for name in ("gain", "fidelity", "windowed_fidelity")]
+        drawn.add_row(
+            *(cell(row[name]) for name in names), str(row["done"]), *shown, _state(row) if row["done"] else ""
+        )
+    drawn.caption = "; ".join(["mean and standard error", ABOUT, *_reasons(table)])
+    return drawn
+
+
+def _with_error(row: dict[str, Any], measure: str) -> str:
+    if row[measure] is None:
+        return ""
+    error = row[f"{measure}_se"]
+    return f"{row[measure]:.3f}" + (f" +- {error:.3f}" if math.isfinite(error) else "")
+
+
+def sweep_figure(
+    rows: Sequence[Mapping[str, Any]], names: Sequence[str], measure: str, title: str, **chosen: Any
+) -> Figure:
+    """A measure of the points of a sweep; several at one place as dots, their mean and its standard error.
+
+    Args:
+        rows: of the points (`gmem_jax.sweeps.table.rows`).
+        names: that vary.
+        measure: one of `MEASURES`.
+        title: of the picture.
+        **chosen: `x`, `by` and `over` of `axes_of`.
+
+    Raises:
+        ValueError: if no point is done, or the choice cannot be (see `axes_of`).
+    """
+    done = [row for row in rows if row["state"] == "done"]
+    if not done:
+        raise ValueError(f"{title}: no point is done, so there is nothing to draw")
+    axes = axes_of(done, names, **chosen)
+    lines = lines_of(done, axes, measure)
+    places = {value for line in lines for value in line.x}
+    ticks = [] if all(map(is_number, places)) else sorted(places, key=str)
+    colours = [f"C{number}" for number in range(len(lines))] if len(lines) <= 10 else ramp(len(lines))
+    marks: list[Curve] = []
+    for line, colour in zip(lines, colours, strict=True):
+        at = np.array([ticks.index(value) if ticks else value for value in line.x])
+        errors = line.error if line.most > 1 else None
+        marks.append(Curve(at, line.mean, _label(line), colour, "o" if ticks else "o-", errors=errors))
+        if line.most > 1:
+            dots = np.array([(x, y) for x, values in zip(at, line.each, strict=True) for y in values])
+            marks.append(Curve(dots[:, 0], dots[:, 1], "", colour, "."))
+    counts = [len(values) for line in lines for values in line.each]
+    samples = f"n = {min(counts)}" + (f" to {max(counts)}" if max(counts) > min(counts) else "")
+    several = f"mean ± SE over {', '.join(axes.over) or 'points'}, {samples}" if max(counts) > 1 else ""
+    few = len(lines) <= FEW_LINES
+    panel = Panel(tuple(marks), "", axes.x, _LABELS[measure], x_names=[cell(value)[:24] for value in ticks])
+    over = (f"{title}: {len(done)} of {len(rows)} points", several)
+    return Figure((panel,), size=(6.4 if few else 8.6, 4.0), title=over, legend="panel" if few else "right")
+
+
+def _label(line: Line) -> str:
+    return ", ".join(f"{name} = {cell(value)}" for name, value in line.values.items())
+
+
+def against(x: str, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Figure | None:
+    """F and G of a sweep against a number that varies and is no sample; None if it is none."""
+    done = [row for row in rows if row["state"] == "done" and isinstance(row[x], int | float)]
+    if is_sample(x) or len({row[x] for row in done}) < 2:
+        return None
+    axes = axes_of(done, names, x)
+    marks: list[Curve] = []
+    for letter, measure in (("F", "fidelity"), ("G", "gain")):
+        for line in lines_of(done, axes, measure):
+            colour = f"C{len(marks) % 7}"
+            marks.append(
+                Curve(np.array(line.x), line.mean, f"{letter} {_label(line)}", colour, "o-", errors=line.error)
+            )
+    label = f"F, G (mean ± SE over {', '.join(axes.over)})" if axes.over else "F, G"
+    return Figure((Panel(tuple(marks), "", x, label),), legend="panel")
