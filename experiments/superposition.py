@@ -119,7 +119,7 @@ def main() -> None:
             found = compare(gm.replace(experiment, signals=gm.words(bits)), prefix, *of_words(bits))
             note(name, f"words {bits}", 1e-3, found)
             began = time.perf_counter()
-            net = classify.train(classify.Lessons(bits=bits)).net
+            net = classify.train(classify.TrainingConfig(bits=bits)).net
             right = {key: float(classify.accuracy(net, found[key])) for key in ("simulated", "both", "linear")}
             print(f"net of {bits} bits, trained in {time.perf_counter() - began:.0f} s; words recognised: "
                   + ", ".join(f"{key} {value:.3f}" for key, value in right.items()), flush=True)  # fmt: skip

@@ -1328,7 +1328,7 @@ MUTATIONS = (
     ),
     mutation(
         "a-list-with-gaps",
-        "files/soundness.py",
+        "files/pack_validation.py",
         "pairs_within(mapped, reach - GRAZING, per_grain) <= len(keys),",
         "True,",
         "test_an_impossible_pack_is_refused_whoever_sealed_it",
