@@ -38,7 +38,7 @@ check: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/mypy experiments
+	$(BIN)/mypy experiments docs/make
 
 # dist/: the sources, and made of them a wheel for machines like this one. .github/workflows/release.yml makes those for all.
 wheel: $(BIN)/python

@@ -213,7 +213,7 @@ def test_broken_and_foreign_files_are_refused(small: classify.Training, tmp_path
     for content, words_said in (
         (whole[:5000], "its checksum does not fit"),
         (b"", "not a readable"),
-        (b"\x01", "schema is 'none'"),
+        (b"\x01", "it has no checksum"),
     ):
         file.write_bytes(content)
         with pytest.raises(gm.FileFormatError, match=words_said):

@@ -425,7 +425,7 @@ def test_only_m2_has_a_largest_overlap():
 
 
 def test_bad_parameters_of_m2_are_refused():
-    with pytest.raises(ValueError, match="Mindlin.points must be 2 to 10000, got 1"):
+    with pytest.raises(ValueError, match=r"Mindlin\.points must be 2 to 10000, got 1"):
         Mindlin(points=1)
     with pytest.raises(ValueError, match="variant"):
         Mindlin(variant="trapezoid")

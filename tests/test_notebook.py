@@ -40,7 +40,7 @@ def test_objects_are_one_line_in_a_terminal(recalled: tuple[gm.Experiment, gm.Re
     experiment, recall = recalled
     gm.save_recall(tmp_path / "r.h5", recall)
     for shown, words in (
-        (experiment.pack, "<Pack tetra(0.6)-27-seed1: grains = 27 tetra(0.6), "),
+        (experiment.pack, "<Pack tetra-27: grains = 27 tetra(0.6), "),
         (experiment, "27 grains, signals = 2, bumps, friction = Hooke, mu = 1, gamma0 = 0.001, "),
         (recall, f"<Recall of 2 signals: G = {float(recall.gain):.4g}, "),
         (gm.load_recall(tmp_path / "r.h5"), "<Recall of 2 signals: "),

@@ -74,7 +74,7 @@ def test_processes_of_ours_take_no_module_from_the_working_folder() -> None:
             if "sys.executable" in line:
                 starts += 1
                 assert re.search(r'sys\.executable, "-[PI]"', line), f"{path}: {line.strip()}"
-    assert starts >= 2
+    assert starts >= 1
 
 
 @pytest.mark.parametrize("more", [[], ["--restart"]])
@@ -85,7 +85,7 @@ def test_a_user_s_folder_with_the_name_of_parts_is_left_alone(
     (tmp_path / "o.h5.parts" / "thesis.tex").write_text("all of it")
     before = tree(tmp_path)
     assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "o.h5", "--t0", "75", *more) == 2
-    assert "holds deep and no run.json of gmem-parts/1, so it is not ours" in capsys.readouterr().err
+    assert "holds deep and no run.json of gmem-parts/0.1, so it is not ours" in capsys.readouterr().err
     assert tree(tmp_path) == before
 
 
@@ -175,7 +175,7 @@ def test_names_in_a_foreign_sweep_lead_nowhere(
 def test_a_sweep_s_file_from_elsewhere_neither_leads_out_nor_acts_on_a_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, card: str, words: str
 ) -> None:
-    (tmp_path / "sweep.json").write_text(f'{{"schema": "gmem-sweep/1", "shared": {{}}, {card}}}')
+    (tmp_path / "sweep.json").write_text(f'{{"schema": "gmem-sweep/0.1", "shared": {{}}, {card}}}')
     for verb in ("status", "show"):
         assert gmem(monkeypatch, "sweep", verb, tmp_path) == 2
         said = "".join(capsys.readouterr())
@@ -367,7 +367,7 @@ def test_a_pack_under_another_s_name_is_refused(tmp_path: Path, monkeypatch: pyt
     named = tmp_path / "gmem_jax" / "packs" / "tetra-28-a.h5"
     named.parent.mkdir(parents=True)
     named.write_bytes(PACK.read_bytes())
-    with pytest.raises(gm.FileFormatError, match=r"it is the pack tetra\(0.6\)-27-seed1, not tetra-28-a"):
+    with pytest.raises(gm.FileFormatError, match=r"it is the pack tetra-27, not tetra-28-a"):
         load_pack("tetra-28-a")
     made = Conductor(spec_of({"prepare": {"grains": 16}, "vary": {"mu": [0.1]}}), tmp_path / "mu", lambda _: None)
     (job,) = made.pack_jobs()

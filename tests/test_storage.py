@@ -20,11 +20,13 @@ from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.exported import frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import writing
+from gmem_jax.files.packs import load_stages
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.state import Grains, State
 from gmem_jax.simulation.sample import Sample
 
 PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+CYCLE = ("rest", "compress", "hold", "decompress")
 
 
 def test_a_pack_survives_the_file_bit_for_bit(tmp_path: Path) -> None:
@@ -100,13 +102,13 @@ def test_another_schema_is_refused_and_named(tmp_path: Path) -> None:
     other = tmp_path / "other.h5"
     with writing(other, "gmem-pack/99"):
         pass
-    with pytest.raises(gm.FileFormatError, match="'gmem-pack/99', expected 'gmem-pack/2'"):
+    with pytest.raises(gm.FileFormatError, match=r"'gmem-pack/99', expected 'gmem-pack/0\.1'"):
         gm.load_pack(other)
 
 
 def test_a_file_without_its_data_is_refused(tmp_path: Path) -> None:
     empty = tmp_path / "empty.h5"
-    with writing(empty, "gmem-pack/2"):
+    with writing(empty, "gmem-pack/0.1"):
         pass
     with pytest.raises(gm.FileFormatError, match="incomplete"):
         gm.load_pack(empty)
@@ -224,10 +226,19 @@ def test_a_bad_waveform_file_is_refused(tmp_path: Path, text: str, words: str) -
         gm.load_waveforms(tmp_path / "bad.csv")
 
 
-@pytest.mark.parametrize("name", [f"tetra-325-{letter}" for letter in "abcde"])
+@pytest.mark.parametrize("name", gm.list_packs())
 def test_every_shipped_pack_is_at_rest_and_says_how_it_was_made(name: str) -> None:
-    pack = gm.load_pack(name)
-    assert pack.grains == 325
-    assert pack.info["recipe"]["seed"] == "abcde".index(name[-1]) + 1
+    pack, (_, grains, letter) = gm.load_pack(name), name.split("-")
+    assert (pack.name, pack.grains) == (name, int(grains))
+    assert pack.info["recipe"]["seed"] == "abcde".index(letter) + 1
     assert pack.info["at_rest"]["largest_speed"] <= pack.info["recipe"]["quiet"]
-    assert 20.0 < float(pack.ringing_period) < 60.0
+    assert 20.0 < float(pack.ringing_period) < 200.0
+    assert set(pack.info["material"]) == {entry.name for entry in fields(gm.Material)}
+
+
+@pytest.mark.parametrize("name", ["tetra-325-a", "tetra-1024-b"])
+def test_shipped_packs_keep_the_stages_of_their_preparation(name: str) -> None:
+    stages = load_stages(name)
+    assert list(stages) == [*(f"cycle {number}: {kind}" for number in (1, 2) for kind in CYCLE), "rest"]
+    for kind, ends in {"compress": (1 / 256, 1.0), "hold": (1.0, 1.0), "decompress": (255 / 256, 0.0)}.items():
+        np.testing.assert_array_equal(stages[f"cycle 2: {kind}"].u[[0, -1], 0], ends)

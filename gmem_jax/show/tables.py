@@ -360,12 +360,10 @@ def pack_table(pack: Pack) -> Table:
             Fact("filling phi", f"{rest['filling']:.4f}"),
             Fact("coordination Z (grain pairs)", f"{rest['coordination']:.2f}"),
             Fact("sphere contacts, times two, per grain", f"{rest['contacts']:.2f}"),
+            Fact("contacts per grain, with walls", f"{0.5 * rest['contacts'] + rest['wall_contacts']:.2f}"),
+            Fact("p_x, p_y, p_z", pressures, "kPa"),
+            Fact("largest speed", f"{rest['largest_speed']:.1e}", "R/t_c"),
         ]
-        if "wall_contacts" in rest:
-            with_walls = 0.5 * rest["contacts"] + rest["wall_contacts"]
-            rows.append(Fact("contacts per grain, with walls", f"{with_walls:.2f}"))
-        rows.append(Fact("p_x, p_y, p_z", pressures, "kPa"))
-        rows.append(Fact("largest speed", f"{rest['largest_speed']:.1e}", "R/t_c"))
         if (met := pressure_over_wanted(pack.info)) is not None:
             rows.append(Fact("p_z over the wanted one", f"{met:.2f}"))
     if recipe:

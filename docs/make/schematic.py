@@ -1,6 +1,6 @@
 """The schematic of docs/experiment.md: the box from above, its motion, one stored waveform and its recall.
 
-python experiments/schematic.py
+python docs/make/schematic.py
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
-OUTPUT = Path(__file__).parent.parent / "docs" / "experiment.png"
+OUTPUT = Path(__file__).parents[1] / "experiment.png"
 STAGES = (  # name, u before and after, length in t0
     ("rest", 0, 0, 0.2),
     ("compress", 0, 1, 1.0),

@@ -1,6 +1,6 @@
 """docs/files.md, from the tables that files are written from and read by.
 
-python experiments/files_page.py
+python docs/make/files_page.py
 """
 
 from pathlib import Path
@@ -8,4 +8,4 @@ from pathlib import Path
 from gmem_jax.files.schemas import page
 
 if __name__ == "__main__":
-    Path(__file__).parent.parent.joinpath("docs", "files.md").write_text(page())
+    Path(__file__).parents[1].joinpath("files.md").write_text(page())

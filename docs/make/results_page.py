@@ -1,6 +1,6 @@
 """The tables of docs/results/figures.md, as `gmem reproduce` wrote them, and of docs/remember_more.md, of words.
 
-python experiments/results_page.py [--redraw]
+PYTHONPATH=experiments python docs/make/results_page.py [--redraw]
 
 What is published beside each point is looked up anew. With --redraw pictures are drawn anew too, those that show no
 more than their table holds and those that need no run; those of recalls (figs. 3, 4, 6 and 13) stay as they are.
@@ -25,14 +25,14 @@ from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import PICTURES
 from gmem_jax.show.tables import published
 
-HERE = Path(__file__).parent.parent / "docs" / "results"
+HERE = Path(__file__).parents[1] / "results"
 JOINED = {  # figures that no one command makes
     "fig12b-paper": "Fig. 6 of this scale, figs. 8 and 12b of smaller ones, "
     "`--scale workstation,sizes=31680,few=1` and `experiments/large_pack.py`, put together by `experiments/joined.py`",
 }
 TITLES = {"fig03": "packs at rest, by size and by shape", "choices": "what the paper leaves open, each tried otherwise"}
 RATES = {"fig12b-paper": "1,800 to 18,000"}  # of figures whose points are of several
-BEGIN, END = "<!-- made by experiments/results_page.py -->", "<!-- end -->"
+BEGIN, END = "<!-- made by docs/make/results_page.py -->", "<!-- end -->"
 
 
 def table(path: Path) -> list[str]:
