@@ -18,10 +18,9 @@ import numpy as np
 
 import gmem_jax as gm
 from gmem_jax import classify
-from gmem_jax.experiment.recall import prefix_of, run
+from gmem_jax.experiment.recall import Prefix, prefix_of, run
 from gmem_jax.experiment.signals import bit_width
 from gmem_jax.physics.material import Material
-from gmem_jax.simulation.runner import Runner
 
 GAMMAS = (1e-4, 3e-4, 1e-3, 3e-3)
 BITS = (3, 4, 5)
@@ -33,10 +32,10 @@ def error(predicted: np.ndarray, simulated: np.ndarray) -> float:
     return float(np.linalg.norm(predicted - simulated) / np.linalg.norm(simulated))
 
 
-def compare(experiment: gm.Experiment, begun: Runner, n: int, width: float) -> dict[str, Any]:
+def compare(experiment: gm.Experiment, prefix: Prefix, n: int, width: float) -> dict[str, Any]:
     """Predictions of the experiment's signals from a kernel on n bumps that can form them, and their simulation."""
-    kernel = gm.memory_kernel(experiment, n, width, begun=begun)
-    simulated = np.asarray(run(experiment, begun).p_sig)
+    kernel = gm.memory_kernel(experiment, n, width, prefix=prefix)
+    simulated = np.asarray(run(experiment, prefix=prefix).p_sig)
     both, linear = kernel.predict(experiment.signals), kernel.predict(experiment.signals, even=False)
     return {
         "both": both,
