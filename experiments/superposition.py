@@ -105,18 +105,18 @@ def main() -> None:
     names = arguments.packs.split(",")
     for name in names:
         experiment = gm.Experiment(gm.load_pack(name), gm.six_signals(), t0=arguments.t0)
-        begun = prefix_of(experiment)
+        prefix = prefix_of(experiment)
         for gamma0 in GAMMAS:
-            found = compare(gm.replace(experiment, gamma0=gamma0), begun, 17, 0.2)
+            found = compare(gm.replace(experiment, gamma0=gamma0), prefix, 17, 0.2)
             note(name, "six", gamma0, found)
             if name == names[0] and gamma0 == 1e-3:
                 shown = found
         for bits in BITS:
-            found = compare(gm.replace(experiment, signals=gm.words(bits)), begun, *of_words(bits))
+            found = compare(gm.replace(experiment, signals=gm.words(bits)), prefix, *of_words(bits))
             note(name, f"words {bits}", 1e-3, found)
         if name == names[0] and arguments.long:
             bits = arguments.long
-            found = compare(gm.replace(experiment, signals=gm.words(bits)), begun, *of_words(bits))
+            found = compare(gm.replace(experiment, signals=gm.words(bits)), prefix, *of_words(bits))
             note(name, f"words {bits}", 1e-3, found)
             began = time.perf_counter()
             net = classify.train(classify.Lessons(bits=bits)).net

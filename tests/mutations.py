@@ -323,14 +323,14 @@ MUTATIONS = (
     ),
     # ---------------------------------------------------------------- the native library
     mutation(
-        "packed-guest-torques-swapped",
+        "packed-remote-torques-swapped",
         "packed.h",
         "to[1] = away_is_one ? torque_one : torque_other;",
         "to[1] = away_is_one ? torque_other : torque_one;",
         f"{DOMAINS}[1-H]",
     ),
     mutation(
-        "packed-guest-force-reversed",
+        "packed-remote-force-reversed",
         "packed.h",
         "to[0] = away_is_one ? force : -force;",
         "to[0] = away_is_one ? -force : force;",
@@ -351,14 +351,14 @@ MUTATIONS = (
         f"{DOMAINS}[1-H]",
     ),
     mutation(
-        "replicas-guest-torques-swapped",
+        "replicas-remote-torques-swapped",
         "replicas.h",
         "store_vec(to + 3, away_is_one ? push.torque_one : push.torque_other);",
         "store_vec(to + 3, away_is_one ? push.torque_other : push.torque_one);",
         f"{DOMAINS}[9-H]",
     ),
     mutation(
-        "replicas-guest-force-reversed",
+        "replicas-remote-force-reversed",
         "replicas.h",
         "store_vec(to, away_is_one ? push.force : -push.force);",
         "store_vec(to, away_is_one ? -push.force : push.force);",
@@ -367,8 +367,8 @@ MUTATIONS = (
     mutation(
         "replicas-spin-times-five",
         "replicas.h",
-        "load_vec(one + kSpin),\n            load_vec(other + kSpin)};",
-        "load_vec(one + kSpin),\n            splat(5.0) * load_vec(other + kSpin)};",
+        "load_vec(one + kSpin),\n              load_vec(other + kSpin)};",
+        "load_vec(one + kSpin),\n              splat<V>(5.0) * load_vec(other + kSpin)};",
         f"{DOMAINS}[9-M2]",
     ),
     mutation(
@@ -379,7 +379,7 @@ MUTATIONS = (
         f"{DOMAINS}[9-H]",
     ),
     mutation(
-        "replicas-remote-forces-not-forgotten",
+        "replicas-remotes-not-forgotten",
         "replicas.h",
         "for (int q = 0; q < 6; ++q) remote[6",
         "for (int q = 0; q < 3; ++q) remote[6",
@@ -494,7 +494,7 @@ MUTATIONS = (
         f"{ACROSS}[H]",
     ),
     mutation(
-        "adjoint-guest-of-the-other-sphere",
+        "adjoint-remote-of-the-other-sphere",
         "plan.cc",
         "away(c) == c.grain_one ? c.one : c.other",
         "away(c) == c.grain_one ? c.other : c.one",
@@ -530,7 +530,7 @@ MUTATIONS = (
     ),
     mutation(
         "native-walls-and-spheres",
-        "native/__init__.py",
+        "native/march.py",
         "(material.normal_stiffness, material.normal_damping, material.wall_stiffness)",
         "(material.wall_stiffness, material.normal_damping, material.normal_stiffness)",
         f"{DOMAINS}[1-H]",
@@ -580,7 +580,7 @@ MUTATIONS = (
     ),
     mutation(
         "gpu-list-taken-on-trust",
-        "native/gpu.py",
+        "native/cuda.py",
         " & (listed == mine)",
         "",
         "test_a_broken_list_gives_no_numbers",

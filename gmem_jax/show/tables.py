@@ -364,6 +364,10 @@ def pack_table(pack: Pack) -> Table:
             Fact("p_x, p_y, p_z", pressures, "kPa"),
             Fact("largest speed", f"{rest['largest_speed']:.1e}", "R/t_c"),
         ]
+        with_walls = 0.5 * rest["contacts"] + rest["wall_contacts"]
+        rows.append(Fact("contacts per grain, with walls", f"{with_walls:.2f}"))
+        rows.append(Fact("p_x, p_y, p_z", pressures, "kPa"))
+        rows.append(Fact("largest speed", f"{rest['largest_speed']:.1e}", "R/t_c"))
         if (met := pressure_over_wanted(pack.info)) is not None:
             rows.append(Fact("p_z over the wanted one", f"{met:.2f}"))
     if recipe:

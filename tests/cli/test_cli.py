@@ -11,6 +11,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.command import app as cli
@@ -18,7 +19,7 @@ from gmem_jax.command import recalls
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.files.hdf5 import writing
 
-PACK = Path(__file__).parent.parent / "data" / "tetra-27.h5"
+PACK = TETRA_27
 SHORT = ["--t0", "75", "--store", "0.1", "--rest", "0.1", "--hold", "0.1"]
 
 

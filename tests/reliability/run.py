@@ -40,7 +40,7 @@ def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
         "-q",
         "-p",
         "no:cacheprovider",
-        str(ROOT / "tests/test_sanitizers.py"),
+        str(ROOT / "tests/native/test_sanitizers.py"),
     ]
     studies = [*STUDIES, "builds"] if shutil.which("clang++") else STUDIES
     others = [
