@@ -360,9 +360,6 @@ def pack_table(pack: Pack) -> Table:
             Fact("filling phi", f"{rest['filling']:.4f}"),
             Fact("coordination Z (grain pairs)", f"{rest['coordination']:.2f}"),
             Fact("sphere contacts, times two, per grain", f"{rest['contacts']:.2f}"),
-            Fact("contacts per grain, with walls", f"{0.5 * rest['contacts'] + rest['wall_contacts']:.2f}"),
-            Fact("p_x, p_y, p_z", pressures, "kPa"),
-            Fact("largest speed", f"{rest['largest_speed']:.1e}", "R/t_c"),
         ]
         with_walls = 0.5 * rest["contacts"] + rest["wall_contacts"]
         rows.append(Fact("contacts per grain, with walls", f"{with_walls:.2f}"))
