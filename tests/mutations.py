@@ -897,9 +897,9 @@ MUTATIONS = (
     ),
     mutation(
         "key-without-the-pack",
-        "files/configuration.py",
-        'own = {**written(experiment), "pack": pack_fingerprint(experiment.pack)}',
-        'own = {**written(experiment), "pack": ""}',
+        "experiment/record.py",
+        'own = {**to_dict(experiment), "pack": pack_fingerprint(experiment.pack)}',
+        'own = {**to_dict(experiment), "pack": ""}',
         "test_a_key_stands_for_all_that_numbers_depend_on",
     ),
     mutation(
