@@ -5,20 +5,28 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo test test-slow check docs mutations reliability cluster wheel install clean
+.PHONY: demo quick test test-slow check docs mutations reliability cluster wheel install clean
 
 demo: install
 	$(REBUILD)
 	$(BIN)/gmem demo --force
 
+# Units and physics: what to run after every change. Its budget is two minutes on two quiet cores.
+QUICK := tests/physics tests/simulation/test_drive.py tests/simulation/test_protocol.py tests/experiment/test_analysis.py \
+  tests/experiment/test_samples.py tests/experiment/test_signals.py tests/files/test_columns.py tests/reading/test_readers.py \
+  tests/reading/test_capacity.py
+quick: install-dev
+	$(REBUILD)
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow" $(QUICK)
+
 test: install-dev
 	$(REBUILD)
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow" $(TESTS)
 
-# What takes minutes for one statement: sanitizers, plain JAX on several devices.
+# Cases of ten seconds and more that say of others what a quicker one says, and what takes minutes for one statement.
 test-slow: install-dev
 	$(REBUILD)
-	$(BIN)/pytest -n 2 --dist loadgroup -m slow
+	$(BIN)/pytest -n 2 --dist loadgroup -m slow $(TESTS)
 
 # Wrong code that the tests must notice; an hour or two. Names of mutations: make mutations NAMES="step-* native-*"
 mutations: install-dev
@@ -38,7 +46,7 @@ check: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/mypy experiments
+	$(BIN)/mypy experiments docs/make
 
 # dist/: the sources, and made of them a wheel for machines like this one. .github/workflows/release.yml makes those for all.
 wheel: $(BIN)/python

@@ -112,8 +112,8 @@ def run_piece(piece: Piece, file: Path) -> None:
 
 def use_build(name: str, folder: Path) -> None:
     """Have this process load a library of another build, compiled if it is not there yet."""
-    from gmem_jax import native
     from gmem_jax.native import build
+    from gmem_jax.native import library as loaded
 
     cxx, optimise, instructions = BUILDS[name]
     library = (folder / f"{cxx}{optimise}.so").resolve()
@@ -122,7 +122,7 @@ def use_build(name: str, folder: Path) -> None:
         build.FLAGS = tuple(optimise if flag == "-O3" else flag for flag in build.FLAGS)
         build.build(library)
     build.source_hash = lambda: ""  # its flags are others on purpose
-    native._path = lambda: library
+    loaded.path = lambda: library
     if instructions:
         os.environ["GMEM_ISA"] = instructions
 

@@ -13,7 +13,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
 MEASURED = ("bench", "paper_rate/bench", "large_packs", "gpu")
-FROM_ELSEWHERE = ["CHANGELOG.md", *(f"benchmarks/{name}.md" for name in MEASURED)]
+FROM_ELSEWHERE = ["CHANGELOG.md", "CONTRIBUTING.md", *(f"benchmarks/{name}.md" for name in MEASURED)]
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 INLINE = re.compile(r"\$([^$\n]+)\$")

@@ -1,7 +1,8 @@
-"""Small deterministic scenes, and compiled runs of them, shared by the tests of the core."""
+"""Small deterministic scenes, and compiled runs of them, shared by the tests of the core; where files of tests are."""
 
 import functools
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,10 @@ from gmem_jax.physics.state import Box, Grains, State, replicate, still_box
 from gmem_jax.simulation.protocol import Bin
 from gmem_jax.simulation.sample import Sample, end_bin
 from gmem_jax.simulation.strain import StrainPath
+
+TESTS = Path(__file__).parent
+ROOT = TESTS.parent
+TETRA_27 = TESTS / "data" / "tetra-27.h5"
 
 ELASTIC = Material(normal_damping=0.0)
 SPHERE = sphere()

@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import pkgutil
 import re
 import shlex
 from pathlib import Path
@@ -95,6 +96,12 @@ def test_pages_that_the_code_names_are_there(source: str) -> None:
     assert not [page for page in named if not (ROOT / page).is_file()]
 
 
+@pytest.mark.parametrize("file", [*map(name, PAGES), "Makefile", "pyproject.toml", ".ci/run"])
+def test_tests_that_are_named_are_there(file: str) -> None:
+    named = re.findall(r"\btests/[\w/]+(?:\.\w+)?", (ROOT / file).read_text())
+    assert not [one for one in named if not (ROOT / one).exists()]
+
+
 ROOT_COMMAND: Any = typer.main.get_command(app)
 COMMANDS = ROOT_COMMAND.commands
 
@@ -155,6 +162,7 @@ def test_every_public_name_is_in_the_reference() -> None:
     shown = set(re.findall(r"^::: gmem_jax\.(\w+)$", page, re.MULTILINE))
     assert shown == set(gm.__all__) - {"capacity", "classify"}
     assert all(f"::: gmem_jax.reading.{name}" in page for name in ("capacity", "classify"))
+    assert all(pkgutil.resolve_name(shown) for shown in re.findall(r"^::: (\S+)$", page, re.MULTILINE))
 
 
 def test_every_record_is_in_the_table_of_contents() -> None:

@@ -3,17 +3,17 @@
 import contextlib
 import itertools
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.physics.rules import usual_rules
 
-PACK = Path(__file__).parent / "data" / "tetra-27.h5"
+PACK = TETRA_27
 FLAGS: dict[str, Callable[[], contextlib.AbstractContextManager]] = {
     "rank promotion raises": lambda: jax.numpy_rank_promotion("raise"),
     "strict dtype promotion": lambda: jax.numpy_dtype_promotion("strict"),

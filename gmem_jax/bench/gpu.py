@@ -13,8 +13,8 @@ from gmem_jax import native
 from gmem_jax.bench import measure
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance
-from gmem_jax.native import gpu
-from gmem_jax.native.gpu import Needs
+from gmem_jax.native import cuda
+from gmem_jax.native.cuda import Needs
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.simulation import sample
@@ -35,7 +35,7 @@ def device() -> Any:
         found = jax.devices("cuda")[0]
     except RuntimeError as error:
         raise ValueError("JAX sees no CUDA GPU here (with one: pip install 'gmem-jax[cuda13]')") from error
-    if reason := (native.available()[1] if not native.available()[0] else gpu.missing()):
+    if reason := (native.available()[1] if not native.available()[0] else cuda.missing()):
         raise ValueError(f"the native backend cannot use the GPU: {reason}")
     return found
 
@@ -72,7 +72,7 @@ def bytes_per_grain_step(pack: Pack, law: str = "H") -> dict[str, float]:
 
 def registers() -> dict[str, dict[str, Needs]]:
     """What the step takes, by law and architecture; empty without NVRTC or library."""
-    if gpu.missing() or not native.available()[0]:
+    if cuda.missing() or not native.available()[0]:
         return {}
 
     def of(law: FrictionLaw, tangent: bool) -> dict[str, Needs]:

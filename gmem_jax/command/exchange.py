@@ -26,7 +26,7 @@ def export(
 ) -> None:
     """Write a pack, or the configurations along a recall, for other programs (docs/exchange.md)."""
     file = pack_called(str(file)) or file
-    if schema_of(file) in (PACK.name, *PACK.before):
+    if schema_of(file) == PACK.name:
         pack = load_pack(file)
         material = material_from(pack.info.get("material", {}))
         mass, found = float(pack.clump.mass), load_frames(file) if frames else frames_of_pack(pack, material)

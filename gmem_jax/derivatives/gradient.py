@@ -43,11 +43,6 @@ def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
     return experiment.compare(p_sig).fidelity
 
 
-def gain_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
-    """G of the set: a `Loss`."""
-    return experiment.compare(p_sig).gain
-
-
 _OFFSETS = "pack.clump.offsets"
 
 

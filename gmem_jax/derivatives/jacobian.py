@@ -20,6 +20,7 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within
 
 LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
+SHARE = 0.7  # of the time that all derivatives take, those by the drive
 
 
 @comparable
@@ -71,12 +72,11 @@ def _pressures(recall: Recall) -> dict[str, np.ndarray]:
 
 @usual_rules()
 @shows_progress
-def exact(experiment: Experiment, *, law: bool = True, progress: ProgressChoice = None) -> Jacobian:
+def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobian:
     """Forward mode, parameters as replicas; two runs, because mu and the stiffness act on the prefix too.
 
     Args:
         experiment: of one signal of n bumps.
-        law: whether to take derivatives by mu and stiffness also.
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
@@ -92,29 +92,27 @@ def exact(experiment: Experiment, *, law: bool = True, progress: ProgressChoice 
         "signals.amplitudes": jnp.asarray(np.eye(n + 1, n)),
         "gamma0": jnp.zeros(n + 2).at[-1].set(1.0),
     }
-    share = 0.7 if law else 1.0
-    pushed = gradient.push(drive, direction, progress=within(tell, 0.0, share))
+    pushed = gradient.push(drive, direction, progress=within(tell, 0.0, SHARE))
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
     p_sig, p_xy = [np.asarray(pushed.p_sig_slope)], [_p_xy(experiment, pushed.slope)[1:]]
-    if law:
-        two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # replicas 0, 1: no signal; 2, 3: it
-        wide = {path: jnp.full(4, value_at(experiment, path)) for path in LAW.values()}
-        laws = replace(experiment, {**wide, "signals": _copies(bumps, two)})
-        direction = {
-            "friction.mu": jnp.asarray([1.0, 0.0, 1.0, 0.0]),
-            "friction.stiffness": jnp.asarray([0.0, 1.0, 0.0, 1.0]),
-        }
-        pushed = gradient.push(laws, direction, progress=within(tell, share, 1.0))
-        change = np.asarray(analysis.recalled(jnp.asarray(pushed.slope[experiment.protocol.reads[0]])))
-        p_sig.append(-(change[2:] - change[:2]))
-        p_xy.append(_p_xy(experiment, pushed.slope)[2:])
-        names += LAW
-        values += _law_values(experiment)
+    two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # replicas 0, 1: no signal; 2, 3: it
+    wide = {path: jnp.full(4, value_at(experiment, path)) for path in LAW.values()}
+    laws = replace(experiment, {**wide, "signals": _copies(bumps, two)})
+    direction = {
+        "friction.mu": jnp.asarray([1.0, 0.0, 1.0, 0.0]),
+        "friction.stiffness": jnp.asarray([0.0, 1.0, 0.0, 1.0]),
+    }
+    pushed = gradient.push(laws, direction, progress=within(tell, SHARE, 1.0))
+    change = np.asarray(analysis.recalled(jnp.asarray(pushed.slope[experiment.protocol.reads[0]])))
+    p_sig.append(-(change[2:] - change[:2]))
+    p_xy.append(_p_xy(experiment, pushed.slope)[2:])
+    names += LAW
+    values += _law_values(experiment)
     return Jacobian(tuple(names), np.asarray(values), np.concatenate(p_sig), np.concatenate(p_xy))
 
 
-def differences(experiment: Experiment, relative: float, *, law: bool = True, progress: Progress = silent) -> Jacobian:
+def differences(experiment: Experiment, relative: float, *, progress: Progress = silent) -> Jacobian:
     """Central differences with steps of `relative` times each parameter (amplitudes: times 1), as replicas.
 
     Raises:
@@ -135,24 +133,23 @@ def differences(experiment: Experiment, relative: float, *, law: bool = True, pr
     slopes = [(recalled[up] - recalled[down]) / widths], [(p_xy[up] - p_xy[down]) / widths]
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
-    if law:
-        law_values = _law_values(experiment)
-        factor = {"mu": [1.0, -1.0, 0.0, 0.0], "stiffness": [0.0, 0.0, 1.0, -1.0]}
-        shifted = {
-            path: jnp.asarray(value * (1.0 + relative * np.tile(factor[name], 2)))
-            for (name, path), value in zip(LAW.items(), law_values, strict=True)
-        }
-        rows = jnp.asarray(np.concatenate([np.zeros((3, n)), np.repeat(row, 4, axis=0)]))
-        other = replace(experiment, {**shifted, "signals": _copies(bumps, rows)})
-        pressure = _pressures(run(other, progress=progress))
-        change = np.asarray(analysis.recalled(jnp.asarray(pressure[experiment.protocol.reads[0]])))
-        signal = -(change[4:] - change[:4])
-        p_xy = _p_xy(experiment, pressure)[4:]
-        widths = 2.0 * relative * np.asarray(law_values)[:, None]
-        slopes[0].append((signal[[0, 2]] - signal[[1, 3]]) / widths)
-        slopes[1].append((p_xy[[0, 2]] - p_xy[[1, 3]]) / widths)
-        names += LAW
-        values += law_values
+    law_values = _law_values(experiment)
+    factor = {"mu": [1.0, -1.0, 0.0, 0.0], "stiffness": [0.0, 0.0, 1.0, -1.0]}
+    shifted = {
+        path: jnp.asarray(value * (1.0 + relative * np.tile(factor[name], 2)))
+        for (name, path), value in zip(LAW.items(), law_values, strict=True)
+    }
+    rows = jnp.asarray(np.concatenate([np.zeros((3, n)), np.repeat(row, 4, axis=0)]))
+    other = replace(experiment, {**shifted, "signals": _copies(bumps, rows)})
+    pressure = _pressures(run(other, progress=progress))
+    change = np.asarray(analysis.recalled(jnp.asarray(pressure[experiment.protocol.reads[0]])))
+    signal = -(change[4:] - change[:4])
+    p_xy = _p_xy(experiment, pressure)[4:]
+    widths = 2.0 * relative * np.asarray(law_values)[:, None]
+    slopes[0].append((signal[[0, 2]] - signal[[1, 3]]) / widths)
+    slopes[1].append((p_xy[[0, 2]] - p_xy[[1, 3]]) / widths)
+    names += LAW
+    values += law_values
     return Jacobian(tuple(names), np.asarray(values), np.concatenate(slopes[0]), np.concatenate(slopes[1]))
 
 

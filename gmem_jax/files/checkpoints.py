@@ -26,12 +26,12 @@ from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import json_of, read_npy, refusing, require
 from gmem_jax.files.ours import Folder, release, sweep
-from gmem_jax.files.seal import BLOCK, seal, sealed
+from gmem_jax.files.seal import BLOCK, require_sealed, seal
 from gmem_jax.physics.pytree import KINDS
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 
-PART_SCHEMA = "gmem-part/3"
-PARTS_SCHEMA = "gmem-parts/1"
+PART_SCHEMA = "gmem-part/0.1"
+PARTS_SCHEMA = "gmem-parts/0.1"
 MARKER = "run.json"
 OWN = r"[\w.+-]+\.(?:npz|now|before)|(?:run|job)\.json"
 """Names of files in a folder of parts; a sweep puts the job there that they belong to."""
@@ -100,8 +100,7 @@ def load_part(path: Path, of: str = "") -> Any:
         FileFormatError: if the file is damaged, none of this schema, or something else than `of`.
     """
     with refusing(path, "part of a run"), path.open("rb") as opened:
-        if not sealed(opened, path):
-            raise FileFormatError(f"{path}: not a readable part of a run (no checksum); remove it")
+        require_sealed(opened, "part of a run")
         with zipfile.ZipFile(opened) as archive:
             found = _members(archive, path.stat().st_size)
         head = json_of(found.pop("head", np.zeros(0, np.uint8)).tobytes(), "head")

@@ -1,39 +1,33 @@
 """What all HDF5 files of this package have in common: a seal, a schema, the configuration that made them, samples.
 
 A file is sealed (see `seal`), holds nothing but what `tree` allows, and every array is compared with a declaration
-before it is read. Files from before there were seals are copied into sealed ones on the fly.
+before it is read.
 """
 
 import io
-import subprocess
-import sys
-import tempfile
-import warnings
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import h5py
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.files import tree
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checked import Array, fit, refusing
 from gmem_jax.files.schemas import DIMENSIONS, STAGE
-from gmem_jax.files.seal import BLOCK, seal, sealed
+from gmem_jax.files.seal import BLOCK, require_sealed, seal
+from gmem_jax.files.tree import Tree
 from gmem_jax.simulation.protocol import BINS
 from gmem_jax.simulation.sample import Sample
 
-_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_PATIENCE, _PACE = 5.0, 2e7  # seconds, and bytes a second, that copying an old file may take
 _SAMPLE = tuple(entry.name for entry in fields(Sample))
 
 
-class Content(tree.Tree):
+class Content(Tree):
     """A file that is open for reading: its attributes, and its arrays once they are found to be as declared."""
 
     @property
@@ -102,8 +96,8 @@ def writing(path: Path, schema: str) -> Iterator[h5py.File]:
 
 
 @contextmanager
-def reading(path: Path, *schemas: str) -> Iterator[Content]:
-    """The content of an HDF5 file of one of these schemas; of any if none is given.
+def reading(path: Path, schema: str = "") -> Iterator[Content]:
+    """The content of an HDF5 file of a schema; of any if none is given.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -111,35 +105,13 @@ def reading(path: Path, *schemas: str) -> Iterator[Content]:
             goes wrong in the block.
     """
     path = Path(path)
-    with refusing(path, "HDF5 file"), path.open("rb") as raw, tempfile.TemporaryDirectory() as folder:
-        if sealed(raw, path):
-            source: BinaryIO = raw
-        else:
-            copied = _resealed(path, raw, Path(folder) / "copy.h5")
-            source = copied.open("rb")
-        with source, h5py.File(source, "r") as file:
+    with refusing(path, "HDF5 file"), path.open("rb") as raw:
+        require_sealed(raw, "HDF5 file")
+        with h5py.File(raw, "r") as file:
             content = Content(file)
-            if schemas and content.schema not in schemas:
-                raise FileFormatError(f"{path}: schema is {content.schema[:40]!r}, expected {schemas[0]!r}")
+            if schema and content.schema != schema:
+                raise FileFormatError(f"{path}: schema is {content.schema[:40]!r}, expected {schema!r}")
             yield content
-
-
-def _resealed(path: Path, raw: BinaryIO, copied: Path) -> Path:
-    """A copy of a file that was written without a seal, made in a process of its own: libhdf5 trusts what it parses."""
-    raw.seek(0)
-    if raw.read(len(_SIGNATURE)) != _SIGNATURE:
-        raise FileFormatError(f"{path}: not a readable HDF5 file (truncated?)")
-    command = [sys.executable, "-I", tree.__file__, str(path.absolute()), str(copied)]
-    patience = _PATIENCE + path.stat().st_size / _PACE
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=patience)
-    except subprocess.TimeoutExpired:
-        raise FileFormatError(f"{path}: not a readable HDF5 file (libhdf5 went on for {patience:.0f} s)") from None
-    if done.returncode:
-        said = done.stderr.strip().rpartition("\n")[2][:160] if done.returncode == 2 else "libhdf5 broke down"
-        raise FileFormatError(f"{path}: not a readable HDF5 file (truncated?): {said}")
-    warnings.warn(f"{path}: written before files had checksums: its numbers are plausible, no more", stacklevel=2)
-    return copied
 
 
 def schema_of(path: Path) -> str:

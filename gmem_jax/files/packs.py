@@ -109,7 +109,7 @@ def load_pack(source: str | Path) -> Pack:
     """
     path = _path_of(source)
     with refusing(path, "pack"):
-        with reading(path, PACK.name, *PACK.before) as content:
+        with reading(path, PACK.name) as content:
             found = content.arrays(PACK.arrays)
             label, record, shape = content.text("name"), content.text("record"), content.text("shape", "clump")
             isotropic = content.attributes["clump"].get("isotropic")
@@ -135,7 +135,7 @@ def load_stages(source: str | Path) -> OrderedDict[str, Sample]:
         FileFormatError: if they are incomplete.
     """
     path = _path_of(source)
-    with refusing(path, "pack"), reading(path, PACK.name, *PACK.before) as content:
+    with refusing(path, "pack"), reading(path, PACK.name) as content:
         return content.samples("stages")
 
 

@@ -40,7 +40,7 @@ def save_result(path: Path, schema: Schema, result: dict[str, Any]) -> None:
 
 
 def load_result(path: Path) -> tuple[Schema, dict[str, Any]]:
-    """Read what `save_result` wrote, and what commands wrote before there were schemas.
+    """Read what `save_result` wrote.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -62,8 +62,7 @@ def load_result(path: Path) -> tuple[Schema, dict[str, Any]]:
 def _schema_of(found: dict[str, Any]) -> Schema:
     told = found.get("schema")
     for schema in _KINDS:
-        own = {name.partition("/")[0] for name in schema.arrays}
-        if told == schema.name or (told is None and own <= set(found)):
+        if told == schema.name:
             return schema
     names = ", ".join(schema.name for schema in _KINDS)
     raise FileFormatError(f"schema is {str(told)[:40]!r}, expected one of {names}")

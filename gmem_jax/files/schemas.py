@@ -35,7 +35,6 @@ class Schema(NamedTuple):
         words: what it is and what makes it.
         arrays: every array by its path, or every field of JSON.
         texts: attributes, by name.
-        before: older versions that are still read, and how they differ.
     """
 
     name: str
@@ -43,13 +42,11 @@ class Schema(NamedTuple):
     words: str
     arrays: Mapping[str, Array]
     texts: Mapping[str, str] = {}
-    before: Mapping[str, str] = {}
 
 
 _CONFIGURATION = {
     "configuration": "JSON: every parameter of the experiment, what its defaults came to, versions, commit, device"
 }
-_UNSEALED = "without a checksum"
 
 STAGE = {  # of a recall or a preparation, in stages/NAME; `common` is the last dimension where there is one run for all
     "time": Array("real", ("time",), "t0", "end of the bin, since the first stage in the file began"),
@@ -71,7 +68,7 @@ FRAMES = {  # configurations along the run that made a recall or a pack, in fram
 }
 
 PACK = Schema(
-    "gmem-pack/2",
+    "gmem-pack/0.1",
     "Pack (.h5)",
     "Grains at rest in their box: `gmem prepare`, `gm.save_pack`.",
     {
@@ -96,7 +93,6 @@ PACK = Schema(
         "clump: shape": 'like "tetra(0.6)"',
         "clump: isotropic": "whether its three moments are equal",
     },
-    {"gmem-pack/1": _UNSEALED},
 )
 
 RECALL = Schema(
@@ -109,7 +105,7 @@ RECALL = Schema(
         "shear": Array("real", ("signal", "u"), "1", "I(u), the waveforms as applied, in parts of gamma0"),
         "J": Array("real", ("signal", "u"), "1", "J(u), their integrals averaged over each bin"),
         "p_sig": Array("real", ("signal", "u"), "E", "recalled signals, the background subtracted"),
-        "rounding": Array("real", ("signal",), "E", "round-off in p_sig, root mean square; not in older files"),
+        "rounding": Array("real", ("signal",), "E", "round-off in p_sig, root mean square"),
         "gain": Array("real", (), "1", "G of the set"),
         "fidelity": Array("real", (), "1", "F of the set"),
         "windowed_gain": Array("real", (), "1", "G after a running mean over the ringing period"),
@@ -124,15 +120,10 @@ RECALL = Schema(
         "dt": Array("real", (), "t_c", "time step; [replica] where t0 differs between replicas"),
     },
     _CONFIGURATION,
-    {
-        "gmem-recall/3": "without G and F of each signal",
-        "gmem-recall/2": "without names, time and u of the stages",
-        "gmem-recall/1": f"{_UNSEALED} and I(u)",
-    },
 )
 
 KERNEL = Schema(
-    "gmem-kernel/1",
+    "gmem-kernel/0.1",
     "Memory kernel (.h5)",
     "The linear part of a pack's memory, measured on n bumps: `gmem kernel`.",
     {
@@ -155,7 +146,7 @@ _RUN = {
 _MADE = {**_RUN, "configuration": Array("object", (), "", _CONFIGURATION["configuration"])}
 
 GRADIENT = Schema(
-    "gmem-gradient/1",
+    "gmem-gradient/0.1",
     "Gradient (.json)",
     "Exact derivatives of the fidelity: `gmem gradient`.",
     {
@@ -168,11 +159,10 @@ GRADIENT = Schema(
         "gradient/stiffness": Array("real, if any", (), "1/(E R)", "dF/dk_H (or k_M, 1/(E R^0.5)); where there is one"),
         **_MADE,
     },
-    before={"": "without `schema` and `about`"},
 )
 
 TUNED = Schema(
-    "gmem-tuned/1",
+    "gmem-tuned/0.1",
     "Tuned drive (.json)",
     "The drive with the best mean fidelity of some packs: `gmem tune`.",
     {
@@ -184,11 +174,10 @@ TUNED = Schema(
         "history": Array("list", ("iteration",), "", "those values and their mean F after every iteration"),
         **_MADE,
     },
-    before={"": "without `schema` and `about`"},
 )
 
 READING = Schema(
-    "gmem-reading/1",
+    "gmem-reading/0.1",
     "Classification (.json)",
     "How well the words of a recall are read: `gmem classify`.",
     {
@@ -210,7 +199,6 @@ READING = Schema(
         **_RUN,
         "status": Array("whole", (), "1", "bits of gm.Status of the recall; 0 is sound"),
     },
-    before={"": "without `schema` and `about`"},
 )
 
 DESIGN = Schema(
@@ -226,7 +214,7 @@ DESIGN = Schema(
 )
 
 NET = Schema(
-    "gmem-classifier/2",
+    "gmem-classifier/0.1",
     "Net (.msgpack)",
     "The reader of words of one length and seed, finished or not: `gmem classify --nets`. 512 bytes of checksum, then "
     "MessagePack as flax writes it.",
@@ -236,11 +224,10 @@ NET = Schema(
         "parameters/Dense_k/kernel": Array("real", ("inputs", "outputs"), "1", "weights of layer k, float32"),
         "parameters/Dense_k/bias": Array("real", ("outputs",), "1", "biases of layer k, float32"),
     },
-    before={"gmem-classifier/1": _UNSEALED},
 )
 
 SWEEP = Schema(
-    "gmem-sweep/1",
+    "gmem-sweep/0.1",
     "Sweep (a folder)",
     "`gmem sweep`: points/KEY.h5 are recalls, packs/KEY.h5 packs; `gmem sweep export` makes one table of them. "
     "sweep.json holds:",
@@ -261,7 +248,7 @@ def page() -> str:
 
 _INTRODUCTION = """# What the files hold
 
-<!-- made by experiments/files_page.py -->
+<!-- made by docs/make/files_page.py -->
 
 Units are R = E = rho = 1, time in t_c = R sqrt(rho / E); `gm.Material` converts to SI. The time axis of stages is in
 t0, the duration of one compression. `gmem show FILE` prints what any of these files holds, `gmem show FILE --plot WHAT
@@ -296,9 +283,6 @@ def _section(schema: Schema) -> str:
         lines += _table(FRAMES)
     if schema.texts:
         lines += ["", "Attributes: " + "; ".join(f"`{name}`, {words}" for name, words in schema.texts.items()) + "."]
-    if schema.before:
-        older = (f"`{name}`, {words}" if name else f"files {words}" for name, words in schema.before.items())
-        lines += ["", f"Still read: {'; '.join(older)}."]
     return "\n".join([*lines, ""])
 
 

@@ -36,16 +36,20 @@ def seal(path: Path) -> None:
         file.write(block)
 
 
-def sealed(file: BinaryIO, path: Path) -> bool:
-    """Whether a file, open for reading, has a seal, which then fits; False for one that never had any.
+def require_sealed(file: BinaryIO, what: str) -> None:
+    """Refuse a file, open for reading, whose seal does not fit.
+
+    Args:
+        file: it is left at the end of its first 512 bytes.
+        what: the kind of file that is wanted.
 
     Raises:
-        FileFormatError: if the file was damaged after it was sealed.
+        FileFormatError: if it has no seal, or was damaged after it was sealed.
     """
     file.seek(0)
     found = file.read(BLOCK)
     if not found.startswith(_MARK):
-        return False
+        raise FileFormatError(f"not a readable {what}: it has no checksum (truncated, or made by another program?)")
     if found != _block(file):
-        raise FileFormatError(f"{path}: damaged, its checksum does not fit its content; restore it, or make it anew")
-    return True
+        raise FileFormatError("damaged, its checksum does not fit its content; restore it, or make it anew")
+    file.seek(BLOCK)

@@ -162,10 +162,13 @@ def _check_record(found: Found, record: dict[str, Any], overlap: np.ndarray) -> 
     """What was measured of the pack when it was made is what its numbers still say."""
     if "recipe" in record:
         require_fields(record["recipe"], "recipe", seed=whole, t0=is_number)
+    if "material" in record:
+        require_fields(record["material"], "material", wall_rigidity=is_number)
     if "at_rest" not in record:
         return
     triple = {"pressure": numbers, "lengths": numbers}
-    single = dict.fromkeys(("filling", "coordination", "contacts", "largest_speed", "largest_overlap"), is_number)
+    counted = ("coordination", "contacts", "wall_contacts")
+    single = dict.fromkeys(("filling", *counted, "largest_speed", "largest_overlap"), is_number)
     rest = record["at_rest"]
     require_fields(rest, "record", **triple, **single)
     require(

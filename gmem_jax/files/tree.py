@@ -1,20 +1,13 @@
-"""What an HDF5 file declares, looked at before anything is read; and old files, copied in a process of their own.
+"""What an HDF5 file declares, looked at before anything is read.
 
 Files of this package hold groups, short attributes, and arrays of numbers or names in one piece. All else that HDF5 can
 hold is refused: links to elsewhere, storage elsewhere, virtual, compressed or unwritten data, objects, strings without
 end.
-
-Run as a program it copies OLD to NEW: files from before there were checksums are parsed there, where a broken one can
-do no harm. So this module imports nothing of the package.
 """
 
-import contextlib
-import os
-import sys
 from typing import Any
 
 import h5py
-import numpy as np
 
 DEPTH = 4  # groups within groups
 ITEMS = 10_000  # datasets and groups of a file
@@ -87,35 +80,3 @@ def _require_plain(array: h5py.Dataset, path: str) -> None:
     stored = array.id.get_storage_size()
     if declared != stored or declared > array.file.id.get_filesize():
         raise ValueError(f"{path!r} declares shape {array.shape}, {declared} bytes; the file holds {stored} of them")
-
-
-def copy(old: str, new: str) -> None:
-    """Write the items of one file to another, with room for a seal.
-
-    Raises:
-        ValueError: see `Tree`.
-    """
-    with h5py.File(old, "r") as source, h5py.File(new, "w", userblock_size=512) as target:
-        tree = Tree(source)
-        for path, values in tree.attributes.items():
-            target.require_group(path or "/").attrs.update(values)
-        for path, dataset in tree.datasets.items():
-            target.create_dataset(path, data=np.asarray(dataset[()]))
-
-
-def _limit(path: str) -> None:
-    """Take little memory, whatever a file declares; where there are no limits, as on Windows, there is none."""
-    with contextlib.suppress(ImportError):
-        import resource
-
-        most = (2 << 30) + 4 * os.path.getsize(path)
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
-
-
-if __name__ == "__main__":
-    try:
-        _limit(sys.argv[1])
-        copy(*sys.argv[1:])
-    except Exception as error:  # whatever it is, it is said in one line to the process that asked
-        print(" ".join(str(error).split()), file=sys.stderr)
-        sys.exit(2)

@@ -1,20 +1,25 @@
 """The search for candidate contacts in the library: the pairs of `gmem_jax.physics.search`, some ten times faster."""
 
 import ctypes
-from collections.abc import Callable
-from pathlib import Path
+import functools
 
 import numpy as np
 
+from gmem_jax.native import library
+from gmem_jax.physics.search import Search
 
-def searcher(path: Path) -> Callable[[np.ndarray, int, float], np.ndarray]:
-    """A `gmem_jax.physics.search.Search` by the library at `path`."""
-    call = ctypes.CDLL(str(path)).gmem_search
+
+@functools.cache
+def search() -> Search | None:
+    """The search in the library; None where it is not available."""
+    if not library.available()[0]:
+        return None
+    call = ctypes.CDLL(str(library.path())).gmem_search
     call.restype = ctypes.c_int64
     pointer, integer = ctypes.c_void_p, ctypes.c_int64
     call.argtypes = [pointer, integer, integer, ctypes.c_double, pointer, integer]
 
-    def search(centres: np.ndarray, spheres_per_grain: int, reach: float) -> np.ndarray:
+    def keys_of(centres: np.ndarray, spheres_per_grain: int, reach: float) -> np.ndarray:
         if not np.isfinite(centres).all():
             raise ValueError("sphere centres must be finite to look for neighbours")
         # In a dense pack a sphere has six candidates with a skin of 0.5 R, sixteen with 1 R.
@@ -28,4 +33,4 @@ def searcher(path: Path) -> Callable[[np.ndarray, int, float], np.ndarray]:
                 return keys[:found].copy()
             room = found
 
-    return search
+    return keys_of

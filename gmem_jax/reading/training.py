@@ -2,7 +2,6 @@
 
 import json
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import serialization
 
 from gmem_jax.errors import FileFormatError
@@ -28,14 +26,13 @@ from gmem_jax.files.checked import (
     require_finite,
     whole,
 )
-from gmem_jax.files.seal import BLOCK, seal, sealed
+from gmem_jax.files.schemas import NET
+from gmem_jax.files.seal import BLOCK, require_sealed, seal
 from gmem_jax.physics import chance
 from gmem_jax.reading.lessons import Examples, Lessons, examples
 from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
 from gmem_jax.simulation.protocol import BINS
 
-SCHEMA = "gmem-classifier/2"
-_BEFORE = "gmem-classifier/1"  # the same, without a seal
 STEPS = 250  # to a call from the host: a second or so, and one check of the validation accuracy
 QUICK_CHECK = 4_096  # held-out examples tried after every call
 LAST_CHECK = 65_536  # held-out examples, at most, that must agree before training stops early
@@ -50,14 +47,12 @@ def learn(
 
     A step depends on its number and the seed alone, so that training can be broken off and taken up anywhere.
     """
-    optimiser = optax.sgd(net.lessons.rate)  # plain: its state is empty
     key = jax.random.fold_in(chance.key(seed), 2)
 
     def step(net: Net, number: Any) -> tuple[Net, jax.Array]:
         inputs, word = data.training(jax.random.fold_in(key, number))
         loss, slope = jax.value_and_grad(loss_of)(net, inputs, word)
-        change, _ = optimiser.update(slope, optimiser.init(net))
-        return optax.apply_updates(net, change), loss
+        return jax.tree.map(lambda weight, uphill: weight - net.lessons.rate * uphill, net, slope), loss
 
     net, losses = jax.lax.scan(step, net, first + jnp.arange(count))
     return net, jnp.mean(losses)
@@ -187,7 +182,7 @@ def save(path: Path, training: Training) -> None:
         OSError: if the path cannot be written.
     """
     content = {
-        "schema": SCHEMA,
+        "schema": NET.name,
         "recipe": json.dumps(asdict(training.net.lessons)),
         "training": {entry.name: getattr(training, entry.name) for entry in fields(training) if entry.name != "net"},
         "parameters": jax.tree.map(np.asarray, training.net.parameters),
@@ -206,13 +201,12 @@ def load(path: Path) -> Training:
     """
     path = Path(path)
     with refusing(path, "classifier file"), path.open("rb") as file:
-        known = sealed(file, path)
-        file.seek(BLOCK if known else 0)
+        require_sealed(file, "classifier file")
         # Nothing that it unpacks to is larger than the file: it has no compression, and no code.
         content = serialization.msgpack_restore(file.read())
         found = content.get("schema", "none") if isinstance(content, dict) else "none"
-        if found != (SCHEMA if known else _BEFORE):
-            raise FileFormatError(f"{path}: schema is {found!r}, expected {SCHEMA!r}")
+        if found != NET.name:
+            raise FileFormatError(f"{path}: schema is {found!r}, expected {NET.name!r}")
         recipe = json_of(content.get("recipe"), "recipe")
         require_fields(recipe, "recipe", **_RECIPE)
         require(set(recipe) == set(_RECIPE), "its recipe has fields that lessons have not")
@@ -220,10 +214,6 @@ def load(path: Path) -> Training:
         require_fields(content.get("training"), "training", **_TRAINING)
         require(set(content["training"]) == set(_TRAINING), "its training has fields that it should not have")
         net = Net(_parameters(content.get("parameters"), lessons), lessons)
-        if not known:
-            warnings.warn(
-                f"{path}: written before files had checksums: its numbers are plausible, no more", stacklevel=2
-            )
         return Training(net, **content["training"])
 
 

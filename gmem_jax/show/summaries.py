@@ -139,9 +139,9 @@ def _summary_of(file: Path, against: str, signals: Sequence[int], each: bool, ch
     schema_name = schema_of(file)
     if schema_name == KERNEL.name:
         return of_kernel(*load_kernel(file), name=file.name)
-    if schema_name in (PACK.name, *PACK.before):
+    if schema_name == PACK.name:
         return _stored_pack(file, against)
-    if schema_name in (RECALL.name, *RECALL.before):
+    if schema_name == RECALL.name:
         return of_recall(load_recall(file), file.name, against=against, signals=signals, each=each)
     known = ", ".join(schema.name for schema in (RECALL, PACK, KERNEL))
     raise FileFormatError(f"{file}: schema is {schema_name[:40]!r}, expected one of {known}")

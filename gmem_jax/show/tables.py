@@ -361,9 +361,8 @@ def pack_table(pack: Pack) -> Table:
             Fact("coordination Z (grain pairs)", f"{rest['coordination']:.2f}"),
             Fact("sphere contacts, times two, per grain", f"{rest['contacts']:.2f}"),
         ]
-        if "wall_contacts" in rest:
-            with_walls = 0.5 * rest["contacts"] + rest["wall_contacts"]
-            rows.append(Fact("contacts per grain, with walls", f"{with_walls:.2f}"))
+        with_walls = 0.5 * rest["contacts"] + rest["wall_contacts"]
+        rows.append(Fact("contacts per grain, with walls", f"{with_walls:.2f}"))
         rows.append(Fact("p_x, p_y, p_z", pressures, "kPa"))
         rows.append(Fact("largest speed", f"{rest['largest_speed']:.1e}", "R/t_c"))
         if (met := pressure_over_wanted(pack.info)) is not None:

@@ -34,7 +34,7 @@ class Simulation:
         dt: time step, in t_c; scalar or [B].
         drag: viscous drag while the walls stand still, 1 / t_c; scalar or [B].
         steps: steps in a bin.
-        backend: who does them; see `native.marcher`.
+        backend: who does them; see `native.resolve`.
         precision: of contacts, likewise.
     """
 
@@ -45,6 +45,11 @@ class Simulation:
     steps: int = static(1)
     backend: str = static("auto")
     precision: str = static("double")
+
+    @property
+    def resolved(self) -> native.ResolvedBackend:
+        """What does the steps; the same object for all simulations that ask for the same."""
+        return native.resolve(self.backend, self.precision, self.system.friction)
 
     def with_pairs(self, pairs: Pairs) -> "Simulation":
         """The same with another list of candidates."""
@@ -85,8 +90,7 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
         drag = _padded(jnp.where(still, simulation.drag, 0.0), state.replicas)
     with jax.named_scope("steps"):
         dt = _padded(simulation.dt, state.replicas)
-        march = native.marcher(simulation.backend, simulation.precision)
-        state, total = march(simulation.system, state, boxes, dt, drag)
+        state, total = simulation.resolved.march(simulation.system, state, boxes, dt, drag)
     with jax.named_scope("sample"):
         last = jax.tree.map(lambda leaf: leaf[-1], boxes)
         return end_bin(simulation.system, state, last, total / simulation.steps, row.u)

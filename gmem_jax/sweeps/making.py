@@ -79,7 +79,7 @@ def require_prepared(experiment: Experiment, pack: str) -> None:
 
 
 def _prepared_with(pack: Pack) -> dict[str, float]:
-    """What is known of `FOLLOW` of a pack: an imported one says nothing of walls, older ones had rigid ones."""
+    """What is known of `FOLLOW` of a pack: an imported one says nothing of walls."""
     material = pack.info.get("material")
-    walls = {} if material is None else {"wall_rigidity": float(material.get("wall_rigidity", 1.0))}
+    walls = {} if material is None else {"wall_rigidity": float(material["wall_rigidity"])}
     return {"delta0": float(pack.delta0), **walls}

@@ -25,9 +25,9 @@ from gmem_jax.files.checked import NAME, is_number, printable, source, title, wh
 from gmem_jax.files.checkpoints import OWN, is_locked, locked
 from gmem_jax.files.ours import Folder, sweep
 from gmem_jax.files.recalls import load_recall, save_recall
+from gmem_jax.files.schemas import SWEEP
 from gmem_jax.sweeps.plan import Point
 
-SWEEP_SCHEMA = "gmem-sweep/1"
 MARKER = "sweep.json"
 ROOM = 1 << 20  # bytes that must be left on the disk: some points of a small pack
 WRITTEN = 3600.0  # s in which a file is surely written: workers write while others look
@@ -55,9 +55,9 @@ class Store:
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:
         self.folder = Path(folder)
-        if not (make or Folder.about(self.folder, MARKER, SWEEP_SCHEMA)):
-            raise FileFormatError(f"{folder}: no sweep here (no sweep.json of {SWEEP_SCHEMA}, or behind a link)")
-        self._own = Folder(self.folder, MARKER, SWEEP_SCHEMA, _OWN, {"shared": {}, "names": [], "points": []})
+        if not (make or Folder.about(self.folder, MARKER, SWEEP.name)):
+            raise FileFormatError(f"{folder}: no sweep here (no sweep.json of {SWEEP.name}, or behind a link)")
+        self._own = Folder(self.folder, MARKER, SWEEP.name, _OWN, {"shared": {}, "names": [], "points": []})
         for name in FOLDERS if make else ():
             self._own.make(name)
             sweep(self.folder / name, age=WRITTEN)
@@ -87,7 +87,7 @@ class Store:
         Raises:
             FileFormatError: if there is nothing of the kind.
         """
-        card = Folder.about(self.folder, MARKER, SWEEP_SCHEMA)
+        card = Folder.about(self.folder, MARKER, SWEEP.name)
         try:
             if card is None:
                 raise ValueError("there is none")

@@ -17,7 +17,7 @@ from gmem_jax.physics.state import explain, together
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import WARNINGS
 
-TABLE_SCHEMA = "gmem-sweep-table/2"
+TABLE_SCHEMA = "gmem-sweep-table/0.1"
 FORMATS = (".csv", ".parquet", ".h5", ".nc")
 
 

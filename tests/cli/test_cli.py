@@ -11,6 +11,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.command import app as cli
@@ -18,7 +19,7 @@ from gmem_jax.command import recalls
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.files.hdf5 import writing
 
-PACK = Path(__file__).parent.parent / "data" / "tetra-27.h5"
+PACK = TETRA_27
 SHORT = ["--t0", "75", "--store", "0.1", "--rest", "0.1", "--hold", "0.1"]
 
 
@@ -157,7 +158,7 @@ def test_recalled_words_are_classified_and_the_nets_are_used_again(
     spoken = capsys.readouterr()
     said = json.loads(spoken.out)
     stored = json.loads(target.read_text())
-    assert stored.pop("schema") == "gmem-reading/1"
+    assert stored.pop("schema") == "gmem-reading/0.1"
     assert set(stored.pop("about")) == set(said)
     assert stored == said
     assert (said["bits"], said["background"]) == (1, "sub2-bl")
@@ -237,7 +238,7 @@ BAD = [
     (["recall", "{pack}", "--signals", "{short.csv}", "-o", "{out}"], "at least 2 samples"),
     (["recall", "{pack}", "--friction", "glue", "-o", "{out}"], "friction must be one of frictionless, hooke, m1, m2"),
     (["recall", "{truncated.h5}", "-o", "{out}"], "its checksum does not fit its content"),
-    (["recall", "{schema.h5}", "-o", "{out}"], "schema is 'gmem-pack/99', expected 'gmem-pack/2'"),
+    (["recall", "{schema.h5}", "-o", "{out}"], "schema is 'gmem-pack/99', expected 'gmem-pack/0.1'"),
     (["recall", "no-such-pack", "-o", "{out}"], "neither a file nor a shipped pack"),
     (["recall", "{pack}", "-o", "/proc/recall.h5"], "cannot write there"),
     (["demo", "--packs", "tetra-7"], "no such shipped pack"),
@@ -247,7 +248,7 @@ BAD = [
         "--signals words:13: words need a length from 1 to 12",
     ),
     (["recall", "{pack}", "--signals", "words", "-o", "{out}"], "words need a length from 1 to 12, as in words:3"),
-    (["classify", "{pack}", "-o", "{json}"], "schema is 'gmem-pack/2', expected 'gmem-recall/4'"),
+    (["classify", "{pack}", "-o", "{json}"], "schema is 'gmem-pack/0.1', expected 'gmem-recall/0.1'"),
     (["classify", "{truncated.h5}", "-o", "{json}"], "its checksum does not fit its content"),
     (["classify", "nothing.h5", "-o", "{json}"], "nothing.h5: no such file"),
     (["classify", "nothing.h5", "--seeds", "0", "-o", "{out}"], "'--seeds'"),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import ROOT
 from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
@@ -218,7 +219,7 @@ def test_a_recall_of_few_spheres_says_that_they_hold_little() -> None:
 def test_the_demo_stores_in_the_pack_of_the_middle_and_says_what_packs_differ_by(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
-    measured = (Path(__file__).parents[2] / "docs" / "measured.md").read_text()
+    measured = (ROOT / "docs" / "measured.md").read_text()
     row = next(line for line in measured.splitlines() if line.startswith("| a / b / c / d / e |"))
     fidelities = [float(value) for value in row.split("|")[3].split("/")]
     assert "abcde"[fidelities.index(sorted(fidelities)[2])] == recalls.TYPICAL[-1]
@@ -232,7 +233,7 @@ def test_the_demo_stores_in_the_pack_of_the_middle_and_says_what_packs_differ_by
     assert asked == [recalls.TYPICAL]
     assert f"G = {gain:.3f} ± {gain_sd:.3f}" in said
     assert f"F = {fidelity:.3f} ± {fidelity_sd:.3f} (mean ± SD)" in said
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    readme = (ROOT / "README.md").read_text()
     assert f'gm.load_pack("{recalls.TYPICAL}")' in readme
     gains = [float(value) for value in row.split("|")[2].split("/")]
     place = "abcde".index(recalls.TYPICAL[-1])

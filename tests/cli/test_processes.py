@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
+from scenes import TETRA_27
 from test_cli import gmem
 
 from gmem_jax.command import recalls
@@ -25,7 +26,7 @@ from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import Requeued
 
 HELPERS = importlib.import_module("submitit.helpers")  # here, since it sets up logging, which closes captured streams
-PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
+PACK = TETRA_27
 ENTRY = "from gmem_jax.command.app import main; main()"
 LONG = f"""[experiment]
 pack = "{PACK}"

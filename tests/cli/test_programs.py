@@ -8,8 +8,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from scenes import TETRA_27
 
-PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
+PACK = TETRA_27
 ENTRY = "from gmem_jax.command.app import main; main()"
 SHORT = ["--t0", "75", "--store", "0.2", "--no-picture", "--json"]
 

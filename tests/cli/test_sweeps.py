@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from scenes import TETRA_27
 from test_cli import gmem
 
 import gmem_jax as gm
 
-PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
+PACK = TETRA_27
 ENTRY = "from gmem_jax.command.app import main; main()"
 SWEEP = f"""[experiment]
 pack = "{PACK}"

@@ -1,4 +1,4 @@
-"""A program as a user writes it, checked by mypy --strict: see tests/test_arguments.py."""
+"""A program as a user writes it, checked by mypy --strict: see tests/experiment/test_arguments.py."""
 
 from pathlib import Path
 

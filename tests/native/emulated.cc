@@ -9,15 +9,15 @@ namespace cuda {
 namespace {
 
 template <class V, class Law>
-void run(Kernel kernel, int threads, const Arguments& a, int step) {
+void run(GpuKernel kernel, int threads, const Arguments& a, int step) {
   namespace k = gmem::GMEM_ISA;
   threads = (threads + kBlock - 1) / kBlock * kBlock;  // blocks are whole
   for (int thread = 0; thread < threads; ++thread) {
     switch (kernel) {
-      case Kernel::enter: k::enter<V, Law>(a, thread); break;
-      case Kernel::advance: k::advance<V, Law>(a, step, thread); break;
-      case Kernel::collect: k::collect<V>(a, thread); break;
-      case Kernel::leave: k::leave<V, Law>(a, thread); break;
+      case GpuKernel::enter: k::enter<V, Law>(a, thread); break;
+      case GpuKernel::advance: k::advance<V, Law>(a, step, thread); break;
+      case GpuKernel::collect: k::collect<V>(a, thread); break;
+      case GpuKernel::leave: k::leave<V, Law>(a, thread); break;
     }
   }
 }
@@ -35,7 +35,7 @@ auto without_stream() { return with_arguments(xla::ffi::Ffi::Bind()); }
 Launcher::Launcher(void* stream, const Which& which) : stream_(stream), kernels_(new Which(which)) {}
 Launcher::~Launcher() { delete static_cast<const Which*>(kernels_); }
 
-void Launcher::operator()(Kernel kernel, int threads, const Arguments& a, int step) const {
+void Launcher::operator()(GpuKernel kernel, int threads, const Arguments& a, int step) const {
   const Which& which = *static_cast<const Which*>(kernels_);
   with_law(which.law, which.variant, [&](auto law) {
     using L = decltype(law);

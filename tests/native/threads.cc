@@ -114,7 +114,7 @@ void lists_that_lead_astray_are_refused() {
   CHECK(!refused(1, 3));
 }
 
-// A kernel whose third block, or every team's last thread, segments out of memory.
+// A kernel whose third block, or every team's last thread, runs out of memory.
 std::size_t no_scratch(const Problem&, const Block&) { return 64; }
 void fail(const Problem&, const Block& block, Team& team, int rank, void*) {
   team.barrier();

@@ -65,7 +65,7 @@ struct Scene {
   void list(int i, int j, bool is_valid) { first.push_back(i), second.push_back(j), valid.push_back(is_valid); }
 };
 
-// Segments one call; the results of the first replica. `plant` is the defect.
+// Runs one call; the results of the first replica. `plant` is the defect.
 Numbers run(const Case& c, int threads, const std::string& plant = "") {
   const Scene scene(c);
   const int n = scene.grains, b = c.replicas, points = 5, candidates = static_cast<int>(scene.first.size());

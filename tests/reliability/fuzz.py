@@ -37,7 +37,6 @@ from gmem_jax.command import show as showing
 from gmem_jax.command.sweep import planned
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files import tree
 from gmem_jax.files.checkpoints import load_part, save_part
 from gmem_jax.files.seal import BLOCK, seal
 from gmem_jax.files.waveforms import load_target
@@ -91,12 +90,9 @@ class Kind(NamedTuple):
 def make_samples(folder: Path) -> None:
     """Write them."""
     shutil.copy(PACK, folder / "pack.h5")
-    old = folder / "old-pack.h5"
-    _unsealed(PACK, old, "gmem-pack/1")
     pack = gm.load_pack(PACK)
     experiment = gm.Experiment(pack, gm.Bumps(np.ones((2, 1)), np.full((2, 1), 0.5), 0.2))
     gm.save_recall(folder / "recall.h5", _recall(experiment).described(gm.describe(experiment, 1.0)))
-    _unsealed(folder / "recall.h5", folder / "old-recall.h5", "gmem-recall/1")
     save_part(folder / "part.npz", (OrderedDict(rest=_sample(4, 3)), np.arange(5)))
     from gmem_jax.reading import lessons, net, training
 
@@ -126,16 +122,6 @@ def _recall(experiment: gm.Experiment) -> Recall:
     status = np.zeros(count + 1, np.int32)
     lone = {"residual_speed": np.full(count + 1, 1e-3), "rounding": np.full(count, 1e-16), "status": status}
     return Recall(u=u, **curves, **single, **lone, stages=stages, protocol=protocol)
-
-
-def _unsealed(new: Path, old: Path, schema: str) -> None:
-    """The same file as it was written before there were seals."""
-    tree.copy(str(new), str(old))
-    with h5py.File(old, "r+") as file:
-        file.attrs["schema"] = schema
-        if "shear" in file:
-            del file["shear"]
-    old.write_bytes(old.read_bytes()[BLOCK:])
 
 
 # ---- mutations of bytes and of what HDF5 files hold ----
@@ -508,14 +494,12 @@ _SWEEP = st.lists(
 ).map(lambda lines: "\n".join(lines).encode())
 
 KINDS: dict[str, Kind] = {
-    "packs": Kind(0.24, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("pack.h5", _show(showing.show))),
-    "recalls": Kind(0.20, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("recall.h5", _show(showing.show))),
+    "packs": Kind(0.25, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("pack.h5", _show(showing.show))),
+    "recalls": Kind(0.21, st.one_of(_RAW, _INSIDE, _INSIDE), file_judge("recall.h5", _show(showing.show))),
     "parts": Kind(0.12, st.one_of(_RAW, _FORGED), file_judge("part.npz", load_part)),
     "nets": Kind(0.10, st.one_of(_RAW, _FORGED), file_judge("net.msgpack", _load_net)),
     "csv": Kind(0.06, _RAW, file_judge("waves.csv", _load_waves, sealed=False)),
     "npy": Kind(0.05, _RAW, file_judge("waves.npy", _load_waves, sealed=False)),
-    "packs without a seal": Kind(0.01, _RAW, file_judge("old-pack.h5", gm.load_pack, sealed=False)),
-    "recalls without a seal": Kind(0.01, _RAW, file_judge("old-recall.h5", gm.load_recall, sealed=False)),
     "sweeps": Kind(0.05, st.one_of(_RAW, _of("whole", _SWEEP)), file_judge("sweep.toml", _load_sweep, sealed=False)),
     "command lines": Kind(0.16, _lines(), judge_line),
 }

@@ -46,7 +46,10 @@ NAMES = [
     "data.h5",
 ]
 INNER = ["jobs", "points", "failed", "packs", "parts", "parts/abc", "workers", "other"]
-MARKS = ['{"schema": "gmem-parts/1", "key": {}}', '{"schema": "gmem-sweep/1", "shared": {}, "names": [], "points": []}']
+MARKS = [
+    '{"schema": "gmem-parts/0.1", "key": {}}',
+    '{"schema": "gmem-sweep/0.1", "shared": {}, "names": [], "points": []}',
+]
 
 
 def _looks(folder: Path) -> dict[str, bytes]:

@@ -40,7 +40,7 @@ def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
         "-q",
         "-p",
         "no:cacheprovider",
-        str(ROOT / "tests/test_sanitizers.py"),
+        str(ROOT / "tests/native/test_sanitizers.py"),
     ]
     studies = [*STUDIES, "builds"] if shutil.which("clang++") else STUDIES
     others = [
@@ -85,7 +85,7 @@ def _inputs(found: dict[str, Any]) -> list[str]:
         cells = [count, one.get("refused", 0), one.get("accepted", 0), *(one.get(word, 0) for word in bad)]
         lines.append(f"| {name} | " + " | ".join(map(str, cells)) + " |")
     about = (
-        "Refused: one line and exit 2. Accepted: plausible numbers in a file sealed anew or without a seal, or a "
+        "Refused: one line and exit 2. Accepted: plausible numbers in a file sealed anew, or a "
         "command that came up to its run. Lie: a damaged file that was accepted. Wordy: more than a line."
     )
     return [about, "", *lines]

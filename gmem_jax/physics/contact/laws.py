@@ -1,6 +1,7 @@
 """The friction laws by name: the one table for the command line, files, benchmarks and the native backend."""
 
-from dataclasses import fields
+from collections.abc import Iterable
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -11,28 +12,60 @@ from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 
 
 class Entry(NamedTuple):
-    """A law that has a name.
+    """A law that has a name, and what the native library knows of it (native/src/physics/parameters.h).
 
     Attributes:
         name: in files and on the command line.
         paper: what the paper calls it.
         kind: its class.
-        native: its number in the native library (native/src/physics/parameters.h, enum Law).
-        numbers: attributes that the native library is given, in the order of its parameter array.
+        native: its number, enum Law.
+        history: axes of the arrays of its history: contacts P, points Q, replicas B, or a length.
+        numbers: attributes that the library is given, in the order of its parameter array.
+        variants: values of its attribute `variant`, in the order of enum Variant.
     """
 
     name: str
     paper: str
     kind: Any
     native: int
+    history: tuple[str, ...]
     numbers: tuple[str, ...] = ("mu", "stiffness", "damping_time", "spinning")
+    variants: tuple[str, ...] = ()
+
+    @property
+    def layered(self) -> bool:
+        """Whether its history is resolved into rings; the library keeps these in double precision."""
+        return any("Q" in axes for axes in self.history)
+
+    def points(self, law: Any) -> int:
+        """Q of a law of this kind; 0 if it has no rings."""
+        return int(law.points) if self.layered else 0
+
+    def variant(self, law: Any) -> int:
+        """The number of the variant of a law of this kind; 0 if there is one only."""
+        return self.variants.index(law.variant) if self.variants else 0
+
+    def with_numbers(self, law: Any, values: Iterable[Any]) -> Any:
+        """A law of this kind with other `numbers`, the first of `values`."""
+        own = dict(zip(self.numbers, values, strict=False))
+        if "spacing" in own:  # which the law has from its largest overlap
+            own["p_max"] = (own.pop("spacing") * (law.points - 1)) ** 2
+        return replace(law, **own)
 
 
 LAWS = (
-    Entry("frictionless", "mu = 0", Frictionless, 0, ()),
-    Entry("hooke", "H", Hooke, 1),
-    Entry("m1", "M1", MindlinRescaled, 2),
-    Entry("m2", "M2", Mindlin, 3, ("mu", "stiffness", "damping_time", "spinning", "spacing")),
+    Entry("frictionless", "mu = 0", Frictionless, 0, (), ()),
+    Entry("hooke", "H", Hooke, 1, ("P3B",)),
+    Entry("m1", "M1", MindlinRescaled, 2, ("P3B", "P1B")),
+    Entry(
+        "m2",
+        "M2",
+        Mindlin,
+        3,
+        ("PQ2B", "P3B", "P1B"),
+        ("mu", "stiffness", "damping_time", "spinning", "spacing"),
+        ("exact", "averaged", "paper"),
+    ),
 )
 
 

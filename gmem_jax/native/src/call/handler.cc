@@ -61,7 +61,7 @@ struct Signature {
 
 // Arguments of the three tasks are those of the steps themselves, then, for derivatives, a number for each of the
 // results' or arguments' own; see `Task`.
-// gmem_jax/native/calls.py: _library, _of_results, _of_arrays
+// gmem_jax/native/primitives.py: _library, _of_results, _of_arrays
 Signature signature(Task task, Law law) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
                       {"validities", "P", ffi::PRED},   {"reference centres", "S3"},
@@ -85,7 +85,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   problem.variant = static_cast<Variant>(variant);
   problem.isotropic = isotropic != 0;
   problem.mixed = mixed != 0;
-  require(!problem.mixed || (task == Task::forward && problem.law != Law::mindlin),
+  require(!problem.mixed || (task == Task::forward && !is_layered(problem.law)),
           "there is no mixed precision for derivatives and the Mindlin law");
   const Signature wanted = signature(task, problem.law);
   require(static_cast<std::size_t>(leaves) == histories(problem.law).size() && args.size() == wanted.arguments.size() &&

@@ -33,6 +33,10 @@ inline Wants histories(Law law) {
   });
 }
 
+inline bool is_layered(Law law) {
+  return with_law(law, Variant::exact, [](auto law) { return decltype(law)::kLayered; });
+}
+
 inline Wants fields_of_grains() {
   return {{"positions", "N3B"}, {"quaternions", "N4B"},   {"velocities", "N3B"},
           {"spins", "N3B"},     {"accelerations", "N3B"}, {"spin rates", "N3B"}};
@@ -44,7 +48,7 @@ inline void require_law(int64_t law, int64_t variant, int64_t points) {
   require(0 <= law && law <= static_cast<int64_t>(Law::mindlin), "no friction law has number " + std::to_string(law));
   require(0 <= variant && variant <= static_cast<int64_t>(Variant::paper),
           "no variant of the Mindlin law has number " + std::to_string(variant));
-  require(static_cast<Law>(law) != Law::mindlin || points >= 2, "the Mindlin law needs two points or more");
+  require(!is_layered(static_cast<Law>(law)) || points >= 2, "the Mindlin law needs two points or more");
 }
 
 // A binding with what a call is given: numbers by name, in the order of a handler's arguments, then arrays.

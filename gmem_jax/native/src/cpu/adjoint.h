@@ -163,10 +163,8 @@ struct Adjoint : AdjointLayout<Law> {
   // Between the rows of a state and where the forward steps keep them.
   template <class Move>
   void move_state(int u, V* s, const Move& move) const {
-    for (const FieldPlace& field : kField) {
-      V* at = (field.hot ? of_grain(forward.hot, u, kHot) : of_grain(forward.cold, u, kCold)) + field.slot;
-      for (int q = 0; q < field.size; ++q) move(*s++, at[q]);
-    }
+    for (int f = 0; f < kFields; ++f)
+      for (int q = 0; q < kField[f].size; ++q) move(*s++, field_at(f, u, forward.hot, forward.cold)[q]);
   }
 
   V* state_of(int step, int u) const { return of_grain(state + static_cast<std::size_t>(step) * problem.grains * kState, u, kState); }
@@ -218,7 +216,7 @@ struct Adjoint : AdjointLayout<Law> {
       each(place.leaf, place.row, q);
     }
     for (int q = Law::kHistory; q < remembered(problem); ++q)
-      each(0, row * problem.points * 2 + q - Law::kHistory, q);
+      each(0, ring_place(problem, row, 0, q - Law::kHistory).row, q);
   }
 
   void load_bars() {
@@ -379,18 +377,18 @@ struct Adjoint : AdjointLayout<Law> {
   }
 
   void contact_back(std::size_t c, const Taped* parameter, const LawParameters<Taped>& law, const Trace<V>& seen) {
-    constexpr int kMeeting = 18;
+    constexpr int kInputs = 18;
     const auto mark = recorded.mark();
     const Candidate& pair = plan.candidate[c];
-    const ContactInput<V> m = forward.mode.contact_input(pair, load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.one)),
-                                           load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.other)));
-    const ContactInput<Taped> meeting{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
-                                 leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
+    const auto centre = [&](int i) { return load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(i)); };
+    const ContactInput<V> m = forward.mode.contact_input(pair, centre(pair.one), centre(pair.other));
+    const ContactInput<Taped> input{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
+                                    leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
     Taped memory[Law::kHistory + 1];
     for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(seen.history[c * Law::kHistory + q]);
     Contact<Taped> contact;
     contact.history = memory;
-    relative_motion(meeting, dot(meeting.separation, meeting.separation), contact);
+    relative_motion(input, dot(input.separation, input.separation), contact);
     close(&contact, 1, parameter);
     std::vector<Segment<Taped>> now;
     const int leaves = recorded.mark().slots, before = Law::kLayered ? seen.segments[c] : -1;
@@ -417,17 +415,17 @@ struct Adjoint : AdjointLayout<Law> {
       seed(now[k].force.along, of_segments[2 * k]), seed(now[k].force.across, of_segments[2 * k + 1]);
     recorded.reverse(mark);
 
-    for (int q = 0; q < Law::kHistory; ++q) bar[q] = recorded.bar(mark.slots + kMeeting + q);
+    for (int q = 0; q < Law::kHistory; ++q) bar[q] = recorded.bar(mark.slots + kInputs + q);
     for (int q = 0; before >= 0 && q < 2 * problem.points; ++q) of_segments[q] = q < 2 * before ? recorded.bar(leaves + q) : V{};
     share_out(pair, mark.slots);
   }
 
-  // The bars of a meeting go to the two grains and spheres it was made from.
+  // The bars of a contact's input go to the two grains and spheres it was made from.
   void share_out(const Candidate& pair, int first) {
     const Vec<V> separation = bars(first), lever_one = bars(first + 3), lever_other = bars(first + 6);
     const Vec<V> velocity = bars(first + 9), spin_one = bars(first + 12), spin_other = bars(first + 15);
     const Vec<V> point = splat<V>(0.5) * (lever_one + lever_other);
-    const bool away_is_one = pair.grain_one > pair.grain_other;
+    const bool away_is_one = pair.away_is_one();
     give(pair, !away_is_one, pair.one, pair.grain_one, {point - separation, -lever_one, -velocity, spin_one});
     give(pair, away_is_one, pair.other, pair.grain_other, {point + separation, -lever_other, velocity, spin_other});
   }
@@ -470,7 +468,7 @@ struct Adjoint : AdjointLayout<Law> {
       WallForces<Taped> on{};
       V* of_spheres = of_grain(sphere_bar, u, 3 * spheres);
       V* bar = of_grain(mid_bar, u, kMid);
-      take_guests(u, bar);
+      take_remotes(u, bar);
       spheres_of(constants, m, block.pack->offsets, spheres, forward.arm, walls.box, on,
                  [&](int k, Vec<Taped> centre) { seed(centre, load_vec(of_spheres + 3 * k)); });
       seed(on.force, load_vec(bar + kMidForce));
@@ -495,7 +493,7 @@ struct Adjoint : AdjointLayout<Law> {
     walls.add_bars(to);
   }
 
-  void take_guests(int u, V* bar) {
+  void take_remotes(int u, V* bar) {
     for (int n = plan.remote_start[u]; n < plan.remote_start[u + 1]; ++n) {
       const V* from = of_grain(remote_bar, n, kRemote);
       add_vec(sphere_bar + 3 * static_cast<std::size_t>(plan.remote_sphere[n]), load_vec(from + kRemoteCentre));

@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <cstring>
 
+#include "cpu/histories.h"
 #include "cpu/problem.h"
 #include "cpu/team.h"
 #include "physics/contact.h"
@@ -33,6 +34,13 @@ struct FieldPlace {
 };
 constexpr FieldPlace kField[kFields] = {{true, kPosition, 3}, {false, kQuaternion, 4},   {true, kVelocity, 3},
                                         {true, kSpin, 3},     {false, kAcceleration, 3}, {false, kSpinRate, 3}};
+
+// Where field number f of unit u is kept.
+template <class V>
+inline V* field_at(int f, int u, V* hot, V* cold) {
+  V* unit = kField[f].hot ? hot + static_cast<std::size_t>(u) * kHot : cold + static_cast<std::size_t>(u) * kCold;
+  return unit + kField[f].slot;
+}
 
 inline int chunks(const Problem& p) { return (p.grains + kChunk - 1) / kChunk; }
 
@@ -206,7 +214,7 @@ struct Engine : EngineLayout<Mode> {
     const int units = Mode::units(problem);
     for (int u = share_begin(units); u < share_begin(units, 1); ++u) mode.load_unit(u, hot, cold);
     const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
-    for (int c = share_begin(plan.candidates); c < share_begin(plan.candidates, 1); ++c) mode.load_history(c, law);
+    for (int c = share_begin(plan.candidates); c < share_begin(plan.candidates, 1); ++c) load_history(mode, c, law);
     if (rank == 0) mode.load_dummies();
     team.barrier();
   }
@@ -224,8 +232,8 @@ struct Engine : EngineLayout<Mode> {
     for (int u = share_begin(units); u < share_begin(units, 1); ++u) mode.unload_unit(u, hot, cold, steps_done);
     const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
     for (int c = share_begin(plan.candidates); c < share_begin(plan.candidates, 1); ++c)
-      mode.unload_history(c, law, steps_done);
-    for (int c = share_begin(plan.padding); c < share_begin(plan.padding, 1); ++c) mode.unload_padding(c, steps_done);
+      unload_history(mode, c, law, steps_done);
+    for (int c = share_begin(plan.padding); c < share_begin(plan.padding, 1); ++c) unload_padding(mode, c, steps_done);
     team.barrier();
   }
 

@@ -6,7 +6,7 @@
 #include <cstddef>
 
 #include "cpu/block.h"
-#include "cpu/marks.h"
+#include "cpu/histories.h"
 #include "numbers/rows.h"
 
 namespace gmem {
@@ -50,7 +50,9 @@ struct Packed : PackedLayout<Law> {
   using V = Real;
   using OfContacts = Real;
   static constexpr bool kKeepsMotion = false;
+  static constexpr bool apart = false;  // see `Replicas::apart`
   using Layout::kHistoryRows;
+  using OfLaw = Law;
 
   const Problem& problem;
   const Block& block;
@@ -74,85 +76,46 @@ struct Packed : PackedLayout<Law> {
   int grain_in(int u, int l) const { return u * W + l < problem.grains ? u * W + l : problem.grains - 1; }
 
   void load_unit(int u, V* hot, V* cold) const {
-    for (int f = 0; f < kFields; ++f) {
-      const FieldPlace field = kField[f];
-      V* to = (field.hot ? hot + static_cast<std::size_t>(u) * kHot : cold + static_cast<std::size_t>(u) * kCold) + field.slot;
+    for (int f = 0; f < kFields; ++f)
       for (int l = 0; l < W; ++l) {
-        const std::ptrdiff_t from = static_cast<std::ptrdiff_t>(plan.grain[grain_in(u, l)]) * field.size;
-        for (int q = 0; q < field.size; ++q) to[q][l] = lane.grains_in[f][(from + q) * problem.stride];
+        const std::ptrdiff_t from = static_cast<std::ptrdiff_t>(plan.grain[grain_in(u, l)]) * kField[f].size;
+        for (int q = 0; q < kField[f].size; ++q)
+          field_at(f, u, hot, cold)[q][l] = lane.grains_in[f][(from + q) * problem.stride];
       }
-    }
   }
 
   void unload_unit(int u, const V* hot, const V* cold, int) const {
-    for (int f = 0; f < kFields; ++f) {
-      const FieldPlace field = kField[f];
-      const V* from =
-          (field.hot ? hot + static_cast<std::size_t>(u) * kHot : cold + static_cast<std::size_t>(u) * kCold) + field.slot;
+    for (int f = 0; f < kFields; ++f)
       for (int l = 0; l < W && u * W + l < problem.grains; ++l) {
-        const std::ptrdiff_t to = static_cast<std::ptrdiff_t>(plan.grain[u * W + l]) * field.size;
-        for (int q = 0; q < field.size; ++q) lane.grains_out[f][(to + q) * problem.stride] = from[q][l];
+        const std::ptrdiff_t to = static_cast<std::ptrdiff_t>(plan.grain[u * W + l]) * kField[f].size;
+        for (int q = 0; q < kField[f].size; ++q)
+          lane.grains_out[f][(to + q) * problem.stride] = field_at(f, u, hot, cold)[q][l];
       }
-    }
   }
 
   std::ptrdiff_t segment_stride() const { return plan.candidates + 1; }
-  StoredSegments<double, RowOfSegment> segments_of(std::size_t c) const { return {segment + c, segment_stride(), marks.segments + c, problem.points}; }
+  StoredSegments<double, RowOfSegment> segments_of(std::size_t c) const {
+    return {segment + c, segment_stride(), marks.segments + c, problem.points};
+  }
   // Number q of the history of a contact.
   double& remembered(std::size_t c, int q) const { return reinterpret_cast<double*>(history + c * kHistoryRows)[q]; }
   double outermost(std::size_t c, const LawParameters<V>& law) const {
     return Reach<V, Law::variant>(splat<V>(remembered(c, kLastOverlap)), law, problem.points).outer[0];
   }
 
-  void load_history(std::ptrdiff_t c, const LawParameters<V>& law) {
-    const std::ptrdiff_t row = plan.candidate[c].row;
-    marks.touched[c] = false;
-    marks.next_check[c] = -1.0;  // not looked at yet
-    for (int q = 0; q < Law::kGiven; ++q) {
-      const Place place = place_of<Law>(row, q);
-      remembered(c, q) = lane.history_in[place.leaf][place.row * problem.stride];
-    }
-    if constexpr (Law::kLayered) {
-      const double outer = outermost(c, law);
-      marks.rings[c] = rings_of(problem, outer);
-      const auto ring = [&](int j) {
-        const double* from = lane.history_in[0] + (row * problem.points + j) * 2 * problem.stride;
-        return Flat<double>{from[0], from[problem.stride]};
-      };
-      store_layers(&remembered(c, kLayers), segments_of(c).load(outer, kLacking<Law::variant>, false, ring));
-    }
+  double history_in(Place place) const { return lane.history_in[place.leaf][place.row * problem.stride]; }
+  void history_out(Place place, double number, int) const {
+    lane.history_out[place.leaf][place.row * problem.stride] = number;
   }
 
-  void unload_history(std::ptrdiff_t c, const LawParameters<V>& law, int) const {
-    const std::ptrdiff_t row = plan.candidate[c].row;
-    for (int q = 0; q < Law::kGiven; ++q) {
-      const Place place = place_of<Law>(row, q);
-      lane.history_out[place.leaf][place.row * problem.stride] = remembered(c, q);
-    }
-    if constexpr (Law::kLayered) {
-      const double outer = outermost(c, law);
-      const Layers<double> layers = load_layers(&remembered(c, kLayers));
-      segments_of(c).unload(layers, outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Flat<double> f) {
-        double* to = lane.history_out[0] + (row * problem.points + j) * 2 * problem.stride;
-        to[0] = f.along, to[problem.stride] = f.across;
-      });
-    }
+  void mark_new(std::size_t c) const {
+    marks.touched[c] = false;
+    marks.next_check[c] = -1.0;  // not looked at yet
   }
 
   void unload_pressure(Vec<V> pressure, int) const {
     const V p[3] = {pressure.x, pressure.y, pressure.z};
     for (int axis = 0; axis < 3; ++axis) lane.pressure[axis * problem.stride] = p[axis][0];
-  }
-
-  void unload_padding(int n, int) const {
-    const std::ptrdiff_t row = plan.padding_row[n];
-    for (int q = 0; q < Law::kGiven; ++q) {
-      const Place place = place_of<Law>(row, q);
-      lane.history_out[place.leaf][place.row * problem.stride] = 0.0;
-    }
-    if (Law::kLayered && !problem.history_aliased)
-      for (int q = 0; q < 2 * problem.points; ++q)
-        lane.history_out[0][(row * problem.points * 2 + q) * problem.stride] = 0.0;
   }
 
   int dummy_sphere() const { return units(problem) * W * problem.spheres_per_grain; }
@@ -251,25 +214,21 @@ struct Packed : PackedLayout<Law> {
   };
 
   void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel) {
-    constexpr int kLook = 256, kBatch = kTogether * W, kAhead = 8;
-    int awake[kLook + 1], touching[kBatch];
+    constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether * W, kAhead = 8;
+    int near[kLook + 1], touching[kBatch];
     int count = 0;
     for (int look = first; look < end; look += kLook) {
-      const int look_end = look + kLook < end ? look + kLook : end;
-      int found = 0;
-      for (int c = look; c < look_end; ++c) {
-        awake[found] = c;
-        found += !(marks.next_check[c] > travel);  // also where it is not a number
-      }
+      const int found = marks.find_near(look, end, travel, near);
       for (int n = 0; n < found; ++n) {
-        const int c = awake[n];
+        const int c = near[n];
         // Large packs are in no cache: ask in time for what does not lie in a row with what others want.
         if (n + kAhead < found) {
-          const std::size_t later = awake[n + kAhead];
+          const std::size_t later = near[n + kAhead];
           const GrainRows* other = grain + plan.candidate[later].grain_other;
           __builtin_prefetch(sphere + plan.candidate[later].other);
           if constexpr (kHistoryRows > 0) __builtin_prefetch(history + later * kHistoryRows);
-          if (marks.touched[later]) __builtin_prefetch(other), __builtin_prefetch(&other->spin), __builtin_prefetch(&other->torque);
+          if (marks.touched[later])
+            __builtin_prefetch(other), __builtin_prefetch(&other->spin), __builtin_prefetch(&other->torque);
         }
         if (!marks.touched[c] && !touches(c, travel)) continue;
         touching[count++] = c;
@@ -287,7 +246,7 @@ struct Packed : PackedLayout<Law> {
     const double square = fma(d[2], d[2], fma(d[1], d[1], d[0] * d[0]));
     if (square < 4.0) return marks.touched[c] = true;
     if (marks.next_check[c] < 0.0) blank(c);
-    marks.next_check[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(square) - 2.0);
+    marks.next_check[c] = next_check(travel, square);
     return false;
   }
 
@@ -398,10 +357,9 @@ struct Packed : PackedLayout<Law> {
     for (int l = 0; l < g.count; ++l) add(g.pair[l], f[l], t_one[l], t_other[l]);
   }
 
-  // The lower-numbered grain is at home in this domain, the other may be elsewhere.
   GMEM_INLINE void add(const Candidate& pair, Row force, Row torque_one, Row torque_other) {
     GrainRows &one = grain[pair.grain_one], &other = grain[pair.grain_other];
-    const bool away_is_one = pair.grain_one > pair.grain_other;
+    const bool away_is_one = pair.away_is_one();
     if (pair.remote < 0 || !away_is_one) one.force += force, one.torque += torque_one;
     if (pair.remote < 0 || away_is_one) other.force -= force, other.torque += torque_other;
     if (pair.remote >= 0) {

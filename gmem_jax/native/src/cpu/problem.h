@@ -1,7 +1,22 @@
 // What a call is asked to do, in plain structures shared by the handler and the kernels of every instruction set.
 //
-// One call runs all steps of one bin for all replicas. Vectors of the CPU hold W doubles ("lanes"). A block of work
-// is either W replicas of one pack, or one replica whose grains and contacts fill the lanes.
+// One call runs all steps of one bin for all replicas. Its words:
+//
+//   pack    a candidate list (as a plan) and the shape of a grain, which replicas may share.
+//   plan    the candidates sorted for memory and threads, with grains and spheres numbered anew (plan.h).
+//   lane    one of the W doubles of a vector of the CPU; and the replica that is computed in it, `Lane`.
+//   block   what a team of threads computes at once: W replicas of one pack, each in a lane (replicas.h), or one replica
+//           whose grains and contacts fill the lanes (packed.h). These two are the modes of an `Engine` (block.h).
+//   unit    the grains of one vector: one grain of W replicas, or W grains of one replica.
+//   chunk   16 grains: what a thread takes at once, and of which wall forces are summed before they are added up.
+//   domain  the contacts that a thread takes at once: those whose lower-numbered grain is in one part of the pack.
+//   remote  a force on a grain of another domain, which waits until that grain is moved.
+//   side    on GPUs, a candidate as one of its two grains sees it (cuda/arguments.h).
+//
+// Most candidates are apart for many steps. `Engine::travel` is how much closer any two spheres can have come since the
+// call began: twice what the fastest grain can have moved and turned, summed over the steps. When a candidate is found
+// apart by some gap it cannot touch before `travel` has grown by that gap; that travel is its `next_check`, and until
+// then a step reads this one number of it and no more. Both are upper bounds, so that no contact is missed.
 
 #pragma once
 
@@ -34,8 +49,11 @@ struct Problem {
 struct Candidate {
   int32_t one, other;              // spheres
   int32_t grain_one, grain_other;  // their grains
-  int32_t remote;                   // where the force on the grain of another domain waits, or -1
+  int32_t remote;                  // where the force on the grain of another domain waits, or -1
   int32_t row;                     // in the arrays of the call
+
+  // Of two grains in different domains that of the lower number is at home, the other away.
+  bool away_is_one() const { return grain_one > grain_other; }
 };
 
 // The candidate list, sorted for memory and threads; see plan.h. Grains and spheres are numbered anew.
@@ -47,8 +65,8 @@ struct Plan {
   const int32_t* grain;             // number in the call of each grain, [N]
   const Candidate* candidate;       // by domain
   const int32_t* domain_candidate;  // first candidate of each domain, [domains + 1]
-  const int32_t* remote_start;       // the remotes of each grain: remote_start[g] to remote_start[g + 1], [N + 1]
-  const int32_t* remote_sphere;      // that each remote acts on, [remotes]
+  const int32_t* remote_start;      // the remotes of each grain: remote_start[g] to remote_start[g + 1], [N + 1]
+  const int32_t* remote_sphere;     // that each remote acts on, [remotes]
   const int32_t* padding_row;       // [padding]
 };
 

@@ -7,7 +7,7 @@
 #include <type_traits>
 
 #include "cpu/block.h"
-#include "cpu/marks.h"
+#include "cpu/histories.h"
 #include "numbers/dual.h"
 #include "numbers/single.h"
 
@@ -82,6 +82,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   using Layout::sphere, Layout::motion, Layout::remote, Layout::history, Layout::segment, Layout::marks;
   using Number = V;
   using OfContacts = C;
+  using OfLaw = Law;
   static constexpr bool kMixed = !std::is_same<V, C>::value;
   static constexpr bool kKeepsMotion = kMixed;
 
@@ -117,7 +118,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   // Number `row` of an array in every lane; a short block repeats its last replica.
   template <class Pointer>
   Real gather(const Lane* lanes, const Pointer& pointer, std::ptrdiff_t row, int first = 0) const {
-    Real a;
+    Real a{};
     for (int l = 0; l < W; ++l)
       a[l] = pointer(lanes[first + l < block.count ? first + l : block.count - 1])[row * problem.stride];
     return a;
@@ -164,83 +165,43 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   }
 
   void load_unit(int u, V* hot, V* cold) const {
-    for (int f = 0; f < kFields; ++f) {
-      const FieldPlace field = kField[f];
-      V* to = (field.hot ? hot + static_cast<std::size_t>(u) * kHot : cold + static_cast<std::size_t>(u) * kCold) + field.slot;
-      for (int q = 0; q < field.size; ++q)
-        to[q] = read([f](const Lane& lane) { return lane.grains_in[f]; },
-                     static_cast<std::ptrdiff_t>(plan.grain[u]) * field.size + q);
-    }
+    for (int f = 0; f < kFields; ++f)
+      for (int q = 0; q < kField[f].size; ++q)
+        field_at(f, u, hot, cold)[q] = read([f](const Lane& lane) { return lane.grains_in[f]; },
+                                            static_cast<std::ptrdiff_t>(plan.grain[u]) * kField[f].size + q);
   }
 
   void unload_unit(int u, const V* hot, const V* cold, int steps_done) const {
-    for (int f = 0; f < kFields; ++f) {
-      const FieldPlace field = kField[f];
-      const V* from =
-          (field.hot ? hot + static_cast<std::size_t>(u) * kHot : cold + static_cast<std::size_t>(u) * kCold) + field.slot;
-      for (int q = 0; q < field.size; ++q)
+    for (int f = 0; f < kFields; ++f)
+      for (int q = 0; q < kField[f].size; ++q)
         write([f](const Lane& lane) { return lane.grains_out[f]; },
-              static_cast<std::ptrdiff_t>(plan.grain[u]) * field.size + q, from[q], steps_done);
-    }
+              static_cast<std::ptrdiff_t>(plan.grain[u]) * kField[f].size + q, field_at(f, u, hot, cold)[q], steps_done);
   }
 
   StoredSegments<V> segments_of(std::size_t c) const {
-    if (!trace.touched) return {segment + c, plan.candidates, marks.segments + c, problem.points};
-    return {segment + c, plan.candidates, marks.segments + c, problem.points, trace.segment + c * problem.points, trace.segments + c};
+    int* const stored = marks.segments + c;
+    if (!trace.touched) return {segment + c, plan.candidates, stored, problem.points};
+    Segment<V>* const seen = trace.segment + c * problem.points;
+    return {segment + c, plan.candidates, stored, problem.points, seen, trace.segments + c};
   }
   V outermost(std::size_t c, const LawParameters<V>& law) const {
     return Reach<V, Law::variant>(history[c * Law::kHistory + kLastOverlap], law, problem.points).outer;
   }
 
-  void load_history(std::ptrdiff_t c, const LawParameters<V>& law) {
-    const std::ptrdiff_t row = plan.candidate[c].row;
+  // Number q of the history of a contact.
+  C& remembered(std::size_t c, int q) const { return history[c * Law::kHistory + q]; }
+
+  C history_in(Place place) const {
+    return convert<C>(read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row));
+  }
+  void history_out(Place place, C number, int steps_done) const {
+    const auto out = [place](const Lane& lane) { return lane.history_out[place.leaf]; };
+    write(out, place.row, convert<V>(number), steps_done);
+  }
+
+  void mark_new(std::size_t c) const {
     marks.touched[c] = true;
     marks.next_check[c] = 0.0;
-    for (int q = 0; q < Law::kGiven; ++q) {
-      const Place place = place_of<Law>(row, q);
-      history[c * Law::kHistory + q] =
-          convert<C>(read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row));
-    }
-    if constexpr (Law::kLayered) {
-      const V outer = outermost(c, law);
-      marks.rings[c] = rings_of(problem, outer);
-      const auto ring = [&](int j) {
-        const auto in = [](const Lane& lane) { return lane.history_in[0]; };
-        const std::ptrdiff_t from = (row * problem.points + j) * 2;
-        return Flat<V>{read(in, from), read(in, from + 1)};
-      };
-      store_layers(history + c * Law::kHistory + kLayers, segments_of(c).load(outer, kLacking<Law::variant>, apart, ring));
-    }
-  }
-
-  void unload_history(std::ptrdiff_t c, const LawParameters<V>& law, int steps_done) const {
-    const std::ptrdiff_t row = plan.candidate[c].row;
-    for (int q = 0; q < Law::kGiven; ++q) {
-      const Place place = place_of<Law>(row, q);
-      write([place](const Lane& lane) { return lane.history_out[place.leaf]; }, place.row,
-            convert<V>(history[c * Law::kHistory + q]), steps_done);
-    }
-    if constexpr (Law::kLayered) {
-      const V outer = outermost(c, law);
-      const Layers<V> layers = load_layers(history + c * Law::kHistory + kLayers);
-      segments_of(c).unload(layers, outer, rings_to_write(problem, marks.rings[c], outer), [&](int j, Flat<V> f) {
-        const auto out = [](const Lane& lane) { return lane.history_out[0]; };
-        const std::ptrdiff_t to = (row * problem.points + j) * 2;
-        write(out, to, f.along, steps_done);
-        write(out, to + 1, f.across, steps_done);
-      });
-    }
-  }
-
-  void unload_padding(int n, int steps_done) const {
-    const std::ptrdiff_t row = plan.padding_row[n];
-    for (int q = 0; q < Law::kGiven; ++q) {
-      const Place place = place_of<Law>(row, q);
-      write([place](const Lane& lane) { return lane.history_out[place.leaf]; }, place.row, V{}, steps_done);
-    }
-    if (Law::kLayered && !problem.history_aliased)
-      for (int q = 0; q < 2 * problem.points; ++q)
-        write([](const Lane& lane) { return lane.history_out[0]; }, row * problem.points * 2 + q, V{}, steps_done);
   }
 
   void load_dummies() {}
@@ -301,26 +262,22 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   }
 
   void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel) {
-    constexpr int kLook = 256, kBatch = kTogether, kAhead = 6;
+    constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether, kAhead = 6;
     const V contact_square = splat<V>(4.0);
-    int awake[kLook + 1], touching[kBatch];
+    int near[kLook + 1], touching[kBatch];
     Contact<C> contact[kBatch];
     int count = 0;
     for (int look = first; look < end; look += kLook) {
-      const int look_end = look + kLook < end ? look + kLook : end;
-      int found = 0;
-      for (int c = look; c < look_end; ++c) {
-        awake[found] = c;
-        found += !(marks.next_check[c] > travel);  // also where it is not a number
-      }
+      const int found = marks.find_near(look, end, travel, near);
       for (int n = 0; n < found; ++n) {
-        const int c = awake[n];
+        const int c = near[n];
         const Candidate& pair = plan.candidate[c];
         // Large packs are in no cache: ask in time for what does not lie in a row with what others want. (In a function of
         // its own GCC takes this for nothing.)
         if (n + kAhead < found) {
-          const std::size_t later = awake[n + kAhead];
-          const char* centre = reinterpret_cast<const char*>(sphere + 3 * static_cast<std::size_t>(plan.candidate[later].other));
+          const std::size_t later = near[n + kAhead];
+          const V* of_sphere = sphere + 3 * static_cast<std::size_t>(plan.candidate[later].other);
+          const char* centre = reinterpret_cast<const char*>(of_sphere);
           const char* remembered = reinterpret_cast<const char*>(history + later * Law::kHistory);
           for (std::size_t at = 0; at < 3 * sizeof(V); at += 64) __builtin_prefetch(centre + at);
           if (marks.touched[later])
@@ -331,7 +288,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
         const V square = dot(other - one, other - one);
         if (!bits_less(square, contact_square)) {
           if (marks.touched[c]) forget(c, pair);
-          marks.next_check[c] = travel + (1.0 - 1e-9) * (__builtin_sqrt(smallest(square)) - 2.0);
+          marks.next_check[c] = next_check(travel, smallest(square));
           continue;
         }
         marks.touched[c] = true;
@@ -379,21 +336,20 @@ struct Replicas : ReplicasLayout<Law, V, C> {
               load_vec(of_one.spin),
               load_vec(of_other.spin)};
     } else {
-    const Vec<V> point = splat<V>(0.5) * (centre_one + centre_other);
-    return {centre_other - centre_one,
-            point - load_vec(one + kPosition),
-            point - load_vec(other + kPosition),
-            load_vec(other + kVelocity) - load_vec(one + kVelocity),
-            load_vec(one + kSpin),
-            load_vec(other + kSpin)};
+      const Vec<V> point = splat<V>(0.5) * (centre_one + centre_other);
+      return {centre_other - centre_one,
+              point - load_vec(one + kPosition),
+              point - load_vec(other + kPosition),
+              load_vec(other + kVelocity) - load_vec(one + kVelocity),
+              load_vec(one + kSpin),
+              load_vec(other + kSpin)};
     }
   }
 
-  // The lower-numbered grain is at home in this domain, the other may be elsewhere.
   GMEM_INLINE void add(const Candidate& pair, const ContactLoads<C>& push) {
     V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
     V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
-    const bool away_is_one = pair.grain_one > pair.grain_other;
+    const bool away_is_one = pair.away_is_one();
     if (pair.remote < 0 || !away_is_one) {
       store_vec(one + kForce, load_vec(one + kForce) + convert<V>(push.force));
       store_vec(one + kTorque, load_vec(one + kTorque) + convert<V>(push.torque_one));

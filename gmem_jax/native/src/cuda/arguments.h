@@ -28,7 +28,7 @@ struct Table {
 };
 
 // A candidate seen from one of its grains.
-// gmem_jax/native/gpu.py: sides_of
+// gmem_jax/native/cuda.py: sides_of
 struct Side {
   int mine, other;  // spheres; the latter as ~s where it is the one listed first
   int row;          // in the list
@@ -54,7 +54,7 @@ struct Arguments {
   int* stored;      // ... how many, [2 P, L]
 };
 
-enum class Kernel { enter, advance, collect, leave };
+enum class GpuKernel { enter, advance, collect, leave };
 
 }  // namespace cuda
 }  // namespace gmem

@@ -22,7 +22,7 @@ constexpr int kOfPack = 5;  // arguments that belong to a pack
 
 // Beside the letters of call/signature.h: starts G = N + 1, sides M = 2 P, numbers of a cold grain C, of a history H,
 // derivatives and values D, lanes L.
-// gmem_jax/native/gpu.py: run, sides_of, between_steps
+// gmem_jax/native/cuda.py: run, sides_of, between_steps
 Wants arguments_of(Task task, Law law) {
   const Wants pack = {{"starts", "G", ffi::S32}, {"sides", "M3", ffi::S32}, {"places", "P", ffi::S32},
                       {"offsets", "K3"},         {"arms", ""}};
@@ -36,7 +36,7 @@ Wants results_of(Law law) {
                          {"sums", "DN3L"}, {"memories", "DMHL"}};
   const Wants layered = {{"segments", "DMQ3L"}, {"stored", "ML", ffi::S32}};
   const Wants all = fields_of_grains() + pressures() + histories(law) + between;
-  return law == Law::mindlin ? all + layered : all;
+  return is_layered(law) ? all + layered : all;
 }
 
 int numbers_remembered(Law law) {
@@ -129,7 +129,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.cold = between(next(), a.grains * int64_t{10});
   a.pressure = between(next(), a.grains * int64_t{3});
   a.history = between(next(), reader.size('M') * reader.size('H'));
-  if (which.law == Law::mindlin) {
+  if (is_layered(which.law)) {
     a.segments = between(next(), reader.size('M') * points * 3);
     a.stored = reinterpret_cast<int*>(next());
   }
@@ -137,10 +137,10 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   const int of_grains = threads_for(reader.size('N') * a.lanes);
   const int of_rows = threads_for(std::max<int64_t>(3, a.rows) * a.lanes);
   const Launcher launch(stream, which);
-  launch(Kernel::enter, of_grains, a);
-  for (int step = 0; step < a.steps; ++step) launch(Kernel::advance, of_grains, a, step);
-  launch(Kernel::collect, threads_for((a.grains + kChunk - 1) / kChunk * int64_t{3} * a.lanes), a);
-  launch(Kernel::leave, of_rows, a);
+  launch(GpuKernel::enter, of_grains, a);
+  for (int step = 0; step < a.steps; ++step) launch(GpuKernel::advance, of_grains, a, step);
+  launch(GpuKernel::collect, threads_for((a.grains + kChunk - 1) / kChunk * int64_t{3} * a.lanes), a);
+  launch(GpuKernel::leave, of_rows, a);
   return ffi::Error::Success();
 }
 

@@ -104,7 +104,7 @@ Launcher::~Launcher() {
   driver().pop(&context);
 }
 
-void Launcher::operator()(Kernel kernel, int threads, const Arguments& arguments, int step) const {
+void Launcher::operator()(GpuKernel kernel, int threads, const Arguments& arguments, int step) const {
   if (threads == 0) return;
   const Driver& d = driver();
   void* parameters[] = {const_cast<Arguments*>(&arguments), &step};

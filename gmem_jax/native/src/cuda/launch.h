@@ -16,7 +16,7 @@ class Launcher {
   Launcher(const Launcher&) = delete;
 
   // Does not wait.
-  void operator()(Kernel kernel, int threads, const Arguments& arguments, int step = 0) const;
+  void operator()(GpuKernel kernel, int threads, const Arguments& arguments, int step = 0) const;
 
  private:
   void* stream_;

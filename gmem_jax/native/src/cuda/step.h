@@ -50,12 +50,13 @@ inline double result(Dual<double> a) { return a.slope; }
 inline bool is_zero(double a) { return a == 0.0; }
 inline bool is_zero(Dual<double> a) { return a.value == 0.0 && a.slope == 0.0; }
 
+// One replica - a lane of the kernels - as its threads see it.
 template <class V>
-struct Lane {
+struct ReplicaView {
   const Arguments& a;
   int lane, entry, replica;
 
-  Lane(const Arguments& a, int lane) : a(a), lane(lane), entry(lane / a.replicas), replica(lane % a.replicas) {}
+  ReplicaView(const Arguments& a, int lane) : a(a), lane(lane), entry(lane / a.replicas), replica(lane % a.replicas) {}
 
   Column<V> in(const Table& t) const {
     return {t.value.of(entry) + replica, __is_class(V) ? t.slope.of(entry) + replica : nullptr, t.stride};
@@ -116,13 +117,13 @@ struct Segments {
 
 // The outermost ring that a side has reached.
 template <class V, class Law>
-int outermost(const Lane<V>& on, long long side, const LawParameters<V>& law) {
+int outermost(const ReplicaView<V>& on, long long side, const LawParameters<V>& law) {
   const V overlap = on.in(on.a.history)[side * Law::kHistory + kLastOverlap];
   return static_cast<int>(largest(Reach<V, Law::variant>(overlap, law, on.a.points).outer));
 }
 
 template <class V>
-Segments<V> segments_of(const Lane<V>& on, long long side) {
+Segments<V> segments_of(const ReplicaView<V>& on, long long side) {
   const Arguments& a = on.a;
   Column<V> at = on.in(a.segments);
   at.value += side * a.points * 3 * at.stride;
@@ -132,7 +133,7 @@ Segments<V> segments_of(const Lane<V>& on, long long side) {
 
 // Begins a step whose numbers go to side `next` of the double tables.
 template <class V>
-GMEM_INLINE void begin(const Lane<V>& on, int grain, const GrainParameters<V>& constants, const Grain<V>& from,
+GMEM_INLINE void begin(const ReplicaView<V>& on, int grain, const GrainParameters<V>& constants, const Grain<V>& from,
                        int next) {
   const Arguments& a = on.a;
   const HalfStep<V> m = begin_step(constants, from);
@@ -150,7 +151,7 @@ GMEM_INLINE void begin(const Lane<V>& on, int grain, const GrainParameters<V>& c
 }
 
 template <class V>
-inline void deliver(const Lane<V>& on, int grain, const Grain<V>& g) {
+inline void deliver(const ReplicaView<V>& on, int grain, const Grain<V>& g) {
   const V number[kFields][4] = {{g.position.x, g.position.y, g.position.z},
                                 {g.orientation.w, g.orientation.v.x, g.orientation.v.y, g.orientation.v.z},
                                 {g.velocity.x, g.velocity.y, g.velocity.z},
@@ -165,7 +166,7 @@ inline void deliver(const Lane<V>& on, int grain, const Grain<V>& g) {
 }
 
 template <class V>
-GrainParameters<V> read_parameters(const Lane<V>& on, V* parameter) {
+GrainParameters<V> read_parameters(const ReplicaView<V>& on, V* parameter) {
   for (int row = 0; row < kParameters; ++row) parameter[row] = on.in(on.a.parameters)[row];
   return GrainParameters<V>(parameter);
 }
@@ -174,7 +175,7 @@ GrainParameters<V> read_parameters(const Lane<V>& on, V* parameter) {
 template <class V, class Law>
 void enter(const Arguments& a, int thread) {
   if (thread >= a.grains * a.lanes) return;
-  const Lane<V> on(a, thread % a.lanes);
+  const ReplicaView<V> on(a, thread % a.lanes);
   const int grain = thread / a.lanes;
   V parameter[kParameters];
   const GrainParameters<V> constants = read_parameters(on, parameter);
@@ -213,7 +214,7 @@ struct Load {
 
 // The contact of one side, which touches.
 template <class V, class Law>
-GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side& side, const HalfStep<V>& own,
+GMEM_INLINE void touch(const ReplicaView<V>& on, int now, long long number, const Side& side, const HalfStep<V>& own,
                        Vec<V> here, Vec<V> there, const V* parameter, const LawParameters<V>& law, Load<V>& load) {
   const Arguments& a = on.a;
   const bool first = side.other >= 0;
@@ -226,16 +227,16 @@ GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side&
   const auto pick = [first](Vec<V> one, Vec<V> two) {
     return Vec<V>{select(first, one.x, two.x), select(first, one.y, two.y), select(first, one.z, two.z)};
   };
-  const ContactInput<V> meeting{pick(gap, -gap),
-                           pick(point - own.position, point - position),
-                           pick(point - position, point - own.position),
-                           pick(velocity - own.velocity, own.velocity - velocity),
-                           pick(own.spin, spin),
-                           pick(spin, own.spin)};
+  const ContactInput<V> input{pick(gap, -gap),
+                              pick(point - own.position, point - position),
+                              pick(point - position, point - own.position),
+                              pick(velocity - own.velocity, own.velocity - velocity),
+                              pick(own.spin, spin),
+                              pick(spin, own.spin)};
   V history[Law::kHistory + 1];
   for (int n = 0; n < Law::kHistory; ++n) history[n] = stored[number * Law::kHistory + n];
   Contact<V> contact;
-  relative_motion(meeting, dot(gap, gap), contact);
+  relative_motion(input, dot(gap, gap), contact);
   contact.history = history;
   close(&contact, 1, parameter);
   if constexpr (Law::kLayered) {
@@ -251,7 +252,7 @@ GMEM_INLINE void touch(const Lane<V>& on, int now, long long number, const Side&
 
 // A side whose spheres are apart has nothing to remember.
 template <class V, class Law>
-inline void forget(const Lane<V>& on, long long number) {
+inline void forget(const ReplicaView<V>& on, long long number) {
   const Column<V> stored = on.in(on.a.history);
   if (Law::kHistory > kLastOverlap && is_zero(stored[number * Law::kHistory + kLastOverlap])) return;
   for (int n = 0; n < Law::kHistory; ++n)
@@ -263,7 +264,7 @@ inline void forget(const Lane<V>& on, long long number) {
 template <class V, class Law>
 void advance(const Arguments& a, int step, int thread) {
   if (thread >= a.grains * a.lanes) return;
-  const Lane<V> on(a, thread % a.lanes);
+  const ReplicaView<V> on(a, thread % a.lanes);
   const int grain = thread / a.lanes, now = step & 1;
   V parameter[kParameters];
   const GrainParameters<V> constants = read_parameters(on, parameter);
@@ -303,7 +304,7 @@ template <class V>
 void collect(const Arguments& a, int thread) {
   const int axis = thread / a.lanes % 3, first = thread / (3 * a.lanes) * kChunk;
   if (first >= a.grains) return;
-  const Column<V> sum = Lane<V>(a, thread % a.lanes).in(a.pressure);
+  const Column<V> sum = ReplicaView<V>(a, thread % a.lanes).in(a.pressure);
   const int end = first + kChunk < a.grains ? first + kChunk : a.grains;
   V total{};
   for (int grain = first; grain < end; ++grain) total = total + sum[grain * 3ll + axis];
@@ -313,7 +314,7 @@ void collect(const Arguments& a, int thread) {
 // Histories and pressures to the arrays of the call. Thread of row and lane; the first also of axis and lane.
 template <class V, class Law>
 void leave(const Arguments& a, int thread) {
-  const Lane<V> on(a, thread % a.lanes);
+  const ReplicaView<V> on(a, thread % a.lanes);
   const int row = thread / a.lanes;
   if (row < 3) {
     V total{};

@@ -18,7 +18,7 @@ enum class Law { frictionless = 0, hooke = 1, mindlin_rescaled = 2, mindlin = 3 
 enum class Variant { exact = 0, averaged = 1, paper = 2 };
 
 // Rows of the parameter array; a law's own follow.
-// gmem_jax/native/__init__.py: _parameters
+// gmem_jax/native/march.py: _parameters
 enum Parameter { kDt, kDrag, kMass, kInertia, kNormalStiffness = kInertia + 3, kNormalDamping, kWallStiffness, kLaw };
 constexpr int kLawParameters = 5;  // mu, stiffness, damping time, spinning, spacing of Mindlin's points
 constexpr int kParameters = kLaw + kLawParameters;

@@ -1,0 +1,129 @@
+"""Which code does the steps: what "auto" means here, for a friction law and a precision, decided once."""
+
+import functools
+from dataclasses import dataclass
+from typing import Literal, cast, get_args
+
+from jax.extend.backend import get_backend
+
+from gmem_jax.native import cuda, library
+from gmem_jax.native.march import March, march, march_anywhere, march_mixed, require_mixed
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.laws import entry_of
+
+Backend = Literal["auto", "jax", "native"]
+Precision = Literal["double", "mixed"]
+BACKENDS: tuple[Backend, ...] = get_args(Backend)
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+
+
+@dataclass(frozen=True)
+class ResolvedBackend:
+    """A backend, as it was asked for, on JAX's default device.
+
+    Attributes:
+        name: "jax" or "native".
+        precision: "double" or "mixed".
+        march: the steps of a bin; for "auto" also right in what is compiled for other devices than the default one.
+        why: the instruction set of the native backend on CPUs, or why plain JAX runs.
+    """
+
+    name: Backend
+    precision: Precision
+    march: March
+    why: str
+
+
+def supports(law: FrictionLaw) -> bool:
+    """Whether the native backend knows this friction law (a user's own runs in plain JAX)."""
+    return entry_of(law) is not None
+
+
+def resolve(backend: str, precision: str, law: FrictionLaw) -> ResolvedBackend:
+    """What does the steps for a friction law; the same object for the same arguments.
+
+    Args:
+        backend: as of `marcher`.
+        precision: likewise.
+        law: its class matters, and not its parameters.
+
+    Raises:
+        ValueError: if the backend is unknown or not available, or the precision is not to be had with it.
+    """
+    return _resolve(backend, precision, type(law), supports(law), *library.available())
+
+
+@functools.cache
+def _resolve(backend: str, precision: str, law: type, known: bool, built: bool, said: str) -> ResolvedBackend:
+    steps = marcher(backend, precision)
+    why = "it was asked for" if backend == "jax" else _why_not(law, known, built, said) if backend == "auto" else ""
+    name: Backend = "jax" if why else "native"
+    return ResolvedBackend(name, cast(Precision, precision), steps, why or said)
+
+
+def _why_not(law: type, known: bool, built: bool, said: str) -> str:
+    """Why "auto" means plain JAX on the default device; "" if it does not."""
+    if not built:
+        return said
+    if not known:
+        return f"the native backend does not know the friction law {law.__name__}"
+    client = get_backend()
+    if client.platform == "gpu" and "cuda" in client.platform_version:
+        return cuda.missing()
+    return "" if client.platform == "cpu" else f"the native backend does not run on {client.platform}"
+
+
+def name(backend: str, law: FrictionLaw) -> Backend:
+    """What "auto" means for this friction law on JAX's default device, "jax" or "native"; others are themselves.
+
+    Raises:
+        ValueError: if there is no such backend.
+    """
+    _require_known(backend)
+    return resolve(backend, "double", law).name if backend == "auto" else cast(Backend, backend)
+
+
+def _require_known(backend: str) -> None:
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
+
+
+def require_precision(precision: str, backend: str, law: FrictionLaw) -> None:
+    """Refuse a precision that is unknown, or not to be had.
+
+    Raises:
+        ValueError: saying why.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
+    if precision == "double":
+        return
+    if name(backend, law) != "native":
+        built, said = library.available()
+        why = "" if backend == "jax" or built else f", which is not available: {said}"
+        raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")
+    require_mixed(law)
+
+
+def marcher(backend: str = "auto", precision: str = "double") -> March:
+    """The `march` of a backend, for any friction law.
+
+    Args:
+        backend: "jax", the definition; "native", the library, which is refused where there is none; or "auto": native
+            in what is compiled for CPUs and CUDA GPUs, where the library is at hand and knows the friction law, else
+            plain JAX.
+        precision: "double", or "mixed": contacts and their histories in single precision, on the native backend; see
+            `gmem_jax.native.march.march_mixed`.
+
+    Raises:
+        ValueError: if the backend is unknown or not available, or the precision is not its own.
+    """
+    _require_known(backend)
+    if precision not in PRECISIONS or (precision == "mixed" and backend == "jax"):
+        raise ValueError(f"precision {precision!r} is not one of the backend {backend!r}")
+    if backend == "native" or precision == "mixed":
+        library.require()
+    if precision == "mixed":
+        return march_mixed
+    return {"jax": dynamics.march, "native": march, "auto": march_anywhere}[backend]

@@ -1,0 +1,85 @@
+"""The compiled library: where it lies, whether it can be loaded, and what it says of itself."""
+
+import ctypes
+import functools
+from pathlib import Path
+
+import jax
+
+from gmem_jax.native import cuda, primitives
+from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.laws import Entry, entry_of
+
+
+def path() -> Path:
+    """The library's file, whether it is there or not."""
+    from gmem_jax.native.build import LIBRARY  # here, so that ``python -m gmem_jax.native.build`` loads it only once
+
+    return Path(__file__).parent / LIBRARY
+
+
+@functools.cache
+def load() -> tuple[str, str]:
+    """Load and register the library, once; returns its instruction set, and why that failed ("" if it did not)."""
+    from gmem_jax.native.build import SOURCES, is_stale  # here, as in `path`
+
+    file = path()
+    if not file.exists():
+        return "", "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
+    try:
+        library = ctypes.CDLL(str(file))
+        if is_stale(library):
+            return "", "its library is older than its sources; rebuild it: python -m gmem_jax.native.build"
+        for target in primitives.TARGETS:
+            jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
+        cuda.register(library, SOURCES)
+        library.gmem_instruction_set.restype = ctypes.c_char_p
+        return library.gmem_instruction_set().decode(), ""
+    except (OSError, AttributeError) as error:
+        return "", f"its library could not be loaded: {error}"
+
+
+def available() -> tuple[bool, str]:
+    """Whether the native backend can run on this machine's CPU, and the instruction set it uses (or why not)."""
+    instructions, reason = load()
+    return not reason, reason or instructions
+
+
+def require() -> None:
+    """Refuse to go on without the library.
+
+    Raises:
+        ValueError: saying why it is not available.
+    """
+    possible, reason = available()
+    if not possible:
+        raise ValueError(f"the native backend is not available: {reason}")
+
+
+def entry(law: FrictionLaw) -> Entry:
+    """The row of a friction law in `gmem_jax.physics.contact.laws`.
+
+    Raises:
+        ValueError: if the library does not know the law.
+    """
+    found = entry_of(law)
+    if found is None:
+        raise ValueError(f"the native backend does not know the friction law {type(law).__name__}")
+    return found
+
+
+def needs(law: FrictionLaw, architecture: str, *, tangent: bool = False) -> dict[str, cuda.Needs]:
+    """What the kernels of a law take of a GPU, compiled for its architecture ("sm_90") on this machine.
+
+    Args:
+        law: one that the library knows.
+        architecture: as NVRTC calls it.
+        tangent: of numbers that carry derivatives.
+
+    Raises:
+        RuntimeError: if there is no NVRTC, or it does not know the architecture.
+        ValueError: if the library is not available, or does not know the law.
+    """
+    require()
+    row = entry(law)
+    return cuda.needs(ctypes.CDLL(str(path())), row.native, row.variant(law), architecture, tangent=tangent)

@@ -1,0 +1,260 @@
+"""The steps of a bin by the library, with the signature of `gmem_jax.physics.step.march`; their tangents and adjoints.
+
+Here a system and a state become the arrays and numbers of a call, and its results a state again. How a call is made is
+in `gmem_jax.native.primitives`.
+"""
+
+import functools
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.backend import get_backend
+
+from gmem_jax.native import library, primitives
+from gmem_jax.native.primitives import Arrays, Call, Fixed, Results
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.laws import LAWS, entry_of
+from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.state import Box, Grains, State
+from gmem_jax.physics.step import System
+
+March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
+"""The signature of `gmem_jax.physics.step.march`."""
+
+_LAW_NUMBERS = max(len(entry.numbers) for entry in LAWS)  # rows of the parameter array for a law's own
+
+
+def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
+    """`gmem_jax.physics.step.march` on the native backend.
+
+    Args:
+        system: the system; parameters of its friction law are scalars or [B].
+        state: at time t.
+        boxes: the walls at t + dt, t + 2 dt, ...; leaves [steps, 3, B], in R and R / t_c.
+        dt: scalar or [B], in t_c.
+        drag: scalar or [B], in 1 / t_c.
+
+    Returns:
+        The state after them, and the sum over the steps of the wall pressures, [3, B], in E.
+
+    Raises:
+        ValueError: if the backend is not available, does not know the friction law, or the state is not float64; or if
+            an argument does not fit the number of replicas.
+        NotImplementedError: if it is compiled for anything but a CPU or a CUDA GPU, or for that without NVRTC.
+    """
+    return _march(system, state, boxes, dt, drag, _Mode())
+
+
+def march_mixed(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
+    """`march` with contacts in single precision: their forces, torques and histories.
+
+    Positions, orientations, velocities, the sums of forces and the gaps of contacts are in double precision, and the
+    gaps rounded. It pays from many replicas side by side, so that a lone one runs in double precision.
+
+    Raises:
+        ValueError: as of `march` and `require_mixed`.
+    """
+    require_mixed(system.friction)
+    return _march(system, state, boxes, dt, drag, _Mode(mixed=state.replicas > 1))
+
+
+def require_mixed(law: FrictionLaw) -> None:
+    """Refuse what cannot be done with contacts in single precision.
+
+    Raises:
+        ValueError: if the law is kept in double precision or unknown, or JAX's default device is no CPU.
+    """
+    if get_backend().platform != "cpu":
+        raise ValueError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
+    if library.entry(law).layered:
+        raise ValueError("precision='mixed' is not for the Mindlin law, whose rings are kept in double precision")
+
+
+def march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
+    """`march` on CPUs and CUDA GPUs, its definition elsewhere."""
+    if entry_of(system.friction) is None:
+        return dynamics.march(system, state, boxes, dt, drag)
+    built, reason = library.available()
+    if not built:
+        warn_once(reason)
+        return dynamics.march(system, state, boxes, dt, drag)
+    return _march(system, state, boxes, dt, drag, _Mode(anywhere=True))
+
+
+@functools.cache
+def warn_once(reason: str) -> None:
+    """Say that a CPU could be faster, and how."""
+    warnings.warn(f"plain JAX runs, and slowly: the native backend is not available: {reason}", stacklevel=4)
+
+
+class _Mode(NamedTuple):
+    """How the steps of a bin are done.
+
+    Attributes:
+        anywhere: their definition stands for them where there is no library.
+        mixed: contacts in single precision.
+    """
+
+    anywhere: bool = False
+    mixed: bool = False
+
+
+def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, mode: _Mode) -> tuple[State, jax.Array]:
+    library.require()
+    library.entry(system.friction)
+    if state.grains.position.dtype != jnp.float64:
+        raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
+    law = {field.name: getattr(system.friction, field.name) for field in fields(system.friction)}  # type: ignore[arg-type]
+    dynamics.require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass, **law)
+    boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
+    system, state, boxes, dt, drag = dynamics.together((system, state, boxes, jnp.asarray(dt), jnp.asarray(drag)))
+    grains, history, total = _bin(mode, system, state.grains, state.history, boxes, (dt, drag))
+    return State(grains, history, state.status), total
+
+
+_Result = tuple[Grains, Any, jax.Array]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _bin(
+    mode: _Mode, system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]
+) -> _Result:
+    """The steps whose walls are `boxes` ([steps, 3, B]); `numbers` are (dt, drag).
+
+    Returns:
+        The grains, the history, and the sum over the steps of the wall pressures, [3, B].
+    """
+    arrays = arrays_of(system, grains, history, boxes, numbers)
+    definition = PlainDefinition.of(system, history, mode.anywhere)
+    call = call_of(system)._replace(mixed=int(mode.mixed))
+    return _result(grains, history, primitives.forward(call, definition, fixed_of(system), arrays))
+
+
+@functools.partial(_bin.defjvp, symbolic_zeros=True)
+def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
+    """The tangent with respect to what is being differentiated and no more."""
+    if mode.mixed:
+        raise NotImplementedError("there are no derivatives in mixed precision; use precision='double'")
+    leaves, structure = jax.tree.flatten(primals)
+    slopes = jax.tree.leaves(tangents)
+    active = [place for place, slope in enumerate(slopes) if not _is_zero(slope)]
+    varied, directions = [leaves[place] for place in active], [slopes[place] for place in active]
+
+    def filled(varied: Sequence[jax.Array]) -> tuple[Any, ...]:
+        whole = list(leaves)
+        for place, leaf in zip(active, varied, strict=True):
+            whole[place] = leaf
+        rebuilt: tuple[Any, ...] = jax.tree.unflatten(structure, whole)
+        return rebuilt
+
+    system, _, history, *_ = primals
+    if not all(map(_is_zero, jax.tree.leaves((tangents[0].pairs, tangents[0].clump.offsets)))):
+        # The library has no derivatives by these.
+        _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
+        return _bin(mode, *primals), slope
+    arrays, along = jax.jvp(lambda *varied: arrays_of(*filled(varied)), varied, directions)
+    definition = PlainDefinition.of(system, history, mode.anywhere)
+    change = primitives.tangent(call_of(system), definition, fixed_of(system), arrays, along)
+    return _bin(mode, *primals), _result(primals[1], history, change)
+
+
+def _is_zero(slope: Any) -> bool:
+    return isinstance(slope, jax.custom_derivatives.SymbolicZero)
+
+
+def _plain(system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]) -> _Result:
+    """The definition of `_bin`."""
+    state = State(grains, history, jnp.zeros(grains.position.shape[-1], jnp.int32))
+    state, total = dynamics.march(system, state, boxes, *numbers)
+    return state.grains, state.history, total
+
+
+class _Solid(NamedTuple):
+    """What a step asks of a `Material`."""
+
+    normal_stiffness: jax.Array
+    normal_damping: jax.Array
+    wall_stiffness: jax.Array
+
+
+@dataclass(frozen=True)
+class PlainDefinition:
+    """`_plain` on the arguments of a call, `gmem_jax.native.primitives.Definition`.
+
+    Attributes:
+        system: structure of the `System`.
+        history: structure of the history.
+        anywhere: see `gmem_jax.native.primitives.Definition`.
+    """
+
+    system: Any
+    history: Any
+    anywhere: bool = True
+
+    @classmethod
+    def of(cls, system: System, history: Any, anywhere: bool = True) -> "PlainDefinition":
+        """That of a system with such a history."""
+        return cls(jax.tree.structure(system), jax.tree.structure(history), anywhere)
+
+    def __call__(self, fixed: Fixed, arrays: Arrays) -> Results:
+        """The steps."""
+        empty: System = jax.tree.unflatten(self.system, [None] * self.system.num_leaves)
+        dt, drag, mass, *inertia = arrays.parameters[:6]
+        clump = replace(empty.clump, offsets=fixed.offsets, mass=mass, inertia=jnp.stack(inertia))
+        law: Any = empty.friction
+        law = library.entry(law).with_numbers(law, arrays.parameters[9:])
+        material: Any = _Solid(*arrays.parameters[6:9])
+        lists = ("first", "second", "valid", "incidence")
+        pairs = replace(empty.pairs, **{field: getattr(fixed, field) for field in lists})
+        boxes = Box(*jnp.split(arrays.walls, 4, axis=1))
+        history = jax.tree.unflatten(self.history, arrays.history)
+        system = replace(empty, clump=clump, friction=law, pairs=pairs, material=material)
+        grains, history, total = _plain(system, Grains(*arrays.fields), history, boxes, (dt, drag))
+        return Results(jax.tree.leaves(grains), total, jax.tree.leaves(history))
+
+
+def call_of(system: System) -> Call:
+    """What the library is told beside arrays."""
+    law = system.friction
+    row = library.entry(law)
+    return Call(
+        law=row.native,
+        variant=row.variant(law),
+        points=row.points(law),
+        isotropic=int(system.clump.isotropic),
+        leaves=len(row.history),
+    )
+
+
+def fixed_of(system: System) -> Fixed:
+    """Arguments without derivatives."""
+    pairs = system.pairs
+    candidates = (pairs.first, pairs.second, pairs.valid, pairs.incidence, pairs.reference[..., 0], pairs.smallest)
+    return Fixed(*candidates, system.clump.offsets)
+
+
+def arrays_of(system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]) -> Arrays:
+    """Arguments with derivatives."""
+    walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
+    parameters = _parameters(system, numbers, grains.position.shape[-1])
+    return Arrays(jax.tree.leaves(grains), parameters, walls, jax.tree.leaves(history))
+
+
+def _result(grains: Grains, history: Any, results: Results) -> _Result:
+    moved = jax.tree.unflatten(jax.tree.structure(grains), results.fields)
+    return moved, jax.tree.unflatten(jax.tree.structure(history), results.history), results.pressure
+
+
+def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: int) -> jax.Array:
+    """What parameters.h calls the rows of the parameter array, [rows, B]."""
+    law, clump, material = system.friction, system.clump, system.material
+    own = [getattr(law, number) for number in library.entry(law).numbers]
+    own += [1.0] * (_LAW_NUMBERS - len(own))
+    solid = (material.normal_stiffness, material.normal_damping, material.wall_stiffness)
+    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own)
+    return jnp.stack([jnp.broadcast_to(jnp.asarray(row, jnp.float64), (replicas,)) for row in rows])

@@ -1,0 +1,118 @@
+// What both modes do alike with the candidates: which of them are looked at, and how their histories come from
+// the arrays of a call and go back.
+
+#pragma once
+
+#include <cstddef>
+
+#include "cpu/problem.h"
+#include "physics/laws.h"
+
+namespace gmem {
+namespace GMEM_ISA {
+
+// The travel up to which two spheres that are now apart, by the square of their distance, cannot touch.
+inline double next_check(double travel, double square) {
+  return travel + (1.0 - 1e-9) * (__builtin_sqrt(square) - 2.0);
+}
+
+// What is kept of each candidate beside forces and histories.
+template <class Law>
+struct Marks {
+  bool* touched;       // in any lane, at the last step: only then is there a history to forget
+  double* next_check;  // the travel at which it may next touch: until then it need not be looked at
+  int* segments;       // Mindlin: how many are stored
+  int* rings;          // ... of how many rings, at the beginning of the call; those beyond were zero
+
+  void place(const Plan& plan, Arena& arena) {
+    const std::size_t count = static_cast<std::size_t>(plan.candidates) + 1;  // and a dummy
+    touched = arena.take<bool>(count);
+    next_check = arena.take<double>(count);
+    segments = arena.take<int>(Law::kLayered ? count : 0);
+    rings = arena.take<int>(Law::kLayered ? count : 0);
+  }
+
+  static constexpr int kLook = 256;  // candidates looked at at once
+
+  // Of these, from `first` on and before `end`, those that may touch go to `near`; returns how many.
+  GMEM_INLINE int find_near(int first, int end, double travel, int (&near)[kLook + 1]) const {
+    const int look_end = first + kLook < end ? first + kLook : end;
+    int found = 0;
+    for (int c = first; c < look_end; ++c) {
+      near[found] = c;
+      found += !(next_check[c] > travel);  // also where it is not a number
+    }
+    return found;
+  }
+};
+
+// Rings that may hold something where the outermost is `outer`: one more, since JAX's root may differ in its last digit.
+template <class V>
+int rings_of(const Problem& p, V outer) {
+  const int last = static_cast<int>(largest(outer));
+  return last < 0 ? 0 : last + 2 < p.points ? last + 2 : p.points;
+}
+
+// How many rings of a result are to be written.
+template <class V>
+int rings_to_write(const Problem& p, int before, V outer) {
+  const int now = static_cast<int>(largest(outer)) + 1;
+  return !p.history_aliased ? p.points : now > before ? now : before;
+}
+
+// Where number `axis` of ring j lies in the arrays of a call.
+inline Place ring_place(const Problem& p, std::ptrdiff_t row, int j, int axis = 0) {
+  return {0, (row * p.points + j) * 2 + axis};
+}
+
+// The history of candidate c, from the arrays of the call to where a mode keeps it.
+template <class Mode, class V>
+void load_history(Mode& mode, std::ptrdiff_t c, const LawParameters<V>& law) {
+  using Law = typename Mode::OfLaw;
+  const std::ptrdiff_t row = mode.plan.candidate[c].row;
+  mode.mark_new(c);
+  for (int q = 0; q < Law::kGiven; ++q) mode.remembered(c, q) = mode.history_in(place_of<Law>(row, q));
+  if constexpr (Law::kLayered) {
+    const auto outer = mode.outermost(c, law);
+    mode.marks.rings[c] = rings_of(mode.problem, outer);
+    const auto ring = [&](int j) {
+      using Number = decltype(mode.history_in(Place{}));
+      const Number along = mode.history_in(ring_place(mode.problem, row, j));
+      return Flat<Number>{along, mode.history_in(ring_place(mode.problem, row, j, 1))};
+    };
+    const auto layers = mode.segments_of(c).load(outer, kLacking<Law::variant>, mode.apart, ring);
+    store_layers(&mode.remembered(c, kLayers), layers);
+  }
+}
+
+// ... and back: to the lanes that have done all their steps.
+template <class Mode, class V>
+void unload_history(const Mode& mode, std::ptrdiff_t c, const LawParameters<V>& law, int steps_done) {
+  using Law = typename Mode::OfLaw;
+  const std::ptrdiff_t row = mode.plan.candidate[c].row;
+  for (int q = 0; q < Law::kGiven; ++q) mode.history_out(place_of<Law>(row, q), mode.remembered(c, q), steps_done);
+  if constexpr (Law::kLayered) {
+    const auto outer = mode.outermost(c, law);
+    const auto layers = load_layers(&mode.remembered(c, kLayers));
+    const int end = rings_to_write(mode.problem, mode.marks.rings[c], outer);
+    mode.segments_of(c).unload(layers, outer, end, [&](int j, const auto& force) {
+      mode.history_out(ring_place(mode.problem, row, j), force.along, steps_done);
+      mode.history_out(ring_place(mode.problem, row, j, 1), force.across, steps_done);
+    });
+  }
+}
+
+// Zero to row number n of those without a candidate.
+template <class Mode>
+void unload_padding(const Mode& mode, int n, int steps_done) {
+  using Law = typename Mode::OfLaw;
+  const decltype(mode.history_in(Place{})) nothing{};
+  const std::ptrdiff_t row = mode.plan.padding_row[n];
+  for (int q = 0; q < Law::kGiven; ++q) mode.history_out(place_of<Law>(row, q), nothing, steps_done);
+  if (Law::kLayered && !mode.problem.history_aliased)
+    for (int q = 0; q < 2 * mode.problem.points; ++q)
+      mode.history_out(ring_place(mode.problem, row, 0, q), nothing, steps_done);
+}
+
+}  // namespace GMEM_ISA
+}  // namespace gmem

@@ -1,0 +1,119 @@
+"""What a user puts in the wrong place is answered in one line that says what is right; types say it before it runs."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import TESTS, TETRA_27
+
+import gmem_jax as gm
+
+PACK = gm.load_pack(TETRA_27)
+SIX: Any = gm.six_signals()
+EXPERIMENT = gm.Experiment(PACK, gm.words(1), t0=60.0)
+
+
+def test_a_wrong_part_of_an_experiment_is_refused_with_what_makes_a_right_one() -> None:
+    wrong: list[tuple[Callable[[], Any], str]] = [
+        (
+            lambda: gm.Experiment("tetra-325-a", SIX),
+            "pack must be a pack, got 'tetra-325-a'; gm.load_pack('tetra-325-a') reads one",
+        ),
+        (lambda: gm.Experiment(None, SIX), "pack must be a pack, got None; see gm.load_pack and gm.prepare"),
+        (
+            lambda: gm.Experiment(PACK, np.ones((2, 8))),
+            "signals must be waveforms, got an array of shape (2, 8); gm.waveform makes waveforms of samples",
+        ),
+        (
+            lambda: gm.Experiment(PACK, [0.1, 0.2]),
+            "signals must be waveforms, got a list; gm.waveform makes waveforms of samples",
+        ),
+        (
+            lambda: gm.Experiment(PACK, gm.six_signals),
+            "signals must be waveforms, got a function; as gm.six_signals(), gm.words(3)",
+        ),
+        (
+            lambda: gm.Experiment(PACK, SIX, gm.Mindlin),
+            "friction must be a friction law, got the class Mindlin; make one with its parameters, as Mindlin(mu=1.0)",
+        ),
+        (lambda: gm.Experiment(PACK, SIX, 0.5), "friction must be a friction law, got 0.5; gm.Hooke(mu=0.5)"),
+        (
+            lambda: gm.replace(EXPERIMENT, pack="tetra-325-a"),
+            "pack must be a pack, got 'tetra-325-a'; gm.load_pack('tetra-325-a') reads one",
+        ),
+    ]
+    for make, words in wrong:
+        with pytest.raises(ValueError) as refused:  # noqa: PT011
+            make()
+        assert str(refused.value) == words
+
+
+def test_names_values_and_batches_in_the_wrong_form_are_refused_with_the_right_one() -> None:
+    wrong: list[tuple[Callable[[], Any], str]] = [
+        (lambda: gm.value_and_grad(EXPERIMENT, "gamma0"), r'write \["gamma0"\] for "gamma0"'),
+        (lambda: gm.value_and_grad(EXPERIMENT, ["steps"]), "steps is fixed when a program is compiled"),
+        (lambda: gm.value_and_grad(EXPERIMENT, ["dt"]), "dt is fixed when a program is compiled"),
+        (lambda: gm.value_and_grad(EXPERIMENT, ["background"]), "background is fixed .*; numbers like gamma0"),
+        (lambda: gm.value_and_grad(EXPERIMENT, ["pack.name"]), "pack.name is fixed"),
+        (lambda: gm.run(EXPERIMENT, batch=0), "batch must be at least 1, got 0"),
+        (lambda: gm.replace(EXPERIMENT, {"gamma0": 1e-3}, gamma0=2e-3), "gamma0 is given twice"),
+        (
+            lambda: gm.replace(EXPERIMENT, {"friction.mu": 0.5, "friction": gm.Hooke()}),
+            "friction is given twice; leave one away",
+        ),
+        (lambda: gm.sweep(EXPERIMENT, {"gamma0": 1e-3}), r"gamma0 varies over a list of values: write \[0.001\]"),
+        (lambda: gm.sweep(EXPERIMENT, {"pack": "tetra-325-a"}), r"write \['tetra-325-a'\] for 'tetra-325-a'"),
+    ]
+    for make, words in wrong:
+        with pytest.raises(ValueError, match=words) as refused:
+            make()
+        assert "\n" not in str(refused.value)
+    with_part = gm.replace(EXPERIMENT, {"friction": gm.Hooke(), "friction.mu": 0.5})
+    assert with_part.friction == gm.Hooke(mu=0.5)
+
+
+def test_files_are_named_by_paths_or_texts(tmp_path: Path) -> None:
+    gm.save_pack(str(tmp_path / "pack.h5"), PACK)
+    assert gm.load_pack(str(tmp_path / "pack.h5")).grains == 27
+    samples = jnp.asarray([[0.1, 0.2, 0.1]])
+    gm.save_waveforms(str(tmp_path / "waves.csv"), gm.waveform(samples))
+    np.testing.assert_allclose(gm.load_waveforms(str(tmp_path / "waves.csv")), samples)
+
+
+def test_the_package_lists_its_own_names_those_loaded_later_too_and_nothing_foreign() -> None:
+    listed = [name for name in dir(gm) if not name.startswith("__")]
+    assert listed == sorted(gm.__all__)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("mypy") is None, reason="needs mypy")
+def test_a_program_of_a_user_is_typed_throughout_and_its_mistakes_are_found(tmp_path: Path) -> None:
+    root = Path(gm.__file__).parent.parent
+    good = (TESTS / "data" / "program.py").read_text()
+    (tmp_path / "good.py").write_text(good)
+    (tmp_path / "bad.py").write_text(
+        good.replace('backend="native"', 'backend="nativ"').replace("pack, gm.", '"a", gm.')
+    )
+    settings = tmp_path / "mypy.ini"
+    settings.write_text(
+        "[mypy]\nstrict = True\nuntyped_calls_exclude = jax\n[mypy-gmem_jax.*]\nfollow_imports = silent\n"
+    )
+    command = [sys.executable, "-m", "mypy", "--config-file", str(settings), "--cache-dir", str(tmp_path / "cache")]
+    done = subprocess.run(
+        [*command, "good.py", "bad.py"],
+        cwd=tmp_path,
+        env={**os.environ, "MYPYPATH": str(root)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    errors = [line for line in done.stdout.splitlines() if ": error:" in line]
+    assert [line.split(":")[0] for line in errors] == ["bad.py"] * 2, done.stdout + done.stderr
+    assert all(any(words in line for line in errors) for words in ("auto", 'expected "Pack"')), errors

@@ -1,0 +1,256 @@
+"""The library's derivatives are those of the definition, for every law, in both modes and under vmap."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import TETRA_27, Motion, advance_by
+
+import gmem_jax as gm
+from gmem_jax import native
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.state import State, replicate
+from gmem_jax.physics.step import System, start
+from gmem_jax.simulation.loop import Simulation, rollout, rollout_chunk
+from gmem_jax.simulation.protocol import BINS, Stage
+from gmem_jax.simulation.sample import measure
+from gmem_jax.simulation.strain import StrainPath
+
+BUILT, REASON = native.available()
+# Without a C++ compiler there is no native backend to compare; plain JAX is then all there is.
+pytestmark = pytest.mark.skipif(not BUILT, reason=REASON)
+
+PACK = gm.load_pack(TETRA_27)
+LAWS: dict[str, Any] = {
+    "frictionless": gm.Frictionless(),
+    "H": gm.Hooke(mu=0.5),
+    "M1": gm.MindlinRescaled(mu=0.5),
+    **{f"M2-{variant}": gm.Mindlin(mu=0.5, points=8, variant=variant) for variant in ("exact", "averaged", "paper")},
+}
+# Ten seconds each, nearly all of it compiling, that say of others what "H" with isotropic grains says.
+ALIKE = [
+    pytest.param(name, isotropic, marks=pytest.mark.slow)
+    for name, isotropic in [*((name, True) for name in LAWS if name != "H"), ("H", False)]
+]
+HEIGHTS = jnp.asarray([[1.0], [-0.4]])
+# Both are exact derivatives of one program over 20 steps. Round-off is some 1e-14 of the largest, and is magnified
+# where a force is carried along whose normal part nearly cancels (by 1e3 seen in one of 11,000 numbers).
+TOLERANCE = 1e-9
+
+
+def squeezed(law: Any) -> tuple[System, State]:
+    """Three replicas in the middle of a sheared compression by 6 %: contacts stick, slide, form and break."""
+    system = System(PACK.clump, law, PACK.pairs)
+    state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
+    return system, advance_by(native.march)(system, replicate(state, 3), motion(), 0.3, bins=1, steps=600)[0]
+
+
+def motion(gamma0: Any = 3e-2, heights: jax.Array = HEIGHTS) -> Motion:
+    shear = gm.Bumps(heights, jnp.full_like(HEIGHTS, 0.5), 0.9)
+    return Motion(PACK.lower[:, None], PACK.upper[:, None], 0.06, 0.0, 1.0, 300.0, gamma0, shear)
+
+
+def end(march: native.March, system: System, state: State, theta: dict[str, Any]) -> Any:
+    """Everything that 20 more steps give, as a function of everything they depend on."""
+    law = replace(system.friction, **theta["law"])
+    clump = replace(system.clump, mass=theta["mass"], inertia=theta["inertia"])
+    state = replace(state, grains=theta["grains"], history=theta["history"])
+    after, sample = advance_by(march)(
+        replace(system, friction=law, clump=clump),
+        state,
+        motion(theta["gamma0"], theta["heights"]),
+        theta["dt"],
+        first_bin=60,
+        bins=2,
+        steps=10,
+        drag=theta["drag"],
+    )
+    return after.grains, after.history, sample.pressure
+
+
+def arguments(system: System, state: State) -> dict[str, Any]:
+    names = [] if isinstance(system.friction, gm.Frictionless) else ["mu", "stiffness", "damping_time"]
+    return {
+        "grains": state.grains,
+        "history": state.history,
+        "law": {name: jnp.asarray(getattr(system.friction, name)) for name in names},
+        "mass": system.clump.mass,
+        "inertia": system.clump.inertia,
+        "gamma0": jnp.asarray(3e-2),
+        "heights": HEIGHTS,
+        "dt": jnp.asarray(0.3),
+        "drag": jnp.asarray(0.01),
+    }
+
+
+def random_like(tree: Any, seed: int) -> Any:
+    generator = np.random.default_rng(seed)
+    return jax.tree.map(lambda leaf: jnp.asarray(generator.normal(size=jnp.shape(leaf))), tree)
+
+
+def assert_close(one: Any, other: Any) -> None:
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        scale = float(jnp.abs(b).max()) if b.size else 0.0
+        np.testing.assert_allclose(a, b, atol=TOLERANCE * scale, rtol=0.0)
+
+
+@pytest.mark.parametrize(("name", "isotropic"), [("H", True), *ALIKE])
+def test_both_modes_agree_with_plain_jax(name: str, isotropic: bool) -> None:
+    system, state = squeezed(LAWS[name])
+    moments = system.clump.inertia * (1.0 if isotropic else jnp.asarray([0.8, 1.0, 1.3]))
+    system = replace(system, clump=replace(system.clump, isotropic=isotropic, inertia=moments))
+    theta = arguments(system, state)
+    touching = measure(system, state, motion().box_at(180.0), jnp.ones((3, 3)), 0.5).contacts
+    assert np.all(np.asarray(touching) > 5.0)
+
+    def both(march: native.March) -> Callable[..., Any]:
+        def derivatives(theta: Any, direction: Any, weights: Any) -> Any:
+            _, forward = jax.jvp(lambda theta: end(march, system, state, theta), (theta,), (direction,))
+            _, pull = jax.vjp(lambda theta: end(march, system, state, theta), theta)
+            return forward, pull(weights)[0]
+
+        return jax.jit(derivatives)
+
+    shapes = jax.eval_shape(lambda theta: end(dynamics.march, system, state, theta), theta)
+    direction, weights = random_like(theta, 0), random_like(shapes, 1)
+
+    def known(history: Any) -> Any:
+        """Without derivatives by what is zero and stays so: histories of contacts apart, Mindlin's unreached layers."""
+        return jax.tree.map(lambda slope, leaf: jnp.where(leaf != 0.0, slope, 0.0), history, state.history)
+
+    # Quaternions of unit length and forces in the tangent plane are not needed: the derivative is by each number.
+    direction["history"] = known(direction["history"])
+    fast = both(native.march)(theta, direction, weights)
+    plain = both(dynamics.march)(theta, direction, weights)
+    for _, pulled in (fast, plain):
+        pulled["history"] = known(pulled["history"])
+    assert float(jnp.abs(plain[1]["gamma0"])) > 0.0
+    assert_close(fast, plain)
+
+
+@pytest.mark.slow
+def test_derivatives_through_200_steps_are_those_of_the_definition() -> None:
+    def last(march: native.March, mu: jax.Array) -> jax.Array:
+        system = System(PACK.clump, gm.Hooke(mu=mu), PACK.pairs)
+        state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
+        walls = Motion(PACK.lower[:, None], PACK.upper[:, None], 0.05, 0.0, 1.0, 60.0)
+        _, sample = advance_by(march)(system, state, walls, 0.3, bins=2, steps=100)
+        return 1e3 * jnp.sum(sample.pressure[-1])
+
+    mu = jnp.asarray(0.3)
+    for derivative in (jax.grad, jax.jacfwd):
+        fast, plain = (
+            jax.jit(derivative(lambda m, by=march: last(by, m)))(mu) for march in (native.march, dynamics.march)
+        )
+        assert abs(float(plain)) > 1e-3
+        np.testing.assert_allclose(fast, plain, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_vmap_and_grad_in_either_order() -> None:
+    system, state = squeezed(LAWS["H"])
+    theta = arguments(system, state)
+
+    def loss(mu: jax.Array, gamma0: jax.Array) -> jax.Array:
+        law = {**theta["law"], "mu": mu}
+        return jnp.sum(end(native.march, system, state, {**theta, "law": law, "gamma0": gamma0})[2][-1] ** 2)
+
+    several = jnp.asarray([0.3, 0.5])
+    one_by_one = jnp.stack([jax.grad(loss, argnums=1)(mu, theta["gamma0"]) for mu in several])
+    outside = jax.vmap(jax.grad(loss, argnums=1), in_axes=(0, None))(several, theta["gamma0"])
+    inside = jax.grad(lambda gamma0: jnp.sum(jax.vmap(loss, in_axes=(0, None))(several, gamma0)))(theta["gamma0"])
+    np.testing.assert_allclose(outside, one_by_one, rtol=TOLERANCE)
+    np.testing.assert_allclose(inside, one_by_one.sum(), rtol=TOLERANCE)
+
+
+def test_any_number_of_threads_gives_the_same_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
+    pack = gm.load_pack("tetra-325-a")  # large enough for the threads to share a block
+    system = System(pack.clump, gm.Hooke(), pack.pairs)
+    state = replicate(start(system, pack.position[..., None], pack.quaternion[..., None], pack.box), 3)
+    walls = Motion(pack.lower[:, None], pack.upper[:, None], 0.05, 0.0, 1.0, 300.0)
+
+    def last(grains: Any, mu: jax.Array) -> jax.Array:
+        chosen = replace(system, friction=gm.Hooke(mu=mu))
+        advanced = advance_by(native.march)(chosen, replace(state, grains=grains), walls, 0.3, bins=1, steps=20)
+        return advanced[1].pressure
+
+    run = jax.jit(jax.jacrev(lambda grains, mu: jnp.sum(last(grains, mu)), argnums=(0, 1)))
+
+    def derivatives(threads: int) -> list[jax.Array]:
+        monkeypatch.setenv("GMEM_THREADS", str(threads))
+        return jax.tree.leaves(jax.block_until_ready(run(state.grains, jnp.asarray(0.3))))
+
+    alone = derivatives(1)
+    assert all(bool(jnp.any(leaf != 0.0)) for leaf in alone)
+    for threads in (2, 5):
+        for one, other in zip(derivatives(threads), alone, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("instructions", ["baseline", pytest.param("avx2", marks=pytest.mark.slow)])
+def test_every_instruction_set_has_the_same_derivatives(monkeypatch: pytest.MonkeyPatch, instructions: str) -> None:
+    system, state = squeezed(LAWS["M1"])
+    theta = arguments(system, state)
+
+    def pull() -> Any:
+        result, back = jax.vjp(lambda theta: end(native.march, system, state, theta), theta)
+        return back(jax.tree.map(jnp.ones_like, result))[0]
+
+    best = pull()
+    monkeypatch.setenv("GMEM_ISA", instructions)
+    assert_close(pull(), best)
+
+
+@pytest.mark.slow
+def test_bins_counted_only_at_run_time_are_differentiated_forwards() -> None:
+    system, state = squeezed(LAWS["H"])
+    walls = motion()
+    drive = StrainPath(walls.lower, walls.upper, walls.delta0, walls.gamma0, walls.signals)
+    encode = Stage(
+        "encode", 0.0, 1.0, 100.0 / BINS, "write", sheared=True
+    )  # of 100 bins of 10 steps: as long as `motion`
+
+    def simulation(mu: jax.Array, backend: str) -> Simulation:
+        return Simulation(replace(system, friction=gm.Hooke(mu=mu)), drive, 0.3, steps=10, backend=backend)
+
+    for backend in ("native", "jax"):
+
+        def counted(mu: jax.Array, count: Any, by: str = backend) -> jax.Array:
+            return rollout_chunk(simulation(mu, by), state, encode.bin(60), count, 3)[1].pressure[:2]
+
+        def listed(mu: jax.Array, by: str = backend) -> jax.Array:
+            return rollout(simulation(mu, by), state, encode.rows(60, 2))[1].pressure
+
+        slope = jax.jit(lambda mu, count, of=counted: jax.jvp(lambda mu: of(mu, count), (mu,), (1.0,)))(0.3, 2)
+        for found, known in zip(slope, jax.jvp(listed, (0.3,), (1.0,)), strict=True):
+            assert np.abs(known[-1]).max() > 0.0
+            np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-18)
+
+
+@pytest.mark.parametrize("march", [native.march, pytest.param(dynamics.march, marks=pytest.mark.slow)])
+def test_nothing_changes_where_programs_are_not_compiled_as_a_whole(march: native.March) -> None:
+    system = System(PACK.clump, LAWS["H"], PACK.pairs)
+    state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
+    boxes = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), PACK.box)
+
+    def pressure(dt: jax.Array) -> jax.Array:
+        return jnp.sum(march(system, state, boxes, dt, 0.0)[1])
+
+    compiled = jax.jit(jax.value_and_grad(pressure))(jnp.asarray(0.3))
+    with jax.disable_jit():
+        assert_close(jax.value_and_grad(pressure)(jnp.asarray(0.3)), compiled)
+
+
+def test_second_derivatives_are_refused_in_one_line() -> None:
+    system, state = squeezed(LAWS["H"])
+    theta = arguments(system, state)
+
+    def loss(gamma0: jax.Array) -> jax.Array:
+        return jnp.sum(end(native.march, system, state, {**theta, "gamma0": gamma0})[2])
+
+    with pytest.raises(NotImplementedError, match="backend='jax'"):
+        jax.grad(jax.grad(loss))(theta["gamma0"])

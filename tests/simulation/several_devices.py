@@ -1,0 +1,38 @@
+"""What `test_devices` runs in processes of its own: experiments whose replicas lie on several devices.
+
+XLA_FLAGS=--xla_force_host_platform_device_count=8 python tests/simulation/several_devices.py alone native out.npz
+python tests/simulation/several_devices.py ADDRESS native out.npz 2 0    # the first of two processes
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import gmem_jax as gm
+from gmem_jax.experiment.several import run_several
+
+PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
+SHORT = {"t0": 75.0, "rest": 0.02, "hold": 0.02, "store": 0.02}  # one step a bin
+
+
+def main(address: str, backend: str, target: str, processes: str = "1", number: str = "0") -> None:
+    """Run some experiments on all devices there are; the first process writes their recalls."""
+    jax.config.update("jax_enable_x64", True)
+    if address != "alone":
+        jax.distributed.initialize(address, int(processes), int(number))
+    from scenes import with_skin  # which computes
+
+    pack = with_skin(gm.load_pack(PACK), 0.05)  # lists are made anew on the way
+    base = gm.Experiment(pack, gm.six_signals(), backend=backend, **SHORT)
+    points = [gm.replace(base, {"friction.mu": mu, "gamma0": gamma0}) for mu, gamma0 in ((1.0, 1e-3), (0.4, 2e-3))]
+    recalls = [gm.run(base, batch=3), *run_several(points)]
+    if number == "0":
+        named = {f"p_sig-{place}": recall.p_sig for place, recall in enumerate(recalls)}
+        status = [np.asarray(recall.status) for recall in recalls]
+        np.savez(target, devices=jax.device_count(), status=np.asarray(status), **named)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
