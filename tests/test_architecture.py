@@ -41,6 +41,7 @@ def modules() -> dict[str, Path]:
 
 
 MODULES = modules()
+LATE = ("import_module", "__import__")  # imports by a string
 
 
 def imports(name: str) -> set[str]:
@@ -53,6 +54,11 @@ def imports(name: str) -> set[str]:
             assert node.level == 0, f"{name}: relative import in line {node.lineno}"
             below = {f"{node.module}.{alias.name}" for alias in node.names}
             found |= {one if one in MODULES else str(node.module) for one in below}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in (
+            "import_module",
+            "__import__",
+        ):
+            found |= {one.value for one in node.args[:1] if isinstance(one, ast.Constant)}
     return {one for one in found if one.split(".")[0] == ROOT.name}
 
 

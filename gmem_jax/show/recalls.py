@@ -75,7 +75,7 @@ def recall_figure(
         ValueError: if there is no such picture, or no such signal.
     """
     known = dict(configuration or recall.configuration)
-    names = recall.names
+    names = recall.described(known).names
     title = tables.heading(known) if known else "recall"
     found = {name.lower(): name for name in PICTURES}.get(what.lower())
     if found is None or against not in AGAINST:
