@@ -290,8 +290,14 @@ def run(
         ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
             for too many or too few frames, a u beyond 0 and 1, frames of a prefix that was run before, or a signal that
             there is not.
+        TypeError: if it is no `Experiment`.
         RunFailedError: if the simulation broke down.
     """
+    if not isinstance(experiment, Experiment):
+        kind = type(experiment).__name__
+        raise TypeError(
+            f"gm.run takes a gm.Experiment, got a {kind}; make one with gm.Experiment(pack, gm.six_signals())"
+        )
     began, tell = time.perf_counter(), callback(progress)
     count = experiment.signals.count
     size = count if batch is None else batch

@@ -97,14 +97,19 @@ def _require_names(path: Path, names: list[str], values: np.ndarray, rows: list[
 
 
 def _require_no_axis(path: Path, names: list[str], values: np.ndarray, axes: list[int]) -> None:
-    """Refuse a column that rises by equal steps beside others: times, places or row numbers are no waveform."""
+    """Refuse a column that rises by equal steps beside others: times, places or row numbers are no waveform.
+
+    Steps are equal if no number is further than half a step from the straight line: times are often rounded.
+    """
     if len(values) < 2 or values.shape[1] < 3:
         return
     for place, column in enumerate(values):
         if place in axes:
             continue
         name = names[place] if names else ""
-        steps = np.diff(column)
-        if steps[0] > 0.0 and np.allclose(steps, steps[0], rtol=1e-3, atol=0.0) and not _OWN.fullmatch(name):
+        step = (column[-1] - column[0]) / (len(column) - 1)
+        line = np.linspace(column[0], column[-1], len(column))
+        rises = step > 0.0 and np.all(np.diff(column) >= 0.0) and np.all(np.abs(column - line) <= 0.5 * step)
+        if rises and not _OWN.fullmatch(name):
             called = f"column {place + 1}" + (f" ({name!r})" if name else "")
             raise FileFormatError(f"{path}: {called} rises by equal steps, as times and row numbers do; {_AS_AXIS}")

@@ -52,7 +52,8 @@ def refusing(path: Path, what: str) -> Iterator[None]:
         StartError: if JAX does not start; see `gmem_jax.physics.rules`.
     """
     if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        there = "is a folder, not a file" if Path(path).is_dir() else "is no regular file"
+        raise FileNotFoundError(f"{path}: {there if Path(path).exists() else 'no such file'}")
     try:
         yield
     except FileFormatError as error:

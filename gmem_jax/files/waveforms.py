@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
@@ -17,6 +18,7 @@ from gmem_jax.files.columns import Columns, read_columns
 from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.validation import json_of, numbers, read_npy, refusing, require_fields, title
 from gmem_jax.physics.rules import usual_rules
+from gmem_jax.simulation.protocol import BINS
 
 _LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB
 _TARGET, _DESIGN = "# target: ", "# design: "
@@ -130,20 +132,21 @@ def _npy(path: Path) -> np.ndarray:
 
 @usual_rules()
 def save_waveforms(
-    path: str | Path, signals: Spline, target: Signals | None = None, *, design: Mapping[str, Any] | None = None
+    path: str | Path, signals: Signals, target: Signals | None = None, *, design: Mapping[str, Any] | None = None
 ) -> None:
     """Write waveforms as a CSV that `load_waveforms` and `gmem recall --signals` read: a column for every signal.
 
     Args:
         path: the file.
-        signals: the waveforms.
+        signals: the waveforms; of any but a `Spline` samples are written, one for each of 256 bins.
         target: those whose recall they imitate, kept in a comment that `load_target` reads.
         design: how that went, kept in a comment that `load_design` reads.
 
     Raises:
         OSError: if the path cannot be written.
     """
-    values = np.asarray(signals.nodes)[:, 1:-1].T
+    inner = jnp.arange(1, BINS) / BINS
+    values = np.asarray(signals.nodes)[:, 1:-1].T if isinstance(signals, Spline) else np.asarray(signals.shear(inner))
     header = ",".join(f"signal_{number + 1}" for number in range(values.shape[1]))
     if design is not None:
         header = f"{_DESIGN}{json.dumps(design)}\n{header}"

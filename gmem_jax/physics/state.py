@@ -70,7 +70,7 @@ SENTENCES = {
     Status.IMPOSSIBLE: "a parameter or a waveform is impossible; use numbers that `Experiment` accepts outside a trace",
     Status.DEEP_OVERLAP: "an overlap exceeded 0.2 R, and Hertz's law is for small ones; use a smaller delta0 or gamma0",
     Status.NOT_QUASI_STATIC: "the walls move too fast (inertial number above 5e-3); use a larger t0 or smaller gamma0",
-    Status.RINGING: "the pack rings: F over its period is larger by 0.03; use a larger t0, or F over T1",
+    Status.RINGING: "the pack rings: F over its period is larger by more than 0.03; use a larger t0, or F over T1",
     Status.SHEAR_BEYOND_COMPRESSION: "the shear exceeds delta0 / 4, where the gain depends on it; use a smaller gamma0",
     Status.LARGE_WAVEFORM: "a waveform exceeds 2, and gains are per gamma0; use waveforms up to 1 and a larger gamma0",
     Status.LARGE_FRICTION: "mu exceeds 10, as no material does, so that contacts hardly slide; use a smaller mu",

@@ -79,6 +79,18 @@ def test_names_values_and_batches_in_the_wrong_form_are_refused_with_the_right_o
     assert with_part.friction == gm.Hooke(mu=0.5)
 
 
+def test_what_is_no_experiment_is_not_run() -> None:
+    with pytest.raises(TypeError, match=r"gm\.run takes a gm\.Experiment, got a Pack"):
+        gm.run(PACK)  # type: ignore[arg-type]
+
+
+def test_any_waveforms_can_be_written_and_read_back(tmp_path: Path) -> None:
+    six, u = gm.six_signals(), jnp.linspace(0.0, 1.0, 41)
+    gm.save_waveforms(tmp_path / "six.csv", six)
+    again = gm.waveform(gm.load_waveforms(tmp_path / "six.csv"))
+    np.testing.assert_allclose(again.shear(u), six.shear(u), atol=0.02)  # kinks between two samples are rounded
+
+
 def test_files_are_named_by_paths_or_texts(tmp_path: Path) -> None:
     gm.save_pack(str(tmp_path / "pack.h5"), PACK)
     assert gm.load_pack(str(tmp_path / "pack.h5")).grains == 27

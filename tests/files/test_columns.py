@@ -68,6 +68,14 @@ def test_a_column_of_times_is_the_axis(tmp_path: Path, name: str) -> None:
     assert said == [f"{tmp_path / 'wave.csv'}: {name} from 3 to 5 is u from 0 to 1"]
 
 
+@pytest.mark.parametrize("digits", [4, 5])
+@pytest.mark.parametrize("name", ["x,CH1", "second,Volt"])
+def test_times_that_an_instrument_rounded_are_no_waveform(tmp_path: Path, name: str, digits: int) -> None:
+    times = np.round(0.1 + np.linspace(0.0, 0.1, 301), digits)  # steps of 3.3e-4: at 4 digits they are 3e-4 or 4e-4
+    with pytest.raises(gm.FileFormatError, match="rises by equal steps"):
+        loaded(tmp_path, table(times, np.sin(times) ** 2, names=name))
+
+
 def test_a_column_of_u_places_the_samples(tmp_path: Path) -> None:
     u = np.array([0.25, 0.5, 0.75])
     samples, said = loaded(tmp_path, table(u, u * (1.0 - u), names="u,I"))
