@@ -20,7 +20,7 @@ import sys
 import jax
 import gmem_jax as gm
 from gmem_jax.experiment.several import run_several
-from gmem_jax.files.programs import keep_programs
+from gmem_jax.files.compilation_cache import keep_programs
 keep_programs()
 jax.config.update("jax_enable_x64", True)
 pack = gm.load_pack(sys.argv[1])

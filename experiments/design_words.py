@@ -30,7 +30,7 @@ from gmem_jax.experiment.record import key_of_run
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.reading import training
-from gmem_jax.reading.lessons import Lessons
+from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import linear_decoder, nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
@@ -64,7 +64,7 @@ def main() -> None:
             if there(folder / TABLE, name, bits, arguments.t0, arguments.iterations):
                 continue
             kept = folder / f"words-{bits}-seed-0.msgpack"
-            net = training.train(Lessons(bits), 0, budget=arguments.budget, checkpoint=kept).net
+            net = training.train(TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=kept).net
             number = drawn(2**bits, arguments.drawn)
             row = design(folder, any_words, kernel, bits, number, net, arguments.iterations)
             print(row, flush=True)

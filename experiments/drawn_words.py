@@ -26,7 +26,7 @@ from gmem_jax.experiment.record import key_of_run
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.reading import training
-from gmem_jax.reading.lessons import Lessons
+from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
@@ -64,7 +64,7 @@ def main() -> None:
             run(experiment, file)
         recall = gm.load_recall(file)
         net = training.train(
-            Lessons(bits), 0, budget=arguments.budget, checkpoint=folder / f"words-{bits}-seed-0.msgpack"
+            TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=folder / f"words-{bits}-seed-0.msgpack"
         ).net
         row = {"pack": pack.name, "t0": arguments.t0, **read(experiment, recall, bits, number, net)}
         print(row, flush=True)

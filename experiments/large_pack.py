@@ -23,7 +23,7 @@ import gmem_jax as gm
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.provenance import sources
 from gmem_jax.files.checkpoints import Checkpoints
-from gmem_jax.physics.state import together
+from gmem_jax.physics.state import combined_status
 from gmem_jax.preparation.recipe import Recipe
 
 STANDARD = Recipe()
@@ -85,7 +85,7 @@ def measured(
     rows = np.asarray([ran.index(number) for number in those])
     pair = recall.p_sig[rows], recall.J[rows], experiment.scale
     plain, smooth = analysis.compare(*pair), analysis.compare(*pair, float(recall.window) / float(experiment.t0))
-    status = together(np.asarray(recall.status)[[0, *(rows + 1)]])
+    status = combined_status(np.asarray(recall.status)[[0, *(rows + 1)]])
     values = (float(value) for match in (plain, smooth) for value in match)
     return {**dict(zip(MEASURES, (round(value, 6) for value in values), strict=True)), "status": status}
 

@@ -18,10 +18,9 @@ import numpy as np
 
 import gmem_jax as gm
 from gmem_jax import classify
-from gmem_jax.experiment.recall import prefix_of, run
+from gmem_jax.experiment.recall import Prefix, prefix_of, run
 from gmem_jax.experiment.signals import bit_width
 from gmem_jax.physics.material import Material
-from gmem_jax.simulation.runner import Runner
 
 GAMMAS = (1e-4, 3e-4, 1e-3, 3e-3)
 BITS = (3, 4, 5)
@@ -33,10 +32,10 @@ def error(predicted: np.ndarray, simulated: np.ndarray) -> float:
     return float(np.linalg.norm(predicted - simulated) / np.linalg.norm(simulated))
 
 
-def compare(experiment: gm.Experiment, begun: Runner, n: int, width: float) -> dict[str, Any]:
+def compare(experiment: gm.Experiment, prefix: Prefix, n: int, width: float) -> dict[str, Any]:
     """Predictions of the experiment's signals from a kernel on n bumps that can form them, and their simulation."""
-    kernel = gm.memory_kernel(experiment, n, width, begun=begun)
-    simulated = np.asarray(run(experiment, begun).p_sig)
+    kernel = gm.memory_kernel(experiment, n, width, prefix=prefix)
+    simulated = np.asarray(run(experiment, prefix=prefix).p_sig)
     both, linear = kernel.predict(experiment.signals), kernel.predict(experiment.signals, even=False)
     return {
         "both": both,
@@ -106,21 +105,21 @@ def main() -> None:
     names = arguments.packs.split(",")
     for name in names:
         experiment = gm.Experiment(gm.load_pack(name), gm.six_signals(), t0=arguments.t0)
-        begun = prefix_of(experiment)
+        prefix = prefix_of(experiment)
         for gamma0 in GAMMAS:
-            found = compare(gm.replace(experiment, gamma0=gamma0), begun, 17, 0.2)
+            found = compare(gm.replace(experiment, gamma0=gamma0), prefix, 17, 0.2)
             note(name, "six", gamma0, found)
             if name == names[0] and gamma0 == 1e-3:
                 shown = found
         for bits in BITS:
-            found = compare(gm.replace(experiment, signals=gm.words(bits)), begun, *of_words(bits))
+            found = compare(gm.replace(experiment, signals=gm.words(bits)), prefix, *of_words(bits))
             note(name, f"words {bits}", 1e-3, found)
         if name == names[0] and arguments.long:
             bits = arguments.long
-            found = compare(gm.replace(experiment, signals=gm.words(bits)), begun, *of_words(bits))
+            found = compare(gm.replace(experiment, signals=gm.words(bits)), prefix, *of_words(bits))
             note(name, f"words {bits}", 1e-3, found)
             began = time.perf_counter()
-            net = classify.train(classify.Lessons(bits=bits)).net
+            net = classify.train(classify.TrainingConfig(bits=bits)).net
             right = {key: float(classify.accuracy(net, found[key])) for key in ("simulated", "both", "linear")}
             print(f"net of {bits} bits, trained in {time.perf_counter() - began:.0f} s; words recognised: "
                   + ", ".join(f"{key} {value:.3f}" for key, value in right.items()), flush=True)  # fmt: skip

@@ -897,9 +897,9 @@ MUTATIONS = (
     ),
     mutation(
         "key-without-the-pack",
-        "files/configuration.py",
-        'own = {**written(experiment), "pack": pack_fingerprint(experiment.pack)}',
-        'own = {**written(experiment), "pack": ""}',
+        "experiment/record.py",
+        'own = {**to_dict(experiment), "pack": pack_fingerprint(experiment.pack)}',
+        'own = {**to_dict(experiment), "pack": ""}',
         "test_a_key_stands_for_all_that_numbers_depend_on",
     ),
     mutation(
@@ -1328,7 +1328,7 @@ MUTATIONS = (
     ),
     mutation(
         "a-list-with-gaps",
-        "files/soundness.py",
+        "files/pack_validation.py",
         "pairs_within(mapped, reach - GRAZING, per_grain) <= len(keys),",
         "True,",
         "test_an_impossible_pack_is_refused_whoever_sealed_it",
@@ -1336,7 +1336,7 @@ MUTATIONS = (
     mutation(
         "another-target",
         "show/tables.py",
-        'wanted = bin_average(signals_from(configuration["target"]))',
+        'wanted = bin_average(signals_from_dict(configuration["target"]))',
         "wanted = jnp.asarray(recall.J)",
         "test_a_recall_of_designed_waveforms_is_compared_with_their_target_too",
     ),

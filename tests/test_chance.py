@@ -19,9 +19,9 @@ import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 from gmem_jax.physics.grain import tetra
 from gmem_jax.preparation.preparation import Recipe, _gas
-from gmem_jax.reading.lessons import Lessons, examples
+from gmem_jax.reading.lessons import TrainingConfig, examples
 from gmem_jax.reading.net import initial
-small = Lessons(1, hidden=(4,), shifts=3, amplitudes=3, draws=3, batch=4)
+small = TrainingConfig(1, hidden=(4,), shifts=3, amplitudes=3, draws=3, batch=4)
 data = examples(small, 3)
 made = [_gas(Recipe(grains=27, seed=2**33 + 5), tetra()), data.order, data.held_out(np.arange(4)),
         data.training(jax.random.split(data.noise)[0]), initial(small, 3).parameters]

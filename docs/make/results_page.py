@@ -150,11 +150,11 @@ def effects(path: Path) -> list[Effect]:
         for row in csv.DictReader(file):
             choice = known[row["choice"]]
             value = next(one for one in choice.values if str(one) == row["value"])
-            numbers = [
+            gain, fidelity, of_gain, of_fidelity = (
                 Estimate(float(row[name]), float(row[f"{name}_sd"] or math.nan), int(row["packs"]))
                 for name in ("G", "F", "dG_over_G", "dF")
-            ]
-            found.append(Effect(choice, value, *numbers, int(row["status"])))
+            )
+            found.append(Effect(choice, value, gain, fidelity, of_gain, of_fidelity, int(row["status"])))
     return found
 
 

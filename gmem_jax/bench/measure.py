@@ -25,7 +25,7 @@ import numpy as np
 
 from gmem_jax import native
 from gmem_jax.bench import lammps
-from gmem_jax.bench.race import REPEATS, Rival, Row, race
+from gmem_jax.bench.race import REPEATS, Candidate, Row, interleave
 from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.experiment import Experiment
@@ -80,7 +80,7 @@ def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str, t0: float 
     return simulation, replicate(experiment.begin(), replicas)
 
 
-def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, seconds: float = 0.5) -> Rival:
+def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, seconds: float = 0.5) -> Candidate:
     """A rollout of some bins on a backend, compiled; timed for about `seconds` each time.
 
     Raises:
@@ -104,15 +104,15 @@ def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, 
             calls += 1
         return 1e6 * (time.perf_counter() - began) / (calls * BINS * simulation.steps * pack.grains * replicas)
 
-    return Rival(Row(backend, law, pack.grains, replicas, compile_s=compile_s, p_xy=p_xy), once)
+    return Candidate(Row(backend, law, pack.grains, replicas, compile_s=compile_s, p_xy=p_xy), once)
 
 
 def measure(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 0.5) -> Row:
     """Time a rollout of some bins on a backend by itself."""
-    return race([rival(pack, backend, law, replicas, seconds=seconds)])[0]
+    return interleave([rival(pack, backend, law, replicas, seconds=seconds)])[0]
 
 
-def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Rival]:
+def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Candidate]:
     """LAMMPS on the same pack with its walls at rest: one core, serial runs side by side, and MPI ranks.
 
     Its neighbour settings are tuned first. Law H has no dashpot there (see `lammps.pair_lines`).
@@ -141,7 +141,7 @@ def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Rival]:
     unit, many = 1e6 / (steps * pack.grains), cores()
     note = f"skin {setting[0]} R, every {setting[1]}"
     alone = Row("lammps", law, pack.grains, 1, note=f"1 core, {note}")
-    rivals = [Rival(alone, lambda: unit * seconds(setting, steps))]
+    rivals = [Candidate(alone, lambda: unit * seconds(setting, steps))]
     if many > 1:
 
         def together() -> float:
@@ -149,9 +149,9 @@ def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Rival]:
                 return unit * max(pool.map(lambda _: seconds(setting, steps), range(many))) / many
 
         beside = replace(alone, replicas=many, note=f"{many} serial runs side by side")
-        rivals.append(Rival(beside, together))
+        rivals.append(Candidate(beside, together))
         ranks = replace(alone, note=f"{many} ranks")
-        rivals.append(Rival(ranks, lambda: unit * seconds(setting, steps, many)))
+        rivals.append(Candidate(ranks, lambda: unit * seconds(setting, steps, many)))
     return rivals
 
 
@@ -334,10 +334,10 @@ def run(
         counts = [count for count in replicas if fits(pack, law, count)]
         ours = [(backend, count) for backend in backends if _worth(pack, first, backend, law) for count in counts]
         if law == "M2":  # its histories are large, and it has no rival
-            found = [row for backend, count in ours for row in race([rival(pack, backend, law, count, t0=t0)])]
+            found = [row for backend, count in ours for row in interleave([rival(pack, backend, law, count, t0=t0)])]
         else:
             theirs = lammps_rivals(pack, law) if absent is None else []
-            found = race([*(rival(pack, backend, law, count, t0=t0) for backend, count in ours), *theirs])
+            found = interleave([*(rival(pack, backend, law, count, t0=t0) for backend, count in ours), *theirs])
         wrong += disagreements(found)  # of this pack: another one of as many grains has another p_xy
         add("rows", found)
     if wrong:
@@ -347,7 +347,7 @@ def run(
     for place, times in enumerate(sizes):
         tiled = first if times == (1, 1, 1) else tile(first, times)
         say(f"cost against N: {tiled.grains}", 0.7 + 0.25 * place / len(sizes))
-        found = race([rival(tiled, fastest, "H", count) for count in (1, 8)])
+        found = interleave([rival(tiled, fastest, "H", count) for count in (1, 8)])
         add("growth", [replace(row, note="tiled") for row in found])
     say("memory", 0.95)
     largest = max(loaded, key=lambda name: loaded[name].grains)

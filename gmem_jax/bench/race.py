@@ -37,7 +37,7 @@ class Row:
     p_xy: float = float("nan")
 
 
-class Rival(NamedTuple):
+class Candidate(NamedTuple):
     """Something to be timed.
 
     Attributes:
@@ -49,7 +49,7 @@ class Rival(NamedTuple):
     once: Callable[[], float]
 
 
-def race(rivals: Sequence[Rival], repeats: int = REPEATS) -> list[Row]:
+def interleave(rivals: Sequence[Candidate], repeats: int = REPEATS) -> list[Row]:
     """Time each of them `repeats` times, all in turn; the rows with their times."""
     times: list[list[float]] = [[] for _ in rivals]
     for _ in range(repeats):

@@ -11,10 +11,10 @@ from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from gmem_jax.command import benchmark, classify, derive, exchange, packs, recalls, report, reproduce, show, sweep
-from gmem_jax.command.console import GIVEN, RunInterruptedError, UnheardError, emit, say
+from gmem_jax.command.console import GIVEN, RunInterruptedError, UnheardError, log, print_result
 from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.provenance import versions
-from gmem_jax.files.programs import keep_programs
+from gmem_jax.files.compilation_cache import keep_programs
 from gmem_jax.physics.rules import StartError, usual_rules, why_not_started
 from gmem_jax.simulation.progress import no_further_bar
 
@@ -62,7 +62,7 @@ for group in (packs, recalls, show, exchange, classify, derive, sweep, report, r
 
 def _version(wanted: bool) -> None:
     if wanted:
-        emit(False, {}, f"gmem-jax {versions()['gmem-jax']}")
+        print_result(False, {}, f"gmem-jax {versions()['gmem-jax']}")
         raise typer.Exit
 
 
@@ -76,7 +76,7 @@ def _gmem(
 
 
 def _one_line(message: Warning | str, *_: Any, **__: Any) -> None:
-    say(f"warning: {' '.join(str(message).split())}", style="yellow")
+    log(f"warning: {' '.join(str(message).split())}", style="yellow")
 
 
 _OUT_OF_MEMORY = "out of memory; use fewer replicas (--batch) or a smaller pack"
@@ -113,7 +113,7 @@ def main() -> None:
     keep_programs()
     warnings.showwarning = _one_line
     if getattr(jax.config, "jax_disable_jit", False):
-        say("warning: JAX_DISABLE_JIT is set: nothing is compiled, and a run takes hours for seconds", style="yellow")
+        log("warning: JAX_DISABLE_JIT is set: nothing is compiled, and a run takes hours for seconds", style="yellow")
     try:
         with no_further_bar(), usual_rules():
             code = app(args=sys.argv[1:] or ["--help"], prog_name="gmem", standalone_mode=False)
@@ -125,13 +125,13 @@ def main() -> None:
     except (ValueError, OSError) as error:
         problem = " ".join(str(error).split())
     except RunFailedError as error:
-        say(f"gmem: the run failed: {error}", style="red")
+        log(f"gmem: the run failed: {error}", style="red")
         sys.exit(1)
     except RunInterruptedError as error:
-        say(f"gmem: interrupted; {error}")
+        log(f"gmem: interrupted; {error}")
         sys.exit(INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
-        say("gmem: interrupted; nothing was written, and the same command begins anew")
+        log("gmem: interrupted; nothing was written, and the same command begins anew")
         sys.exit(INTERRUPTED)
     except UnheardError as error:
         problem = f"stdout takes no result ({error}); files that were to be written are complete"
@@ -141,5 +141,5 @@ def main() -> None:
         problem = _of_jax(error)
         if not problem:
             raise
-    say(f"gmem: {problem}", style="red")
+    log(f"gmem: {problem}", style="red")
     sys.exit(2)

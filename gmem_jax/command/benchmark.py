@@ -7,9 +7,9 @@ import typer
 
 from gmem_jax.bench import gpu, measure
 from gmem_jax.bench.table import markdown, save
-from gmem_jax.command.console import AsJson, InputError, claim, emit, refuse_idle, reporting
-from gmem_jax.files.checked import json_of, refusing
+from gmem_jax.command.console import AsJson, InputError, check_output, print_result, refuse_idle, reporting
 from gmem_jax.files.packs import list_packs, load_pack
+from gmem_jax.files.validation import json_of, refusing
 
 
 def bench_command(
@@ -51,7 +51,7 @@ def bench_command(
     if baseline:
         with refusing(baseline, "bench.json"):
             before = json_of(baseline.read_text(encoding="utf-8"), "content")
-    claim(output.parent / "bench.json" if not output.is_dir() else output / "bench.json", ".json", force=True)
+    check_output(output.parent / "bench.json" if not output.is_dir() else output / "bench.json", ".json", force=True)
     with reporting() as progress:
         result = measure.run(
             load_pack,
@@ -65,7 +65,7 @@ def bench_command(
             keep=lambda so_far: save(output, so_far, markdown(so_far, before)),
             say=lambda what, fraction: progress(what, 0.0, fraction),
         )
-    emit(as_json, {**result, "status": 0}, markdown(result, before))
+    print_result(as_json, {**result, "status": 0}, markdown(result, before))
 
 
 def _on_gpu(as_json: bool) -> None:
@@ -76,7 +76,7 @@ def _on_gpu(as_json: bool) -> None:
     with reporting() as progress:
         times = gpu.timed(load_pack, say=lambda what, fraction: progress(what, 0.0, fraction))
     facts = gpu.described(load_pack)
-    emit(as_json, {**facts, **times, "status": 0}, gpu.markdown(facts, times))
+    print_result(as_json, {**facts, **times, "status": 0}, gpu.markdown(facts, times))
 
 
 COMMANDS = {"bench": bench_command}

@@ -9,12 +9,24 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich import progress
 
-from gmem_jax.command.console import EVERY, AsJson, Force, InputError, Output, Picture, claim, drawing, emit, log, say
+from gmem_jax.command.console import (
+    EVERY,
+    AsJson,
+    Force,
+    InputError,
+    Output,
+    Picture,
+    check_output,
+    drawing,
+    log,
+    print_result,
+    stderr,
+)
 from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
-from gmem_jax.physics.state import explain, together
+from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.show import summaries
 from gmem_jax.show.render_matplotlib import render
 
@@ -31,20 +43,20 @@ def _training(budget: float) -> Iterator["training.Listener"]:
         return f"{passed}, held-out accuracy {one.validation:.4f}"
 
     began = time.perf_counter()
-    if not log.is_terminal:
+    if not stderr.is_terminal:
         last = began
 
         def line(one: "training.Training") -> None:
             nonlocal last
             if one.finished or time.perf_counter() - last > EVERY:
                 last = time.perf_counter()
-                say(words(one))
+                log(words(one))
 
         yield line
         return
     columns = (progress.TextColumn("{task.description}"), progress.BarColumn())
     more = (progress.TextColumn("of the time budget"), progress.TimeElapsedColumn())
-    with progress.Progress(*columns, *more, console=log) as bar:
+    with progress.Progress(*columns, *more, console=stderr) as bar:
         task = bar.add_task("compiling", total=budget)
         yield lambda one: bar.update(task, completed=min(time.perf_counter() - began, budget), description=words(one))
 
@@ -71,7 +83,7 @@ def classify_command(
     configuration = kept.configuration
     # Here, not above: flax takes a second to load, and no other command needs it.
     from gmem_jax.reading import report, training
-    from gmem_jax.reading.lessons import Lessons
+    from gmem_jax.reading.lessons import TrainingConfig
     from gmem_jax.reading.readers import stored_words
 
     try:
@@ -79,25 +91,25 @@ def classify_command(
         stored = stored_words(kept, signals_from_dict(designed) if designed else None)
     except ValueError as error:
         raise InputError(f"{recall}: {error}; make one with gmem recall --signals words:L") from error
-    claim(output, ".json", inputs=(recall,), force=force)
-    drawn = claim(output.with_suffix(".png"), ".png", force=force) if picture else None
+    check_output(output, ".json", inputs=(recall,), force=force)
+    drawn = check_output(output.with_suffix(".png"), ".png", force=force) if picture else None
     folder = recall.parent / "gmem-nets" if nets is None else nets
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--nets {folder}: cannot make this folder ({error.strerror})") from error
-    say(f"{stored.bits}-bit words of pack {configuration['pack']}, background {stored.background.upper()}")
-    if status := together(kept.status):
-        say(f"{recall}: {explain(status)}", style="yellow")
+    log(f"{stored.bits}-bit words of pack {configuration['pack']}, background {stored.background.upper()}")
+    if status := combined_status(kept.status):
+        log(f"{recall}: {explain(status)}", style="yellow")
     began = time.perf_counter()
     trained = []
     for seed in range(seeds):
-        file = claim(folder / f"words-{stored.bits}-seed-{seed}.msgpack", "", force=True, option="--nets")
+        file = check_output(folder / f"words-{stored.bits}-seed-{seed}.msgpack", "", force=True, option="--nets")
         with _training(budget) as listener:
-            one = training.train(Lessons(stored.bits), seed, budget=budget, checkpoint=file, listener=listener)
+            one = training.train(TrainingConfig(stored.bits), seed, budget=budget, checkpoint=file, listener=listener)
         trained.append(one)
         state = "trained" if one.finished else "out of time"
-        say(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}")
+        log(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}")
     result = report.reading(stored, trained)
     seconds = time.perf_counter() - began
     result = {"recall": str(recall), "pack": configuration["pack"], "status": status, "seconds": seconds, **result}
@@ -108,8 +120,8 @@ def classify_command(
         with drawing(drawn):
             render(summary.figures["confusion"]()).save(drawn)
             told += f" and {drawn}"
-    say(told)
-    emit(as_json, result, *summary.lines)
+    log(told)
+    print_result(as_json, result, *summary.lines)
 
 
 COMMANDS = {"classify": classify_command}

@@ -21,13 +21,13 @@ from rich.console import Console
 from rich.table import Table
 
 from gmem_jax.files.atomic import probe
-from gmem_jax.files.checked import NAME, printable, title
 from gmem_jax.files.ours import promise
 from gmem_jax.files.results import finite
 from gmem_jax.files.sizes import in_bytes, in_time
+from gmem_jax.files.validation import NAME, printable, title
 from gmem_jax.simulation.progress import Progress
 
-log = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
+stderr = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
 out = Console(highlight=False, markup=False)
 
 COST = {
@@ -84,9 +84,9 @@ class RunInterruptedError(Exception):
     """Ctrl-C in a run, and how to go on; no KeyboardInterrupt, which typer makes an exit without words."""
 
 
-def say(line: str, **style: Any) -> None:
+def log(line: str, **style: Any) -> None:
     """A line of the log."""
-    log.print(printable(line), soft_wrap=True, markup=False, **style)
+    stderr.print(printable(line), soft_wrap=True, markup=False, **style)
 
 
 @contextlib.contextmanager
@@ -104,7 +104,7 @@ def heard() -> Iterator[None]:
         raise UnheardError(os.strerror(error.errno) if error.errno else str(error)) from error
 
 
-def emit(as_json: bool, result: Any, *tables: Any) -> None:
+def print_result(as_json: bool, result: Any, *tables: Any) -> None:
     """The result: one JSON object, or tables and lines for a person.
 
     Raises:
@@ -143,7 +143,9 @@ def require_name(name: str) -> None:
         raise InputError(f"--name: must be a line of at most {NAME} printable characters")
 
 
-def claim(path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool, option: str = "--output") -> Path:
+def check_output(
+    path: Path, suffix: str, *, inputs: tuple[Any, ...] = (), force: bool, option: str = "--output"
+) -> Path:
     """`path`, once it is sure that writing it can succeed and destroys nothing: a long run must not end in a refusal.
 
     Args:
@@ -208,14 +210,14 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
     needs = f"{takes}, and {in_bytes(memory)} of memory"
     if memory > free:
         raise InputError(f"{what} needs {needs}, and {in_bytes(free)} are free")
-    say(f"{what}: {needs}{', in plain JAX' if backend == 'jax' else ''}")
+    log(f"{what}: {needs}{', in plain JAX' if backend == 'jax' else ''}")
     return {"grain_steps": grain_steps, "seconds": seconds, "memory_bytes": memory}
 
 
 def emit_cost(as_json: bool, cost: dict[str, float], output: Path, disk_bytes: float) -> None:
     """The result of a dry run: what `announce` returned, and what the output takes of the disk."""
     line = f"disk: {in_bytes(disk_bytes)} for {output}; nothing was run or written"
-    emit(as_json, {**cost, "disk_bytes": disk_bytes, "status": 0}, line)
+    print_result(as_json, {**cost, "disk_bytes": disk_bytes, "status": 0}, line)
 
 
 @contextlib.contextmanager
@@ -225,7 +227,7 @@ def drawing(picture: Path) -> Iterator[None]:
         yield
     except Exception as error:  # matplotlib's, by the user's fonts and settings
         why = " ".join(str(error).split()) or type(error).__name__
-        say(f"warning: {picture}: could not be drawn ({why})", style="yellow")
+        log(f"warning: {picture}: could not be drawn ({why})", style="yellow")
 
 
 @contextlib.contextmanager
@@ -246,7 +248,7 @@ def reporting(*, goes_on: bool = False) -> Iterator[Progress]:
 
 @contextlib.contextmanager
 def _reporting() -> Iterator[Progress]:
-    if not log.is_terminal:
+    if not stderr.is_terminal:
         told, at = "", -math.inf
         first: tuple[float, float] | None = None  # when the first chunk was done: what came before is compiling
         last = 0.0
@@ -262,13 +264,13 @@ def _reporting() -> Iterator[Progress]:
             told, at = stage, now
             since, done = now - first[0], fraction - first[1]
             left = f", {since * (1.0 - fraction) / done:.0f} s left" if done > 0.01 and fraction < 1.0 else ""
-            say(f"{fraction:5.0%}  {stage}" + (f" (t = {moment:.0f} t_c{left})" if moment else left))
+            log(f"{fraction:5.0%}  {stage}" + (f" (t = {moment:.0f} t_c{left})" if moment else left))
 
         yield line
         return
     columns = (progress.TextColumn("{task.description}"), progress.BarColumn(), progress.TaskProgressColumn())
     times = (progress.TimeElapsedColumn(), progress.TextColumn("ETA"), progress.TimeRemainingColumn())
-    with progress.Progress(*columns, *times, console=log) as bar:
+    with progress.Progress(*columns, *times, console=stderr) as bar:
         task = bar.add_task("compiling", total=1.0)
 
         def move(stage: str, moment: float, fraction: float) -> None:

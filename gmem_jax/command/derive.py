@@ -16,9 +16,9 @@ from gmem_jax.command.console import (
     PackName,
     Picture,
     announce,
-    claim,
+    check_output,
     drawing,
-    emit,
+    print_result,
     refuse_idle,
     reporting,
 )
@@ -86,7 +86,7 @@ def gradient_command(
     as_json: AsJson = False,
 ) -> None:
     """Exact derivatives of the fidelity by waveforms, gamma0, mu and stiffness (reverse mode; minutes)."""
-    (experiment,), drawn = chosen.claim([pack], output, ".json", picture=picture, force=force)
+    (experiment,), drawn = chosen.check_output([pack], output, ".json", picture=picture, force=force)
     began = time.perf_counter()
     waves, places = _waveform_of(experiment)
     law = experiment.friction
@@ -116,7 +116,7 @@ def gradient_command(
     if drawn:
         with drawing(drawn):
             render(summary.figures["waveforms"]()).save(drawn)
-    emit(as_json, result, *summary.lines)
+    print_result(as_json, result, *summary.lines)
 
 
 def _of_waveforms(
@@ -165,7 +165,7 @@ def kernel_command(
     as_json: AsJson = False,
 ) -> None:
     """The linear memory kernel of a pack: singular values, resolution, capacity, and what it predicts."""
-    (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
+    (experiment,), drawn = chosen.check_output([pack], output, ".h5", picture=picture, force=force)
     began = time.perf_counter()
     runs = 2.0 * n / experiment.signals.count
     _announce(experiment, "kernel", 1.0 + runs, 2 * n)
@@ -192,7 +192,7 @@ def kernel_command(
         with drawing(drawn):
             render(summary.figures["kernel"]()).save(drawn)
     error = "superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"])
-    emit(as_json, result, *summary.lines, error)
+    print_result(as_json, result, *summary.lines, error)
 
 
 def _needs_sub0(experiment: Experiment) -> None:
@@ -260,13 +260,13 @@ def design_command(
     if words is not None:
         refuse_idle("beside --words, which says what they are", "signals")
     chosen = chosen if words is None else chosen.with_signals(f"words:{words}")
-    (experiment,), drawn = chosen.claim([pack], output, ".csv", picture=picture, force=force)
+    (experiment,), drawn = chosen.check_output([pack], output, ".csv", picture=picture, force=force)
     _needs_sub0(experiment)
     if start is not None:
-        claim(output, ".csv", inputs=(start,), force=force)
+        check_output(output, ".csv", inputs=(start,), force=force)
     history = output.with_name(f"{output.stem}-history.png")
     if picture:
-        claim(history, ".png", force=force)
+        check_output(history, ".png", force=force)
     began = time.perf_counter()
     count = experiment.signals.count
     by = by or ("kernel" if words is not None or count > MANY else "jacobian")
@@ -307,7 +307,7 @@ def design_command(
         "status": 0,
     }
     line = f"F of the recall with respect to the wanted J: {found.before:.4f} -> {found.fidelity:.4f}"
-    emit(as_json, result, f"{line} (gain {found.gain:.3f}); wrote {output}")
+    print_result(as_json, result, f"{line} (gain {found.gain:.3f}); wrote {output}")
 
 
 def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
@@ -345,7 +345,7 @@ def tune_command(
 ) -> None:
     """Choose gamma0, mu and the friction stiffness within bounds so that the mean fidelity of packs grows."""
     names, limits = packs.split(","), parse_bounds(bounds)
-    experiments, drawn = chosen.claim(names, output, ".json", picture=picture, force=force)
+    experiments, drawn = chosen.check_output(names, output, ".json", picture=picture, force=force)
     _needs_sub0(experiments[0])
     start_within(experiments, limits)
     began = time.perf_counter()
@@ -371,7 +371,7 @@ def tune_command(
     if drawn:
         with drawing(drawn):
             render(summary.figures["history"]()).save(drawn)
-    emit(as_json, result, *summary.lines, f"wrote {output}")
+    print_result(as_json, result, *summary.lines, f"wrote {output}")
 
 
 COMMANDS = {

@@ -5,9 +5,19 @@ from typing import Annotated
 
 import typer
 
-from gmem_jax.command.console import AsJson, Force, InputError, Output, claim, emit, reporting, require_name, say
+from gmem_jax.command.console import (
+    AsJson,
+    Force,
+    InputError,
+    Output,
+    check_output,
+    log,
+    print_result,
+    reporting,
+    require_name,
+)
 from gmem_jax.files.configuration import material_from
-from gmem_jax.files.exported import FORMATS, format_of, frames_of_pack
+from gmem_jax.files.exporters import FORMATS, format_of, frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.packs import load_pack, pack_called, save_pack
@@ -39,7 +49,7 @@ def export(
     if found is None:
         raise InputError(f"{file}: holds no configurations; keep some with gmem {command} --frames 16")
     chosen = format_of(to, several=frames, suffix=output.suffix)
-    claim(output, chosen.suffix, inputs=(file,), force=force)
+    check_output(output, chosen.suffix, inputs=(file,), force=force)
     beside = output.with_suffix("")
     taken = beside.exists() or beside.is_symlink()
     if chosen.folder and taken and not (force and beside.is_dir() and not beside.is_symlink()):
@@ -49,8 +59,8 @@ def export(
     chosen.write(output, found, mass, material)
     _, grains, _ = found.position.shape
     facts = {"output": str(output), "frames": found.count, "grains": grains, "spheres": grains * len(found.offsets)}
-    say(f"wrote {output}: {facts['frames']} x {facts['spheres']} spheres in {grains} grains")
-    emit(as_json, {**facts, "status": 0})
+    log(f"wrote {output}: {facts['frames']} x {facts['spheres']} spheres in {grains} grains")
+    print_result(as_json, {**facts, "status": 0})
 
 
 def import_command(
@@ -67,14 +77,14 @@ def import_command(
     from gmem_jax.preparation.imported import import_pack
 
     require_name(name)
-    claim(output, ".h5", inputs=(file,), force=force)
+    check_output(output, ".h5", inputs=(file,), force=force)
     with reporting() as progress:
         pack = import_pack(file, radius=radius, delta0=delta0, name=name, progress=progress)
     save_pack(output, pack)
-    say(f"wrote {output}: {pack.grains} grains, {pack.clump.shape}")
+    log(f"wrote {output}: {pack.grains} grains, {pack.clump.shape}")
     facts = {"pack": pack.name, "output": str(output), "grains": pack.grains, "grain": pack.clump.shape}
     facts["notes"] = pack.info["imported"]["notes"]
-    emit(as_json, {**facts, "ringing_period": float(pack.ringing_period), "status": 0}, tables.pack_table(pack))
+    print_result(as_json, {**facts, "ringing_period": float(pack.ringing_period), "status": 0}, tables.pack_table(pack))
 
 
 COMMANDS = {"export": export, "import": import_command}

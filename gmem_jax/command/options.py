@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gmem_jax.command.console import claim, refuse_idle, say
+from gmem_jax.command.console import check_output, log, refuse_idle
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.signals import Signals
@@ -72,7 +72,7 @@ class Chosen:
         """The same, but for the signals."""
         return Chosen({**self._values, "signals": name})
 
-    def claim(
+    def check_output(
         self, packs: Sequence[str], output: Path, suffix: str, *, picture: bool, force: bool
     ) -> tuple[list[Experiment], Path | None]:
         """The experiments on some packs, once it is sure that the output and the picture beside it can be written.
@@ -83,8 +83,8 @@ class Chosen:
         """
         experiments = [self.experiment(pack) for pack in packs]
         inputs = (*packs, self._values["signals"])
-        claim(output, suffix, inputs=inputs, force=force)
-        drawn = claim(output.with_suffix(".png"), ".png", inputs=inputs, force=force) if picture else None
+        check_output(output, suffix, inputs=inputs, force=force)
+        drawn = check_output(output.with_suffix(".png"), ".png", inputs=inputs, force=force) if picture else None
         return experiments, drawn
 
     def target(self, count: int) -> Signals | None:
@@ -114,7 +114,7 @@ class Chosen:
 
     @functools.cached_property
     def _signals(self) -> Signals:
-        return named_signals(*waveforms_of(self._values), told=say)
+        return named_signals(*waveforms_of(self._values), told=log)
 
 
 def with_experiment(command: Callable[..., None]) -> Callable[..., None]:

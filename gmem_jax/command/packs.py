@@ -16,20 +16,20 @@ from gmem_jax.command.console import (
     InputError,
     KeptFrames,
     announce,
-    claim,
-    emit,
+    check_output,
     emit_cost,
+    log,
+    print_result,
     refuse_idle,
     reporting,
     require_name,
-    say,
 )
 from gmem_jax.command.options import with_recipe
 from gmem_jax.command.resuming import Restart, resumable
 from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.experiment.provenance import provenance, sources
 from gmem_jax.experiment.record import fingerprint
-from gmem_jax.files.home import kept_pack
+from gmem_jax.files.cache import kept_pack
 from gmem_jax.files.packs import STANDARD, list_packs, save_pack
 from gmem_jax.files.sizes import pack_bytes
 from gmem_jax.files.spheres import load_clump
@@ -56,7 +56,7 @@ def info(as_json: AsJson = False) -> None:
     lines += [f"commit: {facts['commit']}", f"backend: {facts['backend']}"]
     lines += [f"device: {device}" for device in facts["devices"]]
     lines += ["shipped packs: " + ", ".join(facts["packs"])]
-    emit(as_json, facts, "\n".join(lines))
+    print_result(as_json, facts, "\n".join(lines))
 
 
 PREPARATION_BYTES = 2e4  # of memory a grain: lists while grains fly, at N = 10,240
@@ -140,7 +140,7 @@ def prepare_command(
         raise InputError("--output is missing: name a file, or a standard pack like tetra-31680-a")
     require_name(name)
     frame_schedule(recipe, frames)  # refuses what cannot be before anything is begun
-    claim(output, ".h5", force=force)
+    check_output(output, ".h5", force=force)
     backend = native.name(backend, Frictionless())
     cost = announce(f"{recipe.grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * recipe.grains, backend)
     if dry_run:
@@ -157,10 +157,10 @@ def prepare_command(
         save_pack(output, pack, stages, *film)
     seconds = time.perf_counter() - began
     rest = pack.info["at_rest"]
-    say(f"at rest: largest grain speed {rest['largest_speed']:.1e} R/t_c; wrote {output} in {seconds:.0f} s")
+    log(f"at rest: largest grain speed {rest['largest_speed']:.1e} R/t_c; wrote {output} in {seconds:.0f} s")
     result = {"pack": pack.name, "output": str(output), "seconds": seconds, "status": 0, **rest}
     result["pressure_over_wanted"] = pressure_over_wanted(pack.info)
-    emit(as_json, result, tables.pack_table(pack))
+    print_result(as_json, result, tables.pack_table(pack))
 
 
 COMMANDS = {"info": info, "prepare": prepare_command}

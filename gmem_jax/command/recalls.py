@@ -19,13 +19,13 @@ from gmem_jax.command.console import (
     PackName,
     Picture,
     announce,
-    claim,
+    check_output,
     drawing,
-    emit,
     emit_cost,
+    log,
+    print_result,
     refuse_idle,
     reporting,
-    say,
 )
 from gmem_jax.command.options import Chosen, with_experiment
 from gmem_jax.command.resuming import Restart, batch_for, resumable
@@ -38,7 +38,7 @@ from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
 from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.contact.hooke import Hooke
-from gmem_jax.physics.state import together
+from gmem_jax.physics.state import combined_status
 from gmem_jax.show import tables
 from gmem_jax.show.render_matplotlib import render
 from gmem_jax.show.summaries import Summary, of_recall
@@ -89,10 +89,10 @@ def _run(
         with drawing(picture):
             render(summary.figures["signals"]()).save(picture)
             told += f" and {picture}"
-    say(told)
+    log(told)
     row = {**summary.facts, "seconds": configuration["seconds"], "output": str(data)}
     if row["status"]:
-        say(f"warning: {row['status_text']}", style="yellow")
+        log(f"warning: {row['status_text']}", style="yellow")
     return replace(summary, facts=row)
 
 
@@ -116,7 +116,7 @@ def recall_command(
     as_json: AsJson = False,
 ) -> None:
     """Store waveforms in a pack and recall them."""
-    (experiment,), drawn = chosen.claim([pack], output, ".h5", picture=picture, force=force)
+    (experiment,), drawn = chosen.check_output([pack], output, ".h5", picture=picture, force=force)
     target = chosen.target(experiment.signals.count)
     at = _compressions(frames_at)
     if not frames and not at:
@@ -128,7 +128,7 @@ def recall_command(
         return
     film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": at}
     summary = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
-    emit(as_json, summary.facts, *summary.lines)
+    print_result(as_json, summary.facts, *summary.lines)
 
 
 def _compressions(text: str) -> list[float]:
@@ -162,15 +162,15 @@ def demo(
         raise InputError(f"--output {output}: cannot make this folder ({error.strerror})") from error
     stems = [output / ("recall.h5" if len(names) == 1 else f"recall-{name}.h5") for name in names]
     for data in stems:
-        claim(data, ".h5", force=force)
-        claim(data.with_suffix(".png"), ".png", force=force)
+        check_output(data, ".h5", force=force)
+        check_output(data.with_suffix(".png"), ".png", force=force)
     rows = []
     for name, data in zip(names, stems, strict=True):
-        say(f"pack {name}")
+        log(f"pack {name}")
         experiment = Experiment(load_pack(name), six_signals(), law)
         rows.append(_run(experiment, data, data.with_suffix(".png")).facts)
     means = {key: spread([row[key] for row in rows])[0] for key in ("gain", "fidelity")}
-    bits = together([row["status"] for row in rows])
+    bits = combined_status([row["status"] for row in rows])
     total = {"status": bits, "seconds": sum(row["seconds"] for row in rows)}
     result: dict[str, Any] = {**means, **total, "packs": rows}
     lines: list[Any] = [tables.recall_table(rows, rows[-1]["configuration"])]
@@ -182,7 +182,7 @@ def demo(
             f"F = {fidelity:.3f} ± {fidelity_sd:.3f} (mean ± SD) at this rate (gmem demo --packs all).\n"
             "Larger ones remember better: 10,240 grains, driven ten times more slowly, have F = 0.903."
         )
-    emit(as_json, result, *lines)
+    print_result(as_json, result, *lines)
 
 
 COMMANDS = {"recall": recall_command, "demo": demo}

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gmem_jax.command.console import AsJson, Force, Output, claim, emit, say
+from gmem_jax.command.console import AsJson, Force, Output, check_output, log, print_result
 from gmem_jax.files.atomic import atomic
 
 Files = Annotated[
@@ -22,7 +22,7 @@ def report_command(
     from gmem_jax.show.render_plotly import script
     from gmem_jax.show.report import Report
 
-    claim(output, ".html", inputs=tuple(files), force=force)
+    check_output(output, ".html", inputs=tuple(files), force=force)
     began = time.perf_counter()
     script()  # refuses at once where there is no plotly
     report = Report()
@@ -32,9 +32,9 @@ def report_command(
     with atomic(output) as temporary:
         temporary.write_text(text, encoding="utf-8")
     megabytes = len(text) / 1e6
-    say(f"wrote {output} ({megabytes:.1f} MB)")
+    log(f"wrote {output} ({megabytes:.1f} MB)")
     result = {"output": str(output), "megabytes": megabytes, "sections": [title for title, _ in report.sections]}
-    emit(as_json, {**result, "seconds": time.perf_counter() - began, "status": 0})
+    print_result(as_json, {**result, "seconds": time.perf_counter() - began, "status": 0})
 
 
 COMMANDS = {"report": report_command}

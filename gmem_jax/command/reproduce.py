@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from gmem_jax.command.console import AsJson, DryRun, InputError, emit, reporting, say
+from gmem_jax.command.console import AsJson, DryRun, InputError, log, print_result, reporting
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
@@ -23,11 +23,11 @@ from gmem_jax.reproduce.run import (
     RUNS,
     Outcome,
     Weighed,
-    judge,
+    check_claims,
     picture,
     reproduce,
+    sensitivity,
     summary_of,
-    weigh,
 )
 from gmem_jax.simulation.progress import Progress
 from gmem_jax.sweeps.cost import cost_of
@@ -82,24 +82,24 @@ def reproduce_command(
         return [name for name in names if what in (name, "all")]
 
     def how(progress: Progress) -> tuple[Any, ...]:
-        return output, scale, executor_named(executor, workers, options), progress, say
+        return output, scale, executor_named(executor, workers, options), progress, log
 
     with locked(output / "figures"):
-        if retry and (count := Store(output / RUNS).forgive()):
-            say(f"{count} points and packs that failed are tried again")
+        if retry and (count := Store(output / RUNS).clear_failures()):
+            log(f"{count} points and packs that failed are tried again")
         for name in wanted((GALLERY, *PICTURES)):
             with _going_on(broken), reporting(goes_on=True) as progress:
                 drawn += picture(name, *how(progress))
-                say(f"wrote {drawn[-1]}")
+                log(f"wrote {drawn[-1]}")
         if wanted(["claims"]):
             with _going_on(broken), reporting(goes_on=True) as progress:
-                verdicts = judge(*how(progress))
+                verdicts = check_claims(*how(progress))
         if wanted(["choices"]):
             with reporting(goes_on=True) as progress:
-                weighed = weigh(*how(progress))
+                weighed = sensitivity(*how(progress))
             _say_written(weighed)
         for name in wanted(FIGURES):
-            say(f"{name}: {FIGURES[name].title}")
+            log(f"{name}: {FIGURES[name].title}")
             with reporting(goes_on=True) as progress:
                 outcomes.append(reproduce(name, *how(progress)))
             _say_written(outcomes[-1])
@@ -116,7 +116,7 @@ def reproduce_command(
     }
     lines = [f"{'yes' if verdict.holds else 'NO ':4}{verdict.claim}\n    {verdict.numbers}" for verdict in verdicts]
     more = [_choices_table(weighed.effects)] if weighed.effects else []
-    emit(as_json, result, *lines, *more, *map(_table, outcomes))
+    print_result(as_json, result, *lines, *more, *map(_table, outcomes))
     broken += weighed.failed + [reason for outcome in outcomes for reason in outcome.failed]
     if broken:
         raise RunFailedError(f"{len(broken)} points or packs; --retry tries them again")
@@ -131,7 +131,7 @@ def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) 
         facts, lines = cost._asdict(), cost.lines
     training = size.nets * len(size.lengths) * size.budget if "fig14" in names else 0.0
     lines += [f"nets: trained for {training / 60.0:.0f} min at most"] if training else []
-    emit(as_json, {**facts, "training_seconds": training, "status": 0}, *lines)
+    print_result(as_json, {**facts, "training_seconds": training, "status": 0}, *lines)
 
 
 @contextlib.contextmanager
@@ -141,7 +141,7 @@ def _going_on(broken: list[str]) -> Iterator[None]:
         yield
     except RunFailedError as error:
         broken.append(str(error))
-        say(f"failed: {error}", style="yellow")
+        log(f"failed: {error}", style="yellow")
 
 
 def _options(texts: Sequence[str]) -> dict[str, Any]:
@@ -164,9 +164,9 @@ def _options(texts: Sequence[str]) -> dict[str, Any]:
 
 def _say_written(done: Outcome | Weighed) -> None:
     for reason in sorted(set(done.failed)):
-        say(f"failed: {reason}", style="yellow")
+        log(f"failed: {reason}", style="yellow")
     if done.files:
-        say(f"wrote {', '.join(map(str, done.files))}")
+        log(f"wrote {', '.join(map(str, done.files))}")
 
 
 def _choices_table(effects: Sequence[Effect]) -> Table:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import psutil
 import typer
 
-from gmem_jax.command.console import InputError, RunInterruptedError, say
+from gmem_jax.command.console import InputError, RunInterruptedError, log
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import default_batch
 from gmem_jax.files.checkpoints import Checkpoints, locked
@@ -53,7 +53,7 @@ def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[C
         parts = Checkpoints(folder_of(output), key, restart=restart)
         if parts.finished() or parts.begun():
             begun = " and one that is begun" if parts.begun() else ""
-            say(f"going on from {parts.folder}: {parts.finished()} finished parts{begun}")
+            log(f"going on from {parts.folder}: {parts.finished()} finished parts{begun}")
         done = False
         try:
             yield parts

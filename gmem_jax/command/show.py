@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from gmem_jax.command import sweep
-from gmem_jax.command.console import AsJson, Force, InputError, claim, emit, heard, refuse_idle, say
+from gmem_jax.command.console import AsJson, Force, InputError, check_output, heard, log, print_result, refuse_idle
 from gmem_jax.show.render_matplotlib import FORMATS, render
 from gmem_jax.show.stages import AGAINST, QUANTITIES
 from gmem_jax.show.summaries import PLOTS, Draw, summary_of
@@ -81,7 +81,7 @@ def show(
         with heard():
             sys.stdout.write(found.csv(each=each))
     else:
-        emit(as_json, found.facts, *found.lines)
+        print_result(as_json, found.facts, *found.lines)
 
 
 def _numbers(text: str) -> list[int]:
@@ -97,7 +97,7 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
     if plot == "list":
         refuse_idle("with --plot list, which draws nothing", "output")
         lines = "\n".join(f"{name:17}  {PLOTS[name]}" for name in pictures)
-        return emit(as_json, {"pictures": list(pictures), "status": 0}, lines)
+        return print_result(as_json, {"pictures": list(pictures), "status": 0}, lines)
     if plot.lower() not in names:
         raise InputError(f"--plot {plot}: there is no such picture of {file}; there are {', '.join(pictures)}")
     if output is None:
@@ -105,9 +105,9 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
     if output.suffix.lower() not in FORMATS:
         raise InputError(f"--output {output}: must end in one of {', '.join(FORMATS)}")
     drawn = render(pictures[names[plot.lower()]]())
-    drawn.save(claim(output, "", inputs=(file,), force=force))
-    say(f"wrote {output}")
-    emit(as_json, {"output": str(output), "status": 0})
+    drawn.save(check_output(output, "", inputs=(file,), force=force))
+    log(f"wrote {output}")
+    print_result(as_json, {"output": str(output), "status": 0})
 
 
 COMMANDS = {"show": show}

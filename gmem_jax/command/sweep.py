@@ -8,7 +8,17 @@ from typing import Annotated, Any
 
 import typer
 
-from gmem_jax.command.console import AsJson, DryRun, Force, InputError, claim, emit, refuse_idle, reporting, say
+from gmem_jax.command.console import (
+    AsJson,
+    DryRun,
+    Force,
+    InputError,
+    check_output,
+    log,
+    print_result,
+    refuse_idle,
+    reporting,
+)
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
@@ -19,8 +29,8 @@ from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.processes import stop, waiting
 from gmem_jax.sweeps.spec import Spec, read_spec
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.sweep import Conductor
-from gmem_jax.sweeps.table import FORMATS, doubts, export, means, rows
+from gmem_jax.sweeps.sweep import SweepRunner
+from gmem_jax.sweeps.table import FORMATS, export, means, rows, warnings_of
 
 VERBS = ("status", "show", "export", "stop")
 RUN = ("executor", "workers", AS_THEY_ARE)
@@ -81,7 +91,7 @@ def sweep_command(
     if dry_run:
         with _of_file(path):
             cost = cost_of(spec, target, workers=count or 1)
-        emit(as_json, {"folder": str(target), **cost._asdict(), "status": 0}, *cost.lines)
+        print_result(as_json, {"folder": str(target), **cost._asdict(), "status": 0}, *cost.lines)
         return
     chosen = executor_named(executor or str(spec.run.get("executor", "processes")), count, options)
     if not target.parent.is_dir():
@@ -91,32 +101,32 @@ def sweep_command(
     except OSError as error:
         raise InputError(f"--output {target}: cannot write there ({error.strerror})") from error
     with locked(target), reporting(goes_on=True) as progress:
-        conductor = planned(path, spec, target)
-        if retry and (count := conductor.store.forgive()):
-            say(f"{count} points that failed are tried again")
-        conductor.run(chosen, progress)
-    table = rows(conductor.store)
+        runner = planned(path, spec, target)
+        if retry and (count := runner.store.clear_failures()):
+            log(f"{count} points that failed are tried again")
+        runner.run(chosen, progress)
+    table = rows(runner.store)
     failed = [row for row in table if row["state"] == "failed"]
     for row in failed[:3]:
-        say(f"failed: {_values(row, spec.names)}: {row['why']}", style="yellow")
+        log(f"failed: {_values(row, spec.names)}: {row['why']}", style="yellow")
     for line in _doubtful(table):
-        say(f"warning: {line}", style="yellow")
-    say(f"{len(table) - len(failed)} of {len(table)} points in {target}; gmem sweep show {target}")
-    emit(as_json, sweep_facts(conductor.store, table), points_table(table, spec.names))
+        log(f"warning: {line}", style="yellow")
+    log(f"{len(table) - len(failed)} of {len(table)} points in {target}; gmem sweep show {target}")
+    print_result(as_json, sweep_facts(runner.store, table), points_table(table, spec.names))
     if failed:
         raise RunFailedError(f"{len(failed)} of {len(table)} points; again with --retry")
 
 
-def planned(path: Path, spec: Spec, folder: Path) -> Conductor:
+def planned(path: Path, spec: Spec, folder: Path) -> SweepRunner:
     """The sweep of a file, once it is sure that its points can be.
 
     Raises:
         FileFormatError: if one cannot, or the folder holds something else.
     """
     with _of_file(path):
-        conductor = Conductor(spec, folder, say)
-        conductor.check()  # leaves nothing behind where it refuses
-    return conductor
+        runner = SweepRunner(spec, folder, log)
+        runner.check()  # leaves nothing behind where it refuses
+    return runner
 
 
 @contextlib.contextmanager
@@ -149,17 +159,17 @@ def _status(store: Store, as_json: bool) -> None:
     summary = sweep_facts(store, table)
     lines = [f"{summary[state]} {state}" for state in ("done", "failed", "open")]
     taken = {job["name"] for job in store.jobs() if store.taken(job)}
-    at_work = [one for one in store.told() if one["job"].partition("-")[0] in taken]
+    at_work = [one for one in store.progress() if one["job"].partition("-")[0] in taken]
     busy = [f"{one['what']}, {one['fraction']:.0%}" for one in at_work if one["fraction"] < 1.0]
     reasons = sorted({row["why"] for row in table if row["state"] == "failed"})
     problems = [*(f"failed: {reason}" for reason in reasons), *(f"warning: {line}" for line in _doubtful(table))]
     waits = waiting(store)
-    emit(as_json, {**summary, "waiting": waits}, ", ".join(lines), *busy, *waits, *problems)
+    print_result(as_json, {**summary, "waiting": waits}, ", ".join(lines), *busy, *waits, *problems)
 
 
 def _doubtful(table: list[dict[str, Any]]) -> list[str]:
     """How many points are doubtful, and why: a line for each reason."""
-    counts = Counter(reason for row in table if (reason := doubts(row)))
+    counts = Counter(reason for row in table if (reason := warnings_of(row)))
     return [f"{count} of {len(table)} points: {reason}" for reason, count in counts.items()]
 
 
@@ -172,9 +182,9 @@ def _stop(store: Store, as_json: bool) -> None:
     """End whoever works on a sweep; what is computed stays."""
     ended, left = stop(store)
     for line in left:
-        say(line, style="yellow")
+        log(line, style="yellow")
     told = [f"ended {one}" for one in ended] or ["nobody is at work here"]
-    emit(as_json, {"folder": str(store.folder), "ended": ended, "left": left}, *told)
+    print_result(as_json, {"folder": str(store.folder), "ended": ended, "left": left}, *told)
     if left:
         raise RunFailedError(f"{len(left)} workers cannot be ended from here")
 
@@ -187,22 +197,22 @@ def show(store: Store, over: str, as_json: bool) -> None:
         raise InputError(f"--over {unknown[0]}: does not vary here; {', '.join(names)} do")
     if averaged:
         found = means(table, names, averaged)
-        emit(
+        print_result(
             as_json,
             {"folder": str(store.folder), "means": found},
             means_table(found, [name for name in names if name not in averaged]),
         )
     else:
-        emit(as_json, sweep_facts(store, table), points_table(table, names))
+        print_result(as_json, sweep_facts(store, table), points_table(table, names))
 
 
 def _export(store: Store, output: Path | None, force: bool, as_json: bool) -> None:
     if output is None or output.suffix.lower() not in FORMATS:
         raise InputError(f"gmem sweep export: name a file with -o that ends in one of {', '.join(FORMATS)}")
-    claim(output, "", force=force)
+    check_output(output, "", force=force)
     about = export(store, output)
-    say(f"wrote {output}" + (f": {about}" if about else ""))
-    emit(as_json, {"output": str(output), "about": about, "status": 0})
+    log(f"wrote {output}" + (f": {about}" if about else ""))
+    print_result(as_json, {"output": str(output), "about": about, "status": 0})
 
 
 COMMANDS = {"sweep": sweep_command}

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from gmem_jax.design.kernel import MemoryKernel
-from gmem_jax.files.checked import json_of, refusing, require, require_finite
 from gmem_jax.files.hdf5 import reading, write_arrays, writing
 from gmem_jax.files.schemas import KERNEL
+from gmem_jax.files.validation import json_of, refusing, require, require_finite
 
 _NUMBERS = ("width", "gamma0", "delta0")
 

@@ -25,7 +25,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.own_law import require_law
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pytree import Scalar, impossible, parameter, pytree, settle, static, traced
+from gmem_jax.physics.pytree import Scalar, out_of_range, parameter, pytree, static, traced, validate
 from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State, Status, replicate
@@ -112,7 +112,7 @@ class Experiment:
         for name in ("dt", "rest", "hold", "store"):
             object.__setattr__(self, name, _static_number(name, getattr(self, name)))
         object.__setattr__(self, "background", str(self.background).lower())
-        settle(self)
+        validate(self)
         if self.background not in analysis.BACKGROUNDS:
             raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {self.background!r}")
         if self.shear not in ("during", "before"):
@@ -248,7 +248,7 @@ class Experiment:
 
     def _impossible(self) -> jax.Array:
         ends = _ends(self.signals)
-        return impossible(self) | ~jnp.all(jnp.isfinite(ends) & (jnp.abs(ends) <= _OPEN))
+        return out_of_range(self) | ~jnp.all(jnp.isfinite(ends) & (jnp.abs(ends) <= _OPEN))
 
     def fan_out(self, state: State) -> State:
         """A replica for the zero signal and one for each of the others, if there is only one so far."""

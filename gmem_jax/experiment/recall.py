@@ -20,7 +20,7 @@ from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
 from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
-from gmem_jax.physics.state import DOUBTFUL, Status, explain, together
+from gmem_jax.physics.state import WARNINGS, Status, combined_status, explain
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.compiled import Compiled, require_x64
 from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, concatenate, places, places_at
@@ -58,7 +58,7 @@ class Recall:
         window: that period T_1, in t_c.
         residual_speed: largest grain speed when the readout began, over the walls' speed, [S + 1].
         status: bits of `Status`, [S + 1]; replica 0 is the zero signal. Those of
-            `DOUBTFUL` leave the numbers as they are.
+            `WARNINGS` leave the numbers as they are.
         stages: samples of every stage by name, leading axis bins; one replica before the first waveform. Ordered: JAX
             sorts the keys of plain dictionaries.
         dt: the time step used, in t_c.
@@ -108,7 +108,7 @@ class Recall:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}
         rows = {**measures, "F over T1": self.windowed_fidelity, "T1 (t_c)": self.window}
         if not traced(self.status):
-            rows["status"] = explain(together(self.status))
+            rows["status"] = explain(combined_status(self.status))
         return f"Recall of {self.J.shape[-2]} signals", rows
 
     def __repr__(self) -> str:
@@ -125,7 +125,7 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
     residual = stages[experiment.protocol.before_read].largest_speed[-1] / compression_speed(experiment)
     status = status | jnp.where(residual < REST_SPEED, 0, int(Status.NOT_AT_REST)).astype(jnp.int32)
     # A factor, not a choice: the derivative of what is broken must be NaN too.
-    sound = jnp.where(jnp.any(status & ~int(DOUBTFUL)), jnp.nan, 1.0)
+    sound = jnp.where(jnp.any(status & ~int(WARNINGS)), jnp.nan, 1.0)
     found = experiment.recalled({name: stages[name].pressure for name in experiment.protocol.reads})
     p_sig = sound * found
     noise = rounding(experiment, stages)

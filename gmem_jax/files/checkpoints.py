@@ -24,9 +24,9 @@ import numpy as np
 
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.checked import json_of, read_npy, refusing, require
 from gmem_jax.files.ours import Folder, release, sweep
 from gmem_jax.files.seal import BLOCK, require_sealed, seal
+from gmem_jax.files.validation import json_of, read_npy, refusing, require
 from gmem_jax.physics.pytree import KINDS
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 

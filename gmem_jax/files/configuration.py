@@ -11,8 +11,8 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.record import PARTS, SIGNALS, pack_fingerprint
 from gmem_jax.experiment.signals import PAD, WIDTH, Signals, six_signals, words
-from gmem_jax.files.checked import numbers, require, require_kinds
 from gmem_jax.files.packs import load_pack
+from gmem_jax.files.validation import numbers, require, require_kinds
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import law_named
 from gmem_jax.physics.material import Material

@@ -7,9 +7,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gmem_jax.files.checked import fit, refusing, require, require_finite, title, whole
 from gmem_jax.files.hdf5 import Content, reading, write_arrays
 from gmem_jax.files.schemas import FRAMES
+from gmem_jax.files.validation import fit, refusing, require, require_finite, title, whole
 from gmem_jax.simulation.frames import Frames
 
 GROUP = "frames"

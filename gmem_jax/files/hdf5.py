@@ -17,10 +17,10 @@ import numpy as np
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.checked import Array, fit, refusing
 from gmem_jax.files.schemas import DIMENSIONS, STAGE
 from gmem_jax.files.seal import BLOCK, require_sealed, seal
 from gmem_jax.files.tree import Tree
+from gmem_jax.files.validation import Array, fit, refusing
 from gmem_jax.simulation.protocol import BINS
 from gmem_jax.simulation.sample import Sample
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.files.checked import require
+from gmem_jax.files.validation import require
 
 SAME = 1e-5  # by which radii, masses and densities may differ from the one that is meant; GSD is in single precision
 _STYLES = {  # of atoms: columns

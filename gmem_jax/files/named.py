@@ -9,7 +9,7 @@ from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.samples import Told, untold
 from gmem_jax.experiment.signals import LONGEST_WORD, Signals, six_signals, waveform, words
-from gmem_jax.files.checked import require_kinds
+from gmem_jax.files.validation import require_kinds
 from gmem_jax.files.waveforms import load_waveforms
 from gmem_jax.physics.contact.laws import LAWS, law_named
 from gmem_jax.physics.material import Material

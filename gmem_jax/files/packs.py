@@ -11,12 +11,12 @@ import numpy as np
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.files import soundness
-from gmem_jax.files.checked import fit, json_of, refusing, require, title
+from gmem_jax.files import pack_validation
+from gmem_jax.files.cache import kept_pack
 from gmem_jax.files.frames import check_frames, write_frames
 from gmem_jax.files.hdf5 import reading, write_arrays, write_samples, writing
-from gmem_jax.files.home import kept_pack
 from gmem_jax.files.schemas import PACK
+from gmem_jax.files.validation import fit, json_of, refusing, require, title
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import candidates, tabulate
 from gmem_jax.physics.rules import usual_rules
@@ -92,7 +92,7 @@ def _check(found: dict[str, np.ndarray], isotropic: Any, label: Any, shape: Any,
         isinstance(isotropic, bool | np.bool_), "incomplete file, attribute 'isotropic' is missing or not a truth value"
     )
     require(title(label) and title(shape), "its name or that of its grain is not a short line of text")
-    soundness.check(found, isotropic=bool(isotropic), record=json_of(record, "record"))
+    pack_validation.check(found, isotropic=bool(isotropic), record=json_of(record, "record"))
 
 
 @usual_rules()

@@ -8,7 +8,13 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.checked import (
+from gmem_jax.files.configuration import signals_from_dict
+from gmem_jax.files.datasets import each_csv, recall_csv, recall_dataset
+from gmem_jax.files.frames import read_frames, write_frames
+from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
+from gmem_jax.files.measures import EACH, of_each
+from gmem_jax.files.schemas import RECALL
+from gmem_jax.files.validation import (
     Array,
     is_number,
     json_of,
@@ -21,14 +27,8 @@ from gmem_jax.files.checked import (
     title,
     whole,
 )
-from gmem_jax.files.configuration import signals_from_dict
-from gmem_jax.files.frames import read_frames, write_frames
-from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
-from gmem_jax.files.labelled import each_csv, recall_csv, recall_dataset
-from gmem_jax.files.measures import EACH, of_each
-from gmem_jax.files.schemas import RECALL
 from gmem_jax.physics.rules import usual_rules
-from gmem_jax.physics.state import DOUBTFUL, Status
+from gmem_jax.physics.state import WARNINGS, Status
 from gmem_jax.simulation.protocol import BINS, Protocol
 from gmem_jax.simulation.sample import Sample
 
@@ -135,7 +135,7 @@ def _check(recall: Recall) -> None:
     require(
         (recall.window > 0.0) & np.all(np.asarray(recall.dt) > 0.0), "its time step or ringing period is not positive"
     )
-    if not np.any(status & ~int(DOUBTFUL)):
+    if not np.any(status & ~int(WARNINGS)):
         measured = {name: getattr(recall, name) for name in ("p_sig", *MEASURES, "window", "residual_speed")}
         require_finite(measured)
     reads = recall.protocol.reads

@@ -8,8 +8,8 @@ from typing import Any
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.checked import is_number, json_of, refusing, require, title, whole
 from gmem_jax.files.schemas import GRADIENT, READING, TUNED, Schema
+from gmem_jax.files.validation import is_number, json_of, refusing, require, title, whole
 
 _LARGEST = 1 << 28  # bytes
 _KINDS = (GRADIENT, TUNED, READING)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from gmem_jax.files.checked import FIXED, Array
+from gmem_jax.files.validation import FIXED, Array
 from gmem_jax.simulation.sample import MEASURED
 
 DIMENSIONS = {  # names of lengths, and what the scales of those say that no array of a file is a scale of
@@ -219,7 +219,7 @@ NET = Schema(
     "The reader of words of one length and seed, finished or not: `gmem classify --nets`. 512 bytes of checksum, then "
     "MessagePack as flax writes it.",
     {
-        "recipe": Array("text", (), "", "JSON: gm.classify.Lessons, what it was built and taught from"),
+        "recipe": Array("text", (), "", "JSON: gm.classify.TrainingConfig, what it was built and taught from"),
         "training": Array("object", (), "", "seed, steps, loss (nats), validation accuracy, seconds"),
         "parameters/Dense_k/kernel": Array("real", ("inputs", "outputs"), "1", "weights of layer k, float32"),
         "parameters/Dense_k/bias": Array("real", ("outputs",), "1", "biases of layer k, float32"),

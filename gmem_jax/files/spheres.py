@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.files.checked import NAME, refusing, require, title
-from gmem_jax.files.soundness import MOST
+from gmem_jax.files.pack_validation import MOST
+from gmem_jax.files.validation import NAME, refusing, require, title
 from gmem_jax.physics.grain import Clump, clump
 
 _LARGEST = 1 << 16  # bytes: 256 lines of four long numbers

@@ -13,9 +13,9 @@ from gmem_jax.experiment.record import signals_to_dict
 from gmem_jax.experiment.samples import Told, require_gentle, untold, waveform_from
 from gmem_jax.experiment.signals import Signals, Spline
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.checked import json_of, numbers, read_npy, refusing, require_fields, title
 from gmem_jax.files.columns import Columns, read_columns
 from gmem_jax.files.configuration import signals_from_dict
+from gmem_jax.files.validation import json_of, numbers, read_npy, refusing, require_fields, title
 from gmem_jax.physics.rules import usual_rules
 
 _LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB

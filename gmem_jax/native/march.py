@@ -112,7 +112,7 @@ def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, m
     law = {field.name: getattr(system.friction, field.name) for field in fields(system.friction)}  # type: ignore[arg-type]
     dynamics.require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass, **law)
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
-    system, state, boxes, dt, drag = dynamics.together((system, state, boxes, jnp.asarray(dt), jnp.asarray(drag)))
+    system, state, boxes, dt, drag = dynamics.mark_varying((system, state, boxes, jnp.asarray(dt), jnp.asarray(drag)))
     grains, history, total = _bin(mode, system, state.grains, state.history, boxes, (dt, drag))
     return State(grains, history, state.status), total
 

@@ -25,7 +25,7 @@ from jax.interpreters import ad, batching, mlir
 from jax.sharding import NamedSharding, PartitionSpec
 
 from gmem_jax.native import cuda
-from gmem_jax.physics.step import together
+from gmem_jax.physics.step import mark_varying
 
 TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint")
 
@@ -122,7 +122,7 @@ def tangent(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, al
 
 
 def _bind(primitive: Primitive, call: Call, definition: Definition, *parts: Any) -> list[jax.Array]:
-    leaves, tree = jax.tree.flatten(together(parts))
+    leaves, tree = jax.tree.flatten(mark_varying(parts))
     found: list[jax.Array] = primitive.bind(*leaves, tree=tree, call=call, definition=definition)
     return found
 

@@ -6,7 +6,7 @@ that time is measured in t_c = R sqrt(rho / E), pressure in E, force in E R^2 an
 
 from dataclasses import dataclass
 
-from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle
+from gmem_jax.physics.pytree import Scalar, parameter, pytree, validate
 
 
 @pytree
@@ -38,7 +38,7 @@ class Material:
     )
 
     def __post_init__(self) -> None:
-        settle(self)
+        validate(self)
 
     @property
     def time_unit(self) -> Scalar:

@@ -165,7 +165,7 @@ def _parameters(made: Any) -> Iterator[tuple[str, Interval]]:
 
 
 @usual_rules()
-def settle(made: Any) -> None:
+def validate(made: Any) -> None:
     """Bring the parameters of a new object to one kind of number, and refuse those outside their interval.
 
     Raises:
@@ -189,7 +189,7 @@ def _shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float | int) and math.isfinite(value) else str(value)
 
 
-def impossible(made: Any) -> jax.Array:
+def out_of_range(made: Any) -> jax.Array:
     """Whether any parameter in `made`, or in a pytree of this kind within it, is outside its interval; a scalar."""
     bad = jnp.asarray(False)
     for name, interval in _parameters(made):
@@ -197,5 +197,5 @@ def impossible(made: Any) -> jax.Array:
     for entry in fields(made):
         within = getattr(made, entry.name)
         if is_dataclass(within):
-            bad |= impossible(within)
+            bad |= out_of_range(within)
     return bad

@@ -40,10 +40,10 @@ class Status(enum.IntFlag):
     @property
     def fatal(self) -> bool:
         """Whether the numbers of the run are meaningless, and not only doubtful."""
-        return bool(self & ~DOUBTFUL)
+        return bool(self & ~WARNINGS)
 
 
-DOUBTFUL = (
+WARNINGS = (
     Status.NOT_AT_REST
     | Status.DEEP_OVERLAP
     | Status.NOT_QUASI_STATIC
@@ -82,7 +82,7 @@ SENTENCES = {
 }
 
 
-def together(status: npt.ArrayLike) -> int:
+def combined_status(status: npt.ArrayLike) -> int:
     """The bits that any of several replicas or packs has set."""
     return int(np.bitwise_or.reduce(np.asarray(status), axis=None))
 

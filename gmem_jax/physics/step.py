@@ -38,7 +38,7 @@ class System:
     material: Material = Material()
 
 
-def _apart(alive: jax.Array, function: Callable[..., Any], *args: Any) -> Any:
+def _fusion_barrier(alive: jax.Array, function: Callable[..., Any], *args: Any) -> Any:
     """`function(*args)`, compiled apart from its surroundings.
 
     XLA's CPU backend fuses a producer into each of its consumers and so computes shared intermediates of the contact
@@ -49,7 +49,7 @@ def _apart(alive: jax.Array, function: Callable[..., Any], *args: Any) -> Any:
     return lax.cond(alive, function, lambda *_: jax.tree.map(jnp.zeros_like, shapes), *args)
 
 
-def together(tree: Any) -> Any:
+def mark_varying(tree: Any) -> Any:
     """`tree`, each leaf marked as varying over the axes of a `jax.shard_map` that any of them varies over.
 
     What the devices have in common becomes part of what they have not, in a loop at the latest; said at the start, the
@@ -131,8 +131,10 @@ def contact_forces(
         stack = [jnp.concatenate([force, torque], axis=1), jnp.concatenate([-force, torque], axis=1), nothing]
         return jnp.concatenate(stack, axis=0), new_history
 
-    stack, history = _apart(alive, law, *_apart(alive, lambda table: relative_motion(pairs, table), table), history)
-    return _apart(alive, lambda rows: jnp.sum(rows[pairs.incidence], axis=1), stack), history
+    stack, history = _fusion_barrier(
+        alive, law, *_fusion_barrier(alive, lambda table: relative_motion(pairs, table), table), history
+    )
+    return _fusion_barrier(alive, lambda rows: jnp.sum(rows[pairs.incidence], axis=1), stack), history
 
 
 @jax.jit
@@ -142,7 +144,7 @@ def _loads(
     """Of every sphere: its arm [N, K, 3, B], contact forces and torques [S, 6, B], wall forces; and the new history."""
     material = system.material
     with jax.named_scope("spheres"):
-        table, arms = _apart(alive, lambda grains: sphere_table(system.clump, grains), grains)
+        table, arms = _fusion_barrier(alive, lambda grains: sphere_table(system.clump, grains), grains)
     with jax.named_scope("contacts"):
         contact, history = contact_forces(system, table, history, dt, alive)
     with jax.named_scope("walls"):
@@ -254,7 +256,7 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
     """
     require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass)
     numbers: tuple[jax.Array, jax.Array] = (jnp.asarray(dt), jnp.asarray(drag))
-    system, state, boxes, numbers = together((system, state, boxes, numbers))
+    system, state, boxes, numbers = mark_varying((system, state, boxes, numbers))
 
     def one_step(carry: tuple[State, jax.Array], xs: tuple[jax.Array, Box]) -> tuple[tuple[State, jax.Array], None]:
         state, total = carry

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
-from gmem_jax.files.checked import require
-from gmem_jax.files.foreign import Spheres, load_spheres
+from gmem_jax.files.importers import Spheres, load_spheres
 from gmem_jax.files.lammpsdata import SAME
+from gmem_jax.files.pack_validation import pairs_within
 from gmem_jax.files.packs import check_pack
-from gmem_jax.files.soundness import pairs_within
+from gmem_jax.files.validation import require
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, clump, sphere, tetra
@@ -95,7 +95,7 @@ def import_pack(
     friction: FrictionLaw | None = None,
     progress: Progress = silent,
 ) -> Pack:
-    """A pack of the grains in a LAMMPS data file or a GSD file; see `gmem_jax.files.foreign`.
+    """A pack of the grains in a LAMMPS data file or a GSD file; see `gmem_jax.files.importers`.
 
     Args:
         path: the file.

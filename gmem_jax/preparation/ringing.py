@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.errors import RunFailedError
-from gmem_jax.files.soundness import LISTENED, PERIODS, period_bounds
+from gmem_jax.files.pack_validation import LISTENED, PERIODS, period_bounds
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.state import Box
 from gmem_jax.physics.step import System, accelerate, start

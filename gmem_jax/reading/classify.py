@@ -1,16 +1,16 @@
 """The paper's reader in one place, as `gmem_jax.classify`: its lessons, the net, its training."""
 
-from gmem_jax.reading.lessons import Examples, Lessons, examples
+from gmem_jax.reading.lessons import Examples, TrainingConfig, examples
 from gmem_jax.reading.net import Net, Perceptron, accuracy, cross_entropy, initial, logits, normalise, predict
 from gmem_jax.reading.training import Listener, Training, learn, load, save, silent, train, validate
 
 __all__ = [
     "Examples",
-    "Lessons",
     "Listener",
     "Net",
     "Perceptron",
     "Training",
+    "TrainingConfig",
     "accuracy",
     "cross_entropy",
     "examples",

@@ -22,7 +22,7 @@ RATIOS = 64  # of noise to signal at which the size of a set is calculated, and 
 
 
 @dataclass(frozen=True)
-class Lessons:
+class TrainingConfig:
     """What the net is and what it is trained on; by default the paper's net and 17,325 examples a word.
 
     Attributes:
@@ -87,7 +87,7 @@ class Examples:
     level: jax.Array
     order: jax.Array
     noise: jax.Array
-    lessons: Lessons
+    lessons: TrainingConfig
 
     def make(self, word: jax.Array, combination: jax.Array) -> jax.Array:
         """Input [..., 256] of word number `word` (from 0) under a combination; the same numbers, the same input."""
@@ -126,17 +126,17 @@ def _ladder(place: jax.Array, rungs: int) -> jax.Array:
     return 2.0 * place / (rungs - 1) - 1.0 if rungs > 1 else 0.0 * place
 
 
-def _scale(lessons: Lessons, factor: jax.Array) -> jax.Array:
+def _scale(lessons: TrainingConfig, factor: jax.Array) -> jax.Array:
     """By what a set is multiplied."""
     return 1.0 + lessons.amplitude * _ladder(factor, lessons.amplitudes)
 
 
-def _deviation(lessons: Lessons, draw: jax.Array) -> jax.Array:
+def _deviation(lessons: TrainingConfig, draw: jax.Array) -> jax.Array:
     """SD of the noise of a set, in <|J|>."""
     return lessons.noise * (draw / max(lessons.draws - 1, 1))
 
 
-def examples(lessons: Lessons, seed: jax.typing.ArrayLike) -> Examples:
+def examples(lessons: TrainingConfig, seed: jax.typing.ArrayLike) -> Examples:
     """The training and validation set of a seed."""
     shuffle, noise = jax.random.split(jax.random.fold_in(chance.key(seed), 1))
     order = jax.random.permutation(shuffle, lessons.combinations)
@@ -144,7 +144,7 @@ def examples(lessons: Lessons, seed: jax.typing.ArrayLike) -> Examples:
     return Examples(table=table, level=_level(lessons, table), order=order, noise=noise, lessons=lessons)
 
 
-def _table(lessons: Lessons) -> jax.Array:
+def _table(lessons: TrainingConfig) -> jax.Array:
     """J_s shifted, over the mean of |J| of the words as they are, [S, shifts, 256]."""
     signals = words(lessons.bits)
     mean = jnp.mean(jnp.abs(bin_average(signals)))
@@ -157,7 +157,7 @@ def _table(lessons: Lessons) -> jax.Array:
     return jnp.moveaxis(jax.lax.map(moved, steps), 0, 1)
 
 
-def _level(lessons: Lessons, table: jax.Array) -> jax.Array:
+def _level(lessons: TrainingConfig, table: jax.Array) -> jax.Array:
     """Mean of |scale J + deviation n| over words, u and Gaussian n, [shifts, amplitudes, draws]."""
     scale = _scale(lessons, jnp.arange(lessons.amplitudes))[:, None]
     noise = _deviation(lessons, jnp.arange(lessons.draws)) / scale  # of a set that is not scaled

@@ -14,7 +14,7 @@ import optax
 from flax import linen as nn
 
 from gmem_jax.physics import chance
-from gmem_jax.reading.lessons import Lessons
+from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.simulation.protocol import BINS
 
 
@@ -46,10 +46,10 @@ class Net:
     """
 
     parameters: Any
-    lessons: Lessons
+    lessons: TrainingConfig
 
 
-def initial(lessons: Lessons, seed: jax.typing.ArrayLike) -> Net:
+def initial(lessons: TrainingConfig, seed: jax.typing.ArrayLike) -> Net:
     """The untrained net of a seed."""
     key = jax.random.fold_in(chance.key(seed), 0)
     module = Perceptron(lessons.classes, lessons.hidden)

@@ -15,7 +15,9 @@ from flax import serialization
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.signals import LONGEST_WORD
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.checked import (
+from gmem_jax.files.schemas import NET
+from gmem_jax.files.seal import BLOCK, require_sealed, seal
+from gmem_jax.files.validation import (
     Array,
     fit,
     is_number,
@@ -26,10 +28,8 @@ from gmem_jax.files.checked import (
     require_finite,
     whole,
 )
-from gmem_jax.files.schemas import NET
-from gmem_jax.files.seal import BLOCK, require_sealed, seal
 from gmem_jax.physics import chance
-from gmem_jax.reading.lessons import Examples, Lessons, examples
+from gmem_jax.reading.lessons import Examples, TrainingConfig, examples
 from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
 from gmem_jax.simulation.protocol import BINS
 
@@ -109,7 +109,7 @@ _examples = jax.jit(examples, static_argnames="lessons")
 
 
 def train(
-    lessons: Lessons,
+    lessons: TrainingConfig,
     seed: int = 0,
     *,
     budget: float = 600.0,
@@ -166,7 +166,7 @@ def train(
     return training
 
 
-def _take_up(lessons: Lessons, seed: int, checkpoint: Path | None) -> Training:
+def _take_up(lessons: TrainingConfig, seed: int, checkpoint: Path | None) -> Training:
     if checkpoint is None or not Path(checkpoint).exists():
         return Training(initial(lessons, seed), seed)
     found = load(checkpoint)
@@ -210,7 +210,7 @@ def load(path: Path) -> Training:
         recipe = json_of(content.get("recipe"), "recipe")
         require_fields(recipe, "recipe", **_RECIPE)
         require(set(recipe) == set(_RECIPE), "its recipe has fields that lessons have not")
-        lessons = Lessons(**{**recipe, "hidden": tuple(recipe["hidden"])})
+        lessons = TrainingConfig(**{**recipe, "hidden": tuple(recipe["hidden"])})
         require_fields(content.get("training"), "training", **_TRAINING)
         require(set(content["training"]) == set(_TRAINING), "its training has fields that it should not have")
         net = Net(_parameters(content.get("parameters"), lessons), lessons)
@@ -238,7 +238,7 @@ _TRAINING: dict[str, Callable[[Any], bool]] = {
 }
 
 
-def _parameters(found: Any, lessons: Lessons) -> dict[str, dict[str, jax.Array]]:
+def _parameters(found: Any, lessons: TrainingConfig) -> dict[str, dict[str, jax.Array]]:
     """Weights and biases of the net of some lessons.
 
     Raises:

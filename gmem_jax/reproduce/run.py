@@ -13,7 +13,7 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.physics.contact.laws import entry_of, law_named
-from gmem_jax.reading.lessons import Lessons
+from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reading.report import reading
 from gmem_jax.reading.training import train
@@ -34,7 +34,7 @@ from gmem_jax.sweeps.executors import Executor, Processes
 from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.sweep import SIDE_BY_SIDE, Conductor
+from gmem_jax.sweeps.sweep import SIDE_BY_SIDE, SweepRunner
 
 RUNS = "runs"  # the folder of the sweep that all figures share
 MOST_SHOWN = 8  # words of a length in Fig. 13
@@ -62,9 +62,9 @@ PICTURES = {
 GALLERY = "fig03"  # pictures of packs, which may have to be made
 
 
-def _run(spec: Spec, folder: Path, executor: Executor | None, progress: Progress, say: Tell) -> Conductor:
+def _run(spec: Spec, folder: Path, executor: Executor | None, progress: Progress, say: Tell) -> SweepRunner:
     """Do what is missing of a sweep, whose conductor has done it."""
-    conductor = Conductor(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
+    conductor = SweepRunner(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
     conductor.run(executor or Processes(), progress)
     return conductor
 
@@ -99,7 +99,7 @@ def picture(
         return [path for suffix in (".png", ".svg", ".csv") if (path := target.with_suffix(suffix)).is_file()]
     size = scale_of(scale)
     spec = Spec(shared={"t0": size.t0}, extra=tuple(shown_packs(size)))
-    shown = Conductor(spec, folder / RUNS, say).packs(executor or Processes(), progress)
+    shown = SweepRunner(spec, folder / RUNS, say).packs(executor or Processes(), progress)
     target = _target(folder, name, scale)
     packs_figure(target, shown, "Packs at rest, by size and by shape")
     return [target]
@@ -119,7 +119,7 @@ class Weighed(NamedTuple):
     failed: list[str]
 
 
-def weigh(
+def sensitivity(
     folder: Path | str = "reproduce",
     scale: str = "laptop",
     executor: Executor | None = None,
@@ -147,7 +147,7 @@ def weigh(
     return Weighed(found, [target, target.with_suffix(".svg"), target.with_suffix(".csv")], _failed(store))
 
 
-def judge(
+def check_claims(
     folder: Path | str = "reproduce",
     scale: str = "laptop",
     executor: Executor | None = None,
@@ -296,7 +296,7 @@ def read_words(folder: Path, store: Store, points: Sequence[Point], scale: Scale
         nets = []
         for seed in range(scale.nets):
             file = folder / "nets" / f"words-{length}-{seed}.msgpack"
-            nets.append(train(Lessons(length), seed, budget=scale.budget, checkpoint=file))
+            nets.append(train(TrainingConfig(length), seed, budget=scale.budget, checkpoint=file))
             say(f"net {seed} for {length} bits: {nets[-1].step} steps, held-out accuracy {nets[-1].validation:.4f}")
         for point in points:
             if point.conditions.bits == length:

@@ -11,8 +11,8 @@ from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.experiment import PAPER_T0, Experiment
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import describe
-from gmem_jax.files.checked import is_number
 from gmem_jax.files.measures import relative_scale
+from gmem_jax.files.validation import is_number
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.show import tables

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.files.checked import optional
+from gmem_jax.files.validation import optional
 from gmem_jax.show.figure import Curve, Figure, Image, Panel
 
 COLOURS = {

@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
-from gmem_jax.files.checked import optional
+from gmem_jax.files.validation import optional
 from gmem_jax.physics.state import Status
 from gmem_jax.show import render_plotly, tables, view
 from gmem_jax.show.figure import Figure

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.files.exported import frames_of_pack
+from gmem_jax.files.exporters import frames_of_pack
 from gmem_jax.physics.material import Material
 from gmem_jax.simulation.frames import Frames
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gmem_jax.files.checked import is_number
+from gmem_jax.files.validation import is_number
 from gmem_jax.physics.material import Material
 from gmem_jax.show.figure import CYCLE, GREY, Curve, Figure, Panel, U
 from gmem_jax.simulation.protocol import BINS

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from gmem_jax.files.checked import is_number
+from gmem_jax.files.validation import is_number
 from gmem_jax.physics.state import SENTENCES, Status
 from gmem_jax.show.figure import Curve, Figure, Panel, ramp
 from gmem_jax.show.tables import cell

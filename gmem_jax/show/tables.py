@@ -20,7 +20,7 @@ from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.measures import of_each, relative_scale
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.state import Status, explain, together
+from gmem_jax.physics.state import Status, combined_status, explain
 from gmem_jax.preparation.recipe import pressure_over_wanted
 from gmem_jax.simulation.protocol import BINS
 
@@ -106,7 +106,7 @@ def summary(recall: Recall) -> dict[str, Any]:
     readout = recall.stages[recall.protocol.reads[0]]
     pressure = np.asarray(readout.pressure)
     unit = Material().modulus
-    status = together(recall.status)
+    status = combined_status(recall.status)
     return {
         "pack": configuration["pack"],
         "grains": configuration["grains"],

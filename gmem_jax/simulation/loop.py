@@ -16,7 +16,7 @@ from gmem_jax import native
 from gmem_jax.physics.pairs import Pairs
 from gmem_jax.physics.pytree import Scalar, pytree, static
 from gmem_jax.physics.state import Box, State
-from gmem_jax.physics.step import System, together
+from gmem_jax.physics.step import System, mark_varying
 from gmem_jax.simulation import scan
 from gmem_jax.simulation.protocol import Bin
 from gmem_jax.simulation.sample import Sample, end_bin
@@ -101,7 +101,7 @@ def rollout(simulation: Simulation, state: State, rows: Bin) -> tuple[State, Sam
 
     Reverse mode keeps states at two levels and computes the rest again (see `scan.scan`).
     """
-    state, _ = together((state, simulation))
+    state, _ = mark_varying((state, simulation))
     return scan.scan(lambda state, row: bin_step(simulation, state, row), state, rows)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from gmem_jax.errors import RunFailedError
 from gmem_jax.physics.pairs import carry_history
 from gmem_jax.physics.search import PairFinder
-from gmem_jax.physics.state import Box, State, Status, explain, together
+from gmem_jax.physics.state import Box, State, Status, combined_status, explain
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint, ResultCache
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.neighbors import SKIN, WIDEST, pair_finder, skin_left
@@ -30,7 +30,7 @@ from gmem_jax.simulation.stability import cause
 
 def status_of(state: State) -> int:
     """All status bits of all replicas."""
-    return together(to_host(state.status))
+    return combined_status(to_host(state.status))
 
 
 def raise_if_fatal(status: int, where: str, simulation: Simulation | None = None) -> None:

@@ -97,7 +97,7 @@ class Sample:
     )
     wall_contacts: jax.Array = measured(
         "1",
-        "spheres touching a wall per grain, once for each wall",
+        "spheres touching a wall per grain, once for each wall; NaN if not counted",
         plot="wall_contacts",
         label="spheres at walls per grain",
     )

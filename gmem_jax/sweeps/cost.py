@@ -9,7 +9,7 @@ import psutil
 from gmem_jax.files.sizes import in_bytes, in_time, pack_bytes, recall_bytes
 from gmem_jax.sweeps.plan import plan
 from gmem_jax.sweeps.spec import Spec
-from gmem_jax.sweeps.sweep import Conductor, seconds_of
+from gmem_jax.sweeps.sweep import SweepRunner, seconds_of
 
 
 class Cost(NamedTuple):
@@ -52,15 +52,15 @@ def cost_of(spec: Spec, folder: Path, *, workers: int = 1, only_packs: bool = Fa
 
     Raises:
         FileFormatError: if the folder holds something else.
-        ValueError: if a point cannot be (see `Conductor.check`).
+        ValueError: if a point cannot be (see `SweepRunner.check`).
         FileNotFoundError: if there is no such pack.
     """
     with TemporaryDirectory() as nowhere:
-        conductor = Conductor(spec, folder if folder.exists() else Path(nowhere) / "sweep", lambda _: None)
-        conductor.check()
-        makes = conductor.pack_jobs()
-        later, points = ([], []) if only_packs else (conductor.points_to_come(), conductor.points())
-        known, failed = conductor.store.done(), set(conductor.store.failed())
+        runner = SweepRunner(spec, folder if folder.exists() else Path(nowhere) / "sweep", lambda _: None)
+        runner.check()
+        makes = runner.pack_jobs()
+        later, points = ([], []) if only_packs else (runner.points_to_come(), runner.points())
+        known, failed = runner.store.done(), set(runner.store.failed())
     asked = {one.key: one for one in points}
     missing = [one for key, one in asked.items() if key not in known | failed]
     memory = psutil.virtual_memory().available // workers
@@ -68,9 +68,9 @@ def cost_of(spec: Spec, folder: Path, *, workers: int = 1, only_packs: bool = Fa
     work = [*makes, *later, *jobs]
     disk = sum(pack_bytes(job["recipe"]["grains"]) for job in makes) + sum(one["bytes"] for one in later)
     return Cost(
-        points=len(asked) + len(conductor.impossible),
+        points=len(asked) + len(runner.impossible),
         there=len(asked.keys() & known),
-        failed=len(asked.keys() & failed) + len(conductor.impossible) - len(later),
+        failed=len(asked.keys() & failed) + len(runner.impossible) - len(later),
         packs=len(makes),
         runs=len(jobs) + len(later),
         grain_steps=float(sum(job["work"] for job in work)),

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gmem_jax.experiment.analysis import spread
-from gmem_jax.files.checked import is_number
+from gmem_jax.files.validation import is_number
 
 Rows = Sequence[Mapping[str, Any]]
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gmem_jax.errors import RunFailedError
-from gmem_jax.files.checked import optional
+from gmem_jax.files.validation import optional
 from gmem_jax.sweeps import slurm, work
 from gmem_jax.sweeps.processes import CONDUCTOR, PATIENCE, job_name, known_by, python, safe_path
 from gmem_jax.sweeps.store import Store
@@ -64,7 +64,7 @@ class Executor(ABC):
             while True:
                 open_ = [job for job in open_ if not store.finished(job)]
                 now = total - sum(job["work"] for job in open_)
-                fractions = {one["job"]: float(one["fraction"]) for one in store.told()}
+                fractions = {one["job"]: float(one["fraction"]) for one in store.progress()}
                 now += sum(min(1.0, fractions.get(job["name"], 0.0)) * job["work"] for job in open_)
                 told(now / total)
                 if not open_:

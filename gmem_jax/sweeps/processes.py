@@ -14,7 +14,7 @@ from gmem_jax.sweeps import slurm
 from gmem_jax.sweeps.store import Store
 
 PATIENCE = 10.0  # s for a process to end by itself, before it is killed
-CONDUCTOR = "conductor"  # whose workers they are
+CONDUCTOR = "runner"  # whose workers they are
 SAFE = {"PYTHONSAFEPATH": "1"}
 """Environment of Python processes that somebody else starts for us; see `python`."""
 

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.files.checked import is_number, whole
+from gmem_jax.files.validation import is_number, whole
 
 TABLES = ("experiment", "vary", "zip", "points", "prepare", "run")
 PREPARE = "prepare."

@@ -21,11 +21,11 @@ from typing import Any
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.checked import NAME, is_number, printable, source, title, whole
 from gmem_jax.files.checkpoints import OWN, is_locked, locked
 from gmem_jax.files.ours import Folder, sweep
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.files.schemas import SWEEP
+from gmem_jax.files.validation import NAME, is_number, printable, source, title, whole
 from gmem_jax.sweeps.plan import Point
 
 MARKER = "sweep.json"
@@ -62,7 +62,7 @@ class Store:
             self._own.make(name)
             sweep(self.folder / name, age=WRITTEN)
 
-    def remember(
+    def write_manifest(
         self,
         points: Sequence[Point],
         shared: dict[str, Any],
@@ -181,7 +181,7 @@ class Store:
         """Remove the recall of a point."""
         self._own.remove(f"points/{key}.h5")
 
-    def forgive(self) -> int:
+    def clear_failures(self) -> int:
         """Forget all failures, so that they are tried again; how many there were."""
         failed = self._own.files("failed")
         for path in failed:
@@ -237,7 +237,7 @@ class Store:
         return self._own.at(f"parts/{job['name']}/{JOB}").parent
 
     @contextlib.contextmanager
-    def mine(self, job: dict[str, Any]) -> Iterator[None]:
+    def lock(self, job: dict[str, Any]) -> Iterator[None]:
         """Have a job to oneself: the operating system lets go of it when this process dies.
 
         Raises:
@@ -256,7 +256,7 @@ class Store:
         with atomic(self._own.at(f"workers/{worker}.json"), flush=False) as temporary:
             temporary.write_text(json.dumps({"job": job, "fraction": fraction, "what": what}), encoding="utf-8")
 
-    def told(self) -> list[dict[str, Any]]:
+    def progress(self) -> list[dict[str, Any]]:
         """What the workers said last; what is no such record is passed over."""
         said = (_json(path) for path in self._own.files("workers") if path.suffix == ".json")
         fits = {"job": title, "fraction": is_number, "what": title}

@@ -20,13 +20,13 @@ from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall, replica_bins
-from gmem_jax.files.checked import require_kinds
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.sizes import recall_bytes
+from gmem_jax.files.validation import require_kinds
 from gmem_jax.physics.rules import usual_rules
-from gmem_jax.physics.state import explain, together
+from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within, work_of_bin
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.making import AS_THEY_ARE, pack_job, recipe_of, require_prepared
@@ -59,7 +59,7 @@ class Results(list[Result]):
                 *(_label(one.values[name]) for name in names),
                 one.recall.gain,
                 one.recall.fidelity,
-                explain(together(one.recall.status)),
+                explain(combined_status(one.recall.status)),
             ]
             for one in self
         ]
@@ -100,7 +100,7 @@ def sweep(
         points.append(point(values, with_values(experiment, own)))
     store = None if folder is None else Store(Path(folder))
     if store:
-        store.remember([replace(one, values=_labels(one.values)) for one in points], {}, list(vary))
+        store.write_manifest([replace(one, values=_labels(one.values)) for one in points], {}, list(vary))
     found = {one.key: store.load(one.key) for one in points if store and store.at(one.key).is_file()}
     missing = list({one.key: one for one in points if one.key not in found}.values())
     jobs = list(groups(missing, ABREAST, psutil.virtual_memory().available))
@@ -135,7 +135,7 @@ def seconds_of(jobs: Sequence[Mapping[str, Any]], cost: float = COST) -> float:
     return cost * blocks * SIDE_BY_SIDE / work_of_bin(SIDE_BY_SIDE)
 
 
-class Conductor:
+class SweepRunner:
     """A sweep as a file asks for it, done by workers on a store.
 
     Args:
@@ -279,7 +279,9 @@ class Conductor:
             self._finish(executor, makes, progress, "packs")
         points = self.points()
         failed = [(digest([self.spec.shared, values]), values, reason) for values, reason in self.impossible]
-        self.store.remember(points, self.spec.shared, self.spec.names, [(key, values) for key, values, _ in failed])
+        self.store.write_manifest(
+            points, self.spec.shared, self.spec.names, [(key, values) for key, values, _ in failed]
+        )
         for key, _, reason in failed:
             self.store.fail(key, reason)
         for key in self.store.unreadable({one.key for one in points}):

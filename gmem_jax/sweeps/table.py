@@ -10,10 +10,10 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import MEASURES, spread
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.checked import optional
-from gmem_jax.files.labelled import described, plain_cell
+from gmem_jax.files.datasets import described, plain_cell
 from gmem_jax.files.measures import EACH, of_each
-from gmem_jax.physics.state import explain, together
+from gmem_jax.files.validation import optional
+from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import WARNINGS
 
@@ -37,7 +37,7 @@ def rows(store: Store) -> list[dict[str, Any]]:
         if store.at(key).is_file():
             recall = store.load(key)
             configuration = recall.configuration
-            status = together(recall.status)
+            status = combined_status(recall.status)
             row |= {"state": "done", **{name: float(getattr(recall, name)) for name in MEASURES}}
             row |= {"status": status, "why": explain(status) if status else ""}
             row |= {
@@ -51,7 +51,7 @@ def rows(store: Store) -> list[dict[str, Any]]:
     return found
 
 
-def doubts(row: Mapping[str, Any]) -> str:
+def warnings_of(row: Mapping[str, Any]) -> str:
     """Why a point that is done is doubtful, from its row: its status and what was warned of; "" if nothing is."""
     return "; ".join(filter(None, (row["why"], row["warnings"]))) if row["state"] == "done" else ""
 
@@ -73,7 +73,7 @@ def means(table: Sequence[dict[str, Any]], names: Sequence[str], over: Sequence[
         for measure in MEASURES:
             mean, deviation, error = spread([one[measure] for one in done]) if done else (None, None, None)
             row |= {measure: mean, f"{measure}_sd": deviation, f"{measure}_se": error}
-        row["status"] = together([one["status"] for one in done]) if done else None
+        row["status"] = combined_status([one["status"] for one in done]) if done else None
         row["warnings"] = "; ".join(dict.fromkeys(one["warnings"] for one in done if one["warnings"]))
         found.append(row)
     return found

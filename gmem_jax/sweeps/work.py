@@ -28,9 +28,9 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import OtherCompressionWarning, Recall, run
 from gmem_jax.experiment.several import run_several
 from gmem_jax.files.checkpoints import Checkpoints, part_with
+from gmem_jax.files.compilation_cache import keep_programs
 from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.packs import load_pack, save_pack
-from gmem_jax.files.programs import keep_programs
 from gmem_jax.physics.material import Material
 from gmem_jax.preparation.preparation import prepare
 from gmem_jax.preparation.recipe import Recipe
@@ -157,7 +157,7 @@ def work(folder: Path, name: str) -> int:
     for job in worker.store.jobs():
         with contextlib.ExitStack() as mine:
             try:
-                mine.enter_context(worker.store.mine(job))
+                mine.enter_context(worker.store.lock(job))
             except FileFormatError:  # another worker has it
                 continue
             if not worker.store.finished(job):

@@ -13,7 +13,7 @@ import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.bench import gpu, table
 from gmem_jax.bench import measure as bench
-from gmem_jax.bench.race import Rival, Row, race
+from gmem_jax.bench.race import Candidate, Row, interleave
 
 PACK = TETRA_27
 
@@ -101,16 +101,16 @@ def test_the_table_has_ratios_to_lammps_and_to_the_baseline() -> None:
 def test_rivals_take_turns_and_the_best_counts() -> None:
     turns: list[str] = []
 
-    def rival(name: str, times: list[float]) -> Rival:
+    def rival(name: str, times: list[float]) -> Candidate:
         left = iter(times)
 
         def once() -> float:
             turns.append(name)
             return next(left)
 
-        return Rival(Row(name, "H", 1, 1), once)
+        return Candidate(Row(name, "H", 1, 1), once)
 
-    rows = race([rival("a", [3.0, 1.0, 2.0]), rival("b", [5.0, 6.0, 4.0])], repeats=3)
+    rows = interleave([rival("a", [3.0, 1.0, 2.0]), rival("b", [5.0, 6.0, 4.0])], repeats=3)
     assert turns == list("ababab")
     assert [(row.us, row.median, row.worst) for row in rows] == [(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)]
 

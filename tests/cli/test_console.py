@@ -50,7 +50,7 @@ def test_no_number_of_a_table_is_cut_however_narrow_the_terminal(
     monkeypatch.setattr(console, "out", Console(highlight=False, markup=False, width=width))
     other = Table("name", "value")
     other.add_row("a long name", "123456789.25")
-    console.emit(False, {}, tables.recall_table([ROW, ROW], CONDITIONS), other)
+    console.print_result(False, {}, tables.recall_table([ROW, ROW], CONDITIONS), other)
     said = capsys.readouterr().out
     for number in ("0.259", "0.658", "0.261", "0.901", "40", "123456789.25"):
         assert f" {number} " in said

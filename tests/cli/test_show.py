@@ -62,7 +62,7 @@ def folder(recalled: tuple[gm.Experiment, gm.Recall], tmp_path_factory: pytest.T
     save_waveforms(folder / "designed.csv", gm.waveform(np.ones((6, 4))), gm.six_signals(), design=design)
     store = Store(folder / "swept")
     points = [point({"mu": mu}, gm.replace(experiment, {"friction.mu": mu})) for mu in (0.5, 1.0)]
-    store.remember(points, {}, ["mu"])
+    store.write_manifest(points, {}, ["mu"])
     for one in points:
         store.save(one.key, found)
     return folder
@@ -71,10 +71,10 @@ def folder(recalled: tuple[gm.Experiment, gm.Recall], tmp_path_factory: pytest.T
 @pytest.fixture(scope="module")
 def net(folder: Path) -> Path:
     from gmem_jax.reading import net, training
-    from gmem_jax.reading.lessons import Lessons
+    from gmem_jax.reading.lessons import TrainingConfig
 
     path = folder / "net.msgpack"
-    training.save(path, training.Training(net.initial(Lessons(bits=1, hidden=(4,)), 0), 0, loss=0.5))
+    training.save(path, training.Training(net.initial(TrainingConfig(bits=1, hidden=(4,)), 0), 0, loss=0.5))
     return path
 
 

@@ -14,7 +14,7 @@ from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
 from gmem_jax.errors import FileFormatError
-from gmem_jax.files.home import kept, kept_pack
+from gmem_jax.files.cache import kept, kept_pack
 from gmem_jax.physics.rules import StartError
 from gmem_jax.show import summaries
 from gmem_jax.show.figure import Curve, Figure, Panel

@@ -263,7 +263,7 @@ def test_at_the_coulomb_limit_the_derivative_is_that_of_one_side(law: Any) -> No
 
 
 def test_the_classifier_is_differentiated_through_the_recall_to_the_waveform(experiment: gm.Experiment) -> None:
-    lessons = classify.Lessons(2, hidden=(16,))
+    lessons = classify.TrainingConfig(2, hidden=(16,))
     net = classify.initial(lessons, 1)
     words = gm.words(2)
 

@@ -17,7 +17,7 @@ from gmem_jax.experiment import validity as limits
 from gmem_jax.experiment.validity import compression_speed, validity
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
-from gmem_jax.physics.state import DOUBTFUL, Box, State, Status
+from gmem_jax.physics.state import WARNINGS, Box, State, Status
 from gmem_jax.simulation.loop import walls
 from gmem_jax.simulation.sample import Sample
 
@@ -132,7 +132,7 @@ def test_an_infinite_friction_is_refused_and_a_traced_one_is_impossible() -> Non
 def test_all_doubts_leave_the_numbers_and_all_else_is_fatal() -> None:
     fatal = {"STALE_PAIRS", "OUTSIDE_BOX", "NOT_FINITE", "OVERLAP_RANGE", "STEP_TOO_LARGE", "IMPOSSIBLE"}
     assert {bit.name for bit in Status if bit.fatal} == fatal
-    assert not DOUBTFUL.fatal
+    assert not WARNINGS.fatal
 
 
 SHORT = {"store": 0.2, "rest": 0.05, "hold": 0.05}

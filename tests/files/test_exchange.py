@@ -14,9 +14,9 @@ from scenes import TETRA_27, orientations
 import gmem_jax as gm
 from gmem_jax.bench import lammps
 from gmem_jax.command import app as cli
-from gmem_jax.files import exported
-from gmem_jax.files.exported import format_of, frames_of_pack
-from gmem_jax.files.foreign import load_spheres
+from gmem_jax.files import exporters
+from gmem_jax.files.exporters import format_of, frames_of_pack
+from gmem_jax.files.importers import load_spheres
 from gmem_jax.files.loads import pressure_tensor, wall_forces
 from gmem_jax.physics import grain
 from gmem_jax.preparation import imported
@@ -123,7 +123,7 @@ def test_a_series_that_cannot_be_written_leaves_nothing(
     pytest.importorskip("pyvista")
     with pytest.raises(ValueError, match="characters that XML cannot hold"):
         format_of("vtk", several=True).write(tmp_path / "a\x01.pvd", run_frames, MASS, SOLID)
-    real, written_before = exported._write_vtp, []
+    real, written_before = exporters._write_vtp, []
 
     def full(path: Path, mesh: object) -> None:
         if len(written_before) == 3:
@@ -131,7 +131,7 @@ def test_a_series_that_cannot_be_written_leaves_nothing(
         written_before.append(path)
         real(path, mesh)
 
-    monkeypatch.setattr(exported, "_write_vtp", full)
+    monkeypatch.setattr(exporters, "_write_vtp", full)
     with pytest.raises(OSError, match="no space left"):
         format_of("vtk", several=True).write(tmp_path / "a.pvd", run_frames, MASS, SOLID)
     assert not list(tmp_path.iterdir())

@@ -11,8 +11,8 @@ from scenes import TETRA_27
 import gmem_jax as gm
 from gmem_jax.bench import lammps
 from gmem_jax.command import app as cli
-from gmem_jax.files.exported import format_of, frames_of_pack
-from gmem_jax.files.foreign import load_spheres
+from gmem_jax.files.exporters import format_of, frames_of_pack
+from gmem_jax.files.importers import load_spheres
 from gmem_jax.preparation import imported
 from gmem_jax.preparation.ringing import spectrum_peak
 

@@ -15,14 +15,14 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.command import app as cli
-from gmem_jax.command.console import claim
+from gmem_jax.command.console import check_output
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import Folder, sweep, temporary
 from gmem_jax.files.packs import load_pack
 from gmem_jax.sweeps.spec import spec_of
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.sweep import Conductor
+from gmem_jax.sweeps.sweep import SweepRunner
 from gmem_jax.sweeps.table import export, rows
 
 PACK = TETRA_27
@@ -155,7 +155,7 @@ def test_names_in_a_foreign_sweep_lead_nowhere(
     (swept / "jobs" / "notes.json").write_text("mine")
     (swept / "jobs" / "00007-ab.json").write_text("{}")
     before = tree(tmp_path)
-    assert (store.jobs(), store.told()) == ([], [])
+    assert (store.jobs(), store.progress()) == ([], [])
     assert gmem(monkeypatch, "sweep", "status", swept) == 0
     assert tree(tmp_path) == before
     store.order([])
@@ -195,12 +195,12 @@ def test_a_refused_sweep_leaves_nothing(
 
 def test_an_output_that_appears_during_a_run_survives(tmp_path: Path) -> None:
     output = tmp_path / "o.txt"
-    claim(output, ".txt", force=False)
+    check_output(output, ".txt", force=False)
     output.write_text("somebody else's")
     with pytest.raises(FileExistsError, match="made by somebody else since this command began"):
         _write(output, "ours")
     assert tree(tmp_path) == {"o.txt": b"somebody else's"}
-    claim(output, ".txt", force=True)
+    check_output(output, ".txt", force=True)
     _write(output, "ours")
     assert tree(tmp_path) == {"o.txt": b"ours"}
 
@@ -213,10 +213,10 @@ def test_an_output_where_nothing_came_is_written_also_without_hard_links(
 
     for link in (os.link, refuse):
         monkeypatch.setattr(os, "link", link)
-        output = claim(tmp_path / f"{link.__name__}.txt", ".txt", force=False)
+        output = check_output(tmp_path / f"{link.__name__}.txt", ".txt", force=False)
         _write(output, "ours")
         assert output.read_text() == "ours"
-        claim(other := tmp_path / f"{link.__name__}-other.txt", ".txt", force=False)
+        check_output(other := tmp_path / f"{link.__name__}-other.txt", ".txt", force=False)
         other.write_text("else's")
         with pytest.raises(FileExistsError):
             _write(other, "ours")
@@ -231,10 +231,10 @@ def _write(path: Path, text: str) -> None:
 def test_any_name_that_a_file_may_have_can_be_written_and_longer_ones_are_refused_first(tmp_path: Path) -> None:
     for length in (200, 242, 249, 255):
         path = tmp_path / ("x" * (length - 5) + ".json")
-        _write(claim(path, ".json", force=False), "ours")
+        _write(check_output(path, ".json", force=False), "ours")
         assert path.read_text() == "ours"
     with pytest.raises(ValueError, match="too long"):
-        claim(tmp_path / ("x" * 251 + ".json"), ".json", force=False)
+        check_output(tmp_path / ("x" * 251 + ".json"), ".json", force=False)
     assert len(list(tmp_path.iterdir())) == 4
 
 
@@ -370,7 +370,7 @@ def test_a_pack_under_another_s_name_is_refused(tmp_path: Path, monkeypatch: pyt
     named.write_bytes(PACK.read_bytes())
     with pytest.raises(gm.FileFormatError, match=r"it is the pack tetra-27, not tetra-28-a"):
         load_pack("tetra-28-a")
-    made = Conductor(spec_of({"prepare": {"grains": 16}, "vary": {"mu": [0.1]}}), tmp_path / "mu", lambda _: None)
+    made = SweepRunner(spec_of({"prepare": {"grains": 16}, "vary": {"mu": [0.1]}}), tmp_path / "mu", lambda _: None)
     (job,) = made.pack_jobs()
     made.store.pack_at(job["name"]).write_bytes(PACK.read_bytes())
     with pytest.raises(gm.FileFormatError, match="files were exchanged"):

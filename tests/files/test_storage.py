@@ -18,7 +18,7 @@ from gmem_jax.experiment.record import to_dict
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import Checkpoints, load_part, locked, save_part
 from gmem_jax.files.configuration import from_dict
-from gmem_jax.files.exported import frames_of_pack
+from gmem_jax.files.exporters import frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.packs import load_stages

@@ -13,8 +13,8 @@ from gmem_jax.experiment.signals import bin_average, words
 from gmem_jax.reading import classify
 from gmem_jax.reading.training import QUICK_CHECK, STEPS
 
-SMALL = classify.Lessons(2, hidden=(32, 32))
-PAPER = classify.Lessons(3)
+SMALL = classify.TrainingConfig(2, hidden=(32, 32))
+PAPER = classify.TrainingConfig(3)
 MAKE = jax.jit(lambda data, word, combination: data.make(word, combination))
 
 
@@ -65,7 +65,7 @@ def test_an_example_is_a_shifted_scaled_word_plus_noise_of_its_rung(data: classi
 
 def test_every_set_is_as_large_as_every_other() -> None:
     bits = 7  # 128 words: |J| of a set with its noise is known to 1 / sqrt(128 * 256)
-    data = classify.examples(classify.Lessons(bits), 3)
+    data = classify.examples(classify.TrainingConfig(bits), 3)
     for shift, factor, draw in ((0, 0, 0), (20, 32, 24), (10, 0, 24), (3, 30, 6)):
         made = np.asarray(MAKE(data, jnp.arange(1 << bits), jnp.asarray((shift * 33 + factor) * 25 + draw)))
         assert np.mean(np.abs(made)) == pytest.approx(1.0, rel=1e-4 if draw == 0 else 4.0 / np.sqrt(128 * 256))
@@ -110,7 +110,7 @@ def test_held_out_combinations_are_never_trained_on(data: classify.Examples) -> 
 
 
 def test_no_two_examples_have_the_same_noise() -> None:
-    recipe = classify.Lessons(2, shifts=2, amplitudes=3, draws=3)
+    recipe = classify.TrainingConfig(2, shifts=2, amplitudes=3, draws=3)
     data = classify.examples(recipe, 0)
     word, combination = (part.ravel() for part in jnp.meshgrid(jnp.arange(4), jnp.arange(18), indexing="ij"))
     shift, factor, draw = combination // 9, combination // 3 % 3, combination % 3

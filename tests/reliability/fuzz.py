@@ -96,7 +96,7 @@ def make_samples(folder: Path) -> None:
     save_part(folder / "part.npz", (OrderedDict(rest=_sample(4, 3)), np.arange(5)))
     from gmem_jax.reading import lessons, net, training
 
-    small = lessons.Lessons(2, hidden=(8,))
+    small = lessons.TrainingConfig(2, hidden=(8,))
     training.save(folder / "net.msgpack", training.Training(net.initial(small, 0), 0, loss=0.5))
     waves = gm.waveform(np.sin(np.linspace(0.1, 3.0, 9)) * np.ones((6, 1)))
     gm.save_waveforms(folder / "waves.csv", waves, gm.six_signals())
@@ -427,7 +427,7 @@ def _without_runs() -> None:
     from gmem_jax.reading import training
 
     recalls.run = packs.prepare = measure.run = training.train = _stop  # type: ignore[assignment]
-    sweep.Conductor.run = _stop  # type: ignore[method-assign]
+    sweep.SweepRunner.run = _stop  # type: ignore[method-assign]
     for name in ("value_and_grad", "prefix_of", "memory_kernel", "simulate", "design_waveforms", "design_drive"):
         setattr(derive, name, _stop)
 

@@ -25,7 +25,7 @@ import psutil
 import gmem_jax as gm
 from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import sweep
-from gmem_jax.reading.lessons import Lessons
+from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.training import Training, initial, save, train
 from gmem_jax.sweeps.processes import CONDUCTOR
 from gmem_jax.sweeps.store import Store
@@ -83,7 +83,7 @@ def deletion(tries: int, chance: random.Random) -> Counter[str]:
     acts: dict[str, Callable[[Path], object]] = {
         "parts": lambda folder: Checkpoints(folder, {"seed": 1})("one", lambda _: np.zeros(1)),
         "parts, --restart": lambda folder: Checkpoints(folder, {"seed": 1}, restart=True).discard(),
-        "sweep": lambda folder: (Store(folder).order([]), Store(folder).forgive()),
+        "sweep": lambda folder: (Store(folder).order([]), Store(folder).clear_failures()),
         "sweep, looked at": lambda folder: rows(Store(folder, make=False)),
         "leftovers": lambda folder: sweep(folder.resolve()),
         "lock": lambda folder: _lock(folder / "o"),
@@ -131,7 +131,7 @@ def identity(tries: int, chance: random.Random) -> Counter[str]:
             for part in ("one", "two"):
                 Checkpoints(folder / f"{seed}", {"seed": seed})(part, lambda _: np.zeros(1))
         for seed in (0, 1):
-            save(folder / f"net-{seed}", Training(initial(Lessons(2), seed), seed))
+            save(folder / f"net-{seed}", Training(initial(TrainingConfig(2), seed), seed))
         kinds = {
             "points": (sorted((folder / "mu" / "points").iterdir()), lambda: rows(Store(folder / "mu", make=False))),
             "parts": (sorted(folder.glob("[12]/*.npz")), lambda: _read_parts(folder)),
@@ -162,7 +162,7 @@ def _read_parts(folder: Path) -> None:
 
 def _read_nets(folder: Path) -> None:
     for seed in (0, 1):
-        train(Lessons(2), seed, budget=0.0, most_steps=0, checkpoint=folder / f"net-{seed}")
+        train(TrainingConfig(2), seed, budget=0.0, most_steps=0, checkpoint=folder / f"net-{seed}")
 
 
 def concurrency(tries: int) -> Counter[str]:

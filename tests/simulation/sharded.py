@@ -22,7 +22,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.physics.state import Box, replicate
-from gmem_jax.physics.step import System, start, together
+from gmem_jax.physics.step import System, mark_varying, start
 
 REPLICAS, STEPS, BINS = 8, 5, 2
 jax.config.update("jax_enable_x64", True)  # before the first array
@@ -57,7 +57,7 @@ class Runs:
             lower, still = jnp.zeros_like(upper) + PACK.lower[:, None], jnp.zeros_like(upper)
             return march(system, state, Box(lower, upper, still, still - rate), 0.3, 0.0)
 
-        return jax.lax.scan(one_bin, together((state, mu, rates))[0], STEPS * jnp.arange(BINS))
+        return jax.lax.scan(one_bin, mark_varying((state, mu, rates))[0], STEPS * jnp.arange(BINS))
 
     def loss(self, mu: Any, rates: Any) -> jax.Array:
         """One number for each replica, [B]."""

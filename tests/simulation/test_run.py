@@ -13,7 +13,7 @@ import gmem_jax as gm
 from gmem_jax.experiment.recall import finish
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.search import PairFinder
-from gmem_jax.physics.state import State, Status, replicate, together
+from gmem_jax.physics.state import State, Status, combined_status, replicate
 from gmem_jax.physics.step import System, start
 from gmem_jax.simulation import stability
 from gmem_jax.simulation.loop import Simulation
@@ -168,7 +168,7 @@ def test_a_traced_recall_tells_a_stale_list_from_a_grain_outside_and_a_step_too_
     recall = jax.jit(lambda position, t0: gm.recall(gm.replace(experiment, {"pack.position": position, "t0": t0})))
 
     def said(position: jax.Array, t0: float = 60.0) -> str:
-        return gm.explain(together(recall(position, t0).status))
+        return gm.explain(combined_status(recall(position, t0).status))
 
     assert "use gm.run, which makes it anew" in said(PACK.position.at[0].add(0.2))
     assert "a grain left the box" in said(PACK.position.at[0, 2].add(20.0))

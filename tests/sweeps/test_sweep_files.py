@@ -21,16 +21,16 @@ from gmem_jax.sweeps.executors import Executor, Submitted, executor
 from gmem_jax.sweeps.plan import plan, point
 from gmem_jax.sweeps.spec import read_spec, spec_of
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.sweep import Conductor, _labels
-from gmem_jax.sweeps.table import doubts, export, means, rows
+from gmem_jax.sweeps.sweep import SweepRunner, _labels
+from gmem_jax.sweeps.table import export, means, rows, warnings_of
 from gmem_jax.sweeps.work import run_group
 
 PACK = TETRA_27
 MEMORY = 1 << 33
 
 
-def conductor(folder: Path, **tables: object) -> Conductor:
-    return Conductor(spec_of(tables), folder / "store", lambda _: None)
+def runner(folder: Path, **tables: object) -> SweepRunner:
+    return SweepRunner(spec_of(tables), folder / "store", lambda _: None)
 
 
 def run_job(name: str, points: list[str]) -> dict[str, Any]:
@@ -128,7 +128,7 @@ UNKNOWN = {
 def test_impossible_points_are_refused_before_anything_is_computed(tmp_path: Path, name: str) -> None:
     tables, problem = UNKNOWN[name]
     with pytest.raises(ValueError, match=problem):
-        conductor(tmp_path, **tables).check()
+        runner(tmp_path, **tables).check()
 
 
 def test_a_sweep_is_utf_8_with_or_without_a_byte_order_mark(tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_what_is_no_number_is_refused_in_a_written_experiment(part: str, name: s
 
 def recipes(folder: Path, **tables: object) -> list[tuple[float, float]]:
     """delta0 and rigidity of the walls of the packs that a sweep makes."""
-    made = conductor(folder, **tables)
+    made = runner(folder, **tables)
     made.check()
     return [(job["recipe"]["delta0"], job["material"]["wall_rigidity"]) for job in made.pack_jobs()]
 
@@ -190,12 +190,12 @@ def test_a_pack_that_was_prepared_for_another_experiment_is_refused_unless_wante
 ) -> None:
     tables = {"experiment": {"pack": "tetra-325-a"}, "vary": {name: [float(was), 0.08]}}
     with pytest.raises(ValueError, match=rf"{name} = 0.08, and tetra-325-a was prepared with {was}: .*\[prepare\]"):
-        conductor(tmp_path, **tables).check()
-    wanted = conductor(tmp_path, **tables, run={"packs_as_they_are": True})
+        runner(tmp_path, **tables).check()
+    wanted = runner(tmp_path, **tables, run={"packs_as_they_are": True})
     wanted.check()
     assert [value_at(one.experiment, PATHS[name]) for one in wanted.points()] == [float(was), 0.08]
     with pytest.raises(gm.FileFormatError, match=r"packs_as_they_are in \[run\] must be true or false, got 1"):
-        conductor(tmp_path, **tables, run={"packs_as_they_are": 1})
+        runner(tmp_path, **tables, run={"packs_as_they_are": 1})
 
 
 PATHS = {"delta0": "delta0", "wall_rigidity": "material.wall_rigidity"}
@@ -214,14 +214,14 @@ def test_what_is_warned_of_in_a_run_stands_in_the_table(
 
     monkeypatch.setattr("gmem_jax.sweeps.work.run", doubtful)
     store, here = Store(tmp_path), point({"delta0": 0.04}, other)
-    store.remember([here], {}, ["delta0"])
+    store.write_manifest([here], {}, ["delta0"])
     with pytest.warns(OtherCompressionWarning), pytest.warns(UserWarning, match="something is odd"):
         run_group([here.key], [other], store=store)
     (row,) = rows(store)
     assert row["status"] & int(gm.Status.OTHER_COMPRESSION)
     assert "cycled with another delta0" in row["why"]
     assert row["warnings"] == "something is odd"
-    assert doubts(row) == f"{row['why']}; something is odd"
+    assert warnings_of(row) == f"{row['why']}; something is odd"
     (mean,) = means([row, row], ["delta0"], ["delta0"])
     assert (mean["status"], mean["warnings"]) == (row["status"], row["warnings"])
 
@@ -239,7 +239,7 @@ def test_signals_of_points_that_have_fewer_are_filled_up_and_counted(
             return kept[key]
 
     store = Kept(tmp_path / "store")
-    store.remember([], {}, ["signals"], [("a", {"signals": "two"}), ("b", {"signals": "one"}), ("c", {})])
+    store.write_manifest([], {}, ["signals"], [("a", {"signals": "two"}), ("b", {"signals": "one"}), ("c", {})])
     for key in kept:
         store.at(key).write_text("")
     about = export(store, tmp_path / "table.nc")
@@ -256,7 +256,7 @@ def test_signals_of_points_that_have_fewer_are_filled_up_and_counted(
 
 
 def test_points_that_differ_in_replica_parameters_become_one_run(tmp_path: Path) -> None:
-    made = conductor(
+    made = runner(
         tmp_path,
         experiment={"t0": 150.0},
         vary={"pack": [str(PACK), "tetra-325-a"], "mu": [0.1, 0.2, 0.4, 0.6, 0.8, 1.0], "background": ["sub0", "sub2"]},
@@ -432,9 +432,9 @@ class Killed(Executor):
 def test_runs_that_were_begun_go_on_as_they_were(tmp_path: Path) -> None:
     values = {"experiment": {"pack": str(PACK), "t0": 150.0}, "vary": {"mu": [0.1 * n for n in range(1, 9)]}}
     first, again = Killed(), Killed()
-    conductor(tmp_path, **values).run(first, silent)
+    runner(tmp_path, **values).run(first, silent)
     assert [len(job["points"]) for job in first.jobs] == [4, 4]
-    conductor(tmp_path, **values).run(again, silent)
+    runner(tmp_path, **values).run(again, silent)
     assert [job["name"] for job in again.jobs] == [
         first.jobs[1]["name"]
     ]  # not two runs of two, which two workers would be given anew
@@ -457,7 +457,7 @@ def test_what_was_begun_outlives_another_figure_s_jobs(tmp_path: Path) -> None:
 
 
 def test_why_a_pack_could_not_be_made_is_said_of_its_points(tmp_path: Path) -> None:
-    made = conductor(tmp_path, prepare={"grains": 16}, vary={"mu": [0.1, 0.2]})
+    made = runner(tmp_path, prepare={"grains": 16}, vary={"mu": [0.1, 0.2]})
     (job,) = made.pack_jobs()
     made.store.fail(job["name"], "settle: not at rest")
     made.run(Killed(), silent)
@@ -485,7 +485,7 @@ def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
     store.order([job])
     for name in ("abc-0", "old"):
         (tmp_path / "parts" / name).mkdir()
-    with store.mine(job), atomic(store.at("key")) as temporary:
+    with store.lock(job), atomic(store.at("key")) as temporary:
         Store(tmp_path).order([])  # another sweep is asked for meanwhile, or somebody looks
         assert temporary.is_file()
         assert [path.name for path in (tmp_path / "parts").iterdir()] == ["abc-0"]
@@ -496,7 +496,7 @@ def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
 def test_no_cell_of_a_table_is_a_formula(tmp_path: Path) -> None:
     store = Store(tmp_path / "mu")
     values = ["=HYPERLINK(1)", "+1+1", "-2", "@x", "tetra-325-a", -2.0]
-    store.remember([], {}, ["pack"], [(f"key{number}", {"pack": value}) for number, value in enumerate(values)])
+    store.write_manifest([], {}, ["pack"], [(f"key{number}", {"pack": value}) for number, value in enumerate(values)])
     export(store, tmp_path / "o.csv")
     with (tmp_path / "o.csv").open() as file:
         told = [row["pack"] for row in csv.DictReader(file)]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from gmem_jax.physics.contact.friction import TANGENTIAL_DAMPING, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
-from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle
+from gmem_jax.physics.pytree import Scalar, parameter, pytree, validate
 
 
 @pytree
@@ -34,7 +34,7 @@ class Hooke:
     spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
 
     def __post_init__(self) -> None:
-        settle(self)
+        validate(self)
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> jax.Array:
         """No elastic force yet: zeros, [contacts, 3, replicas]."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from gmem_jax.physics.contact.friction import TANGENTIAL_DAMPING, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle, static
+from gmem_jax.physics.pytree import Scalar, parameter, pytree, static, validate
 from gmem_jax.physics.rotation import cross, dot
 
 MOST_POINTS = 10_000  # of a history; the paper has 100
@@ -83,7 +83,7 @@ class Mindlin:
     variant: Literal["averaged", "exact", "paper"] = static("averaged", "m2: averaged, exact or paper")
 
     def __post_init__(self) -> None:
-        settle(self)
+        validate(self)
         if not 2 <= self.points <= MOST_POINTS:
             raise ValueError(f"Mindlin.points must be 2 to {MOST_POINTS}, got {self.points}")
         if self.variant not in ("averaged", "exact", "paper"):

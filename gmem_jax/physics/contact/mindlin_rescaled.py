@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from gmem_jax.physics.contact.friction import TANGENTIAL_DAMPING, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pytree import Scalar, parameter, pytree, settle
+from gmem_jax.physics.pytree import Scalar, parameter, pytree, validate
 
 
 @pytree
@@ -51,7 +51,7 @@ class MindlinRescaled:
     spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
 
     def __post_init__(self) -> None:
-        settle(self)
+        validate(self)
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> RescaledHistory:
         """No elastic force and no overlap yet."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 
-from gmem_jax.files.home import kept
+from gmem_jax.files.cache import kept
 
 SWITCH = "GMEM_COMPILE_CACHE"  # another folder, or "off"
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.checked import optional
 from gmem_jax.files.measures import of_each
 from gmem_jax.files.schemas import RECALL, STAGE
+from gmem_jax.files.validation import optional
 from gmem_jax.simulation.protocol import BINS
 
 

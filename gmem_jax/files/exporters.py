@@ -13,8 +13,8 @@ import numpy as np
 
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.checked import optional
 from gmem_jax.files.loads import pressure_tensor, wall_forces
+from gmem_jax.files.validation import optional
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import candidates
 from gmem_jax.simulation.frames import Frames, sphere_places

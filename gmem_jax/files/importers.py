@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.files.checked import optional, refusing, require, require_finite
 from gmem_jax.files.lammpsdata import SAME, Read, one_value, read_lammps
+from gmem_jax.files.validation import optional, refusing, require, require_finite
 
 LARGEST = 1 << 30  # bytes of a file
 _GSD = b"\xdf\x65\xdf\x65\xdf\x65\xdf\x65"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.files.checked import is_number, numbers, require, require_fields, require_finite, title, whole
+from gmem_jax.files.validation import is_number, numbers, require, require_fields, require_finite, title, whole
 from gmem_jax.simulation.frames import sphere_places
 
 UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
