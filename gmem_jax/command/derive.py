@@ -110,7 +110,8 @@ def gradient_command(
             "seconds": time.perf_counter() - began,
             "status": 0,
         }
-        save_result(output, schemas.GRADIENT, {**result, "configuration": describe(experiment, result["seconds"])})
+        result["configuration"] = describe(experiment, result["seconds"])
+        save_result(output, schemas.GRADIENT, result)
     summary = summaries.of_gradient(result)
     if drawn:
         with drawing(drawn):

@@ -51,14 +51,12 @@ def show(
     if plot:
         refuse_idle("beside --plot", "csv")
     if not plot or plot == "list":
-        refuse_idle("unless something is drawn with --plot", "against", "force")
+        refuse_idle("unless something is drawn with --plot", "against", "force", "signal")
     elif plot.lower() not in _OF_STAGES:
         refuse_idle(f"with --plot {plot}: only pictures of stages ({', '.join(QUANTITIES)}) have it", "against")
     if csv:
         refuse_idle("beside --csv", "as_json")
     chosen = _numbers(signal)
-    if chosen and (not plot or plot == "list"):
-        raise InputError(f"--signal {signal}: chooses what is drawn; say what with --plot")
     axes = {"x": x, "by": sweep.names_of(by), "over": sweep.names_of(over)}
     if file.is_dir():
         if chosen:

@@ -296,7 +296,8 @@ def of_gradient(facts: dict[str, Any], name: str = "") -> Summary:
     """What is said of the derivatives of a fidelity, from their result."""
     slopes, configuration = facts["gradient"], facts.get("configuration", {})
     title = f"{cell(facts['pack'])}: F = {facts['fidelity']:.4f}"
-    units = {"stiffness": " per E R" if configuration.get("friction") == "hooke" else " per E R^0.5"}
+    law = configuration.get("friction")
+    units = {"stiffness": " per E R" if law == "hooke" else " per E R^0.5"} if law else {}
     lines = [title]
     lines += [f"dF/d{key} = {value:.5g}{units.get(key, '')}" for key, value in slopes.items() if is_number(value)]
     rows = enumerate(slopes["waveform"], 1)

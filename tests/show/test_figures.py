@@ -10,6 +10,7 @@ from gmem_jax.show import render_matplotlib, render_plotly
 from gmem_jax.show.figure import Curve, Figure, Image, Panel
 from gmem_jax.show.recalls import recall_figure
 from gmem_jax.show.stages import PAGE, QUANTITIES
+from gmem_jax.show.summaries import of_gradient
 from gmem_jax.simulation.sample import MEASURED
 
 X = np.linspace(0.0, 1.0, 5)
@@ -68,3 +69,11 @@ def test_a_recall_without_its_configuration_is_drawn_with_the_names_of_an_experi
     for known, names in ((None, ["signal 1", "signal 2"]), (experiment, ["0", "1"])):
         drawn = gm.plot(bare, "signals", known)
         assert [axis.get_title() for axis in drawn.figure.axes[:2]] == names
+
+
+def test_the_unit_of_a_derivative_is_that_of_the_law_and_none_where_the_law_is_not_known() -> None:
+    slopes = {"stiffness": 2.0, "waveform": [[1.0]]}
+    result = {"pack": "a", "fidelity": 0.5, "places": [[0.5]], "gradient": slopes}
+    for law, unit in (("hooke", " per E R"), ("mindlin", " per E R^0.5"), ("", "")):
+        known = {"configuration": {"friction": law}} if law else {}
+        assert f"dF/dstiffness = 2{unit}\n" in str(of_gradient({**result, **known}).lines[0])
