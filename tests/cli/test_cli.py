@@ -213,7 +213,10 @@ BAD = [
     ),
     (["prepare", "--grains", "0", "-o", "{out}"], "grains must be at least 12 to jam between six walls, got 0"),
     (["prepare", "--overlap", "1.0", "-o", "{out}"], "overlap must be in [0, 1), got 1"),
-    (["prepare", "--shape", "sphere", "--overlap", "0.3", "-o", "{out}"], "--overlap does nothing with --shape sphere: it is that of a tetra grain"),
+    (
+        ["prepare", "--shape", "sphere", "--overlap", "0.3", "-o", "{out}"],
+        "--overlap does nothing with --shape sphere: it is that of a tetra grain",
+    ),
     (["prepare", "--shape", "nowhere.txt", "-o", "{out}"], "nowhere.txt: no such file"),
     (["prepare", "--pressure", "-2", "-o", "{out}"], "pressure must be in (0, inf) E, got -2"),
     (["prepare", "--grains", "12", "--filling", "0.05", "-o", "{out}"], "flatter than a grain (3.0 R)"),

@@ -193,7 +193,7 @@ def test_who_must_leave_keeps_a_checkpoint_first(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="7"):
         kept("one", run)
     assert kept.begun() == 1
-    went_on = kept("one", lambda checkpoint: checkpoint.begun())
+    went_on = kept("one", lambda checkpoint: checkpoint.restore())
     np.testing.assert_array_equal(went_on, np.ones(3))
 
 
@@ -221,7 +221,7 @@ def test_ctrl_c_says_how_to_go_on(
 def test_ctrl_c_before_a_run_says_that_nothing_was_written(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
-    def interrupt(*_: Any) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(recalls, "batch_for", interrupt)
