@@ -63,10 +63,10 @@ GALLERY = "fig03"  # pictures of packs, which may have to be made
 
 
 def _run(spec: Spec, folder: Path, executor: Executor | None, progress: Progress, say: Tell) -> SweepRunner:
-    """Do what is missing of a sweep, whose conductor has done it."""
-    conductor = SweepRunner(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
-    conductor.run(executor or Processes(), progress)
-    return conductor
+    """Do what is missing of a sweep, whose runner has done it."""
+    runner = SweepRunner(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
+    runner.run(executor or Processes(), progress)
+    return runner
 
 
 def _target(folder: Path, name: str, scale: str, suffix: str = ".png") -> Path:
@@ -163,12 +163,12 @@ def check_claims(
     (named,) = packs(size, size.grains, 1)
     (spheres,) = packs(size, size.grains, 1, shape="sphere")
     spec = Spec(shared={"t0": size.t0}, extra=(*claims.points([named]), spheres))
-    conductor = _run(spec, folder, executor, progress, say)
-    store = conductor.store
+    runner = _run(spec, folder, executor, progress, say)
+    store = runner.store
     if failed := _failed(store):
         raise RunFailedError(failed[0])
     runs = [(row["values"], store.load(row["key"])) for row in store.card()["points"]]
-    tetra, sphere = (conductor.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
+    tetra, sphere = (runner.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
     found = claims.verdicts(tetra, size.t0, runs[:-1], {"sphere": sphere})
     with atomic(_target(folder, "claims", scale, ".json")) as path:
         path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n", encoding="utf-8")

@@ -16,7 +16,7 @@ from typing import Any
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.validation import optional
 from gmem_jax.sweeps import slurm, work
-from gmem_jax.sweeps.processes import CONDUCTOR, PATIENCE, job_name, known_by, python, safe_path
+from gmem_jax.sweeps.processes import RUNNER, PATIENCE, job_name, known_by, python, safe_path
 from gmem_jax.sweeps.store import Store
 
 POLL = 0.5  # s
@@ -60,7 +60,7 @@ class Executor(ABC):
         total = sum(job["work"] for job in jobs) or 1.0
         deaths, furthest, open_ = 0, -1.0, jobs
         try:
-            store.record(CONDUCTOR, known_by(os.getpid()))
+            store.record(RUNNER, known_by(os.getpid()))
             while True:
                 open_ = [job for job in open_ if not store.finished(job)]
                 now = total - sum(job["work"] for job in open_)
@@ -83,7 +83,7 @@ class Executor(ABC):
                 time.sleep(POLL)
         finally:
             self.stop()
-            for name in (CONDUCTOR, *names):
+            for name in (RUNNER, *names):
                 store.erase(name)
 
     def said(self, store: Store) -> str:

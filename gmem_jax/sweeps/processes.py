@@ -14,7 +14,7 @@ from gmem_jax.sweeps import slurm
 from gmem_jax.sweeps.store import Store
 
 PATIENCE = 10.0  # s for a process to end by itself, before it is killed
-CONDUCTOR = "runner"  # whose workers they are
+RUNNER = "runner"  # whose workers they are
 SAFE = {"PYTHONSAFEPATH": "1"}
 """Environment of Python processes that somebody else starts for us; see `python`."""
 
@@ -83,7 +83,7 @@ def stop(store: Store) -> tuple[list[str], list[str]]:
     """
     ended, left = [], []
     records = store.records()
-    for worker in sorted(records, key=lambda name: (name != CONDUCTOR, name)):
+    for worker in sorted(records, key=lambda name: (name != RUNNER, name)):
         who = records[worker]
         if "slurm" in who:
             number = str(who["slurm"])

@@ -254,7 +254,7 @@ def _workers(folder: Path, sweep: subprocess.Popen[str]) -> list[psutil.Process]
         assert time.monotonic() < deadline
         time.sleep(0.1)
     found = Store(folder / "mu", make=False).records()
-    return [psutil.Process(who["pid"]) for worker, who in found.items() if worker != processes.CONDUCTOR]
+    return [psutil.Process(who["pid"]) for worker, who in found.items() if worker != processes.RUNNER]
 
 
 @pytest.mark.slow
@@ -269,7 +269,7 @@ def test_no_worker_outlives_its_sweep(tmp_path: Path, how: str) -> None:
     if how == "stop":
         command = [sys.executable, "-P", "-c", ENTRY, "sweep", "stop", "mu"]
         told = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True).stdout
-        assert "ended conductor, process" in told
+        assert "ended runner, process" in told
     elif how == "interrupted":
         workers[0].suspend()  # which would be waited for without end
         sweep.send_signal(signal.SIGINT)

@@ -27,7 +27,7 @@ from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import sweep
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.training import Training, initial, save, train
-from gmem_jax.sweeps.processes import CONDUCTOR
+from gmem_jax.sweeps.processes import RUNNER
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.table import rows
 
@@ -203,7 +203,7 @@ def ended(tries: int, chance: random.Random) -> Counter[str]:
             workers = []
             for worker, who in Store(folder / "mu", make=False).records().items():
                 with contextlib.suppress(psutil.Error):
-                    workers += [psutil.Process(who["pid"])] * (worker != CONDUCTOR)
+                    workers += [psutil.Process(who["pid"])] * (worker != RUNNER)
             if workers and chance.random() < 0.3 and kind == signal.SIGINT:
                 workers[0].suspend()
             sweep_.send_signal(kind)
