@@ -16,7 +16,7 @@ from typing import Any
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.validation import optional
 from gmem_jax.sweeps import slurm, work
-from gmem_jax.sweeps.processes import RUNNER, PATIENCE, job_name, known_by, python, safe_path
+from gmem_jax.sweeps.processes import PATIENCE, RUNNER, job_name, known_by, python, safe_path
 from gmem_jax.sweeps.store import Store
 
 POLL = 0.5  # s
