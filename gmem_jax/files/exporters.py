@@ -14,6 +14,7 @@ import numpy as np
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.loads import pressure_tensor, wall_forces
+from gmem_jax.files.ours import place
 from gmem_jax.files.validation import optional
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import candidates
@@ -195,7 +196,7 @@ def write_pvd(path: Path, frames: Frames, mass: float, material: Material) -> No
         temporary.write_text(head + "\n".join(rows) + "\n</Collection></VTKFile>\n", encoding="utf-8")
         folder.mkdir(exist_ok=True)
         for whole in Path(made).iterdir():
-            whole.replace(folder / whole.name)
+            place(whole, folder / whole.name)
 
 
 def _points(frames: Frames, number: int, material: Material) -> Any:

@@ -16,12 +16,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from gmem_jax.errors import FileFormatError
+
 _TEMPORARY = re.compile(r"\.gmem-([0-9a-f]{12})-[0-9a-f]{12}\.tmp")
 _new: set[Path] = set()  # outputs that were free when a command claimed them
-
-
-class FileFormatError(ValueError):
-    """A file that is not what it should be; the message names the file, what is wrong and what would be right."""
 
 
 def _tag(name: str) -> str:

@@ -4,8 +4,8 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.files.schemas import STAGE
 from gmem_jax.simulation.protocol import BINS
 
-FIXED_BYTES = 1.0e5  # of a file: names, units, scales; measured 1.0e5 on recalls, 1.4e5 on packs with their stages
-PACK_BYTES = 425.0  # of a grain and its candidates, on packs of 325 to 10,240
+FIXED_BYTES = 1.0e5  # of a file: names, units, scales; measured 1.0e5 on recalls, 2.5e5 on packs with their stages
+PACK_BYTES = 408.0  # of a grain and its candidates, on packs of 325 to 10,240
 FRAME_BYTES = 460.0  # of a grain in a configuration, with its ten contacts
 _SAMPLE = 8 * sum(3 if "axis" in array.shape else 1 for array in STAGE.values())  # of a replica in a bin
 
@@ -19,7 +19,7 @@ def recall_bytes(experiment: Experiment, frames: int = 0) -> float:
 
 def pack_bytes(grains: int, frames: int = 0) -> float:
     """Of the file of a pack with so many configurations of its preparation, about."""
-    return 1.4 * FIXED_BYTES + (PACK_BYTES + FRAME_BYTES * frames) * grains
+    return 2.5 * FIXED_BYTES + (PACK_BYTES + FRAME_BYTES * frames) * grains
 
 
 def in_bytes(count: float) -> str:

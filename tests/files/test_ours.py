@@ -345,7 +345,7 @@ def test_a_checkpoint_of_another_part_is_not_gone_on_from(tmp_path: Path) -> Non
 
     def die(checkpoint: Any) -> None:
         checkpoint._wait = 0.0
-        checkpoint.reached(lambda: np.full(3, 7.0))
+        checkpoint.maybe_save(lambda: np.full(3, 7.0))
         raise KilledError
 
     parts, begun = Checkpoints(tmp_path, {"seed": 1}), []
@@ -354,7 +354,7 @@ def test_a_checkpoint_of_another_part_is_not_gone_on_from(tmp_path: Path) -> Non
     (tmp_path / "two.now").write_bytes((tmp_path / "one.now").read_bytes())
 
     def look(checkpoint: Any) -> np.ndarray:
-        begun.append(checkpoint.begun())
+        begun.append(checkpoint.restore())
         return np.zeros(1)
 
     parts("one", look)

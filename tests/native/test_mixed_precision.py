@@ -113,8 +113,6 @@ def test_results_say_their_precision_and_are_kept_apart() -> None:
     assert (double.precision, mixed.precision) == ("double", "mixed")
     assert key_of_run(mixed) != key_of_run(double)
     assert from_dict(to_dict(mixed), PACK).precision == "mixed"
-    older = {name: value for name, value in to_dict(double).items() if name != "precision"}
-    assert from_dict(older, PACK).precision == "double"
 
 
 def test_a_recall_in_mixed_precision_is_that_in_double() -> None:
