@@ -103,9 +103,8 @@ def cores() -> list[int]:
 def threads(cpus: int) -> str:
     """The threads of a worker with so many CPUs: one on each, or fewer if GMEM_THREADS asks for fewer."""
     told = os.environ.get(THREADS, "")
-    return (
-        told if told and not (told.isdecimal() and int(told) > cpus) else str(cpus)
-    )  # what is no number is told there
+    more = told.isdecimal() and int(told) > cpus
+    return told if told and not more else str(cpus)  # the worker refuses what is no number
 
 
 class Processes(Executor):

@@ -242,7 +242,7 @@ def test_a_gas_too_thin_for_any_candidate_can_still_be_observed():
     grains = make_grains([[5.0, 5.0, 5.0], [15.0, 15.0, 15.0]])
     pairs = tabulate(np.zeros((2, 0), int), np.zeros((2, 3, 1)), np.full(3, 20.0), 2.4, 1)
     system = dynamics.System(SPHERE, Hooke(), pairs)
-    sample = jax.jit(measure)(system, blank_state(system, grains), box, jnp.zeros((3, 1)))
+    sample = jax.jit(measure)(system, blank_state(system, grains), box, jnp.zeros((3, 1)), 0.0)
     assert candidates(pairs).shape == (2, 0)
     assert (float(sample.coordination[0]), float(sample.contacts[0])) == (0.0, 0.0)
     assert float(sample.largest_overlap[0]) <= 0.0

@@ -11,7 +11,7 @@ from scenes import TETRA_27
 import gmem_jax as gm
 from gmem_jax.experiment.record import fingerprint, signals_to_dict, to_dict
 from gmem_jax.experiment.signals import bit_width, words
-from gmem_jax.files.configuration import from_dict, signals_from_dict
+from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.named import named_experiment, named_signals
 from gmem_jax.physics.contact.kinematics import transport
 from gmem_jax.physics.contact.path import led_contact
@@ -90,15 +90,6 @@ def test_words_that_do_not_fit_and_pads_of_other_signals_are_refused() -> None:
         words(3, pad=0.5, width=1.5)
     with pytest.raises(ValueError, match="are for words:L only"):
         named_signals("six", 3.0)
-
-
-def test_files_from_before_the_choices_read_as_the_defaults() -> None:
-    experiment = gm.Experiment(PACK, words(2), t0=150.0)
-    older = to_dict(experiment)
-    del older["shear_share"], older["friction"]["spinning"], older["material"]["wall_rigidity"]
-    older["signals"] = {"kind": "words", "bits": 2}
-    older["material"]["tangential_damping"] = 0.069
-    assert to_dict(from_dict(older, PACK)) == to_dict(experiment)
 
 
 def test_every_value_is_tried_once_on_every_pack() -> None:

@@ -1,6 +1,7 @@
 """What a sweep file may say, how its points become runs, and what is refused in one line."""
 
 import csv
+import os
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -113,7 +114,7 @@ UNKNOWN = {
     ),
     "recipe": ({"vary": {"prepare.delta0": ["0.05"]}}, 'prepare.delta0 must be a number, got "0.05"'),
     "seeds": ({"vary": {"prepare.seed": [True]}}, "prepare.seed must be a whole number, got true"),
-    "large seeds": ({"vary": {"prepare.seed": [1 << 63]}}, "seed must be a whole number from 0 to 9007199254740991"),
+    "large seeds": ({"vary": {"prepare.seed": [1 << 63]}}, r"seed must be in \[0, 9007199254740991\], got 92233"),
     "spheres": ({"prepare": {"shape": "sphere", "overlap": 0.3}, "vary": {"mu": [1]}}, "overlap does nothing"),
     "dt": ({"experiment": {"pack": str(PACK), "dt": 0.2, "steps": 30}, "vary": {"mu": [1]}}, "dt does nothing"),
     "two names": (
@@ -336,7 +337,12 @@ def test_a_worker_has_no_more_threads_than_it_is_told_or_has_cpus(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: str | None, threads: str
 ) -> None:
     started: list[dict[str, str]] = []
-    monkeypatch.setattr("gmem_jax.sweeps.executors.subprocess.Popen", lambda *_, env, **__: started.append(env))
+
+    def start(*_: Any, env: dict[str, str], **__: Any) -> Any:
+        started.append(env)
+        return SimpleNamespace(pid=os.getpid())
+
+    monkeypatch.setattr("gmem_jax.sweeps.executors.subprocess.Popen", start)
     monkeypatch.setattr("gmem_jax.sweeps.executors.cores", lambda: [0, 1, 2, 3])
     if told is None:
         monkeypatch.delenv("GMEM_THREADS", raising=False)
