@@ -242,7 +242,11 @@ def test_nothing_changes_where_programs_are_not_compiled_as_a_whole(march: nativ
 
     compiled = jax.jit(jax.value_and_grad(pressure))(jnp.asarray(0.3))
     with jax.disable_jit():
-        assert_close(jax.value_and_grad(pressure)(jnp.asarray(0.3)), compiled)
+        plain = jax.value_and_grad(pressure)(jnp.asarray(0.3))
+    assert_close(plain[0], compiled[0])
+    # At rest the pressure, 0.013, hardly depends on dt: its slope, 8e-12, is what large terms leave of one another. The
+    # two ways of compiling round them differently, at most by the last digit of the pressure in a step.
+    np.testing.assert_allclose(plain[1], compiled[1], rtol=0.0, atol=np.finfo(float).eps * float(plain[0]) / 0.3)
 
 
 def test_second_derivatives_are_refused_in_one_line() -> None:
