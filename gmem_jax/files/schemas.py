@@ -262,7 +262,7 @@ import h5py
 import xarray
 
 h5py.File("recall.h5")["p_sig"].attrs["units"]
-xarray.open_dataset("recall.h5", engine="h5netcdf").p_sig.sel(signal="signal 1").plot()
+xarray.open_dataset("recall.h5", engine="h5netcdf").p_sig.isel(signal=0).plot()
 xarray.open_dataset("recall.h5", engine="h5netcdf", group="stages/readout").pressure
 ```
 

@@ -313,7 +313,7 @@ def test_claims_are_judged_by_their_runs(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(reproducing, "packs", lambda *_, **__: [{"pack": PACK}])
     monkeypatch.setattr(reproducing, "quick_cost", lambda points: 1e-7)
-    found = reproducing.judge(tmp_path, "tiny", Here(), silent, lambda line: None)
+    found = reproducing.check_claims(tmp_path, "tiny", Here(), silent, lambda line: None)
     assert [row["claim"] for row in json.loads((tmp_path / "claims-tiny.json").read_text())] == [v.claim for v in found]
     assert len(found) == 8
     by_claim = {verdict.claim: verdict for verdict in found}

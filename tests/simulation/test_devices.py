@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import TESTS
 
 from gmem_jax import native
 
@@ -19,7 +20,9 @@ BUILT, REASON = native.available()
 
 def start(devices: int, *arguments: object) -> subprocess.Popen[str]:
     """A process whose CPU counts as some devices."""
-    environment = {**os.environ, "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+    paths = os.pathsep.join([str(TESTS), *filter(None, [os.environ.get("PYTHONPATH")])])
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    environment = {**os.environ, "PYTHONPATH": paths, "XLA_FLAGS": flags}
     command = [sys.executable, str(HERE / "several_devices.py"), *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
