@@ -47,6 +47,7 @@ from gmem_jax.simulation.observers import forward
 from gmem_jax.simulation.protocol import Stage
 from gmem_jax.simulation.runner import status_of
 from gmem_jax.simulation.strain import smallest_box
+from gmem_jax.sweeps.executors import cores
 
 LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
 T0 = 1.8e3  # duration of the compression that is timed, t_c, if not chosen
@@ -63,12 +64,7 @@ def processor() -> str:
     file = Path("/proc/cpuinfo")
     lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    return f"{names[0] if names else platform.processor()}, {cores()} cores"
-
-
-def cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return f"{names[0] if names else platform.processor()}, {len(cores())} cores"
 
 
 def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str, t0: float = T0) -> tuple[Simulation, State]:
@@ -138,7 +134,7 @@ def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Candidate]
             return lammps.loop_seconds(script, folder, steps=count, ranks=ranks)
 
     setting = min(LAMMPS_LISTS, key=lambda setting: seconds(setting, max(100, steps // 4)))
-    unit, many = 1e6 / (steps * pack.grains), cores()
+    unit, many = 1e6 / (steps * pack.grains), len(cores())
     note = f"skin {setting[0]} R, every {setting[1]}"
     alone = Row("lammps", law, pack.grains, 1, note=f"1 core, {note}")
     rivals = [Candidate(alone, lambda: unit * seconds(setting, steps))]

@@ -27,6 +27,7 @@ def _commit() -> str | None:
     return next((line.split()[0] for line in lines if line.endswith(" " + name)), None)
 
 
+@functools.cache
 def versions() -> dict[str, str]:
     """Versions of Python, this package and the packages that decide its numbers."""
     names = ("gmem-jax", "jax", "jaxlib", "jax-md", "flax", "numpy", "h5py")
@@ -41,7 +42,7 @@ def versions() -> dict[str, str]:
 
 def code() -> dict[str, Any]:
     """Versions and git commit: what code a number came from."""
-    return {"versions": versions(), "commit": _commit()}
+    return {"versions": dict(versions()), "commit": _commit()}
 
 
 @functools.cache

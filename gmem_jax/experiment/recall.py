@@ -50,7 +50,7 @@ class Recall:
         shear: the waveforms I there, [S, 256].
         J: integrals of the waveforms, averaged over each bin, [S, 256].
         p_sig: recalled signals, [S, 256], in E.
-        rounding: what round-off makes of each, root mean square over the bins, [S], in E; see `doubts.rounding`.
+        rounding: what round-off makes of each, root mean square over the bins, [S], in E; see `validity.rounding`.
         gain: G of the set.
         fidelity: F of the set.
         windowed_gain: G after a running mean of p_sig and J over the ringing period.

@@ -170,7 +170,7 @@ def validate(made: Any) -> None:
 
     Raises:
         ValueError: naming the parameter, where it may lie, and what was given. Traced ones cannot be refused; see
-            `impossible`.
+            `out_of_range`.
     """
     for name, interval in _parameters(made):
         given = getattr(made, name)

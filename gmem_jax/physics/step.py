@@ -115,7 +115,7 @@ def contact_forces(
         table: rows of `sphere_table`, [S, 9, B].
         history: the friction law's.
         dt: time step.
-        alive: see `_apart`.
+        alive: see `_fusion_barrier`.
 
     Returns:
         [S, 6, B], and the new history.
@@ -187,7 +187,7 @@ def step(
         box: the walls at t + dt.
         dt: scalar or [B].
         drag: rate of a viscous drag on velocities and spins, 1 / t_c; 0 for the physics of the paper.
-        alive: any true scalar that the compiler cannot fold (see `_apart`).
+        alive: any true scalar that the compiler cannot fold (see `_fusion_barrier`).
 
     Returns:
         The state at t + dt, and the forces on the lower and upper walls, [2, 3, B].

@@ -82,7 +82,7 @@ class Store:
         self._own.mark({"shared": shared, "names": list(names), "points": rows})
 
     def card(self) -> dict[str, Any]:
-        """What `remember` wrote.
+        """What `write_manifest` wrote.
 
         Raises:
             FileFormatError: if there is nothing of the kind.
