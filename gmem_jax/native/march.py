@@ -138,7 +138,7 @@ def _bin(
 @functools.partial(_bin.defjvp, symbolic_zeros=True)
 def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
     """The tangent with respect to what is being differentiated and no more."""
-    if mode.mixed:
+    if mode.mixed:  # the adjoint does not know what was rounded: docs/decisions/computing.md
         raise NotImplementedError("there are no derivatives in mixed precision; use precision='double'")
     leaves, structure = jax.tree.flatten(primals)
     slopes = jax.tree.leaves(tangents)
