@@ -29,7 +29,7 @@ SIZES = ("tetra-325-a", "tetra-3267-a", "tetra-10240-b")
 def costs(pack: gm.Pack, replicas: int, seconds: float, t0: float) -> dict[str, np.ndarray]:
     """Microseconds per grain-step of every call, by precision."""
     simulation, state = encode(pack, LAWS["H"], replicas, "native", t0)
-    calls = {name: (replace(simulation, precision=name), state, ENCODE.bin(0), 1) for name in PRECISIONS}
+    calls = {name: (replace(simulation, precision=name), state, simulation.rows(ENCODE, 0), 1) for name in PRECISIONS}
     taken: dict[str, list[float]] = {name: [] for name in PRECISIONS}
     for call in calls.values():
         jax.block_until_ready(forward(*call, most=4))

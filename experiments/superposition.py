@@ -36,7 +36,7 @@ def compare(experiment: gm.Experiment, prefix: Prefix, n: int, width: float) -> 
     """Predictions of the experiment's signals from a kernel on n bumps that can form them, and their simulation."""
     kernel = gm.memory_kernel(experiment, n, width, prefix=prefix)
     simulated = np.asarray(run(experiment, prefix=prefix).p_sig)
-    both, linear = kernel.predict(experiment.signals), kernel.predict(experiment.signals, even=False)
+    both, linear = kernel.predict(experiment.waveforms), kernel.predict(experiment.waveforms, even=False)
     return {
         "both": both,
         "linear": linear,

@@ -21,7 +21,8 @@ from gmem_jax.experiment.pack import Pack, pack_from, stack
 from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
 from gmem_jax.experiment.record import describe, to_dict
 from gmem_jax.experiment.samples import waveform_from
-from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, waveform, words
+from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, signals, six_signals, waveform, words
+from gmem_jax.experiment.stages import compress, cycle, hold, read, rest, shake, train, write
 from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
 from gmem_jax.files.recalls import load_recall, save_recall, to_csv, to_xarray
@@ -35,11 +36,13 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, explain
 from gmem_jax.preparation.preparation import prepare
 from gmem_jax.preparation.recipe import Recipe
+from gmem_jax.simulation.protocol import Drive, Protocol, Stage
 
 if TYPE_CHECKING:
     from gmem_jax.design.by_kernel import design_by_kernel
     from gmem_jax.design.drive import TunedDrive, design_drive
     from gmem_jax.design.waveforms import Design, design_waveforms
+    from gmem_jax.experiment import protocols
     from gmem_jax.reading import capacity, classify
     from gmem_jax.show.recalls import plot
     from gmem_jax.show.view import view
@@ -54,6 +57,7 @@ _LATER = {  # what loads flax or optax, or is seldom asked for, or stands above 
     "design_drive": "gmem_jax.design.drive",
     "capacity": "gmem_jax.reading.capacity",
     "classify": "gmem_jax.reading.classify",
+    "protocols": "gmem_jax.experiment.protocols",
     "ProgressBar": "gmem_jax.simulation.progress",
     "sweep": "gmem_jax.sweeps.sweep",
     "plot": "gmem_jax.show.recalls",
@@ -65,7 +69,7 @@ def __getattr__(name: str) -> Any:
     if name not in _LATER:
         raise AttributeError(f"module 'gmem_jax' has no attribute {name!r}")
     module = importlib.import_module(_LATER[name])
-    return module if name in ("capacity", "classify") else getattr(module, name)
+    return module if name in ("capacity", "classify", "protocols") else getattr(module, name)
 
 
 def __dir__() -> list[str]:
@@ -76,6 +80,7 @@ __all__ = [
     "Bumps",
     "Clump",
     "Design",
+    "Drive",
     "Experiment",
     "FileFormatError",
     "Frictionless",
@@ -86,16 +91,21 @@ __all__ = [
     "MindlinRescaled",
     "Pack",
     "ProgressBar",
+    "Protocol",
     "Recall",
     "Recipe",
     "RunFailedError",
+    "SignalSets",
     "Signals",
     "Spline",
+    "Stage",
     "Status",
     "TunedDrive",
     "capacity",
     "classify",
     "clump",
+    "compress",
+    "cycle",
     "describe",
     "design_by_kernel",
     "design_drive",
@@ -104,6 +114,7 @@ __all__ = [
     "fidelity",
     "from_dict",
     "gain",
+    "hold",
     "jacobian",
     "list_packs",
     "load_pack",
@@ -113,13 +124,18 @@ __all__ = [
     "pack_from",
     "plot",
     "prepare",
+    "protocols",
+    "read",
     "recall",
     "replace",
+    "rest",
     "run",
     "running_mean",
     "save_pack",
     "save_recall",
     "save_waveforms",
+    "shake",
+    "signals",
     "six_signals",
     "sphere",
     "stack",
@@ -128,9 +144,11 @@ __all__ = [
     "to_csv",
     "to_dict",
     "to_xarray",
+    "train",
     "value_and_grad",
     "view",
     "waveform",
     "waveform_from",
     "words",
+    "write",
 ]

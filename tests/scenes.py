@@ -19,7 +19,7 @@ from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import uniform
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, Grains, State, replicate, still_box
-from gmem_jax.simulation.protocol import Bin
+from gmem_jax.simulation.protocol import Bin, Lane
 from gmem_jax.simulation.sample import Sample, end_bin
 from gmem_jax.simulation.strain import StrainPath
 
@@ -123,8 +123,17 @@ class Motion:
 
     def box_at(self, time: jax.Array) -> Box:
         """The walls at `time` since the start of the stage."""
-        drive = StrainPath(self.lower, self.upper, self.delta0, self.gamma0, self.signals)
-        return drive.box_at(Bin(self.start, self.stop, 1, 0, self.sheared), jnp.asarray(time), self.duration)
+        drive = strain_path(self.lower, self.upper, self.delta0, self.gamma0, self.signals)
+        amplitudes = () if self.signals is None else (jnp.asarray(self.sheared, float),)
+        still = self.start == self.stop
+        row = Bin(self.start, self.stop, 1, 0, timed=still, still=still, amplitudes=amplitudes)
+        return drive.box_at(row, jnp.asarray(time), self.duration)
+
+
+def strain_path(lower, upper, delta0, gamma0=0.0, signals=None, **share) -> StrainPath:
+    """The walls of the paper: waveforms on channel xy, or none."""
+    lanes = {} if signals is None else {"waveforms": (signals,), "lanes": (Lane("xy", "xy"),), "fixed": (False,)}
+    return StrainPath(lower, upper, delta0, gamma0, **lanes, **share)
 
 
 def advance_by(march):

@@ -44,14 +44,14 @@ from gmem_jax.physics.step import System
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.neighbors import SKIN, pair_finder
 from gmem_jax.simulation.observers import forward
-from gmem_jax.simulation.protocol import Stage
+from gmem_jax.simulation.protocol import Drive, Stage
 from gmem_jax.simulation.runner import status_of
 from gmem_jax.simulation.strain import smallest_box
 from gmem_jax.sweeps.executors import cores
 
 LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
 T0 = 1.8e3  # duration of the compression that is timed, t_c, if not chosen
-ENCODE = Stage("encode", 0.0, 1.0, 1.0, "write", sheared=True)
+ENCODE = Stage("encode", 0.0, 1.0, 1.0, "write", (Drive("xy", "xy"),))
 BINS = 8  # bins per timed call, so that checks and samples weigh as in a run; which does 32 at once
 AGREEMENT = 1e-8  # of the pressure, between backends: round-off grown over a few hundred steps
 LAMMPS_LISTS = ((0.1, 20), (0.2, 50), (0.2, 1000), (0.3, 1000))  # (skin in R, steps between checks) tried for LAMMPS
@@ -83,7 +83,7 @@ def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, 
         RuntimeError: if the simulation breaks down.
     """
     simulation, state = encode(pack, LAWS[law], replicas, backend, t0)
-    call = (simulation, state, ENCODE.bin(0), BINS)
+    call = (simulation, state, simulation.rows(ENCODE, 0), BINS)
     began = time.perf_counter()
     binary = forward.program.lower(*call, most=BINS).compile()
     compile_s = time.perf_counter() - began
@@ -196,7 +196,7 @@ def _peak_memory(load: Callable[[str], Pack], name: str, backend: str, law: str,
     """Peak resident bytes of a fresh process that runs one bin."""
     jax.config.update("jax_enable_x64", True)
     simulation, state = encode(load(name), LAWS[law], replicas, backend)
-    jax.block_until_ready(forward(simulation, state, ENCODE.bin(0), 1, most=BINS))
+    jax.block_until_ready(forward(simulation, state, simulation.rows(ENCODE, 0), 1, most=BINS))
     return _peak_bytes()
 
 

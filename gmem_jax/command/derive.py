@@ -176,7 +176,7 @@ def kernel_command(
             kernel = memory_kernel(experiment, n, width, prefix=prefix, cache=parts, progress=most)
             rest = within(progress, 0.05 + 0.95 * runs / (1.0 + runs), 1.0)
             p_sig = run(experiment, prefix=prefix, cache=parts.scoped("check"), progress=rest).p_sig
-        signals, configuration = experiment.signals, describe(experiment, time.perf_counter() - began)
+        signals, configuration = experiment.waveforms, describe(experiment, time.perf_counter() - began)
         summary = summaries.of_kernel(kernel, configuration, noise)
         result = {
             **summary.facts,
@@ -291,7 +291,7 @@ def design_command(
             design = by_kernel.design_by_kernel if by == "kernel" else waveforms.design_waveforms
             found = design(experiment, cache=parts, progress=progress, **options)
         way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
-        save_waveforms(output, found.signals, experiment.signals, design=way)
+        save_waveforms(output, found.signals, experiment.waveforms, design=way)
     if drawn:
         with drawing(drawn):
             render(design_figure(found, float(experiment.scale), cell(pack))).save(drawn)

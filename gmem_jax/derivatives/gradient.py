@@ -35,7 +35,7 @@ Loss = Callable[[Experiment, jax.Array], jax.Array]
 FIXED = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
 FORWARDS = 0.1  # of a gradient's time is the way forward
 
-Moving = tuple[Any, Any]  # grains and history: what of a state can be differentiated
+Moving = tuple[Any, Any, Any]  # grains, history and held walls: what of a state can be differentiated
 
 
 def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
@@ -78,7 +78,11 @@ def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array], offsets:
 
 
 def _moving(state: State) -> Moving:
-    return state.grains, state.history
+    return state.grains, state.history, state.servo
+
+
+def _state(moving: Moving, status: jax.Array) -> State:
+    return State(moving[0], moving[1], status, moving[2])
 
 
 def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int, offsets: bool) -> Any:
@@ -86,12 +90,12 @@ def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: 
 
     def chunk(numbers: Any, moving: Moving) -> Any:
         changed = _with_numbers(simulation, numbers, offsets)
-        after, sample = rollout_chunk(changed, State(moving[0], moving[1], state.status), first, count, most)
+        after, sample = rollout_chunk(changed, _state(moving, state.status), first, count, most)
         return (_moving(after), sample.pressure), (after.status, sample)
 
     at = (_numbers(simulation, offsets), _moving(state))
     (moving, _), slope, (status, sample) = jax.jvp(chunk, at, slopes, has_aux=True)
-    return State(moving[0], moving[1], status), sample, slope
+    return _state(moving, status), sample, slope
 
 
 def _pull(simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving, jax.Array], offsets: bool) -> Any:
@@ -99,7 +103,7 @@ def _pull(simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving,
 
     def chunk(numbers: Any, moving: Moving) -> Any:
         changed = _with_numbers(simulation, numbers, offsets)
-        after, sample = rollout(changed, State(moving[0], moving[1], state.status), rows)
+        after, sample = rollout(changed, _state(moving, state.status), rows)
         return _moving(after), sample.pressure
 
     return jax.vjp(chunk, _numbers(simulation, offsets), _moving(state))[1](slopes)
@@ -146,7 +150,8 @@ class _Pushing(Observer):
     def rebuild(self, history: Any, move: Move, blank: Any) -> None:
         """Move the tangent of the history too."""
         if self.moving is not None:
-            self.moving = self.moving[0], move(self.moving[1], jax.tree.map(jnp.zeros_like, blank))
+            grains, history, servo = self.moving
+            self.moving = grains, move(history, jax.tree.map(jnp.zeros_like, blank)), servo
 
 
 class _Piece(NamedTuple):
@@ -169,7 +174,7 @@ class _Remembering(Observer):
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
         """Remember the state before the chunk, and how to go back through it."""
         simulation, before, first, count = chunk.simulation, chunk.state, chunk.first, chunk.count
-        rows = chunk.stage.rows(first, count)
+        rows = simulation.rows(chunk.stage, first, count)
 
         def back(slope: Moving) -> Moving:
             known = self.reads.get(chunk.stage.name)
@@ -186,7 +191,7 @@ class _Remembering(Observer):
     def rebuild(self, history: Any, move: Move, blank: Any) -> None:
         """Remember how the history was moved."""
         _, pull = jax.vjp(lambda old: move(old, blank), history)
-        self.tape.append(_Piece(lambda slope: (slope[0], pull(slope[1])[0])))
+        self.tape.append(_Piece(lambda slope: (slope[0], pull(slope[1])[0], slope[2])))
 
 
 @dataclass(frozen=True)
@@ -381,7 +386,7 @@ def value_and_grad(
 def _fan_out(experiment: Experiment) -> Callable[[Moving], Moving]:
     def spread(moving: Moving) -> Moving:
         status = jnp.zeros(moving[0].position.shape[-1], jnp.int32)
-        return _moving(experiment.fan_out(State(moving[0], moving[1], status)))
+        return _moving(experiment.fan_out(_state(moving, status)))
 
     return spread
 

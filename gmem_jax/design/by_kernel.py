@@ -141,7 +141,7 @@ def design_by_kernel(
     def guess(gain: float) -> np.ndarray:
         """What the kernel alone says."""
         # Where a unit of J is recalled with the kernel's gain, this much of each waveform is needed.
-        amplitudes = nearest(kernel.basis, experiment.signals) * gain / kernel.gain()
+        amplitudes = nearest(kernel.basis, experiment.waveforms) * gain / kernel.gain()
         for _ in range(PREDICTED):
             missed = gain * float(experiment.scale) * target - kernel.recalled(amplitudes)
             amplitudes = bounded(amplitudes + correction(slopes(kernel, amplitudes), missed, firm), width)

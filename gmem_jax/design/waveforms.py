@@ -181,7 +181,7 @@ def design_waveforms(
     gain = 0.5 * own_gain if gain is None else gain
     wanted = gain * float(experiment.scale) * target
     basis = bumps(np.eye(n), width)
-    amplitudes = bounded(nearest(basis, experiment.signals) * gain / own_gain, width)
+    amplitudes = bounded(nearest(basis, experiment.waveforms) * gain / own_gain, width)
     count = len(target)
 
     def make(rows: jax.Array | np.ndarray) -> Experiment:

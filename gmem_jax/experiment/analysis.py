@@ -76,6 +76,33 @@ def compare(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scala
     return Match(gain, 1.0 - jnp.sqrt(miss / jnp.sum(signal * signal)))
 
 
+def compare_channels(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None) -> Match:
+    """Gain and fidelity of signals that were stored on several channels at once.
+
+    Args:
+        signal: p_sig of each channel, [C, S, bins], in E.
+        integral: J of what was written on each, [C, S, bins]; a channel where all is zero was silent.
+        scale: delta0 gamma0; scalar or [S, 1].
+        window: of `compare`.
+
+    Returns:
+        The gain matrix [C, C], which minimises |p_sig_c - sum_d G_cd E delta0 gamma0 J_d|^2: off its diagonal is the
+        cross-talk, what channel c gives back of what was written on d. And of each channel the fidelity [C] with which
+        it follows its own J: cross-talk counts as error. NaN for what was written on a silent channel.
+    """
+    if window is not None:
+        signal, integral = (running_mean(series, window * series.shape[-1]) for series in (signal, integral))
+    channels = signal.shape[0]
+    template = (scale * integral).reshape(channels, -1)
+    series = signal.reshape(channels, -1)
+    products = template @ template.T
+    silent = jnp.diagonal(products) == 0.0
+    gain = jnp.linalg.solve(products + jnp.diag(jnp.where(silent, 1.0, 0.0)), template @ series.T).T
+    own = jnp.diagonal(gain)[:, None] * template
+    miss = jnp.sum((series - own) ** 2, axis=-1) / jnp.sum(series * series, axis=-1)
+    return Match(jnp.where(silent, jnp.nan, gain), jnp.where(silent, jnp.nan, 1.0 - jnp.sqrt(miss)))
+
+
 def each(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None) -> Match:
     """Gain and fidelity of each signal by itself, [S]: each has a gain of its own. NaN where p_sig or J is zero.
 

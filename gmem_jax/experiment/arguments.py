@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.signals import Signals
+from gmem_jax.experiment.signals import Signals, SignalSets
 from gmem_jax.physics.contact.friction import FrictionLaw
 
 
@@ -21,7 +21,7 @@ def require_parts(pack: Any, signals: Any, friction: Any) -> None:
     if not isinstance(pack, Pack):
         read = f"gm.load_pack({pack!r}) reads one" if isinstance(pack, str) else "see gm.load_pack and gm.prepare"
         raise ValueError(f"pack must be a pack, got {_said(pack)}; {read}")
-    if isinstance(signals, type) or not isinstance(signals, Signals):
+    if isinstance(signals, type) or not isinstance(signals, Signals | SignalSets):
         numbers = isinstance(signals, list | tuple | np.ndarray) or hasattr(signals, "shape")
         made = "gm.waveform makes waveforms of samples" if numbers else "as gm.six_signals(), gm.words(3)"
         raise ValueError(f"signals must be waveforms, got {_said(signals)}; {made}")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.readings import Readings
 from gmem_jax.physics.pairs import sphere_offsets
 from gmem_jax.physics.rotation import unit
 
@@ -47,6 +48,27 @@ def require_inside(pack: Pack) -> None:
             f"pack {pack.name}: grain {grain + 1} does not lie in the box: its centre is at {place}, the box is from "
             f"{lower} to {upper} (R)"
         )
+
+
+def require_told_apart(readings: Readings, integrals: np.ndarray) -> None:
+    """Refuse waveforms of several channels that are so alike that what one gives back cannot be told from another's.
+
+    Args:
+        readings: what is read.
+        integrals: J, [R, C, S, bins], axes of length one left out.
+
+    Raises:
+        ValueError: saying what to do.
+    """
+    channels = readings.channels
+    for templates in integrals.reshape(-1, len(channels), integrals.shape[-2] * integrals.shape[-1]):
+        loud = templates[np.any(templates, axis=1)]
+        unit = loud / np.linalg.norm(loud, axis=1, keepdims=True)
+        if len(loud) > 1 and np.linalg.svd(unit, compute_uv=False)[-1] < 1e-3:
+            raise ValueError(
+                f"the waveforms of channels {' and '.join(channels)} are alike in all replicas: what one gives back "
+                "cannot be told from the other's; store them in different orders, or one set with its signs changed"
+            )
 
 
 def require_seen(middles: np.ndarray, integrals: np.ndarray) -> None:

@@ -15,13 +15,15 @@ from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
 from gmem_jax.experiment.arguments import require_once, require_parts
-from gmem_jax.experiment.asked import require_double, require_seen
+from gmem_jax.experiment.asked import require_double, require_seen, require_told_apart
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocols import Shear, memory_protocol
-from gmem_jax.experiment.signals import Signals, bin_average, part
+from gmem_jax.experiment.readings import Readings
+from gmem_jax.experiment.signals import Signals, SignalSets, bin_average, part, sets_of, waveform
 from gmem_jax.native import Backend, Precision
-from gmem_jax.physics.contact.friction import FrictionLaw
+from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
+from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.own_law import require_law
 from gmem_jax.physics.material import Material
@@ -30,9 +32,10 @@ from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State, Status, replicate
 from gmem_jax.physics.step import System, start
-from gmem_jax.simulation.loop import Simulation
-from gmem_jax.simulation.protocol import BINS, Protocol, Stage
-from gmem_jax.simulation.strain import StrainPath
+from gmem_jax.simulation.channels import CHANNELS
+from gmem_jax.simulation.loop import Observe, Simulation, at_rest
+from gmem_jax.simulation.protocol import BINS, Columns, Drive, Lane, Protocol, Stage
+from gmem_jax.simulation.strain import Sine, StrainPath, Waveforms
 
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
@@ -57,7 +60,7 @@ class Experiment:
 
     Attributes:
         pack: the pack at rest.
-        signals: the waveforms.
+        signals: the waveforms; several sets of them by `gmem_jax.experiment.signals.signals`.
         friction: the friction law.
         material: the elastic solid.
         gamma0: shear amplitude.
@@ -74,6 +77,10 @@ class Experiment:
         store: storage, in t0.
         background: "sub0", "sub2" or "sub2-bl" (in any case); the last two add a second readout.
         shear: when the waveforms are applied: "during" the compression, or "before" it, as functions of time at u = 0.
+        protocol: what is done; default the paper's, made of rest, hold, store, background and shear. With one of your
+            own say lengths there; "sub2" and "sub2-bl" take its second read for the background of the first.
+        observe: functions of (simulation, state) by name, called at the end of each bin; what they give is in
+            `Recall.stages[...].observed`. See `gmem_jax.simulation.observables`.
         backend: "jax", the definition; "native", C++ on CPUs; "auto", native where it is built and knows the law.
         precision: "double"; or "mixed", contacts in single precision on the native backend, without derivatives.
 
@@ -83,7 +90,7 @@ class Experiment:
     """
 
     pack: Pack
-    signals: Signals = dataclasses.field(metadata={"after_prefix": True})
+    signals: Signals | SignalSets = dataclasses.field(metadata={"after_prefix": True})
     friction: FrictionLaw = Hooke()
     material: Material = Material()
     gamma0: Scalar = parameter(1e-3, "(0, 0.5)", "Shear amplitude", varies=True, after_prefix=True)
@@ -104,6 +111,8 @@ class Experiment:
     shear: Shear = static("during", "Waveforms are applied during the compression, or before it (in time, at u = 0)")
     backend: Backend = static("auto", "auto, jax or native")
     precision: Precision = static("double", "double; or mixed, contacts in single precision (native)")
+    protocol: Protocol = static(None)
+    observe: tuple[tuple[str, Observe], ...] = static(())
     steps_per_bin: int = dataclasses.field(init=False, default=1, metadata={"static": True})
 
     @usual_rules()
@@ -112,11 +121,14 @@ class Experiment:
         for name in ("dt", "rest", "hold", "store"):
             object.__setattr__(self, name, _static_number(name, getattr(self, name)))
         object.__setattr__(self, "background", str(self.background).lower())
+        observe = self.observe.items() if isinstance(self.observe, Mapping) else self.observe
+        object.__setattr__(self, "observe", tuple(observe))
         validate(self)
         if self.background not in analysis.BACKGROUNDS:
             raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {self.background!r}")
         if self.shear not in ("during", "before"):
             raise ValueError(f"shear must be during or before, got {self.shear!r}")
+        self._set_protocol()
         if self.backend not in native.BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(native.BACKENDS)}; got {self.backend!r}")
         native.require_precision(self.precision, self.backend, self.friction)
@@ -153,6 +165,73 @@ class Experiment:
             )
         return max(1, math.ceil(fewest))
 
+    def _set_protocol(self) -> None:
+        paper, names = self._paper_protocol(), tuple(self.sets)
+        given: Protocol | None = self.protocol
+        if given is not None and not isinstance(given, Protocol):
+            raise ValueError(f"protocol must be a gm.Protocol, got a {type(given).__name__}")
+        protocol = paper if given is None else given.with_sets(names)
+        if protocol is None:
+            raise ValueError(
+                f"the sets of waveforms are {', '.join(names)}, and the paper's protocol writes those that are called "
+                f"like a channel, {', '.join(CHANNELS)}: give a protocol that says what is written when"
+            )
+        if protocol != paper:
+            odd = [name for name in _OF_PAPER if getattr(self, name) != _DEFAULTS[name]]
+            if odd:
+                raise ValueError(
+                    f"{odd[0]} makes the paper's protocol, and another one was given: say it in a stage of that"
+                )
+            if not protocol.reads:
+                raise ValueError("the protocol has no stage that reads, as gm.read() is one")
+            if not protocol.channels:
+                raise ValueError("the protocol writes no waveforms of the replicas, as gm.write() does")
+            if self.background != "sub0" and len(protocol.reads) != 2:
+                raise ValueError(
+                    f"background {self.background!r} takes the second read for the background of the first; the "
+                    f"protocol has {len(protocol.reads)}"
+                )
+        if protocol.columns.friction and not isinstance(self.friction, CoulombLaw | Frictionless):
+            raise ValueError(
+                f"the protocol switches friction off, and {type(self.friction).__name__} has no mu to switch"
+            )
+        object.__setattr__(self, "protocol", protocol)
+
+    def _paper_protocol(self) -> Protocol | None:
+        """None where no set of waveforms is called like a channel."""
+        if not any(name in CHANNELS for name in self.sets):
+            return None
+        again = self.background != "sub0"
+        paper = memory_protocol(self.rest, self.hold, self.store, second_readout=again, shear=self.shear)
+        return paper.with_sets(self.sets)
+
+    @property
+    def is_paper(self) -> bool:
+        """Whether the protocol is the paper's."""
+        return self.protocol == self._paper_protocol()
+
+    @property
+    def sets(self) -> dict[str, Signals]:
+        """Sets of waveforms by name; the only one is "xy"."""
+        return sets_of(self.signals)
+
+    @property
+    def waveforms(self) -> Signals:
+        """The signals of an experiment that has one set of them.
+
+        Raises:
+            ValueError: if it has several.
+        """
+        if isinstance(self.signals, SignalSets):
+            names = ", ".join(self.signals.names)
+            raise ValueError(f"this works with one set of waveforms, and the experiment has {names}")
+        return self.signals
+
+    @property
+    def readings(self) -> Readings:
+        """What is read."""
+        return Readings(self.protocol, self.background)
+
     def _check_shapes(self) -> None:
         for name in ("signals", "friction"):
             if jax.tree_util.all_leaves([getattr(self, name)]):
@@ -176,14 +255,21 @@ class Experiment:
         """The walls are unsheared at u = 0 and u = 1; a waveform that is not would make them jump."""
         if traced(self.signals):
             return
-        with jax.ensure_compile_time_eval():
-            ends, within = (np.asarray(values) for values in _probe(self.signals))
-            integrals = np.asarray(bin_average(self.signals))
-        if not np.all(np.isfinite(ends)) or np.max(np.abs(ends)) > _OPEN:
-            raise ValueError(f"waveforms must vanish at u = 0 and u = 1; found {np.abs(ends).max():g} there")
-        if not np.any(within) and not np.any(integrals):
+        loud = []
+        for one in self.sets.values():
+            with jax.ensure_compile_time_eval():
+                ends, within = (np.asarray(values) for values in _probe(one))
+                integrals = np.asarray(bin_average(one))
+            if not np.all(np.isfinite(ends)) or np.max(np.abs(ends)) > _OPEN:
+                raise ValueError(f"waveforms must vanish at u = 0 and u = 1; found {np.abs(ends).max():g} there")
+            loud.append(np.any(within) or np.any(integrals))
+            require_seen(within, integrals)
+        if not any(loud):
             raise ValueError("every waveform is zero: there is nothing to recall, and no gain or fidelity")
-        require_seen(within, integrals)
+        if len(self.readings.channels) > 1:
+            with jax.ensure_compile_time_eval():
+                templates = np.asarray(self.integral())
+            require_told_apart(self.readings, templates)
 
     @property
     def replicas(self) -> int:
@@ -210,30 +296,42 @@ class Experiment:
         return Timing(self.t0 / (BINS * self.steps_per_bin), self.steps_per_bin)
 
     @property
-    def protocol(self) -> Protocol:
-        """The stages that are gone through."""
-        again = self.background != "sub0"
-        return memory_protocol(self.rest, self.hold, self.store, second_readout=again, shear=self.shear)
-
-    @property
     def phases(self) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
         """The shear-free prefix, run once for all signals; and the stages from the first sheared one on."""
-        return self.protocol.phases
+        phases: tuple[tuple[Stage, ...], tuple[Stage, ...]] = self.protocol.phases
+        return phases
 
     def simulation(self, *, sheared: bool) -> Simulation:
         """What a rollout is told, in the prefix or after it."""
         lower, upper = self.pack.box.lower, self.pack.box.upper
-        gamma0, signals, share = (self.gamma0, self.signals, self.shear_share) if sheared else (0.0, None, 1.0)
+        columns: Columns = self.protocol.columns
+        if sheared:
+            waveforms = tuple(map(self._waveforms, columns.lanes))
+            fixed = tuple(Drive(*lane).fixed for lane in columns.lanes)
+            drive = (self.gamma0, waveforms, self.shear_share, columns.lanes, fixed)
+        else:
+            columns, drive = columns._replace(lanes=()), (0.0, (), 1.0, (), ())
         dt, steps = self.timing
         return Simulation(
             System(self.pack.clump, self.friction, self.pack.pairs, self.material),
-            StrainPath(lower, upper, self.compression, gamma0, signals, share),
+            StrainPath(lower, upper, self.compression, *drive),
             dt,
             self.drag,
             steps=steps,
             backend=self.backend,
             precision=self.precision,
+            columns=columns,
+            observe=self.observe,
         )
+
+    def _waveforms(self, lane: Lane) -> Waveforms:
+        drive = Drive(*lane)
+        if not drive.fixed:
+            return self.sets[str(lane.waveform)]
+        if drive.periods:
+            return Sine(float(drive.periods))
+        with jax.ensure_compile_time_eval():
+            return waveform(np.asarray(lane.waveform))
 
     def begin(self) -> State:
         """The pack at rest with friction switched on: one replica, or all where parameters differ in the prefix."""
@@ -241,14 +339,20 @@ class Experiment:
         wide = self.replicas if any(jnp.ndim(value) for value in before) else 1
         turned = unit(self.pack.quaternion[..., None])
         position, quaternion = replicate((self.pack.position[..., None], turned), wide)
-        state = start(self.simulation(sheared=False).system, position, quaternion, self.pack.box)
+        simulation = self.simulation(sheared=False)
+        state = start(simulation.system, position, quaternion, self.pack.box)
+        if simulation.columns.pressure:
+            state = dataclasses.replace(state, servo=at_rest(simulation, state, self.pack.box))
         bits = jnp.where(self._impossible(), int(Status.IMPOSSIBLE), 0)
         bits |= jnp.where(jnp.all(jnp.asarray(self.timing.dt) <= LARGEST_STEP), 0, int(Status.STEP_TOO_LARGE))
         return dataclasses.replace(state, status=state.status | bits.astype(jnp.int32))
 
     def _impossible(self) -> jax.Array:
-        ends = _ends(self.signals)
-        return out_of_range(self) | ~jnp.all(jnp.isfinite(ends) & (jnp.abs(ends) <= _OPEN))
+        impossible = out_of_range(self)
+        for one in self.sets.values():
+            ends = _ends(one)
+            impossible |= ~jnp.all(jnp.isfinite(ends) & (jnp.abs(ends) <= _OPEN))
+        return impossible
 
     def fan_out(self, state: State) -> State:
         """A replica for the zero signal and one for each of the others, if there is only one so far."""
@@ -262,23 +366,23 @@ class Experiment:
         return scale if jnp.ndim(scale) == 0 else jnp.asarray(scale)[1:, None]
 
     def integral(self) -> jax.Array:
-        """J of every signal averaged over each bin, [S, 256]."""
-        averaged: jax.Array = bin_average(self.signals)
-        return averaged
+        """J of every signal averaged over each bin, [S, 256]; by read and channel where there are several."""
+        return self.readings.integrals(self.sets)
 
     def recalled(self, pressures: Mapping[str, jax.Array]) -> jax.Array:
-        """p_sig of every signal in ascending u, [S, 256], in E, from the pressures [256, 3, S + 1] by stage."""
-        return analysis.subtract(self.background, *(analysis.recalled(pressures[name]) for name in self.protocol.reads))
+        """p_sig of every signal in ascending u, likewise, in E, from the pressures [bins, 3, S + 1] by stage."""
+        return self.readings.recalled(pressures)
 
-    def compare(self, p_sig: jax.Array) -> analysis.Match:
-        """Gain and fidelity of recalled signals [S, 256]."""
-        return analysis.compare(p_sig, self.integral(), self.scale)
+    def compare(self, p_sig: jax.Array, window: Scalar | None = None) -> analysis.Match:
+        """Gain and fidelity of recalled signals; `window` is that of `analysis.compare`."""
+        return self.readings.compare(p_sig, self.integral(), self.scale, window)
 
     def _facts(self) -> Facts:
         pack, dt = self.pack, self.timing.dt
         rows = {
             "pack": f"{pack.name}, {pack.grains} grains",
             "signals": f"{self.signals.count}, {type(self.signals).__name__.lower()}",
+            **({} if self.is_paper else {"protocol": ", ".join(stage.name for stage in self.protocol)}),
             "friction": f"{type(self.friction).__name__}, mu = {brief(getattr(self.friction, 'mu', 0.0))}",
             "gamma0": self.gamma0,
             "delta0": self.compression,
@@ -297,6 +401,8 @@ class Experiment:
 
 
 _OPEN = 1e-9  # of a waveform where it should vanish
+_OF_PAPER = ("rest", "hold", "store", "shear")
+_DEFAULTS = {entry.name: entry.default for entry in fields(Experiment)}
 
 
 def _ends(signals: Signals) -> jax.Array:
@@ -360,11 +466,14 @@ def replace(experiment: Experiment, values: Mapping[str, Any] | None = None, /, 
     for path, value in (values or {}).items():
         name, *deeper = path.split(".")
         _require_field(experiment, name)
-        found[name] = _with(found.get(name, getattr(experiment, name)), deeper, value)
+        before = found.get(name, getattr(experiment, name))
+        found[name] = _with(before, deeper, value)
     for name in found:
         _require_field(experiment, name)
     if traced(found.get("t0")):
         found.setdefault("steps", experiment.steps_per_bin)
+    if experiment.is_paper:  # it is made anew of the new numbers and sets
+        found.setdefault("protocol", None)
     return dataclasses.replace(experiment, **found)
 
 
@@ -378,6 +487,11 @@ def with_part(experiment: Experiment, first: int, last: int) -> Experiment:
 def _with(tree: Any, path: list[str], value: Any) -> Any:
     if not path:
         return value
+    if isinstance(tree, Protocol):
+        return tree.with_value(".".join(path), value)
+    if isinstance(tree, SignalSets) and path[0] in tree.names:
+        sets = [_with(one, path[1:], value) if name == path[0] else one for name, one in sets_of(tree).items()]
+        return SignalSets(tuple(sets), tree.names)
     _require_field(tree, path[0])
     return dataclasses.replace(tree, **{path[0]: _with(getattr(tree, path[0]), path[1:], value)})
 
@@ -393,6 +507,9 @@ def value_at(experiment: Experiment, path: str) -> Any:
         return resolved[path]
     found: Any = experiment
     for name in path.split("."):
+        if isinstance(found, SignalSets) and name in found.names:
+            found = sets_of(found)[name]
+            continue
         _require_field(found, name)
         found = getattr(found, name)
     return found

@@ -5,7 +5,7 @@ import json
 import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,21 +13,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment import analysis, html
+from gmem_jax.experiment import html
 from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
 from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
-from gmem_jax.physics.state import WARNINGS, Status, combined_status, explain
+from gmem_jax.physics.state import WARNINGS, State, Status, combined_status, explain, replicate
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.compiled import Compiled, require_x64
 from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, concatenate, places, places_at
-from gmem_jax.simulation.loop import rollout
+from gmem_jax.simulation.loop import Simulation, rollout_stages
 from gmem_jax.simulation.observers import CHUNK
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, work_of
-from gmem_jax.simulation.protocol import BINS, Protocol, Stage, table
+from gmem_jax.simulation.protocol import BINS, Protocol, Stage
 from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.sharding import placement_of
@@ -44,6 +44,9 @@ LARGEST_BATCH = 63  # signals; with the zero signal they fill whole vectors of e
 @dataclass(frozen=True)
 class Recall:
     """What a pack gave back of S signals. Where the status is fatal, p_sig and all measures are NaN.
+
+    With R reads and C channels, shear, J and p_sig are [R, C, S, 256], gains [R, C, C] and fidelities [R, C]; an axis
+    of length one is left out, as below. `at` gives one read of one channel. p_sig and J are 0 where a read does not go.
 
     Attributes:
         u: centres of the bins, [256].
@@ -63,6 +66,8 @@ class Recall:
             sorts the keys of plain dictionaries.
         dt: the time step used, in t_c.
         protocol: the stages that were gone through.
+        reads: names of the R stages that p_sig is of.
+        channels: names of the C channels.
         frames: configurations of one replica along the run, if they were asked for.
         record: JSON of the configuration that it belongs to: what `describe` says of the experiment. "{}" for a recall
             of a traced experiment. A label: no part of what programs are compiled for.
@@ -83,6 +88,8 @@ class Recall:
     stages: OrderedDict[str, Sample]
     dt: Scalar
     protocol: Protocol = static()
+    reads: tuple[str, ...] = static(())
+    channels: tuple[str, ...] = static(())
     frames: Frames | None = None
     record: str = label("{}")
 
@@ -95,7 +102,7 @@ class Recall:
     @property
     def names(self) -> list[str]:
         """What the signals are called: words by their bits, others by their number from 1."""
-        known, count = self.configuration.get("signals"), len(self.J)
+        known, count = self.configuration.get("signals"), self.J.shape[-2]
         if isinstance(known, list) and len(known) == count:
             return [str(name) for name in known]
         return [f"signal {number + 1}" for number in range(count)]
@@ -104,9 +111,38 @@ class Recall:
         """The same recall with this configuration."""
         return dataclasses.replace(self, record=json.dumps(configuration))
 
+    @property
+    def second_readout(self) -> str | None:
+        """The stage that was read for the background, if there is one."""
+        known, reads = self.protocol.reads, self.reads
+        return known[1] if len(known) == 2 and reads == known[:1] else None
+
+    def at(self, read: str | int = 0, channel: str | int = 0) -> "Recall":
+        """The recall of one channel in one read, as of a run that has no others: p_sig [S, 256], one G and one F.
+
+        Raises:
+            ValueError: if there is no such read or channel.
+        """
+        axes = (("read", self.reads, read), ("channel", self.channels, channel))
+        place = tuple(_number(*axis) for axis in axes)
+        reads, channels = self.reads[place[0]], self.channels[place[1]]
+        place = tuple(number for number, (_, known, _) in zip(place, axes, strict=True) if len(known) > 1)
+        if not place:
+            return self
+        own = place[-1:] if len(self.channels) > 1 else ()
+        curves = {name: getattr(self, name)[place] for name in ("shear", "J", "p_sig", "fidelity", "windowed_fidelity")}
+        gains = {name: getattr(self, name)[(*place, *own)] for name in ("gain", "windowed_gain")}
+        return dataclasses.replace(self, **curves, **gains, reads=(reads,), channels=(channels,))
+
+    def each(self) -> "Iterator[Recall]":
+        """`at` every read and channel."""
+        return (self.at(read, channel) for read in self.reads for channel in self.channels)
+
     def _facts(self) -> html.Facts:
         measures: dict[str, Any] = {"G": self.gain, "F": self.fidelity, "G over T1": self.windowed_gain}
         rows = {**measures, "F over T1": self.windowed_fidelity, "T1 (t_c)": self.window}
+        if len(self.reads) * len(self.channels) > 1:
+            rows = {"reads": ", ".join(self.reads), "channels": ", ".join(self.channels), **rows}
         if not traced(self.status):
             rows["status"] = explain(combined_status(self.status))
         return f"Recall of {self.J.shape[-2]} signals", rows
@@ -116,6 +152,15 @@ class Recall:
 
     def _repr_html_(self) -> str:
         return html.facts(*self._facts())
+
+
+def _number(kind: str, known: tuple[str, ...], wanted: str | int) -> int:
+    """The place of a read or channel by its name or number."""
+    if wanted in known:
+        return known.index(str(wanted))
+    if isinstance(wanted, int) and 0 <= wanted < len(known):
+        return wanted
+    raise ValueError(f"the recall has no {kind} {wanted!r}; it has {', '.join(known)}")
 
 
 def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
@@ -130,14 +175,13 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
     p_sig = sound * found
     noise = rounding(experiment, stages)
     part = noise / readable(experiment, found)
-    integral = experiment.integral()
+    unrecorded = [stage.name for stage in experiment.protocol if not stage.recorded]
     match = experiment.compare(p_sig)
-    smooth = analysis.compare(p_sig, integral, experiment.scale, pack.ringing_period / jnp.max(jnp.asarray(t0)))
-    u = (jnp.arange(BINS) + 0.5) / BINS
+    smooth = experiment.compare(p_sig, pack.ringing_period / jnp.max(jnp.asarray(t0)))
     return Recall(
-        u=u,
-        shear=experiment.signals.shear(u).T,
-        J=integral,
+        u=(jnp.arange(BINS) + 0.5) / BINS,
+        shear=experiment.readings.shears(experiment.sets),
+        J=experiment.integral(),
         p_sig=p_sig,
         rounding=noise,
         gain=match.gain,
@@ -147,9 +191,11 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
         window=pack.ringing_period,
         residual_speed=residual,
         status=status | validity(experiment, stages, match.fidelity, smooth.fidelity, part),
-        stages=stages,
+        stages=OrderedDict((name, sample) for name, sample in stages.items() if name not in unrecorded),
         dt=step,
         protocol=experiment.protocol,
+        reads=experiment.readings.reads,
+        channels=experiment.readings.channels,
     )
 
 
@@ -166,9 +212,13 @@ def _by_stage(sample: Sample, stages: tuple[Stage, ...]) -> "OrderedDict[str, Sa
 @jax.jit
 def _recall(experiment: Experiment) -> Recall:
     common, own = experiment.phases
-    state, before = rollout(experiment.simulation(sheared=False), experiment.begin(), table(common))
-    state, after = rollout(experiment.simulation(sheared=True), experiment.fan_out(state), table(own))
-    return finish(experiment, _by_stage(before, common) | _by_stage(after, own), state.status)
+    simulation, state, samples = experiment.simulation(sheared=False), experiment.begin(), OrderedDict[str, Sample]()
+    if common:
+        simulation, state, before = rollout_stages(simulation.marked(state, common[0]), state, common)
+        samples |= _by_stage(before, common)
+    state = experiment.fan_out(state)
+    _, state, after = rollout_stages(with_waveforms(experiment, simulation, state), state, own)
+    return finish(experiment, samples | _by_stage(after, own), state.status)
 
 
 @usual_rules()
@@ -217,13 +267,27 @@ def runner_of(experiment: Experiment, **options: Any) -> Runner:
     smallest = smallest_box(np.asarray(pack.lower), np.asarray(pack.upper), deepest)
     state = _begin(experiment)
     raise_if_fatal(status_of(state), "begin")
-    return Runner(experiment.simulation(sheared=False), state, smallest, **options)
+    simulation = experiment.simulation(sheared=False)
+    return Runner(simulation.marked(state, experiment.protocol.stages[0]), state, smallest, **options)
+
+
+def with_waveforms(experiment: Experiment, before: Simulation, state: State) -> Simulation:
+    """What is run after the prefix, for a state of all replicas; `before` is what was run in it.
+
+    Observers compare with this moment if the protocol marks no stage.
+    """
+    simulation, own = experiment.simulation(sheared=True), experiment.phases[1]
+    if not any(stage.mark for stage in experiment.protocol):
+        return simulation.marked(state, own[0])
+    mark = before.mark
+    narrow = mark is not None and mark.touching.shape[-1] == 1 < state.replicas
+    return dataclasses.replace(simulation, mark=replicate(mark, state.replicas) if narrow else mark)
 
 
 def apply_waveforms(runner: Runner, experiment: Experiment) -> None:
     """Bring a runner from the end of the prefix to the first sheared stage: all replicas, with their waveforms."""
-    runner.simulation = experiment.simulation(sheared=True).with_pairs(runner.simulation.system.pairs)
-    runner.state = _fan_out(experiment, runner.state)
+    pairs, runner.state = runner.simulation.system.pairs, _fan_out(experiment, runner.state)
+    runner.simulation = with_waveforms(experiment, runner.simulation, runner.state).with_pairs(pairs)
 
 
 class Prefix(NamedTuple):

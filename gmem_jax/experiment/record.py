@@ -15,8 +15,10 @@ from gmem_jax.experiment.signals import (
     LONGEST_WORD,
     Bumps,
     Signals,
+    SignalSets,
     Spline,
     bit_width,
+    sets_of,
     six_signals,
     word_bits,
     words,
@@ -27,7 +29,8 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.rules import usual_rules
 
 SIGNALS = {"bumps": Bumps, "spline": Spline}
-PARTS = ("pack", "signals", "friction", "material")
+PARTS = ("pack", "signals", "friction", "material", "protocol", "observe")
+"""Fields of an experiment that are no numbers. What observes it is no part of its written form: it changes nothing."""
 DIGITS = 9  # of the pad and width of words
 
 
@@ -56,8 +59,10 @@ def _equal(one: Signals, other: Signals) -> bool:
     return fingerprint(one) == fingerprint(other) if type(one) is type(other) else False
 
 
-def signals_to_dict(signals: Signals) -> dict[str, Any]:
+def signals_to_dict(signals: Signals | SignalSets) -> dict[str, Any]:
     """Waveforms as JSON: by name where they have one, else by their numbers."""
+    if isinstance(signals, SignalSets):
+        return {"kind": "sets", **{name: signals_to_dict(one) for name, one in sets_of(signals).items()}}
     if _equal(signals, six_signals()):
         return {"kind": "six"}
     if form := _as_words(signals):
@@ -88,7 +93,7 @@ def _as_words(signals: Signals) -> dict[str, Any]:
         return {}
 
 
-def names_of(signals: Signals) -> list[str]:
+def names_of(signals: Signals | SignalSets) -> list[str]:
     """What the signals are called: words by their bits, others by their number from 1."""
     form = signals_to_dict(signals)
     if form["kind"] == "words":
@@ -119,6 +124,7 @@ def to_dict(experiment: Experiment) -> dict[str, Any]:
         "friction": law_to_dict(experiment.friction),
         "material": {entry.name: plain(getattr(material, entry.name)) for entry in fields(Material)},
         **{name: plain(getattr(experiment, name)) for name in numbers},
+        "protocol": None if experiment.is_paper else experiment.protocol.to_list(),
     }
 
 
@@ -146,6 +152,8 @@ def describe(experiment: Experiment, seconds: float) -> dict[str, Any]:
         "grain": {"shape": clump.shape, "mass": float(clump.mass), "diameter": float(clump.diameter)},
         "pack_record": pack.info,
         "signals": names_of(experiment.signals),
+        "reads": list(experiment.readings.reads),
+        "channels": list(experiment.readings.channels),
         "friction": entry.name if entry else type(law).__name__,
         "mu": plain(law.mu) if isinstance(law, CoulombLaw) else 0.0,
         **{name: plain(value_at(experiment, name)) for name in NUMBERS},

@@ -18,7 +18,7 @@ import numpy as np
 from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, replace, replica_parameters, value_at
 from gmem_jax.experiment.recall import PREFIX, Recall, finished, runner_of, warn_of_another_compression
 from gmem_jax.experiment.record import describe
-from gmem_jax.experiment.signals import Signals, bin_average
+from gmem_jax.experiment.signals import Signals, SignalSets, bin_average
 from gmem_jax.physics.pytree import pytree
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
@@ -68,7 +68,8 @@ def match(one: Experiment, other: Experiment) -> bool:
     scalars = all(jnp.ndim(value) == 0 for each in (one, other) for value in replica_parameters(each).values())
     slips = [float(np.min(getattr(each.friction, "mu", 1.0))) == 0.0 for each in (one, other)]
     same = slips[0] == slips[1] and all(getattr(one, name) == getattr(other, name) for name in alike)
-    return scalars and same and one.pack is other.pack and laws[0] == laws[1]
+    alone = not any(isinstance(each.signals, SignalSets) or each.observe for each in (one, other))
+    return alone and scalars and same and one.pack is other.pack and laws[0] == laws[1]
 
 
 class _Side:
@@ -107,7 +108,7 @@ class _Side:
         for each in self.experiments:
             if id(each.signals) not in begun:
                 begun[id(each.signals)] = 1 + sum(one.count for one in sets)
-                sets.append(each.signals)
+                sets.append(each.waveforms)
             numbers += [0, *(begun[id(each.signals)] + np.arange(each.signals.count)).tolist()]
         return Chosen(tuple(sets), jnp.asarray(numbers[1:]))
 

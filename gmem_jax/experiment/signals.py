@@ -1,20 +1,20 @@
 """Shear waveforms I(u) and their integrals J(u), on the compression variable u in [0, 1].
 
 A set of S signals is a pytree with two methods, `shear(u)` and `integral(u)`, each [..., S] for u of shape [...].
-All waveforms vanish at u = 0 and u = 1, so that the box is unsheared outside the encoding ramp.
+All waveforms vanish at u = 0 and u = 1, so that the box is unsheared outside the stages that apply them.
 """
 
 import functools
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.html import line
-from gmem_jax.physics.pytree import Scalar, pytree, traced
+from gmem_jax.physics.pytree import Scalar, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import BINS
 
@@ -41,13 +41,62 @@ class Signals(Protocol):
         ...
 
 
-def part(signals: Signals, first: int, last: int) -> Signals:
-    """Signals number `first` to `last` - 1 of a set, as a set."""
+@pytree
+@dataclass(frozen=True)
+class SignalSets:
+    """Several sets of S waveforms: each replica has one of each. Made by `signals`.
+
+    Attributes:
+        sets: the sets.
+        names: of them; one that is called like a channel is written there where a protocol does not say otherwise.
+    """
+
+    sets: tuple[Signals, ...]
+    names: tuple[str, ...] = static()
+
+    def __repr__(self) -> str:
+        return line(self, lambda: (f"{self.count} signals", dict(zip(self.names, map(repr, self.sets), strict=True))))
+
+    @property
+    def count(self) -> int:
+        """Number of signals S."""
+        return self.sets[0].count
+
+
+def sets_of(signals: Signals | SignalSets) -> dict[str, Signals]:
+    """Sets of waveforms by name; one alone is written on the paper's channel, "xy"."""
+    if isinstance(signals, SignalSets):
+        return dict(zip(signals.names, signals.sets, strict=True))
+    return {"xy": signals}
+
+
+@usual_rules()
+def signals(**sets: Signals) -> Signals | SignalSets:
+    """Waveforms for several channels, or for several writes: replica s has the s-th of each set.
+
+    Args:
+        sets: sets of one length, as `xy=..., z=...` for two channels at once, or by names that stages ask for, as
+            `first=..., second=...` with `gm.write(xy="first")`.
+
+    Raises:
+        ValueError: if there is none, or they differ in length.
+    """
+    counts = {name: one.count for name, one in sets.items()}
+    if len(set(counts.values())) != 1:
+        raise ValueError(f"sets of waveforms have one length, got {counts or 'none'}")
+    return SignalSets(tuple(sets.values()), tuple(sets)) if tuple(sets) != ("xy",) else sets["xy"]
+
+
+Chosen = TypeVar("Chosen", bound=Signals | SignalSets)
+
+
+def part(signals: Chosen, first: int, last: int) -> Chosen:
+    """Signals number `first` to `last` - 1 of a set, or of each of several, as a set."""
 
     def rows(leaf: jax.Array) -> jax.Array:
         return leaf[first:last] if jnp.ndim(leaf) > 0 and jnp.shape(leaf)[0] == signals.count else leaf
 
-    chosen: Signals = jax.tree.map(rows, signals)
+    chosen: Chosen = jax.tree.map(rows, signals)
     return chosen
 
 

@@ -5,6 +5,7 @@ what was measured on either side of it is in docs/trust.md. All follows from the
 traced runs are judged too.
 """
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -65,7 +66,7 @@ def validity(
     found = {
         Status.DEEP_OVERLAP: deepest > DEEPEST,
         Status.NOT_QUASI_STATIC: fastest > FASTEST,
-        Status.RINGING: windowed - raw > RINGING,
+        Status.RINGING: jnp.any(windowed - raw > RINGING),
         Status.SHEAR_BEYOND_COMPRESSION: shear > LARGEST_SHEAR,
         Status.LARGE_WAVEFORM: waveform > LARGEST_WAVEFORM,
         Status.LARGE_FRICTION: friction > LARGEST_FRICTION,
@@ -122,16 +123,23 @@ def rounding(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.Array:
 def readable(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
     """Root mean square of recalled signals [S, 256], or of the part of them that is like J, whichever is less: [S].
 
-    Infinite for waveforms that are zero: nothing is read there.
+    Of several reads and channels the smallest. Infinite for waveforms that are zero: nothing is read there.
     """
-    integral, scale = experiment.integral(), jnp.asarray(experiment.scale)
-    template = scale / jnp.max(scale) * integral
-    alike = compare(p_sig, template, 1.0).gain * template
-    size = jnp.sqrt(jnp.min(jnp.mean(jnp.stack([p_sig, alike]) ** 2, axis=-1), axis=0))
-    return lax.stop_gradient(jnp.where(jnp.any(integral, axis=-1), size, jnp.inf))
+    scale = jnp.asarray(experiment.scale)
+
+    def of_one(p_sig: jax.Array, integral: jax.Array) -> jax.Array:
+        template = scale / jnp.max(scale) * integral
+        alike = compare(p_sig, template, 1.0).gain * template
+        size = jnp.sqrt(jnp.min(jnp.mean(jnp.stack([p_sig, alike]) ** 2, axis=-1), axis=0))
+        return jnp.where(jnp.any(integral, axis=-1), size, jnp.inf)
+
+    curves = (each.reshape(-1, *each.shape[-2:]) for each in (p_sig, experiment.integral()))
+    sizes = [of_one(*each) for each in zip(*curves, strict=True)]
+    return lax.stop_gradient(functools.reduce(jnp.minimum, sizes))
 
 
 def _largest_waveforms(experiment: Experiment) -> jax.Array:
     """max |I| of every replica, [S + 1], the zero signal's first."""
-    values = experiment.signals.shear((jnp.arange(BINS) + 0.5) / BINS)
-    return jnp.concatenate([jnp.zeros(1), jnp.max(jnp.abs(values), axis=0)])
+    u = (jnp.arange(BINS) + 0.5) / BINS
+    largest = [jnp.max(jnp.abs(one.shear(u)), axis=0) for one in experiment.sets.values()]
+    return jnp.concatenate([jnp.zeros(1), functools.reduce(jnp.maximum, largest)])

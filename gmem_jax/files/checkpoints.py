@@ -49,6 +49,8 @@ def _taken_apart(tree: Any, arrays: list[np.ndarray]) -> Any:
     if isinstance(tree, np.ndarray | np.generic | jax.Array):
         arrays.append(np.asarray(tree))
         return {"array": len(arrays) - 1}
+    if tree is None:
+        return {"none": 0}
     if isinstance(tree, tuple):
         return {"tuple": [_taken_apart(item, arrays) for item in tree]}
     if isinstance(tree, dict):
@@ -61,6 +63,8 @@ def _taken_apart(tree: Any, arrays: list[np.ndarray]) -> Any:
 
 def _put_together(form: Any, arrays: list[np.ndarray]) -> Any:
     """The tree that `_taken_apart` took apart."""
+    if "none" in form:
+        return None
     if "array" in form:
         return arrays[form["array"]]
     if "tuple" in form:

@@ -10,13 +10,25 @@ from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.record import PARTS, SIGNALS, pack_fingerprint
-from gmem_jax.experiment.signals import PAD, WIDTH, Signals, six_signals, words
+from gmem_jax.experiment.signals import PAD, WIDTH, Signals, SignalSets, signals, six_signals, words
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.validation import numbers, require, require_kinds
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import law_named
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.rules import usual_rules
+from gmem_jax.simulation.protocol import Protocol
+
+
+def sets_from_dict(written: Mapping[str, Any]) -> Signals | SignalSets:
+    """The waveforms of a written form, or several sets of them.
+
+    Raises:
+        ValueError: as of `signals_from_dict`.
+    """
+    if written["kind"] != "sets":
+        return signals_from_dict(written)
+    return signals(**{name: signals_from_dict(one) for name, one in written.items() if name != "kind"})
 
 
 def signals_from_dict(written: Mapping[str, Any]) -> Signals:
@@ -61,7 +73,7 @@ def from_dict(configuration: Mapping[str, Any], pack: Pack | None = None) -> Exp
         FileFormatError: if the pack is another one than was written, or the form is not one of an experiment.
         ValueError: for impossible numbers, or own laws and signals, which have no written form.
     """
-    known = {entry.name for entry in fields(Experiment) if entry.init}
+    known = {entry.name for entry in fields(Experiment) if entry.init} - {"observe"}
     if odd := sorted(known ^ set(configuration)):
         problem = "its {} is missing" if odd[0] in known else "it has no field {}"
         raise FileFormatError(f"not the written form of an experiment: {problem.format(repr(odd[0]))}")
@@ -72,9 +84,11 @@ def from_dict(configuration: Mapping[str, Any], pack: Pack | None = None) -> Exp
     require_kinds({name: value for name, value in configuration.items() if name not in PARTS})
     require_kinds(configuration["material"])
     own = {name: _number(value) for name, value in configuration.items() if name not in PARTS}
+    if configuration["protocol"] is not None:
+        own["protocol"] = Protocol.from_list(configuration["protocol"])
     material = material_from(configuration["material"])
     return Experiment(
-        pack, signals_from_dict(configuration["signals"]), _law_from(configuration["friction"]), material, **own
+        pack, sets_from_dict(configuration["signals"]), _law_from(configuration["friction"]), material, **own
     )
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.files.hdf5 import OBSERVED, observed_array
 from gmem_jax.files.measures import of_each
-from gmem_jax.files.schemas import RECALL, STAGE
+from gmem_jax.files.schemas import RECALL, STAGE, declared_of_recall
 from gmem_jax.files.validation import optional
 from gmem_jax.simulation.protocol import BINS
 
@@ -47,12 +48,24 @@ def recall_dataset(recall: Recall) -> Any:
         own = (np.asarray(getattr(sample, name)) for sample in stages.values())
         wide = [np.broadcast_to(values, (*values.shape[:-1], replicas)) for values in own]
         data[name] = (array.shape, np.concatenate(wide), about)
+    for name in next(iter(stages.values())).observed or {}:
+        about = configuration.get("observed", {}).get(name, {})
+        own = (np.asarray((sample.observed or {})[name]) for sample in stages.values())
+        wide = [np.broadcast_to(values, (*values.shape[:-1], replicas)) for values in own]
+        array = observed_array(OBSERVED + name, wide[0].ndim)
+        data[OBSERVED + name] = (array.shape, np.concatenate(wide), about)
     derived = of_each(recall)
-    for name, array in RECALL.arrays.items():
+    declared = declared_of_recall(len(recall.reads), len(recall.channels), own_steps=np.ndim(recall.dt) > 0)
+    for name, array in declared.items():
         if name not in ("u", "signal"):
             values = derived[name] if name in derived else np.asarray(getattr(recall, name))
-            data[name] = (array.shape if values.ndim == len(array.shape) else ("replica",), values, described(name))
+            data[name] = (array.shape, values, described(name))
+    several = {"read": list(recall.reads), "channel": list(recall.channels), "written": list(recall.channels)}
+    several = {
+        name: names for name, names in several.items() if any(name in array.shape for array in declared.values())
+    }
     coordinates = {
+        **several,
         "signal": ("signal", recall.names, described("signal")),
         "u": ("u", np.asarray(recall.u), described("u")),
         "replica": np.arange(replicas),
@@ -75,8 +88,14 @@ def recall_csv(recall: Recall) -> str:
     """The recalled signals as CSV: u, and p_sig of every signal in E."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["u", *(f"p_sig of {name} (E)" for name in recall.names)])
-    writer.writerows(np.column_stack([recall.u, np.asarray(recall.p_sig).T]).tolist())
+    several = len(recall.reads) * len(recall.channels) > 1
+    columns = ["u"]
+    for one in recall.each():
+        where = f", {one.reads[0]}, {one.channels[0]}" if several else ""
+        columns += [f"p_sig of {name}{where} (E)" for name in recall.names]
+    writer.writerow(columns)
+    signals = np.asarray(recall.p_sig).reshape(-1, len(np.asarray(recall.u)))
+    writer.writerows(np.column_stack([recall.u, signals.T]).tolist())
     return text.getvalue()
 
 
@@ -84,8 +103,10 @@ def each_csv(recall: Recall) -> str:
     """What is said of each signal by itself (`of_each`) as CSV, a row for each."""
     text, measures = io.StringIO(), of_each(recall)
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["signal", *(name.removeprefix("signal_") for name in measures)])
-    writer.writerows(
-        [name, *row] for name, row in zip(recall.names, np.column_stack([*measures.values()]).tolist(), strict=True)
-    )
+    several = len(recall.reads) * len(recall.channels) > 1
+    writer.writerow([*(["read", "channel"] * several), "signal", *(name.removeprefix("signal_") for name in measures)])
+    values = np.stack([*measures.values()], axis=-1).reshape(-1, len(recall.names), len(measures)).tolist()
+    for one, rows in zip(recall.each(), values, strict=True):
+        where = [one.reads[0], one.channels[0]] * several
+        writer.writerows([*where, name, *row] for name, row in zip(recall.names, rows, strict=True))
     return text.getvalue()

@@ -8,7 +8,6 @@ import io
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,9 @@ from gmem_jax.files.seal import BLOCK, require_sealed, seal
 from gmem_jax.files.tree import Tree
 from gmem_jax.files.validation import Array, fit, refusing
 from gmem_jax.simulation.protocol import BINS
-from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.sample import MEASURED, Sample
 
-_SAMPLE = tuple(entry.name for entry in fields(Sample))
+OBSERVED = "observed_"  # begins the names of what observers gave
 
 
 class Content(Tree):
@@ -71,10 +70,25 @@ class Content(Tree):
         stages = OrderedDict()
         for stage in sorted(orders, key=orders.__getitem__):
             path = f"{group}/{stage}/"
-            found = self.arrays({path + name: STAGE[name] for name in _SAMPLE})
-            own: Any = {name: found[path + name] for name in _SAMPLE}
-            stages[stage] = Sample(**{**own, "u": np.broadcast_to(own["u"][:, None], own["filling"].shape)})
+            observed = {
+                name.removeprefix(path): dataset
+                for name, dataset in self.datasets.items()
+                if name.startswith(path + OBSERVED)
+            }
+            declared = {name: STAGE[name] for name in MEASURED}
+            declared |= {name: observed_array(name, len(dataset.shape)) for name, dataset in observed.items()}
+            found = self.arrays({path + name: array for name, array in declared.items()})
+            own: Any = {name: found[path + name] for name in MEASURED}
+            seen = {name.removeprefix(OBSERVED): found[path + name] for name in observed}
+            u = np.broadcast_to(own["u"][:, None], own["filling"].shape)
+            stages[stage] = Sample(**{**own, "u": u}, observed=seen or None)
         return stages
+
+
+def observed_array(name: str, dimensions: int, units: str = "", words: str = "") -> Array:
+    """What is declared of what an observer gave: bins, dimensions of its own, replicas."""
+    own = (f"{name}_{number}" for number in range(1, dimensions - 1))
+    return Array("real", ("time", *own, "replica"), units, words)
 
 
 @contextmanager
@@ -154,14 +168,23 @@ def _described(group: h5py.Group, path: str, values: np.ndarray, declared: Array
 def _scale(group: h5py.Group, name: str, length: int) -> h5py.Dataset:
     at = group if name in group else group.file
     if name not in at:
-        _described(at, name, np.arange(length, dtype="i4"), Array("whole", (name,), "1", DIMENSIONS[name]))
+        words = DIMENSIONS.get(name, "number")
+        _described(at, name, np.arange(length, dtype="i4"), Array("whole", (name,), "1", words))
     if not at[name].is_scale:
         at[name].make_scale(name)
     return at[name]
 
 
-def write_samples(group: h5py.Group, stages: Mapping[str, Sample]) -> None:
-    """A group for every stage, in order, with a dataset for each quantity."""
+def write_samples(
+    group: h5py.Group, stages: Mapping[str, Sample], observed: Mapping[str, Mapping[str, str]] | None = None
+) -> None:
+    """A group for every stage, in order, with a dataset for each quantity.
+
+    Args:
+        group: where they are put.
+        stages: samples by stage.
+        observed: unit and words of what observers gave, by name.
+    """
     passed = 0
     for number, (name, sample) in enumerate(stages.items()):
         stage = group.create_group(name)
@@ -170,10 +193,15 @@ def write_samples(group: h5py.Group, stages: Mapping[str, Sample]) -> None:
         ends = np.arange(1, bins + 1)
         values = {**vars(sample), "time": (passed + ends) / BINS, "u": np.asarray(sample.u)[:, 0]}
         passed += bins
-        write_arrays(stage, STAGE if wide > 1 else _COMMON, values)
+        declared = dict(STAGE)
+        for name, seen in (sample.observed or {}).items():
+            known = (observed or {}).get(name, {})
+            values[OBSERVED + name] = np.asarray(seen, float)
+            declared[OBSERVED + name] = observed_array(OBSERVED + name, np.ndim(seen), **known)
+        write_arrays(
+            stage, declared if wide > 1 else {name: _common(array) for name, array in declared.items()}, values
+        )
 
 
-_COMMON = {
-    name: array._replace(shape=tuple("common" if one == "replica" else one for one in array.shape))
-    for name, array in STAGE.items()
-}
+def _common(array: Array) -> Array:
+    return array._replace(shape=tuple("common" if one == "replica" else one for one in array.shape))

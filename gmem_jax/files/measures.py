@@ -20,10 +20,17 @@ def relative_scale(configuration: Mapping[str, Any]) -> jax.Array:
 
 
 def of_each(recall: Recall) -> dict[str, np.ndarray]:
-    """`EACH` of every signal, [S]: G and F with a gain of its own, F over T1, correlation with J; NaN of silence."""
-    configuration = recall.configuration
-    p_sig, integral, scale = jnp.asarray(recall.p_sig), jnp.asarray(recall.J), relative_scale(configuration)
-    window = recall.window / np.max(configuration.get("t0", np.nan))
-    own, smooth = (analysis.each(p_sig, integral, scale, over) for over in (None, window))
-    values = (own.gain, own.fidelity, smooth.fidelity, analysis.correlation(p_sig, integral))
-    return dict(zip(EACH, map(np.asarray, values), strict=True))
+    """`EACH` of every signal: G and F with a gain of its own, F over T1, correlation with J; NaN of silence.
+
+    Arrays [S], or [R, C, S] as in the recall.
+    """
+    configuration, shape = recall.configuration, np.shape(recall.J)[:-1]
+    scale, window = relative_scale(configuration), recall.window / np.max(configuration.get("t0", np.nan))
+    curves = [jnp.asarray(each).reshape(-1, *np.shape(each)[-2:]) for each in (recall.p_sig, recall.J)]
+    found: dict[str, list[Any]] = {name: [] for name in EACH}
+    for p_sig, integral in zip(*curves, strict=True):
+        own, smooth = (analysis.each(p_sig, integral, scale, over) for over in (None, window))
+        values = (own.gain, own.fidelity, smooth.fidelity, analysis.correlation(p_sig, integral))
+        for name, value in zip(EACH, values, strict=True):
+            found[name].append(np.asarray(value))
+    return {name: np.stack(values).reshape(shape) for name, values in found.items()}

@@ -1,6 +1,7 @@
 """Recall files: what was measured, and the configuration that it belongs to."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from gmem_jax.files.datasets import each_csv, recall_csv, recall_dataset
 from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
 from gmem_jax.files.measures import EACH, of_each
-from gmem_jax.files.schemas import RECALL
+from gmem_jax.files.schemas import RECALL, declared_of_recall
 from gmem_jax.files.validation import (
     Array,
     is_number,
@@ -29,6 +30,7 @@ from gmem_jax.files.validation import (
 )
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, Status
+from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.protocol import BINS, Protocol
 from gmem_jax.simulation.sample import Sample
 
@@ -55,16 +57,16 @@ def save_recall(path: str | Path, recall: Recall) -> None:
     with writing(Path(path), RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
         file.attrs["protocol"] = json.dumps(recall.protocol.to_list())
+        file.attrs["reads"], file.attrs["channels"] = json.dumps(recall.reads), json.dumps(recall.channels)
         values = {**vars(recall), **of_each(recall), "signal": names}
-        write_arrays(file, _declared(np.ndim(recall.dt)), values)
-        write_samples(file.create_group("stages"), recall.stages)
+        write_arrays(file, _declared(recall.reads, recall.channels, np.ndim(recall.dt)), values)
+        write_samples(file.create_group("stages"), recall.stages, configuration.get("observed"))
         if recall.frames is not None:
             write_frames(file, recall.frames)
 
 
-def _declared(dt_dimensions: int) -> dict[str, Array]:
-    dt = RECALL.arrays["dt"]
-    return {**RECALL.arrays, "dt": dt._replace(shape=("replica",) if dt_dimensions else ())}
+def _declared(reads: Sequence[str], channels: Sequence[str], dt_dimensions: int) -> dict[str, Array]:
+    return declared_of_recall(len(reads), len(channels), own_steps=dt_dimensions > 0)
 
 
 def to_xarray(recall: Recall) -> Any:
@@ -102,11 +104,22 @@ def load_recall(path: str | Path) -> Recall:
 
 def _recall_of(content: Content) -> Recall:
     dt = content.datasets.get("dt")
-    found = content.arrays(_declared(0 if dt is None else len(dt.shape)))
+    protocol = Protocol.from_list(json.loads(content.text("protocol")))
+    reads, channels = (json.loads(content.text(name)) for name in ("reads", "channels"))
+    for name, own, known in (("reads", reads, protocol.reads), ("channels", channels, tuple(CHANNELS))):
+        sound = isinstance(own, list) and own and len(set(map(str, own))) == len(own)
+        require(sound and all(one in known for one in own), f"its {name} are none that its protocol has")
+    found = content.arrays(_declared(reads, channels, 0 if dt is None else len(dt.shape)))
     for name in ("signal", *EACH):  # the configuration has the names too, and the rest follows
         found.pop(name)
-    protocol = Protocol.from_list(json.loads(content.text("protocol")))
-    return Recall(**found, stages=content.samples("stages"), protocol=protocol, frames=read_frames(content))  # type: ignore[arg-type]
+    return Recall(
+        **found,  # type: ignore[arg-type]
+        stages=content.samples("stages"),
+        protocol=protocol,
+        reads=tuple(reads),
+        channels=tuple(channels),
+        frames=read_frames(content),
+    )
 
 
 def _check_configuration(configuration: dict[str, Any]) -> None:
@@ -126,7 +139,7 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
 
 
 def _check(recall: Recall) -> None:
-    signals, replicas = len(recall.J), len(recall.status)
+    signals, replicas = recall.J.shape[-2], len(recall.status)
     status = np.asarray(recall.status)
     require(signals > 0 and replicas == signals + 1, f"it has {signals} signals and {replicas} replicas, not one more")
     require((status >= 0) & (status & ~_EVERY_BIT == 0), "its status is none that there is")
@@ -136,19 +149,24 @@ def _check(recall: Recall) -> None:
         (recall.window > 0.0) & np.all(np.asarray(recall.dt) > 0.0), "its time step or ringing period is not positive"
     )
     if not np.any(status & ~int(WARNINGS)):
-        measured = {name: getattr(recall, name) for name in ("p_sig", *MEASURES, "window", "residual_speed")}
+        measured = {name: getattr(recall, name) for name in ("p_sig", "window", "residual_speed")}
         require_finite(measured)
+        for one in recall.each():  # nothing can be said of what was not written
+            if np.any(one.J):
+                require_finite({name: getattr(one, name) for name in MEASURES})
     reads = recall.protocol.reads
     require(len(reads) > 0, "its protocol reads nothing")
     for name in reads:
         require(name in recall.stages, f"incomplete file, the stage {name!r} is missing")
+    lengths = {stage.name: stage.bins for stage in recall.protocol}
     for name, stage in recall.stages.items():
         require(title(name), "the name of a stage is not a line of text")
-        _check_stage(name, stage, replicas, read=name in reads)
+        _check_stage(name, stage, replicas, bins=lengths[name] if name in reads else 0)
 
 
-def _check_stage(name: str, stage: Sample, replicas: int, *, read: bool) -> None:
-    bins, wide = np.shape(stage.pressure)[0], np.shape(stage.pressure)[-1]
-    require(bins > 0 and wide in (1, replicas), f"stage {name!r} has {wide} replicas, must have 1 or {replicas}")
-    if read:
-        require((bins, wide) == (BINS, replicas), f"stage {name!r} must have {BINS} bins of {replicas} replicas")
+def _check_stage(name: str, stage: Sample, replicas: int, *, bins: int) -> None:
+    """Refuse a stage of odd shape; one that reads has the `bins` of the protocol, others any (0)."""
+    found, wide = np.shape(stage.pressure)[0], np.shape(stage.pressure)[-1]
+    require(found > 0 and wide in (1, replicas), f"stage {name!r} has {wide} replicas, must have 1 or {replicas}")
+    if bins:
+        require((found, wide) == (bins, replicas), f"stage {name!r} must have {bins} bins of {replicas} replicas")

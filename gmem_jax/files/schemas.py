@@ -23,6 +23,9 @@ DIMENSIONS = {  # names of lengths, and what the scales of those say that no arr
     "boundary": "number of the configuration, and one more",
     "contact": "number of the contact, of all configurations",
     "bump": "number of the basis waveform",
+    "read": "number of the stage that reads, of those in the attribute `reads`",
+    "channel": "number of the channel that is read, of those in the attribute `channels`",
+    "written": "number of the channel that was written on",
 }
 
 
@@ -138,6 +141,27 @@ KERNEL = Schema(
     },
     _CONFIGURATION,
 )
+
+
+def declared_of_recall(reads: int, channels: int, *, own_steps: bool = False) -> dict[str, Array]:
+    """The arrays of a recall of several reads and channels: an axis for each where there is more than one.
+
+    Args:
+        reads: how many.
+        channels: likewise.
+        own_steps: whether replicas have time steps of their own.
+    """
+    lead = ("read",) * (reads > 1) + ("channel",) * (channels > 1)
+    found = dict(RECALL.arrays)
+    for name, array in found.items():
+        if name.startswith("signal_") or name in ("shear", "J", "p_sig", "fidelity", "windowed_fidelity"):
+            found[name] = array._replace(shape=(*lead, *array.shape))
+        elif name in ("gain", "windowed_gain"):
+            found[name] = array._replace(shape=lead + ("written",) * (channels > 1))
+    if own_steps:
+        found["dt"] = found["dt"]._replace(shape=("replica",))
+    return found
+
 
 _RUN = {
     "seconds": Array("real", (), "s", "wall time of the run"),
@@ -272,10 +296,20 @@ their fields' units and descriptions in `about`.
 """
 
 
+_SEVERAL = (
+    "Where a protocol reads several times, or on several channels, the waveforms, `p_sig` and the measures have the "
+    "axes read and channel before their own, and the gains a last axis, the channel that was written on. The "
+    "attributes `reads` and `channels` name them. In `stages/NAME`, `observed_X` is what the observer X gave: a value "
+    "or an array of them for each bin and replica."
+)
+
+
 def _section(schema: Schema) -> str:
     name = f"`{schema.name}`. " if schema.name else ""
     lines = [f"## {schema.title}", "", f"{name}{schema.words}", ""]
     lines += _table(schema.arrays)
+    if schema is RECALL:
+        lines += ["", _SEVERAL]
     if schema is RECALL or schema is PACK:
         lines += ["", "In `stages/NAME`, in the order of the attribute `order` (in packs where they were kept):", ""]
         lines += _table(STAGE)

@@ -65,6 +65,16 @@ def label(default: str) -> Any:
     return field(default=default, metadata={"label": True})
 
 
+RECORDS: dict[str, type] = {}
+"""Every class that `static_record` registered, by name."""
+
+
+def static_record(cls: type[T]) -> type[T]:
+    """Register a frozen, hashable dataclass that may be the value of a static field of an exported program."""
+    RECORDS[cls.__name__] = cls
+    return cls
+
+
 class _Labels(tuple[str, ...]):
     """Texts that look alike to JAX."""
 
@@ -130,7 +140,7 @@ def pytree(cls: type[T]) -> type[T]:
         jax.export.register_pytree_node_serialization(
             cls,
             serialized_name=f"gmem_jax.{cls.__name__}",
-            serialize_auxdata=lambda structure: json.dumps(structure).encode(),
+            serialize_auxdata=lambda structure: json.dumps(structure, default=_record).encode(),
             deserialize_auxdata=_structure,
         )
     return cls
@@ -142,7 +152,16 @@ def _structure(written: bytes | bytearray) -> Any:
     return tuple(map(_hashable, fixed)), _Labels(labels)
 
 
+def _record(made: Any) -> dict[str, Any]:
+    return {"record": type(made).__name__, **{entry.name: getattr(made, entry.name) for entry in fields(made)}}
+
+
 def _hashable(value: Any) -> Any:
+    if isinstance(value, dict):
+        made: Any = object.__new__(RECORDS[value.pop("record")])
+        for name, part in value.items():
+            object.__setattr__(made, name, _hashable(part))
+        return made
     return tuple(map(_hashable, value)) if isinstance(value, list) else value
 
 

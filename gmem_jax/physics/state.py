@@ -132,6 +132,20 @@ class Box:
 
 @pytree
 @dataclass(frozen=True)
+class HeldWalls:
+    """Walls that give way to the pressure on them, axis by axis.
+
+    Attributes:
+        stretch: by how much of it each edge of the box is longer than prescribed, [3, B].
+        pressure: on the walls, averaged over the last bin, [3, B], in E.
+    """
+
+    stretch: jax.Array
+    pressure: jax.Array
+
+
+@pytree
+@dataclass(frozen=True)
 class State:
     """Everything that evolves: a run resumes bit for bit from this and the walls' motion.
 
@@ -139,11 +153,13 @@ class State:
         grains: see `Grains`.
         history: what the friction law remembers of each candidate contact, a pytree with leaves [P, ..., B].
         status: sticky bits of `Status`, int32 [B].
+        servo: of walls that are held at a pressure; None where none ever are.
     """
 
     grains: Grains
     history: Any
     status: jax.Array
+    servo: HeldWalls | None = None
 
     @property
     def replicas(self) -> int:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.experiment.protocols import cycle
+from gmem_jax.experiment.stages import cycle
 from gmem_jax.files.validation import is_number
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pytree import interval

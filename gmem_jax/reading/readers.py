@@ -50,10 +50,10 @@ def stored_words(recall: Recall, target: Signals | None = None) -> Stored:
     # J of a word is of order u_b / pi: a tenth of a thousandth of it is far above round-off, far below another word.
     if expected.shape != templates.shape or not np.allclose(templates, expected, atol=1e-4 / (np.pi * (bits + 4))):
         raise ValueError(f"the recall holds {len(templates)} signals that are not the words of one length")
-    first = analysis.recalled(jnp.asarray(recall.stages[recall.protocol.reads[0]].pressure))
-    if len(recall.protocol.reads) < 2:
-        return Stored(bits, "sub0", np.asarray(analysis.subtract("sub0", first)), templates)
-    second = analysis.recalled(jnp.asarray(recall.stages[recall.protocol.reads[1]].pressure))
+    if recall.second_readout is None:
+        return Stored(bits, "sub0", np.asarray(recall.p_sig), templates)
+    first = analysis.recalled(jnp.asarray(recall.stages[recall.reads[0]].pressure))
+    second = analysis.recalled(jnp.asarray(recall.stages[recall.second_readout].pressure))
     return Stored(bits, "sub2-bl", np.asarray(analysis.subtract("sub2-bl", first, second)), templates)
 
 

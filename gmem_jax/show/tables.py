@@ -103,7 +103,7 @@ def _number(cell: str) -> str | float:
 def summary(recall: Recall) -> dict[str, Any]:
     """The numbers of one recall and its resolved configuration, for JSON output and `recall_table`."""
     configuration = recall.configuration
-    readout = recall.stages[recall.protocol.reads[0]]
+    readout = recall.stages[recall.reads[0]]
     pressure = np.asarray(readout.pressure)
     unit = Material().modulus
     status = combined_status(recall.status)
@@ -180,7 +180,7 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
     "second_readout" has mean and standard error over the S signals of the correlation with J and of the gain. Words
     are sums of few bits, so that their errors are not independent: the spread over packs is the better measure.
     """
-    if len(recall.protocol.reads) < 2:
+    if recall.second_readout is None:
         return {}
     first, second = (analysis.recalled(recall.stages[name].pressure) for name in recall.protocol.reads)
     scale = relative_scale(configuration)

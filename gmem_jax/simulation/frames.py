@@ -142,7 +142,7 @@ class FrameRecorder(Observer):
         """Record the configuration before the first bin of a stage, if it is wanted."""
         name, path = chunk.stage.name, chunk.simulation.path
         if chunk.first == 0 and self.schedule.begins(name) and name not in self.recorded:
-            self.record(chunk, chunk.state, np.asarray(path.lower), np.asarray(path.upper), chunk.stage.start)
+            self.record(chunk, chunk.state, np.asarray(path.lower), np.asarray(path.upper), chunk.stage.ends[0])
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
         """Record what is wanted of a chunk."""
@@ -152,7 +152,8 @@ class FrameRecorder(Observer):
             half = 0.5 * chunk.gather(then_sample.lengths)[bins - 1]
             path, stage = chunk.simulation.path, chunk.stage
             centre = 0.5 * np.asarray(path.lower + path.upper)
-            u = stage.start + (stage.stop - stage.start) * done / stage.bins
+            start, stop = stage.ends
+            u = start + (stop - start) * done / stage.bins
             self.record(chunk, then, centre - half, centre + half, u, chunk.simulation.duration(bins))
 
     def record(
@@ -243,9 +244,10 @@ def places_at(stages: Sequence[Stage], compressions: Sequence[float]) -> dict[st
         if not 0.0 <= u <= 1.0:
             raise ValueError(f"frames at u = {u:g}: u goes from 0, not compressed, to 1, fully compressed")
         for number, stage in enumerate(stages):
-            if stage.start == stage.stop:
+            start, stop = stage.ends
+            if start == stop or not min(stage.ends) <= u <= max(stage.ends):
                 continue
-            bins = round(stage.bins * (u - stage.start) / (stage.stop - stage.start))
+            bins = round(stage.bins * (u - start) / (stop - start))
             at, bins = (stage, bins) if bins or not number else (stages[number - 1], stages[number - 1].bins)
             found.setdefault(at.name, set()).add(bins)
     return {stage.name: sorted(found[stage.name]) for stage in stages if stage.name in found}

@@ -4,8 +4,9 @@ Everything that moves grains along a protocol goes through `bin_step`: the rollo
 computation, and the chunks of the host (`simulation.runner`), forwards and for derivatives.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +14,27 @@ import numpy as np
 from jax import lax
 
 from gmem_jax import native
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.pairs import Pairs
 from gmem_jax.physics.pytree import Scalar, pytree, static
-from gmem_jax.physics.state import Box, State
+from gmem_jax.physics.state import Box, Grains, HeldWalls, State
 from gmem_jax.physics.step import System, mark_varying
 from gmem_jax.simulation import scan
-from gmem_jax.simulation.protocol import Bin
-from gmem_jax.simulation.sample import Sample, end_bin
-from gmem_jax.simulation.strain import StrainPath
+from gmem_jax.simulation.protocol import Bin, Columns, Stage, table
+from gmem_jax.simulation.sample import Sample, end_bin, overlaps
+from gmem_jax.simulation.strain import StrainPath, servo_strain, stretched
+
+Observe = Callable[["Simulation", State], Any]
+"""A reduction of a state to arrays [..., B], in plain JAX: jitted, vmapped and differentiated with the steps."""
+
+
+class Mark(NamedTuple):
+    """What observers compare with: a state, without its histories, and its walls."""
+
+    grains: Grains
+    box: Box
+    touching: jax.Array  # pairs of spheres, [B]
 
 
 @pytree
@@ -36,6 +50,12 @@ class Simulation:
         steps: steps in a bin.
         backend: who does them; see `native.resolve`.
         precision: of contacts, likewise.
+        columns: what the stages make use of.
+        observe: names and functions of (simulation, state), called at the end of each bin: what they give, a tree of
+            arrays [..., B], is kept in `Sample.observed`. They find the walls in `box` and the sample in `sample`.
+        mark: the state and walls that they may compare with.
+        box: walls at the end of the bin, for them.
+        sample: of the bin, for them.
     """
 
     system: System
@@ -45,11 +65,25 @@ class Simulation:
     steps: int = static(1)
     backend: str = static("auto")
     precision: str = static("double")
+    columns: Columns = static(Columns())
+    observe: tuple[tuple[str, Observe], ...] = static(())
+    mark: Mark | None = None
+    box: Box | None = None
+    sample: Sample | None = None
 
     @property
     def resolved(self) -> native.ResolvedBackend:
         """What does the steps; the same object for all simulations that ask for the same."""
         return native.resolve(self.backend, self.precision, self.system.friction)
+
+    def marked(self, state: State, stage: Stage) -> "Simulation":
+        """The same, whose observers compare with a state at the beginning of a stage."""
+        if not self.observe:
+            return self
+        box = self.box_before(self.rows(stage, 0), state.servo)
+        wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, state.replicas)), box)
+        apart = overlaps(self.system, state)
+        return replace(self, mark=Mark(state.grains, wide, jnp.sum(apart > 0.0, axis=0)))
 
     def with_pairs(self, pairs: Pairs) -> "Simulation":
         """The same with another list of candidates."""
@@ -59,19 +93,40 @@ class Simulation:
         """How long some bins take, in t_c; the longest of the replicas."""
         return bins * self.steps * float(np.max(np.asarray(self.dt)))
 
-    def box_before(self, row: Bin) -> Box:
+    def rows(self, stage: Stage, first: Any, count: int | None = None) -> Bin:
+        """Bins of a stage as this simulation takes them; see `Stage.rows`."""
+        return stage.rows(first, count, self.columns)
+
+    def box_before(self, row: Bin, servo: HeldWalls | None = None) -> Box:
         """The walls at the beginning of a bin; their velocities are per bin here."""
-        return self.path.box_at(row, jnp.asarray(float(row.number)), float(row.bins))
+        box = self.path.box_at(row, jnp.asarray(float(row.number)), float(row.bins))
+        return box if servo is None else stretched(box, servo.stretch)
 
 
-def walls(simulation: Simulation, row: Bin, replicas: int) -> Box:
-    """The walls at the end of each step of a bin, leaves [steps, 3, B]."""
+def at_rest(simulation: Simulation, state: State, box: Box) -> HeldWalls:
+    """The servo of a pack at rest in a box: nothing stretched, and the pressures on its walls."""
+    replicas = state.replicas
+    wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (1, 3, replicas)), box)
+    nothing = jnp.zeros(())
+    _, pressure = dynamics.march(simulation.system, replace(state, servo=None), wide, nothing, nothing)
+    return HeldWalls(jnp.zeros((3, replicas)), pressure)
+
+
+def walls(simulation: Simulation, row: Bin, state: State) -> tuple[Box, HeldWalls | None]:
+    """The walls at the end of each step of a bin, leaves [steps, 3, B]; and where its servo ends."""
+    replicas = state.replicas
     dt, steps = jnp.asarray(simulation.dt), simulation.steps
     count = row.number * steps + 1 + jnp.arange(steps)
     times = count.reshape(-1, *(1 for _ in dt.shape)) * dt
     boxes = jax.vmap(lambda time: simulation.path.box_at(row, time, (row.bins * steps) * dt))(times)
     wide: Box = jax.tree.map(lambda leaf: jnp.broadcast_to(_padded(leaf, replicas), (steps, 3, replicas)), boxes)
-    return wide
+    if state.servo is None or row.pressure is None:
+        return wide, None
+    strain, servo = servo_strain(state.servo, jnp.stack([jnp.asarray(p) for p in row.pressure])[:, None]), state.servo
+    passed = (1.0 + jnp.arange(steps))[:, None, None] / steps
+    rate = strain / (steps * _padded(dt, replicas))
+    moved = stretched(wide, servo.stretch + passed * strain, rate)
+    return moved, replace(servo, stretch=servo.stretch + strain)
 
 
 def _padded(leaf: Any, replicas: int) -> Any:
@@ -85,15 +140,31 @@ def _padded(leaf: Any, replicas: int) -> Any:
 def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sample]:
     """One bin: its steps, the checks at its end, its sample."""
     with jax.named_scope("walls"):
-        boxes = walls(simulation, row, state.replicas)
-        still = (row.start == row.stop) & ~jnp.asarray(row.sheared, bool)
-        drag = _padded(jnp.where(still, simulation.drag, 0.0), state.replicas)
+        boxes, servo = walls(simulation, row, state)
+        drag = jnp.where(jnp.asarray(row.still, bool), simulation.drag, 0.0)
+        drag = _padded(drag if row.drag is None else drag + row.drag, state.replicas)
     with jax.named_scope("steps"):
         dt = _padded(simulation.dt, state.replicas)
-        state, total = simulation.resolved.march(simulation.system, state, boxes, dt, drag)
+        system = _rubbing(simulation.system, row)
+        state, total = simulation.resolved.march(system, replace(state, servo=None), boxes, dt, drag)
     with jax.named_scope("sample"):
+        pressure = total / simulation.steps
+        if servo is not None:
+            state = replace(state, servo=replace(servo, pressure=pressure))
         last = jax.tree.map(lambda leaf: leaf[-1], boxes)
-        return end_bin(simulation.system, state, last, total / simulation.steps, row.u)
+        state, sample = end_bin(simulation.system, state, last, pressure, row.u)
+        if not simulation.observe:
+            return state, sample
+        seen = replace(simulation, box=last, sample=sample)
+        return state, replace(sample, observed={name: reduce(seen, state) for name, reduce in simulation.observe})
+
+
+def _rubbing(system: System, row: Bin) -> System:
+    """The system with friction as the stage has it."""
+    law = system.friction
+    if row.friction is None or not isinstance(law, CoulombLaw):
+        return system
+    return replace(system, friction=replace(law, mu=law.mu * row.friction))  # type: ignore[type-var]
 
 
 def rollout(simulation: Simulation, state: State, rows: Bin) -> tuple[State, Sample]:
@@ -103,6 +174,21 @@ def rollout(simulation: Simulation, state: State, rows: Bin) -> tuple[State, Sam
     """
     state, _ = mark_varying((state, simulation))
     return scan.scan(lambda state, row: bin_step(simulation, state, row), state, rows)
+
+
+def rollout_stages(simulation: Simulation, state: State, stages: tuple[Stage, ...]) -> tuple[Simulation, State, Sample]:
+    """Stages one after the other; the simulation with its last mark, the state after them, and their samples."""
+    parts, first = [], 0
+    for place in range(1, len(stages) + 1):
+        if place < len(stages) and not (stages[place].mark and simulation.observe):
+            continue
+        if stages[first].mark:
+            simulation = simulation.marked(state, stages[first])
+        state, sample = rollout(simulation, state, table(stages[first:place], simulation.columns))
+        parts.append(sample)
+        first = place
+    joined: Sample = parts[0] if len(parts) == 1 else jax.tree.map(lambda *each: jnp.concatenate(each), *parts)
+    return simulation, state, joined
 
 
 def rollout_chunk(

@@ -53,7 +53,7 @@ class Chunk:
     @property
     def row(self) -> Bin:
         """The first bin."""
-        return self.stage.bin(self.first)
+        return self.simulation.rows(self.stage, self.first)
 
     @property
     def ends_stage(self) -> bool:

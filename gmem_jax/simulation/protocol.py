@@ -3,20 +3,26 @@
 import itertools
 import math
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
 
+from gmem_jax.physics.pytree import static_record
+from gmem_jax.simulation.channels import CHANNELS
+
 BINS = 256  # bins of a stage of length t0, as in the paper: the resolution of every recorded quantity
+SINE = "sine:"  # begins the name of a drive of whole sine periods
 
 Numbers = float | np.ndarray | jax.Array
 """A number, or a column of a table."""
 
 Role = Literal["condition", "write", "hold", "read"]
 """What a stage is for: to strain the pack without a waveform, to apply one, to wait, or to measure what it recalls."""
+Along = Literal["u", "time"]
+"""What a waveform is a function of: the compression u, or the time since the stage began, over its length."""
 
 
 class Bin(NamedTuple):
@@ -27,14 +33,24 @@ class Bin(NamedTuple):
         stop: u at the end of its stage.
         bins: length of its stage.
         number: its place in the stage, from 0.
-        sheared: whether the waveform is applied.
+        timed: whether waveforms are functions of time.
+        still: whether the drag of the simulation acts.
+        amplitudes: of each of `Columns.lanes`; 0 where it is not applied.
+        drag: of the stage, in the place of the simulation's, 1 / t_c; None where no stage has one.
+        friction: 1, or 0 where the stage switches friction off; None where no stage does.
+        pressure: that the walls of each axis are held at, in E, 0 for walls that are not; None where no stage has one.
     """
 
     start: Numbers
     stop: Numbers
     bins: Numbers
     number: Numbers
-    sheared: Numbers
+    timed: Numbers
+    still: Numbers
+    amplitudes: tuple[Numbers, ...] = ()
+    drag: Numbers | None = None
+    friction: Numbers | None = None
+    pressure: tuple[Numbers, Numbers, Numbers] | None = None
 
     @property
     def u(self) -> Any:
@@ -42,76 +58,288 @@ class Bin(NamedTuple):
         return self.start + (self.stop - self.start) * ((self.number + 1) / self.bins)
 
 
+@static_record
+@dataclass(frozen=True)
+class Drive:
+    """A waveform on a channel.
+
+    Attributes:
+        channel: one of `CHANNELS`; "" for the channel that is called like the waveforms.
+        waveform: the name of a set of waveforms, of which each replica has its own; "" for all sets that are called
+            like a channel. Or one for all replicas, the zero signal's too: its samples at k / (n + 1), k = 1..n, or
+            "sine:n", n whole periods.
+        amplitude: what it is multiplied with, beside gamma0.
+
+    Raises:
+        ValueError: for an unknown channel, or what makes no waveform.
+    """
+
+    channel: str = ""
+    waveform: str | tuple[float, ...] = ""
+    amplitude: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.channel and self.channel not in CHANNELS:
+            raise ValueError(f"a channel must be one of {', '.join(CHANNELS)}; got {self.channel!r}")
+        if not isinstance(self.waveform, str):
+            object.__setattr__(self, "waveform", tuple(map(float, self.waveform)))
+            if len(self.waveform) < 2 or not all(map(math.isfinite, self.waveform)):
+                raise ValueError(
+                    "a fixed waveform is made of 2 or more finite samples between its ends, which are zero"
+                )
+        elif self.waveform.startswith(SINE) and self.periods < 1:
+            raise ValueError(f"a sine has whole periods, as in 'sine:4'; got {self.waveform!r}")
+        if self.fixed and not self.channel:
+            raise ValueError("a fixed waveform needs a channel, as in channel='xy'")
+        if isinstance(self.amplitude, bool) or not math.isfinite(self.amplitude):
+            raise ValueError(f"the amplitude of a drive must be a finite number, got {self.amplitude!r}")
+        object.__setattr__(self, "amplitude", float(self.amplitude))
+
+    @property
+    def fixed(self) -> bool:
+        """Whether it is the same for all replicas."""
+        return not isinstance(self.waveform, str) or self.waveform.startswith(SINE)
+
+    @property
+    def periods(self) -> int:
+        """Of a sine; 0 of what is none."""
+        count = self.waveform.removeprefix(SINE) if isinstance(self.waveform, str) else ""
+        return int(count) if count.isdecimal() else 0
+
+    @property
+    def lane(self) -> "Lane":
+        """What of it does not change from bin to bin."""
+        return Lane(self.channel, self.waveform)
+
+
+class Lane(NamedTuple):
+    """A waveform on a channel, whatever its amplitude: a column of a table of bins. See `Drive`."""
+
+    channel: str
+    waveform: str | tuple[float, ...]
+
+
+OWN = (Drive(),)
+"""Each set of waveforms on the channel of its name."""
+
+
+class Columns(NamedTuple):
+    """What some stages make use of: programs are compiled for it.
+
+    Attributes:
+        lanes: waveforms by channel.
+        drag: whether any stage has a drag of its own.
+        friction: whether any switches friction off.
+        pressure: whether any holds walls at a pressure.
+    """
+
+    lanes: tuple[Lane, ...] = ()
+    drag: bool = False
+    friction: bool = False
+    pressure: bool = False
+
+
+@static_record
 @dataclass(frozen=True)
 class Stage:
     """One stage of a protocol.
 
     Attributes:
         name: for people; nothing follows from it.
-        start: u at its beginning.
-        stop: u at its end.
+        start: u at its beginning; None for where the stage before ends.
+        stop: u at its end; None for where it begins.
         length: duration in units of t0.
         role: what it is for.
-        sheared: whether the waveform is applied: as a function of u, or, where u stands still, of time from 0 to 1.
+        drives: the waveforms that are applied.
+        along: what they are a function of; default u, or time where u stands still.
+        drag: viscous drag, 1 / t_c; default the experiment's where the walls stand still, else none.
+        friction: whether grains rub.
+        pressure: at which the walls of x, y, z are held by a servo, in E; None for walls that follow u. They stay where
+            the stage leaves them: what follows strains the box from there.
+        of: of a stage that reads, the stage whose waveforms its recall is compared with; default the last that wrote on
+            each channel.
+        mark: whether observers compare with the beginning of this stage (`gmem_jax.simulation.observables`).
+        recorded: whether its samples are kept.
 
     Raises:
-        ValueError: for an unknown role, or a length that is negative or infinite.
+        ValueError: for what no stage can be.
     """
 
     name: str
-    start: float
-    stop: float
-    length: float
+    start: float | None = None
+    stop: float | None = None
+    length: float = 1.0
     role: Role = "condition"
-    sheared: bool = False
+    drives: tuple[Drive, ...] = ()
+    along: Along | None = None
+    drag: float | None = None
+    friction: bool = True
+    pressure: tuple[float | None, float | None, float | None] | None = None
+    of: str | None = None
+    mark: bool = False
+    recorded: bool = True
 
     def __post_init__(self) -> None:
+        def refuse(problem: str) -> None:
+            raise ValueError(f"stage {self.name!r}: {problem}")
+
+        object.__setattr__(self, "drives", tuple(self.drives))
+        if not isinstance(self.name, str) or not self.name.isprintable() or not self.name or "/" in self.name:
+            raise ValueError(f"a stage has a name of printable letters without '/', got {self.name!r}")
         if self.role not in get_args(Role):
-            raise ValueError(f"the role of stage {self.name!r} must be one of {', '.join(get_args(Role))}")
+            refuse(f"its role must be one of {', '.join(get_args(Role))}; got {self.role!r}")
+        if self.along not in (None, *get_args(Along)):
+            refuse(f"along must be one of {', '.join(get_args(Along))}; got {self.along!r}")
+        for name in ("start", "stop"):
+            u = getattr(self, name)
+            if u is not None and not 0.0 <= u <= 1.0:
+                refuse(f"u must be in [0, 1], and its {name} is {u}")
         if not 0.0 <= self.length < math.inf:
-            raise ValueError(f"the length of stage {self.name!r} must be in [0, inf), got {self.length}")
+            refuse(f"its length must be in [0, inf), got {self.length}")
+        if self.drag is not None and not 0.0 <= self.drag < math.inf:
+            refuse(f"its drag must be in [0, inf), got {self.drag}")
+        if self.role == "write" and not self.drives:
+            refuse("it writes no waveform; give it drives, or another role")
+        if self.of is not None and self.role != "read":
+            refuse("only a stage that reads is compared with another")
+        if self.role == "read" and not self.recorded:
+            refuse("what is read is recorded")
+        if self.pressure is not None:
+            object.__setattr__(self, "pressure", tuple(self.pressure))
+            if len(self.pressure) != 3 or not all(p is None or 0.0 < p < math.inf for p in self.pressure):
+                refuse(f"its pressure is three numbers above 0 or none, for x, y and z; got {self.pressure}")
 
     @property
     def bins(self) -> int:
         """Length in bins of t0 / 256; a hold is rounded up to whole bins."""
         return max(1, math.ceil(self.length * BINS - 1e-9))
 
-    def bin(self, number: Numbers) -> Bin:
-        """The bin of a number, or the bins of several."""
-        return Bin(self.start, self.stop, self.bins, number, self.sheared)
+    @property
+    def ends(self) -> tuple[float, float]:
+        """u at its beginning and at its end, of a stage of a protocol."""
+        return self.start or 0.0, self.stop or 0.0
 
-    def rows(self, first: int, count: int) -> Bin:
-        """`count` bins from number `first` on, as columns [count]."""
-        return Bin(*(np.broadcast_to(column, count) for column in self.bin(first + np.arange(count))))
+    @property
+    def moves(self) -> bool:
+        """Whether u changes."""
+        return self.start != self.stop
+
+    @property
+    def timed(self) -> bool:
+        """Whether waveforms are functions of time."""
+        return self.along == "time" or not self.moves
+
+    @property
+    def sheared(self) -> bool:
+        """Whether a waveform is applied."""
+        return bool(self.drives)
+
+    @property
+    def own(self) -> tuple[Drive, ...]:
+        """The drives of which each replica has its own waveform."""
+        return tuple(drive for drive in self.drives if not drive.fixed)
+
+    def rows(self, first: Any, count: int | None = None, columns: Columns | None = None) -> Bin:
+        """The bin of number `first`, or `count` bins from there on, as columns [count].
+
+        Args:
+            first: number of the bin, from 0.
+            count: how many; None for one bin, of numbers.
+            columns: which columns the table has; default those that this stage needs.
+        """
+        columns = columns_of((self,)) if columns is None else columns
+        held = None if self.pressure is None else tuple(p or 0.0 for p in self.pressure)
+        amplitudes = Counter[Lane]()
+        for drive in self.drives:
+            amplitudes[drive.lane] += drive.amplitude  # type: ignore[assignment]
+        row = Bin(
+            *self.ends,
+            self.bins,
+            first if count is None else first + np.arange(count),
+            self.timed,
+            not (self.moves or self.drives) and self.drag is None,
+            tuple(float(amplitudes[lane]) for lane in columns.lanes),
+            (self.drag or 0.0) if columns.drag else None,
+            float(self.friction) if columns.friction else None,
+            (held or (0.0, 0.0, 0.0)) if columns.pressure else None,  # type: ignore[arg-type]
+        )
+        if count is None:
+            return row
+        table_: Bin = jax.tree.map(lambda column: np.broadcast_to(column, count), row)
+        return table_
 
 
-def table(stages: tuple[Stage, ...]) -> Bin:
+def columns_of(stages: Iterable[Stage]) -> Columns:
+    """The columns that some stages need."""
+    stages = tuple(stages)
+    lanes = dict.fromkeys(drive.lane for stage in stages for drive in stage.drives)
+    return Columns(
+        tuple(lanes),
+        any(stage.drag is not None for stage in stages),
+        not all(stage.friction for stage in stages),
+        any(stage.pressure is not None for stage in stages),
+    )
+
+
+def table(stages: Iterable[Stage], columns: Columns | None = None) -> Bin:
     """All bins of some stages, one after the other; [rows] each."""
-    columns = zip(*(stage.rows(0, stage.bins) for stage in stages), strict=True)
-    return Bin(*(np.concatenate(column) for column in columns))
+    stages = tuple(stages)
+    columns = columns_of(stages) if columns is None else columns
+    parts = [stage.rows(0, stage.bins, columns) for stage in stages]
+    joined: Bin = jax.tree.map(lambda *column: np.concatenate(column), *parts)
+    return joined
 
 
-@dataclass(frozen=True)
+@static_record
+@dataclass(frozen=True, init=False)
 class Protocol:
     """Stages one after the other.
 
+    Args:
+        stages: stages, or tuples of them as the builders of `gmem_jax.experiment.protocols` give. A stage that does not
+            say where u is goes on from the one before, the first from u = 0. Of several that share a name the second
+            becomes NAME-2, and so on.
+
     Raises:
-        ValueError: if there is none, two have one name, or the walls would jump from one to the next.
+        ValueError: if there is none, the walls would jump from one to the next, or a waveform would not end at zero.
     """
 
     stages: tuple[Stage, ...]
 
-    def __post_init__(self) -> None:
-        if not self.stages:
-            raise ValueError("a protocol has at least one stage")
-        name, times = Counter(stage.name for stage in self.stages).most_common(1)[0]
-        if times > 1:
-            raise ValueError(f"the stages of a protocol have different names; {name!r} is there {times} times")
-        for one, other in itertools.pairwise(self.stages):
-            if one.stop != other.start:
+    def __init__(self, *stages: Stage | Iterable[Any]) -> None:
+        u, made, names, given = 0.0, list[Stage](), Counter[str](), list(_flat(stages))
+        taken = {stage.name for stage in given}
+        for stage in given:
+            names[stage.name] += 1
+            name, number = stage.name, names[stage.name]
+            while number > 1 and (name := f"{stage.name}-{number}") in taken:
+                number += 1
+            taken.add(name)
+            start = u if stage.start is None else float(stage.start)
+            if made and start != u:
                 raise ValueError(
-                    f"the walls would jump: stage {one.name!r} ends at u = {one.stop:g}, and {other.name!r} begins at "
-                    f"u = {other.start:g}"
+                    f"the walls would jump: stage {made[-1].name!r} ends at u = {u:g}, and {name!r} begins at "
+                    f"u = {start:g}"
+                )
+            u = start if stage.stop is None else float(stage.stop)
+            made.append(replace(stage, name=name, start=start, stop=u))
+            _require_closed(made[-1])
+        if not made:
+            raise ValueError("a protocol has at least one stage")
+        object.__setattr__(self, "stages", tuple(made))
+        self._require_readable()
+
+    def _require_readable(self) -> None:
+        for place, stage in enumerate(self.stages):
+            if stage.role != "read":
+                continue
+            before = [earlier for earlier in self.stages[:place] if earlier.role == "write"]
+            if not before:
+                raise ValueError(f"stage {stage.name!r} reads before anything was written")
+            if stage.of is not None and stage.of not in [earlier.name for earlier in before]:
+                raise ValueError(
+                    f"stage {stage.name!r} is compared with {stage.of!r}, and what was written before it is "
+                    f"{', '.join(earlier.name for earlier in before)}"
                 )
 
     def __iter__(self) -> Iterator[Stage]:
@@ -148,22 +376,133 @@ class Protocol:
 
     @property
     def phases(self) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
-        """The stages before the first sheared one, common to all waveforms and run once; and those from it on."""
-        common = tuple(itertools.takewhile(lambda stage: not stage.sheared, self.stages))
+        """The stages before the first with a waveform, common to all replicas and run once; and those from it on."""
+        common = tuple(itertools.takewhile(lambda stage: not stage.drives, self.stages))
         return common, self.stages[len(common) :]
 
+    @property
+    def columns(self) -> Columns:
+        """The columns that its table of bins has."""
+        return columns_of(self.stages)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The channels on which replicas write waveforms of their own, in the order of `CHANNELS`."""
+        written = {drive.channel for stage in self.stages if stage.role == "write" for drive in stage.own}
+        return tuple(channel for channel in CHANNELS if channel in written)
+
+    def written(self, read: str) -> dict[str, Drive]:
+        """What a stage that reads is compared with: the drive that last wrote on each channel before it.
+
+        Raises:
+            ValueError: if there is no stage of this name.
+        """
+        place = [stage.name for stage in self.stages].index(read)
+        of = self.stages[place].of
+        before = [stage for stage in self.stages[:place] if stage.role == "write" and of in (None, stage.name)]
+        return {drive.channel: drive for stage in before for drive in stage.own}
+
+    def with_sets(self, names: Iterable[str]) -> "Protocol":
+        """The same protocol for sets of waveforms of these names: drives that leave channel or set open say which.
+
+        Raises:
+            ValueError: if a drive names a set that there is not, or none of them is called like a channel.
+        """
+        names = tuple(names)
+        return Protocol(replace(stage, drives=_named_drives(stage, names)) for stage in self.stages)
+
+    def with_value(self, path: str, value: Any) -> "Protocol":
+        """The same protocol with another value of a stage's field, by a name like "store.length".
+
+        Raises:
+            ValueError: if there is no such stage or field, or it becomes no protocol.
+        """
+        name, _, field = path.rpartition(".")
+        known = [entry.name for entry in fields(Stage)]
+        if name not in [stage.name for stage in self.stages]:
+            raise ValueError(f"the protocol has no stage {name!r}; it has {', '.join(s.name for s in self.stages)}")
+        if field == "amplitude":
+            return Protocol(
+                replace(s, drives=tuple(replace(d, amplitude=value) for d in s.drives)) if s.name == name else s
+                for s in self.stages
+            )
+        if field not in known:
+            raise ValueError(f"a stage has no {field!r}; it has {', '.join(known)} and amplitude")
+        return Protocol(replace(s, **{field: value}) if s.name == name else s for s in self.stages)
+
     def to_list(self) -> list[dict[str, Any]]:
-        """The stages as JSON has them."""
-        return [asdict(stage) for stage in self.stages]
+        """The stages as JSON has them, without what is left to its default."""
+        return [_without_defaults(stage) for stage in self.stages]
 
     @classmethod
-    def from_list(cls, stages: list[dict[str, Any]]) -> "Protocol":
+    def from_list(cls, stages: Iterable[Mapping[str, Any]]) -> "Protocol":
         """The protocol of `to_list`.
 
         Raises:
-            ValueError: if a stage has other fields, or they make no protocol.
+            ValueError: if a stage has other fields, two have one name, or they make no protocol.
         """
         try:
-            return cls(tuple(Stage(**stage) for stage in stages))
-        except TypeError as error:
+            made = [
+                Stage(**{**stage, "drives": tuple(Drive(**drive) for drive in stage.get("drives", ()))})
+                for stage in stages
+            ]
+        except (TypeError, AttributeError) as error:
             raise ValueError(f"not the stages of a protocol: {error}") from None
+        name, times = Counter(stage.name for stage in made).most_common(1)[0] if made else ("", 0)
+        if times > 1:
+            raise ValueError(f"the stages of a protocol have different names; {name!r} is there {times} times")
+        return cls(*made)
+
+
+def _flat(parts: Iterable[Any]) -> Iterator[Stage]:
+    for part in parts:
+        if isinstance(part, Stage):
+            yield part
+        elif isinstance(part, Iterable) and not isinstance(part, str | Mapping):
+            yield from _flat(part)
+        else:
+            raise ValueError(f"a protocol is made of stages, as gm.cycle() and gm.hold(2.0) give; got {part!r}")
+
+
+def _require_closed(stage: Stage) -> None:
+    """Refuse a stage at whose ends a waveform does not vanish: the walls would jump there."""
+    ends = {stage.start, stage.stop}
+    if stage.moves and stage.length == 0.0:
+        raise ValueError(f"the walls would jump: stage {stage.name!r} changes u in no time")
+    if stage.drives and not stage.timed and not ends <= {0.0, 1.0}:
+        raise ValueError(
+            f"stage {stage.name!r} goes from u = {stage.start:g} to {stage.stop:g}, and waveforms vanish only at u = 0 "
+            "and 1: use along='time', by which a waveform is gone through from its beginning to its end"
+        )
+
+
+def _named_drives(stage: Stage, names: tuple[str, ...]) -> tuple[Drive, ...]:
+    """The drives of a stage with channel and set."""
+    found: list[Drive] = []
+    for drive in stage.drives:
+        if drive.fixed:
+            found.append(drive)
+            continue
+        wanted = (drive.waveform,) if drive.waveform else tuple(name for name in names if name in CHANNELS)
+        if not drive.waveform and drive.channel:
+            wanted = (drive.channel,) if drive.channel in names else names[:1]
+        if not wanted or any(name not in names for name in wanted):
+            raise ValueError(
+                f"stage {stage.name!r} writes {drive.waveform or 'the sets called like a channel'!r}, and the sets of "
+                f"waveforms are {', '.join(names)}"
+            )
+        for name in map(str, wanted):
+            channel = drive.channel or (name if name in CHANNELS else "xy")
+            found.append(replace(drive, channel=channel, waveform=name))
+    return tuple(found)
+
+
+def _without_defaults(made: Any) -> dict[str, Any]:
+    kept = {entry.name: getattr(made, entry.name) for entry in fields(made)}
+    kept = {e.name: kept[e.name] for e in fields(made) if e.name in _ALWAYS or kept[e.name] != e.default}
+    if "drives" in kept:
+        kept["drives"] = [_without_defaults(drive) for drive in kept["drives"]]
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in kept.items()}
+
+
+_ALWAYS = ("name", "start", "stop", "length", "role")

@@ -18,7 +18,7 @@ from gmem_jax.physics.pairs import carry_history
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, State, Status, combined_status, explain
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint, ResultCache
-from gmem_jax.simulation.loop import Simulation
+from gmem_jax.simulation.loop import Mark, Simulation
 from gmem_jax.simulation.neighbors import SKIN, WIDEST, pair_finder, skin_left
 from gmem_jax.simulation.observers import CHUNK, CheckpointWriter, Chunk, Observer, SampleRecorder
 from gmem_jax.simulation.progress import Progress, silent, work_of_bin
@@ -113,11 +113,14 @@ class Runner:
             "counters": counters,
             "finder": {} if self.finder is None else self.finder.kept(),
             "observers": tuple(observer.saved() for observer in self.observers),
+            "mark": () if self.simulation.mark is None else self.gather(tuple(self.simulation.mark)),
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Stand where a runner of the same simulation stood when it gave `snapshot`."""
+        mark = Mark(*snapshot["mark"]) if snapshot["mark"] else None
         self.state, self.simulation = snapshot["state"], self.simulation.with_pairs(snapshot["pairs"])
+        self.simulation = replace(self.simulation, mark=mark)
         self.place_on(self.placement)
         self.time, self.work, rebuilds, self.skin, chunk, lasted = snapshot["counters"].tolist()
         self.rebuilds, self.chunk, self._lasted = int(rebuilds), int(chunk), int(lasted)
@@ -147,6 +150,8 @@ class Runner:
         writer = CheckpointWriter(checkpoint, lambda: {"runner": self.snapshot(), "samples": samples.saved()})
         for stage in stages:
             while (done := samples.bins(stage.name)) < stage.bins:
+                if stage.mark and done == 0:
+                    self.simulation = self.simulation.marked(self.state, stage)
                 self._run_chunk(stage, done, (*self.observers, samples), writer)
         found = samples.saved()
         return OrderedDict((stage.name, found[stage.name]) for stage in stages)
@@ -224,7 +229,7 @@ class Runner:
     def _foresee(self, stage: Stage, done: int) -> None:
         """Renew a list that would not last for another chunk, if grains went on using it up as they have."""
         count = min(self.chunk, stage.bins - done)
-        box = self.simulation.box_before(stage.bin(done))
+        box = self.simulation.box_before(self.simulation.rows(stage, done), self.state.servo)
         left = float(np.min(np.asarray(skin_left(self.simulation.system, self.state, box))))
         if (self.skin - left) * (1.0 + count / self._lasted) > self.skin:
             self._renewed_at = (stage.name, self.time)
@@ -246,4 +251,4 @@ class Runner:
                 why = why or "the steps are unstable; use a smaller dt, or check pack and friction law"
                 raise RunFailedError(f"{chunk.stage.name}: grains moved by most of R within one bin: {why}")
         self._renewed_at = (chunk.stage.name, self.time)
-        self.renew(self.simulation.box_before(chunk.row))
+        self.renew(self.simulation.box_before(chunk.row, chunk.state.servo))

@@ -57,6 +57,7 @@ class Sample:
     """What is recorded of one bin of steps: arrays [B], or [3, B] of vectors; a rollout adds a leading axis of bins.
 
     The fields and their units are in docs/files.md, which is made of their `measured`, as are files and pictures.
+    `observed` holds what the observers of the simulation gave, by name: arrays [..., B].
     """
 
     u: jax.Array = measured("1", "compression variable at the end of the bin", ())
@@ -114,6 +115,7 @@ class Sample:
         label="inertial number I",
         log=True,
     )
+    observed: dict[str, Any] | None = None
 
     @property
     def contacts_per_grain(self) -> jax.Array:
@@ -125,7 +127,9 @@ class Sample:
         return 0.5 * self.contacts + self.wall_contacts
 
 
-MEASURED: dict[str, Measured] = {entry.name: entry.metadata["measured"] for entry in fields(Sample)}
+MEASURED: dict[str, Measured] = {
+    entry.name: entry.metadata["measured"] for entry in fields(Sample) if "measured" in entry.metadata
+}
 """What is said of the fields of a `Sample`, by name."""
 
 
@@ -143,12 +147,18 @@ def check(system: System, state: State, box: Box) -> State:
     return replace(state, status=state.status | bits)
 
 
+def overlaps(system: System, state: State) -> jax.Array:
+    """Overlap of every candidate pair of spheres, [P, B], in R; negative where they are apart."""
+    pairs, spheres = system.pairs, sphere_centres(state.grains, system.clump)
+    square = dot(spheres[pairs.second] - spheres[pairs.first], spheres[pairs.second] - spheres[pairs.first])[:, 0]
+    return jnp.where(pairs.valid[:, None], 2.0 - jnp.sqrt(jnp.where(pairs.valid[:, None], square, 1.0)), -1.0)
+
+
 def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scalar) -> Sample:
     """The instantaneous quantities of a `Sample`, beside the bin-averaged pressure and u, which are given."""
     grains, clump, pairs = state.grains, system.clump, system.pairs
     spheres = sphere_centres(grains, clump)
-    square = dot(spheres[pairs.second] - spheres[pairs.first], spheres[pairs.second] - spheres[pairs.first])[:, 0]
-    overlap = jnp.where(pairs.valid[:, None], 2.0 - jnp.sqrt(jnp.where(pairs.valid[:, None], square, 1.0)), -1.0)
+    overlap = overlaps(system, state)
     touching = (overlap > 0.0).astype(jnp.int32)
     count = grains.position.shape[0]
     touching_pairs = jax.ops.segment_max(touching, pairs.grain_pair, num_segments=pairs.capacity)

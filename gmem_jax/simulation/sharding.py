@@ -68,7 +68,8 @@ class Placement:
         friction = jax.tree.map(self._put_number, system.friction)
         everywhere: Simulation = jax.tree.map(self._put, simulation)
         pairs = replace(everywhere.system.pairs, reference=own)
-        return replace(everywhere, system=replace(everywhere.system, pairs=pairs, friction=friction))
+        mark = jax.tree.map(self._put_last, simulation.mark)
+        return replace(everywhere, system=replace(everywhere.system, pairs=pairs, friction=friction), mark=mark)
 
     def _put_number(self, leaf: Any) -> Any:
         """A number for all replicas, or one for each, [B]."""

@@ -1,4 +1,4 @@
-"""How the walls move: compression u(t), shear gamma(u) (paper, Sec. II)."""
+"""How the walls move: compression u(t), waveforms on channels of shear (paper, Sec. II), a servo for pressures."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -7,9 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.physics.pytree import Scalar, pytree
-from gmem_jax.physics.state import Box
-from gmem_jax.simulation.protocol import Bin, Numbers
+from gmem_jax.physics.pytree import Scalar, pytree, static
+from gmem_jax.physics.state import Box, HeldWalls
+from gmem_jax.simulation.channels import CHANNELS
+from gmem_jax.simulation.protocol import Bin, Lane, Numbers
+
+SERVO_GAIN = 2.5e-4  # strain in a bin for a relative error of 1: stresses follow within some 20 bins, and do not ring
+SERVO_STRAIN = 2.5e-4  # strain in a bin at most: some times that of a compression
 
 
 class Waveforms(Protocol):
@@ -22,35 +26,58 @@ class Waveforms(Protocol):
 
 @pytree
 @dataclass(frozen=True)
-class StrainPath:
-    """Prescribed walls: u runs linearly during a stage, the shear follows a waveform of u (of time, if u stands still).
+class Sine:
+    """One waveform: sin(2 pi n u).
 
-    L_x = X (1 - share gamma), L_y = Y (1 + share gamma) with X, Y = L0 (1 - (1 - sqrt(1 - delta0)) u); z does not
-    move. The box stays centred.
+    Attributes:
+        periods: n.
+    """
+
+    periods: Scalar
+
+    def shear(self, u: jax.Array) -> jax.Array:
+        """I(u), [..., 1]."""
+        return jnp.sin(2.0 * jnp.pi * self.periods * u)[..., None]
+
+
+@pytree
+@dataclass(frozen=True)
+class StrainPath:
+    """Prescribed walls: u runs linearly during a stage; waveforms follow u or time.
+
+    L_i = X_i (1 + 2 m_i share gamma), summed over the lanes, with X, Y = L0 (1 - (1 - sqrt(1 - delta0)) u), Z = L0, and
+    m the mode of the lane's channel: L_x = X (1 - share gamma), L_y = Y (1 + share gamma) for "xy". The box stays
+    centred.
 
     Attributes:
         lower: lower planes at u = 0, [3, 1].
         upper: upper planes at u = 0, [3, 1].
         delta0: areal compression at u = 1, scalar or [B].
         gamma0: shear amplitude, scalar or [B].
-        signals: the waveforms of the replicas, or None for no shear; replica 0 is always the zero signal.
+        waveforms: of each lane: one for all replicas, or one for each but replica 0, which has none.
         share: of gamma on each axis, scalar or [B]. The paper does not say; a half is this project's reading.
+        lanes: which waveforms are applied on which channel; rows of a table say when.
+        fixed: of each lane, whether its waveform is the same for all replicas.
     """
 
     lower: jax.Array
     upper: jax.Array
     delta0: Scalar
     gamma0: Scalar = 0.0
-    signals: Waveforms | None = None
+    waveforms: tuple[Waveforms, ...] = ()
     share: Scalar = 0.5
+    lanes: tuple[Lane, ...] = static(())
+    fixed: tuple[bool, ...] = static(())
 
-    def _shear(self, u: Numbers, sheared: Numbers) -> jax.Array:
-        if self.signals is None:
-            return jnp.zeros(1)
-        u = jnp.asarray(u)
-        shapes = jnp.concatenate([jnp.zeros((*u.shape, 1)), self.signals.shear(u)], axis=-1)
-        own = shapes if u.ndim == 0 else jnp.diagonal(shapes)  # each replica at its own u, where t0 differs
-        return jnp.where(sheared, self.gamma0 * own, 0.0)
+    def _shear(self, lane: int, at: jax.Array, amplitude: Numbers) -> jax.Array:
+        """Share of gamma of one lane, [B] or [1]."""
+        shapes = self.waveforms[lane].shear(at)
+        if not self.fixed[lane]:
+            shapes = jnp.concatenate([jnp.zeros((*at.shape, 1)), shapes], axis=-1)
+        elif at.ndim:
+            shapes = jnp.broadcast_to(shapes, (*at.shape, at.shape[-1]))
+        own = shapes if at.ndim == 0 else jnp.diagonal(shapes)  # each replica at its own u, where t0 differs
+        return self.share * jnp.where(jnp.asarray(amplitude) != 0.0, (amplitude * self.gamma0) * own, 0.0)
 
     def box_at(self, row: Bin, time: jax.Array, duration: Numbers) -> Box:
         """Planes and their velocities, [3, B] (or [3, 1] without shear).
@@ -64,14 +91,40 @@ class StrainPath:
         def lengths(moment: jax.Array) -> jax.Array:
             passed = moment / duration
             u = row.start + (row.stop - row.start) * passed
+            at = jnp.asarray(jnp.where(row.timed, passed, u))
             squeeze = 1.0 - (1.0 - jnp.sqrt(1.0 - self.delta0)) * u
-            sheared = self.share * self._shear(jnp.where(row.start == row.stop, passed, u), row.sheared)
-            scale = jnp.stack(jnp.broadcast_arrays(squeeze * (1.0 - sheared), squeeze * (1.0 + sheared), jnp.ones(1)))
-            return (self.upper - self.lower) * scale
+            strains = [self._shear(lane, at, amplitude) for lane, amplitude in enumerate(row.amplitudes)]
+            scale = []
+            for axis, base in enumerate((squeeze, squeeze, jnp.ones(1))):
+                stretch: Scalar = 1.0
+                for lane, strain in zip(self.lanes, strains, strict=True):
+                    if part := 2.0 * CHANNELS[lane.channel].mode[axis]:
+                        stretch = stretch + part * strain
+                scale.append(base * stretch)
+            return (self.upper - self.lower) * jnp.stack(jnp.broadcast_arrays(*scale))
 
         now, rate = jax.jvp(lengths, (time,), (jnp.ones_like(time),))
         centre = 0.5 * (self.lower + self.upper)
         return Box(centre - 0.5 * now, centre + 0.5 * now, -0.5 * rate, 0.5 * rate)
+
+
+def stretched(box: Box, stretch: jax.Array, rate: Scalar = 0.0) -> Box:
+    """A box whose edges are longer by a factor 1 + stretch [3, B], which grows at a rate, in 1 / t_c."""
+    lengths, growth = box.lengths, box.upper_velocity - box.lower_velocity
+    half = 0.5 * lengths * (1.0 + stretch)
+    speed = 0.5 * (growth * (1.0 + stretch) + lengths * rate)
+    centre = 0.5 * (box.lower + box.upper)
+    return Box(centre - half, centre + half, -speed, speed)
+
+
+def servo_strain(servo: HeldWalls, target: jax.Array) -> jax.Array:
+    """Strain of each axis in the next bin, [3, B], by which its pressure is brought to `target` [3, 1].
+
+    Where the target is 0 the strain is. Pressures that are too large let the wall go.
+    """
+    held = target > 0.0
+    error = servo.pressure / jnp.where(held, target, 1.0) - 1.0
+    return jnp.where(held, jnp.clip(SERVO_GAIN * error, -SERVO_STRAIN, SERVO_STRAIN), 0.0)
 
 
 def smallest_box(lower: np.ndarray, upper: np.ndarray, delta0: float) -> np.ndarray:

@@ -126,7 +126,7 @@ def _dataset(store: Store, table: Sequence[dict[str, Any]]) -> Any:
         return data
     counts = np.zeros(len(table), int)
     for place, recall in loaded.items():
-        counts[place] = len(recall.J)
+        counts[place] = recall.J.shape[-2]
     u = np.asarray(next(iter(loaded.values())).u)
     blank = (len(table), counts.max())
     names = np.full(blank, "", object)

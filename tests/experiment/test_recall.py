@@ -11,7 +11,7 @@ from scenes import SPHERE, TETRA_27, scene
 import gmem_jax as gm
 from gmem_jax.experiment.recall import Recall, finish
 from gmem_jax.physics.state import Status
-from gmem_jax.simulation.sample import Sample, end_bin
+from gmem_jax.simulation.sample import MEASURED, Sample, end_bin
 
 PACK = gm.load_pack(TETRA_27)
 FINISH = jax.jit(finish)
@@ -48,7 +48,7 @@ def finished(speed: object = 0.0, ripple: float = 0.0, status: object = 0) -> Re
     def sample(**given: jax.Array) -> Sample:
         bins = len(next(iter(given.values())))
         loaded = {"pressure": jnp.full((bins, 3, 3), LOAD)}
-        return Sample(**{name: jnp.zeros((bins, 3)) for name in Sample.__dataclass_fields__} | loaded | given)
+        return Sample(**{name: jnp.zeros((bins, 3)) for name in MEASURED} | loaded | given)
 
     stages = {"store": sample(largest_speed=speeds), "readout": sample(pressure=pressure)}
     return FINISH(one, stages, jnp.broadcast_to(jnp.asarray(status, jnp.int32), 3))

@@ -17,9 +17,9 @@ from gmem_jax.experiment import validity as limits
 from gmem_jax.experiment.validity import compression_speed, validity
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
-from gmem_jax.physics.state import WARNINGS, Box, State, Status
+from gmem_jax.physics.state import WARNINGS, Box, State, Status, replicate
 from gmem_jax.simulation.loop import walls
-from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.sample import MEASURED, Sample
 
 PACK = gm.load_pack(TETRA_27)
 LARGER = gm.load_pack("tetra-325-a")
@@ -53,7 +53,7 @@ def judged(
     bumps = gm.Bumps(jnp.asarray([[0.5, -0.5], [1.0, -1.0]]), jnp.asarray([[0.3, 0.7]] * 2), 0.2)
     experiment = gm.replace(gm.Experiment(PACK, bumps, delta0=0.05), changes)
     walls = {"lengths": jnp.ones((4, 3, 3)), "pressure": jnp.full((4, 3, 3), 1e-3)}
-    nothing = Sample(**{name: jnp.zeros((4, 3)) for name in Sample.__dataclass_fields__} | walls)
+    nothing = Sample(**{name: jnp.zeros((4, 3)) for name in MEASURED} | walls)
     fast = jnp.asarray(speed) * compression_speed(experiment)
     middle = replace(
         nothing,
@@ -107,7 +107,7 @@ def test_one_fast_moment_is_not_unrest() -> None:
     """A rearrangement kicks grains; what is unstable keeps them moving."""
     experiment = gm.Experiment(PACK, two_bumps(1.0, -0.6), delta0=0.05)
     speeds = jnp.zeros((256, 2)).at[:100].set(100.0)
-    quiet = Sample(**{name: jnp.ones((256, 2)) for name in Sample.__dataclass_fields__})
+    quiet = Sample(**{name: jnp.ones((256, 2)) for name in MEASURED})
     sample = replace(quiet, lengths=jnp.ones((256, 3, 2)), pressure=jnp.ones((256, 3, 2)), largest_speed=speeds)
     assert np.all(limits._restlessness(experiment, {"encode": sample}) == 0.0)
     longer = replace(sample, largest_speed=speeds.at[:200].set(100.0))
@@ -237,12 +237,14 @@ def march_recorded(system: dynamics.System, state: State, dt: float, boxes: Box,
 def energy_terms(dt: float) -> tuple[dict[str, float], float]:
     """Where the work of the walls went in a whole recall of 27 grains, and the sum of its magnitudes over stages."""
     experiment = gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=75.0, dt=dt, backend="jax", **SHORT)
-    bins_of = jax.jit(lambda simulation, rows: jax.vmap(lambda row: walls(simulation, row, 2))(rows))
+    wide = replicate(experiment.begin(), 2)
+    bins_of = jax.jit(lambda simulation, rows: jax.vmap(lambda row: walls(simulation, row, wide)[0])(rows))
     boxes, drag, ends = [], [], [0]
     for stages, sheared in zip(experiment.phases, (False, True), strict=True):
         for stage in stages:
-            rows = jax.tree.map(jnp.asarray, stage.rows(0, stage.bins))
-            whole = bins_of(experiment.simulation(sheared=sheared), rows)  # leaves [bins, steps, 3, 2]
+            simulation = experiment.simulation(sheared=sheared)
+            rows = jax.tree.map(jnp.asarray, simulation.rows(stage, 0, stage.bins))
+            whole = bins_of(simulation, rows)  # leaves [bins, steps, 3, 2]
             boxes.append(jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, 3, 2)[..., 1:], whole))
             drag.append(np.full(len(boxes[-1].lower), experiment.drag if stage.start == stage.stop else 0.0))
             ends.append(ends[-1] + len(drag[-1]))

@@ -24,7 +24,7 @@ from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.packs import load_stages
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.physics.state import Grains, State
-from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.sample import MEASURED, Sample
 
 PACK = TETRA_27
 CYCLE = ("rest", "compress", "hold", "decompress")
@@ -76,7 +76,7 @@ def test_frames_and_stages_that_could_not_be_read_are_not_written(tmp_path: Path
         with pytest.raises(gm.FileFormatError, match=reason):
             gm.save_pack(tmp_path / "a.h5", pack, frames=wrong)
     with pytest.raises(gm.FileFormatError, match="'gas/1' is no name of a stage"):
-        gm.save_pack(tmp_path / "a.h5", pack, {"gas/1": Sample(*[np.zeros(1)] * len(fields(Sample)))})
+        gm.save_pack(tmp_path / "a.h5", pack, {"gas/1": Sample(*[np.zeros(1)] * len(MEASURED))})
     assert not list(tmp_path.iterdir())
     gm.save_pack(tmp_path / "a.h5", pack, frames=frames)
     assert load_frames(tmp_path / "a.h5").count == 1

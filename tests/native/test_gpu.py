@@ -28,7 +28,7 @@ from gmem_jax.physics.grain import sphere
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import System, start
 from gmem_jax.simulation.loop import rollout_chunk
-from gmem_jax.simulation.protocol import Stage
+from gmem_jax.simulation.protocol import Drive, Stage
 
 BUILT, REASON = native.available()
 pytestmark = [
@@ -306,7 +306,7 @@ def test_a_bin_of_an_experiment_on_a_gpu_is_one_call_and_waits_for_nothing(monke
     simulation, state = experiment.simulation(sheared=True), replicate(experiment.begin(), REPLICAS)
     program = jax.jit(functools.partial(rollout_chunk, most=4))
     allowed = [export.DisabledSafetyCheck.custom_call(target) for target in cuda.TARGETS]
-    row = Stage("encode", 0.0, 1.0, 1.0, "write", sheared=True).bin(0)
+    row = Stage("encode", 0.0, 1.0, 1.0, "write", (Drive("xy", "xy"),)).rows(0)
     text = export.export(program, platforms=["cuda"], disabled_checks=allowed)(simulation, state, row, 4).mlir_module()
     assert text.count("custom_call @gmem_advance") == 1
     assert "stablehlo.case" not in text  # the host would wait for its condition

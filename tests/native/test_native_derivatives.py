@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import TETRA_27, Motion, advance_by
+from scenes import TETRA_27, Motion, advance_by, strain_path
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -16,9 +16,8 @@ from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.state import State, replicate
 from gmem_jax.physics.step import System, start
 from gmem_jax.simulation.loop import Simulation, rollout, rollout_chunk
-from gmem_jax.simulation.protocol import BINS, Stage
+from gmem_jax.simulation.protocol import BINS, Drive, Stage
 from gmem_jax.simulation.sample import measure
-from gmem_jax.simulation.strain import StrainPath
 
 BUILT, REASON = native.available()
 # Without a C++ compiler there is no native backend to compare; plain JAX is then all there is.
@@ -209,10 +208,9 @@ def test_every_instruction_set_has_the_same_derivatives(monkeypatch: pytest.Monk
 def test_bins_counted_only_at_run_time_are_differentiated_forwards() -> None:
     system, state = squeezed(LAWS["H"])
     walls = motion()
-    drive = StrainPath(walls.lower, walls.upper, walls.delta0, walls.gamma0, walls.signals)
-    encode = Stage(
-        "encode", 0.0, 1.0, 100.0 / BINS, "write", sheared=True
-    )  # of 100 bins of 10 steps: as long as `motion`
+    drive = strain_path(walls.lower, walls.upper, walls.delta0, walls.gamma0, walls.signals)
+    # Of 100 bins of 10 steps: as long as `motion`.
+    encode = Stage("encode", 0.0, 1.0, 100.0 / BINS, "write", (Drive("xy", "xy"),))
 
     def simulation(mu: jax.Array, backend: str) -> Simulation:
         return Simulation(replace(system, friction=gm.Hooke(mu=mu)), drive, 0.3, steps=10, backend=backend)
@@ -220,7 +218,7 @@ def test_bins_counted_only_at_run_time_are_differentiated_forwards() -> None:
     for backend in ("native", "jax"):
 
         def counted(mu: jax.Array, count: Any, by: str = backend) -> jax.Array:
-            return rollout_chunk(simulation(mu, by), state, encode.bin(60), count, 3)[1].pressure[:2]
+            return rollout_chunk(simulation(mu, by), state, encode.rows(60), count, 3)[1].pressure[:2]
 
         def listed(mu: jax.Array, by: str = backend) -> jax.Array:
             return rollout(simulation(mu, by), state, encode.rows(60, 2))[1].pressure

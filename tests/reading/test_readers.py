@@ -10,7 +10,7 @@ from gmem_jax.experiment.protocols import memory_protocol
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average, six_signals, word_bits, words
 from gmem_jax.reading import readers
-from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.sample import MEASURED, Sample
 
 J = {bits: np.asarray(bin_average(words(bits))) for bits in (1, 3, 5)}
 
@@ -130,14 +130,24 @@ def recall(bits: int, second: bool) -> Recall:
     def sample(p_xy: jnp.ndarray) -> Sample:
         pressure = jnp.zeros((256, 3, len(p_xy))).at[:, 0].set(jnp.flip(p_xy.T, axis=0))
         empty = jnp.zeros((256, len(p_xy)))
-        return Sample(**{name: empty for name in Sample.__dataclass_fields__} | {"pressure": pressure})
+        return Sample(**{name: empty for name in MEASURED} | {"pressure": pressure})
 
     stages = {"readout": sample(first)}
     if second:
         stages["readout-2"] = sample(jnp.broadcast_to(jnp.linspace(1.0, 2.0, 256), first.shape))
     rest = {name: jnp.zeros(()) for name in Recall.__dataclass_fields__}
     protocol = memory_protocol(0.2, 0.2, 2.0, second_readout=second)
-    return Recall(**rest | {"J": signals, "p_sig": signals, "stages": stages, "protocol": protocol})
+    return Recall(
+        **rest
+        | {
+            "J": signals,
+            "p_sig": signals,
+            "stages": stages,
+            "protocol": protocol,
+            "reads": ("readout",),
+            "channels": ("xy",),
+        }
+    )
 
 
 def test_words_are_read_by_sub2_bl_where_there_is_a_second_readout() -> None:

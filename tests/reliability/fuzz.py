@@ -21,7 +21,6 @@ import tempfile
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,8 +39,8 @@ from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.checkpoints import load_part, save_part
 from gmem_jax.files.seal import BLOCK, seal
 from gmem_jax.files.waveforms import load_target
-from gmem_jax.simulation.protocol import Protocol, Stage
-from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.protocol import Drive, Protocol, Stage
+from gmem_jax.simulation.sample import MEASURED, Sample
 from gmem_jax.sweeps.spec import read_spec
 
 PATIENCE = 10.0  # seconds for one input
@@ -110,7 +109,7 @@ def make_samples(folder: Path) -> None:
 
 def _sample(bins: int, replicas: int) -> Sample:
     wide = {name: np.full((bins, 3, replicas), 0.5) for name in ("pressure", "lengths")}
-    return Sample(**{entry.name: wide.get(entry.name, np.full((bins, replicas), 0.1)) for entry in fields(Sample)})
+    return Sample(**{name: wide.get(name, np.full((bins, replicas), 0.1)) for name in MEASURED})
 
 
 def _recall(experiment: gm.Experiment) -> Recall:
@@ -118,10 +117,14 @@ def _recall(experiment: gm.Experiment) -> Recall:
     curves = dict.fromkeys(("shear", "J", "p_sig"), np.sin(np.arange(count * 256.0)).reshape(count, 256))
     single = dict.fromkeys(("gain", "fidelity", "windowed_gain", "windowed_fidelity", "window", "dt"), np.asarray(0.25))
     stages = OrderedDict(rest=_sample(5, 1), readout=_sample(256, count + 1))
-    protocol = Protocol((Stage("rest", 1.0, 1.0, 5 / 256, "hold"), Stage("readout", 1.0, 0.0, 1.0, "read")))
+    protocol = Protocol(
+        Stage("rest", 1.0, 1.0, 5 / 256, "write", (Drive("xy", "xy"),)), Stage("readout", 1.0, 0.0, 1.0, "read")
+    )
     status = np.zeros(count + 1, np.int32)
     lone = {"residual_speed": np.full(count + 1, 1e-3), "rounding": np.full(count, 1e-16), "status": status}
-    return Recall(u=u, **curves, **single, **lone, stages=stages, protocol=protocol)
+    return Recall(
+        u=u, **curves, **single, **lone, stages=stages, protocol=protocol, reads=("readout",), channels=("xy",)
+    )
 
 
 # ---- mutations of bytes and of what HDF5 files hold ----

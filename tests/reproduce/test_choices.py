@@ -6,7 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import TETRA_27
+from scenes import TETRA_27, strain_path
 
 import gmem_jax as gm
 from gmem_jax.experiment.record import fingerprint, signals_to_dict, to_dict
@@ -35,9 +35,9 @@ def test_defaults_are_those_that_the_table_of_choices_names() -> None:
 @pytest.mark.parametrize("share", [0.25, 1.0])
 def test_the_share_of_the_shear_goes_to_each_axis(share: float) -> None:
     lower, upper = -jnp.ones((3, 1)), jnp.ones((3, 1))
-    row, time = Bin(0.0, 1.0, 1, 0, True), jnp.asarray(0.3)
-    sheared = StrainPath(lower, upper, 0.05, 0.01, gm.six_signals(), share).box_at(row, time, 1.0).lengths
-    plain = StrainPath(lower, upper, 0.05).box_at(row, time, 1.0).lengths
+    row, time = Bin(0.0, 1.0, 1, 0, timed=False, still=False, amplitudes=(1.0,)), jnp.asarray(0.3)
+    sheared = strain_path(lower, upper, 0.05, 0.01, gm.six_signals(), share=share).box_at(row, time, 1.0).lengths
+    plain = StrainPath(lower, upper, 0.05).box_at(row._replace(amplitudes=()), time, 1.0).lengths
     np.testing.assert_allclose(sheared[:, 1], plain[:, 0] * np.array([1.0 - 0.01 * share, 1.0 + 0.01 * share, 1.0]))
 
 

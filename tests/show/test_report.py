@@ -8,7 +8,7 @@ import time
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from gmem_jax.show.recalls import signals_figure
 from gmem_jax.show.report import Report, table
 from gmem_jax.show.scene import Quantity, at_rest, links, packed, quantities
 from gmem_jax.simulation.frames import Frames
-from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.sample import MEASURED, Sample
 
 PACK_FILE = TETRA_27
 PACK = gm.load_pack(PACK_FILE)
@@ -113,7 +113,7 @@ def made_up() -> gm.Recall:
         slope = np.linspace(1.0, 2.0, stage.bins)[:, None] * np.linspace(1.0, 1.01, wide)
         vectors = {name: 1e-3 * np.repeat(slope[:, None], 3, axis=1) for name in ("pressure", "lengths")}
         at = np.broadcast_to(np.linspace(stage.start, stage.stop, stage.bins)[:, None], slope.shape)
-        stages[stage.name] = Sample(**{entry.name: slope for entry in fields(Sample)} | vectors | {"u": at})
+        stages[stage.name] = Sample(**dict.fromkeys(MEASURED, slope) | vectors | {"u": at})
     numbers: dict[str, Any] = {name: np.asarray(0.3) for name in ("gain", "fidelity", "dt")}
     numbers |= {"windowed_gain": np.asarray(0.31), "windowed_fidelity": np.asarray(0.35), "window": np.asarray(40.0)}
     per_replica = {"residual_speed": np.full(3, 1e-4), "status": np.array([0, 0, int(gm.Status.RINGING)])}
@@ -124,6 +124,8 @@ def made_up() -> gm.Recall:
         **curves,
         stages=stages,
         protocol=EXPERIMENT.protocol,
+        reads=("readout",),
+        channels=("xy",),
         frames=squeezed(),
         record=RECORD,
     )

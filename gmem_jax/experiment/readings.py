@@ -1,0 +1,130 @@
+"""What is read: from the pressures of a protocol's stages to recalled signals by read and channel.
+
+A run has R reads, C channels and S signals. Its arrays have these axes in this order, [R, C, S, 256], gains
+[R, C, C]; an axis of length one is left out, so that the paper's experiment has p_sig [S, 256] and one G and F.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment import analysis
+from gmem_jax.experiment.signals import Signals, bin_average
+from gmem_jax.physics.pytree import Scalar
+from gmem_jax.simulation.channels import CHANNELS
+from gmem_jax.simulation.protocol import BINS, Drive, Protocol, Stage
+
+
+class Readings(NamedTuple):
+    """What is read in a protocol.
+
+    Attributes:
+        protocol: the protocol.
+        background: one of `analysis.BACKGROUNDS`.
+    """
+
+    protocol: Protocol
+    background: str
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Names of the R stages that are read; with a second readout for the background the first alone."""
+        return self.protocol.reads if self.background == "sub0" else self.protocol.reads[:1]
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The C channels."""
+        return self.protocol.channels
+
+    def squeezed(self, rows: list[list[jax.Array]]) -> jax.Array:
+        """Arrays by read and channel as one; axes of length one are left out."""
+        by_read = [row[0] if len(row) == 1 else jnp.stack(row) for row in rows]
+        return by_read[0] if len(by_read) == 1 else jnp.stack(by_read)
+
+    def recalled(self, pressures: Mapping[str, jax.Array]) -> jax.Array:
+        """p_sig in ascending u, [R, C, S, 256], in E, from the pressures [bins, 3, S + 1] by stage."""
+        stages = {stage.name: stage for stage in self.protocol if stage.role == "read"}
+
+        def stress(read: str, channel: str) -> jax.Array:
+            return placed(stages[read], CHANNELS[channel].stress(pressures[read]))
+
+        if self.background == "sub0":
+            found = [[analysis.subtract("sub0", stress(read, c)) for c in self.channels] for read in self.reads]
+        else:
+            first, second = self.protocol.reads
+            found = [[analysis.subtract(self.background, stress(first, c), stress(second, c)) for c in self.channels]]
+        return self.squeezed(found)
+
+    def _by_drive(self, sets: Mapping[str, Signals], of: Any) -> jax.Array:
+        """What `of` gives of a set, for what each read is compared with; zero where nothing was written."""
+        known = {name: of(one) for name, one in sets.items()}
+        nothing = jnp.zeros_like(next(iter(known.values())))
+        stages = {stage.name: stage for stage in self.protocol}
+
+        def one(read: str, channel: str) -> jax.Array:
+            drive: Drive | None = self.protocol.written(read).get(channel)
+            if drive is None or not stages[read].moves:
+                return nothing
+            own: jax.Array = known[str(drive.waveform)]
+            own = own if drive.amplitude == 1.0 else drive.amplitude * own
+            return jnp.where(_seen(stages[read]), own, 0.0) if _partial(stages[read]) else own
+
+        return self.squeezed([[one(read, channel) for channel in self.channels] for read in self.reads])
+
+    def integrals(self, sets: Mapping[str, Signals]) -> jax.Array:
+        """J averaged over each bin, [R, C, S, 256]; 0 where nothing is read or was written."""
+        return self._by_drive(sets, bin_average)
+
+    def shears(self, sets: Mapping[str, Signals]) -> jax.Array:
+        """I at the centres of the bins, likewise."""
+        u = (jnp.arange(BINS) + 0.5) / BINS
+        return self._by_drive(sets, lambda one: one.shear(u).T)
+
+    def compare(
+        self, signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None
+    ) -> analysis.Match:
+        """Gain [R, C, C] and fidelity [R, C]; see `analysis.compare` and `analysis.compare_channels`."""
+        channels = len(self.channels)
+
+        def of_read(signal: jax.Array, integral: jax.Array) -> analysis.Match:
+            if channels == 1:
+                return analysis.compare(signal, integral, scale, window)
+            return analysis.compare_channels(signal, integral, scale, window)
+
+        if len(self.reads) == 1:
+            return of_read(signal, integral)
+        return jax.vmap(of_read)(signal, integral)
+
+
+def _partial(stage: Stage) -> bool:
+    return set(stage.ends) != {0.0, 1.0}
+
+
+def _seen(stage: Stage) -> np.ndarray:
+    """Which of the 256 bins of u a stage goes through for the greater part, [256]."""
+    low, high = sorted(stage.ends)
+    centre = (np.arange(BINS) + 0.5) / BINS
+    inside: np.ndarray = (centre > low) & (centre < high)
+    return inside
+
+
+def placed(stage: Stage, stress: jax.Array) -> jax.Array:
+    """Stresses of a stage [bins, B] on the 256 bins of ascending u, [B, 256]; of time, where u stands still.
+
+    A stage of other length is averaged or interpolated; bins that it does not go through are 0.
+    """
+    if stage.bins == BINS and not _partial(stage):
+        return (jnp.flip(stress, axis=0) if stage.start == 1.0 else stress).T
+    start, stop = stage.ends if stage.moves else (0.0, 1.0)
+    edges = start + (stop - start) * np.arange(stage.bins + 1) / stage.bins
+    if stop < start:
+        edges, stress = edges[::-1], jnp.flip(stress, axis=0)
+    bins = np.arange(BINS + 1) / BINS
+    overlap = np.minimum(edges[1:], bins[1:, None]) - np.maximum(edges[:-1], bins[:-1, None])  # [256, stage bins]
+    weight = np.maximum(overlap, 0.0)
+    total = weight.sum(axis=1, keepdims=True)
+    weight = np.where(total > 0.5 / BINS, weight / np.where(total > 0.0, total, 1.0), 0.0)
+    return (jnp.asarray(weight) @ stress).T
