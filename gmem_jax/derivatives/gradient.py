@@ -378,7 +378,8 @@ def value_and_grad(
     slope = jax.tree.map(jnp.add, slope, pull_numbers(True, rest.numbers))
     if any(map(acts_on_prefix, by)):
         back = way.through(prefix, fan_out(back)[0])
-        slope = jax.tree.map(jnp.add, slope, pull_numbers(False, prefix.numbers))
+        if prefix.numbers is not None:  # a protocol may begin with a waveform
+            slope = jax.tree.map(jnp.add, slope, pull_numbers(False, prefix.numbers))
         slope = jax.tree.map(jnp.add, slope, pull_begin(back)[0])
     return Gradient(value, slope, p_sig)
 
