@@ -835,8 +835,8 @@ MUTATIONS = (
     mutation(
         "list-not-resumed",
         "simulation/runner.py",
-        '= snapshot["state"], self.simulation.with_pairs(snapshot["pairs"])\n        self.place_on',
-        '= snapshot["state"], self.simulation\n        self.place_on',
+        '= snapshot["state"], self.simulation.with_pairs(snapshot["pairs"])',
+        '= snapshot["state"], self.simulation',
         "test_a_run_goes_on_with_the_lists_it_had",
     ),
     mutation(
@@ -1067,15 +1067,15 @@ MUTATIONS = (
     mutation(
         "tangent-forgotten-at-renewal",
         "derivatives/gradient.py",
-        "move(self.moving[1], jax.tree.map(jnp.zeros_like, blank))",
+        "move(history, jax.tree.map(jnp.zeros_like, blank))",
         "jax.tree.map(jnp.zeros_like, blank)",
         "test_derivatives_do_not_mind_lists_that_are_made_anew[friction.mu]",
     ),
     mutation(
         "cotangent-forgotten-at-renewal",
         "derivatives/gradient.py",
-        "(slope[0], pull(slope[1])[0])",
-        "(slope[0], jax.tree.map(jnp.zeros_like, history))",
+        "(slope[0], pull(slope[1])[0], slope[2])",
+        "(slope[0], jax.tree.map(jnp.zeros_like, history), slope[2])",
         "test_derivatives_do_not_mind_lists_that_are_made_anew[friction.mu]",
     ),
     mutation(

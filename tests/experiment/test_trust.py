@@ -234,9 +234,8 @@ def march_recorded(system: dynamics.System, state: State, dt: float, boxes: Box,
     return jax.lax.scan(one, state, (boxes, drag))[1]
 
 
-def energy_terms(dt: float) -> tuple[dict[str, float], float]:
+def energy_terms(experiment: gm.Experiment) -> tuple[dict[str, float], float]:
     """Where the work of the walls went in a whole recall of 27 grains, and the sum of its magnitudes over stages."""
-    experiment = gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=75.0, dt=dt, backend="jax", **SHORT)
     wide = replicate(experiment.begin(), 2)
     bins_of = jax.jit(lambda simulation, rows: jax.vmap(lambda row: walls(simulation, row, wide)[0])(rows))
     boxes, drag, ends = [], [], [0]
@@ -246,7 +245,8 @@ def energy_terms(dt: float) -> tuple[dict[str, float], float]:
             rows = jax.tree.map(jnp.asarray, simulation.rows(stage, 0, stage.bins))
             whole = bins_of(simulation, rows)  # leaves [bins, steps, 3, 2]
             boxes.append(jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, 3, 2)[..., 1:], whole))
-            drag.append(np.full(len(boxes[-1].lower), experiment.drag if stage.start == stage.stop else 0.0))
+            own = stage.drag if stage.drag is not None else experiment.drag if stage.rows(0).still else 0.0
+            drag.append(np.full(len(boxes[-1].lower), own))
             ends.append(ends[-1] + len(drag[-1]))
     path, drags = jax.tree.map(lambda *parts: np.concatenate(parts), *boxes), np.concatenate(drag)
     system, step = experiment.simulation(sheared=False).system, experiment.timing.dt
@@ -257,15 +257,33 @@ def energy_terms(dt: float) -> tuple[dict[str, float], float]:
     return terms, float(np.abs(work).sum())
 
 
-def test_the_energy_of_a_whole_recall_is_accounted_for_to_a_millionth_of_the_work() -> None:
-    # Measured: 4.2e-6 of the walls' work (the magnitudes of all stages) at dt = 0.3, 7.9e-7 at 0.15.
+PAPER: dict[str, Any] = {"signals": two_bumps(1.0, -0.6), **SHORT}
+OWN: dict[str, Any] = {
+    "signals": gm.signals(xy=two_bumps(1.0, -0.6), z=two_bumps(-0.6, 1.0)),
+    "protocol": gm.Protocol(
+        gm.compress(0.5, 0.5),
+        gm.shake(0.5, 2, length=0.5, channel="z"),
+        gm.compress(0.0, 0.5),
+        gm.write(),
+        gm.hold(0.1, drag=0.02),
+        gm.read(to=0.25, length=0.75),
+    ),
+}
+
+
+@pytest.mark.parametrize(("kind", "most"), [(PAPER, 1e-6), (OWN, 2e-6)], ids=["paper", "own"])
+def test_the_energy_of_a_whole_recall_is_accounted_for_to_a_millionth_of_the_work(
+    kind: dict[str, Any], most: float
+) -> None:
+    # Measured: 4.2e-6 of the walls' work (the magnitudes of all stages) at dt = 0.3, 7.9e-7 at 0.15; of the other
+    # protocol, whose walls move faster, 1.3e-6 at 0.15.
     missing = {}
     for dt in (0.3, 0.15):
-        terms, turned_over = energy_terms(dt)
+        terms, turned_over = energy_terms(gm.Experiment(PACK, **kind, t0=75.0, dt=dt, backend="jax"))
         rest = terms["work"] - terms["stored"] - terms["viscous"] - terms["slid"] - terms["dragged"]
         assert min(terms[name] for name in ("viscous", "slid", "dragged")) > 1e-4 * turned_over  # all take part
         missing[dt] = abs(rest) / turned_over
-    assert missing[0.15] < 1e-6
+    assert missing[0.15] < most
     assert missing[0.15] < 0.6 * missing[0.3]
 
 
