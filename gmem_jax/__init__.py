@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.derivatives.jacobian import exact as jacobian
-from gmem_jax.design.kernel import MemoryKernel, memory_kernel
+from gmem_jax.design.kernel import KernelMatrix, MemoryKernel, kernel_matrix, memory_kernel
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.experiment import Experiment, replace
@@ -85,6 +85,7 @@ __all__ = [
     "FileFormatError",
     "Frictionless",
     "Hooke",
+    "KernelMatrix",
     "Material",
     "MemoryKernel",
     "Mindlin",
@@ -116,6 +117,7 @@ __all__ = [
     "gain",
     "hold",
     "jacobian",
+    "kernel_matrix",
     "list_packs",
     "load_pack",
     "load_recall",

@@ -15,11 +15,11 @@ import numpy as np
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import Prefix, run
-from gmem_jax.experiment.signals import Bumps, Signals, bin_average
+from gmem_jax.experiment.signals import Bumps, Signals, bin_average, signals
 from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
-from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress
+from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
 from gmem_jax.simulation.protocol import BINS
 
 FINE = 2048  # points of v for inner products of basis functions
@@ -182,15 +182,91 @@ def memory_kernel(
     if jnp.ndim(wanted.scale):
         raise ValueError("a kernel is measured at one gamma0 and one delta0, not one for each replica")
     p_sig = np.asarray(run(wanted, prefix=prefix, cache=cache.scoped("basis"), progress=tell).p_sig)
+    if p_sig.ndim > 2:
+        raise ValueError("a kernel is of one read and one channel; gm.kernel_matrix measures those of several channels")
+    return _kernel_of(wanted, both, p_sig)
+
+
+@comparable
+@dataclass(frozen=True)
+class KernelMatrix:
+    """What each channel gives back of what was written on each: the kernels of several channels of one pack.
+
+    Attributes:
+        channels: their names, C.
+        blocks: the kernel of what channel c gives back of channel d, [C][C]; off the diagonal is the cross-talk.
+    """
+
+    channels: tuple[str, ...]
+    blocks: tuple[tuple[MemoryKernel, ...], ...]
+
+    def singular_values(self) -> np.ndarray:
+        """RMS of p_sig over all channels (in E) for the best, second best, ... set of waveforms, [C n], falling.
+
+        One channel alone has those of its `MemoryKernel`; a waveform of unit RMS is one on any of the channels.
+        """
+        recalled = np.block(
+            [[block._orthonormal()[0] for block in column] for column in zip(*self.blocks, strict=True)]
+        )
+        values: np.ndarray = np.linalg.svd(recalled, compute_uv=False) / np.sqrt(BINS)
+        return values
+
+
+@usual_rules()
+@shows_progress
+def kernel_matrix(
+    experiment: Experiment,
+    n: int = 17,
+    width: float = 0.2,
+    *,
+    cache: ResultCache = no_cache,
+    progress: ProgressChoice = None,
+) -> KernelMatrix:
+    """Measure the memory kernels of all channels that an experiment writes on.
+
+    Args:
+        experiment: pack, parameters and protocol, with one read; its waveforms do not matter, the names of their sets
+            do: each is written alone.
+        n: basis waveforms; 2 n + 1 replicas are run for each set.
+        width: of the bumps.
+        cache: asked for the recalls of each set.
+        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
+
+    Raises:
+        ValueError: if n < 2, the experiment has several reads, or as many sets as channels are not written.
+        RunFailedError: if the simulation broke down.
+    """
+    channels, sets = experiment.readings.channels, experiment.sets
+    written = experiment.protocol.written(experiment.readings.reads[0])
+    if (
+        n < 2
+        or len(experiment.readings.reads) > 1
+        or len({drive.waveform for drive in written.values()}) < len(channels)
+    ):
+        raise ValueError("a kernel matrix needs 2 or more basis waveforms, one read, and a set for each channel")
+    loud, silent = bumps(np.concatenate([np.eye(n), -np.eye(n)]), width), bumps(np.zeros((2 * n, n)), width)
+    tell, columns = callback(progress), []
+    for number, channel in enumerate(channels):
+        alone = {name: loud if name == written[channel].waveform else silent for name in sets}
+        one = replace(experiment, signals=signals(**alone))
+        share = within(tell, number / len(channels), (number + 1) / len(channels))
+        recall = run(one, cache=cache.scoped(f"basis-{channel}"), progress=share)
+        columns.append([_kernel_of(one, loud, np.asarray(recall.at(channel=name).p_sig)) for name in channels])
+    return KernelMatrix(channels, tuple(zip(*columns, strict=True)))
+
+
+def _kernel_of(experiment: Experiment, both: Bumps, p_sig: np.ndarray) -> MemoryKernel:
+    """The kernel from the recalls [2 n, 256] of n bumps and their opposites."""
+    n = len(p_sig) // 2
     plus, minus = p_sig[:n], p_sig[n:]
     return MemoryKernel(
         u=(np.arange(BINS) + 0.5) / BINS,
         centres=np.asarray(both.centres[0]),
-        width=width,
+        width=float(both.width),
         odd=0.5 * (plus - minus),
         even=0.5 * (plus + minus),
-        gamma0=float(wanted.gamma0),
-        delta0=float(wanted.compression),
+        gamma0=float(experiment.gamma0),
+        delta0=float(experiment.compression),
     )
 
 

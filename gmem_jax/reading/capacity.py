@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.design.kernel import MemoryKernel
+from gmem_jax.design.kernel import KernelMatrix, MemoryKernel
 from gmem_jax.experiment.signals import word_bits
 from gmem_jax.reading.readers import linear_decoder
 from gmem_jax.simulation.protocol import BINS
@@ -94,7 +94,7 @@ def _bitwise(truth: np.ndarray, read: np.ndarray, weight: np.ndarray) -> np.ndar
     return np.asarray(each.sum(axis=-1))
 
 
-def channels(kernel: MemoryKernel, noise: float, power: float = 1.0) -> np.ndarray:
+def channels(kernel: MemoryKernel | KernelMatrix, noise: float, power: float = 1.0) -> np.ndarray:
     """Bits that each singular waveform of a linear memory can carry at most, [n], falling: an upper bound in all.
 
     Shannon's capacity of parallel channels, 1/2 log2(1 + p_i 256 s_i^2 / noise^2), with the power shared out by
@@ -102,9 +102,9 @@ def channels(kernel: MemoryKernel, noise: float, power: float = 1.0) -> np.ndarr
     for the odd part of the kernel and for waveforms made up of its basis, and for nothing else.
 
     Args:
-        kernel: of n basis waveforms.
+        kernel: of n basis waveforms; or of n for each of several channels of strain.
         noise: standard deviation in each bin, in E.
-        power: largest mean of I^2 over u.
+        power: largest mean of I^2 over u, of all channels of strain together.
 
     Raises:
         ValueError: if noise or power is not above 0.

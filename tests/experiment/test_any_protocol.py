@@ -1,6 +1,7 @@
 """Protocols of one's own: what is read of them, by read and channel; held walls; observers; what is refused."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -288,3 +289,18 @@ def test_gradients_through_a_protocol_of_ones_own(backend: str) -> None:
             other = gm.replace(one, {name: middle * (1.0 + sign * step)})
             values.append(float(loss(other, gm.run(other, progress=False).p_sig)))
         assert float(slope) == pytest.approx((values[0] - values[1]) / (2.0 * step * middle), rel=1e-4), name
+
+
+def test_kernels_of_two_channels_hold_what_each_says_of_the_other() -> None:
+    one = experiment(None, gm.signals(xy=ONE, z=OTHER), store=0.1)
+    matrix = gm.kernel_matrix(one, n=2, width=0.6, progress=False)
+    alone = gm.memory_kernel(experiment(None, ONE, store=0.1), n=2, width=0.6, progress=False)
+    np.testing.assert_allclose(matrix.blocks[0][0].odd, alone.odd, atol=1e-12 * np.abs(alone.odd).max())
+    assert np.abs(matrix.blocks[1][0].odd).max() > 0.0
+    # The singular values of a pack whose channels did not speak would be those of each.
+    deaf = replace(alone, odd=0.0 * alone.odd)
+    apart = gm.KernelMatrix(("xy", "z"), ((alone, deaf), (deaf, replace(alone, odd=2.0 * alone.odd))))
+    each = alone.singular_values()
+    np.testing.assert_allclose(apart.singular_values(), np.sort([*each, *(2.0 * each)])[::-1], rtol=1e-12)
+    with pytest.raises(ValueError, match=r"gm.kernel_matrix measures those of several channels"):
+        gm.memory_kernel(experiment(gm.Protocol(gm.write(), gm.read("a"), gm.write(), gm.read("b"))), n=2, width=0.6)
