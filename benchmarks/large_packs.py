@@ -18,7 +18,7 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 import gmem_jax as gm  # noqa: E402
-from gmem_jax.bench.measure import ENCODE, LAWS, encode, processor  # noqa: E402
+from gmem_jax.bench.measure import ENCODE, TIMED_LAWS, encode, processor  # noqa: E402
 from gmem_jax.experiment.provenance import provenance  # noqa: E402
 from gmem_jax.simulation.observers import forward  # noqa: E402
 
@@ -28,7 +28,7 @@ SIZES = ("tetra-325-a", "tetra-3267-a", "tetra-10240-b")
 
 def costs(pack: gm.Pack, replicas: int, seconds: float, t0: float) -> dict[str, np.ndarray]:
     """Microseconds per grain-step of every call, by precision."""
-    simulation, state = encode(pack, LAWS["H"], replicas, "native", t0)
+    simulation, state = encode(pack, TIMED_LAWS["H"], replicas, "native", t0)
     calls = {name: (replace(simulation, precision=name), state, simulation.rows(ENCODE, 0), 1) for name in PRECISIONS}
     taken: dict[str, list[float]] = {name: [] for name in PRECISIONS}
     for call in calls.values():

@@ -21,7 +21,7 @@ from console import say
 from packs import over_packs
 
 import gmem_jax as gm
-from gmem_jax.design.by_kernel import BUMPS, WIDTH
+from gmem_jax.design.by_kernel import KERNEL_BUMP_WIDTH, KERNEL_BUMPS
 from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.recall import LARGEST_BATCH
 from gmem_jax.experiment.record import key_of_run
@@ -71,7 +71,7 @@ class Case:
 
     def kernel(self) -> gm.MemoryKernel:
         """The memory kernel on narrow bumps."""
-        return gm.memory_kernel(self.experiment, BUMPS, WIDTH, cache=self.parts, progress=say)
+        return gm.memory_kernel(self.experiment, KERNEL_BUMPS, KERNEL_BUMP_WIDTH, cache=self.parts, progress=say)
 
     def recalled(self, name: str, signals: gm.Signals) -> np.ndarray:
         """Recalls of any signals, [S, 256], a batch at a time."""
@@ -189,7 +189,7 @@ def check(table: Table, case: Case, noises: Noises) -> None:
     table.note(case, f"words {SHORT} checked", checked(kernel.predict(words), found))
     if case.gamma0 == USUAL:
         amplitudes, recalls, _ = alphabet_of(kernel)
-        found = case.recalled("alphabet", bumps(amplitudes[:LARGEST_BATCH], WIDTH))
+        found = case.recalled("alphabet", bumps(amplitudes[:LARGEST_BATCH], KERNEL_BUMP_WIDTH))
         table.note(case, "alphabet checked", checked(recalls[:LARGEST_BATCH], found))
 
 

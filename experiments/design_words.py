@@ -24,7 +24,7 @@ from console import say
 from packs import over_packs
 
 import gmem_jax as gm
-from gmem_jax.design.by_kernel import BUMPS, WIDTH
+from gmem_jax.design.by_kernel import KERNEL_BUMP_WIDTH, KERNEL_BUMPS
 from gmem_jax.experiment.recall import LARGEST_BATCH
 from gmem_jax.experiment.record import key_of_run
 from gmem_jax.experiment.signals import bin_average
@@ -59,7 +59,7 @@ def main() -> None:
     for name in arguments.packs.split(","):
         any_words = gm.Experiment(gm.load_pack(name), gm.words(3), t0=arguments.t0)
         measured = Checkpoints(folder / f"{name}-t0-{arguments.t0:g}.kernel", key_of_run(any_words))
-        kernel = gm.memory_kernel(any_words, BUMPS, WIDTH, cache=measured, progress=say)
+        kernel = gm.memory_kernel(any_words, KERNEL_BUMPS, KERNEL_BUMP_WIDTH, cache=measured, progress=say)
         for bits in map(int, arguments.bits.split(",")):
             if there(folder / TABLE, name, bits, arguments.t0, arguments.iterations):
                 continue

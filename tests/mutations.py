@@ -1117,8 +1117,8 @@ MUTATIONS = (
     mutation(
         "ringing-unit",
         "preparation/ringing.py",
-        "pressure[:, 1], STEPS * float(dt), shortest)",
-        "pressure[:, 1], 0.7 * STEPS * float(dt), shortest)",
+        "pressure[:, 1], STEPS_PER_SAMPLE * float(dt), shortest)",
+        "pressure[:, 1], 0.7 * STEPS_PER_SAMPLE * float(dt), shortest)",
         "test_two_spheres_between_two_walls_ring_at_the_rate_of_their_springs",
     ),
     mutation(
@@ -1145,8 +1145,8 @@ MUTATIONS = (
     mutation(
         "gas-too-thick",
         "preparation/recipe.py",
-        "APART = 1.02",
-        "APART = 0.9",
+        "LATTICE_SPACING = 1.02",
+        "LATTICE_SPACING = 0.9",
         "test_the_gas_starts_as_thin_as_the_recipe_says_and_never_thicker_than_grains_that_turn_freely",
     ),
     mutation(

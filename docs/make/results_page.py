@@ -22,7 +22,7 @@ from gmem_jax.reproduce import draw
 from gmem_jax.reproduce.choices import CHOICES, Effect
 from gmem_jax.reproduce.compare import Estimate, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
-from gmem_jax.reproduce.run import PICTURES
+from gmem_jax.reproduce.run import SCHEMATICS
 from gmem_jax.show.tables import published
 
 HERE = Path(__file__).parents[1] / "results"
@@ -136,7 +136,7 @@ def figure(picture: Path) -> list[str]:
     """A picture, what it shows, and its numbers, if it has any."""
     numbers = picture.with_suffix(".csv")
     name = picture.stem.partition("-")[0]
-    shows = (FIGURES | PICTURES)[name].title if name in FIGURES | PICTURES else TITLES[name]
+    shows = (FIGURES | SCHEMATICS)[name].title if name in FIGURES | SCHEMATICS else TITLES[name]
     lines = [f"![{shows}]({picture.relative_to(HERE)})", "", f"{shows[0].upper()}{shows[1:]}.", ""]
     if not numbers.is_file():
         return lines
@@ -176,7 +176,7 @@ def anew(path: Path) -> None:
 def redraw() -> None:
     """Every picture that needs no run."""
     jax.config.update("jax_enable_x64", True)
-    for name, picture in PICTURES.items():
+    for name, picture in SCHEMATICS.items():
         picture.draw(target := HERE / "laptop" / f"{name}.png")
         for suffix in (".svg", ".csv"):
             target.with_suffix(suffix).unlink(missing_ok=True)

@@ -22,7 +22,7 @@ from gmem_jax.simulation import sample
 PACKS = ("tetra-1024-a", "tetra-10240-b")
 REPLICAS = (1, 8, 32, 128)
 ARCHITECTURES = {"sm_80": "A100", "sm_90": "H100, H200", "sm_100": "B200", "sm_120": "RTX 50"}
-LAWS = {"frictionless": Frictionless(), **measure.LAWS}
+GPU_LAWS = {"frictionless": Frictionless(), **measure.TIMED_LAWS}
 
 
 def device() -> Any:
@@ -60,7 +60,7 @@ def bytes_per_grain_step(pack: Pack, law: str = "H") -> dict[str, float]:
         candidates and the grains of those that touch, which caches may hold. "held": memory of a grain and replica,
         between steps and in the arrays of a call.
     """
-    simulation, state = measure.encode(pack, measure.LAWS[law], 1, "native")
+    simulation, state = measure.encode(pack, measure.TIMED_LAWS[law], 1, "native")
     touching = float(sample.measure(simulation.system, state, pack.box, jnp.ones((3, 1)), 0.0).contacts[0])
     sides = 2.0 * float(np.asarray(pack.pairs.valid).sum()) / pack.grains
     remembered = {"H": 3, "M1": 4}[law]
@@ -78,8 +78,8 @@ def registers() -> dict[str, dict[str, Needs]]:
     def of(law: FrictionLaw, tangent: bool) -> dict[str, Needs]:
         return {name: native.needs(law, name, tangent=tangent)["advance"] for name in ARCHITECTURES}
 
-    plain = {name: of(law, tangent=False) for name, law in LAWS.items()}
-    return {**plain, **{f"{name}, with derivatives": of(LAWS[name], tangent=True) for name in ("H", "M2")}}
+    plain = {name: of(law, tangent=False) for name, law in GPU_LAWS.items()}
+    return {**plain, **{f"{name}, with derivatives": of(GPU_LAWS[name], tangent=True) for name in ("H", "M2")}}
 
 
 def timed(

@@ -49,10 +49,10 @@ from gmem_jax.simulation.runner import status_of
 from gmem_jax.simulation.strain import smallest_box
 from gmem_jax.sweeps.executors import cores
 
-LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
+TIMED_LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
 T0 = 1.8e3  # duration of the compression that is timed, t_c, if not chosen
 ENCODE = Stage("encode", 0.0, 1.0, 1.0, "write", (Drive("xy", "xy"),))
-BINS = 8  # bins per timed call, so that checks and samples weigh as in a run; which does 32 at once
+BINS_PER_CALL = 8  # bins per timed call, so that checks and samples weigh as in a run; which does 32 at once
 AGREEMENT = 1e-8  # of the pressure, between backends: round-off grown over a few hundred steps
 LAMMPS_LISTS = ((0.1, 20), (0.2, 50), (0.2, 1000), (0.3, 1000))  # (skin in R, steps between checks) tried for LAMMPS
 Say = Callable[[str, float], None]
@@ -82,10 +82,10 @@ def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, 
     Raises:
         RuntimeError: if the simulation breaks down.
     """
-    simulation, state = encode(pack, LAWS[law], replicas, backend, t0)
-    call = (simulation, state, simulation.rows(ENCODE, 0), BINS)
+    simulation, state = encode(pack, TIMED_LAWS[law], replicas, backend, t0)
+    call = (simulation, state, simulation.rows(ENCODE, 0), BINS_PER_CALL)
     began = time.perf_counter()
-    binary = forward.program.lower(*call, most=BINS).compile()
+    binary = forward.program.lower(*call, most=BINS_PER_CALL).compile()
     compile_s = time.perf_counter() - began
     final, sample = jax.block_until_ready(binary(*call))  # warm-up
     if Status(status_of(final)).fatal:
@@ -98,7 +98,7 @@ def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, 
         while calls < 1 or time.perf_counter() - began < seconds:
             jax.block_until_ready(binary(*call))
             calls += 1
-        return 1e6 * (time.perf_counter() - began) / (calls * BINS * simulation.steps * pack.grains * replicas)
+        return 1e6 * (time.perf_counter() - began) / (calls * BINS_PER_CALL * simulation.steps * pack.grains * replicas)
 
     return Candidate(Row(backend, law, pack.grains, replicas, compile_s=compile_s, p_xy=p_xy), once)
 
@@ -116,7 +116,7 @@ def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Candidate]
     Raises:
         ValueError: for law M2, which it does not have.
     """
-    friction = LAWS[law]
+    friction = TIMED_LAWS[law]
     if isinstance(friction, Mindlin):
         raise ValueError("LAMMPS has no counterpart of M2")
     if isinstance(friction, Hooke):
@@ -195,8 +195,8 @@ def tile(pack: Pack, times: tuple[int, int, int]) -> Pack:
 def _peak_memory(load: Callable[[str], Pack], name: str, backend: str, law: str, replicas: int) -> int:
     """Peak resident bytes of a fresh process that runs one bin."""
     jax.config.update("jax_enable_x64", True)
-    simulation, state = encode(load(name), LAWS[law], replicas, backend)
-    jax.block_until_ready(forward(simulation, state, simulation.rows(ENCODE, 0), 1, most=BINS))
+    simulation, state = encode(load(name), TIMED_LAWS[law], replicas, backend)
+    jax.block_until_ready(forward(simulation, state, simulation.rows(ENCODE, 0), 1, most=BINS_PER_CALL))
     return _peak_bytes()
 
 
@@ -359,7 +359,7 @@ def run(
 
 def fits(pack: Pack, law: str, replicas: int, share: float = 0.25) -> bool:
     """Whether the contact histories of a case fit into `share` of the memory (Mindlin's are dense in XLA)."""
-    friction = LAWS[law]
+    friction = TIMED_LAWS[law]
     points = friction.points if isinstance(friction, Mindlin) else 1
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return 2 * 8 * points * pack.pairs.capacity * replicas * 3 < share * total

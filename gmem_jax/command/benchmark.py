@@ -40,8 +40,8 @@ def bench_command(
     shipped = {int(name.split("-")[1]): name for name in reversed(list_packs())}
     names = packs.split(",") if packs else [shipped[size] for size in sorted(shipped)]
     chosen = laws.split(",")
-    if unknown := [law for law in chosen if law not in measure.LAWS]:
-        raise InputError(f"--laws {unknown[0]}: no such law; there are {', '.join(measure.LAWS)}")
+    if unknown := [law for law in chosen if law not in measure.TIMED_LAWS]:
+        raise InputError(f"--laws {unknown[0]}: no such law; there are {', '.join(measure.TIMED_LAWS)}")
     counts = replicas.split(",")
     if not all(count.isdigit() and int(count) > 0 for count in counts):
         raise InputError(f"--replicas {replicas}: must be positive whole numbers, separated by commas")

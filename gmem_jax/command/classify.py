@@ -10,7 +10,7 @@ import typer
 from rich import progress
 
 from gmem_jax.command.console import (
-    EVERY,
+    LOG_INTERVAL,
     AsJson,
     Force,
     InputError,
@@ -48,7 +48,7 @@ def _training(budget: float) -> Iterator["training.Listener"]:
 
         def line(one: "training.Training") -> None:
             nonlocal last
-            if one.finished or time.perf_counter() - last > EVERY:
+            if one.finished or time.perf_counter() - last > LOG_INTERVAL:
                 last = time.perf_counter()
                 log(words(one))
 

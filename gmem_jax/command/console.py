@@ -30,12 +30,12 @@ from gmem_jax.simulation.progress import Progress
 stderr = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
 out = Console(highlight=False, markup=False)
 
-COST = {
+STEP_COST = {
     "native": (0.2, 0.08),
     "jax": (2.0, 1.3),
 }  # us a grain-step on two cores, one replica and several; see benchmarks
-LONGEST = 3e9  # seconds, a century: what is longer was not meant
-EVERY = 30.0  # seconds between lines of progress where there is no terminal
+LONGEST_DURATION = 3e9  # seconds, a century: what is longer was not meant
+LOG_INTERVAL = 30.0  # seconds between lines of progress where there is no terminal
 
 Output = Annotated[Path, typer.Option("-o", "--output", help="File to write.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; logs go to stderr.")]
@@ -202,8 +202,8 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
         InputError: saying what is needed and what there is.
     """
     free = psutil.virtual_memory().available
-    seconds = 1e-6 * COST[backend][replicas > 1] * grain_steps
-    if not seconds < LONGEST:
+    seconds = 1e-6 * STEP_COST[backend][replicas > 1] * grain_steps
+    if not seconds < LONGEST_DURATION:
         years = seconds / 3.15e7
         raise InputError(f"{what} would take {years:.0e} years; choose a larger dt, a smaller t0 or fewer grains")
     takes = f"{in_time(seconds)} on a free machine once compiled"
@@ -259,7 +259,7 @@ def _reporting() -> Iterator[Progress]:
             if first is None or fraction < last:  # less than before: another pass has begun, as points after packs
                 first = now, fraction
             last = fraction
-            if stage == told and now - at < EVERY:
+            if stage == told and now - at < LOG_INTERVAL:
                 return
             told, at = stage, now
             since, done = now - first[0], fraction - first[1]

@@ -25,7 +25,14 @@ from gmem_jax.command.console import (
 from gmem_jax.command.options import Chosen, with_experiment
 from gmem_jax.command.resuming import Restart, batch_for, resumable
 from gmem_jax.derivatives.gradient import Gradient, value_and_grad
-from gmem_jax.design import by_kernel, waveforms
+from gmem_jax.design import waveforms
+from gmem_jax.design.by_kernel import (
+    KERNEL_BUMP_WIDTH,
+    KERNEL_BUMPS,
+    KERNEL_ITERATIONS,
+    design_by_kernel,
+    kernel_design_cost,
+)
 from gmem_jax.design.drive import PARAMETERS, design_drive, start_within
 from gmem_jax.design.kernel import memory_kernel, relative_error
 from gmem_jax.design.stored import save_kernel
@@ -45,7 +52,7 @@ from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 from gmem_jax.simulation.observers import CHUNK
 from gmem_jax.simulation.progress import within
 
-GRADIENT = 11.0  # cost of a gradient in runs; see benchmarks
+GRADIENT_COST = 11.0  # cost of a gradient in runs; see benchmarks
 MANY = 16  # signals above which one kernel serves all rather than a Jacobian each
 
 
@@ -93,7 +100,7 @@ def gradient_command(
     names = {"waveform": waves, **{name: path for name, path in PARAMETERS.items() if _has(law, path)}}
     # The way back needs the state at the beginning of every chunk.
     chunks = experiment.protocol.bins / CHUNK
-    _announce(experiment, "gradient", GRADIENT, experiment.signals.count, 1.0 + chunks / COPIES)
+    _announce(experiment, "gradient", GRADIENT_COST, experiment.signals.count, 1.0 + chunks / COPIES)
     with resumable(output, key_of_run(experiment, by=list(names)), restart=restart) as parts:
         found = _gradient(experiment, tuple(names.values()), parts)
         slopes = {name: np.asarray(found.slope[path]) for name, path in names.items()}
@@ -218,13 +225,14 @@ def design_command(
         int | None,
         typer.Option(
             min=1,
-            help=f"Corrections; default {waveforms.ITERATIONS} by Jacobians, {by_kernel.ITERATIONS} by the kernel.",
+            help=f"Corrections; default {waveforms.ITERATIONS} by Jacobians, {KERNEL_ITERATIONS} by the kernel.",
         ),
     ] = None,
     bumps: Annotated[
         int | None,
         typer.Option(
-            min=2, help=f"Of a waveform; default {waveforms.BUMPS} by Jacobians, {by_kernel.BUMPS} by the kernel."
+            min=2,
+            help=f"Of a waveform; default {waveforms.BUMPS} by Jacobians, {KERNEL_BUMPS} by the kernel.",
         ),
     ] = None,
     width: Annotated[
@@ -232,7 +240,7 @@ def design_command(
         typer.Option(
             min=0.01,
             max=1.0,
-            help=f"Of bumps, in u; default {waveforms.WIDTH} by Jacobians, {by_kernel.WIDTH} by the kernel.",
+            help=f"Of bumps, in u; default {waveforms.BUMP_WIDTH} by Jacobians, {KERNEL_BUMP_WIDTH} by the kernel.",
         ),
     ] = None,
     gain: Annotated[
@@ -275,7 +283,7 @@ def design_command(
     if by == "kernel":
         options["batch"] = batch_for(experiment, output, restart=restart)
         options["measured"] = measured
-        effort = by_kernel.cost(experiment, iterations, bumps or by_kernel.BUMPS, measured)
+        effort = kernel_design_cost(experiment, iterations, bumps or KERNEL_BUMPS, measured)
         _announce(experiment, "design", effort, min(count * max(1, measured), options["batch"]))
         if start is not None:
             options["start"] = named_signals(str(start))
@@ -288,7 +296,7 @@ def design_command(
     begun = {"start": fingerprint(options["start"])} if start is not None else {}
     with resumable(output, key_of_run(experiment, by=by, **{**options, **begun}), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
-            design = by_kernel.design_by_kernel if by == "kernel" else waveforms.design_waveforms
+            design = design_by_kernel if by == "kernel" else waveforms.design_waveforms
             found = design(experiment, cache=parts, progress=progress, **options)
         way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
         save_waveforms(output, found.signals, experiment.waveforms, design=way)

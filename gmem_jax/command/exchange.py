@@ -17,7 +17,7 @@ from gmem_jax.command.console import (
     require_name,
 )
 from gmem_jax.files.configuration import material_from
-from gmem_jax.files.exporters import FORMATS, format_of, frames_of_pack
+from gmem_jax.files.exporters import EXPORT_FORMATS, format_of, frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.packs import load_pack, pack_called, save_pack
@@ -28,7 +28,7 @@ from gmem_jax.show import tables
 
 def export(
     file: Annotated[Path, typer.Argument(help="A pack or a recall file, or the name of a pack.")],
-    to: Annotated[str, typer.Option(help=f"{', '.join(FORMATS)}.")],
+    to: Annotated[str, typer.Option(help=f"{', '.join(EXPORT_FORMATS)}.")],
     output: Output,
     frames: Annotated[bool, typer.Option("--frames", help="Of a pack: the configurations of its preparation.")] = False,
     force: Force = False,

@@ -30,7 +30,7 @@ from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.experiment.provenance import provenance, sources
 from gmem_jax.experiment.record import fingerprint
 from gmem_jax.files.cache import kept_pack
-from gmem_jax.files.packs import STANDARD, list_packs, save_pack
+from gmem_jax.files.packs import STANDARD_NAME, list_packs, save_pack
 from gmem_jax.files.sizes import pack_bytes
 from gmem_jax.files.spheres import load_clump
 from gmem_jax.physics import grain
@@ -60,7 +60,7 @@ def info(as_json: AsJson = False) -> None:
 
 
 PREPARATION_BYTES = 2e4  # of memory a grain: lists while grains fly, at N = 10,240
-OVERLAP = 0.6
+CLUMP_OVERLAP = 0.6
 
 
 def standard_recipe(name: str) -> Recipe:
@@ -69,7 +69,7 @@ def standard_recipe(name: str) -> Recipe:
     Raises:
         InputError: if it is no such name.
     """
-    if not (found := STANDARD.fullmatch(name)):
+    if not (found := STANDARD_NAME.fullmatch(name)):
         raise InputError(
             f"{name}: a standard pack is called tetra-N-x, N grains and a letter for the seed: tetra-31680-a"
         )
@@ -86,7 +86,7 @@ def grain_of(shape: str, overlap: float | None) -> Clump:
         FileNotFoundError: if there is no such file.
     """
     if shape == "tetra":
-        return grain.tetra(OVERLAP if overlap is None else overlap)
+        return grain.tetra(CLUMP_OVERLAP if overlap is None else overlap)
     if overlap is not None:
         raise InputError(f"--overlap does nothing with --shape {shape}: it is that of a tetra grain")
     if shape == "sphere":
@@ -109,7 +109,7 @@ def prepare_command(
     shape: Annotated[str, typer.Option(help="tetra, sphere, or a file of spheres: x y z r in every line.")] = "tetra",
     overlap: Annotated[
         float | None,
-        typer.Option(help=f"Overlap O of a tetra grain, in [0, 1); default {OVERLAP}.", show_default=False),
+        typer.Option(help=f"Overlap O of a tetra grain, in [0, 1); default {CLUMP_OVERLAP}.", show_default=False),
     ] = None,
     name: Annotated[str, typer.Option(help="Name of the pack; default from grain, size and seed.")] = "",
     backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",

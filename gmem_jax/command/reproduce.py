@@ -19,8 +19,8 @@ from gmem_jax.reproduce.cost import spec_of_all
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import (
     GALLERY,
-    PICTURES,
     RUNS,
+    SCHEMATICS,
     Outcome,
     Weighed,
     check_claims,
@@ -34,11 +34,11 @@ from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
 from gmem_jax.sweeps.store import Store
 
-NAMES = sorted((*FIGURES, *PICTURES, GALLERY, "claims", "choices"))
+REPRODUCIBLE = sorted((*FIGURES, *SCHEMATICS, GALLERY, "claims", "choices"))
 
 
 def reproduce_command(
-    what: Annotated[str, typer.Argument(help=f"{', '.join(NAMES)}, or all.")],
+    what: Annotated[str, typer.Argument(help=f"{', '.join(REPRODUCIBLE)}, or all.")],
     scale: Annotated[
         str,
         typer.Option(help=f"How large and slow: {', '.join(SCALES)}; or changed, as in paper,t0=5400,packs=1."),
@@ -60,8 +60,8 @@ def reproduce_command(
     Says what it will cost, resumes, and computes no point twice, whichever figures need it. Writes NAME-SCALE.png,
     .svg and .csv, each of our points beside the published one.
     """
-    if what not in (*NAMES, "all"):
-        raise InputError(f"reproduce {what}: no such figure; there are {', '.join(NAMES)} and all")
+    if what not in (*REPRODUCIBLE, "all"):
+        raise InputError(f"reproduce {what}: no such figure; there are {', '.join(REPRODUCIBLE)} and all")
     try:
         scale_of(scale)
     except ValueError as error:
@@ -87,7 +87,7 @@ def reproduce_command(
     with locked(output / "figures"):
         if retry and (count := Store(output / RUNS).clear_failures()):
             log(f"{count} points and packs that failed are tried again")
-        for name in wanted((GALLERY, *PICTURES)):
+        for name in wanted((GALLERY, *SCHEMATICS)):
             with _going_on(broken), reporting(goes_on=True) as progress:
                 drawn += picture(name, *how(progress))
                 log(f"wrote {drawn[-1]}")

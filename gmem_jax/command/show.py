@@ -8,7 +8,7 @@ import typer
 
 from gmem_jax.command import sweep
 from gmem_jax.command.console import AsJson, Force, InputError, check_output, heard, log, print_result, refuse_idle
-from gmem_jax.show.render_matplotlib import FORMATS, render
+from gmem_jax.show.render_matplotlib import PICTURE_FORMATS, render
 from gmem_jax.show.stages import AGAINST, QUANTITIES
 from gmem_jax.show.summaries import PLOTS, Draw, summary_of
 
@@ -100,8 +100,8 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
         raise InputError(f"--plot {plot}: there is no such picture of {file}; there are {', '.join(pictures)}")
     if output is None:
         raise InputError(f"--plot {plot}: name the picture with -o, as in -o {names[plot.lower()]}.png")
-    if output.suffix.lower() not in FORMATS:
-        raise InputError(f"--output {output}: must end in one of {', '.join(FORMATS)}")
+    if output.suffix.lower() not in PICTURE_FORMATS:
+        raise InputError(f"--output {output}: must end in one of {', '.join(PICTURE_FORMATS)}")
     drawn = render(pictures[names[plot.lower()]]())
     drawn.save(check_output(output, "", inputs=(file,), force=force))
     log(f"wrote {output}")

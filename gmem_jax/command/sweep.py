@@ -30,7 +30,7 @@ from gmem_jax.sweeps.processes import stop, waiting
 from gmem_jax.sweeps.spec import Spec, read_spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SweepRunner
-from gmem_jax.sweeps.table import FORMATS, export, means, rows, warnings_of
+from gmem_jax.sweeps.table import TABLE_FORMATS, export, means, rows, warnings_of
 
 VERBS = ("status", "show", "export", "stop")
 RUN = ("executor", "workers", AS_THEY_ARE)
@@ -207,8 +207,8 @@ def show(store: Store, over: str, as_json: bool) -> None:
 
 
 def _export(store: Store, output: Path | None, force: bool, as_json: bool) -> None:
-    if output is None or output.suffix.lower() not in FORMATS:
-        raise InputError(f"gmem sweep export: name a file with -o that ends in one of {', '.join(FORMATS)}")
+    if output is None or output.suffix.lower() not in TABLE_FORMATS:
+        raise InputError(f"gmem sweep export: name a file with -o that ends in one of {', '.join(TABLE_FORMATS)}")
     check_output(output, "", force=force)
     about = export(store, output)
     log(f"wrote {output}" + (f": {about}" if about else ""))

@@ -32,7 +32,7 @@ from gmem_jax.simulation.sample import Sample
 Loss = Callable[[Experiment, jax.Array], jax.Array]
 """From an experiment and its p_sig [S, 256] to a number."""
 
-FIXED = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
+STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
 FORWARDS = 0.1  # of a gradient's time is the way forward
 
 Moving = tuple[Any, Any, Any]  # grains, history and held walls: what of a state can be differentiated
@@ -264,7 +264,7 @@ def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
     for name, tree in found.items():
         if inside := next((other for other in found if name.startswith(f"{other}.")), ""):
             raise ValueError(f"{name} is part of {inside}; name one of them")
-        if name in FIXED or tree is None or not all(map(_is_number, jax.tree.leaves(tree))):
+        if name in STATIC_FIELDS or tree is None or not all(map(_is_number, jax.tree.leaves(tree))):
             raise ValueError(
                 f"{name} is fixed when a program is compiled and has no derivative; "
                 "numbers like gamma0, friction.mu, signals.amplitudes and pack.position have"

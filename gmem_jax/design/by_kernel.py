@@ -29,14 +29,14 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress
 
-BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
-WIDTH = 0.08  # of them, in u
-DAMPING = 0.05  # of the first correction, in parts of the kernel's largest singular value
+KERNEL_BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
+KERNEL_BUMP_WIDTH = 0.08  # of them, in u
+KERNEL_DAMPING = 0.05  # of the first correction, in parts of the kernel's largest singular value
 EASED, FIRMED = 0.6, 1.8  # times the damping after a step that was better, and one that was worse
-ITERATIONS = 6  # simulations of all waveforms
-MEASURED = (1 / 3, 2 / 3)  # parts of the iterations after which slopes are measured
+KERNEL_ITERATIONS = 6  # simulations of all waveforms
+SLOPES_AT = (1 / 3, 2 / 3)  # parts of the iterations after which slopes are measured
 PROBE = (0.01, 0.05)  # shortest and longest step along a direction that is measured
-ROOM = 0.6  # of the bound |I| <= 1, that the first guess may take where no gain is asked for
+FIRST_GUESS_BOUND = 0.6  # of the bound |I| <= 1, that the first guess may take where no gain is asked for
 SHORTEST = 1e-6  # step from which slopes are learned; a waveform of nothing takes none
 PREDICTED = 6  # corrections of the first guess, by the kernel alone
 
@@ -47,9 +47,11 @@ def slopes(kernel: MemoryKernel, amplitudes: np.ndarray) -> np.ndarray:
     return slope
 
 
-def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS, measured: int = 0) -> float:
+def kernel_design_cost(
+    experiment: Experiment, iterations: int | None = None, n: int = KERNEL_BUMPS, measured: int = 0
+) -> float:
     """What a design takes, in runs of its signals."""
-    return (iterations or ITERATIONS) + 2.0 + 2.0 * n / experiment.signals.count + len(MEASURED) * measured
+    return (iterations or KERNEL_ITERATIONS) + 2.0 + 2.0 * n / experiment.signals.count + len(SLOPES_AT) * measured
 
 
 def shares(runs: int, needs: np.ndarray, most: int) -> np.ndarray:
@@ -77,13 +79,13 @@ def refuse_another_drive(kernel: MemoryKernel, experiment: Experiment) -> None:
 def design_by_kernel(
     experiment: Experiment,
     *,
-    iterations: int = ITERATIONS,
-    n: int = BUMPS,
-    width: float = WIDTH,
+    iterations: int = KERNEL_ITERATIONS,
+    n: int = KERNEL_BUMPS,
+    width: float = KERNEL_BUMP_WIDTH,
     kernel: MemoryKernel | None = None,
     gain: float | None = None,
     start: Signals | None = None,
-    damping: float = DAMPING,
+    damping: float = KERNEL_DAMPING,
     measured: int = 0,
     batch: int | None = None,
     cache: ResultCache = no_cache,
@@ -121,7 +123,7 @@ def design_by_kernel(
     if kernel is not None:
         refuse_another_drive(kernel, experiment)
         n, width = len(kernel.centres), kernel.width
-    work = Work(cost(experiment, iterations, 0 if kernel else n, measured), tell)
+    work = Work(kernel_design_cost(experiment, iterations, 0 if kernel else n, measured), tell)
 
     once = cache.memoised()
 
@@ -155,9 +157,9 @@ def design_by_kernel(
         gain = 0.5 * float(original.gain)
         amplitudes = guess(gain)
         for _ in range(PREDICTED):  # a guess that is cut off at the bound does not say how much too large it is
-            if (peak := float(np.max(largest(amplitudes, width)))) <= ROOM:
+            if (peak := float(np.max(largest(amplitudes, width)))) <= FIRST_GUESS_BOUND:
                 break
-            gain *= ROOM / peak
+            gain *= FIRST_GUESS_BOUND / peak
             amplitudes = guess(gain)
 
     def made(rows: np.ndarray) -> Spline:
@@ -171,8 +173,8 @@ def design_by_kernel(
     learned = np.zeros((len(best), *kernel.odd.shape))  # of each waveform's slopes, beyond the kernel
     strongest = np.linalg.svd(kernel.odd)[0].T  # [n, n]
     damped = firm
-    passed = 0.0 if start is None else MEASURED[0]  # what an earlier design has learned already
-    moments = [max(1, int((part - passed) * iterations)) for part in MEASURED]
+    passed = 0.0 if start is None else SLOPES_AT[0]  # what an earlier design has learned already
+    moments = [max(1, int((part - passed) * iterations)) for part in SLOPES_AT]
     for iteration in range(1, iterations):
         if measured and iteration in moments:
             missed = wanted - p_sig

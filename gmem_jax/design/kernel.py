@@ -22,7 +22,7 @@ from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
 from gmem_jax.simulation.protocol import BINS
 
-FINE = 2048  # points of v for inner products of basis functions
+QUADRATURE_POINTS = 2048  # points of v for inner products of basis functions
 
 
 @comparable
@@ -60,10 +60,10 @@ class MemoryKernel:
         return result
 
     def _orthonormal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Recalls [n, 256] of, and values on the fine grid [n, FINE] of, an orthonormal basis of the same space."""
-        v = (np.arange(FINE) + 0.5) / FINE
+        """Recalls [n, 256] of, and values [n, QUADRATURE_POINTS] of, an orthonormal basis of the same space."""
+        v = (np.arange(QUADRATURE_POINTS) + 0.5) / QUADRATURE_POINTS
         shapes = np.asarray(self.basis.shear(jnp.asarray(v))).T
-        values, vectors = np.linalg.eigh(shapes @ shapes.T / FINE)
+        values, vectors = np.linalg.eigh(shapes @ shapes.T / QUADRATURE_POINTS)
         whiten = vectors @ np.diag(values**-0.5) @ vectors.T
         return whiten @ self.odd, whiten @ shapes
 
@@ -105,12 +105,12 @@ class MemoryKernel:
             return 1.0
         modes = left[:, kept].T @ shapes
         widths = []
-        for at in range(FINE // 5, 4 * FINE // 5, FINE // 32):
+        for at in range(QUADRATURE_POINTS // 5, 4 * QUADRATURE_POINTS // 5, QUADRATURE_POINTS // 32):
             spread = modes[:, at] @ modes
             half = spread < 0.5 * spread[at]
-            right = np.argmax(half[at:]) if half[at:].any() else FINE - at
+            right = np.argmax(half[at:]) if half[at:].any() else QUADRATURE_POINTS - at
             back = np.argmax(half[at::-1]) if half[at::-1].any() else at
-            widths.append((right + back) / FINE)
+            widths.append((right + back) / QUADRATURE_POINTS)
         return float(np.mean(widths))
 
     @usual_rules()
@@ -143,7 +143,7 @@ def bumps(amplitudes: np.ndarray | jax.Array, width: float) -> Bumps:
 
 def nearest(basis: Signals, signals: Signals) -> np.ndarray:
     """Amplitudes of n basis functions that come nearest to waveforms (least squares), [S, n]."""
-    v = (jnp.arange(FINE) + 0.5) / FINE
+    v = (jnp.arange(QUADRATURE_POINTS) + 0.5) / QUADRATURE_POINTS
     shapes, wanted = np.asarray(basis.shear(v)), np.asarray(signals.shear(v))
     result: np.ndarray = np.linalg.lstsq(shapes, wanted, rcond=None)[0].T
     return result

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.derivatives.gradient import push
-from gmem_jax.design.kernel import FINE, bumps, nearest
+from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline, waveform
@@ -27,7 +27,7 @@ DAMPING = (0.01, 0.005)
 FRACTIONS = (1.0, 0.5, 0.25)  # of a step that are tried
 ITERATIONS = 3  # corrections of a design
 BUMPS = 17  # basis waveforms of a design
-WIDTH = 0.2  # of them, in u
+BUMP_WIDTH = 0.2  # of them, in u
 TANGENT = 2.5  # cost of a tangent in runs; see benchmarks
 
 
@@ -59,7 +59,7 @@ class Design:
 
 def largest(amplitudes: np.ndarray, width: float) -> np.ndarray:
     """Largest |I| of waveforms [S, n], [S]."""
-    v = (jnp.arange(FINE) + 0.5) / FINE
+    v = (jnp.arange(QUADRATURE_POINTS) + 0.5) / QUADRATURE_POINTS
     found: np.ndarray = np.max(np.abs(np.asarray(bumps(amplitudes, width).shear(v))), axis=0)
     return found
 
@@ -148,7 +148,7 @@ def design_waveforms(
     *,
     iterations: int = ITERATIONS,
     n: int = BUMPS,
-    width: float = WIDTH,
+    width: float = BUMP_WIDTH,
     gain: float | None = None,
     damping: Sequence[float] = DAMPING,
     cache: ResultCache = no_cache,

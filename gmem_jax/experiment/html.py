@@ -8,7 +8,7 @@ import numpy as np
 
 from gmem_jax.physics.pytree import traced
 
-MOST = 20  # rows of a long table
+MOST_ROWS = 20  # rows of a long table
 
 
 def brief(value: Any) -> str:
@@ -44,8 +44,8 @@ def facts(title: str, rows: Mapping[str, Any]) -> str:
 
 def listing(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """A table with a line for each row, of which the first 20 are shown."""
-    more = [[f"... {len(rows) - MOST} more"]] if len(rows) > MOST else []
-    shown = [[brief(value) for value in row] for row in rows[:MOST]]
+    more = [[f"... {len(rows) - MOST_ROWS} more"]] if len(rows) > MOST_ROWS else []
+    shown = [[brief(value) for value in row] for row in rows[:MOST_ROWS]]
     return _table(title, [*shown, *more], columns)
 
 

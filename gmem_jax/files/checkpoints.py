@@ -27,16 +27,16 @@ from gmem_jax.files.atomic import atomic
 from gmem_jax.files.ours import Folder, release, sweep
 from gmem_jax.files.seal import BLOCK, require_sealed, seal
 from gmem_jax.files.validation import json_of, read_npy, refusing, require
-from gmem_jax.physics.pytree import KINDS
+from gmem_jax.physics.pytree import REGISTERED
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 
 PART_SCHEMA = "gmem-part/0.1"
 PARTS_SCHEMA = "gmem-parts/0.1"
-MARKER = "run.json"
+RUN_MARKER = "run.json"
 OWN = r"[\w.+-]+\.(?:npz|now|before)|(?:run|job)\.json"
 """Names of files in a folder of parts; a sweep puts the job there that they belong to."""
 FIRST = 5.0  # s before the first checkpoint of an unfinished part; each next one takes twice as long to come
-EVERY = 120.0  # s between checkpoints at most: doing it again must cost more than writing them
+CHECKPOINT_INTERVAL = 120.0  # s between checkpoints at most: doing it again must cost more than writing them
 AT_MILESTONES = 20.0  # s likewise, where a stage has just ended
 
 
@@ -55,7 +55,7 @@ def _taken_apart(tree: Any, arrays: list[np.ndarray]) -> Any:
         return {"tuple": [_taken_apart(item, arrays) for item in tree]}
     if isinstance(tree, dict):
         return {"ordered": [[name, _taken_apart(item, arrays)] for name, item in tree.items()]}
-    if is_dataclass(tree) and KINDS.get(type(tree).__name__) is type(tree):
+    if is_dataclass(tree) and REGISTERED.get(type(tree).__name__) is type(tree):
         own = {entry.name: _taken_apart(getattr(tree, entry.name), arrays) for entry in fields(tree)}
         return {"kind": type(tree).__name__, "fields": own}
     raise TypeError(f"a {type(tree).__name__} cannot be kept in a file")
@@ -71,7 +71,7 @@ def _put_together(form: Any, arrays: list[np.ndarray]) -> Any:
         return tuple(_put_together(item, arrays) for item in form["tuple"])
     if "ordered" in form:
         return OrderedDict((name, _put_together(item, arrays)) for name, item in form["ordered"])
-    return KINDS[form["kind"]](**{name: _put_together(item, arrays) for name, item in form["fields"].items()})
+    return REGISTERED[form["kind"]](**{name: _put_together(item, arrays) for name, item in form["fields"].items()})
 
 
 def save_part(path: Path, tree: Any, of: str = "") -> None:
@@ -138,7 +138,7 @@ class _StoredCheckpoint(Checkpoint):
 
     def __init__(self, own: Folder, name: str, of: str) -> None:
         self._own, self._names, self._of = own, (f"{name}.now", f"{name}.before"), f"{of}, unfinished"
-        self._last, self._wait, self._keeps = time.monotonic(), min(FIRST, EVERY), True
+        self._last, self._wait, self._keeps = time.monotonic(), min(FIRST, CHECKPOINT_INTERVAL), True
 
     def restore(self) -> Any:
         for name in self._names:
@@ -161,7 +161,7 @@ class _StoredCheckpoint(Checkpoint):
             save_part(self._own.at(now), state(), self._of)
         except TypeError:  # a law of the user's may remember in classes of its own: there is nothing to go on from
             self._keeps = False
-        self._last, self._wait = time.monotonic(), min(EVERY, 2.0 * self._wait)
+        self._last, self._wait = time.monotonic(), min(CHECKPOINT_INTERVAL, 2.0 * self._wait)
 
     def discard(self) -> None:
         """Remove both."""
@@ -197,7 +197,7 @@ class Checkpoints(ResultCache):
         self.folder = Path(folder)
         wanted = json.loads(json.dumps(key))
         self._run = hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:20]
-        self._own = Folder(self.folder, MARKER, PARTS_SCHEMA, re.compile(OWN), {"key": wanted})
+        self._own = Folder(self.folder, RUN_MARKER, PARTS_SCHEMA, re.compile(OWN), {"key": wanted})
         if restart or not (self.finished() or self.begun()):
             self._own.clear(keep=True)
         elif found := self.key_of(self.folder):
@@ -214,7 +214,7 @@ class Checkpoints(ResultCache):
     @staticmethod
     def key_of(folder: Path) -> dict[str, Any]:
         """The key stored in a folder of parts; empty if there is none that can be read."""
-        key = (Folder.about(Path(folder), MARKER, PARTS_SCHEMA) or {}).get("key")
+        key = (Folder.about(Path(folder), RUN_MARKER, PARTS_SCHEMA) or {}).get("key")
         return key if isinstance(key, dict) else {}
 
     def __call__(self, name: str, run: Callable[[Checkpoint], Any]) -> Any:

@@ -253,7 +253,7 @@ class Format(NamedTuple):
     folder: bool = False
 
 
-FORMATS = {
+EXPORT_FORMATS = {
     "gsd": Format(".gsd", write_gsd),
     "vtk": Format(".vtp", write_vtp, Format(".pvd", write_pvd, folder=True)),
     "xyz": Format(".xyz", write_xyz),
@@ -265,14 +265,14 @@ def format_of(name: str, *, several: bool, suffix: str = "") -> Format:
     """A format by its name.
 
     Args:
-        name: one of `FORMATS`.
+        name: one of `EXPORT_FORMATS`.
         several: whether there are several configurations.
         suffix: of the file; that of a series asks for one of a single configuration, too.
 
     Raises:
         ValueError: if there is none of that name.
     """
-    if name not in FORMATS:
-        raise ValueError(f"--to must be one of {', '.join(FORMATS)}; got {name!r}")
-    found = FORMATS[name]
+    if name not in EXPORT_FORMATS:
+        raise ValueError(f"--to must be one of {', '.join(EXPORT_FORMATS)}; got {name!r}")
+    found = EXPORT_FORMATS[name]
     return found.series if found.series and (several or suffix.lower() == found.series.suffix) else found

@@ -12,12 +12,12 @@ from gmem_jax.files.validation import is_number, numbers, require, require_field
 from gmem_jax.simulation.frames import sphere_places
 
 UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
-DEEPEST = 0.5  # R, overlap of spheres at rest; packs are at 0.1, and Hertz's law is long wrong at 0.5
+LARGEST_OVERLAP = 0.5  # R, overlap of spheres at rest; packs are at 0.1, and Hertz's law is long wrong at 0.5
 GRAZING = 1e-9  # R: distances that may round to either side of a limit
 LOOSEST, DENSEST = 0.1, 0.85  # filling; packs are at 0.68, one squeezed to 0.9 would have 0.93
-WIDEST = 1e5  # R, of a box
-MOST = 256  # spheres of a grain
-FASTEST = 1.0  # R / t_c, of a rod of the solid: packs have 0.46 at 2e-3 E, and some p^(1/6) at other pressures
+LARGEST_BOX = 1e5  # R, of a box
+MOST_SPHERES = 256  # spheres of a grain
+LARGEST_SPEED = 1.0  # R / t_c, of a rod of the solid: packs have 0.46 at 2e-3 E, and some p^(1/6) at other pressures
 LISTENED = 40.0  # longest edges, in t_c, for which T_1 is listened for: some 15 periods
 PERIODS = 3  # of the slowest mode that can be told from drift in that time
 _BALL = 4.0 * np.pi / 3.0
@@ -46,11 +46,11 @@ def check(found: Found, *, isotropic: bool, record: dict[str, Any]) -> None:
     _check_list(found, spheres)
     first, second = found["pairs/candidates"]
     overlap = 2.0 - np.linalg.norm(spheres[second] - spheres[first], axis=1)
-    deepest = float(overlap.max(initial=0.0))
     walls = 1.0 - min(np.min(spheres - lower), np.min(upper - spheres))
+    deepest = max(overlap.max(initial=0.0), walls)
     require(
-        max(deepest, walls) < DEEPEST,
-        f"grains or walls overlap by {max(deepest, walls):.2f} R, must be below {DEEPEST} R: this is no pack at rest",
+        deepest < LARGEST_OVERLAP,
+        f"grains or walls overlap by {deepest:.2f} R, must be below {LARGEST_OVERLAP} R: this is no pack at rest",
     )
     _check_record(found, record, overlap)
 
@@ -59,7 +59,7 @@ def _check_clump(found: Found, isotropic: bool) -> None:
     """Bounds on the mass properties of a union of K unit spheres, whichever it is."""
     offsets, mass = found["clump/offsets"], float(found["clump/mass"])
     inertia, diameter = found["clump/inertia"], float(found["clump/diameter"])
-    require(0 < len(offsets) <= MOST, f"its grain has {len(offsets)} spheres, must have 1 to {MOST}")
+    require(0 < len(offsets) <= MOST_SPHERES, f"its grain has {len(offsets)} spheres, must have 1 to {MOST_SPHERES}")
     extent = 2.0 * (1.0 + np.linalg.norm(offsets, axis=1).max())
     require(abs(diameter - extent) < UNIT * extent, f"the grain's diameter is {diameter:g}, its spheres say {extent:g}")
     require(
@@ -80,7 +80,7 @@ def _check_box(found: Found) -> None:
     require(len(found["position"]) > 0, "it holds no grains")
     require(lower < upper, "a lower wall of the box is not below the upper one")
     require(0.0 < delta0 < 0.5, f"delta0 must be in (0, 0.5), got {delta0:g}")
-    require(upper - lower < WIDEST, f"a box wider than {WIDEST:g} R is none of a pack at rest")
+    require(upper - lower < LARGEST_BOX, f"a box wider than {LARGEST_BOX:g} R is none of a pack at rest")
     filling = _filling(found)
     require(
         LOOSEST < filling < DENSEST,
@@ -98,7 +98,7 @@ def _check_box(found: Found) -> None:
 def period_bounds(lengths: np.ndarray) -> tuple[float, float]:
     """Where T_1 of a box with these edges [3] can be, in t_c: a wave across it no faster than in the solid, and the
     slowest that its measurement can tell."""
-    return float(np.min(lengths)) / FASTEST, LISTENED * float(np.max(lengths)) / PERIODS
+    return float(np.min(lengths)) / LARGEST_SPEED, LISTENED * float(np.max(lengths)) / PERIODS
 
 
 def _filling(found: Found) -> float:

@@ -23,7 +23,7 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import Sample
 
-STANDARD = re.compile(r"tetra-([1-9][0-9]{1,6})-([a-z])")
+STANDARD_NAME = re.compile(r"tetra-([1-9][0-9]{1,6})-([a-z])")
 """Names of standard packs: the number of tetra grains, and a letter for the seed, a for 1."""
 
 _CLUMP = [path.removeprefix("clump/") for path in PACK.arrays if path.startswith("clump/")]
@@ -144,7 +144,7 @@ def _path_of(source: str | Path) -> Path:
     if known := pack_called(name):
         return known
     if not path.is_file() and path.suffix == "":
-        how = f"; `gmem prepare {name}` makes it" if STANDARD.fullmatch(name) else ""
+        how = f"; `gmem prepare {name}` makes it" if STANDARD_NAME.fullmatch(name) else ""
         raise FileNotFoundError(f"{name}: neither a file nor a shipped pack ({', '.join(list_packs())}){how}")
     return path
 
@@ -154,7 +154,7 @@ def pack_called(name: str) -> Path | None:
     if name in list_packs():
         return Path(str(resources.files("gmem_jax") / "packs" / f"{name}.h5"))
     made = kept_pack(name)
-    return made if made and STANDARD.fullmatch(name) and made.is_file() else None
+    return made if made and STANDARD_NAME.fullmatch(name) and made.is_file() else None
 
 
 def list_packs() -> list[str]:

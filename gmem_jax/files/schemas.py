@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from gmem_jax.files.validation import FIXED, Array
+from gmem_jax.files.validation import FIXED_LENGTHS, Array
 from gmem_jax.simulation.sample import MEASURED
 
 DIMENSIONS = {  # names of lengths, and what the scales of those say that no array of a file is a scale of
@@ -323,6 +323,8 @@ def _section(schema: Schema) -> str:
 def _table(arrays: Mapping[str, Array]) -> list[str]:
     lines = ["| name | shape | units | |", "|---|---|---|---|"]
     for path, (_, shape, units, words) in arrays.items():
-        sizes = ", ".join(f"{name} ({FIXED[name]})" if name in FIXED else str(name) for name in map(str, shape))
+        sizes = ", ".join(
+            f"{name} ({FIXED_LENGTHS[name]})" if name in FIXED_LENGTHS else str(name) for name in map(str, shape)
+        )
         lines.append(f"| `{path}` | {f'[{sizes}]' if sizes else ''} | {units} | {words} |")
     return lines

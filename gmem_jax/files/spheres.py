@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.files.pack_validation import MOST
+from gmem_jax.files.pack_validation import MOST_SPHERES
 from gmem_jax.files.validation import NAME, refusing, require, title
 from gmem_jax.physics.grain import Clump, clump
 
@@ -27,12 +27,15 @@ def load_clump(path: Path) -> Clump:
     """
     path = Path(path)
     with refusing(path, "file of spheres"):
-        require(path.stat().st_size <= _LARGEST, f"more than {MOST} lines of four numbers")
+        require(path.stat().st_size <= _LARGEST, f"more than {MOST_SPHERES} lines of four numbers")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
         rows = [
             _sphere(number, line) for number, line in enumerate(lines, 1) if line.strip() and line.strip()[0] != "#"
         ]
-        require(0 < len(rows) <= MOST, f"it lists {len(rows)} spheres, must be 1 to {MOST}: {_COLUMNS} in every line")
+        require(
+            0 < len(rows) <= MOST_SPHERES,
+            f"it lists {len(rows)} spheres, must be 1 to {MOST_SPHERES}: {_COLUMNS} in every line",
+        )
         name = path.stem[:NAME]
         made = clump(np.asarray(rows), shape=name if title(name) else "clump")
     return made

@@ -12,7 +12,7 @@ import h5py
 DEPTH = 4  # groups within groups
 ITEMS = 10_000  # datasets and groups of a file
 ATTRIBUTE = 1 << 26  # bytes of an attribute
-KINDS = "fiubS"  # of numpy: real numbers, integers, booleans; texts of one length, which lie in one piece too
+DTYPE_KINDS = "fiubS"  # of numpy: real numbers, integers, booleans; texts of one length, which lie in one piece too
 
 
 class Tree:
@@ -58,7 +58,7 @@ def _attributes(item: h5py.Group, path: str) -> dict[str, Any]:
         known = item.attrs.get_id(name)
         if known.shape != () or known.get_storage_size() > ATTRIBUTE:
             raise ValueError(f"attribute {name!r} of {path} is not a single value")
-        if known.dtype.kind not in KINDS and h5py.check_string_dtype(known.dtype) is None:
+        if known.dtype.kind not in DTYPE_KINDS and h5py.check_string_dtype(known.dtype) is None:
             raise ValueError(f"attribute {name!r} of {path} is neither a number nor a text")
         value = item.attrs[name]
         found[name] = value.decode() if isinstance(value, bytes) else value
@@ -68,7 +68,7 @@ def _attributes(item: h5py.Group, path: str) -> dict[str, Any]:
 def _require_plain(array: h5py.Dataset, path: str) -> None:
     """An array of numbers whose bytes lie in the file, all of them, as they are."""
     made = array.id.get_create_plist()
-    if array.shape is None or array.dtype.kind not in KINDS:
+    if array.shape is None or array.dtype.kind not in DTYPE_KINDS:
         raise ValueError(f"{path!r} is not an array of numbers")
     if made.get_layout() not in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT) or made.get_nfilters():
         raise ValueError(f"{path!r} is not stored in one piece (chunked, compressed or virtual)")

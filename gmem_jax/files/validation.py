@@ -18,9 +18,9 @@ from gmem_jax.errors import FileFormatError
 from gmem_jax.physics.rules import require_started
 from gmem_jax.simulation.protocol import BINS
 
-KINDS = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",), "text": ("bytes",)}
-FIXED = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that have one length in every file
-LONGEST = 18  # digits of a whole number: no count or seed has more
+DTYPES = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",), "text": ("bytes",)}
+FIXED_LENGTHS = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that have one length in every file
+MOST_DIGITS = 18  # digits of a whole number: no count or seed has more
 NAME = 200  # characters of what is printed
 PATH = 4096  # of a path
 # Names in TOML and JSON and what stands there; under all others a number, or lists of them.
@@ -37,8 +37,8 @@ TEXTS = (
     "precision",
     "variant",
 )
-COUNTS = ("steps", "points", "grains", "seed", "cycles")
-FLAGS = ("scale",)
+WHOLE_NUMBERS = ("steps", "points", "grains", "seed", "cycles")
+YES_OR_NO = ("scale",)
 _SHOWN = 160  # characters of an error of some library
 
 
@@ -105,21 +105,23 @@ def fit(declared: Mapping[str, Array], found: Mapping[str, Any]) -> dict[str, in
     Raises:
         FileFormatError: if an array is missing, or has another shape or kind than declared.
     """
-    lengths = dict(FIXED)
+    lengths = dict(FIXED_LENGTHS)
     for name, (kind, shape, *_) in declared.items():
         if name not in found:
             raise FileFormatError(f"incomplete file, {name!r} is missing")
         own, dtype = tuple(found[name].shape), np.dtype(found[name].dtype)
-        if not dtype.name.startswith(KINDS[kind]) or not dtype.isnative:
-            raise FileFormatError(f"{name!r} holds {dtype}, must hold {' or '.join(KINDS[kind])}")
+        if not dtype.name.startswith(DTYPES[kind]) or not dtype.isnative:
+            raise FileFormatError(f"{name!r} holds {dtype}, must hold {' or '.join(DTYPES[kind])}")
         if len(own) == len(shape):
             for length, symbol in zip(own, shape, strict=True):
                 if isinstance(symbol, str):
                     lengths.setdefault(symbol, length)
         wanted = tuple(lengths.get(symbol, -1) if isinstance(symbol, str) else symbol for symbol in shape)
         if own != wanted:
-            words = ", ".join(str(FIXED.get(str(symbol), symbol)) for symbol in shape)
-            known = ", ".join(f"{name} = {lengths[name]}" for name in lengths if name in shape and name not in FIXED)
+            words = ", ".join(str(FIXED_LENGTHS.get(str(symbol), symbol)) for symbol in shape)
+            known = ", ".join(
+                f"{name} = {lengths[name]}" for name in lengths if name in shape and name not in FIXED_LENGTHS
+            )
             raise FileFormatError(
                 f"{name!r} has shape {list(own)}, must be [{words}]" + (f" with {known}" * bool(known))
             )
@@ -161,7 +163,7 @@ def json_of(text: Any, what: str) -> dict[str, Any]:
 
 
 def _whole(digits: str) -> int:
-    if len(digits) > LONGEST:
+    if len(digits) > MOST_DIGITS:
         raise ValueError(f"a whole number of {len(digits)} digits")
     return int(digits)
 
@@ -184,9 +186,9 @@ def require_kinds(values: Mapping[str, Any]) -> None:
         kind = name.rpartition(".")[2]
         if kind in TEXTS:
             right, words = isinstance(value, str), "a text"
-        elif kind in FLAGS:
+        elif kind in YES_OR_NO:
             right, words = isinstance(value, bool), "true or false"
-        elif kind in COUNTS:
+        elif kind in WHOLE_NUMBERS:
             right, words = isinstance(value, int) and not isinstance(value, bool), "a whole number"
         else:
             right, words = _numeric(value), "a number"

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-TARGETS = {"gmem_advance": "gmem_cuda_advance", "gmem_tangent": "gmem_cuda_tangent"}
+CUDA_TARGETS = {"gmem_advance": "gmem_cuda_advance", "gmem_tangent": "gmem_cuda_tangent"}
 """Symbols of the library by the names of calls; reverse mode is in plain JAX."""
 
 _NAMES = ("libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so")
@@ -67,7 +67,7 @@ def _cache() -> str:
 
 def register(library: ctypes.CDLL, sources: Path) -> None:
     """Tell XLA of the library's calls on GPUs, and the library where its sources are."""
-    for target, symbol in TARGETS.items():
+    for target, symbol in CUDA_TARGETS.items():
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, symbol)), platform="CUDA")
     nvrtc = ":".join([_packaged(), *_NAMES]).lstrip(":")
     library.gmem_cuda_paths(*(ctypes.c_char_p(path.encode()) for path in (nvrtc, str(sources), _cache())))

@@ -292,11 +292,11 @@ def _primitive(
     def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
         if static["call"].mixed:
             raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
-        if target in cuda.TARGETS and not cuda.missing():
+        if target in cuda.CUDA_TARGETS and not cuda.missing():
             return library(context, *values, on_gpu=True, **static)
-        if target in cuda.TARGETS and not definition.anywhere:
+        if target in cuda.CUDA_TARGETS and not definition.anywhere:
             raise NotImplementedError(f"the native backend does not run on this GPU: {cuda.missing()}")
-        if target in cuda.TARGETS:
+        if target in cuda.CUDA_TARGETS:
             cuda.warn_once(cuda.missing())
         return in_plain_jax(context, *values, definition=definition, **static)
 

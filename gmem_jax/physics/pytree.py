@@ -20,7 +20,7 @@ from gmem_jax.physics.rules import usual_rules
 Scalar = float | jax.Array
 """A parameter: one number, or an array that broadcasts against the replica axis [B]."""
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 
 
 class Interval(NamedTuple):
@@ -69,7 +69,7 @@ RECORDS: dict[str, type] = {}
 """Every class that `static_record` registered, by name."""
 
 
-def static_record(cls: type[T]) -> type[T]:
+def static_record(cls: type[_T]) -> type[_T]:
     """Register a frozen, hashable dataclass that may be the value of a static field of an exported program."""
     RECORDS[cls.__name__] = cls
     return cls
@@ -85,7 +85,7 @@ class _Labels(tuple[str, ...]):
         return 0
 
 
-KINDS: dict[str, type] = {}
+REGISTERED: dict[str, type] = {}
 """Every class that `pytree` registered, by name: what files may hold."""
 
 
@@ -109,26 +109,26 @@ def _equal(self: Any, other: Any) -> Any:
     return all(_alike(getattr(self, entry.name), getattr(other, entry.name)) for entry in fields(self))
 
 
-def comparable(cls: type[T]) -> type[T]:
+def comparable(cls: type[_T]) -> type[_T]:
     """Let `==` of a dataclass that holds arrays be True or False; its hash stays, as equal objects have equal ones."""
     cls.__eq__ = _equal  # type: ignore[method-assign]
     return cls
 
 
-def pytree(cls: type[T]) -> type[T]:
+def pytree(cls: type[_T]) -> type[_T]:
     """Register a frozen dataclass with JAX. Rebuilding one runs no checks: its leaves may be tracers, or anything."""
-    KINDS[comparable(cls).__name__] = cls
+    REGISTERED[comparable(cls).__name__] = cls
     kinds: dict[str, list[str]] = {"data": [], "static": [], "label": []}
     for entry in fields(cls):  # type: ignore[arg-type]
         kinds[next((kind for kind in ("static", "label") if kind in entry.metadata), "data")].append(entry.name)
     data, fixed, labels = kinds.values()
 
-    def flatten(made: T) -> tuple[list[tuple[Any, Any]], Any]:
+    def flatten(made: _T) -> tuple[list[tuple[Any, Any]], Any]:
         children = [(jax.tree_util.GetAttrKey(name), getattr(made, name)) for name in data]
         structure = tuple(getattr(made, name) for name in fixed), _Labels(getattr(made, name) for name in labels)
         return children, structure
 
-    def unflatten(structure: Any, children: Any) -> T:
+    def unflatten(structure: Any, children: Any) -> _T:
         made = object.__new__(cls)
         values = (*zip(data, children, strict=True), *zip(fixed, structure[0], strict=True))
         for name, value in (*values, *zip(labels, structure[1], strict=True)):

@@ -1,22 +1,19 @@
 """The +z wall under pressure: a speed-limited servo, and the free flight of the gas (a servo of zero speed)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gmem_jax.native import March
 from gmem_jax.physics.pairs import slack, sphere_centres
 from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.state import Box, State
 from gmem_jax.physics.step import System
 from gmem_jax.simulation.sample import check
 
-March = Callable[..., tuple[State, jax.Array]]
-"""The signature of `gmem_jax.physics.step.march`."""
-
-BLOCK = 8  # steps between two looks at the neighbour list: grains may fly freely here
+STEPS_PER_CHECK = 8  # steps between two looks at the neighbour list: grains may fly freely here
 
 
 @pytree
@@ -48,7 +45,7 @@ class Pressed:
         state: the grains.
         box: the walls.
         pressure: p_z averaged over the last block, [1].
-        blocks: blocks of `BLOCK` steps done by the last call.
+        blocks: blocks of `STEPS_PER_CHECK` steps done by the last call.
         settled: whether pressure and speed are within the servo's bounds.
         crowded: whether the neighbour list must be rebuilt before going on.
     """
@@ -75,7 +72,7 @@ def press(
     enough that it is complete throughout: the next block is allowed for at the speed of the fastest sphere.
     """
     reach = jnp.sqrt(jnp.max(jnp.sum(system.clump.offsets**2, axis=1)))
-    times = dt * jnp.arange(1.0, BLOCK + 1.0)
+    times = dt * jnp.arange(1.0, STEPS_PER_CHECK + 1.0)
 
     def block(now: Pressed) -> Pressed:
         velocity = jnp.clip(servo.gain * (now.pressure / servo.target - 1.0), -servo.speed, servo.speed)
@@ -87,9 +84,9 @@ def press(
         state = check(system, state, box)
         fastest = largest_speed(state)
         spin = jnp.sqrt(jnp.max(jnp.sum(state.grains.spin**2, axis=1)))
-        ahead = 2.0 * BLOCK * dt * (1.2 * (fastest + reach * spin) + servo.speed)
+        ahead = 2.0 * STEPS_PER_CHECK * dt * (1.2 * (fastest + reach * spin) + servo.speed)
         room = jnp.min(slack(system.pairs, sphere_centres(state.grains, system.clump), box))
-        pressure = total[2] / BLOCK
+        pressure = total[2] / STEPS_PER_CHECK
         met = jnp.max(jnp.abs(pressure / servo.target - 1.0)) < servo.error
         return Pressed(
             state=state,

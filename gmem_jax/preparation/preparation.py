@@ -23,7 +23,7 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Grains, still_box
 from gmem_jax.physics.step import System, accelerate, start
-from gmem_jax.preparation.piston import BLOCK, Pressed, Servo, largest_speed, press
+from gmem_jax.preparation.piston import STEPS_PER_CHECK, Pressed, Servo, largest_speed, press
 from gmem_jax.preparation.recipe import (
     SLOWEST_BINS,
     Recipe,
@@ -160,7 +160,7 @@ class _Preparation:
         self, checkpoint: Checkpoint, name: str, servo: Servo, duration: float, drag: float
     ) -> tuple[Any, Pressed]:
         runner = self.runner
-        block, per_bin = BLOCK * self.dt, BLOCK / runner.simulation.steps
+        block, per_bin = STEPS_PER_CHECK * self.dt, STEPS_PER_CHECK / runner.simulation.steps
         no = jnp.asarray(False)
         pressed = Pressed(runner.state, self.box, jnp.zeros(1), jnp.asarray(0), no, no)
         left = math.ceil(duration / block)

@@ -15,13 +15,13 @@ from gmem_jax.physics.pytree import interval
 from gmem_jax.simulation.protocol import BINS, Stage
 
 SETTLING = 500.0  # t_c that coming to rest took per R of a dense pack's height (170 to 880, N = 325 to 10,240)
-FEWEST = 12  # grains of the smallest pack that was prepared
+FEWEST_GRAINS = 12  # grains of the smallest pack that was prepared
 DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with it all six are the paper's
-APART = 1.02  # outer diameters of the grain: the least spacing of the lattice, so that grains turn freely
+LATTICE_SPACING = 1.02  # outer diameters of the grain: the least spacing of the lattice, so that grains turn freely
 SLOWEST_BINS = 1.8e3  # t_c: t0 whose bins and steps a preparation has outside its cycles, unless it is slower. What it
 # costs would grow as t0 falls otherwise: a bin is t0 / 256, a step no longer than that
-STEP = 200.0  # grain-steps that a step costs beside its grains: calls and lists (N = 16 to 250, native)
-BIN = 4000.0  # and that a bin of a cycle costs beside its steps
+STEP_OVERHEAD = 200.0  # grain-steps that a step costs beside its grains: calls and lists (N = 16 to 250, native)
+BIN_OVERHEAD = 4000.0  # and that a bin of a cycle costs beside its steps
 
 
 def _number(default: float, within: str, words: str, unit: str = "") -> Any:
@@ -89,8 +89,8 @@ class Recipe:
             except TypeError:
                 kind = "a whole number" if entry.type is int else "a number"
                 raise ValueError(f"{entry.name} must be {kind} in {within.words}, got {given!r}") from None
-            if entry.name == "grains" and value < FEWEST:
-                raise ValueError(f"grains must be at least {FEWEST} to jam between six walls, got {given}")
+            if entry.name == "grains" and value < FEWEST_GRAINS:
+                raise ValueError(f"grains must be at least {FEWEST_GRAINS} to jam between six walls, got {given}")
             if not within.holds(value):
                 raise ValueError(f"{entry.name} must be in {within.words}{unit and ' ' + unit}, got {given}")
             object.__setattr__(self, entry.name, value)
@@ -137,7 +137,7 @@ def sites_of(recipe: Recipe, clump: Clump) -> tuple[tuple[int, int, int], np.nda
         ValueError: if the pressed pack would be flatter than its grains.
     """
     mass, diameter = float(clump.mass), float(clump.diameter)
-    count, least = recipe.grains, APART * diameter
+    count, least = recipe.grains, LATTICE_SPACING * diameter
     spacing = (mass / recipe.filling) ** (1.0 / 3.0)
     cube = (count * mass / DENSE) ** (1.0 / 3.0)
     if spacing >= least:
@@ -181,4 +181,4 @@ def grain_steps(recipe: Recipe, clump: Clump) -> float:
     """What a preparation will cost about: grains times steps, and what small packs and short bins cost beside them."""
     inside = sum(stage.bins for stage in cycles_of(recipe)), stepping(recipe.t0, recipe.dt)[0]
     outside = bins_outside(recipe, clump), stepping(max(recipe.t0, SLOWEST_BINS), recipe.dt)[0]
-    return sum(bins * (steps * (recipe.grains + STEP) + BIN) for bins, steps in (inside, outside))
+    return sum(bins * (steps * (recipe.grains + STEP_OVERHEAD) + BIN_OVERHEAD) for bins, steps in (inside, outside))

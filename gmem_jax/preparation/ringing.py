@@ -18,7 +18,7 @@ from gmem_jax.simulation.runner import Runner
 from gmem_jax.simulation.strain import StrainPath
 
 KICK = 2.0e-5  # strain rate of the kick, 1 / t_c: strains of about 1e-4, below which the response is linear enough
-STEPS = 4  # steps per sample
+STEPS_PER_SAMPLE = 4  # steps per sample
 
 
 def spectrum_peak(series: np.ndarray, spacing: float, shortest: float = 0.0) -> float:
@@ -75,16 +75,16 @@ def ringing_period(
     """
     lengths = box.lengths
     duration = LISTENED * float(jnp.max(lengths))
-    bins = int(duration / (STEPS * float(dt)))
+    bins = int(duration / (STEPS_PER_SAMPLE * float(dt)))
     state = start(system, position, quaternion, box)
     rate = KICK * jnp.asarray([-1.0, 1.0, 0.0])[:, None]
     velocity = rate * (position - 0.5 * (box.lower + box.upper))
     state = accelerate(system, replace(state, grains=replace(state.grains, velocity=velocity)), box)
-    still = Simulation(system, StrainPath(box.lower, box.upper, 0.0), dt, steps=STEPS, backend=backend)
+    still = Simulation(system, StrainPath(box.lower, box.upper, 0.0), dt, steps=STEPS_PER_SAMPLE, backend=backend)
     ringing = Stage("ringing", 0.0, 0.0, bins / BINS, "hold")
     runner = Runner(still, state, progress=progress, total_work=work_of([ringing], 1))
     sample = runner.run_stages(ringing)["ringing"]
     pressure = np.asarray(sample.pressure)[:, :, 0]
     shortest, longest = period_bounds(np.asarray(lengths)[:, 0])
-    found = spectrum_peak(pressure[:, 0] - pressure[:, 1], STEPS * float(dt), shortest)
+    found = spectrum_peak(pressure[:, 0] - pressure[:, 1], STEPS_PER_SAMPLE * float(dt), shortest)
     return min(max(found, shortest), longest)  # a parabola may lie half a point of the spectrum beyond

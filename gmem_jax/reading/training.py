@@ -33,7 +33,7 @@ from gmem_jax.reading.lessons import Examples, TrainingConfig, examples
 from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
 from gmem_jax.simulation.protocol import BINS
 
-STEPS = 250  # to a call from the host: a second or so, and one check of the validation accuracy
+STEPS_PER_CALL = 250  # to a call from the host: a second or so, and one check of the validation accuracy
 QUICK_CHECK = 4_096  # held-out examples tried after every call
 LAST_CHECK = 65_536  # held-out examples, at most, that must agree before training stops early
 SLICE = 1_024  # examples evaluated side by side
@@ -96,7 +96,7 @@ class Training:
 
 
 Listener = Callable[[Training], None]
-"""Told about every call of `STEPS` steps."""
+"""Told about every call of `STEPS_PER_CALL` steps."""
 
 
 def silent(training: Training) -> None:
@@ -125,12 +125,12 @@ def train(
     Args:
         lessons: the net and its training data.
         seed: of weights, order and noise.
-        budget: seconds that this call may take; it ends within one call of `STEPS` steps and a last check of it.
+        budget: seconds that this call may take; it ends within `STEPS_PER_CALL` steps and a last check of them.
         target: validation accuracy to stop at.
         most_steps: steps to stop at; default no limit.
         checkpoint: file that holds the training, written every 30 s and at the end; if it exists, training goes on
             from there, and one that has reached `target` is only loaded.
-        listener: told about every `STEPS` steps.
+        listener: told about every `STEPS_PER_CALL` steps.
 
     Raises:
         FileFormatError: if the checkpoint is broken.
@@ -146,7 +146,7 @@ def train(
     total = lessons.classes * lessons.kept
     over = False
     while not over:
-        count = STEPS if most_steps is None else min(STEPS, most_steps - training.step)
+        count = STEPS_PER_CALL if most_steps is None else min(STEPS_PER_CALL, most_steps - training.step)
         if count > 0:
             net, loss = _learn(training.net, data, seed, training.step, count)
             training = replace(training, net=net, step=training.step + count, loss=float(loss))

@@ -21,7 +21,7 @@ from gmem_jax.reproduce.figures import Values, crossed
 from gmem_jax.simulation.protocol import BINS
 
 STORES = (0.5, 2.0, 8.0)  # t0
-STANDARD = 2.0
+STANDARD_STORE = 2.0
 AMPLITUDES = (3e-4, 1e-3, 3e-3)
 VARIED = ("gamma0", "store", "background", "shear", "hold_drag")
 LITTLE = 0.1  # of what is recalled: below it, a claim that nothing is left holds
@@ -202,7 +202,7 @@ def _kolmogorov(one: np.ndarray, other: np.ndarray) -> float:
 def points(packs: Sequence[Values]) -> list[Values]:
     """The runs that claims need, on each of some packs."""
     amplitudes: list[Values] = [{"gamma0": gamma0} for gamma0 in AMPLITUDES]
-    stores: list[Values] = [{"store": store} for store in STORES if store != STANDARD]
+    stores: list[Values] = [{"store": store} for store in STORES if store != STANDARD_STORE]
     more: list[Values] = [{"background": "sub2"}, {"shear": "before"}, {"store": max(STORES), "hold_drag": 0.0}]
     return crossed(packs, [*amplitudes, *stores, *more])
 
@@ -226,7 +226,7 @@ def verdicts(
     amplitudes = {gamma0: having(gamma0=gamma0) for gamma0 in AMPLITUDES}
     plain = amplitudes[1e-3]
     standard = Experiment(pack, six_signals(), t0=t0)
-    stores = {store: plain if store == STANDARD else having(store=store) for store in STORES}
+    stores = {store: plain if store == STANDARD_STORE else having(store=store) for store in STORES}
     scale = float(np.asarray(standard.compression)) * 1e-3
     return [
         stress_is_minus_j(plain),

@@ -35,7 +35,7 @@ SYMBOLS = "osD^v<>pPX"
 STYLES = ("-", "--", ":", "-.")
 VECTOR = (".svg",)
 OURS, THEIRS, EITHER = "#1f5fa8", "#d1491b", "0.35"
-APART = 6.0  # printer's points between markers of one place: none lies under another
+MARKER_SPACING = 6.0  # printer's points between markers of one place: none lies under another
 LINE = 0.062  # of the height of a panel, that a line of its legend takes
 
 
@@ -159,7 +159,7 @@ def _curve(axis: Any, rows: Sequence[Compared], across: str, words: Sequence[str
 def _points(axis: Any, points: Sequence[tuple[float, Estimate]], shifted: float, **style: Any) -> None:
     from matplotlib.transforms import ScaledTranslation
 
-    aside = ScaledTranslation(shifted * APART / 72.0, 0.0, axis.figure.dpi_scale_trans)
+    aside = ScaledTranslation(shifted * MARKER_SPACING / 72.0, 0.0, axis.figure.dpi_scale_trans)
     x, estimates = [place for place, _ in points], [estimate for _, estimate in points]
     y, error = [one.mean for one in estimates], [np.nan_to_num(one.error) for one in estimates]
     fixed = {"markersize": 5, "capsize": 2, "linewidth": 1}

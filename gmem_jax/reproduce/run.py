@@ -34,14 +34,13 @@ from gmem_jax.sweeps.executors import Executor, Processes
 from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.sweep import SIDE_BY_SIDE, SweepRunner
+from gmem_jax.sweeps.sweep import SIDE_BY_SIDE, SweepRunner, Tell
 
 RUNS = "runs"  # the folder of the sweep that all figures share
 MOST_SHOWN = 8  # words of a length in Fig. 13
-Tell = Callable[[str], None]
 
 
-class Picture(NamedTuple):
+class Schematic(NamedTuple):
     """A figure of the paper that no experiment has to be run for.
 
     Attributes:
@@ -53,11 +52,11 @@ class Picture(NamedTuple):
     draw: Callable[[Path], object]
 
 
-PICTURES = {
-    "fig05": Picture("the waveforms and some words, with their integrals", draw.waveforms),
-    "fig07": Picture("two grains, and how their contact keeps a shear", two_grains_figure),
-    "fig10": Picture("one contact under every law, beside closed forms", laws_figure),
-    "fig15": Picture("M2 with more and more points", convergence_figure),
+SCHEMATICS = {
+    "fig05": Schematic("the waveforms and some words, with their integrals", draw.waveforms),
+    "fig07": Schematic("two grains, and how their contact keeps a shear", two_grains_figure),
+    "fig10": Schematic("one contact under every law, beside closed forms", laws_figure),
+    "fig15": Schematic("M2 with more and more points", convergence_figure),
 }
 GALLERY = "fig03"  # pictures of packs, which may have to be made
 
@@ -87,7 +86,7 @@ def picture(
     progress: Progress = silent,
     say: Tell = print,
 ) -> list[Path]:
-    """Draw a figure that needs no experiments: one of `PICTURES`, or the packs of `GALLERY`; the files written.
+    """Draw a figure that needs no experiments: one of `SCHEMATICS`, or the packs of `GALLERY`; the files written.
 
     Args and errors are those of `reproduce`; nothing but `GALLERY` depends on the scale.
     """
@@ -95,7 +94,7 @@ def picture(
     folder.mkdir(parents=True, exist_ok=True)
     if name != GALLERY:
         target = folder / f"{name}.png"
-        say(f"{name}: {PICTURES[name].draw(target) or 'drawn'}")
+        say(f"{name}: {SCHEMATICS[name].draw(target) or 'drawn'}")
         return [path for suffix in (".png", ".svg", ".csv") if (path := target.with_suffix(suffix)).is_file()]
     size = scale_of(scale)
     spec = Spec(shared={"t0": size.t0}, extra=tuple(shown_packs(size)))

@@ -25,14 +25,14 @@ FREE: dict[str, Any] = {
 }  # never slides; forces in units of the stiffness
 P_MAX = 1.5
 M2, M2_PAPER = "M2", "M2, paper's weights"
-LAWS: dict[str, FrictionLaw] = {
+DRIVEN_LAWS: dict[str, FrictionLaw] = {
     "H": Hooke(**FREE),
     "M1": MindlinRescaled(**FREE),
     M2: Mindlin(**FREE, p_max=P_MAX),
     M2_PAPER: Mindlin(**FREE, p_max=P_MAX, variant="paper"),
 }
-COUNTS = (20, 35, 60, 100, 180, 400)  # of M2's points
-SHOWN = (("paper, without h", 20), ("paper, with h", 20), ("paper, with h", 100), ("averaged (default)", 20))
+POINT_COUNTS = (20, 35, 60, 100, 180, 400)  # of M2's points
+DRAWN_LAWS = (("paper, without h", 20), ("paper, with h", 20), ("paper, with h", 100), ("averaged (default)", 20))
 
 
 def closed_form(law: str, overlap: np.ndarray) -> np.ndarray:
@@ -66,7 +66,7 @@ def laws_figure(path: Path, points: int = 200) -> dict[str, float]:
         OSError: if they cannot be written.
     """
     overlap, displacement, last = led(points)
-    forces = {name: _force(law, overlap, displacement) for name, law in LAWS.items()}
+    forces = {name: _force(law, overlap, displacement) for name, law in DRIVEN_LAWS.items()}
     figure, (left, middle, right) = pyplot().subplots(1, 3, figsize=(11.5, 3.7))
     left.plot(*CORNERS.T, "o-", color="0.3", markersize=4)
     for number, (p, sigma) in enumerate(CORNERS):
@@ -126,7 +126,7 @@ def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]
     """M2's force on unloading for several numbers of points and weights, and its error against them; also as CSV.
 
     Returns:
-        By weights, the root mean square deviation from the exact force for each of `COUNTS` points, in k_M R^1.5.
+        By weights, the root mean square deviation from the exact force for each of `POINT_COUNTS` points, in k_M R^1.5.
 
     Raises:
         OSError: if they cannot be written.
@@ -135,11 +135,13 @@ def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]
     overlap = led_overlap[last]
     exact = closed_form(M2, overlap)
     forces = {
-        (form, count): _force(_form(form, count), led_overlap, displacement)[last] for form in FORMS for count in COUNTS
+        (form, count): _force(_form(form, count), led_overlap, displacement)[last]
+        for form in FORMS
+        for count in POINT_COUNTS
     }
     figure, (left, middle, right) = pyplot().subplots(1, 3, figsize=(12.5, 3.9))
     left.plot(overlap, exact, color="0.6", linewidth=4, label="exact")
-    for colour, (form, count) in enumerate(SHOWN):
+    for colour, (form, count) in enumerate(DRAWN_LAWS):
         left.plot(overlap, forces[form, count], color=f"C{colour}", linewidth=1.1, label=f"{form}, Q = {count}")
         middle.plot(overlap, forces[form, count] - exact, color=f"C{colour}", linewidth=1.1)
     left.set(xlabel="overlap $p$ ($R$)", ylabel="$f_e / k_M$  ($R^{3/2}$)", title="force on unloading")
@@ -148,11 +150,11 @@ def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]
     middle.set(xlabel="overlap $p$ ($R$)", ylabel=r"$(f_e - f_{exact}) / k_M$  ($R^{3/2}$)", title="deviation")
     errors = {}
     for number, form in enumerate(FORMS):
-        errors[form] = [float(np.sqrt(np.mean((forces[form, count] - exact) ** 2))) for count in COUNTS]
-        right.loglog(COUNTS, errors[form], "osD^"[number] + "-", markersize=4, linewidth=1.1, label=form)
-    right.loglog(COUNTS, 0.4 / np.array(COUNTS), ":", color="0.5", label="1 / Q")
+        errors[form] = [float(np.sqrt(np.mean((forces[form, count] - exact) ** 2))) for count in POINT_COUNTS]
+        right.loglog(POINT_COUNTS, errors[form], "osD^"[number] + "-", markersize=4, linewidth=1.1, label=form)
+    right.loglog(POINT_COUNTS, 0.4 / np.array(POINT_COUNTS), ":", color="0.5", label="1 / Q")
     right.set(xlabel="number of points Q", ylabel=r"rms deviation / $k_M$  ($R^{3/2}$)", title="convergence")
-    right.set_xticks(COUNTS, [str(count) for count in COUNTS])
+    right.set_xticks(POINT_COUNTS, [str(count) for count in POINT_COUNTS])
     right.minorticks_off()
     right.set_ylim(2e-7, 5e-2)  # room for the legend
     right.legend(frameon=False, fontsize=8, loc="lower left")

@@ -19,14 +19,14 @@ from gmem_jax.experiment.signals import Signals, bin_average, part, six_signals
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.path import contact_path
+from gmem_jax.reproduce.figures import DELTA0
 from gmem_jax.reproduce.single_contact import write_columns
 from gmem_jax.show.render_matplotlib import pyplot, save
 from gmem_jax.simulation.protocol import BINS
 
-DELTA0 = 0.05
 STORE = 0.2  # t0, in the picture
-FINE = 4  # points to a bin
-SHOWN = (0.3, 0.5, 0.7)  # u_c of the contacts whose force is drawn
+POINTS_PER_BIN = 4  # points to a bin
+DRAWN_AT = (0.3, 0.5, 0.7)  # u_c of the contacts whose force is drawn
 SIGNAL = 5
 
 
@@ -51,8 +51,8 @@ class Story:
     @property
     def recalled(self) -> np.ndarray:
         """The mean force on decompression, in each bin of ascending u, its sign that of a recalled signal, [256]."""
-        back = self.force[-BINS * FINE :].mean(axis=1)
-        binned: np.ndarray = -back.reshape(BINS, FINE).mean(axis=1)[::-1]
+        back = self.force[-BINS * POINTS_PER_BIN :].mean(axis=1)
+        binned: np.ndarray = -back.reshape(BINS, POINTS_PER_BIN).mean(axis=1)[::-1]
         return binned
 
 
@@ -66,9 +66,9 @@ def tell(closes: np.ndarray, signal: Signals, law: FrictionLaw | None = None, ga
         gamma0: shear amplitude.
     """
     closes = np.asarray(closes, float)
-    way = (np.arange(BINS * FINE) + 1.0) / (BINS * FINE)
-    u = np.concatenate([[0.0], way, np.ones(round(STORE * BINS * FINE)), 1.0 - way])
-    time = np.arange(len(u)) / (BINS * FINE)
+    way = (np.arange(BINS * POINTS_PER_BIN) + 1.0) / (BINS * POINTS_PER_BIN)
+    u = np.concatenate([[0.0], way, np.ones(round(STORE * BINS * POINTS_PER_BIN)), 1.0 - way])
+    time = np.arange(len(u)) / (BINS * POINTS_PER_BIN)
     shear = np.where(time <= 1.0, gamma0 * np.asarray(signal.shear(jnp.asarray(u)))[:, 0], 0.0)
     # Affine: centres 2 R apart come closer by 2 R times the strain of an axis, and slide by R gamma.
     overlap = 2.0 * (1.0 - np.sqrt(1.0 - DELTA0)) * (u[:, None] - closes)
@@ -98,7 +98,7 @@ def two_grains_figure(path: Path, count: int = 96, gamma0: float = 1e-3) -> dict
     u = (np.arange(BINS) + 0.5) / BINS
     figure, (left, middle, right) = pyplot().subplots(1, 3, figsize=(12.0, 3.8), width_ratios=(0.9, 1.6, 1.2))
     _sketch(left)
-    shown = [int(np.argmin(np.abs(story.closes - value))) for value in SHOWN]
+    shown = [int(np.argmin(np.abs(story.closes - value))) for value in DRAWN_AT]
     scale = np.abs(story.force[:, shown]).max() / gamma0
     middle.fill_between(story.time, scale * story.shear, color="0.9", label=r"shear $\gamma$, scaled")
     for colour, contact in enumerate(shown):

@@ -20,7 +20,7 @@ from gmem_jax.show.figure import Curve, Figure, Image, Panel, U, grid, part, u_l
 from gmem_jax.show.render_matplotlib import Drawing, render
 from gmem_jax.show.stages import AGAINST, QUANTITIES, ZERO, stages_figure
 
-MOST = 64  # panels of one picture
+MOST_PANELS = 64  # panels of one picture
 MOST_OF_PAGE = 12  # panels of a page
 MEAN, PALE = "its mean over the ringing period $T_1$", "#a9c6e6"
 SHEAR = r"$I(u) = \gamma / \gamma_0$"
@@ -158,7 +158,7 @@ def signals_figure(
         wanted = np.asarray(1.0 if scale is None else scale) * target
         gain = np.sum(wanted * signals) / np.sum(wanted * wanted)
         curves.append(("the same of the target", gain * wanted, "C2", ":"))
-    shown = min(len(signals), MOST_OF_PAGE if page else MOST)
+    shown = min(len(signals), MOST_OF_PAGE if page else MOST_PANELS)
     columns, size = grid(shown)
     largest = 1.05 * pascal * max(float(np.nanmax(np.abs(each[:shown]), initial=0.0)) for _, each, *_ in curves) or 1.0
     area: dict[str, Any] = {"behind_label": SHEAR}
@@ -183,7 +183,7 @@ def signals_figure(
 
 def waveforms_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
     """I(u) as applied, and J(u), of every signal; at most 64 panels."""
-    shown = min(len(recall.J), MOST)
+    shown = min(len(recall.J), MOST_PANELS)
     columns, size = grid(shown)
     u, curves = np.asarray(recall.u), ((recall.shear, "$I(u)$", "C2", "-"), (recall.J, "$J(u)$", "C3", "--"))
     panels = tuple(

@@ -14,7 +14,7 @@ from gmem_jax.files.atomic import atomic
 from gmem_jax.show.figure import Curve, Discs, Figure, Image, Panel
 
 DPI = 130
-FORMATS = (".png", ".svg", ".pdf")
+PICTURE_FORMATS = (".png", ".svg", ".pdf")
 _POINTS: dict[str, dict[str, Any]] = {
     "o": {"marker": "o", "markersize": 4, "linestyle": "none"},
     "o-": {"marker": "o", "markersize": 4},

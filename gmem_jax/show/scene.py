@@ -16,7 +16,7 @@ from gmem_jax.files.exporters import frames_of_pack
 from gmem_jax.physics.material import Material
 from gmem_jax.simulation.frames import Frames
 
-SHOWN = 0.995  # part of all values that a colour bar spans: the few beyond it have the last colour
+COLOUR_RANGE = 0.995  # part of all values that a colour bar spans: the few beyond it have the last colour
 MILLI = 1e3
 _LEVELS = 65535  # of a number in a page: 1e-3 R in a box of 60 R
 
@@ -40,7 +40,7 @@ class Quantity:
         """Where the colours end; 1 where all is zero, or nothing is there."""
         if not self.values.size:
             return 1.0
-        return float(np.quantile(self.values, SHOWN)) or float(self.values.max()) or 1.0
+        return float(np.quantile(self.values, COLOUR_RANGE)) or float(self.values.max()) or 1.0
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from gmem_jax.simulation.sample import Sample
 from gmem_jax.sweeps import table
 from gmem_jax.sweeps.store import Store
 
-NOISE = 1.0  # Pa RMS, that values of a kernel are compared with; as `gmem kernel` does
+KERNEL_NOISE = 1.0  # Pa RMS, that values of a kernel are compared with; as `gmem kernel` does
 LARGEST_CONFUSION = 256  # words
 _ASYMMETRY = "of the recalls of a waveform and its negative: 0 for a linear memory"
 _RESOLUTION = "width in v of a point of the waveform that is read back"
@@ -235,7 +235,9 @@ def _stored_pack(file: Path, against: str) -> Summary:
     return of_pack(load_pack(file), load_stages(file), load_frames(pack_called(str(file)) or file), against)
 
 
-def of_kernel(kernel: MemoryKernel, configuration: Mapping[str, Any], noise: float = NOISE, name: str = "") -> Summary:
+def of_kernel(
+    kernel: MemoryKernel, configuration: Mapping[str, Any], noise: float = KERNEL_NOISE, name: str = ""
+) -> Summary:
     """What is said of a memory kernel; `noise` in Pa RMS."""
     modulus, count = float(Material().modulus), len(kernel.centres)
     pack = cell(configuration.get("pack", name))

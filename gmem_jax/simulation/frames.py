@@ -20,7 +20,7 @@ from gmem_jax.simulation.protocol import Stage
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.sharding import to_host
 
-FEWEST = 2  # the first configuration and the last
+FEWEST_FRAMES = 2  # the first configuration and the last
 
 
 @pytree
@@ -209,8 +209,8 @@ def places(stages: Sequence[Stage], count: int, every: int) -> dict[str, list[in
         ValueError: if that is too few, or more than there are bins.
     """
     ends = list(itertools.accumulate(stage.bins for stage in stages))
-    if not FEWEST <= count <= ends[-1] + 1:
-        raise ValueError(f"frames must be 0 for none, or {FEWEST} to {ends[-1] + 1} for this run; got {count}")
+    if not FEWEST_FRAMES <= count <= ends[-1] + 1:
+        raise ValueError(f"frames must be 0 for none, or {FEWEST_FRAMES} to {ends[-1] + 1} for this run; got {count}")
     starts = [0, *ends[:-1]]
     cheap = [place for start, end in zip(starts, ends, strict=True) for place in range(start + every, end, every)]
     chosen = [0, ends[-1]]

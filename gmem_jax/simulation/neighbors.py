@@ -16,7 +16,7 @@ from gmem_jax.simulation.compiled import Compiled
 SKIN = 0.3
 """Skin of the neighbour list of an experiment, in R. Measured non-affine displacements over a full compression stay
 below 0.11 R at N = 325 to 3267, so one list serves a whole experiment; the margin covers the shear and a repeat."""
-WIDEST = 2.0  # skin beyond which a list that goes stale within a bin is a broken run
+LARGEST_SKIN = 2.0  # skin beyond which a list that goes stale within a bin is a broken run
 
 
 def pair_finder(clump: Clump, extent: np.ndarray, skin: float, **sizes: Any) -> PairFinder:

@@ -21,11 +21,11 @@ Progress = Callable[[str, float, float], None]
 ProgressChoice = Progress | bool | None
 """A callback; False for none; True for a bar; None for a bar in a terminal or a notebook, and nothing elsewhere."""
 
-P = ParamSpec("P")
-T = TypeVar("T")
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
-STEP = 1.0  # work of a step beside its replicas', in theirs: 0.9 at 10,240 grains, 1.4 at 3,267 and 2 at 325
-EVERY = 0.3  # seconds between changes of what a bar shows
+STEP_WORK = 1.0  # work of a step beside its replicas', in theirs: 0.9 at 10,240 grains, 1.4 at 3,267 and 2 at 325
+REFRESH_INTERVAL = 0.3  # seconds between changes of what a bar shows
 
 
 def silent(stage: str, time: float, fraction: float) -> None:
@@ -38,8 +38,8 @@ def within(progress: Progress, begun: float, ended: float) -> Progress:
 
 
 def work_of_bin(replicas: int) -> float:
-    """What a bin costs, in replica-bins: it takes as long as `STEP` replicas more than there are."""
-    return replicas + STEP
+    """What a bin costs, in replica-bins: it takes as long as `STEP_WORK` replicas more than there are."""
+    return replicas + STEP_WORK
 
 
 def work_of(stages: Iterable[Stage], replicas: int) -> float:
@@ -62,7 +62,7 @@ class ProgressBar:
         now = time.perf_counter()
         if self._first < 0.0:
             self._began, self._first = now, fraction  # what came before the first chunk was compiling
-        elif now - self._told < EVERY and fraction < 1.0:
+        elif now - self._told < REFRESH_INTERVAL and fraction < 1.0:
             return
         self._told = now
         words = f"{fraction:.0%} {stage}" + (f", t = {moment:.0f} t_c" if moment else "")
@@ -118,11 +118,11 @@ def no_further_bar() -> Iterator[None]:
         _bar_is_shown.reset(before)
 
 
-def shows_progress(function: Callable[P, T]) -> Callable[P, T]:
+def shows_progress(function: Callable[_P, _T]) -> Callable[_P, _T]:
     """A function whose keyword `progress` is a `ProgressChoice`; what it calls shows no bar of its own."""
 
     @functools.wraps(function)
-    def showing(*args: P.args, **kwargs: P.kwargs) -> T:
+    def showing(*args: _P.args, **kwargs: _P.kwargs) -> _T:
         asked: Any = kwargs.get("progress")
         with no_further_bar() if _bar_is_shown.get() else _bar(asked) as bar, no_further_bar():
             return function(*args, **{**kwargs, "progress": asked if callable(asked) else bar})  # type: ignore[arg-type]

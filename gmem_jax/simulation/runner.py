@@ -19,7 +19,7 @@ from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, State, Status, combined_status, explain
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint, ResultCache
 from gmem_jax.simulation.loop import Mark, Simulation
-from gmem_jax.simulation.neighbors import SKIN, WIDEST, pair_finder, skin_left
+from gmem_jax.simulation.neighbors import LARGEST_SKIN, SKIN, pair_finder, skin_left
 from gmem_jax.simulation.observers import CHUNK, CheckpointWriter, Chunk, Observer, SampleRecorder
 from gmem_jax.simulation.progress import Progress, silent, work_of_bin
 from gmem_jax.simulation.protocol import Stage
@@ -246,7 +246,7 @@ class Runner:
                 return
             self.skin *= 1.5
             self.finder = None
-            if self.skin > WIDEST:
+            if self.skin > LARGEST_SKIN:
                 why = cause(self.simulation)
                 why = why or "the steps are unstable; use a smaller dt, or check pack and friction law"
                 raise RunFailedError(f"{chunk.stage.name}: grains moved by most of R within one bin: {why}")

@@ -16,7 +16,7 @@ from typing import Any
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.validation import optional
 from gmem_jax.sweeps import slurm, work
-from gmem_jax.sweeps.processes import PATIENCE, RUNNER, job_name, known_by, python, safe_path
+from gmem_jax.sweeps.processes import EXIT_TIMEOUT, RUNNER, job_name, known_by, python, safe_path
 from gmem_jax.sweeps.store import Store
 
 POLL = 0.5  # s
@@ -148,7 +148,7 @@ class Processes(Executor):
         for process in self._running.values():
             if process.poll() is None:
                 process.terminate()
-        last = time.monotonic() + PATIENCE
+        last = time.monotonic() + EXIT_TIMEOUT
         for process in self._running.values():
             try:
                 process.wait(max(0.0, last - time.monotonic()))

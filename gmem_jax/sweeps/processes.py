@@ -13,7 +13,7 @@ import psutil
 from gmem_jax.sweeps import slurm
 from gmem_jax.sweeps.store import Store
 
-PATIENCE = 10.0  # s for a process to end by itself, before it is killed
+EXIT_TIMEOUT = 10.0  # s for a process to end by itself, before it is killed
 RUNNER = "runner"  # whose workers they are
 SAFE = {"PYTHONSAFEPATH": "1"}
 """Environment of Python processes that somebody else starts for us; see `python`."""
@@ -69,10 +69,10 @@ def end(found: psutil.Process) -> None:
     with contextlib.suppress(psutil.Error):
         family = [found, *found.children(recursive=True)]
         found.terminate()
-        for one in psutil.wait_procs(family, PATIENCE)[1]:
+        for one in psutil.wait_procs(family, EXIT_TIMEOUT)[1]:
             with contextlib.suppress(psutil.Error):
                 one.kill()
-        psutil.wait_procs(family, PATIENCE)
+        psutil.wait_procs(family, EXIT_TIMEOUT)
 
 
 def stop(store: Store) -> tuple[list[str], list[str]]:

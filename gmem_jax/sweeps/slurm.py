@@ -4,7 +4,7 @@ import shutil
 import subprocess
 from typing import NamedTuple
 
-PATIENCE = 30.0  # s for a controller to answer
+SLURM_TIMEOUT = 30.0  # s for a controller to answer
 
 
 class Queued(NamedTuple):
@@ -28,7 +28,7 @@ def queue(numbers: list[str]) -> dict[str, Queued] | None:
     """
     command = ["squeue", "--noheader", "--format=%A|%T|%r|%j", f"--jobs={','.join(numbers)}"]
     try:
-        told = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+        told = subprocess.run(command, capture_output=True, text=True, timeout=SLURM_TIMEOUT)
     except (OSError, subprocess.TimeoutExpired):
         return None
     if told.returncode != 0 and "Invalid job id" not in told.stderr:
@@ -39,7 +39,7 @@ def queue(numbers: list[str]) -> dict[str, Queued] | None:
 
 def cancel(number: str) -> None:
     """End a job."""
-    subprocess.run(["scancel", number], capture_output=True, timeout=PATIENCE, check=False)
+    subprocess.run(["scancel", number], capture_output=True, timeout=SLURM_TIMEOUT, check=False)
 
 
 def require_slurm() -> None:
@@ -52,10 +52,10 @@ def require_slurm() -> None:
     if not all(map(shutil.which, ("sbatch", "scontrol"))):
         raise ValueError(f"no SLURM here, sbatch is not on the path; {elsewhere.replace('does', 'is')}")
     try:
-        asked = subprocess.run(["scontrol", "ping"], capture_output=True, text=True, timeout=PATIENCE)
+        asked = subprocess.run(["scontrol", "ping"], capture_output=True, text=True, timeout=SLURM_TIMEOUT)
         if asked.returncode == 0:
             return
         answer = (asked.stdout.strip() or asked.stderr.strip() or "no reason given").splitlines()[0]
     except subprocess.TimeoutExpired:
-        answer = f"scontrol waited {PATIENCE:.0f} s"
+        answer = f"scontrol waited {SLURM_TIMEOUT:.0f} s"
     raise ValueError(f"SLURM's controller does not answer ({answer}); {elsewhere}")

@@ -31,7 +31,7 @@ from gmem_jax.files.validation import is_number, whole
 
 TABLES = ("experiment", "vary", "zip", "points", "prepare", "run")
 PREPARE = "prepare."
-MOST = 100_000  # points: more are a mistake
+MOST_SWEEP_POINTS = 100_000  # points: more are a mistake
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def spec_of(tables: Mapping[str, Any]) -> Spec:
     _require(not twice, f"{twice[:1]} varies twice")
     _require(bool(axes or extra), "nothing varies: give a table [vary], [[zip]] or [[points]]")
     count = math.prod(len(next(iter(axis.values()))) for axis in axes) + len(extra)
-    _require(count <= MOST, f"{count} points; {MOST} at most")
+    _require(count <= MOST_SWEEP_POINTS, f"{count} points; {MOST_SWEEP_POINTS} at most")
     return spec
 
 
@@ -135,7 +135,8 @@ def _values(name: str, value: Any) -> list[Any]:
         )
         count = value["count"]
         _require(
-            whole(count) and 2 <= count <= MOST, f"{name}: count must be a whole number from 2 to {MOST}, got {count}"
+            whole(count) and 2 <= count <= MOST_SWEEP_POINTS,
+            f"{name}: count must be a whole number from 2 to {MOST_SWEEP_POINTS}, got {count}",
         )
         _require(isinstance(value.get("factors", False), bool), f"{name}: factors must be true or false")
         low, high, last = float(numbers[0]), float(numbers[1]), value["count"] - 1

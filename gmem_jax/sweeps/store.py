@@ -28,8 +28,8 @@ from gmem_jax.files.schemas import SWEEP
 from gmem_jax.files.validation import NAME, is_number, printable, source, title, whole
 from gmem_jax.sweeps.plan import Point
 
-MARKER = "sweep.json"
-ROOM = 1 << 20  # bytes that must be left on the disk: some points of a small pack
+SWEEP_MARKER = "sweep.json"
+FREE_BYTES = 1 << 20  # bytes that must be left on the disk: some points of a small pack
 WRITTEN = 3600.0  # s in which a file is surely written: workers write while others look
 JOB = "job.json"  # beside the parts of one that was put aside for others
 FOLDERS = ("jobs", "points", "failed", "packs", "parts", "workers")
@@ -55,9 +55,9 @@ class Store:
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:
         self.folder = Path(folder)
-        if not (make or Folder.about(self.folder, MARKER, SWEEP.name)):
+        if not (make or Folder.about(self.folder, SWEEP_MARKER, SWEEP.name)):
             raise FileFormatError(f"{folder}: no sweep here (no sweep.json of {SWEEP.name}, or behind a link)")
-        self._own = Folder(self.folder, MARKER, SWEEP.name, _OWN, {"shared": {}, "names": [], "points": []})
+        self._own = Folder(self.folder, SWEEP_MARKER, SWEEP.name, _OWN, {"shared": {}, "names": [], "points": []})
         for name in FOLDERS if make else ():
             self._own.make(name)
             sweep(self.folder / name, age=WRITTEN)
@@ -87,7 +87,7 @@ class Store:
         Raises:
             FileFormatError: if there is nothing of the kind.
         """
-        card = Folder.about(self.folder, MARKER, SWEEP.name)
+        card = Folder.about(self.folder, SWEEP_MARKER, SWEEP.name)
         try:
             if card is None:
                 raise ValueError("there is none")
@@ -98,11 +98,11 @@ class Store:
         values: Iterator[tuple[str, Any]] = (pair for row in card["points"] for pair in dict(row["values"]).items())
         for name, value in [*shared.items(), *values]:
             if not title(name) or (isinstance(value, str) and not source(value)):
-                raise FileFormatError(f"{self.folder / MARKER}: {printable(name)[:NAME]} is no name with a value")
+                raise FileFormatError(f"{self.folder / SWEEP_MARKER}: {printable(name)[:NAME]} is no name with a value")
         if not all(map(title, names)):
-            raise FileFormatError(f"{self.folder / MARKER}: a name of what varies is no line of text")
+            raise FileFormatError(f"{self.folder / SWEEP_MARKER}: a name of what varies is no line of text")
         if odd := [str(row["key"]) for row in rows if not re.fullmatch(_KEY, str(row["key"]))]:
-            raise FileFormatError(f"{self.folder / MARKER}: {printable(odd[0])[:NAME]!r} is no key of a point")
+            raise FileFormatError(f"{self.folder / SWEEP_MARKER}: {printable(odd[0])[:NAME]!r} is no key of a point")
         return {"shared": shared, "names": names, "points": rows}
 
     @staticmethod
@@ -169,7 +169,7 @@ class Store:
         """
         try:
             with atomic(self._own.at("trial")) as temporary:
-                temporary.write_bytes(bytes(ROOM))
+                temporary.write_bytes(bytes(FREE_BYTES))
         finally:
             self._own.remove("trial")
 

@@ -35,7 +35,7 @@ from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import run_group
 
-COST = 8e-8  # s a grain-step on two cores, of SIDE_BY_SIDE replicas; see docs/scaling.md
+SECONDS_PER_GRAIN_STEP = 8e-8  # s a grain-step on two cores, of SIDE_BY_SIDE replicas; see docs/scaling.md
 SIDE_BY_SIDE = 8  # replicas: a block
 CHECKED = 50  # values of a name that are tried before a sweep begins
 ANY_PACK = "tetra-325-a"
@@ -129,7 +129,7 @@ def _label(value: Any) -> Any:
     return float(value) if scalar or isinstance(value, numbers.Real) else type(value).__name__
 
 
-def seconds_of(jobs: Sequence[Mapping[str, Any]], cost: float = COST) -> float:
+def seconds_of(jobs: Sequence[Mapping[str, Any]], cost: float = SECONDS_PER_GRAIN_STEP) -> float:
     """How long jobs take, from their work and replicas, at a cost of a grain-step with `SIDE_BY_SIDE` replicas."""
     blocks: float = sum(job["work"] * work_of_bin(job["replicas"]) / job["replicas"] for job in jobs)
     return cost * blocks * SIDE_BY_SIDE / work_of_bin(SIDE_BY_SIDE)
@@ -148,7 +148,7 @@ class SweepRunner:
         FileFormatError: if what is asked for of packs is neither true nor false.
     """
 
-    def __init__(self, spec: Spec, folder: Path, say: Tell, *, cost: float = COST) -> None:
+    def __init__(self, spec: Spec, folder: Path, say: Tell, *, cost: float = SECONDS_PER_GRAIN_STEP) -> None:
         self.spec, self.folder, self.say, self.cost = spec, folder, say, cost
         self._packs = functools.cache(load_pack)
         self._signals = functools.cache(functools.partial(named_signals, told=say))
@@ -319,7 +319,7 @@ class SweepRunner:
         widest = max(job["replicas"] for job in jobs)
         workers = min(executor.workers, len(jobs))
         minutes = max(1, round(seconds_of(jobs, self.cost) / 60.0))
-        where = "here" if self.cost != COST else "of two free cores (native, law H)"
+        where = "here" if self.cost != SECONDS_PER_GRAIN_STEP else "of two free cores (native, law H)"
         cost = f"{work:.2g} grain-steps, some {minutes} min {where}"
         self.say(f"{what}, {widest} replicas side by side at most, workers: {workers}; {cost}")
 

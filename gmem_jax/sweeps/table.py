@@ -15,10 +15,10 @@ from gmem_jax.files.measures import EACH, of_each
 from gmem_jax.files.validation import optional
 from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.work import WARNINGS
+from gmem_jax.sweeps.work import WARNED
 
 TABLE_SCHEMA = "gmem-sweep-table/0.1"
-FORMATS = (".csv", ".parquet", ".h5", ".nc")
+TABLE_FORMATS = (".csv", ".parquet", ".h5", ".nc")
 
 
 def rows(store: Store) -> list[dict[str, Any]]:
@@ -41,7 +41,7 @@ def rows(store: Store) -> list[dict[str, Any]]:
             row |= {"state": "done", **{name: float(getattr(recall, name)) for name in MEASURES}}
             row |= {"status": status, "why": explain(status) if status else ""}
             row |= {
-                "warnings": "; ".join(map(str, configuration.get(WARNINGS, ()))),
+                "warnings": "; ".join(map(str, configuration.get(WARNED, ()))),
                 "seconds": configuration["seconds"],
             }
         else:
@@ -109,7 +109,7 @@ def export(store: Store, path: Path) -> str:
         if len(counts) > 1:
             return f"points have {counts[0]} to {counts[-1]} signals, see `signal_count`; what lies beyond them is NaN"
     else:
-        raise ValueError(f"{path}: must end in one of {', '.join(FORMATS)}")
+        raise ValueError(f"{path}: must end in one of {', '.join(TABLE_FORMATS)}")
     return ""
 
 

@@ -42,8 +42,8 @@ from gmem_jax.sweeps.processes import end_with_parent
 from gmem_jax.sweeps.store import Store
 
 ATTACHED = "attached"
-EVERY = 1.0  # s between two reports of progress
-WARNINGS = "warnings"  # in the configuration of a point: what Python warned of in its run, and the status does not say
+REPORT_INTERVAL = 1.0  # s between two reports of progress
+WARNED = "warnings"  # in the configuration of a point: what Python warned of in its run, and the status does not say
 
 
 def run_group(
@@ -70,7 +70,7 @@ def run_group(
     finally:
         for one in heard:  # they are of the log too, or of who called
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
-    told = {WARNINGS: words} if (words := warned(heard)) else {}
+    told = {WARNED: words} if (words := warned(heard)) else {}
     if store:
         for key, recall in zip(keys, recalls, strict=True):
             store.save(key, recall.described({**recall.configuration, **told}))
@@ -92,7 +92,7 @@ class _Worker:
 
     def progress(self, job: str) -> Callable[[str, float, float], None]:
         def tell(stage: str, _: float, fraction: float) -> None:
-            if time.monotonic() - self._told > EVERY or fraction >= 1.0:
+            if time.monotonic() - self._told > REPORT_INTERVAL or fraction >= 1.0:
                 self._told = time.monotonic()
                 self.store.tell(self.name, job, fraction, stage)
 

@@ -58,7 +58,7 @@ def test_a_worker_ends_when_its_parent_does() -> None:
 
 
 def test_a_stopped_worker_is_not_waited_for(sleeper: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(executors, "PATIENCE", 0.2)
+    monkeypatch.setattr(executors, "EXIT_TIMEOUT", 0.2)
     sleeper.send_signal(signal.SIGSTOP)
     chosen = executors.Processes(1)
     chosen._running["worker-0"] = sleeper
@@ -69,7 +69,7 @@ def test_a_stopped_worker_is_not_waited_for(sleeper: subprocess.Popen[bytes], mo
 def test_stop_ends_what_works_on_a_sweep_and_nobody_else(
     sleeper: subprocess.Popen[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "PATIENCE", 0.2)
+    monkeypatch.setattr(processes, "EXIT_TIMEOUT", 0.2)
     store, who = Store(tmp_path / "mu"), known_by(sleeper.pid)
     store.record("worker-0", {**who, "born": who["born"] - 1.0})  # its number was given to another since
     store.record("worker-1", {**who, "host": "elsewhere"})
@@ -86,7 +86,7 @@ def test_stop_ends_what_works_on_a_sweep_and_nobody_else(
 
 
 def test_children_of_a_worker_end_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(processes, "PATIENCE", 0.2)
+    monkeypatch.setattr(processes, "EXIT_TIMEOUT", 0.2)
     code = "import subprocess, time; subprocess.Popen(['sleep', '60']); time.sleep(60)"
     with subprocess.Popen(python("-c", code)) as worker:
         known = psutil.Process(worker.pid)

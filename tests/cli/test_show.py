@@ -276,7 +276,7 @@ def test_where_a_drive_rings_the_mean_over_the_ringing_is_drawn(recalled: tuple[
 def test_more_signals_than_fit_are_said_to_be_more(
     monkeypatch: pytest.MonkeyPatch, recalled: tuple[gm.Experiment, gm.Recall]
 ) -> None:
-    monkeypatch.setattr(recalls, "MOST", 4)
+    monkeypatch.setattr(recalls, "MOST_PANELS", 4)
     many = {name: np.tile(getattr(recalled[1], name), (40, 1)) for name in ("J", "shear", "p_sig")}
     recall = type(recalled[1])(**{**vars(recalled[1]), **many})
     figure = render(recalls.signals_figure(recall, [f"{number:07b}" for number in range(80)], "a pack")).figure

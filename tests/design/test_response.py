@@ -232,7 +232,7 @@ def test_a_gain_that_is_not_asked_for_leaves_room_below_the_bound(
     own = float(experiment.compare(jnp.asarray(known.predict(experiment.signals))).gain)
     assert found.gain < 0.5 * own
     v = jnp.linspace(0.0, 1.0, 999)
-    assert float(jnp.max(jnp.abs(found.signals.shear(v)))) == pytest.approx(by_kernel.ROOM, rel=0.05)
+    assert float(jnp.max(jnp.abs(found.signals.shear(v)))) == pytest.approx(by_kernel.FIRST_GUESS_BOUND, rel=0.05)
 
 
 def test_a_drive_climbs_to_the_best_value_within_bounds(

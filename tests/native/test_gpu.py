@@ -305,7 +305,7 @@ def test_a_bin_of_an_experiment_on_a_gpu_is_one_call_and_waits_for_nothing(monke
     experiment = gm.Experiment(PACK, signals, LAWS["H"], t0=300.0)
     simulation, state = experiment.simulation(sheared=True), replicate(experiment.begin(), REPLICAS)
     program = jax.jit(functools.partial(rollout_chunk, most=4))
-    allowed = [export.DisabledSafetyCheck.custom_call(target) for target in cuda.TARGETS]
+    allowed = [export.DisabledSafetyCheck.custom_call(target) for target in cuda.CUDA_TARGETS]
     row = Stage("encode", 0.0, 1.0, 1.0, "write", (Drive("xy", "xy"),)).rows(0)
     text = export.export(program, platforms=["cuda"], disabled_checks=allowed)(simulation, state, row, 4).mlir_module()
     assert text.count("custom_call @gmem_advance") == 1

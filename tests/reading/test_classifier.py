@@ -11,7 +11,7 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.experiment.signals import bin_average, words
 from gmem_jax.reading import classify
-from gmem_jax.reading.training import QUICK_CHECK, STEPS
+from gmem_jax.reading.training import QUICK_CHECK, STEPS_PER_CALL
 
 SMALL = classify.TrainingConfig(2, hidden=(32, 32))
 PAPER = classify.TrainingConfig(3)
@@ -164,10 +164,10 @@ def test_training_is_reproducible_and_depends_on_the_seed(small: classify.Traini
 
 def test_broken_off_training_goes_on_to_the_same_net(tmp_path: Path) -> None:
     file = tmp_path / "net.msgpack"
-    limit = 3 * STEPS
+    limit = 3 * STEPS_PER_CALL
     through = classify.train(SMALL, 3, target=1.1, most_steps=limit)
     broken = classify.train(SMALL, 3, target=1.1, budget=0.0, checkpoint=file)  # one call, then out of time
-    assert (broken.step, broken.finished) == (STEPS, False)
+    assert (broken.step, broken.finished) == (STEPS_PER_CALL, False)
     resumed = classify.train(SMALL, 3, target=1.1, most_steps=limit, checkpoint=file)
     assert resumed.step == through.step == limit
     assert resumed.seconds > broken.seconds

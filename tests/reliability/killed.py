@@ -56,7 +56,7 @@ def start(arguments: list[str], log: Path) -> int:
     child = os.fork()
     if child:
         return child
-    checkpoints.EVERY, checkpoints.AT_MILESTONES = 0.2, 0.0
+    checkpoints.CHECKPOINT_INTERVAL, checkpoints.AT_MILESTONES = 0.2, 0.0
     target = os.open(log, os.O_CREAT | os.O_WRONLY | os.O_APPEND)
     os.dup2(target, 1)
     os.dup2(target, 2)

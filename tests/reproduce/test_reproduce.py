@@ -212,7 +212,7 @@ def test_ours_and_published_have_two_colours_and_no_point_is_cut_or_hidden(monke
     assert {line.get_color() for line in points} == {draw.OURS, draw.THEIRS}
     axis.figure.canvas.draw()
     ours, theirs = (line.get_transform().transform(line.get_xydata()) for line in points)
-    assert np.all(np.abs(ours - theirs)[:, 0] > 0.8 * draw.APART / 72.0 * axis.figure.dpi)
+    assert np.all(np.abs(ours - theirs)[:, 0] > 0.8 * draw.MARKER_SPACING / 72.0 * axis.figure.dpi)
     low, high = axis.transData.transform([[axis.get_xlim()[k], axis.get_ylim()[k]] for k in (0, 1)])
     legend = axis.get_legend().get_window_extent()
     for found in (ours, theirs):

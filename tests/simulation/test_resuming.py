@@ -52,7 +52,7 @@ class Deadly(Checkpoints):
 
 @pytest.fixture(autouse=True)
 def _at_every_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checkpoints, "EVERY", 0.0)
+    monkeypatch.setattr(checkpoints, "CHECKPOINT_INTERVAL", 0.0)
     monkeypatch.setattr(checkpoints, "AT_MILESTONES", 0.0)
 
 
