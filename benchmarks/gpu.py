@@ -25,5 +25,5 @@ if __name__ == "__main__":
         times = gpu.timed(load_pack)
     except ValueError:
         times = None
-    text = gpu.markdown(gpu.described(load_pack), times)
+    text = gpu.gpu_markdown(gpu.kernel_facts(load_pack), times)
     Path(__file__).with_suffix(".md").write_text(f"# On a GPU\n\n{text}{OTHERS}")

@@ -17,7 +17,7 @@ from console import say
 
 import gmem_jax as gm
 from gmem_jax.show.figures import history_figure
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 
 BOUNDS = {"gamma0": (3e-4, 3e-3), "friction.mu": (0.5, 2.0), "friction.stiffness": (0.07, 0.29)}
 
@@ -68,7 +68,7 @@ def main() -> None:
         result["delta0"][text] = pair
         print(f"delta0 {text}: " + ", ".join(f"{key} {mean_and_error(row)}" for key, row in pair.items()), flush=True)
     (arguments.output / "drive.json").write_text(json.dumps(result, indent=1))
-    render(history_figure({"drive": [mean for _, mean in found.history]})).save(arguments.output / "history.png")
+    to_matplotlib(history_figure({"drive": [mean for _, mean in found.history]})).save(arguments.output / "history.png")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from console import say
 
 import gmem_jax as gm
 from gmem_jax.show.figures import design_figure, history_figure
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 
 
 def main() -> None:
@@ -46,9 +46,9 @@ def main() -> None:
             + " ".join(f"{value:.3f}" for value in each),
             flush=True,
         )
-        render(design_figure(design, unit, name)).save(arguments.output / f"{name}.png")
+        to_matplotlib(design_figure(design, unit, name)).save(arguments.output / f"{name}.png")
         histories[name] = design.history
-    render(history_figure(histories)).save(arguments.output / "history.png")
+    to_matplotlib(history_figure(histories)).save(arguments.output / "history.png")
 
 
 if __name__ == "__main__":

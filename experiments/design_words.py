@@ -34,7 +34,7 @@ from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import linear_decoder, nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
-from gmem_jax.show.render_matplotlib import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 from gmem_jax.show.tables import published
 
 TABLE = "words.csv"
@@ -157,7 +157,7 @@ def draw(table: Path, path: Path) -> None:
     axes[0].set_ylim(top=1.2)  # room for the legend
     axes[0].legend(fontsize=7, frameon=False, loc="upper left", ncols=2)
     figure.suptitle("Words as they come and designed; mean and SD over packs", fontsize=10)
-    save(path, figure)
+    save_picture(path, figure)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
 from gmem_jax.reproduce.figures import SHOWN_WORD
-from gmem_jax.show.render_matplotlib import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 from gmem_jax.show.tables import published
 
 SHOWN_OF = 10  # bits of the word that the paper shows
@@ -149,7 +149,7 @@ def draw(rows: list[Row], path: Path) -> None:
         "words; published: all words, N = 10,240",
         fontsize=10,
     )
-    save(path, figure)
+    save_picture(path, figure)
 
 
 if __name__ == "__main__":

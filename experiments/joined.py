@@ -11,7 +11,7 @@ import argparse
 from pathlib import Path
 
 from gmem_jax.reproduce import draw
-from gmem_jax.reproduce.compare import Compared, Conditions, read_csv, write_csv
+from gmem_jax.reproduce.compare import Compared, Conditions, comparison_rows, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES, scale_of
 
 
@@ -35,8 +35,8 @@ def main() -> None:
                 rows.setdefault((row.conditions, row.measure), row)
     ordered = sorted(rows.values(), key=lambda row: [getattr(row.conditions, name) for name in figure.across])
     target = arguments.output.parent / f"{arguments.output.name}.png"
-    write_csv(target.with_name(f"{arguments.output.name}.csv"), ordered)
-    draw.against(target, ordered, figure.across, f"{figure.title}\n{draw.said_of(ordered, t0)}")
+    write_csv(target.with_name(f"{arguments.output.name}.csv"), comparison_rows(ordered))
+    draw.draw_comparison(target, ordered, figure.across, f"{figure.title}\n{draw.said_of(ordered, t0)}")
 
 
 if __name__ == "__main__":

@@ -83,6 +83,33 @@ def test_no_import_goes_in_a_circle() -> None:
     assert len(list(TopologicalSorter(graph).static_order())) == len(MODULES) - 1  # raises CycleError, which names it
 
 
+TWICE = {
+    "COMMANDS": "every module of commands has its table of them",
+    "march": "the steps in plain JAX, and the same in C++",
+}
+
+
+def public_names(source: str) -> list[str]:
+    """The functions, classes and variables that a module defines for others."""
+    found = []
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.append(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            found += [one.id for target in targets for one in ast.walk(target) if isinstance(one, ast.Name)]
+    return sorted({name for name in found if not name.startswith("_")})
+
+
+def test_a_public_name_is_defined_in_one_module() -> None:
+    places: dict[str, list[str]] = {}
+    for module, path in MODULES.items():
+        for name in public_names(path.read_text(encoding="utf-8")):
+            places.setdefault(name, []).append(module)
+    assert {name: found for name, found in places.items() if len(found) > 1 and name not in TWICE} == {}
+    assert all(len(places[name]) > 1 for name in TWICE)
+
+
 LOADING = """
 import sys
 import gmem_jax

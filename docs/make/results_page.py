@@ -20,7 +20,7 @@ from packs import over_packs
 from gmem_jax.reproduce import choices as weighed
 from gmem_jax.reproduce import draw
 from gmem_jax.reproduce.choices import CHOICES, Effect
-from gmem_jax.reproduce.compare import Estimate, read_csv, write_csv
+from gmem_jax.reproduce.compare import Estimate, comparison_rows, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import SCHEMATICS
 from gmem_jax.show.tables import published
@@ -144,7 +144,7 @@ def figure(picture: Path) -> list[str]:
 
 
 def effects(path: Path) -> list[Effect]:
-    """The rows that `choices.write_csv` wrote."""
+    """The rows of `choices.effect_rows`, from a file."""
     found, known = [], {choice.name: choice for choice in CHOICES}
     with path.open() as file:
         for row in csv.DictReader(file):
@@ -165,11 +165,11 @@ def anew(path: Path) -> None:
     picture = path.with_suffix(".png")
     if name == "choices":
         found = effects(path)
-        weighed.draw(picture, found, weighed.title(size, found[0].gain.packs))
+        weighed.draw(picture, found, weighed.choices_title(size, found[0].gain.packs))
     elif across := FIGURES[name].across:
         rows = read_csv(path)
         rate = RATES.get(path.stem, f"{size.t0:,.0f}")
-        draw.against(picture, rows, across, f"{FIGURES[name].title}\n{draw.said_of(rows, rate)}")
+        draw.draw_comparison(picture, rows, across, f"{FIGURES[name].title}\n{draw.said_of(rows, rate)}")
     picture.with_suffix(".svg").unlink(missing_ok=True)
 
 
@@ -193,7 +193,7 @@ def main() -> None:
     parser.add_argument("--redraw", action="store_true", help="draw pictures anew")
     arguments = parser.parse_args()
     for path in HERE.glob("*/fig*.csv"):
-        write_csv(path, read_csv(path))
+        write_csv(path, comparison_rows(read_csv(path)))
     if arguments.redraw:
         redraw()
     shown = []

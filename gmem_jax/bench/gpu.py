@@ -98,11 +98,11 @@ def timed(
         rows = []
         for place, (name, count) in enumerate((name, count) for name in packs for count in replicas):
             say(f"native, {name}, {count} replicas", place / (len(packs) * len(replicas)))
-            rows.append({"pack": name, **asdict(measure.measure(load(name), "native", "H", count))})
+            rows.append({"pack": name, **asdict(measure.time_rollout(load(name), "native", "H", count))})
         return {"device": on.device_kind, "copied_bytes_per_s": copied_bytes_per_second(), "rows": rows}
 
 
-def described(load: Callable[[str], Pack]) -> dict[str, Any]:
+def kernel_facts(load: Callable[[str], Pack]) -> dict[str, Any]:
     """What is known without a GPU."""
     return {
         **provenance(),
@@ -111,8 +111,8 @@ def described(load: Callable[[str], Pack]) -> dict[str, Any]:
     }
 
 
-def markdown(facts: dict[str, Any], times: dict[str, Any] | None) -> str:
-    """Tables of `described` and, where there was a GPU, of `timed`."""
+def gpu_markdown(facts: dict[str, Any], times: dict[str, Any] | None) -> str:
+    """Tables of `kernel_facts` and, where there was a GPU, of `timed`."""
     heads = [f"{architecture} ({name})" for architecture, name in ARCHITECTURES.items()]
     lines = ["Registers of a thread and bytes that it spills, for one step (`--fmad=false`, blocks of 128):", ""]
     lines += ["| law | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|"]

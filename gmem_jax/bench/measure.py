@@ -103,7 +103,7 @@ def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, 
     return Candidate(Row(backend, law, pack.grains, replicas, compile_s=compile_s, p_xy=p_xy), once)
 
 
-def measure(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 0.5) -> Row:
+def time_rollout(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 0.5) -> Row:
     """Time a rollout of some bins on a backend by itself."""
     return interleave([rival(pack, backend, law, replicas, seconds=seconds)])[0]
 
@@ -267,7 +267,7 @@ def disagreements(rows: Sequence[Row], scale: float = 2e-3) -> list[str]:
     ]
 
 
-def run(
+def run_benchmark(
     load: Callable[[str], Pack],
     packs: Sequence[str],
     *,
@@ -306,7 +306,7 @@ def run(
     first = loaded[packs[0]]
     fastest = "native" if native.available()[0] else "jax"
     backends = [fastest, "jax"] if with_jax and fastest != "jax" else [fastest]
-    absent = lammps.missing() if with_lammps else "not asked for"
+    absent = lammps.missing_lammps() if with_lammps else "not asked for"
     result: dict[str, Any] = {
         **provenance(),
         "processor": processor(),

@@ -116,7 +116,7 @@ def into(text: str, table: str) -> str:
     return f"{before}{BEGIN}\n{table}{END}{after}"
 
 
-def save(folder: Path, result: dict[str, Any], text: str) -> None:
+def save_benchmark(folder: Path, result: dict[str, Any], text: str) -> None:
     """Write bench.json and bench.md to `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in (("bench.json", json.dumps(result, indent=1) + "\n"), ("bench.md", text)):

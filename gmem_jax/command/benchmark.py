@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import typer
 
 from gmem_jax.bench import gpu, measure
-from gmem_jax.bench.table import markdown, save
+from gmem_jax.bench.table import markdown, save_benchmark
 from gmem_jax.command.console import AsJson, InputError, check_output, print_result, refuse_idle, reporting
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.validation import json_of, refusing
@@ -53,7 +53,7 @@ def bench_command(
             before = json_of(baseline.read_text(encoding="utf-8"), "content")
     check_output(output.parent / "bench.json" if not output.is_dir() else output / "bench.json", ".json", force=True)
     with reporting() as progress:
-        result = measure.run(
+        result = measure.run_benchmark(
             load_pack,
             names,
             laws=chosen,
@@ -62,7 +62,7 @@ def bench_command(
             with_lammps=with_lammps,
             with_jax=with_jax,
             scaling=scaling,
-            keep=lambda so_far: save(output, so_far, markdown(so_far, before)),
+            keep=lambda so_far: save_benchmark(output, so_far, markdown(so_far, before)),
             say=lambda what, fraction: progress(what, 0.0, fraction),
         )
     print_result(as_json, {**result, "status": 0}, markdown(result, before))
@@ -75,8 +75,8 @@ def _on_gpu(as_json: bool) -> None:
         raise InputError(f"--device gpu: {error}") from error
     with reporting() as progress:
         times = gpu.timed(load_pack, say=lambda what, fraction: progress(what, 0.0, fraction))
-    facts = gpu.described(load_pack)
-    print_result(as_json, {**facts, **times, "status": 0}, gpu.markdown(facts, times))
+    facts = gpu.kernel_facts(load_pack)
+    print_result(as_json, {**facts, **times, "status": 0}, gpu.gpu_markdown(facts, times))
 
 
 COMMANDS = {"bench": bench_command}

@@ -28,7 +28,7 @@ from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
 from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.show import summaries
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 
 if TYPE_CHECKING:
     from gmem_jax.reading import training
@@ -110,7 +110,7 @@ def classify_command(
         trained.append(one)
         state = "trained" if one.finished else "out of time"
         log(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}")
-    result = report.reading(stored, trained)
+    result = report.reading_report(stored, trained)
     seconds = time.perf_counter() - began
     result = {"recall": str(recall), "pack": configuration["pack"], "status": status, "seconds": seconds, **result}
     save_result(output, READING, result)
@@ -118,7 +118,7 @@ def classify_command(
     told = f"wrote {output}"
     if drawn:
         with drawing(drawn):
-            render(summary.figures["confusion"]()).save(drawn)
+            to_matplotlib(summary.figures["confusion"]()).save(drawn)
             told += f" and {drawn}"
     log(told)
     print_result(as_json, result, *summary.lines)

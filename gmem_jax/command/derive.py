@@ -22,7 +22,7 @@ from gmem_jax.command.console import (
     refuse_idle,
     reporting,
 )
-from gmem_jax.command.options import Chosen, with_experiment
+from gmem_jax.command.options import ExperimentOptions, with_experiment
 from gmem_jax.command.resuming import Restart, batch_for, resumable
 from gmem_jax.derivatives.gradient import Gradient, value_and_grad
 from gmem_jax.design import waveforms
@@ -46,7 +46,7 @@ from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.show import summaries
 from gmem_jax.show.figures import design_figure, history_figure
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.show.tables import cell
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 from gmem_jax.simulation.observers import CHUNK
@@ -84,7 +84,7 @@ def _waveform_of(experiment: Experiment) -> tuple[str, np.ndarray]:
 
 @with_experiment
 def gradient_command(
-    chosen: Chosen,
+    chosen: ExperimentOptions,
     pack: PackName,
     output: Output = Path("gradient.json"),
     restart: Restart = False,
@@ -122,7 +122,7 @@ def gradient_command(
     summary = summaries.of_gradient(result)
     if drawn:
         with drawing(drawn):
-            render(summary.figures["waveforms"]()).save(drawn)
+            to_matplotlib(summary.figures["waveforms"]()).save(drawn)
     print_result(as_json, result, *summary.lines)
 
 
@@ -160,7 +160,7 @@ def _has(law: Any, path: str) -> bool:
 
 @with_experiment
 def kernel_command(
-    chosen: Chosen,
+    chosen: ExperimentOptions,
     pack: PackName,
     output: Output = Path("kernel.h5"),
     n: Annotated[int, typer.Option("-n", "--bumps", min=2, max=512, help="Basis waveforms.")] = 17,
@@ -197,7 +197,7 @@ def kernel_command(
         save_kernel(output, kernel, configuration)
     if drawn:
         with drawing(drawn):
-            render(summary.figures["kernel"]()).save(drawn)
+            to_matplotlib(summary.figures["kernel"]()).save(drawn)
     error = "superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"])
     print_result(as_json, result, *summary.lines, error)
 
@@ -211,7 +211,7 @@ def _needs_sub0(experiment: Experiment) -> None:
 
 @with_experiment
 def design_command(
-    chosen: Chosen,
+    chosen: ExperimentOptions,
     pack: PackName,
     output: Output = Path("designed.csv"),
     words: Annotated[int | None, typer.Option(help="Design all words of so many bits, as --signals words:L.")] = None,
@@ -302,8 +302,8 @@ def design_command(
         save_waveforms(output, found.signals, experiment.waveforms, design=way)
     if drawn:
         with drawing(drawn):
-            render(design_figure(found, float(experiment.scale), cell(pack))).save(drawn)
-            render(history_figure({cell(pack): found.history})).save(history)
+            to_matplotlib(design_figure(found, float(experiment.scale), cell(pack))).save(drawn)
+            to_matplotlib(history_figure({cell(pack): found.history})).save(history)
     result = {
         "pack": pack,
         "before": found.before,
@@ -339,7 +339,7 @@ def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
 
 @with_experiment
 def tune_command(
-    chosen: Chosen,
+    chosen: ExperimentOptions,
     packs: Annotated[str, typer.Argument(help="Pack files or names of shipped packs, separated by commas.")],
     output: Output = Path("tuned.json"),
     bounds: Annotated[
@@ -378,7 +378,7 @@ def tune_command(
     summary = summaries.of_tuned(result)
     if drawn:
         with drawing(drawn):
-            render(summary.figures["history"]()).save(drawn)
+            to_matplotlib(summary.figures["history"]()).save(drawn)
     print_result(as_json, result, *summary.lines, f"wrote {output}")
 
 

@@ -62,15 +62,15 @@ def _options(entries: Mapping[str, Field[Any]], **defaults: Any) -> _Options:
     return found
 
 
-class Chosen:
+class ExperimentOptions:
     """What the options of a command chose; a pack makes an experiment of it."""
 
     def __init__(self, values: dict[str, Any]) -> None:
         self._values = values
 
-    def with_signals(self, name: str) -> "Chosen":
+    def with_signals(self, name: str) -> "ExperimentOptions":
         """The same, but for the signals."""
-        return Chosen({**self._values, "signals": name})
+        return ExperimentOptions({**self._values, "signals": name})
 
     def check_output(
         self, packs: Sequence[str], output: Path, suffix: str, *, picture: bool, force: bool
@@ -121,7 +121,7 @@ def with_experiment(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command all options of an experiment; it gets what they chose as `chosen`."""
     of_law = _options(OF_LAW, **{**dict.fromkeys(OF_LAW), "mu": Hooke().mu})  # what is not given is the law's
     of_material = _options(OF_MATERIAL, **dict.fromkeys(OF_MATERIAL))
-    return _with(command, "chosen", Chosen, {**_OTHERS, **of_law, **of_material, **_options(NUMBERS)})
+    return _with(command, "chosen", ExperimentOptions, {**_OTHERS, **of_law, **of_material, **_options(NUMBERS)})
 
 
 def with_recipe(command: Callable[..., None]) -> Callable[..., None]:

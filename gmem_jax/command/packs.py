@@ -36,7 +36,7 @@ from gmem_jax.files.spheres import load_clump
 from gmem_jax.physics import grain
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.grain import Clump
-from gmem_jax.preparation.preparation import frame_schedule, prepare
+from gmem_jax.preparation.preparation import preparation_frames, prepare
 from gmem_jax.preparation.recipe import Recipe, grain_steps, pressure_over_wanted
 from gmem_jax.show import tables
 from gmem_jax.simulation.frames import Frames
@@ -139,7 +139,7 @@ def prepare_command(
     elif output is None:
         raise InputError("--output is missing: name a file, or a standard pack like tetra-31680-a")
     require_name(name)
-    frame_schedule(recipe, frames)  # refuses what cannot be before anything is begun
+    preparation_frames(recipe, frames)  # refuses what cannot be before anything is begun
     check_output(output, ".h5", force=force)
     backend = native.name(backend, Frictionless())
     cost = announce(f"{recipe.grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * recipe.grains, backend)

@@ -27,7 +27,7 @@ from gmem_jax.command.console import (
     refuse_idle,
     reporting,
 )
-from gmem_jax.command.options import Chosen, with_experiment
+from gmem_jax.command.options import ExperimentOptions, with_experiment
 from gmem_jax.command.resuming import Restart, batch_for, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
@@ -40,7 +40,7 @@ from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.state import combined_status
 from gmem_jax.show import tables
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.show.summaries import Summary, of_recall
 
 TYPICAL = "tetra-325-e"  # of the five shipped packs of 325 that with the median F
@@ -87,7 +87,7 @@ def _run(
     told, summary = f"wrote {data}", of_recall(recall)
     if picture is not None:
         with drawing(picture):
-            render(summary.figures["signals"]()).save(picture)
+            to_matplotlib(summary.figures["signals"]()).save(picture)
             told += f" and {picture}"
     log(told)
     row = {**summary.facts, "seconds": configuration["seconds"], "output": str(data)}
@@ -98,7 +98,7 @@ def _run(
 
 @with_experiment
 def recall_command(
-    chosen: Chosen,
+    chosen: ExperimentOptions,
     pack: PackName,
     output: Output = Path("recall.h5"),
     batch: Annotated[

@@ -24,10 +24,10 @@ from gmem_jax.reproduce.run import (
     Outcome,
     Weighed,
     check_claims,
+    outcome_summary,
     picture,
     reproduce,
     sensitivity,
-    summary_of,
 )
 from gmem_jax.simulation.progress import Progress
 from gmem_jax.sweeps.cost import cost_of
@@ -108,9 +108,9 @@ def reproduce_command(
     for row in rows:
         status |= row.status
     result = {
-        "figures": [summary_of(outcome) for outcome in outcomes],
+        "figures": [outcome_summary(outcome) for outcome in outcomes],
         "claims": [verdict._asdict() for verdict in verdicts],
-        "choices": choices.rows(weighed.effects),
+        "choices": choices.effect_rows(weighed.effects),
         "pictures": [str(path) for path in drawn],
         "status": status,
     }

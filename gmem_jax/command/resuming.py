@@ -13,7 +13,7 @@ from gmem_jax.command.console import InputError, RunInterruptedError, log
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import default_batch
 from gmem_jax.files.checkpoints import Checkpoints, locked
-from gmem_jax.files.ours import sweep
+from gmem_jax.files.ours import remove_leftovers
 
 Restart = Annotated[bool, typer.Option("--restart", help="Discard what an interrupted run left, and begin anew.")]
 
@@ -49,7 +49,7 @@ def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[C
         if error.errno == errno.ENAMETOOLONG:
             raise InputError(f"{output}: this name leaves no room for that of its parts; shorten it") from None
     with locked(output):
-        sweep(output.parent, output.name)
+        remove_leftovers(output.parent, output.name)
         parts = Checkpoints(folder_of(output), key, restart=restart)
         if parts.finished() or parts.begun():
             begun = " and one that is begun" if parts.begun() else ""

@@ -8,7 +8,7 @@ import typer
 
 from gmem_jax.command import sweep
 from gmem_jax.command.console import AsJson, Force, InputError, check_output, heard, log, print_result, refuse_idle
-from gmem_jax.show.render_matplotlib import PICTURE_FORMATS, render
+from gmem_jax.show.render_matplotlib import PICTURE_FORMATS, to_matplotlib
 from gmem_jax.show.stages import AGAINST, QUANTITIES
 from gmem_jax.show.summaries import PLOTS, Draw, summary_of
 
@@ -57,12 +57,12 @@ def show(
     if csv:
         refuse_idle("beside --csv", "as_json")
     chosen = _numbers(signal)
-    axes = {"x": x, "by": sweep.names_of(by), "over": sweep.names_of(over)}
+    axes = {"x": x, "by": sweep.split_names(by), "over": sweep.split_names(over)}
     if file.is_dir():
         if chosen:
             raise InputError(f"--signal {signal}: a sweep has no signals of its own; name the file of a point")
         if over and not plot:
-            return sweep.show(sweep.there(file), over, as_json)
+            return sweep.show_sweep(sweep.there(file), over, as_json)
     else:
         for name in (name for name, value in axes.items() if value):
             raise InputError(f"{file}: --{name} is for the folder of a sweep")
@@ -102,7 +102,7 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
         raise InputError(f"--plot {plot}: name the picture with -o, as in -o {names[plot.lower()]}.png")
     if output.suffix.lower() not in PICTURE_FORMATS:
         raise InputError(f"--output {output}: must end in one of {', '.join(PICTURE_FORMATS)}")
-    drawn = render(pictures[names[plot.lower()]]())
+    drawn = to_matplotlib(pictures[names[plot.lower()]]())
     drawn.save(check_output(output, "", inputs=(file,), force=force))
     log(f"wrote {output}")
     print_result(as_json, {"output": str(output), "status": 0})

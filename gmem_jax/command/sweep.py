@@ -30,7 +30,7 @@ from gmem_jax.sweeps.processes import stop, waiting
 from gmem_jax.sweeps.spec import Spec, read_spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SweepRunner
-from gmem_jax.sweeps.table import TABLE_FORMATS, export, means, rows, warnings_of
+from gmem_jax.sweeps.table import TABLE_FORMATS, export_table, means, rows, warnings_of
 
 VERBS = ("status", "show", "export", "stop")
 RUN = ("executor", "workers", AS_THEY_ARE)
@@ -73,7 +73,7 @@ def sweep_command(
         elif what == "stop":
             _stop(store, as_json)
         else:
-            show(store, over, as_json)
+            show_sweep(store, over, as_json)
         return
     if folder is not None and Path(what).suffix == ".toml":
         raise InputError(f"{folder}: does nothing after a sweep file; name its folder with -o {folder}")
@@ -173,7 +173,7 @@ def _doubtful(table: list[dict[str, Any]]) -> list[str]:
     return [f"{count} of {len(table)} points: {reason}" for reason, count in counts.items()]
 
 
-def names_of(text: str) -> list[str]:
+def split_names(text: str) -> list[str]:
     """Names separated by commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
@@ -189,10 +189,10 @@ def _stop(store: Store, as_json: bool) -> None:
         raise RunFailedError(f"{len(left)} workers cannot be ended from here")
 
 
-def show(store: Store, over: str, as_json: bool) -> None:
+def show_sweep(store: Store, over: str, as_json: bool) -> None:
     """Print the points of a sweep, or means over some names, separated by commas."""
     table, names = rows(store), store.card()["names"]
-    averaged = names_of(over)
+    averaged = split_names(over)
     if unknown := sorted(set(averaged) - set(names)):
         raise InputError(f"--over {unknown[0]}: does not vary here; {', '.join(names)} do")
     if averaged:
@@ -210,7 +210,7 @@ def _export(store: Store, output: Path | None, force: bool, as_json: bool) -> No
     if output is None or output.suffix.lower() not in TABLE_FORMATS:
         raise InputError(f"gmem sweep export: name a file with -o that ends in one of {', '.join(TABLE_FORMATS)}")
     check_output(output, "", force=force)
-    about = export(store, output)
+    about = export_table(store, output)
     log(f"wrote {output}" + (f": {about}" if about else ""))
     print_result(as_json, {"output": str(output), "about": about, "status": 0})
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.physics.grain import Clump
-from gmem_jax.physics.pairs import Pairs, candidates, tabulate
+from gmem_jax.physics.pairs import Pairs, listed_candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree
 from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
@@ -145,7 +145,7 @@ def _widen(pack: Pack, capacity: int, per_sphere: int) -> Pairs:
     """The pack's own candidates in larger tables."""
     pairs = pack.pairs
     return tabulate(
-        candidates(pairs),
+        listed_candidates(pairs),
         np.asarray(pairs.reference),
         np.asarray(pairs.smallest),
         float(pairs.reach),

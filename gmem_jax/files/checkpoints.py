@@ -24,7 +24,7 @@ import numpy as np
 
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.ours import Folder, release, sweep
+from gmem_jax.files.ours import Folder, release, remove_leftovers
 from gmem_jax.files.seal import BLOCK, require_sealed, seal
 from gmem_jax.files.validation import json_of, read_npy, refusing, require
 from gmem_jax.physics.pytree import REGISTERED
@@ -208,7 +208,7 @@ class Checkpoints(ResultCache):
                     f"({_short(found.get(other[0]))}, now {_short(wanted.get(other[0]))}); begin anew with "
                     "--restart, or choose another output"
                 )
-        sweep(self.folder)
+        remove_leftovers(self.folder)
         self._own.mark({"key": wanted})
 
     @staticmethod

@@ -13,11 +13,11 @@ import numpy as np
 
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.loads import pressure_tensor, wall_forces
+from gmem_jax.files.loads import frame_wall_forces, pressure_tensor
 from gmem_jax.files.ours import place
 from gmem_jax.files.validation import optional
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import candidates
+from gmem_jax.physics.pairs import listed_candidates
 from gmem_jax.simulation.frames import Frames, sphere_places
 
 RADIUS = 1.0
@@ -26,7 +26,7 @@ RADIUS = 1.0
 def frames_of_pack(pack: Pack, material: Material = Material()) -> Frames:
     """A pack as the one configuration that it is: normal forces of its overlaps, and no friction, which no pack has."""
     position, quaternion, offsets = (np.asarray(x) for x in (pack.position, pack.quaternion, pack.clump.offsets))
-    spheres = candidates(pack.pairs).T
+    spheres = listed_candidates(pack.pairs).T
     centres = sphere_places(position, quaternion, offsets)
     overlap = 2.0 - np.linalg.norm(centres[spheres[:, 1]] - centres[spheres[:, 0]], axis=1)
     touching = overlap > 0.0
@@ -79,7 +79,7 @@ def write_gsd(path: Path, frames: Frames, mass: float, material: Material) -> No
             frame.particles.diameter = np.full(len(grain), 2.0 * RADIUS)
             frame.particles.mass = np.full(len(grain), mass / each)
             frame.particles.body = grain
-            own, walls = _contacts(frames, number), wall_forces(frames, number, material)
+            own, walls = _contacts(frames, number), frame_wall_forces(frames, number, material)
             frame.bonds.N, frame.bonds.types = len(frames.spheres[own]), ["contact"]
             frame.bonds.typeid, frame.bonds.group = np.zeros(frame.bonds.N, np.uint32), frames.spheres[own]
             frame.log = {
@@ -103,7 +103,7 @@ def write_xyz(path: Path, frames: Frames, mass: float, material: Material) -> No
     with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for number in range(frames.count):
             lower, lengths = frames.lower[number], frames.upper[number] - frames.lower[number]
-            tensor = pressure_tensor(frames, number, wall_forces(frames, number, material))
+            tensor = pressure_tensor(frames, number, frame_wall_forces(frames, number, material))
             facts = {
                 "Lattice": " ".join(f"{edge:.17g}" for edge in np.diag(lengths).ravel()),
                 "Origin": " ".join(f"{plane:.17g}" for plane in lower),
@@ -200,7 +200,7 @@ def write_pvd(path: Path, frames: Frames, mass: float, material: Material) -> No
 
 
 def _points(frames: Frames, number: int, material: Material) -> Any:
-    grain, walls = _grain_numbers(frames), wall_forces(frames, number, material)
+    grain, walls = _grain_numbers(frames), frame_wall_forces(frames, number, material)
     mesh = optional("pyvista", "vtk").PolyData(frames.centres(number))
     mesh["radius"], mesh["grain"], mesh["wall_force"] = np.full(len(grain), RADIUS), grain, walls
     facts = {

@@ -6,7 +6,7 @@ from gmem_jax.physics.material import Material
 from gmem_jax.simulation.frames import Frames
 
 
-def wall_forces(frames: Frames, number: int, material: Material) -> np.ndarray:
+def frame_wall_forces(frames: Frames, number: int, material: Material) -> np.ndarray:
     """The elastic forces of the walls on every sphere of a frame, [N K, 3], in E R^2.
 
     What damping adds depends on speeds, which frames do not keep: it is left out.
@@ -27,7 +27,7 @@ def pressure_tensor(frames: Frames, number: int, walls: np.ndarray) -> np.ndarra
     Args:
         frames: the configurations.
         number: of the frame.
-        walls: its `wall_forces`.
+        walls: its `frame_wall_forces`.
     """
     own, each = slice(*frames.start[number : number + 2]), len(frames.offsets)
     centres, position = frames.centres(number), frames.position[number]

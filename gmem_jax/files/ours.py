@@ -43,7 +43,7 @@ def drop(made: Path) -> None:
     made.unlink(missing_ok=True)
 
 
-def sweep(folder: Path, name: str = "", *, age: float = 0.0) -> None:
+def remove_leftovers(folder: Path, name: str = "", *, age: float = 0.0) -> None:
     """Remove what killed writers left behind: temporary files of the files in a folder (or of one of them).
 
     Args:
@@ -236,7 +236,7 @@ class Folder:
         for path in self.files(inner):
             if path.name != marker:
                 path.unlink(missing_ok=True)
-        sweep(top)
+        remove_leftovers(top)
         left = sorted(entry.name for entry in top.iterdir() if entry.name != marker) if top.is_dir() else []
         if not (left or keep or top.is_symlink()):
             if marker:

@@ -26,7 +26,7 @@ Found = Mapping[str, np.ndarray]
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def check(found: Found, *, isotropic: bool, record: dict[str, Any]) -> None:
+def check_arrays(found: Found, *, isotropic: bool, record: dict[str, Any]) -> None:
     """Refuse a pack that is impossible.
 
     Args:

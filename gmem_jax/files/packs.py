@@ -18,7 +18,7 @@ from gmem_jax.files.hdf5 import reading, write_arrays, write_samples, writing
 from gmem_jax.files.schemas import PACK
 from gmem_jax.files.validation import fit, json_of, refusing, require, title
 from gmem_jax.physics.grain import Clump
-from gmem_jax.physics.pairs import candidates, tabulate
+from gmem_jax.physics.pairs import listed_candidates, tabulate
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import Sample
@@ -37,7 +37,7 @@ def _arrays(pack: Pack) -> dict[str, Any]:
     values |= {f"clump/{name}": getattr(pack.clump, name) for name in _CLUMP}
     values |= {f"pairs/{name}": getattr(pack.pairs, name) for name in ("smallest", "reach")}
     reference = np.asarray(pack.pairs.reference)[..., 0]
-    return {**values, "pairs/candidates": candidates(pack.pairs), "pairs/reference": reference}
+    return {**values, "pairs/candidates": listed_candidates(pack.pairs), "pairs/reference": reference}
 
 
 @usual_rules()
@@ -92,7 +92,7 @@ def _check(found: dict[str, np.ndarray], isotropic: Any, label: Any, shape: Any,
         isinstance(isotropic, bool | np.bool_), "incomplete file, attribute 'isotropic' is missing or not a truth value"
     )
     require(title(label) and title(shape), "its name or that of its grain is not a short line of text")
-    pack_validation.check(found, isotropic=bool(isotropic), record=json_of(record, "record"))
+    pack_validation.check_arrays(found, isotropic=bool(isotropic), record=json_of(record, "record"))
 
 
 @usual_rules()

@@ -265,7 +265,7 @@ SWEEP = Schema(
 SCHEMAS = (RECALL, PACK, KERNEL, GRADIENT, TUNED, READING, DESIGN, NET, SWEEP)
 
 
-def page() -> str:
+def schema_page() -> str:
     """docs/files.md."""
     return "\n".join([_INTRODUCTION, *(_section(schema) for schema in SCHEMAS)])
 

@@ -58,4 +58,4 @@ __all__ = [
 # process that may have imported the package and no more. It starts no backend. While Python looks for the module of
 # ``python -m gmem_jax.native.build``, which compiles the library, it must not be imported yet.
 if getattr(sys, "argv", [""])[:1] != ["-m"]:
-    library.load()
+    library.load_library()

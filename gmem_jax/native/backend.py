@@ -123,7 +123,7 @@ def marcher(backend: str = "auto", precision: str = "double") -> March:
     if precision not in PRECISIONS or (precision == "mixed" and backend == "jax"):
         raise ValueError(f"precision {precision!r} is not one of the backend {backend!r}")
     if backend == "native" or precision == "mixed":
-        library.require()
+        library.require_library()
     if precision == "mixed":
         return march_mixed
     return {"jax": dynamics.march, "native": march, "auto": march_anywhere}[backend]

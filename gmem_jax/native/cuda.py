@@ -46,7 +46,7 @@ def missing() -> str:
 
 
 @functools.cache
-def warn_once(reason: str) -> None:
+def warn_no_nvrtc(reason: str) -> None:
     """Say that a GPU could be faster, and how."""
     warnings.warn(f"plain JAX runs on the GPU, and slowly: {reason}", stacklevel=2)
 
@@ -85,7 +85,7 @@ class Needs(NamedTuple):
     spilt: int
 
 
-def needs(
+def kernel_needs(
     library: ctypes.CDLL, law: int, variant: int, architecture: str, *, tangent: bool = False
 ) -> dict[str, Needs]:
     """The kernels, compiled for an architecture without a GPU, by their names.
@@ -170,7 +170,7 @@ def between_steps(fixed: Any, history: Sequence[Any], points: int, kinds: int, l
     return [*found, jax.ShapeDtypeStruct((1, sides, lanes), jnp.int32)] if points else found
 
 
-def run(target: str, call: Any, in_place: bool, parts: Any, shapes: Sequence[Any]) -> Sequence[jax.Array]:
+def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Sequence[Any]) -> Sequence[jax.Array]:
     """A call of the library, with results of the given shapes, and what was needed between its steps.
 
     Args:

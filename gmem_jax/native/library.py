@@ -19,7 +19,7 @@ def path() -> Path:
 
 
 @functools.cache
-def load() -> tuple[str, str]:
+def load_library() -> tuple[str, str]:
     """Load and register the library, once; returns its instruction set, and why that failed ("" if it did not)."""
     from gmem_jax.native.build import SOURCES, is_stale  # here, as in `path`
 
@@ -41,11 +41,11 @@ def load() -> tuple[str, str]:
 
 def available() -> tuple[bool, str]:
     """Whether the native backend can run on this machine's CPU, and the instruction set it uses (or why not)."""
-    instructions, reason = load()
+    instructions, reason = load_library()
     return not reason, reason or instructions
 
 
-def require() -> None:
+def require_library() -> None:
     """Refuse to go on without the library.
 
     Raises:
@@ -80,6 +80,6 @@ def needs(law: FrictionLaw, architecture: str, *, tangent: bool = False) -> dict
         RuntimeError: if there is no NVRTC, or it does not know the architecture.
         ValueError: if the library is not available, or does not know the law.
     """
-    require()
+    require_library()
     row = entry(law)
-    return cuda.needs(ctypes.CDLL(str(path())), row.native, row.variant(law), architecture, tangent=tangent)
+    return cuda.kernel_needs(ctypes.CDLL(str(path())), row.native, row.variant(law), architecture, tangent=tangent)

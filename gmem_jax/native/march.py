@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.extend.backend import get_backend
 
 from gmem_jax.native import library, primitives
-from gmem_jax.native.primitives import Arrays, Call, Fixed, Results
+from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import LAWS, entry_of
@@ -81,13 +81,13 @@ def march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: S
         return dynamics.march(system, state, boxes, dt, drag)
     built, reason = library.available()
     if not built:
-        warn_once(reason)
+        warn_no_library(reason)
         return dynamics.march(system, state, boxes, dt, drag)
     return _march(system, state, boxes, dt, drag, _Mode(anywhere=True))
 
 
 @functools.cache
-def warn_once(reason: str) -> None:
+def warn_no_library(reason: str) -> None:
     """Say that a CPU could be faster, and how."""
     warnings.warn(f"plain JAX runs, and slowly: the native backend is not available: {reason}", stacklevel=4)
 
@@ -105,7 +105,7 @@ class _Mode(NamedTuple):
 
 
 def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, mode: _Mode) -> tuple[State, jax.Array]:
-    library.require()
+    library.require_library()
     library.entry(system.friction)
     if state.grains.position.dtype != jnp.float64:
         raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
@@ -132,7 +132,7 @@ def _bin(
     arrays = arrays_of(system, grains, history, boxes, numbers)
     definition = PlainDefinition.of(system, history, mode.anywhere)
     call = call_of(system)._replace(mixed=int(mode.mixed))
-    return _result(grains, history, primitives.forward(call, definition, fixed_of(system), arrays))
+    return _result(grains, history, primitives.advance(call, definition, fixed_of(system), arrays))
 
 
 @functools.partial(_bin.defjvp, symbolic_zeros=True)
@@ -201,7 +201,7 @@ class PlainDefinition:
         """That of a system with such a history."""
         return cls(jax.tree.structure(system), jax.tree.structure(history), anywhere)
 
-    def __call__(self, fixed: Fixed, arrays: Arrays) -> Results:
+    def __call__(self, fixed: Fixed, arrays: Arrays) -> StepOutput:
         """The steps."""
         empty: System = jax.tree.unflatten(self.system, [None] * self.system.num_leaves)
         dt, drag, mass, *inertia = arrays.parameters[:6]
@@ -215,7 +215,7 @@ class PlainDefinition:
         history = jax.tree.unflatten(self.history, arrays.history)
         system = replace(empty, clump=clump, friction=law, pairs=pairs, material=material)
         grains, history, total = _plain(system, Grains(*arrays.fields), history, boxes, (dt, drag))
-        return Results(jax.tree.leaves(grains), total, jax.tree.leaves(history))
+        return StepOutput(jax.tree.leaves(grains), total, jax.tree.leaves(history))
 
 
 def call_of(system: System) -> Call:
@@ -245,7 +245,7 @@ def arrays_of(system: System, grains: Grains, history: Any, boxes: Box, numbers:
     return Arrays(jax.tree.leaves(grains), parameters, walls, jax.tree.leaves(history))
 
 
-def _result(grains: Grains, history: Any, results: Results) -> _Result:
+def _result(grains: Grains, history: Any, results: StepOutput) -> _Result:
     moved = jax.tree.unflatten(jax.tree.structure(grains), results.fields)
     return moved, jax.tree.unflatten(jax.tree.structure(history), results.history), results.pressure
 

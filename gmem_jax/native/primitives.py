@@ -88,7 +88,7 @@ class Arrays(NamedTuple):
     history: list[jax.Array]
 
 
-class Results(NamedTuple):
+class StepOutput(NamedTuple):
     """What the steps give: `Arrays` that moved, and the sum of the wall pressures, [3, B]."""
 
     fields: list[jax.Array]
@@ -107,17 +107,17 @@ class Definition(Protocol):
     def anywhere(self) -> bool:
         """See above."""
 
-    def __call__(self, fixed: Fixed, arrays: Arrays) -> Results:
+    def __call__(self, fixed: Fixed, arrays: Arrays) -> StepOutput:
         """The steps."""
 
 
-def forward(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays) -> Results:
+def advance(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays) -> StepOutput:
     """All steps; not differentiable by itself."""
     return _results(arrays, _bind(_forward_p, call, definition, fixed, arrays))
 
 
-def tangent(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, along: Arrays) -> Results:
-    """The derivative of `forward` along a direction, linear in it."""
+def tangent(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, along: Arrays) -> StepOutput:
+    """The derivative of `advance` along a direction, linear in it."""
     return _results(arrays, _bind(_tangent_p, call, definition, fixed, arrays, along))
 
 
@@ -127,9 +127,9 @@ def _bind(primitive: Primitive, call: Call, definition: Definition, *parts: Any)
     return found
 
 
-def _results(arrays: Arrays, found: list[Any]) -> Results:
+def _results(arrays: Arrays, found: list[Any]) -> StepOutput:
     count = len(arrays.fields)
-    return Results(found[:count], found[count], found[count + 1 :])
+    return StepOutput(found[:count], found[count], found[count + 1 :])
 
 
 # Shapes. Every argument may have leading axes, as many as the others, of size one where there is nothing to share out.
@@ -151,7 +151,7 @@ def _of_results(parts: Any) -> list[Any]:
     arrays: Arrays = parts[1]
     *leading, _, replicas = arrays.parameters.shape
     pressure = jax.ShapeDtypeStruct((*leading, 3, replicas), arrays.parameters.dtype)
-    return jax.tree.leaves(_whole(parts, Results(arrays.fields, pressure, arrays.history)))  # type: ignore[arg-type]
+    return jax.tree.leaves(_whole(parts, StepOutput(arrays.fields, pressure, arrays.history)))  # type: ignore[arg-type]
 
 
 def _of_arrays(parts: Any) -> list[Any]:
@@ -196,16 +196,16 @@ def _library(
     return found
 
 
-def _plain_forward(definition: Definition, fixed: Fixed, arrays: Arrays) -> Results:
+def _plain_forward(definition: Definition, fixed: Fixed, arrays: Arrays) -> StepOutput:
     return definition(fixed, arrays)
 
 
-def _plain_tangent(definition: Definition, fixed: Fixed, arrays: Arrays, along: Arrays) -> Results:
-    slope: Results = jax.jvp(functools.partial(definition, fixed), (arrays,), (along,))[1]
+def _plain_tangent(definition: Definition, fixed: Fixed, arrays: Arrays, along: Arrays) -> StepOutput:
+    slope: StepOutput = jax.jvp(functools.partial(definition, fixed), (arrays,), (along,))[1]
     return slope
 
 
-def _plain_adjoint(definition: Definition, fixed: Fixed, arrays: Arrays, slopes: Results) -> Arrays:
+def _plain_adjoint(definition: Definition, fixed: Fixed, arrays: Arrays, slopes: StepOutput) -> Arrays:
     _, pull = jax.vjp(functools.partial(definition, fixed), arrays)
     found: Arrays = pull(slopes)[0]
     return found
@@ -273,7 +273,7 @@ def _primitive(
             parts = jax.tree.unflatten(tree, leaves)
             if on_gpu:
                 shapes = outputs(parts)
-                return cuda.run(target, call, in_place, parts, shapes)[: len(shapes)]
+                return cuda.call_kernels(target, call, in_place, parts, shapes)[: len(shapes)]
             return _library(target, outputs, call, in_place, parts)
 
         def shared_out(*leaves: jax.Array) -> Any:
@@ -297,7 +297,7 @@ def _primitive(
         if target in cuda.CUDA_TARGETS and not definition.anywhere:
             raise NotImplementedError(f"the native backend does not run on this GPU: {cuda.missing()}")
         if target in cuda.CUDA_TARGETS:
-            cuda.warn_once(cuda.missing())
+            cuda.warn_no_nvrtc(cuda.missing())
         return in_plain_jax(context, *values, definition=definition, **static)
 
     def on_others(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:

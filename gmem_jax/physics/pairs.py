@@ -132,7 +132,7 @@ def tabulate(
     )
 
 
-def candidates(pairs: Pairs) -> np.ndarray:
+def listed_candidates(pairs: Pairs) -> np.ndarray:
     """The listed sphere pairs without padding, [2, n]."""
     real = np.asarray(pairs.valid)
     listed: np.ndarray = np.stack([np.asarray(pairs.first)[real], np.asarray(pairs.second)[real]])
@@ -150,7 +150,7 @@ def carry_history(history: Any, blank: Any, old: Pairs, new: Pairs) -> Any:
     """
     spheres = np.int64(old.reference.shape[0])
 
-    old_keys, new_keys = (one * spheres + other for one, other in (candidates(old), candidates(new)))
+    old_keys, new_keys = (one * spheres + other for one, other in (listed_candidates(old), listed_candidates(new)))
     place = np.minimum(np.searchsorted(old_keys, new_keys), max(0, old_keys.size - 1))
     known = (old_keys[place] == new_keys) if old_keys.size else np.zeros(new_keys.size, dtype=bool)
     # As long as the new list, so that lists of one capacity are moved by one program.

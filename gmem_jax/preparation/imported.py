@@ -35,7 +35,7 @@ _ORDERS = 6  # spheres of a grain up to which they may be listed in another orde
 DT = 0.3  # t_c, of the run that measures the ringing period
 
 
-def clump_of(centres: np.ndarray) -> Clump:
+def clump_of_centres(centres: np.ndarray) -> Clump:
     """The grain whose spheres lie so, [K, 3]; a sphere or tetra grain where it is one."""
     if len(centres) == 1:
         return sphere()
@@ -129,7 +129,7 @@ def _pack_of(
     require((read.centres > read.lower) & (read.centres < read.upper), "a grain lies outside the box")
     _require_pressed(read)
     pairs_within(read.centres.reshape(-1, 3), 2.0 + SKIN, read.centres.shape[1])  # refuses a heap
-    grain = clump_of(read.centres[0])
+    grain = clump_of_centres(read.centres[0])
     position, quaternion = lay(read.centres, np.asarray(grain.offsets))
     box = still_box(jnp.asarray(read.lower)[:, None], jnp.asarray(read.upper)[:, None])
     notes = list(read.notes)

@@ -85,7 +85,7 @@ def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array
 FILMED = ("gas", "press", "settle")  # stages after which a configuration is taken, if any are
 
 
-def frame_schedule(recipe: Recipe, frames: int) -> FrameSchedule:
+def preparation_frames(recipe: Recipe, frames: int) -> FrameSchedule:
     """What is to be recorded of the cycles: of `frames` configurations those beside the lattice, `FILMED` and the pack.
 
     Raises:
@@ -117,7 +117,7 @@ class _Preparation:
     ) -> None:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
         self.recipe, self.cache, self.filmed, self.lengths = recipe, cache, frames > 0, lengths
-        self.frames = FrameRecorder(frame_schedule(recipe, frames))
+        self.frames = FrameRecorder(preparation_frames(recipe, frames))
         self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
         steps, self.dt = stepping(max(recipe.t0, SLOWEST_BINS), recipe.dt)
         finder = pair_finder(

@@ -11,7 +11,7 @@ from gmem_jax.reading.readers import Stored, bit_errors, confusion, information,
 from gmem_jax.reading.training import Training
 
 
-def reading(stored: Stored, nets: Sequence[Training]) -> dict[str, Any]:
+def reading_report(stored: Stored, nets: Sequence[Training]) -> dict[str, Any]:
     """How well the words of a recall are read: by the nets (mean and SD over training seeds) and by the baselines.
 
     Accuracy, error rate of each bit and information (see `information`) for every reader; for the nets over

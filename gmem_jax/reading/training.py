@@ -31,6 +31,7 @@ from gmem_jax.files.validation import (
 from gmem_jax.physics import chance
 from gmem_jax.reading.lessons import Examples, TrainingConfig, examples
 from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
+from gmem_jax.simulation.progress import silent
 from gmem_jax.simulation.protocol import BINS
 
 STEPS_PER_CALL = 250  # to a call from the host: a second or so, and one check of the validation accuracy
@@ -58,7 +59,7 @@ def learn(
     return net, jnp.mean(losses)
 
 
-def validate(net: Net, data: Examples, count: int) -> jax.Array:
+def validation_accuracy(net: Net, data: Examples, count: int) -> jax.Array:
     """Accuracy on the first `count` held-out examples (or on all S * kept, if fewer)."""
     total = min(count, net.lessons.classes * net.lessons.kept)
     slices = -(-total // SLICE)
@@ -99,12 +100,8 @@ Listener = Callable[[Training], None]
 """Told about every call of `STEPS_PER_CALL` steps."""
 
 
-def silent(training: Training) -> None:
-    """Report nothing."""
-
-
 _learn = jax.jit(learn, static_argnames="count")
-_validate = jax.jit(validate, static_argnames="count")
+_validate = jax.jit(validation_accuracy, static_argnames="count")
 _examples = jax.jit(examples, static_argnames="lessons")
 
 

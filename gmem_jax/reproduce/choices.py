@@ -1,16 +1,14 @@
 """What the paper leaves open, and how much G and F change with each choice, on the same packs."""
 
-import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmem_jax.experiment.analysis import spread
-from gmem_jax.files.atomic import atomic
 from gmem_jax.reproduce.compare import Estimate, counted
 from gmem_jax.reproduce.figures import SCALES, Scale, Values, crossed
-from gmem_jax.show.render_matplotlib import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
 _NOTHING: Values = {}
 
@@ -79,7 +77,7 @@ def _values(choice: Choice, value: Any) -> Values:
     return choice.shared if value == choice.values[0] else {**choice.shared, choice.name: value}
 
 
-def points(packs: Sequence[Values]) -> list[Values]:
+def choice_points(packs: Sequence[Values]) -> list[Values]:
     """The runs that the table needs, on some packs; none twice."""
     tried = [_values(choice, value) for choice in CHOICES for value in choice.values]
     return crossed(packs, [values for place, values in enumerate(tried) if values not in tried[:place]])
@@ -134,22 +132,9 @@ def _row(effect: Effect) -> dict[str, Any]:
     return {**about, "default": int(effect.default), **numbers, "packs": effect.gain.packs, "status": effect.status}
 
 
-def rows(found: Sequence[Effect]) -> list[dict[str, Any]]:
+def effect_rows(found: Sequence[Effect]) -> list[dict[str, Any]]:
     """Every value of every choice as a line of a table."""
     return [_row(effect) for effect in found]
-
-
-def write_csv(path: Path, found: Sequence[Effect]) -> None:
-    """A line for each value of each choice.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
-    lines = rows(found)
-    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(lines[0]))
-        writer.writeheader()
-        writer.writerows(lines)
 
 
 def draw(path: Path, found: Sequence[Effect], title: str) -> None:
@@ -175,10 +160,10 @@ def draw(path: Path, found: Sequence[Effect], title: str) -> None:
     axes[0].set_yticks(places, [_label(effect) for effect in shown], fontsize=8)
     axes[0].invert_yaxis()
     figure.suptitle(title, fontsize=10)
-    save(path, figure, also=(".svg",))
+    save_picture(path, figure, also=(".svg",))
 
 
-def title(scale: Scale, packs: int) -> str:
+def choices_title(scale: Scale, packs: int) -> str:
     """What stands over the picture of some packs."""
     of = "one pack" if packs == 1 else f"mean ± SE over {packs} packs"
     return f"What the paper leaves open\nN = {scale.grains:,}, $t_0$ = {scale.t0:,.0f} $t_c$, {of}"

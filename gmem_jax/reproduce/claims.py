@@ -199,7 +199,7 @@ def _kolmogorov(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.max(np.abs(np.subtract(*ranks))))
 
 
-def points(packs: Sequence[Values]) -> list[Values]:
+def claim_points(packs: Sequence[Values]) -> list[Values]:
     """The runs that claims need, on each of some packs."""
     amplitudes: list[Values] = [{"gamma0": gamma0} for gamma0 in AMPLITUDES]
     stores: list[Values] = [{"store": store} for store in STORES if store != STANDARD_STORE]
@@ -215,7 +215,7 @@ def verdicts(
     Args:
         pack: of tetra grains.
         t0: duration of one compression, in t_c.
-        runs: of `points` on this pack, with their values.
+        runs: of `claim_points` on this pack, with their values.
         others: packs of other grains by their names, for the claim on rearrangement.
     """
 

@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
@@ -44,7 +44,7 @@ class Conditions:
     background: str
 
 
-class Point(NamedTuple):
+class ComputedPoint(NamedTuple):
     """One pack at some conditions: `show.tables.summary` of its recall, and where that lies."""
 
     conditions: Conditions
@@ -117,7 +117,7 @@ def conditions_of(configuration: dict[str, Any]) -> Conditions:
     )
 
 
-def points_of(store: Store) -> list[Point]:
+def points_of(store: Store) -> list[ComputedPoint]:
     """Every finished point of the sweep that a store was last asked for."""
     found = []
     done = store.done()
@@ -125,7 +125,7 @@ def points_of(store: Store) -> list[Point]:
         if row["key"] in done:
             recall = store.load(row["key"])
             configuration = recall.configuration
-            found.append(Point(conditions_of(configuration), summary(recall), row["key"]))
+            found.append(ComputedPoint(conditions_of(configuration), summary(recall), row["key"]))
     return found
 
 
@@ -134,7 +134,7 @@ def counted(t0: float) -> tuple[str, str]:
     return ("windowed_gain", "windowed_fidelity") if t0 < RINGS else ("gain", "fidelity")
 
 
-def _measures(point: Point, t0: float) -> dict[Conditions, tuple[float, float]]:
+def _measures(point: ComputedPoint, t0: float) -> dict[Conditions, tuple[float, float]]:
     """G and F of a point by its conditions: one for every background that it has."""
     at = asdict(point.conditions)
     rows = point.numbers.get("backgrounds", {point.conditions.background: point.numbers})
@@ -142,7 +142,7 @@ def _measures(point: Point, t0: float) -> dict[Conditions, tuple[float, float]]:
     return {Conditions(**{**at, "background": name}): (row[gain], row[fidelity]) for name, row in rows.items()}
 
 
-def compare(points: Iterable[Point], t0: float) -> list[Compared]:
+def compare_points(points: Iterable[ComputedPoint], t0: float) -> list[Compared]:
     """Means over packs beside the published points, in the order in which the conditions come.
 
     Args:
@@ -202,12 +202,8 @@ def _closest(
     return Estimate(row[mean], row[sd] if sd else math.nan, packs or int(row["n_packs"])), int(row["n_grains"])
 
 
-def write_csv(path: Path, rows: Sequence[Compared]) -> None:
-    """A line for each measure: conditions, ours, the published, the difference.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+def comparison_rows(rows: Sequence[Compared]) -> list[dict[str, Any]]:
+    """A line for each measure: conditions, ours, the published, the difference."""
     lines = []
     for row in rows:
         theirs = row.theirs or Estimate(math.nan, math.nan, 0)
@@ -217,15 +213,23 @@ def write_csv(path: Path, rows: Sequence[Compared]) -> None:
             | {"published_grains": row.grains, "published_mean": theirs.mean, "published_sd": theirs.sd}
             | {"published_packs": theirs.packs, "combined_errors_apart": row.errors_apart, "status": row.status}
         )
+    return [{name: _cell(value) for name, value in line.items()} for line in lines]
+
+
+def write_csv(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
+    """A table whose lines have the same names.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
     with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
-        for line in lines:
-            writer.writerow({name: _cell(value) for name, value in line.items()})
+        writer.writerows(lines)
 
 
 def read_csv(path: Path) -> list[Compared]:
-    """Ours of a table that `write_csv` wrote, beside the points that are published as far as is known now.
+    """Ours of a table of `comparison_rows`, beside the points that are published as far as is known now.
 
     Raises:
         OSError: if it cannot be read.

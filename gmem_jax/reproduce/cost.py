@@ -19,10 +19,10 @@ def spec_of_all(names: Collection[str], scale: str) -> Spec:
     wanted = [_at(size, values) for name in names if name in FIGURES for values in FIGURES[name].points(size)]
     if "claims" in names:
         (named,), (spheres,) = packs(size, size.grains, 1), packs(size, size.grains, 1, shape="sphere")
-        wanted += [_at(size, values) for values in (*claims.points([named]), spheres)]
+        wanted += [_at(size, values) for values in (*claims.claim_points([named]), spheres)]
     if "choices" in names:
         own = scale_of(scale, choices.SIZES)
-        wanted += [_at(own, values) for values in choices.points(packs(own, own.grains, own.few))]
+        wanted += [_at(own, values) for values in choices.choice_points(packs(own, own.grains, own.few))]
     if list(names) == ["fig03"]:  # no more than packs, and those are of figures 11 and 12b, too
         wanted = [_at(size, values) for values in shown_packs(size)]
     once = {json.dumps(values, sort_keys=True): values for values in wanted}

@@ -17,7 +17,7 @@ from gmem_jax.physics.material import Material
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, counted
 from gmem_jax.show.recalls import MEAN, PALE, mean_over_ringing
-from gmem_jax.show.render_matplotlib import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 from gmem_jax.simulation.sample import Sample
 
 LABELS = {
@@ -71,7 +71,7 @@ def said_of(rows: Sequence[Compared], rate: str) -> str:
     return f"gmem_jax: {size}, $t_0$ = {rate} $t_c$, {own}"
 
 
-def against(path: Path, rows: Sequence[Compared], across: Sequence[str], title: str) -> None:
+def draw_comparison(path: Path, rows: Sequence[Compared], across: Sequence[str], title: str) -> None:
     """G and F against a condition, ours and the published points in two colours; a symbol for each curve.
 
     Args:
@@ -93,7 +93,7 @@ def against(path: Path, rows: Sequence[Compared], across: Sequence[str], title: 
             _curves(axis, [row for row in shown if _panel(row.measure) == panel], name, panel)
     beside = "; published: mean ± SE" if any(row.theirs for row in rows) else ""
     figure.suptitle(title + beside, fontsize=10)
-    save(path, figure, also=VECTOR)
+    save_picture(path, figure, also=VECTOR)
 
 
 def _others(across: str) -> list[str]:
@@ -299,7 +299,7 @@ def through_time(path: Path, recall: Recall, signal: int, title: str) -> None:
     axes[0].legend(fontsize=7, frameon=False)
     axes[-1].set_xlabel("time ($t_0$)")
     figure.suptitle(title, fontsize=10)
-    save(path, figure, also=VECTOR)
+    save_picture(path, figure, also=VECTOR)
 
 
 def waveforms(path: Path, bits: int = 5) -> None:
@@ -333,10 +333,10 @@ def waveforms(path: Path, bits: int = 5) -> None:
         f"u = 0 to 1; dashed: its integral J(u), scaled. Above the six signals, below six of the {1 << bits} words of "
         f"{bits} bits."
     )
-    save(path, figure, also=VECTOR, caption=caption)
+    save_picture(path, figure, also=VECTOR, caption=caption)
 
 
-def words(
+def words_figure(
     path: Path, recalls: Sequence[tuple[Recall, dict[str, Any]]], shown: Sequence[Sequence[int]], title: str
 ) -> None:
     """Recalled words (SUB2-BL) beside their scaled integrals, a line of panels for each length, like Fig. 13.
@@ -390,4 +390,4 @@ def words(
     )
     drawn = f"Pale: recalled, SUB2-BL; blue: {MEAN}" if ringing else "Blue: recalled, SUB2-BL"
     caption = rf"{drawn}; red: $G E \delta_0 \gamma_0 J$. All panels have one scale."
-    save(path, figure, also=VECTOR, caption=caption)
+    save_picture(path, figure, also=VECTOR, caption=caption)

@@ -88,7 +88,7 @@ def _written(value: float | tuple[int, ...]) -> str:
     return "+".join(map(str, value)) if isinstance(value, tuple) else f"{value:g}"
 
 
-class Figure(NamedTuple):
+class PaperFigure(NamedTuple):
     """A figure of the paper.
 
     Attributes:
@@ -175,20 +175,20 @@ def _words(scale: Scale) -> list[Values]:
 
 
 FIGURES = {
-    "fig04": Figure("phi, Z and pressures through the experiment, with signal 5 and with none", _one),
-    "fig06": Figure("six recalled waveforms beside their integrals", _standard),
-    "fig08": Figure("G and F against friction", _friction, ("mu",)),
-    "fig09": Figure("G and F under the three friction laws", _laws, ("law",)),
-    "fig11": Figure(
+    "fig04": PaperFigure("phi, Z and pressures through the experiment, with signal 5 and with none", _one),
+    "fig06": PaperFigure("six recalled waveforms beside their integrals", _standard),
+    "fig08": PaperFigure("G and F against friction", _friction, ("mu",)),
+    "fig09": PaperFigure("G and F under the three friction laws", _laws, ("law",)),
+    "fig11": PaperFigure(
         "G and F against compression and amplitude, and the shape of the grains", _amplitudes, ("gamma0", "overlap")
     ),
-    "fig12a": Figure("G and F against compression", _compression, ("delta0",)),
-    "fig12b": Figure("G and F against the number of grains", _sizes, ("grains",)),
-    "fig13": Figure("Recalled words", _words),
-    "fig14": Figure("F by three backgrounds, and accuracy, against the length of words", _words, ("bits",)),
+    "fig12a": PaperFigure("G and F against compression", _compression, ("delta0",)),
+    "fig12b": PaperFigure("G and F against the number of grains", _sizes, ("grains",)),
+    "fig13": PaperFigure("Recalled words", _words),
+    "fig14": PaperFigure("F by three backgrounds, and accuracy, against the length of words", _words, ("bits",)),
 }
 
 
-def spec_of(figure: Figure, scale: Scale) -> Spec:
+def figure_spec(figure: PaperFigure, scale: Scale) -> Spec:
     """The sweep that a figure needs."""
     return Spec(shared={"t0": scale.t0}, extra=tuple(figure.points(scale)))

@@ -15,18 +15,37 @@ from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.readers import stored_words
-from gmem_jax.reading.report import reading
+from gmem_jax.reading.report import reading_report
 from gmem_jax.reading.training import train
 from gmem_jax.reproduce import choices, claims, draw
 from gmem_jax.reproduce.choices import Effect
 from gmem_jax.reproduce.claims import Verdict
-from gmem_jax.reproduce.compare import Compared, Conditions, Point, compare, compared, points_of, write_csv
-from gmem_jax.reproduce.figures import FIGURES, SHOWN_WORD, Figure, Scale, Values, packs, scale_of, shown_packs, spec_of
+from gmem_jax.reproduce.compare import (
+    Compared,
+    ComputedPoint,
+    Conditions,
+    compare_points,
+    compared,
+    comparison_rows,
+    points_of,
+    write_csv,
+)
+from gmem_jax.reproduce.figures import (
+    FIGURES,
+    SHOWN_WORD,
+    PaperFigure,
+    Scale,
+    Values,
+    figure_spec,
+    packs,
+    scale_of,
+    shown_packs,
+)
 from gmem_jax.reproduce.single_contact import convergence_figure, laws_figure
 from gmem_jax.reproduce.two_grains import two_grains_figure
 from gmem_jax.show.recalls import recall_figure
 from gmem_jax.show.render import packs_figure
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.show.tables import summary
 from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.progress import Progress, silent
@@ -133,7 +152,7 @@ def sensitivity(
     folder.mkdir(parents=True, exist_ok=True)
     named = packs(size, size.grains, size.few)
     same = {AS_THEY_ARE: True}  # a choice is weighed on the same packs
-    spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.points(named)), run=same)
+    spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.choice_points(named)), run=same)
     store = _run(spec, folder, executor, progress, say).store
     done = store.done()
     rows = [row for row in store.card()["points"] if row["key"] in done]
@@ -141,8 +160,8 @@ def sensitivity(
     found, target = choices.effects(named, runs, size.t0), _target(folder, "choices", scale)
     if not found:
         return Weighed([], [], _failed(store))
-    choices.write_csv(target.with_suffix(".csv"), found)
-    choices.draw(target, found, choices.title(size, found[0].gain.packs))
+    write_csv(target.with_suffix(".csv"), choices.effect_rows(found))
+    choices.draw(target, found, choices.choices_title(size, found[0].gain.packs))
     return Weighed(found, [target, target.with_suffix(".svg"), target.with_suffix(".csv")], _failed(store))
 
 
@@ -161,7 +180,7 @@ def check_claims(
     folder.mkdir(parents=True, exist_ok=True)
     (named,) = packs(size, size.grains, 1)
     (spheres,) = packs(size, size.grains, 1, shape="sphere")
-    spec = Spec(shared={"t0": size.t0}, extra=(*claims.points([named]), spheres))
+    spec = Spec(shared={"t0": size.t0}, extra=(*claims.claim_points([named]), spheres))
     runner = _run(spec, folder, executor, progress, say)
     store = runner.store
     if failed := _failed(store):
@@ -235,16 +254,16 @@ def reproduce(
         raise ValueError(f"no figure {name!r}; there are {', '.join(FIGURES)}")
     size, folder = scale_of(scale), Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    store = _run(spec_of(FIGURES[name], size), folder, executor, progress, say).store
+    store = _run(figure_spec(FIGURES[name], size), folder, executor, progress, say).store
     points = points_of(store)
     target = _target(folder, name, scale)
     failed = _failed(store)
     if not points:
         return Outcome(name, [], [], failed)
-    rows = compare(points, size.t0)
+    rows = compare_points(points, size.t0)
     if name == "fig14":
         rows += read_words(folder, store, points, size, say)
-    write_csv(target.with_suffix(".csv"), rows)
+    write_csv(target.with_suffix(".csv"), comparison_rows(rows))
     title = f"{FIGURES[name].title}\n{draw.said_of(rows, f'{size.t0:,.0f}')}"
     _draw(FIGURES[name], name, target, rows, points, store, title)
     files = [target, target.with_suffix(".svg"), target.with_suffix(".csv")]
@@ -252,28 +271,28 @@ def reproduce(
 
 
 def _draw(
-    figure: Figure,
+    figure: PaperFigure,
     name: str,
     target: Path,
     rows: Sequence[Compared],
-    points: Sequence[Point],
+    points: Sequence[ComputedPoint],
     store: Store,
     title: str,
 ) -> None:
     if figure.across:
-        draw.against(target, rows, figure.across, title)
+        draw.draw_comparison(target, rows, figure.across, title)
         return
     recall = store.load(points[0].key)
     configuration = recall.configuration
     if name == "fig04":
         draw.through_time(target, recall, 5, title)
     elif name == "fig06":
-        drawn = render(recall_figure(recall, "signals", configuration))
+        drawn = to_matplotlib(recall_figure(recall, "signals", configuration))
         for suffix in (".png", ".svg"):
             drawn.save(target.with_suffix(suffix))
     else:
         kept = [store.load(point.key) for point in points]
-        draw.words(
+        draw.words_figure(
             target,
             [(recall, recall.configuration) for recall in kept],
             [_shown(point.conditions.bits) for point in points],
@@ -281,7 +300,7 @@ def _draw(
         )
 
 
-def read_words(folder: Path, store: Store, points: Sequence[Point], scale: Scale, say: Tell) -> list[Compared]:
+def read_words(folder: Path, store: Store, points: Sequence[ComputedPoint], scale: Scale, say: Tell) -> list[Compared]:
     """How well recalled words are read, by nets that have seen inputs only, and by the baselines.
 
     Nets are trained once and kept in the folder.
@@ -299,7 +318,7 @@ def read_words(folder: Path, store: Store, points: Sequence[Point], scale: Scale
             say(f"net {seed} for {length} bits: {nets[-1].step} steps, held-out accuracy {nets[-1].validation:.4f}")
         for point in points:
             if point.conditions.bits == length:
-                read = reading(stored_words(store.load(point.key)), nets)["readers"]
+                read = reading_report(stored_words(store.load(point.key)), nets)["readers"]
                 for reader, row in read.items():
                     found.setdefault((point.conditions, f"accuracy {reader}"), []).append(row["accuracy"])
     return [compared(conditions, measure, values, 0) for (conditions, measure), values in found.items()]
@@ -312,7 +331,7 @@ def _shown(bits: int) -> list[int]:
     return [SHOWN_WORD - 1] if bits == 10 else chosen
 
 
-def summary_of(outcome: Outcome) -> dict[str, Any]:
+def outcome_summary(outcome: Outcome) -> dict[str, Any]:
     """An outcome as JSON."""
     lines = [
         {

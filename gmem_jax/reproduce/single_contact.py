@@ -15,7 +15,7 @@ from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.contact.path import contact_path, polyline
 from gmem_jax.physics.pytree import pytree
-from gmem_jax.show.render_matplotlib import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
 CORNERS = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.8), (1.0, 0.8), (1.0, 1.0), (0.0, 1.0)])  # (p, sigma), in R
 FREE: dict[str, Any] = {
@@ -92,7 +92,7 @@ def laws_figure(path: Path, points: int = 200) -> dict[str, float]:
         "along it (middle), and on unloading beside the closed forms (right). M2 remembers at which overlap it was "
         "displaced."
     )
-    save(path, figure, also=(".svg",), caption=caption)
+    save_picture(path, figure, also=(".svg",), caption=caption)
     names = [f"force_{name.replace(', ', '_').replace(' ', '_')}_k" for name in forces]
     write_columns(path.with_suffix(".csv"), ["p_R", "sigma_R", *names], [overlap, displacement, *forces.values()])
     inside = slice(last.start, -1)  # at p = 0 there is no contact any more
@@ -163,7 +163,7 @@ def convergence_figure(path: Path, points: int = 1000) -> dict[str, list[float]]
         "one (middle), and the root mean square of that against Q (right), for the paper's weights, with and without "
         "its h term, and ours."
     )
-    save(path, figure, also=(".svg",), caption=caption)
+    save_picture(path, figure, also=(".svg",), caption=caption)
     shown = {f"{form.replace(', ', ' ')} Q={count}": forces[form, count] for form in FORMS for count in (20, 100, 400)}
     write_columns(path.with_suffix(".csv"), ["p_R", "exact_kM", *shown], [overlap, exact, *shown.values()])
     return errors

@@ -21,7 +21,7 @@ from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.path import contact_path
 from gmem_jax.reproduce.figures import DELTA0
 from gmem_jax.reproduce.single_contact import write_columns
-from gmem_jax.show.render_matplotlib import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 from gmem_jax.simulation.protocol import BINS
 
 STORE = 0.2  # t0, in the picture
@@ -121,7 +121,7 @@ def two_grains_figure(path: Path, count: int = 96, gamma0: float = 1e-3) -> dict
         "the friction forces of three such contacts follow the shear from then on; what is left at u = 1 is released "
         f"where it was taken up. Right: the mean of {count} contacts on the way back is the integral of the waveform."
     )
-    save(path, figure, also=(".svg",), caption=caption)
+    save_picture(path, figure, also=(".svg",), caption=caption)
     names = [f"force_{story.closes[contact]:.3f}_ER2" for contact in shown]
     columns = [story.time, story.u, story.shear, *story.force[:, shown].T]
     write_columns(path.with_suffix(".csv"), ["time_t0", "u", "gamma", *names], columns)

@@ -182,6 +182,6 @@ def u_label(columns: int) -> str:
     return U if columns <= 3 else "u"
 
 
-def part(shown: int, count: int) -> str:
+def shown_part(shown: int, count: int) -> str:
     """What is said where not all signals have panels."""
     return f" (the first {shown} of {count} signals are shown)" if shown < count else ""

@@ -14,7 +14,7 @@ from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.state import Grains
-from gmem_jax.show.figure import Curve, Discs, Figure, Image, Panel, U, grid, part, ramp, u_label
+from gmem_jax.show.figure import Curve, Discs, Figure, Image, Panel, U, grid, ramp, shown_part, u_label
 from gmem_jax.show.recalls import MOST_OF_PAGE, SHEAR
 from gmem_jax.simulation.protocol import BINS
 
@@ -145,7 +145,7 @@ def waves_figure(signals: Signals, target: Signals | None, title: str = "") -> F
         curves = [] if wanted is None else [Curve(u, wanted[number], "target $I(u)$", "0.5", "--", 1.0)]
         curves.append(Curve(u, waves[number], "$I(u)$", "C2"))
         panels.append(Panel(tuple(curves), names[number], u_label(columns), SHEAR, zero=True))
-    over = (f"{title}{part(shown, len(waves))}",)
+    over = (f"{title}{shown_part(shown, len(waves))}",)
     return Figure(tuple(panels), columns, size, over, "panel", shared=("x", "y"))
 
 

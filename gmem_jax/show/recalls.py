@@ -16,8 +16,8 @@ from gmem_jax.files.validation import is_number
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.show import tables
-from gmem_jax.show.figure import Curve, Figure, Image, Panel, U, grid, part, u_label
-from gmem_jax.show.render_matplotlib import Drawing, render
+from gmem_jax.show.figure import Curve, Figure, Image, Panel, U, grid, shown_part, u_label
+from gmem_jax.show.render_matplotlib import Drawing, to_matplotlib
 from gmem_jax.show.stages import AGAINST, QUANTITIES, ZERO, stages_figure
 
 MOST_PANELS = 64  # panels of one picture
@@ -51,7 +51,7 @@ def plot(
         ValueError: if there is no such picture, or no such signal; it names those that there are.
     """
     known = None if experiment is None else describe(experiment, 0.0)
-    return render(recall_figure(recall, what, known, against=against, signals=signals))
+    return to_matplotlib(recall_figure(recall, what, known, against=against, signals=signals))
 
 
 def recall_figure(
@@ -195,7 +195,7 @@ def waveforms_figure(recall: Recall, names: Sequence[str], title: str) -> Figure
         )
         for number in range(shown)
     )
-    return Figure(panels, columns, size, (f"{title}{part(shown, len(recall.J))}",), "panel", shared=("x", "y"))
+    return Figure(panels, columns, size, (f"{title}{shown_part(shown, len(recall.J))}",), "panel", shared=("x", "y"))
 
 
 def image_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
@@ -214,4 +214,4 @@ def image_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
 
 
 def _measures(recall: Recall, shown: int, count: int) -> str:
-    return f"G = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}{part(shown, count)}"
+    return f"G = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}{shown_part(shown, count)}"

@@ -7,7 +7,7 @@ import numpy as np
 
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.physics.pairs import sphere_offsets
-from gmem_jax.show.render_matplotlib import pyplot, save
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
 VIEW = (np.deg2rad(-35.0), np.deg2rad(25.0))  # azimuth and elevation of the eye
 LIGHT = np.array([-0.4, 0.5, 0.77])  # where it comes from: right, up, towards the eye
@@ -81,4 +81,4 @@ def packs_figure(path: Path, packs: Sequence[Pack], title: str, columns: int = 4
         filling = pack.grains * float(pack.clump.mass) / float(np.prod(np.asarray(pack.upper - pack.lower)))
         axis.set_title(f"{pack.grains:,} {pack.clump.shape}, $\\phi$ = {filling:.3f}", fontsize=9)
     figure.suptitle(title, fontsize=10)
-    save(path, figure)
+    save_picture(path, figure)

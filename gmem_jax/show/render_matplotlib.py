@@ -71,7 +71,7 @@ def pyplot() -> Any:
     return plt
 
 
-def save(path: Path, figure: Any, *, also: Sequence[str] = (), caption: str = "") -> None:
+def save_picture(path: Path, figure: Any, *, also: Sequence[str] = (), caption: str = "") -> None:
     """Write a figure of `pyplot` whole, and close it.
 
     Args:
@@ -93,7 +93,7 @@ def save(path: Path, figure: Any, *, also: Sequence[str] = (), caption: str = ""
     pyplot().close(figure)
 
 
-def render(figure: Figure) -> Drawing:
+def to_matplotlib(figure: Figure) -> Drawing:
     """The picture of a figure."""
     from matplotlib.figure import Figure as Canvas
 

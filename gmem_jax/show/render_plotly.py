@@ -42,11 +42,11 @@ def html(figure: Figure | Mapping[str, Figure], name: str) -> str:
         figure: the figure; or several by what is written on their buttons, alike but for their x.
         name: of the part of the page.
     """
-    drawn = render(figure)
+    drawn = to_plotly(figure)
     return str(drawn.to_html(full_html=False, include_plotlyjs=False, config=TOLD, div_id=name))
 
 
-def render(figure: Figure | Mapping[str, Figure]) -> Any:
+def to_plotly(figure: Figure | Mapping[str, Figure]) -> Any:
     """The figure of plotly; see `html`."""
     views = {"": figure} if isinstance(figure, Figure) else dict(figure)
     first = next(iter(views.values()))

@@ -13,7 +13,7 @@ from gmem_jax.files.validation import optional
 from gmem_jax.physics.state import Status
 from gmem_jax.show import render_plotly, tables, view
 from gmem_jax.show.figure import Figure
-from gmem_jax.show.summaries import Grains, Part, Summary, summary_of
+from gmem_jax.show.summaries import GrainView, Part, Summary, summary_of
 
 _CELL = 300  # characters of a value in a configuration
 _NUMBER = re.compile(r"[-+]?\d[\d.,e±\s+-]*|nan|")
@@ -39,7 +39,7 @@ def _cells(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = ""
     return {"head": head, "rows": cells, "right": right, "caption": caption}
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> str:
+def html_table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> str:
     """A table as HTML."""
     return str(_template().module.table(**_cells(head, rows, caption)))
 
@@ -111,13 +111,13 @@ class Report:
         if isinstance(content, Table):
             own = _of_rich(content)
             return own if own["heading"] and not part.heading else {**own, "heading": part.heading}
-        if isinstance(content, Grains):
+        if isinstance(content, GrainView):
             return self._grains(content)
         assert isinstance(content, Figure | Mapping)
         self._figures += 1
         return {"html": _safe(render_plotly.html(content, f"figure-{self._figures}"))}
 
-    def _grains(self, content: Grains) -> Shown:
+    def _grains(self, content: GrainView) -> Shown:
         if content.pack in self._seen:
             return {"text": "Its pack at rest is shown above."}
         try:

@@ -22,7 +22,7 @@ _LEVELS = 65535  # of a number in a page: 1e-3 R in a box of 60 R
 
 
 @dataclass(frozen=True)
-class Quantity:
+class Colouring:
     """What grains are coloured by.
 
     Attributes:
@@ -88,7 +88,7 @@ def _of_grains(frames: Frames, start: np.ndarray, pairs: np.ndarray, values: np.
     return np.asarray(sums).reshape(frames.count, grains)
 
 
-def quantities(frames: Frames, network: Links, newton: float) -> list[Quantity]:
+def quantities(frames: Frames, network: Links, newton: float) -> list[Colouring]:
     """What grains can be coloured by; nothing that is zero everywhere, as friction in a pack at rest.
 
     Args:
@@ -102,13 +102,13 @@ def quantities(frames: Frames, network: Links, newton: float) -> list[Quantity]:
     friction = np.linalg.norm(frames.friction_force, axis=1)
     pushed, rubbed = (_of_grains(frames, frames.start, owners, x) for x in (frames.normal_force, friction))
     moved = [
-        Quantity("displacement", "R", np.linalg.norm(frames.position - frames.position[:1], axis=2)),
-        Quantity("non-affine displacement", "R", np.linalg.norm(frames.position - carried, axis=2)),
+        Colouring("displacement", "R", np.linalg.norm(frames.position - frames.position[:1], axis=2)),
+        Colouring("non-affine displacement", "R", np.linalg.norm(frames.position - carried, axis=2)),
     ]
     found = [
-        Quantity("coordination", "", _of_grains(frames, network.start, network.grains, np.ones(len(network.force)))),
-        Quantity("normal force, sum over contacts", "mN", MILLI * newton * pushed),
-        Quantity("friction force, sum over contacts", "mN", MILLI * newton * rubbed),
+        Colouring("coordination", "", _of_grains(frames, network.start, network.grains, np.ones(len(network.force)))),
+        Colouring("normal force, sum over contacts", "mN", MILLI * newton * pushed),
+        Colouring("friction force, sum over contacts", "mN", MILLI * newton * rubbed),
     ]
     return (moved if frames.count > 1 else []) + [one for one in found if one.values.any()]
 
@@ -126,7 +126,7 @@ def packed(frames: Frames, captions: list[str], material: Material = Material())
     newton = float(material.modulus) * float(material.radius) ** 2
     network = links(frames)
     coloured = quantities(frames, network, newton)
-    force = Quantity("force between grains", "mN", MILLI * newton * network.force)
+    force = Colouring("force between grains", "mN", MILLI * newton * network.force)
     arrays: dict[str, np.ndarray] = {
         "position": frames.position,
         "quaternion": frames.quaternion,
@@ -155,7 +155,7 @@ def packed(frames: Frames, captions: list[str], material: Material = Material())
     return base64.b64encode(zlib.compress(content, 9)).decode()
 
 
-def _told(quantity: Quantity) -> dict[str, Any]:
+def _told(quantity: Colouring) -> dict[str, Any]:
     most = float(quantity.values.max(initial=0.0))
     return {"label": quantity.label, "unit": quantity.unit, "top": quantity.top, "most": most}
 

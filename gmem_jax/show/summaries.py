@@ -47,7 +47,7 @@ _RESOLUTION = "width in v of a point of the waveform that is read back"
 Draw = Callable[[], Figure]
 
 
-class Grains(NamedTuple):
+class GrainView(NamedTuple):
     """A 3D view of a page.
 
     Attributes:
@@ -70,7 +70,7 @@ class Part(NamedTuple):
         folded: whether it is opened by a click on the heading.
     """
 
-    content: str | Table | Figure | Mapping[str, Figure] | Grains
+    content: str | Table | Figure | Mapping[str, Figure] | GrainView
     heading: str = ""
     folded: bool = False
 
@@ -197,7 +197,7 @@ def _grains(recall: Recall, names: Sequence[str], written: Mapping[str, Any]) ->
     if (frames := recall.frames) is not None:
         whose = f"the run of {names[frames.signal - 1]}" if frames.signal else "the run without shear"
         yield Part(f"{frames.count} moments of {whose}; displacements are since the first.", "Grains")
-        yield Part(Grains(lambda: frames, material))
+        yield Part(GrainView(lambda: frames, material))
         return
     yield Part("No frames in this file: gmem recall --frames 10 keeps some.", "Grains")
     of_pack = written.get("pack", {})
@@ -208,7 +208,7 @@ def _grains(recall: Recall, names: Sequence[str], written: Mapping[str, Any]) ->
             raise ValueError("another pack has this name now")
         return at_rest(pack)
 
-    yield Part(Grains(rest, material, str(of_pack.get("sha256"))))
+    yield Part(GrainView(rest, material, str(of_pack.get("sha256"))))
 
 
 def of_pack(
@@ -221,11 +221,11 @@ def of_pack(
     drawn |= {what: partial(stages_figure, kept, what, title, against=against, t0=t0) for what in QUANTITIES if kept}
 
     def parts() -> Iterator[Part]:
-        yield Part(Grains(lambda: at_rest(pack), Material(), pack_fingerprint(pack)))
+        yield Part(GrainView(lambda: at_rest(pack), Material(), pack_fingerprint(pack)))
         if kept:
             yield from _series(kept, [], t0, "Its preparation")
         if frames is not None:
-            yield Part(Grains(lambda: frames, Material()))
+            yield Part(GrainView(lambda: frames, Material()))
 
     facts = {"pack": pack.name, "grains": pack.grains, "ringing_period": float(pack.ringing_period), **pack.info}
     return Summary(f"Pack {pack.name}", facts, [tables.pack_table(pack)], drawn, parts, pack.info)

@@ -310,7 +310,7 @@ def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def reading_tables(result: dict[str, Any]) -> list[Table]:
-    """The readers beside each other and the published accuracy, and the bits' error rates, from a `reading`."""
+    """The readers beside each other and the published accuracy, and the bits' error rates, from a `reading_report`."""
     bits = result["bits"]
     title = f"Reading {result['words']} words of {bits} bits ({result['background'].upper()})"
     readers_table = Table(

@@ -28,8 +28,8 @@ STEP_WORK = 1.0  # work of a step beside its replicas', in theirs: 0.9 at 10,240
 REFRESH_INTERVAL = 0.3  # seconds between changes of what a bar shows
 
 
-def silent(stage: str, time: float, fraction: float) -> None:
-    """Report nothing."""
+def silent(*_: object) -> None:
+    """Report nothing: a callback for whatever reports."""
 
 
 def within(progress: Progress, begun: float, ended: float) -> Progress:

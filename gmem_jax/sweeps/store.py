@@ -22,7 +22,7 @@ from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import OWN, is_locked, locked
-from gmem_jax.files.ours import Folder, sweep
+from gmem_jax.files.ours import Folder, remove_leftovers
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.files.schemas import SWEEP
 from gmem_jax.files.validation import NAME, is_number, printable, source, title, whole
@@ -60,7 +60,7 @@ class Store:
         self._own = Folder(self.folder, SWEEP_MARKER, SWEEP.name, _OWN, {"shared": {}, "names": [], "points": []})
         for name in FOLDERS if make else ():
             self._own.make(name)
-            sweep(self.folder / name, age=WRITTEN)
+            remove_leftovers(self.folder / name, age=WRITTEN)
 
     def write_manifest(
         self,

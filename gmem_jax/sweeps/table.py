@@ -79,7 +79,7 @@ def means(table: Sequence[dict[str, Any]], names: Sequence[str], over: Sequence[
     return found
 
 
-def export(store: Store, path: Path) -> str:
+def export_table(store: Store, path: Path) -> str:
     """Write the table: .csv (see `plain_cell`); .parquet; .h5 or .nc, which xarray reads, with every recalled signal.
 
     Returns:

@@ -173,14 +173,14 @@ class Requeued:
         """Work."""
         if hasattr(signal, "SIGUSR2") and callable(leave := signal.getsignal(signal.SIGUSR2)):
             signal.signal(signal.SIGUSR2, lambda *which: part_with(lambda: leave(*which)))
-        return main(arguments)
+        return run_worker(arguments)
 
     def checkpoint(self, arguments: list[str]) -> Any:
         """The same again, for submitit."""
         return importlib.import_module("submitit.helpers").DelayedSubmission(self, arguments)
 
 
-def main(arguments: list[str]) -> int:
+def run_worker(arguments: list[str]) -> int:
     """Entry point of a worker's process; 0 if it did what it could."""
     if ATTACHED in arguments[3:]:
         end_with_parent()
@@ -200,4 +200,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_worker(sys.argv[1:]))

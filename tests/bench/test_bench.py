@@ -24,12 +24,12 @@ def pack() -> gm.Pack:
 
 
 def test_a_row_is_a_measurement_whose_result_backends_share(pack: gm.Pack) -> None:
-    rows = [bench.measure(pack, "jax", "H", 2, seconds=0.0)]
+    rows = [bench.time_rollout(pack, "jax", "H", 2, seconds=0.0)]
     assert rows[0].grains == 27
     assert 0.0 < rows[0].us < 1e3
     assert rows[0].compile_s > 0.0
     if native.available()[0]:
-        rows.append(bench.measure(pack, "native", "H", 2, seconds=0.0))
+        rows.append(bench.time_rollout(pack, "native", "H", 2, seconds=0.0))
         assert bench.disagreements(rows) == []
     wrong = [*rows[:1], replace(rows[0], engine="native", p_xy=rows[0].p_xy * (1.0 + 1e-3))]
     assert "N = 27, 2 replicas" in bench.disagreements(wrong)[0]
@@ -118,7 +118,7 @@ def test_rivals_take_turns_and_the_best_counts() -> None:
 @pytest.mark.slow
 def test_what_was_measured_is_kept_at_once(pack: gm.Pack) -> None:
     kept: list[int] = []
-    result = bench.run(
+    result = bench.run_benchmark(
         lambda _: pack,
         ["p"],
         laws=["H", "M1"],
@@ -153,11 +153,11 @@ def test_large_histories_are_left_out(pack: gm.Pack) -> None:
 def test_the_table_of_a_gpu_has_what_was_timed_or_says_that_nothing_was() -> None:
     needs = {"H": {name: (188, 0) for name in gpu.ARCHITECTURES}}
     facts = {"registers": needs, "bytes": {"tetra-27": gpu.bytes_per_grain_step(gm.load_pack(PACK))}}
-    text = gpu.markdown(facts, None)
+    text = gpu.gpu_markdown(facts, None)
     assert "| H | 188, 0 | 188, 0 | 188, 0 | 188, 0 |" in text
     assert "Not timed: no GPU was at hand." in text
     row = {"pack": "tetra-27", "grains": 27, "replicas": 8, "us": 2e-3, "compile_s": 1.0}
-    text = gpu.markdown(facts, {"device": "G", "copied_bytes_per_s": 2e12, "rows": [row]})
+    text = gpu.gpu_markdown(facts, {"device": "G", "copied_bytes_per_s": 2e12, "rows": [row]})
     assert "G; a copy moves 2000 GB/s" in text
     assert f"| 27 | 8 | 2.000 | {facts['bytes']['tetra-27']['memory'] / 2.0:.0f} | 1.0 |" in text
 

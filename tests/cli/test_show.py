@@ -16,7 +16,7 @@ from gmem_jax.files import schemas
 from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import save_waveforms
 from gmem_jax.show import recalls
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.show.summaries import PLOTS
 from gmem_jax.sweeps.plan import point
 from gmem_jax.sweeps.store import Store
@@ -268,7 +268,8 @@ def test_where_a_drive_rings_the_mean_over_the_ringing_is_drawn(recalled: tuple[
     assert recalls.MEAN in labels
     slow = dict(gm.describe(experiment, 0.0), t0=1.8e4)
     labels = [
-        text.get_text() for text in render(recalls.recall_figure(recall, "signals", slow)).figure.legends[0].get_texts()
+        text.get_text()
+        for text in to_matplotlib(recalls.recall_figure(recall, "signals", slow)).figure.legends[0].get_texts()
     ]
     assert recalls.MEAN not in labels
 
@@ -279,7 +280,7 @@ def test_more_signals_than_fit_are_said_to_be_more(
     monkeypatch.setattr(recalls, "MOST_PANELS", 4)
     many = {name: np.tile(getattr(recalled[1], name), (40, 1)) for name in ("J", "shear", "p_sig")}
     recall = type(recalled[1])(**{**vars(recalled[1]), **many})
-    figure = render(recalls.signals_figure(recall, [f"{number:07b}" for number in range(80)], "a pack")).figure
+    figure = to_matplotlib(recalls.signals_figure(recall, [f"{number:07b}" for number in range(80)], "a pack")).figure
     assert "the first 4 of 80 signals are shown" in " ".join(figure._suptitle.get_text().split())
     assert [axis.get_title() for axis in figure.axes[:3]] == ["0000000", "0000001", "0000010"]
 

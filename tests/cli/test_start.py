@@ -18,7 +18,7 @@ from gmem_jax.files.cache import kept, kept_pack
 from gmem_jax.physics.rules import StartError
 from gmem_jax.show import summaries
 from gmem_jax.show.figure import Curve, Figure, Panel
-from gmem_jax.show.render_matplotlib import pyplot, render, save
+from gmem_jax.show.render_matplotlib import pyplot, save_picture, to_matplotlib
 
 ENTRY = [sys.executable, "-c", "import sys; sys.argv[0] = 'gmem'; from gmem_start import main; main()"]
 
@@ -110,12 +110,12 @@ def test_a_fault_of_jax_is_not_called_one_of_the_file(monkeypatch: pytest.Monkey
 def test_pictures_need_no_latex_whatever_the_settings_of_matplotlib(tmp_path: Path) -> None:
     with matplotlib.rc_context({"text.usetex": True}):
         curve = Curve(np.arange(2.0), np.arange(2.0), "50 % & more")
-        render(Figure((Panel((curve,)),), legend="panel")).save(tmp_path / "drawing.png")
+        to_matplotlib(Figure((Panel((curve,)),), legend="panel")).save(tmp_path / "drawing.png")
     with matplotlib.rc_context({"text.usetex": True}):
         figure, axis = pyplot().subplots()
         axis.plot([0.0, 1.0])
         axis.set_title("a_b")
-        save(tmp_path / "pyplot.png", figure)
+        save_picture(tmp_path / "pyplot.png", figure)
     assert {path.name for path in tmp_path.iterdir()} == {"drawing.png", "pyplot.png"}
 
 

@@ -17,7 +17,7 @@ from gmem_jax.command import app as cli
 from gmem_jax.files import exporters
 from gmem_jax.files.exporters import format_of, frames_of_pack
 from gmem_jax.files.importers import load_spheres
-from gmem_jax.files.loads import pressure_tensor, wall_forces
+from gmem_jax.files.loads import frame_wall_forces, pressure_tensor
 from gmem_jax.physics import grain
 from gmem_jax.preparation import imported
 from gmem_jax.simulation.frames import Frames, sphere_places
@@ -141,14 +141,14 @@ def test_the_pressure_tensor_of_a_pack_at_rest_is_what_its_walls_measured(
     pack_frames: Frames, run_frames: Frames, tmp_path: Path
 ) -> None:
     measured = PACK.info["at_rest"]["pressure"]
-    walls = wall_forces(pack_frames, 0, SOLID)
+    walls = frame_wall_forces(pack_frames, 0, SOLID)
     tensor = pressure_tensor(pack_frames, 0, walls)
     np.testing.assert_allclose(np.diag(tensor), measured, rtol=1e-5)
     np.testing.assert_allclose(tensor, tensor.T, atol=1e-5 * max(measured))
     assert np.all(np.diag(pressure_tensor(pack_frames, 0, 0.0 * walls)) < 0.8 * np.array(measured))
     moved = replace(run_frames, start=np.array([0, 0, 0]), spheres=np.zeros((0, 2), int), normal_force=np.zeros(0))
     moved = replace(moved, friction_force=np.zeros((0, 3)))
-    one, other = (pressure_tensor(moved, number, wall_forces(moved, number, SOLID)) for number in (0, 1))
+    one, other = (pressure_tensor(moved, number, frame_wall_forces(moved, number, SOLID)) for number in (0, 1))
     np.testing.assert_allclose(one, other, rtol=1e-9)  # wherever the box lies
     told = written(tmp_path, "xyz", pack_frames).read_text().splitlines()[1]
     found = np.array(told.split('pressure_tensor="')[1].split('"')[0].split(), float)
@@ -171,7 +171,7 @@ def test_friction_shears_the_pressure_tensor() -> None:
         offsets=np.zeros((1, 3)),
         stages=("rest",),
     )
-    tensor = pressure_tensor(two, 0, wall_forces(two, 0, SOLID))
+    tensor = pressure_tensor(two, 0, frame_wall_forces(two, 0, SOLID))
     wanted = np.zeros((3, 3))
     wanted[:2, 0] = 3.0 * 1.9 / 1000.0, -2.0 * 1.9 / 1000.0
     np.testing.assert_allclose(tensor, wanted, atol=1e-15)
@@ -183,7 +183,7 @@ def test_paraview_reads_what_was_written(run_frames: Frames, pack_frames: Frames
     np.testing.assert_array_equal(spheres.points, pack_frames.centres(0))
     np.testing.assert_array_equal(spheres["grain"], grains(pack_frames) + 1)
     np.testing.assert_array_equal(spheres["radius"], 1.0)
-    walls = wall_forces(pack_frames, 0, SOLID)
+    walls = frame_wall_forces(pack_frames, 0, SOLID)
     np.testing.assert_array_equal(spheres["wall_force"], walls)
     np.testing.assert_array_equal(
         spheres.field_data["pressure_tensor"].reshape(3, 3), pressure_tensor(pack_frames, 0, walls)
@@ -210,7 +210,7 @@ def test_extended_xyz_has_a_line_for_every_sphere(run_frames: Frames, tmp_path: 
     np.testing.assert_array_equal(table[:, 4], grains(run_frames) + 1)
 
 
-@pytest.mark.skipif(lammps.missing() is not None, reason="LAMMPS does not start")
+@pytest.mark.skipif(lammps.missing_lammps() is not None, reason="LAMMPS does not start")
 def test_lammps_reads_what_was_written(pack_frames: Frames, run_frames: Frames, tmp_path: Path) -> None:
     data, dump = written(tmp_path, "lammps", pack_frames), written(tmp_path, "lammps", run_frames)
     seen = 'write_dump all custom {} id mol x y z radius modify sort id format float "%20.15g"'

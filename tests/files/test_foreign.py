@@ -91,7 +91,7 @@ def test_what_lammps_writes_is_read(tmp_path: Path, content: str | bytes) -> Non
     np.testing.assert_array_equal(found.upper, [2.0, 0.99, 0.99])
 
 
-@pytest.mark.skipif(lammps.missing() is not None, reason="LAMMPS does not start")
+@pytest.mark.skipif(lammps.missing_lammps() is not None, reason="LAMMPS does not start")
 @pytest.mark.parametrize("labels", ["", "types labels"])
 def test_what_lammps_writes_back_of_an_exported_pack_is_that_pack(tmp_path: Path, labels: str) -> None:
     frames = frames_of_pack(PACK)

@@ -18,12 +18,12 @@ from gmem_jax.command import app as cli
 from gmem_jax.command.console import check_output
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import Checkpoints, locked
-from gmem_jax.files.ours import Folder, sweep, temporary
+from gmem_jax.files.ours import Folder, remove_leftovers, temporary
 from gmem_jax.files.packs import load_pack
 from gmem_jax.sweeps.spec import spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SweepRunner
-from gmem_jax.sweeps.table import export, rows
+from gmem_jax.sweeps.table import export_table, rows
 
 PACK = TETRA_27
 ROOT = Path(gm.__file__).parent
@@ -262,10 +262,10 @@ def test_only_leftovers_of_ours_are_swept(tmp_path: Path) -> None:
     other = temporary(tmp_path / "p.h5")
     for name in (".o.h5.notes.tmp", ".gmem-mine.tmp"):
         (tmp_path / name).write_text("mine")
-    sweep(tmp_path, "o.h5")
+    remove_leftovers(tmp_path, "o.h5")
     assert not left.exists()
     assert other.exists()
-    sweep(tmp_path)
+    remove_leftovers(tmp_path)
     assert sorted(tree(tmp_path)) == [".gmem-mine.tmp", ".o.h5.notes.tmp"]
 
 
@@ -317,7 +317,7 @@ def test_points_that_were_exchanged_give_no_numbers(swept: Path, tmp_path: Path)
     exchange(one, other)
     try:
         store = Store(swept, make=False)
-        for read in (lambda: rows(store), lambda: export(store, tmp_path / "o.csv")):
+        for read in (lambda: rows(store), lambda: export_table(store, tmp_path / "o.csv")):
             with pytest.raises(gm.FileFormatError, match="files were exchanged"):
                 read()
         assert set(store.unreadable({one.stem, other.stem})) == {one.stem, other.stem}  # so a sweep runs them again

@@ -156,4 +156,4 @@ def test_a_designed_file_says_how_its_design_went(tmp_path: Path) -> None:
 
 def test_the_page_of_the_files_is_that_of_the_tables() -> None:
     page = ROOT / "docs" / "files.md"
-    assert page.read_text() == schemas.page(), "python docs/make/files_page.py"
+    assert page.read_text() == schemas.schema_page(), "python docs/make/files_page.py"

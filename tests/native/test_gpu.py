@@ -23,7 +23,7 @@ import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.native import build, cuda, library, primitives
 from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of
-from gmem_jax.native.primitives import Arrays, Call, Fixed, Results
+from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics.grain import sphere
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import System, start
@@ -122,17 +122,17 @@ def spheres() -> Scene:
 
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
-def emulate(call: Call, fixed: Fixed, arrays: Arrays) -> tuple[Results, list[jax.Array]]:
+def emulate(call: Call, fixed: Fixed, arrays: Arrays) -> tuple[StepOutput, list[jax.Array]]:
     """What a GPU would give, and what it had between steps."""
     shapes = primitives._of_results((fixed, arrays))
-    found = cuda.run("gmem_emulated_advance", call, True, (fixed, arrays), shapes)
+    found = cuda.call_kernels("gmem_emulated_advance", call, True, (fixed, arrays), shapes)
     return primitives._results(arrays, found[: len(shapes)]), list(found[len(shapes) :])
 
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
-def emulate_tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> Results:
+def emulate_tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> StepOutput:
     shapes = primitives._of_results((fixed, arrays))
-    found = cuda.run("gmem_emulated_tangent", call, False, (fixed, arrays, along), shapes)
+    found = cuda.call_kernels("gmem_emulated_tangent", call, False, (fixed, arrays, along), shapes)
     return primitives._results(arrays, found[: len(shapes)])
 
 

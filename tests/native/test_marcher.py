@@ -16,8 +16,8 @@ from scenes import TETRA_27
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.native import cuda, library, primitives
-from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of, warn_once
-from gmem_jax.native.primitives import Arrays, Results
+from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of, warn_no_library
+from gmem_jax.native.primitives import Arrays, StepOutput
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import System, start
@@ -66,10 +66,10 @@ def derivatives(march: native.March, system: System = SYSTEM) -> Callable[..., A
 
 @pytest.fixture
 def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr(library, "load", lambda: ("", "it was not built"))
-    warn_once.cache_clear()
+    monkeypatch.setattr(library, "load_library", lambda: ("", "it was not built"))
+    warn_no_library.cache_clear()
     yield
-    warn_once.cache_clear()
+    warn_no_library.cache_clear()
 
 
 CALLS_ALLOWED = [export.DisabledSafetyCheck.custom_call(target) for target in primitives.TARGETS]
@@ -97,14 +97,14 @@ def test_auto_is_the_library_where_it_runs_and_the_definition_elsewhere(monkeypa
 @needs_library
 def test_a_gpu_without_nvrtc_runs_plain_jax_and_says_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "missing", lambda: "NVRTC was not found")
-    cuda.warn_once.cache_clear()
+    cuda.warn_no_nvrtc.cache_clear()
     with pytest.warns(UserWarning, match=r"plain JAX runs on the GPU.*NVRTC"):
         program = lowered(native.marcher("auto"), "cuda")
     assert "custom_call @gmem" not in program
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         lowered(native.marcher("auto"), "cuda")
-    cuda.warn_once.cache_clear()
+    cuda.warn_no_nvrtc.cache_clear()
     with pytest.raises(NotImplementedError, match="NVRTC was not found"):
         lowered(native.march, "cuda")
 
@@ -136,13 +136,13 @@ def test_the_definition_of_a_call_is_what_the_library_computes(law: Any, isotrop
         grains = replace(STATE.grains, spin=speed + STATE.grains.spin)
         return arrays_of(system, grains, history, squeeze(RATES * (1.0 + speed)), numbers)
 
-    def both(use: Callable[[Arrays], Results]) -> Any:
+    def both(use: Callable[[Arrays], StepOutput]) -> Any:
         def value(speed: jax.Array) -> Any:
             return jax.tree.map(lambda leaf: jnp.sum(leaf**2), use(arrays(speed)))
 
         return jax.jit(jax.vmap(value))(jnp.asarray([0.0, 0.02]))
 
-    fast = both(lambda arrays: primitives.forward(call, definition, fixed, arrays))
+    fast = both(lambda arrays: primitives.advance(call, definition, fixed, arrays))
     plain = both(lambda arrays: definition(fixed, arrays))
     for one, other in zip(jax.tree.leaves(fast), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-18)

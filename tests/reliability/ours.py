@@ -24,7 +24,7 @@ import psutil
 
 import gmem_jax as gm
 from gmem_jax.files.checkpoints import Checkpoints, locked
-from gmem_jax.files.ours import sweep
+from gmem_jax.files.ours import remove_leftovers
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.training import Training, initial, save, train
 from gmem_jax.sweeps.processes import RUNNER
@@ -85,7 +85,7 @@ def deletion(tries: int, chance: random.Random) -> Counter[str]:
         "parts, --restart": lambda folder: Checkpoints(folder, {"seed": 1}, restart=True).discard(),
         "sweep": lambda folder: (Store(folder).order([]), Store(folder).clear_failures()),
         "sweep, looked at": lambda folder: rows(Store(folder, make=False)),
-        "leftovers": lambda folder: sweep(folder.resolve()),
+        "leftovers": lambda folder: remove_leftovers(folder.resolve()),
         "lock": lambda folder: _lock(folder / "o"),
     }
     for number in range(tries):

@@ -16,7 +16,8 @@ from gmem_jax.files.named import named_experiment, named_signals
 from gmem_jax.physics.contact.kinematics import transport
 from gmem_jax.physics.contact.path import led_contact
 from gmem_jax.reproduce import choices
-from gmem_jax.reproduce.choices import CHOICES, effects, points
+from gmem_jax.reproduce.choices import CHOICES, choice_points, effects
+from gmem_jax.reproduce.compare import write_csv
 from gmem_jax.simulation.protocol import Bin
 from gmem_jax.simulation.strain import StrainPath
 
@@ -94,10 +95,10 @@ def test_words_that_do_not_fit_and_pads_of_other_signals_are_refused() -> None:
 
 def test_every_value_is_tried_once_on_every_pack() -> None:
     packs = [{"pack": "a"}, {"pack": "b"}]
-    rows = [tuple(sorted(values.items())) for values in points(packs)]
+    rows = [tuple(sorted(values.items())) for values in choice_points(packs)]
     assert len(set(rows)) == len(rows)
-    assert {"pack": "a"} in points(packs)
-    assert {"pack": "b", "friction": "M2", "variant": "paper"} in points(packs)
+    assert {"pack": "a"} in choice_points(packs)
+    assert {"pack": "b", "friction": "M2", "variant": "paper"} in choice_points(packs)
 
 
 def test_effects_are_differences_on_the_same_pack(tmp_path: Path) -> None:
@@ -118,7 +119,7 @@ def test_effects_are_differences_on_the_same_pack(tmp_path: Path) -> None:
     assert (stiff.of_gain.sd, stiff.of_gain.packs) == (pytest.approx(0.1 / math.sqrt(2.0)), 2)
     assert found["stiffness", 0.13].default
     assert ("stiffness", 0.10) not in found  # not run
-    choices.write_csv(tmp_path / "choices.csv", list(found.values()))
+    write_csv(tmp_path / "choices.csv", choices.effect_rows(list(found.values())))
     assert (tmp_path / "choices.csv").read_text().count("\n") == 1 + len(found)
     choices.draw(tmp_path / "choices.png", list(found.values()), "two packs")
     assert (tmp_path / "choices.svg").stat().st_size > 200

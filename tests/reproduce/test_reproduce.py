@@ -15,9 +15,19 @@ from scenes import TETRA_27
 import gmem_jax as gm
 from gmem_jax.reproduce import claims, draw, figures
 from gmem_jax.reproduce import run as reproducing
-from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, Point, compare, compared, read_csv, write_csv
+from gmem_jax.reproduce.compare import (
+    Compared,
+    ComputedPoint,
+    Conditions,
+    Estimate,
+    compare_points,
+    compared,
+    comparison_rows,
+    read_csv,
+    write_csv,
+)
 from gmem_jax.reproduce.draw import power
-from gmem_jax.reproduce.figures import FIGURES, SCALES, Figure, packs, scale_of, spec_of
+from gmem_jax.reproduce.figures import FIGURES, SCALES, PaperFigure, figure_spec, packs, scale_of
 from gmem_jax.show.tables import published
 from gmem_jax.simulation.progress import silent
 from gmem_jax.sweeps.executors import Executor
@@ -90,7 +100,10 @@ def test_differences_are_in_units_of_the_combined_error() -> None:
 
 def test_fast_drives_count_after_averaging_over_the_ringing() -> None:
     numbers = {"gain": 0.3, "fidelity": 0.8, "windowed_gain": 0.31, "windowed_fidelity": 0.9, "status": 4}
-    found = [{row.measure: row for row in compare([Point(STANDARD, numbers, "k")], t0)} for t0 in (1.8e3, 1.8e4)]
+    found = [
+        {row.measure: row for row in compare_points([ComputedPoint(STANDARD, numbers, "k")], t0)}
+        for t0 in (1.8e3, 1.8e4)
+    ]
     assert [rows["F"].ours.mean for rows in found] == [0.9, 0.8]
     assert [rows["G"].ours.mean for rows in found] == [0.31, 0.3]
     assert found[0]["F"].status == 4
@@ -101,7 +114,7 @@ def test_so_do_words_by_every_background() -> None:
     numbers = {**of, "status": 0, "backgrounds": {"sub0": {**of, "windowed_fidelity": 0.77}, "sub2-bl": of}}
     words = replace(STANDARD, bits=3, background="sub2-bl")
     for t0, expected in ((5.4e3, {"sub0": 0.77, "sub2-bl": 0.78}), (1.8e4, {"sub0": 0.72, "sub2-bl": 0.72})):
-        rows = [row for row in compare([Point(words, numbers, "k")], t0) if row.measure == "F"]
+        rows = [row for row in compare_points([ComputedPoint(words, numbers, "k")], t0) if row.measure == "F"]
         assert {row.conditions.background: row.ours.mean for row in rows} == expected
 
 
@@ -125,7 +138,7 @@ def test_the_exponent_of_a_power_law() -> None:
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_figure_has_points_and_no_point_twice(name: str, scale: str) -> None:
-    points = spec_of(FIGURES[name], SCALES[scale]).extra
+    points = figure_spec(FIGURES[name], SCALES[scale]).extra
     rows = [tuple(sorted(values.items())) for values in points]
     assert rows
     assert len(set(rows)) == len(rows)
@@ -154,8 +167,8 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     def points(scale: figures.Scale) -> list[figures.Values]:
         return [{"pack": PACK, "mu": mu} for mu in (0.5, 1.0)]
 
-    monkeypatch.setitem(FIGURES, "fig08", Figure("friction", points, ("mu",)))
-    monkeypatch.setitem(FIGURES, "fig06", Figure("one", lambda scale: points(scale)[1:]))
+    monkeypatch.setitem(FIGURES, "fig08", PaperFigure("friction", points, ("mu",)))
+    monkeypatch.setitem(FIGURES, "fig06", PaperFigure("one", lambda scale: points(scale)[1:]))
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(reproducing, "quick_cost", lambda points: 1e-7)
     said: list[str] = []
@@ -179,8 +192,8 @@ def test_each_condition_that_is_varied_has_its_line_of_panels(monkeypatch: pytes
     at += [replace(STANDARD, overlap=0.8), replace(STANDARD, shape="sphere", overlap=1.0)]
     rows = [compared(each, measure, [0.3, 0.4], 0) for each in at for measure in "FG"]
     drawn: list[Any] = []
-    monkeypatch.setattr(draw, "save", lambda path, figure, also: drawn.append(figure))
-    draw.against(tmp_path / "fig11.png", rows, ("gamma0", "overlap"), "title")
+    monkeypatch.setattr(draw, "save_picture", lambda path, figure, also: drawn.append(figure))
+    draw.draw_comparison(tmp_path / "fig11.png", rows, ("gamma0", "overlap"), "title")
     panels = [
         {
             tuple(line.get_xdata())
@@ -193,14 +206,14 @@ def test_each_condition_that_is_varied_has_its_line_of_panels(monkeypatch: pytes
     said = [[text.get_text() for text in axis.get_legend().get_texts()] for axis in drawn[0].axes]
     whose = ["gmem_jax, N = 10,240", "published, N = 10,240"]
     assert said == [[*whose, "$\\delta_0$ = 0.02", "$\\delta_0$ = 0.05"]] * 2 + [whose] * 2
-    draw.against(tmp_path / "fig08.png", rows[:2], ("mu",), "one point")
+    draw.draw_comparison(tmp_path / "fig08.png", rows[:2], ("mu",), "one point")
     assert len(drawn[1].axes) == 2
 
 
 def _axes(monkeypatch: pytest.MonkeyPatch, rows: list[Compared], across: str) -> list[Any]:
     drawn: list[Any] = []
-    monkeypatch.setattr(draw, "save", lambda path, figure, also: drawn.append(figure))
-    draw.against(Path("x.png"), rows, (across,), "title")
+    monkeypatch.setattr(draw, "save_picture", lambda path, figure, also: drawn.append(figure))
+    draw.draw_comparison(Path("x.png"), rows, (across,), "title")
     return list(drawn[0].axes)
 
 
@@ -247,7 +260,7 @@ def test_titles_are_said_in_words() -> None:
 
 def test_a_table_is_read_beside_what_is_published_now(tmp_path: Path) -> None:
     rows = [compared(replace(STANDARD, grains=31_680), "G", [0.393], 1024), compared(STANDARD, "F", [0.9, 0.91], 0)]
-    write_csv(tmp_path / "x.csv", [rows[0]._replace(theirs=None, grains=0), rows[1]])
+    write_csv(tmp_path / "x.csv", comparison_rows([rows[0]._replace(theirs=None, grains=0), rows[1]]))
     one, other = read_csv(tmp_path / "x.csv")
     assert one.theirs == Estimate(0.3671, 0.0033, 7)
     assert (one.grains, one.status, one.ours.packs) == (31_680, 1024, 1)
@@ -274,12 +287,12 @@ def test_all_published_points_are_known(changed: dict[str, Any], measure: str, m
 
 def test_recalled_words_have_one_scale(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     drawn: list[Any] = []
-    monkeypatch.setattr(draw, "save", lambda path, figure, also, caption: drawn.append((figure, caption)))
+    monkeypatch.setattr(draw, "save_picture", lambda path, figure, also, caption: drawn.append((figure, caption)))
     pack, both = gm.load_pack(PACK), []
     for bits in (1, 2):
         experiment = gm.Experiment(pack, gm.words(bits), t0=75.0, store=0.1, rest=0.1, hold=0.1, background="sub2-bl")
         both.append((gm.run(experiment), gm.describe(experiment, 1.0)))
-    draw.words(tmp_path / "fig13.png", both, [[0, 1], [0, 1, 2]], "title")
+    draw.words_figure(tmp_path / "fig13.png", both, [[0, 1], [0, 1, 2]], "title")
     figure, caption = drawn[0]
     assert len({axis.get_ylim() for axis in figure.axes}) == 1
     assert [len(axis.lines) for axis in figure.axes if axis.get_visible()] == [4] * 5  # zero, recalled, mean, integral

@@ -21,7 +21,7 @@ FIGURE = Figure((LEFT, RIGHT), 2, (8.0, 3.0), legend="panel")
 
 def test_both_renderers_draw_the_same_numbers() -> None:
     pytest.importorskip("plotly")
-    picture, page = render_matplotlib.render(FIGURE).figure, render_plotly.render(FIGURE)
+    picture, page = render_matplotlib.to_matplotlib(FIGURE).figure, render_plotly.to_plotly(FIGURE)
     left, right = picture.axes[:2]
     for line, trace in zip((left.containers[0].lines[0], left.lines[-1]), page.data, strict=False):
         np.testing.assert_allclose(line.get_ydata(), trace.y, rtol=1e-6)  # single precision in a page

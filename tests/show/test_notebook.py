@@ -14,7 +14,7 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.experiment.html import listing
 from gmem_jax.show import recalls
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.simulation.progress import ProgressChoice, callback, no_further_bar, shows_progress
 from gmem_jax.sweeps.sweep import Result, Results
 
@@ -98,7 +98,7 @@ def test_the_scaled_integral_without_an_experiment_is_that_with_it(
 ) -> None:
     experiment, recall = recalled
     one, other = (
-        render(recalls.signals_figure(recall, ["0", "1"], "", scale)).figure.axes[0].lines[2].get_ydata()
+        to_matplotlib(recalls.signals_figure(recall, ["0", "1"], "", scale)).figure.axes[0].lines[2].get_ydata()
         for scale in (None, experiment.scale)
     )
     np.testing.assert_allclose(one, other, rtol=1e-12)

@@ -12,7 +12,7 @@ from gmem_jax.experiment.signals import bin_average, part
 from gmem_jax.reproduce import run as reproducing
 from gmem_jax.reproduce.two_grains import tell
 from gmem_jax.show.render import camera, rendered
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.show.sweeps import sweep_figure
 from gmem_jax.show.tables import cell
 
@@ -62,6 +62,6 @@ def test_packs_are_called_by_their_files_and_else_by_their_whole_names() -> None
 
 def test_a_sweep_is_drawn_over_what_can_be_counted() -> None:
     rows = [{"pack": pack, "mu": mu, "gain": mu, "state": "done"} for pack in ("a.h5", "b.h5") for mu in (0.2, 1.0)]
-    (axis,) = render(sweep_figure(rows, ["pack", "mu"], "gain", "mu")).figure.axes
+    (axis,) = to_matplotlib(sweep_figure(rows, ["pack", "mu"], "gain", "mu")).figure.axes
     assert axis.get_xlabel() == "mu"
     np.testing.assert_allclose(axis.lines[1].get_xydata(), [[0.2, 0.2], [1.0, 1.0]])

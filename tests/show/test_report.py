@@ -23,8 +23,8 @@ from gmem_jax.command import app
 from gmem_jax.experiment import analysis
 from gmem_jax.show import render_plotly
 from gmem_jax.show.recalls import signals_figure
-from gmem_jax.show.report import Report, table
-from gmem_jax.show.scene import Quantity, at_rest, links, packed, quantities
+from gmem_jax.show.report import Report, html_table
+from gmem_jax.show.scene import Colouring, at_rest, links, packed, quantities
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import MEASURED, Sample
 
@@ -150,7 +150,7 @@ def test_packs_stand_in_one_table_only_if_nothing_else_differs(folder: Path, tmp
 
 
 def test_colours_end_somewhere_though_nothing_touches() -> None:
-    assert Quantity("force on a grain", "N", np.zeros((1, 0))).top == 1.0
+    assert Colouring("force on a grain", "N", np.zeros((1, 0))).top == 1.0
 
 
 def unpacked(text: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -228,7 +228,7 @@ def test_errors_over_signals_are_those_of_leaving_each_out() -> None:
 
 def test_no_curve_of_the_recalled_signals_is_cut_off() -> None:
     pytest.importorskip("plotly")
-    figure = render_plotly.render(signals_figure(made_up(), ["one", "two"], scale=EXPERIMENT.scale, page=True))
+    figure = render_plotly.to_plotly(signals_figure(made_up(), ["one", "two"], scale=EXPERIMENT.scale, page=True))
     lowest, highest = min(line.y.min() for line in figure.data), max(line.y.max() for line in figure.data)
     for axis in figure.select_yaxes():
         assert axis.range[0] < lowest < highest < axis.range[1]
@@ -265,7 +265,7 @@ def test_a_page_holds_all_that_it_needs(page: Path) -> None:
 
 def test_what_files_say_is_text_and_no_html(page: Path) -> None:
     assert HOSTILE not in page.read_text(encoding="utf-8")
-    assert table(["<a>"], [["&"]]).count("<a>") == 0
+    assert html_table(["<a>"], [["&"]]).count("<a>") == 0
 
 
 def test_a_view_of_a_notebook_is_a_page_in_a_frame() -> None:

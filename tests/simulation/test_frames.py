@@ -17,7 +17,7 @@ from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.schemas import RECALL
 from gmem_jax.physics.state import Grains, State
 from gmem_jax.physics.step import System, contact_forces, sphere_table
-from gmem_jax.preparation.preparation import frame_schedule as preparation_schedule
+from gmem_jax.preparation.preparation import preparation_frames as preparation_schedule
 from gmem_jax.simulation.frames import Frames, concatenate, configuration, places
 
 PACK = gm.load_pack(TETRA_27)

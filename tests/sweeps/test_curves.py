@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gmem_jax.show import render_plotly
-from gmem_jax.show.render_matplotlib import render
+from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.show.sweeps import against, sweep_figure
 from gmem_jax.sweeps.curves import Axes, axes_of, lines_of
 
@@ -58,7 +58,7 @@ def test_errors_are_standard_errors_over_the_samples() -> None:
 
 
 def test_a_picture_has_a_line_with_bars_for_each_value_and_says_over_what() -> None:
-    figure = render(sweep_figure(ROWS, NAMES, "fidelity", "swept")).figure
+    figure = to_matplotlib(sweep_figure(ROWS, NAMES, "fidelity", "swept")).figure
     (axis,) = figure.axes
     assert [text.get_text() for text in axis.get_legend().get_texts()] == ["gamma0 = 0.001", "gamma0 = 0.002"]
     bars = [bar.get_segments() for bar in axis.collections]
@@ -71,7 +71,7 @@ def test_a_picture_has_a_line_with_bars_for_each_value_and_says_over_what() -> N
 def test_names_stand_on_the_axis_as_words_and_make_no_line() -> None:
     rows = [{**row, "friction": law, "hold_drag": drag} for row in ROWS for law in "HM" for drag in (0.1, "none")]
     for x, ticks in {"friction": ["H", "M"], "hold_drag": ["0.1", "none"]}.items():
-        (axis,) = render(sweep_figure(rows, [*NAMES, "friction", "hold_drag"], "fidelity", "s", x=x)).figure.axes
+        (axis,) = to_matplotlib(sweep_figure(rows, [*NAMES, "friction", "hold_drag"], "fidelity", "s", x=x)).figure.axes
         assert [label.get_text() for label in axis.get_xticklabels()] == ticks
 
 
@@ -80,7 +80,7 @@ def test_a_report_draws_no_seed_as_an_axis() -> None:
     assert against("prepare.seed", ROWS, NAMES) is None
     found = against("mu", ROWS, NAMES)
     assert found is not None
-    drawn = render_plotly.render(found)
+    drawn = render_plotly.to_plotly(found)
     assert [trace.name for trace in drawn.data][:2] == ["F gamma0 = 0.001", "F gamma0 = 0.002"]
     np.testing.assert_allclose(drawn.data[0].error_y.array, 0.1 / np.sqrt(3.0), rtol=1e-6)
     assert "mean ± SE over prepare.seed" in drawn.layout.yaxis.title.text

@@ -23,7 +23,7 @@ from gmem_jax.sweeps.plan import plan, point
 from gmem_jax.sweeps.spec import read_spec, spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SweepRunner, _labels
-from gmem_jax.sweeps.table import export, means, rows, warnings_of
+from gmem_jax.sweeps.table import export_table, means, rows, warnings_of
 from gmem_jax.sweeps.work import run_group
 
 PACK = TETRA_27
@@ -243,7 +243,7 @@ def test_signals_of_points_that_have_fewer_are_filled_up_and_counted(
     store.write_manifest([], {}, ["signals"], [("a", {"signals": "two"}), ("b", {"signals": "one"}), ("c", {})])
     for key in kept:
         store.at(key).write_text("")
-    about = export(store, tmp_path / "table.nc")
+    about = export_table(store, tmp_path / "table.nc")
     assert about == "points have 1 to 2 signals, see `signal_count`; what lies beyond them is NaN"
     with xarray.open_dataset(tmp_path / "table.nc", engine="h5netcdf") as data:
         assert data.signal_count.values.tolist() == [2, 1, 0]
@@ -503,7 +503,7 @@ def test_no_cell_of_a_table_is_a_formula(tmp_path: Path) -> None:
     store = Store(tmp_path / "mu")
     values = ["=HYPERLINK(1)", "+1+1", "-2", "@x", "tetra-325-a", -2.0]
     store.write_manifest([], {}, ["pack"], [(f"key{number}", {"pack": value}) for number, value in enumerate(values)])
-    export(store, tmp_path / "o.csv")
+    export_table(store, tmp_path / "o.csv")
     with (tmp_path / "o.csv").open() as file:
         told = [row["pack"] for row in csv.DictReader(file)]
     assert told == ["'=HYPERLINK(1)", "'+1+1", "'-2", "'@x", "tetra-325-a", "-2.0"]
@@ -513,4 +513,4 @@ def test_a_sweep_that_has_no_points_yet_is_shown_and_not_exported(tmp_path: Path
     store = Store(tmp_path / "mu")
     assert rows(store) == []
     with pytest.raises(ValueError, match="has no points yet"):
-        export(store, tmp_path / "o.csv")
+        export_table(store, tmp_path / "o.csv")
