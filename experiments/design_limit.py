@@ -18,7 +18,7 @@ import numpy as np
 import gmem_jax as gm
 from gmem_jax.design.kernel import bumps, nearest
 from gmem_jax.design.waveforms import correction, sampled
-from gmem_jax.files.named import named_signals
+from gmem_jax.files.waveforms import named_signals
 
 STEP = 0.01  # in I
 DAMPINGS = (0.05, 0.02, 0.01, 0.005, 0.002)  # in parts of the largest singular value

@@ -31,7 +31,7 @@ from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance
-from gmem_jax.experiment.recall import run as gmem_run
+from gmem_jax.experiment.recall import run
 from gmem_jax.experiment.signals import Bumps
 from gmem_jax.physics.contact import laws
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -227,15 +227,15 @@ def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int,
     amplitudes = np.random.default_rng(0).normal(scale=0.2, size=(6, values))
     experiment = Experiment(load(name), bumps(amplitudes, 0.2), t0=t0, backend=native.name(backend, Hooke()))
 
-    def seconds(run: Callable[[], Any]) -> float:
+    def seconds(timed: Callable[[], Any]) -> float:
         taken = []
         for _ in range(2):  # the first compiles
             began = time.perf_counter()
-            jax.block_until_ready(run())
+            jax.block_until_ready(timed())
             taken.append(time.perf_counter() - began)
         return min(taken)
 
-    forward = seconds(lambda: gmem_run(experiment).p_sig)
+    forward = seconds(lambda: run(experiment).p_sig)
     before = _peak_bytes()
     reverse = seconds(lambda: value_and_grad(experiment, ["signals.amplitudes"]).slope)
     return {"forward_s": forward, "gradient_s": reverse, "forward_bytes": before, "gradient_bytes": _peak_bytes()}

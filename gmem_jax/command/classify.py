@@ -22,10 +22,10 @@ from gmem_jax.command.console import (
     print_result,
     stderr,
 )
-from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
+from gmem_jax.files.waveforms import signals_from_dict
 from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.show import summaries
 from gmem_jax.show.render_matplotlib import to_matplotlib

@@ -41,9 +41,8 @@ from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run, run
 from gmem_jax.experiment.record import describe, fingerprint, key_of_run, pack_fingerprint
 from gmem_jax.experiment.signals import Bumps, Spline
 from gmem_jax.files import schemas
-from gmem_jax.files.named import named_signals
 from gmem_jax.files.results import save_result
-from gmem_jax.files.waveforms import save_waveforms
+from gmem_jax.files.waveforms import named_signals, save_waveforms
 from gmem_jax.show import summaries
 from gmem_jax.show.figures import design_figure, history_figure
 from gmem_jax.show.render_matplotlib import to_matplotlib

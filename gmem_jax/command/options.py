@@ -13,9 +13,9 @@ from gmem_jax.command.console import check_output, log, refuse_idle
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.signals import Signals
-from gmem_jax.files.named import OF_LAW, OF_MATERIAL, named_experiment, named_signals, waveforms_of
+from gmem_jax.files.configuration import OF_LAW, OF_MATERIAL, named_experiment
 from gmem_jax.files.packs import load_pack
-from gmem_jax.files.waveforms import load_target
+from gmem_jax.files.waveforms import load_target, named_signals, waveforms_of
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.laws import LAWS, law_named

@@ -1,4 +1,7 @@
-"""Experiments from their written form; see `gmem_jax.experiment.record`."""
+"""Experiments from their written form (see `gmem_jax.experiment.record`), and by the names of fields.
+
+The command line and sweep files give those names to the fields of an experiment and to those of its law.
+"""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -7,17 +10,22 @@ from typing import Any
 import jax.numpy as jnp
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.record import PARTS, SIGNALS, pack_fingerprint
-from gmem_jax.experiment.signals import PAD, WIDTH, Signals, SignalSets, signals, six_signals, words
+from gmem_jax.experiment.record import PARTS, pack_fingerprint
+from gmem_jax.experiment.signals import Signals, SignalSets, signals
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.validation import numbers, require, require_kinds
+from gmem_jax.files.waveforms import OF_SAMPLES, OF_WORDS, named_signals, signals_from_dict, waveforms_of
 from gmem_jax.physics.contact.friction import FrictionLaw
-from gmem_jax.physics.contact.laws import law_named
+from gmem_jax.physics.contact.laws import LAWS, law_named
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import Protocol
+
+OF_LAW = {entry.name: entry for law in reversed(LAWS) for entry in fields(law.kind)}
+OF_MATERIAL = {entry.name: entry for entry in fields(Material) if entry.metadata.get("option")}
+NAMES = ("signals", *OF_WORDS, *OF_SAMPLES, "friction", *OF_LAW, *OF_MATERIAL, *NUMBERS)
 
 
 def sets_from_dict(written: Mapping[str, Any]) -> Signals | SignalSets:
@@ -29,25 +37,6 @@ def sets_from_dict(written: Mapping[str, Any]) -> Signals | SignalSets:
     if written["kind"] != "sets":
         return signals_from_dict(written)
     return signals(**{name: signals_from_dict(one) for name, one in written.items() if name != "kind"})
-
-
-def signals_from_dict(written: Mapping[str, Any]) -> Signals:
-    """The waveforms of a written form.
-
-    Raises:
-        ValueError: if they are of a kind that has none, or its numbers make no waveforms.
-    """
-    require_kinds(written)
-    kind = written["kind"]
-    if kind == "six":
-        return six_signals()
-    if kind == "words":
-        return words(written["bits"], written.get("pad", PAD), written.get("width", WIDTH))
-    if kind not in SIGNALS:
-        raise ValueError(f"signals of kind {kind!r} cannot be read back")
-    numbers = {name: value for name, value in written.items() if name != "kind"}
-    made: Signals = SIGNALS[kind](**{name: _number(value) for name, value in numbers.items()})
-    return made
 
 
 def _number(value: Any) -> Any:
@@ -106,3 +95,30 @@ def material_from(written: Mapping[str, Any]) -> Material:
     if odd := sorted(set(written) - known):
         raise FileFormatError(f"its material has a field {odd[0]!r}, which none has")
     return Material(**{name: _number(value) for name, value in written.items() if name in known})
+
+
+def named_experiment(pack: Pack, values: Mapping[str, Any], signals: Signals | None = None) -> Experiment:
+    """An experiment on a pack.
+
+    Args:
+        pack: the pack.
+        values: by name (`NAMES`; dotted ones like "friction.mu" too); None stands for the default.
+        signals: in the place of those that `values` names.
+
+    Raises:
+        ValueError: for an unknown name, or impossible values.
+    """
+    require_kinds(values)
+    given = {name.removeprefix("friction."): value for name, value in values.items() if value is not None}
+    twice = [name for name in given if values.get(name) is not None and values.get(f"friction.{name}") is not None]
+    if twice:
+        raise ValueError(f"{twice[0]} and friction.{twice[0]} are one; give one of them")
+    if unknown := sorted(set(given) - set(NAMES)):
+        raise ValueError(f"an experiment has no {unknown[0]!r}; it has {', '.join(NAMES)}")
+    of_law = {name: given[name] for name in OF_LAW if name in given}
+    law = law_named(str(given.get("friction", "hooke")), **of_law)
+    own = {name: given[name] for name in NUMBERS if name in given}
+    if {"steps", "dt"} <= set(own):
+        raise ValueError("steps and dt: steps in a bin say what the time step is, so that dt does nothing; give one")
+    material = Material(**{name: given[name] for name in OF_MATERIAL if name in given})
+    return Experiment(pack, signals or named_signals(*waveforms_of(given)), law, material, **own)

@@ -9,7 +9,6 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.datasets import each_csv, recall_csv, recall_dataset
 from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
@@ -28,6 +27,7 @@ from gmem_jax.files.validation import (
     title,
     whole,
 )
+from gmem_jax.files.waveforms import signals_from_dict
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, Status
 from gmem_jax.simulation.channels import CHANNELS

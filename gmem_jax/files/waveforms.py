@@ -1,4 +1,4 @@
-"""Waveforms as tables of samples: CSV and NPY."""
+"""Waveforms from tables of samples (CSV and NPY), from their written form, and by what the command line calls them."""
 
 import codecs
 import json
@@ -10,16 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.experiment.record import signals_to_dict
+from gmem_jax.experiment.record import SIGNALS, signals_to_dict
 from gmem_jax.experiment.samples import Told, require_gentle, untold, waveform_from
-from gmem_jax.experiment.signals import Signals, Spline
+from gmem_jax.experiment.signals import LONGEST_WORD, PAD, WIDTH, Signals, Spline, six_signals, waveform, words
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.columns import Columns, read_columns
-from gmem_jax.files.configuration import signals_from_dict
-from gmem_jax.files.validation import json_of, numbers, read_npy, refusing, require_fields, title
+from gmem_jax.files.validation import json_of, numbers, read_npy, refusing, require_fields, require_kinds, title
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import BINS
 
+OF_WORDS = ("word_pad", "word_width")
+OF_SAMPLES = ("smooth", "taper", "scale")
 _LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB
 _TARGET, _DESIGN = "# target: ", "# design: "
 
@@ -154,3 +155,74 @@ def save_waveforms(
         header = f"{_TARGET}{json.dumps(signals_to_dict(target))}\n{header}"
     with atomic(Path(path)) as temporary:
         np.savetxt(temporary, values, delimiter=",", header=header, comments="", fmt="%.17g", encoding="utf-8")
+
+
+def signals_from_dict(written: Mapping[str, Any]) -> Signals:
+    """The waveforms of a written form.
+
+    Raises:
+        ValueError: if they are of a kind that has none, or its numbers make no waveforms.
+    """
+    require_kinds(written)
+    kind = written["kind"]
+    if kind == "six":
+        return six_signals()
+    if kind == "words":
+        return words(written["bits"], written.get("pad", PAD), written.get("width", WIDTH))
+    if kind not in SIGNALS:
+        raise ValueError(f"signals of kind {kind!r} cannot be read back")
+    numbers = {name: value for name, value in written.items() if name != "kind"}
+    made: Signals = SIGNALS[kind](
+        **{name: jnp.asarray(value, float) if isinstance(value, list) else value for name, value in numbers.items()}
+    )
+    return made
+
+
+def named_signals(
+    name: str,
+    pad: float | None = None,
+    width: float | None = None,
+    smooth: float | None = None,
+    taper: float | None = None,
+    scale: bool | None = None,
+    *,
+    told: Told = untold,
+) -> Signals:
+    """Waveforms by what the command line calls them.
+
+    Args:
+        name: "six", "words:3" or a file.
+        pad: of words; None stands for the default.
+        width: of their bumps.
+        smooth: of the samples in a file: see `load_waveforms`.
+        taper: of them.
+        scale: of them.
+        told: what was found in a file and changed.
+
+    Raises:
+        ValueError: if the name is none, or waveforms are given what they cannot have.
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if a file cannot be read.
+    """
+    kind, _, length = name.lower().partition(":")
+    shape = {name: float(value) for name, value in (("pad", pad), ("width", width)) if value is not None}
+    done: dict[str, Any] = {"smooth": smooth, "taper": taper, "scale": scale}
+    done = {name: value for name, value in done.items() if value is not None}
+    if shape and kind != "words":
+        raise ValueError(f"--signals {name}: word_pad and word_width are for words:L only")
+    if done and kind in ("six", "words"):
+        raise ValueError(f"--signals {name}: {', '.join(done)}: for samples in a file only")
+    if kind == "six":
+        return six_signals()
+    if kind == "words":
+        if not length.isdecimal() or not 1 <= int(length) <= LONGEST_WORD:
+            raise ValueError(f"--signals {name}: words need a length from 1 to {LONGEST_WORD}, as in words:3")
+        return words(int(length), **shape)
+    if Path(name).suffix.lower() not in (".csv", ".npy"):
+        raise ValueError(f'--signals {name}: must be "six", "words:L" or a .csv or .npy file')
+    return waveform(load_waveforms(Path(name), told=told, **done))
+
+
+def waveforms_of(values: Mapping[str, Any]) -> tuple[Any, ...]:
+    """The arguments of `named_signals` among named values."""
+    return str(values.get("signals", "six")), *(values.get(name) for name in (*OF_WORDS, *OF_SAMPLES))

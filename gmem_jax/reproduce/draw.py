@@ -11,8 +11,7 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import BACKGROUNDS
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.signals import Bumps, six_signals
-from gmem_jax.experiment.signals import words as all_words
+from gmem_jax.experiment.signals import Bumps, six_signals, words
 from gmem_jax.physics.material import Material
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, counted
@@ -311,10 +310,9 @@ def waveforms(path: Path, bits: int = 5) -> None:
     u = jnp.linspace(0.0, 1.0, 2001)
     six = [f"signal {number + 1}" for number in range(6)]
     chosen = np.linspace(0, (1 << bits) - 1, len(six)).round().astype(int).tolist()
-    words_ = [f"word {word:0{bits}b}" for word in chosen]
     rows: list[tuple[Bumps, Sequence[int], list[str]]] = [
         (six_signals(), range(6), six),
-        (all_words(bits), chosen, words_),
+        (words(bits), chosen, [f"word {word:0{bits}b}" for word in chosen]),
     ]
     figure, axes = pyplot().subplots(2, len(six), figsize=(2.1 * len(six), 4.6), sharex=True, sharey="row")
     for line, (signals, numbers, names) in zip(axes, rows, strict=True):

@@ -17,7 +17,6 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import pack_fingerprint
 from gmem_jax.experiment.signals import bin_average, waveform
-from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.measures import relative_scale
@@ -26,7 +25,7 @@ from gmem_jax.files.recalls import load_recall, to_csv
 from gmem_jax.files.results import load_result
 from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL, TUNED
 from gmem_jax.files.validation import is_number, refusing
-from gmem_jax.files.waveforms import load_design, load_target, load_waveforms
+from gmem_jax.files.waveforms import load_design, load_target, load_waveforms, signals_from_dict
 from gmem_jax.physics.material import Material
 from gmem_jax.reading.readers import confusion
 from gmem_jax.show import figures, sweeps, tables

@@ -17,8 +17,8 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average
-from gmem_jax.files.configuration import signals_from_dict
 from gmem_jax.files.measures import of_each, relative_scale
+from gmem_jax.files.waveforms import signals_from_dict
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, combined_status, explain
 from gmem_jax.preparation.recipe import pressure_over_wanted

@@ -88,7 +88,7 @@ class Executor(ABC):
 
     def said(self, store: Store) -> str:
         """What the workers said."""
-        return store.said()
+        return store.logs()
 
     def _last_words(self, store: Store) -> str:
         lines = [line.strip() for line in self.said(store).splitlines() if line.strip()]

@@ -278,7 +278,7 @@ class Store:
         """The file of what a worker says."""
         return self._own.at(f"workers/{worker}.log")
 
-    def said(self) -> str:
+    def logs(self) -> str:
         """What the workers with such files said, who said something last at the end."""
         logs = [path for path in self._own.files("workers") if path.suffix == ".log"]
         return "\n".join(

@@ -21,10 +21,11 @@ from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall, replica_bins
 from gmem_jax.files.checkpoints import Checkpoints
-from gmem_jax.files.named import named_experiment, named_signals, waveforms_of
+from gmem_jax.files.configuration import named_experiment
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.files.validation import require_kinds
+from gmem_jax.files.waveforms import named_signals, waveforms_of
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within, work_of_bin

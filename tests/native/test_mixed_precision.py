@@ -11,8 +11,7 @@ from scenes import SPHERE, TETRA_27, Motion, advance_by, scene
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.experiment.record import key_of_run, to_dict
-from gmem_jax.files.configuration import from_dict
-from gmem_jax.files.named import named_experiment
+from gmem_jax.files.configuration import from_dict, named_experiment
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.state import State, replicate
 from gmem_jax.physics.step import System, start

@@ -11,8 +11,8 @@ from scenes import TETRA_27, strain_path
 import gmem_jax as gm
 from gmem_jax.experiment.record import fingerprint, signals_to_dict, to_dict
 from gmem_jax.experiment.signals import bit_width, words
-from gmem_jax.files.configuration import signals_from_dict
-from gmem_jax.files.named import named_experiment, named_signals
+from gmem_jax.files.configuration import named_experiment
+from gmem_jax.files.waveforms import named_signals, signals_from_dict
 from gmem_jax.physics.contact.kinematics import transport
 from gmem_jax.physics.contact.path import led_contact
 from gmem_jax.reproduce import choices
