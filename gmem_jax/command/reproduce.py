@@ -13,22 +13,12 @@ from gmem_jax.command.console import AsJson, DryRun, InputError, log, print_resu
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
+from gmem_jax.physics.state import combined_status
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import Effect
 from gmem_jax.reproduce.cost import spec_of_all
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
-from gmem_jax.reproduce.run import (
-    GALLERY,
-    RUNS,
-    SCHEMATICS,
-    Outcome,
-    Weighed,
-    check_claims,
-    outcome_summary,
-    picture,
-    reproduce,
-    sensitivity,
-)
+from gmem_jax.reproduce.run import GALLERY, RUNS, SCHEMATICS, Outcome, Reproduction, Weighed, outcome_summary
 from gmem_jax.simulation.progress import Progress
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
@@ -40,8 +30,7 @@ REPRODUCIBLE = sorted((*FIGURES, *SCHEMATICS, GALLERY, "claims", "choices"))
 def reproduce_command(
     what: Annotated[str, typer.Argument(help=f"{', '.join(REPRODUCIBLE)}, or all.")],
     scale: Annotated[
-        str,
-        typer.Option(help=f"How large and slow: {', '.join(SCALES)}; or changed, as in paper,t0=5400,packs=1."),
+        str, typer.Option(help=f"How large and slow: {', '.join(SCALES)}; or changed, as in paper,t0=5400,packs=1.")
     ] = "laptop",
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for pictures, tables and runs.")] = Path(
         "reproduce"
@@ -81,32 +70,30 @@ def reproduce_command(
     def wanted(names: Iterable[str]) -> list[str]:
         return [name for name in names if what in (name, "all")]
 
-    def how(progress: Progress) -> tuple[Any, ...]:
-        return output, scale, executor_named(executor, workers, options), progress, log
+    def reproduction(progress: Progress) -> Reproduction:
+        return Reproduction(output, scale, executor_named(executor, workers, options), progress, log)
 
     with locked(output / "figures"):
         if retry and (count := Store(output / RUNS).clear_failures()):
             log(f"{count} points and packs that failed are tried again")
         for name in wanted((GALLERY, *SCHEMATICS)):
             with _going_on(broken), reporting(goes_on=True) as progress:
-                drawn += picture(name, *how(progress))
+                drawn += reproduction(progress).picture(name)
                 log(f"wrote {drawn[-1]}")
         if wanted(["claims"]):
             with _going_on(broken), reporting(goes_on=True) as progress:
-                verdicts = check_claims(*how(progress))
+                verdicts = reproduction(progress).claims()
         if wanted(["choices"]):
             with reporting(goes_on=True) as progress:
-                weighed = sensitivity(*how(progress))
+                weighed = reproduction(progress).sensitivity()
             _say_written(weighed)
         for name in wanted(FIGURES):
             log(f"{name}: {FIGURES[name].title}")
             with reporting(goes_on=True) as progress:
-                outcomes.append(reproduce(name, *how(progress)))
+                outcomes.append(reproduction(progress).figure(name))
             _say_written(outcomes[-1])
     rows: list[Any] = [*weighed.effects, *(row for outcome in outcomes for row in outcome.rows)]
-    status = 0
-    for row in rows:
-        status |= row.status
+    status = combined_status([row.status for row in rows])
     result = {
         "figures": [outcome_summary(outcome) for outcome in outcomes],
         "claims": [verdict._asdict() for verdict in verdicts],

@@ -83,8 +83,8 @@ SENTENCES = {
 
 
 def combined_status(status: npt.ArrayLike) -> int:
-    """The bits that any of several replicas or packs has set."""
-    return int(np.bitwise_or.reduce(np.asarray(status), axis=None))
+    """The bits that any of several replicas or packs has set; 0 for none of them."""
+    return int(np.bitwise_or.reduce(np.asarray(status, int), axis=None))
 
 
 def explain(status: int) -> str:

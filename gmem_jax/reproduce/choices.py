@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from gmem_jax.experiment.analysis import spread
+from gmem_jax.physics.state import combined_status
 from gmem_jax.reproduce.compare import Estimate, counted
 from gmem_jax.reproduce.figures import SCALES, Scale, Values, crossed
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
@@ -111,9 +112,7 @@ def _effect(choice: Choice, value: Any, pairs: Sequence[tuple[Any, Any]], t0: fl
     of_gain = [tried[gain] / default[gain] - 1.0 for default, tried in pairs]
     of_fidelity = [tried[fidelity] - default[fidelity] for default, tried in pairs]
     own = [_estimate([tried[name] for _, tried in pairs]) for name in (gain, fidelity)]
-    status = 0
-    for _, tried in pairs:
-        status |= tried["status"]
+    status = combined_status([tried["status"] for _, tried in pairs])
     return Effect(choice, value, own[0], own[1], _estimate(of_gain), _estimate(of_fidelity), status)
 
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, get_type_hints
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.contact.laws import LAWS
+from gmem_jax.physics.state import combined_status
 from gmem_jax.show.tables import published, summary
 from gmem_jax.sweeps.store import Store
 
@@ -155,9 +156,7 @@ def compare_points(points: Iterable[ComputedPoint], t0: float) -> list[Compared]
             groups.setdefault(conditions, []).append((gain, fidelity, point.numbers["status"]))
     found = []
     for conditions, members in groups.items():
-        status = 0
-        for *_, bits in members:
-            status |= bits
+        status = combined_status([bits for *_, bits in members])
         found += [compared(conditions, "F", [fidelity for _, fidelity, _ in members], status)]
         found += [compared(conditions, "G", [gain for gain, *_ in members], status)]
     return found

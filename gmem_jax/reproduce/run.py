@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,7 +54,7 @@ from gmem_jax.sweeps.executors import Executor, Processes
 from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.sweep import SIDE_BY_SIDE, SweepRunner, Tell
+from gmem_jax.sweeps.sweep import SECONDS_PER_GRAIN_STEP, SIDE_BY_SIDE, SweepRunner, Tell
 
 RUNS = "runs"  # the folder of the sweep that all figures share
 MOST_SHOWN = 8  # words of a length in Fig. 13
@@ -80,49 +81,6 @@ SCHEMATICS = {
 GALLERY = "fig03"  # pictures of packs, which may have to be made
 
 
-def _run(spec: Spec, folder: Path, executor: Executor | None, progress: Progress, say: Tell) -> SweepRunner:
-    """Do what is missing of a sweep, whose runner has done it."""
-    runner = SweepRunner(spec, folder / RUNS, say, cost=quick_cost(spec.extra))
-    runner.run(executor or Processes(), progress)
-    return runner
-
-
-def _target(folder: Path, name: str, scale: str, suffix: str = ".png") -> Path:
-    """Where a figure of a scale is written: changes of the scale are in its name."""
-    return folder / f"{name}-{scale.replace(',', '-')}{suffix}"
-
-
-def _failed(store: Store) -> list[str]:
-    """Why points of the last sweep failed, in a list as long as they are many."""
-    return sorted(reason for row in store.card()["points"] if (reason := store.failed().get(row["key"])))
-
-
-def picture(
-    name: str,
-    folder: Path | str = "reproduce",
-    scale: str = "laptop",
-    executor: Executor | None = None,
-    progress: Progress = silent,
-    say: Tell = print,
-) -> list[Path]:
-    """Draw a figure that needs no experiments: one of `SCHEMATICS`, or the packs of `GALLERY`; the files written.
-
-    Args and errors are those of `reproduce`; nothing but `GALLERY` depends on the scale.
-    """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    if name != GALLERY:
-        target = folder / f"{name}.png"
-        say(f"{name}: {SCHEMATICS[name].draw(target) or 'drawn'}")
-        return [path for suffix in (".png", ".svg", ".csv") if (path := target.with_suffix(suffix)).is_file()]
-    size = scale_of(scale)
-    spec = Spec(shared={"t0": size.t0}, extra=tuple(shown_packs(size)))
-    shown = SweepRunner(spec, folder / RUNS, say).packs(executor or Processes(), progress)
-    target = _target(folder, name, scale)
-    packs_figure(target, shown, "Packs at rest, by size and by shape")
-    return [target]
-
-
 class Weighed(NamedTuple):
     """What the paper leaves open came to.
 
@@ -135,62 +93,6 @@ class Weighed(NamedTuple):
     effects: list[Effect]
     files: list[Path]
     failed: list[str]
-
-
-def sensitivity(
-    folder: Path | str = "reproduce",
-    scale: str = "laptop",
-    executor: Executor | None = None,
-    progress: Progress = silent,
-    say: Tell = print,
-) -> Weighed:
-    """Run every choice that the paper leaves open with other values, on the same packs; writes choices-SCALE.
-
-    Args and errors are those of `reproduce`.
-    """
-    size, folder = scale_of(scale, choices.SIZES), Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    named = packs(size, size.grains, size.few)
-    same = {AS_THEY_ARE: True}  # a choice is weighed on the same packs
-    spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.choice_points(named)), run=same)
-    store = _run(spec, folder, executor, progress, say).store
-    done = store.done()
-    rows = [row for row in store.card()["points"] if row["key"] in done]
-    runs = [(row["values"], summary(store.load(row["key"]))) for row in rows]
-    found, target = choices.effects(named, runs, size.t0), _target(folder, "choices", scale)
-    if not found:
-        return Weighed([], [], _failed(store))
-    write_csv(target.with_suffix(".csv"), choices.effect_rows(found))
-    choices.draw(target, found, choices.choices_title(size, found[0].gain.packs))
-    return Weighed(found, [target, target.with_suffix(".svg"), target.with_suffix(".csv")], _failed(store))
-
-
-def check_claims(
-    folder: Path | str = "reproduce",
-    scale: str = "laptop",
-    executor: Executor | None = None,
-    progress: Progress = silent,
-    say: Tell = print,
-) -> list[Verdict]:
-    """Run what the claims of the paper need, on one pack, and judge them; writes claims-SCALE.json.
-
-    Args and errors are those of `reproduce`; a claim cannot be judged where a point of it failed (RunFailedError).
-    """
-    size, folder = scale_of(scale), Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    (named,) = packs(size, size.grains, 1)
-    (spheres,) = packs(size, size.grains, 1, shape="sphere")
-    spec = Spec(shared={"t0": size.t0}, extra=(*claims.claim_points([named]), spheres))
-    runner = _run(spec, folder, executor, progress, say)
-    store = runner.store
-    if failed := _failed(store):
-        raise RunFailedError(failed[0])
-    runs = [(row["values"], store.load(row["key"])) for row in store.card()["points"]]
-    tetra, sphere = (runner.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
-    found = claims.verdicts(tetra, size.t0, runs[:-1], {"sphere": sphere})
-    with atomic(_target(folder, "claims", scale, ".json")) as path:
-        path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n", encoding="utf-8")
-    return found
 
 
 class Outcome(NamedTuple):
@@ -207,6 +109,141 @@ class Outcome(NamedTuple):
     rows: list[Compared]
     files: list[Path]
     failed: list[str]
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """Makes figures and judges claims of the paper; runs nothing again that is there.
+
+    Attributes:
+        folder: for what is written, and for the runs that all figures share; made if it is not there.
+        scale: a name of `SCALES`, or one with changes: see `scale_of`.
+        executor: does the runs; default processes of this machine.
+        progress: told about them.
+        say: told in a line what is planned, and what happened.
+
+    Raises:
+        ValueError: by its methods if there is no such scale, or JAX runs in 32 bits.
+        RunFailedError: if workers die again and again.
+        OSError: if something cannot be written, or no worker started.
+    """
+
+    folder: Path
+    scale: str = "laptop"
+    executor: Executor | None = None
+    progress: Progress = silent
+    say: Tell = print
+
+    def figure(self, name: str) -> Outcome:
+        """Run what is missing of a figure of `FIGURES`, and write its picture (PNG, SVG) and its table (CSV).
+
+        Raises:
+            ValueError: if there is no such figure.
+        """
+        require_x64()
+        if name not in FIGURES:
+            raise ValueError(f"no figure {name!r}; there are {', '.join(FIGURES)}")
+        size, figure = scale_of(self.scale), FIGURES[name]
+        store = self._run(figure_spec(figure, size)).store
+        points, failed = points_of(store), _failed(store)
+        if not points:
+            return Outcome(name, [], [], failed)
+        rows = compare_points(points, size.t0)
+        if name == "fig14":
+            rows += self._read_words(store, points, size)
+        target = self._target(name)
+        write_csv(target.with_suffix(".csv"), comparison_rows(rows))
+        _draw(figure, name, target, rows, points, store, f"{figure.title}\n{draw.said_of(rows, f'{size.t0:,.0f}')}")
+        return Outcome(name, rows, _written(target), failed)
+
+    def picture(self, name: str) -> list[Path]:
+        """Draw a figure that needs no experiments: one of `SCHEMATICS`, or the packs of `GALLERY`; the files written.
+
+        Nothing but `GALLERY` depends on the scale.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if name != GALLERY:
+            target = self.folder / f"{name}.png"
+            self.say(f"{name}: {SCHEMATICS[name].draw(target) or 'drawn'}")
+            return [path for path in _written(target) if path.is_file()]
+        size = scale_of(self.scale)
+        runner = self._runner(Spec(shared={"t0": size.t0}, extra=tuple(shown_packs(size))))
+        shown, target = runner.packs(self.executor or Processes(), self.progress), self._target(name)
+        packs_figure(target, shown, "Packs at rest, by size and by shape")
+        return [target]
+
+    def sensitivity(self) -> Weighed:
+        """Run every choice that the paper leaves open with other values, on the same packs; writes choices-SCALE."""
+        size = scale_of(self.scale, choices.SIZES)
+        named = packs(size, size.grains, size.few)
+        same = {AS_THEY_ARE: True}  # a choice is weighed on the same packs
+        spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.choice_points(named)), run=same)
+        store = self._run(spec).store
+        done = store.done()
+        rows = [row for row in store.card()["points"] if row["key"] in done]
+        runs = [(row["values"], summary(store.load(row["key"]))) for row in rows]
+        found, target = choices.effects(named, runs, size.t0), self._target("choices")
+        if not found:
+            return Weighed([], [], _failed(store))
+        write_csv(target.with_suffix(".csv"), choices.effect_rows(found))
+        choices.draw(target, found, choices.choices_title(size, found[0].gain.packs))
+        return Weighed(found, _written(target), _failed(store))
+
+    def claims(self) -> list[Verdict]:
+        """Run what the claims of the paper need, on one pack, and judge them; writes claims-SCALE.json.
+
+        Raises:
+            RunFailedError: if a point of a claim failed: it cannot be judged.
+        """
+        size = scale_of(self.scale)
+        (named,) = packs(size, size.grains, 1)
+        (spheres,) = packs(size, size.grains, 1, shape="sphere")
+        spec = Spec(shared={"t0": size.t0}, extra=(*claims.claim_points([named]), spheres))
+        runner = self._run(spec)
+        store = runner.store
+        if failed := _failed(store):
+            raise RunFailedError(failed[0])
+        runs = [(row["values"], store.load(row["key"])) for row in store.card()["points"]]
+        tetra, sphere = (runner.pack_of({**spec.shared, **runs[place][0]}) for place in (0, -1))
+        found = claims.verdicts(tetra, size.t0, runs[:-1], {"sphere": sphere})
+        with atomic(self._target("claims", ".json")) as path:
+            path.write_text(json.dumps([verdict._asdict() for verdict in found], indent=1) + "\n", encoding="utf-8")
+        return found
+
+    def _runner(self, spec: Spec, cost: float = SECONDS_PER_GRAIN_STEP) -> SweepRunner:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return SweepRunner(spec, self.folder / RUNS, self.say, cost=cost)
+
+    def _run(self, spec: Spec) -> SweepRunner:
+        """Do what is missing of a sweep, whose runner has done it."""
+        runner = self._runner(spec, quick_cost(spec.extra))
+        runner.run(self.executor or Processes(), self.progress)
+        return runner
+
+    def _target(self, name: str, suffix: str = ".png") -> Path:
+        """Where a figure of a scale is written: changes of the scale are in its name."""
+        return self.folder / f"{name}-{self.scale.replace(',', '-')}{suffix}"
+
+    def _read_words(self, store: Store, points: Sequence[ComputedPoint], size: Scale) -> list[Compared]:
+        """How well recalled words are read, by nets that have seen inputs only, and by the baselines.
+
+        Nets are trained once and kept in the folder.
+        """
+        (self.folder / "nets").mkdir(exist_ok=True)
+        found: dict[tuple[Conditions, str], list[float]] = {}
+        for length in sorted({point.conditions.bits for point in points}):
+            nets = []
+            for seed in range(size.nets):
+                file = self.folder / "nets" / f"words-{length}-{seed}.msgpack"
+                net = train(TrainingConfig(length), seed, budget=size.budget, checkpoint=file)
+                nets.append(net)
+                self.say(f"net {seed} for {length} bits: {net.step} steps, held-out accuracy {net.validation:.4f}")
+            for point in points:
+                if point.conditions.bits == length:
+                    read = reading_report(stored_words(store.load(point.key)), nets)["readers"]
+                    for reader, row in read.items():
+                        found.setdefault((point.conditions, f"accuracy {reader}"), []).append(row["accuracy"])
+        return [compared(conditions, measure, values, 0) for (conditions, measure), values in found.items()]
 
 
 def quick_cost(points: Sequence[Values]) -> float:
@@ -226,48 +263,14 @@ def quick_cost(points: Sequence[Values]) -> float:
     return 1e-6 * sum(timed[case] * weight for case, weight in work.items()) / sum(work.values())
 
 
-def reproduce(
-    name: str,
-    folder: Path | str = "reproduce",
-    scale: str = "laptop",
-    executor: Executor | None = None,
-    progress: Progress = silent,
-    say: Tell = print,
-) -> Outcome:
-    """Run what is missing of a figure, and write its picture (PNG, SVG) and its table (CSV).
+def _written(target: Path) -> list[Path]:
+    """The files of a figure: its picture twice, and its table."""
+    return [target.with_suffix(suffix) for suffix in (".png", ".svg", ".csv")]
 
-    Args:
-        name: one of `FIGURES`.
-        folder: for them, and for the runs that all figures share.
-        scale: a name of `SCALES`, or one with changes: see `scale_of`.
-        executor: does the runs; default processes of this machine.
-        progress: told about them.
-        say: told in a line what is planned, and what happened.
 
-    Raises:
-        ValueError: if there is no such figure or scale, or JAX runs in 32 bits.
-        RunFailedError: if workers die again and again.
-        OSError: if something cannot be written, or no worker started.
-    """
-    require_x64()
-    if name not in FIGURES:
-        raise ValueError(f"no figure {name!r}; there are {', '.join(FIGURES)}")
-    size, folder = scale_of(scale), Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    store = _run(figure_spec(FIGURES[name], size), folder, executor, progress, say).store
-    points = points_of(store)
-    target = _target(folder, name, scale)
-    failed = _failed(store)
-    if not points:
-        return Outcome(name, [], [], failed)
-    rows = compare_points(points, size.t0)
-    if name == "fig14":
-        rows += read_words(folder, store, points, size, say)
-    write_csv(target.with_suffix(".csv"), comparison_rows(rows))
-    title = f"{FIGURES[name].title}\n{draw.said_of(rows, f'{size.t0:,.0f}')}"
-    _draw(FIGURES[name], name, target, rows, points, store, title)
-    files = [target, target.with_suffix(".svg"), target.with_suffix(".csv")]
-    return Outcome(name, rows, files, failed)
+def _failed(store: Store) -> list[str]:
+    """Why points of the last sweep failed, in a list as long as they are many."""
+    return sorted(reason for row in store.card()["points"] if (reason := store.failed().get(row["key"])))
 
 
 def _draw(
@@ -298,30 +301,6 @@ def _draw(
             [_shown(point.conditions.bits) for point in points],
             title,
         )
-
-
-def read_words(folder: Path, store: Store, points: Sequence[ComputedPoint], scale: Scale, say: Tell) -> list[Compared]:
-    """How well recalled words are read, by nets that have seen inputs only, and by the baselines.
-
-    Nets are trained once and kept in the folder.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
-    (folder / "nets").mkdir(exist_ok=True)
-    found: dict[tuple[Conditions, str], list[float]] = {}
-    for length in sorted({point.conditions.bits for point in points}):
-        nets = []
-        for seed in range(scale.nets):
-            file = folder / "nets" / f"words-{length}-{seed}.msgpack"
-            nets.append(train(TrainingConfig(length), seed, budget=scale.budget, checkpoint=file))
-            say(f"net {seed} for {length} bits: {nets[-1].step} steps, held-out accuracy {nets[-1].validation:.4f}")
-        for point in points:
-            if point.conditions.bits == length:
-                read = reading_report(stored_words(store.load(point.key)), nets)["readers"]
-                for reader, row in read.items():
-                    found.setdefault((point.conditions, f"accuracy {reader}"), []).append(row["accuracy"])
-    return [compared(conditions, measure, values, 0) for (conditions, measure), values in found.items()]
 
 
 def _shown(bits: int) -> list[int]:

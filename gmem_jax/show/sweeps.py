@@ -8,7 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from gmem_jax.files.validation import is_number
-from gmem_jax.physics.state import SENTENCES, Status
+from gmem_jax.physics.state import SENTENCES, Status, combined_status
 from gmem_jax.show.figure import Curve, Figure, Panel, ramp
 from gmem_jax.show.tables import cell
 from gmem_jax.sweeps.curves import Line, axes_of, is_sample, lines_of
@@ -28,9 +28,7 @@ def sweep_facts(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
     """What is said of a sweep, and its points."""
     states = {state: sum(row["state"] == state for row in table) for state in ("done", "failed", "open")}
     done = [row for row in table if row["state"] == "done"]
-    status = 0
-    for row in done:
-        status |= row["status"]
+    status = combined_status([row["status"] for row in done])
     seconds = sum(row["seconds"] for row in done)
     return {"folder": str(store.folder), **states, "status": status, "seconds": seconds, "points": table}
 

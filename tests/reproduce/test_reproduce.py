@@ -28,8 +28,8 @@ from gmem_jax.reproduce.compare import (
 )
 from gmem_jax.reproduce.draw import power
 from gmem_jax.reproduce.figures import FIGURES, SCALES, PaperFigure, figure_spec, packs, scale_of
+from gmem_jax.reproduce.run import Reproduction
 from gmem_jax.show.tables import published
-from gmem_jax.simulation.progress import silent
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import work
@@ -159,7 +159,7 @@ def test_shipped_packs_come_first_and_only_where_they_fit() -> None:
 
 def test_single_precision_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with jax.enable_x64(False), pytest.raises(ValueError, match="float64 is needed"):
-        reproducing.reproduce("fig06", tmp_path / "out")
+        Reproduction(tmp_path / "out").figure("fig06")
     assert not any(tmp_path.iterdir())
 
 
@@ -172,7 +172,7 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(reproducing, "quick_cost", lambda points: 1e-7)
     said: list[str] = []
-    outcome = reproducing.reproduce("fig08", tmp_path, "tiny", Here(), silent, said.append)
+    outcome = Reproduction(tmp_path, "tiny", Here(), say=said.append).figure("fig08")
     assert [path.name for path in outcome.files] == ["fig08-tiny.png", "fig08-tiny.svg", "fig08-tiny.csv"]
     assert all(path.stat().st_size > 200 for path in outcome.files)
     with (tmp_path / "fig08-tiny.csv").open() as file:
@@ -182,7 +182,7 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     np.testing.assert_allclose(float(table[0]["mean"]), float(recall.windowed_fidelity), rtol=1e-5)
     assert float(table[2]["published_mean"]) == 0.8996
     assert "2 of 2 points" in said[0]
-    reproducing.reproduce("fig06", tmp_path, "tiny", Here(), silent, said.append)
+    Reproduction(tmp_path, "tiny", Here(), say=said.append).figure("fig06")
     assert said[1:] == ["all 1 points are there"]
     assert (tmp_path / "fig06-tiny.svg").is_file()
 
@@ -305,7 +305,7 @@ def test_pictures_of_recalls_and_words(monkeypatch: pytest.MonkeyPatch, tmp_path
     monkeypatch.setitem(FIGURES, name, FIGURES[name]._replace(points=lambda scale: [values]))
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(reproducing, "quick_cost", lambda points: 1e-7)
-    outcome = reproducing.reproduce(name, tmp_path, "tiny", Here(), silent, lambda line: None)
+    outcome = Reproduction(tmp_path, "tiny", Here(), say=lambda line: None).figure(name)
     assert all(path.stat().st_size > 200 for path in outcome.files)
     if name == "fig14":
         read = {row.measure: row.ours.mean for row in outcome.rows if row.measure.startswith("accuracy")}
@@ -326,7 +326,7 @@ def test_claims_are_judged_by_their_runs(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(reproducing, "packs", lambda *_, **__: [{"pack": PACK}])
     monkeypatch.setattr(reproducing, "quick_cost", lambda points: 1e-7)
-    found = reproducing.check_claims(tmp_path, "tiny", Here(), silent, lambda line: None)
+    found = Reproduction(tmp_path, "tiny", Here(), say=lambda line: None).claims()
     assert [row["claim"] for row in json.loads((tmp_path / "claims-tiny.json").read_text())] == [v.claim for v in found]
     assert len(found) == 8
     by_claim = {verdict.claim: verdict for verdict in found}

@@ -9,7 +9,7 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.experiment.analysis import compare
 from gmem_jax.experiment.signals import bin_average, part
-from gmem_jax.reproduce import run as reproducing
+from gmem_jax.reproduce.run import Reproduction
 from gmem_jax.reproduce.two_grains import tell
 from gmem_jax.show.render import camera, rendered
 from gmem_jax.show.render_matplotlib import to_matplotlib
@@ -50,7 +50,7 @@ def test_a_rendered_sphere_is_a_disc_and_the_nearer_hides_the_farther() -> None:
 
 def test_a_picture_is_written(tmp_path: Path) -> None:
     said: list[str] = []
-    files = reproducing.picture("fig05", tmp_path, say=said.append)
+    files = Reproduction(tmp_path, say=said.append).picture("fig05")
     assert [path.name for path in files] == ["fig05.png", "fig05.svg"]
     assert all(path.stat().st_size > 200 for path in files)
     assert said[0].startswith("fig05")
