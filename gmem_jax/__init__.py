@@ -24,8 +24,9 @@ from gmem_jax.experiment.samples import waveform_from
 from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, signals, six_signals, waveform, words
 from gmem_jax.experiment.stages import compress, cycle, hold, read, rest, shake, train, write
 from gmem_jax.files.configuration import from_dict
+from gmem_jax.files.datasets import to_csv, to_xarray
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
-from gmem_jax.files.recalls import load_recall, save_recall, to_csv, to_xarray
+from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.files.waveforms import load_waveforms, save_waveforms
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke

@@ -17,7 +17,7 @@ from gmem_jax.command.console import (
     Output,
     Picture,
     check_output,
-    drawing,
+    draw_beside,
     log,
     print_result,
     stderr,
@@ -28,7 +28,6 @@ from gmem_jax.files.schemas import READING
 from gmem_jax.files.waveforms import signals_from_dict
 from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.show import summaries
-from gmem_jax.show.render_matplotlib import to_matplotlib
 
 if TYPE_CHECKING:
     from gmem_jax.reading import training
@@ -115,12 +114,7 @@ def classify_command(
     result = {"recall": str(recall), "pack": configuration["pack"], "status": status, "seconds": seconds, **result}
     save_result(output, READING, result)
     summary = summaries.of_reading(result)
-    told = f"wrote {output}"
-    if drawn:
-        with drawing(drawn):
-            to_matplotlib(summary.figures["confusion"]()).save(drawn)
-            told += f" and {drawn}"
-    log(told)
+    log(f"wrote {output}{draw_beside(drawn, summary.figures['confusion'])}")
     print_result(as_json, result, *summary.lines)
 
 

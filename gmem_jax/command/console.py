@@ -7,7 +7,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from types import MappingProxyType
@@ -25,6 +25,8 @@ from gmem_jax.files.ours import promise
 from gmem_jax.files.results import finite
 from gmem_jax.files.sizes import in_bytes, in_time
 from gmem_jax.files.validation import NAME, printable, title
+from gmem_jax.show.figure import Figure
+from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.simulation.progress import Progress
 
 stderr = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
@@ -220,14 +222,25 @@ def emit_cost(as_json: bool, cost: dict[str, float], output: Path, disk_bytes: f
     print_result(as_json, {**cost, "disk_bytes": disk_bytes, "status": 0}, line)
 
 
-@contextlib.contextmanager
-def drawing(picture: Path) -> Iterator[None]:
-    """A picture beside a result that is written already: what goes wrong with it is a warning, and nothing is lost."""
+def draw_beside(picture: Path | None, figure: Callable[[], Figure]) -> str:
+    """Draw a picture beside a result that is written already: what goes wrong is a warning, and nothing is lost.
+
+    Args:
+        picture: file to write; None where none is wanted.
+        figure: makes what it shows.
+
+    Returns:
+        " and FILE", for the line that says what was written; "" if nothing was.
+    """
+    if picture is None:
+        return ""
     try:
-        yield
+        to_matplotlib(figure()).save(picture)
     except Exception as error:  # matplotlib's, by the user's fonts and settings
         why = " ".join(str(error).split()) or type(error).__name__
         log(f"warning: {picture}: could not be drawn ({why})", style="yellow")
+        return ""
+    return f" and {picture}"
 
 
 @contextlib.contextmanager

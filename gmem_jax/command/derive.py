@@ -17,7 +17,7 @@ from gmem_jax.command.console import (
     Picture,
     announce,
     check_output,
-    drawing,
+    draw_beside,
     print_result,
     refuse_idle,
     reporting,
@@ -45,7 +45,6 @@ from gmem_jax.files.results import save_result
 from gmem_jax.files.waveforms import named_signals, save_waveforms
 from gmem_jax.show import summaries
 from gmem_jax.show.figures import design_figure, history_figure
-from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.show.tables import cell
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 from gmem_jax.simulation.observers import CHUNK
@@ -119,9 +118,7 @@ def gradient_command(
         result["configuration"] = describe(experiment, result["seconds"])
         save_result(output, schemas.GRADIENT, result)
     summary = summaries.of_gradient(result)
-    if drawn:
-        with drawing(drawn):
-            to_matplotlib(summary.figures["waveforms"]()).save(drawn)
+    draw_beside(drawn, summary.figures["waveforms"])
     print_result(as_json, result, *summary.lines)
 
 
@@ -194,9 +191,7 @@ def kernel_command(
             "status": 0,
         }
         save_kernel(output, kernel, configuration)
-    if drawn:
-        with drawing(drawn):
-            to_matplotlib(summary.figures["kernel"]()).save(drawn)
+    draw_beside(drawn, summary.figures["kernel"])
     error = "superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"])
     print_result(as_json, result, *summary.lines, error)
 
@@ -223,15 +218,13 @@ def design_command(
     iterations: Annotated[
         int | None,
         typer.Option(
-            min=1,
-            help=f"Corrections; default {waveforms.ITERATIONS} by Jacobians, {KERNEL_ITERATIONS} by the kernel.",
+            min=1, help=f"Corrections; default {waveforms.ITERATIONS} by Jacobians, {KERNEL_ITERATIONS} by the kernel."
         ),
     ] = None,
     bumps: Annotated[
         int | None,
         typer.Option(
-            min=2,
-            help=f"Of a waveform; default {waveforms.BUMPS} by Jacobians, {KERNEL_BUMPS} by the kernel.",
+            min=2, help=f"Of a waveform; default {waveforms.BUMPS} by Jacobians, {KERNEL_BUMPS} by the kernel."
         ),
     ] = None,
     width: Annotated[
@@ -246,8 +239,7 @@ def design_command(
         float | None, typer.Option(help="Wanted gain; default at most half of the untouched waveforms'.")
     ] = None,
     start: Annotated[
-        Path | None,
-        typer.Option(help="Designed waveforms to make better, as --output wrote them; by the kernel only."),
+        Path | None, typer.Option(help="Designed waveforms to make better, as --output wrote them; by the kernel only.")
     ] = None,
     measured: Annotated[
         int,
@@ -299,10 +291,8 @@ def design_command(
             found = design(experiment, cache=parts, progress=progress, **options)
         way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
         save_waveforms(output, found.signals, experiment.waveforms, design=way)
-    if drawn:
-        with drawing(drawn):
-            to_matplotlib(design_figure(found, float(experiment.scale), cell(pack))).save(drawn)
-            to_matplotlib(history_figure({cell(pack): found.history})).save(history)
+    draw_beside(drawn, lambda: design_figure(found, float(experiment.scale), cell(pack)))
+    draw_beside(history if picture else None, lambda: history_figure({cell(pack): found.history}))
     result = {
         "pack": pack,
         "before": found.before,
@@ -375,15 +365,8 @@ def tune_command(
         }
         save_result(output, schemas.TUNED, {**result, "configuration": describe(first, result["seconds"])})
     summary = summaries.of_tuned(result)
-    if drawn:
-        with drawing(drawn):
-            to_matplotlib(summary.figures["history"]()).save(drawn)
+    draw_beside(drawn, summary.figures["history"])
     print_result(as_json, result, *summary.lines, f"wrote {output}")
 
 
-COMMANDS = {
-    "gradient": gradient_command,
-    "kernel": kernel_command,
-    "design": design_command,
-    "tune": tune_command,
-}
+COMMANDS = {"gradient": gradient_command, "kernel": kernel_command, "design": design_command, "tune": tune_command}

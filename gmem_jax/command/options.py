@@ -131,10 +131,7 @@ def with_recipe(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _with(
-    command: Callable[..., None],
-    name: str,
-    make: Callable[[dict[str, Any]], Any],
-    options: _Options,
+    command: Callable[..., None], name: str, make: Callable[[dict[str, Any]], Any], options: _Options
 ) -> Callable[..., None]:
     """A command with more options (default, type, help, flags); it gets what `make` makes of their values as `name`."""
     signature = inspect.signature(command)

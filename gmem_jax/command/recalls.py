@@ -20,7 +20,7 @@ from gmem_jax.command.console import (
     Picture,
     announce,
     check_output,
-    drawing,
+    draw_beside,
     emit_cost,
     log,
     print_result,
@@ -40,7 +40,6 @@ from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.state import combined_status
 from gmem_jax.show import tables
-from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.show.summaries import Summary, of_recall
 
 TYPICAL = "tetra-325-e"  # of the five shipped packs of 325 that with the median F
@@ -84,12 +83,8 @@ def _run(
             configuration["target"] = signals_to_dict(target)
         recall = recall.described(configuration)
         save_recall(data, recall)
-    told, summary = f"wrote {data}", of_recall(recall)
-    if picture is not None:
-        with drawing(picture):
-            to_matplotlib(summary.figures["signals"]()).save(picture)
-            told += f" and {picture}"
-    log(told)
+    summary = of_recall(recall)
+    log(f"wrote {data}{draw_beside(picture, summary.figures['signals'])}")
     row = {**summary.facts, "seconds": configuration["seconds"], "output": str(data)}
     if row["status"]:
         log(f"warning: {row['status_text']}", style="yellow")

@@ -15,14 +15,8 @@ from gmem_jax.files.validation import optional
 from gmem_jax.simulation.protocol import BINS
 
 
-def described(name: str) -> dict[str, str]:
-    """Units and description of an array of a recall."""
-    array = RECALL.arrays[name]
-    return {"units": array.units, "description": array.words}
-
-
-def recall_dataset(recall: Recall) -> Any:
-    """A recall as an xarray.Dataset: its arrays, and the samples of all stages one after the other along `time`.
+def to_xarray(recall: Recall) -> Any:
+    """A recall as an xarray.Dataset with names, units and descriptions; samples of all stages are joined along `time`.
 
     Args:
         recall: the recall; stages that were run once for all replicas are repeated for each.
@@ -40,14 +34,13 @@ def recall_dataset(recall: Recall) -> Any:
     }
     data = {}
     for name, array in STAGE.items():
-        about = {"units": array.units, "description": array.words}
         if name in ("time", "u"):
             at = "u_of_time" if name == "u" else name
-            joined[at] = ("time", joined[at], about)
+            joined[at] = ("time", joined[at], array.attributes)
             continue
         own = (np.asarray(getattr(sample, name)) for sample in stages.values())
         wide = [np.broadcast_to(values, (*values.shape[:-1], replicas)) for values in own]
-        data[name] = (array.shape, np.concatenate(wide), about)
+        data[name] = (array.shape, np.concatenate(wide), array.attributes)
     for name in next(iter(stages.values())).observed or {}:
         about = configuration.get("observed", {}).get(name, {})
         own = (np.asarray((sample.observed or {})[name]) for sample in stages.values())
@@ -59,15 +52,15 @@ def recall_dataset(recall: Recall) -> Any:
     for name, array in declared.items():
         if name not in ("u", "signal"):
             values = derived[name] if name in derived else np.asarray(getattr(recall, name))
-            data[name] = (array.shape, values, described(name))
+            data[name] = (array.shape, values, array.attributes)
     several = {"read": list(recall.reads), "channel": list(recall.channels), "written": list(recall.channels)}
     several = {
         name: names for name, names in several.items() if any(name in array.shape for array in declared.values())
     }
     coordinates = {
         **several,
-        "signal": ("signal", recall.names, described("signal")),
-        "u": ("u", np.asarray(recall.u), described("u")),
+        "signal": ("signal", recall.names, RECALL.arrays["signal"].attributes),
+        "u": ("u", np.asarray(recall.u), RECALL.arrays["u"].attributes),
         "replica": np.arange(replicas),
         "axis": ["x", "y", "z"],
         **joined,
@@ -84,29 +77,24 @@ def plain_cell(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@")) else value
 
 
-def recall_csv(recall: Recall) -> str:
-    """The recalled signals as CSV: u, and p_sig of every signal in E."""
+def to_csv(recall: Recall, *, each: bool = False) -> str:
+    """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F."""
+    several = len(recall.reads) * len(recall.channels) > 1
+    rows: list[list[Any]]
+    if each:
+        measures = of_each(recall)
+        rows = [[*(["read", "channel"] * several), "signal", *(name.removeprefix("signal_") for name in measures)]]
+        values = np.stack([*measures.values()], axis=-1).reshape(-1, len(recall.names), len(measures)).tolist()
+        for one, own in zip(recall.each(), values, strict=True):
+            where = [one.reads[0], one.channels[0]] * several
+            rows += [[*where, name, *row] for name, row in zip(recall.names, own, strict=True)]
+    else:
+        rows = [["u"]]
+        for one in recall.each():
+            of = f", {one.reads[0]}, {one.channels[0]}" if several else ""
+            rows[0] += [f"p_sig of {name}{of} (E)" for name in recall.names]
+        signals = np.asarray(recall.p_sig).reshape(-1, len(np.asarray(recall.u)))
+        rows += np.column_stack([recall.u, signals.T]).tolist()
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    several = len(recall.reads) * len(recall.channels) > 1
-    columns = ["u"]
-    for one in recall.each():
-        where = f", {one.reads[0]}, {one.channels[0]}" if several else ""
-        columns += [f"p_sig of {name}{where} (E)" for name in recall.names]
-    writer.writerow(columns)
-    signals = np.asarray(recall.p_sig).reshape(-1, len(np.asarray(recall.u)))
-    writer.writerows(np.column_stack([recall.u, signals.T]).tolist())
-    return text.getvalue()
-
-
-def each_csv(recall: Recall) -> str:
-    """What is said of each signal by itself (`of_each`) as CSV, a row for each."""
-    text, measures = io.StringIO(), of_each(recall)
-    writer = csv.writer(text, lineterminator="\n")
-    several = len(recall.reads) * len(recall.channels) > 1
-    writer.writerow([*(["read", "channel"] * several), "signal", *(name.removeprefix("signal_") for name in measures)])
-    values = np.stack([*measures.values()], axis=-1).reshape(-1, len(recall.names), len(measures)).tolist()
-    for one, rows in zip(recall.each(), values, strict=True):
-        where = [one.reads[0], one.channels[0]] * several
-        writer.writerows([*where, name, *row] for name, row in zip(recall.names, rows, strict=True))
+    csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()

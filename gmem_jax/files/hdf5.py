@@ -159,7 +159,7 @@ def write_arrays(group: h5py.Group, declared: Mapping[str, Array], values: Mappi
 
 def _described(group: h5py.Group, path: str, values: np.ndarray, declared: Array) -> h5py.Dataset:
     dataset = group.create_dataset(path, data=values)
-    dataset.attrs["units"], dataset.attrs["description"] = declared.units, declared.words
+    dataset.attrs.update(declared.attributes)
     if values.dtype.kind == "S":
         dataset.attrs["_Encoding"] = "utf-8"  # tells xarray that these bytes are texts
     return dataset

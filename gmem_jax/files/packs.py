@@ -72,7 +72,7 @@ def save_pack(
 
 
 def check_pack(pack: Pack) -> None:
-    """Refuse a pack that its file would be refused for; see `soundness`.
+    """Refuse a pack that its file would be refused for; see `pack_validation`.
 
     Raises:
         FileFormatError: saying what is wrong.
@@ -105,7 +105,7 @@ def load_pack(source: str | Path) -> Pack:
     Raises:
         FileNotFoundError: if there is no such file or pack.
         FileFormatError: if the file is damaged, not a complete pack of this schema, or its numbers are not those of
-            grains at rest in their box (see `soundness`).
+            grains at rest in their box (see `pack_validation`).
     """
     path = _path_of(source)
     with refusing(path, "pack"):

@@ -9,7 +9,6 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.files.datasets import each_csv, recall_csv, recall_dataset
 from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
 from gmem_jax.files.measures import EACH, of_each
@@ -67,20 +66,6 @@ def save_recall(path: str | Path, recall: Recall) -> None:
 
 def _declared(reads: Sequence[str], channels: Sequence[str], dt_dimensions: int) -> dict[str, Array]:
     return declared_of_recall(len(reads), len(channels), own_steps=dt_dimensions > 0)
-
-
-def to_xarray(recall: Recall) -> Any:
-    """An xarray.Dataset with names, units and descriptions; the samples of all stages are joined along `time`.
-
-    Raises:
-        ValueError: if xarray is not installed.
-    """
-    return recall_dataset(recall)
-
-
-def to_csv(recall: Recall, *, each: bool = False) -> str:
-    """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F."""
-    return each_csv(recall) if each else recall_csv(recall)
 
 
 @usual_rules()

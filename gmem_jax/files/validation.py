@@ -94,6 +94,11 @@ class Array(NamedTuple):
     units: str = "1"
     words: str = ""
 
+    @property
+    def attributes(self) -> dict[str, str]:
+        """Units and description, as files and datasets carry them."""
+        return {"units": self.units, "description": self.words}
+
 
 def fit(declared: Mapping[str, Array], found: Mapping[str, Any]) -> dict[str, int]:
     """The lengths that the names in a declaration stand for.

@@ -21,9 +21,7 @@ from gmem_jax.simulation.protocol import BINS
 PASCAL = float(Material().modulus)
 
 
-def lines_figure(
-    lines: Mapping[str, tuple[Any, Any]], x: str, y: str, title: str = "", *, style: str = "o-", **more: Any
-) -> Figure:
+def lines_figure(lines: Mapping[str, tuple[Any, Any]], x: str, y: str, title: str = "", **more: Any) -> Figure:
     """Several curves by name in one panel.
 
     Args:
@@ -31,11 +29,10 @@ def lines_figure(
         x: label of the axis.
         y: label of the axis.
         title: over it.
-        style: of the curves.
         more: of the `Panel`.
     """
     curves = tuple(
-        Curve(np.asarray(place, float), np.asarray(values, float), name, f"C{number % 10}", style)
+        Curve(np.asarray(place, float), np.asarray(values, float), name, f"C{number % 10}", "o-")
         for number, (name, (place, values)) in enumerate(lines.items())
     )
     return Figure((Panel(curves, title, x, y, **more),), legend="panel")

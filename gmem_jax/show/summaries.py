@@ -17,11 +17,12 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import pack_fingerprint
 from gmem_jax.experiment.signals import bin_average, waveform
+from gmem_jax.files.datasets import to_csv
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.packs import load_pack, load_stages, pack_called
-from gmem_jax.files.recalls import load_recall, to_csv
+from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import load_result
 from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL, TUNED
 from gmem_jax.files.validation import is_number, refusing
@@ -147,12 +148,7 @@ def _summary_of(file: Path, against: str, signals: Sequence[int], each: bool, ch
 
 
 def of_recall(
-    recall: Recall,
-    name: str = "",
-    *,
-    against: str = "time",
-    signals: Sequence[int] = (),
-    each: bool = False,
+    recall: Recall, name: str = "", *, against: str = "time", signals: Sequence[int] = (), each: bool = False
 ) -> Summary:
     """What is said of a recall; see `summary_of`."""
     configuration, row = recall.configuration, tables.summary(recall)

@@ -10,8 +10,9 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import MEASURES, spread
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.datasets import described, plain_cell
+from gmem_jax.files.datasets import plain_cell
 from gmem_jax.files.measures import EACH, of_each
+from gmem_jax.files.schemas import RECALL
 from gmem_jax.files.validation import optional
 from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.sweeps.store import Store
@@ -40,10 +41,8 @@ def rows(store: Store) -> list[dict[str, Any]]:
             status = combined_status(recall.status)
             row |= {"state": "done", **{name: float(getattr(recall, name)) for name in MEASURES}}
             row |= {"status": status, "why": explain(status) if status else ""}
-            row |= {
-                "warnings": "; ".join(map(str, configuration.get(WARNED, ()))),
-                "seconds": configuration["seconds"],
-            }
+            warned = "; ".join(map(str, configuration.get(WARNED, ())))
+            row |= {"warnings": warned, "seconds": configuration["seconds"]}
         else:
             row |= {"state": "failed" if key in failed else "open", **dict.fromkeys(MEASURES)}
             row |= {"status": None, "why": failed.get(key, ""), "warnings": "", "seconds": None}
@@ -138,18 +137,11 @@ def _dataset(store: Store, table: Sequence[dict[str, Any]]) -> Any:
         for name, array in values.items():
             array[place, : counts[place]] = own[name]
     for name, array in values.items():
-        data[name] = (("point", "signal", "u")[: array.ndim], array, described(name))
-    told = {
-        "units": "1",
-        "description": "signals of the point; what lies beyond them is NaN",
-    }
+        data[name] = (("point", "signal", "u")[: array.ndim], array, RECALL.arrays[name].attributes)
+    told = {"units": "1", "description": "signals of the point; what lies beyond them is NaN"}
     data["signal_count"] = ("point", counts, told)
-    data["signal_name"] = (
-        ("point", "signal"),
-        names.astype(str),
-        {"description": "names of its signals"},
-    )
-    return data.assign_coords(u=("u", u, described("u")))
+    data["signal_name"] = (("point", "signal"), names.astype(str), {"description": "names of its signals"})
+    return data.assign_coords(u=("u", u, RECALL.arrays["u"].attributes))
 
 
 def _column(values: list[Any]) -> np.ndarray:
