@@ -1,7 +1,8 @@
 """What a grain-step costs on a GPU: timed where there is one; registers, launches and bytes are known without."""
 
+import itertools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -21,6 +22,7 @@ from gmem_jax.simulation import sample
 
 PACKS = ("tetra-1024-a", "tetra-10240-b")
 REPLICAS = (1, 8, 32, 128)
+COPIED = 1 << 26  # numbers, for the bandwidth
 ARCHITECTURES = {"sm_80": "A100", "sm_90": "H100, H200", "sm_100": "B200", "sm_120": "RTX 50"}
 GPU_LAWS = {"frictionless": Frictionless(), **measure.TIMED_LAWS}
 
@@ -40,30 +42,30 @@ def device() -> Any:
     return found
 
 
-def copied_bytes_per_second(count: int = 1 << 26) -> float:
-    """What the device reads and writes in a second at best: the median of ten copies of `count` numbers."""
-    copy, numbers = jax.jit(lambda numbers: numbers + 1.0), jnp.zeros(count)
+def copied_bytes_per_second() -> float:
+    """What the device reads and writes in a second at best: the median of ten copies of `COPIED` numbers."""
+    copy, numbers = jax.jit(lambda numbers: numbers + 1.0), jnp.zeros(COPIED)
     jax.block_until_ready(copy(numbers))
     taken = []
     for _ in range(10):
         began = time.perf_counter()
         jax.block_until_ready(copy(numbers))
         taken.append(time.perf_counter() - began)
-    return 16.0 * count / float(np.median(taken))
+    return 16.0 * COPIED / float(np.median(taken))
 
 
-def bytes_per_grain_step(pack: Pack, law: str = "H") -> dict[str, float]:
-    """Bytes of a grain-step for many replicas: those that must come from memory or go there, and those gathered.
+def bytes_per_grain_step(pack: Pack) -> dict[str, float]:
+    """Bytes of a grain-step under law H, many replicas: what must come from memory or go there, and what is gathered.
 
     Returns:
         "memory": own numbers and histories, each read and written once. "gathered": beside them the spheres of all
         candidates and the grains of those that touch, which caches may hold. "held": memory of a grain and replica,
         between steps and in the arrays of a call.
     """
-    simulation, state = measure.encode(pack, measure.TIMED_LAWS[law], 1, "native")
+    simulation, state = measure.encode(pack, measure.TIMED_LAWS["H"], 1, "native")
     touching = float(sample.measure(simulation.system, state, pack.box, jnp.ones((3, 1)), 0.0).contacts[0])
     sides = 2.0 * float(np.asarray(pack.pairs.valid).sum()) / pack.grains
-    remembered = {"H": 3, "M1": 4}[law]
+    remembered = 3  # numbers of a contact
     spheres, own = pack.clump.spheres, 9 + 10
     memory = 8.0 * (2 * own + 2 * 3 * spheres + remembered * (sides + touching))
     held = 8.0 * (9 + own + 6 * spheres + 3 + sides * remembered + 2 * own + sides * remembered / 2.0)
@@ -82,12 +84,7 @@ def registers() -> dict[str, dict[str, Needs]]:
     return {**plain, **{f"{name}, with derivatives": of(GPU_LAWS[name], tangent=True) for name in ("H", "M2")}}
 
 
-def timed(
-    load: Callable[[str], Pack],
-    packs: Sequence[str] = PACKS,
-    replicas: Sequence[int] = REPLICAS,
-    say: measure.Say = lambda what, fraction: None,
-) -> dict[str, Any]:
+def timed(load: Callable[[str], Pack], say: measure.Say = lambda what, fraction: None) -> dict[str, Any]:
     """Every pack and number of replicas under law H, and the bandwidth of a copy.
 
     Raises:
@@ -96,8 +93,8 @@ def timed(
     on = device()
     with jax.default_device(on):
         rows = []
-        for place, (name, count) in enumerate((name, count) for name in packs for count in replicas):
-            say(f"native, {name}, {count} replicas", place / (len(packs) * len(replicas)))
+        for place, (name, count) in enumerate(itertools.product(PACKS, REPLICAS)):
+            say(f"native, {name}, {count} replicas", place / (len(PACKS) * len(REPLICAS)))
             rows.append({"pack": name, **asdict(measure.time_rollout(load(name), "native", "H", count))})
         return {"device": on.device_kind, "copied_bytes_per_s": copied_bytes_per_second(), "rows": rows}
 

@@ -309,14 +309,14 @@ def run_lammps(script: list[str], folder: Path, *, steps: int, every: int, per_g
     return Trajectory(mean[..., 1:4], mean[..., 4:7], mean[..., 7:10], table[..., 10:13], forces)
 
 
-def loop_seconds(script: list[str], folder: Path, *, steps: int, ranks: int = 1, warm_up: int = 100) -> float:
+def loop_seconds(script: list[str], folder: Path, *, steps: int, ranks: int = 1) -> float:
     """Wall seconds of `run steps` alone, as LAMMPS reports them, after a warm-up run without output."""
     script = [
         *script,
         "thermo_style custom step",
         "thermo 1000000",
         "thermo_modify lost ignore",
-        f"run {warm_up}",
+        "run 100",
         f"run {steps}",
     ]
     found = re.findall(r"Loop time of ([0-9.eE+-]+) on", execute(script, folder, ranks))

@@ -84,10 +84,9 @@ def correction(slope: np.ndarray, miss: np.ndarray, damping: np.ndarray | float)
     return result
 
 
-def sampled(signals: Signals, nodes: int = NODES) -> Spline:
-    """The same waveforms as samples at u = k / (nodes + 1), as `gmem recall --signals` reads them."""
-    values = signals.shear(jnp.arange(1, nodes + 1) / (nodes + 1)).T
-    return waveform(values)
+def sampled(signals: Signals) -> Spline:
+    """The same waveforms as samples at u = k / (NODES + 1), as `gmem recall --signals` reads them."""
+    return waveform(signals.shear(jnp.arange(1, NODES + 1) / (NODES + 1)).T)
 
 
 def verified(

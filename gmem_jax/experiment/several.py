@@ -115,17 +115,12 @@ class _Side:
 
 @usual_rules()
 def run_several(
-    experiments: Sequence[Experiment],
-    *,
-    devices: Sequence[jax.Device] | None = None,
-    cache: ResultCache = no_cache,
-    progress: Progress = silent,
+    experiments: Sequence[Experiment], *, cache: ResultCache = no_cache, progress: Progress = silent
 ) -> list[Recall]:
     """Run experiments side by side, as replicas of one run; the recall of each.
 
     Args:
         experiments: that `match` each other.
-        devices: that share out the replicas; default all that JAX sees.
         cache: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).
         progress: told about every chunk.
 
@@ -156,7 +151,7 @@ def run_several(
             pairs = dataclasses.replace(pairs, reference=jnp.asarray(pairs.reference)[..., place])
         on.simulation = everything.simulation(sheared=True).with_pairs(pairs)
         on.state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., place], on.state)
-        on.place_on(placement_of(len(owners), devices))
+        on.place_on(placement_of(len(owners)))
         samples = on.run_stages(*own, checkpoint=checkpoint)
         return samples, on.status()
 

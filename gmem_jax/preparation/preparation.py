@@ -41,14 +41,7 @@ from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, con
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.neighbors import pair_finder
 from gmem_jax.simulation.observers import Chunk
-from gmem_jax.simulation.progress import (
-    Progress,
-    ProgressChoice,
-    callback,
-    shows_progress,
-    work_of,
-    work_of_bin,
-)
+from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, work_of, work_of_bin
 from gmem_jax.simulation.protocol import Stage
 from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
 from gmem_jax.simulation.sample import Sample
