@@ -64,7 +64,7 @@ def main() -> None:
             if there(folder / TABLE, name, bits, arguments.t0, arguments.iterations):
                 continue
             kept = folder / f"words-{bits}-seed-0.msgpack"
-            net = training.train(TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=kept).net
+            net = training.train_net(TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=kept).net
             number = drawn(2**bits, arguments.drawn)
             row = design(folder, any_words, kernel, bits, number, net, arguments.iterations)
             print(row, flush=True)

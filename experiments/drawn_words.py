@@ -63,7 +63,7 @@ def main() -> None:
         if not file.exists():
             run(experiment, file)
         recall = gm.load_recall(file)
-        net = training.train(
+        net = training.train_net(
             TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=folder / f"words-{bits}-seed-0.msgpack"
         ).net
         row = {"pack": pack.name, "t0": arguments.t0, **read(experiment, recall, bits, number, net)}

@@ -105,7 +105,9 @@ def classify_command(
     for seed in range(seeds):
         file = check_output(folder / f"words-{stored.bits}-seed-{seed}.msgpack", "", force=True, option="--nets")
         with _training(budget) as listener:
-            one = training.train(TrainingConfig(stored.bits), seed, budget=budget, checkpoint=file, listener=listener)
+            one = training.train_net(
+                TrainingConfig(stored.bits), seed, budget=budget, checkpoint=file, listener=listener
+            )
         trained.append(one)
         state = "trained" if one.finished else "out of time"
         log(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}")

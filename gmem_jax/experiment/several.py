@@ -28,7 +28,7 @@ from gmem_jax.simulation.sharding import placement_of
 
 @pytree
 @dataclass(frozen=True)
-class Chosen:
+class ChosenSignals:
     """Waveforms chosen from some sets; number 0 is no shear, the others count through the sets.
 
     Attributes:
@@ -100,7 +100,7 @@ class _Side:
         first = self.experiments[0]
         return replace(first, {**changes, "signals": signals, "steps": first.steps_per_bin})
 
-    def signals(self) -> Chosen:
+    def signals(self) -> ChosenSignals:
         """All their waveforms, each set with its zero signal before it; that of the first is replica 0."""
         sets: list[Signals] = []
         begun: dict[int, int] = {}
@@ -110,7 +110,7 @@ class _Side:
                 begun[id(each.signals)] = 1 + sum(one.count for one in sets)
                 sets.append(each.waveforms)
             numbers += [0, *(begun[id(each.signals)] + np.arange(each.signals.count)).tolist()]
-        return Chosen(tuple(sets), jnp.asarray(numbers[1:]))
+        return ChosenSignals(tuple(sets), jnp.asarray(numbers[1:]))
 
 
 @usual_rules()
@@ -138,7 +138,7 @@ def run_several(
     owners = np.repeat(np.arange(len(experiments)), np.diff(side.first))
     sets = side.signals().sets
     loud = 1 + int(np.argmax(np.any(np.asarray(bin_average(sets[0])), axis=1)))  # the prefix applies none of them
-    silence = Chosen(sets, jnp.full(max(1, len(one_each) - 1), loud))
+    silence = ChosenSignals(sets, jnp.full(max(1, len(one_each) - 1), loud))
     everything = side.wide(owners, side.signals())
     on = runner_of(side.wide(one_each, silence), progress=progress)
     on.total_work = work_of(common, on.state.replicas) + work_of(own, len(owners))

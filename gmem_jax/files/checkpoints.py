@@ -33,7 +33,7 @@ from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 PART_SCHEMA = "gmem-part/0.1"
 PARTS_SCHEMA = "gmem-parts/0.1"
 RUN_MARKER = "run.json"
-OWN = r"[\w.+-]+\.(?:npz|now|before)|(?:run|job)\.json"
+PART_FILES = r"[\w.+-]+\.(?:npz|now|before)|(?:run|job)\.json"
 """Names of files in a folder of parts; a sweep puts the job there that they belong to."""
 FIRST = 5.0  # s before the first checkpoint of an unfinished part; each next one takes twice as long to come
 CHECKPOINT_INTERVAL = 120.0  # s between checkpoints at most: doing it again must cost more than writing them
@@ -197,7 +197,7 @@ class Checkpoints(ResultCache):
         self.folder = Path(folder)
         wanted = json.loads(json.dumps(key))
         self._run = hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:20]
-        self._own = Folder(self.folder, RUN_MARKER, PARTS_SCHEMA, re.compile(OWN), {"key": wanted})
+        self._own = Folder(self.folder, RUN_MARKER, PARTS_SCHEMA, re.compile(PART_FILES), {"key": wanted})
         if restart or not (self.finished() or self.begun()):
             self._own.clear(keep=True)
         elif found := self.key_of(self.folder):

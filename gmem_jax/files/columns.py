@@ -18,7 +18,7 @@ _OWN = re.compile(r"signal_\d+")  # as `save_waveforms` names its columns
 _AS_AXIS = "call it u or time if it is the axis, else leave it out"
 
 
-class Columns(NamedTuple):
+class SampleTable(NamedTuple):
     """What a table holds.
 
     Attributes:
@@ -34,7 +34,7 @@ class Columns(NamedTuple):
     said: tuple[str, ...] = ()
 
 
-def read_columns(path: Path) -> Columns:
+def read_columns(path: Path) -> SampleTable:
     """The columns of a CSV: separated by commas, semicolons or tabs, with or without a line of names.
 
     Raises:
@@ -43,7 +43,7 @@ def read_columns(path: Path) -> Columns:
     """
     lines = [line for line in path.read_text("utf-8-sig").splitlines() if line.strip() and not line.startswith("#")]
     if not lines:
-        return Columns(np.zeros((0, 0)))
+        return SampleTable(np.zeros((0, 0)))
     separator = next((one for one in _SEPARATORS if one in lines[0]), ",")
     first = [cell.strip() for cell in next(csv.reader(lines[:1], delimiter=separator))]
     numbers = [_is_number(cell) for cell in first]
@@ -59,8 +59,8 @@ def read_columns(path: Path) -> Columns:
         raise FileFormatError(f"{path}: {', '.join(names)}: must be one axis, and a column for each signal")
     _require_no_axis(path, names, values, axes)
     if not axes:
-        return Columns(values, said=said)
-    return Columns(np.delete(values, axes, axis=0), values[axes[0]], names[axes[0]], said)
+        return SampleTable(values, said=said)
+    return SampleTable(np.delete(values, axes, axis=0), values[axes[0]], names[axes[0]], said)
 
 
 def _is_number(cell: str) -> bool:

@@ -14,7 +14,7 @@ from gmem_jax.experiment.record import SIGNALS, signals_to_dict
 from gmem_jax.experiment.samples import Told, require_gentle, untold, waveform_from
 from gmem_jax.experiment.signals import LONGEST_WORD, PAD, WIDTH, Signals, Spline, six_signals, waveform, words
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.columns import Columns, read_columns
+from gmem_jax.files.columns import SampleTable, read_columns
 from gmem_jax.files.validation import json_of, numbers, read_npy, refusing, require_fields, require_kinds, title
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import BINS
@@ -50,7 +50,7 @@ def load_waveforms(
     with refusing(path, "table of numbers"):
         if path.stat().st_size > _LARGEST:
             raise FileFormatError(f"{path}: waveforms in a file of more than {_LARGEST >> 20} MB")
-        found = Columns(_npy(path)) if path.suffix.lower() == ".npy" else read_columns(path)
+        found = SampleTable(_npy(path)) if path.suffix.lower() == ".npy" else read_columns(path)
     values = found.values
     if values.ndim != 2 or values.shape[0] < 1 or values.shape[1] < 2:
         raise FileFormatError(f"{path}: a waveform needs at least 2 samples; found an array of shape {values.shape}")
@@ -72,7 +72,7 @@ def load_waveforms(
     return values
 
 
-def _places(found: Columns, said: list[str]) -> tuple[np.ndarray, tuple[float, float] | None]:
+def _places(found: SampleTable, said: list[str]) -> tuple[np.ndarray, tuple[float, float] | None]:
     """Where samples were taken, and what is u = 0 and 1 there; None for the first and the last."""
     if found.axis is None:
         count = found.values.shape[1]

@@ -2,7 +2,8 @@
 
 from gmem_jax.reading.lessons import Examples, TrainingConfig, examples
 from gmem_jax.reading.net import Net, Perceptron, accuracy, cross_entropy, initial, logits, normalise, predict
-from gmem_jax.reading.training import Listener, Training, learn, load, save, train
+from gmem_jax.reading.training import Listener, Training, learn, load, save
+from gmem_jax.reading.training import train_net as train
 from gmem_jax.reading.training import validation_accuracy as validate
 from gmem_jax.simulation.progress import silent
 

@@ -105,7 +105,7 @@ _validate = jax.jit(validation_accuracy, static_argnames="count")
 _examples = jax.jit(examples, static_argnames="lessons")
 
 
-def train(
+def train_net(
     lessons: TrainingConfig,
     seed: int = 0,
     *,

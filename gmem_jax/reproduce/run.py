@@ -17,7 +17,7 @@ from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reading.report import reading_report
-from gmem_jax.reading.training import train
+from gmem_jax.reading.training import train_net
 from gmem_jax.reproduce import choices, claims, draw
 from gmem_jax.reproduce.choices import Effect
 from gmem_jax.reproduce.claims import Verdict
@@ -235,7 +235,7 @@ class Reproduction:
             nets = []
             for seed in range(size.nets):
                 file = self.folder / "nets" / f"words-{length}-{seed}.msgpack"
-                net = train(TrainingConfig(length), seed, budget=size.budget, checkpoint=file)
+                net = train_net(TrainingConfig(length), seed, budget=size.budget, checkpoint=file)
                 nets.append(net)
                 self.say(f"net {seed} for {length} bits: {net.step} steps, held-out accuracy {net.validation:.4f}")
             for point in points:

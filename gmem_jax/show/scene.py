@@ -58,7 +58,7 @@ class Links:
     force: np.ndarray
 
 
-at_rest = frames_of_pack
+rest_frames = frames_of_pack
 
 
 def links(frames: Frames) -> Links:

@@ -32,7 +32,7 @@ from gmem_jax.reading.readers import confusion
 from gmem_jax.show import figures, sweeps, tables
 from gmem_jax.show.figure import Figure
 from gmem_jax.show.recalls import MOST_OF_PAGE, PICTURES, recall_figure, signals_figure
-from gmem_jax.show.scene import at_rest
+from gmem_jax.show.scene import rest_frames
 from gmem_jax.show.stages import QUANTITIES, series_figures, stages_figure
 from gmem_jax.show.tables import Fact, cell
 from gmem_jax.simulation.frames import Frames
@@ -201,7 +201,7 @@ def _grains(recall: Recall, names: Sequence[str], written: Mapping[str, Any]) ->
         pack = load_pack(of_pack["source"])
         if pack_fingerprint(pack) != of_pack["sha256"]:
             raise ValueError("another pack has this name now")
-        return at_rest(pack)
+        return rest_frames(pack)
 
     yield Part(GrainView(rest, material, str(of_pack.get("sha256"))))
 
@@ -216,7 +216,7 @@ def of_pack(
     drawn |= {what: partial(stages_figure, kept, what, title, against=against, t0=t0) for what in QUANTITIES if kept}
 
     def parts() -> Iterator[Part]:
-        yield Part(GrainView(lambda: at_rest(pack), Material(), pack_fingerprint(pack)))
+        yield Part(GrainView(lambda: rest_frames(pack), Material(), pack_fingerprint(pack)))
         if kept:
             yield from _series(kept, [], t0, "Its preparation")
         if frames is not None:

@@ -10,7 +10,7 @@ from string import Template
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.material import Material
-from gmem_jax.show.scene import at_rest, packed
+from gmem_jax.show.scene import packed, rest_frames
 from gmem_jax.simulation.frames import Frames
 
 HEIGHT = 730  # pixels of a view in a notebook
@@ -95,5 +95,5 @@ def view(pack: Pack | Frames) -> View:
     Returns:
         What a notebook shows, and `save` writes as a page.
     """
-    frames, name = (at_rest(pack), pack.name) if isinstance(pack, Pack) else (pack, "frames")
+    frames, name = (rest_frames(pack), pack.name) if isinstance(pack, Pack) else (pack, "frames")
     return View(page(name, figure("pack", frames), three=True, bare=True))

@@ -21,7 +21,7 @@ from typing import Any
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.checkpoints import OWN, is_locked, locked
+from gmem_jax.files.checkpoints import PART_FILES, is_locked, locked
 from gmem_jax.files.ours import Folder, remove_leftovers
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.files.schemas import SWEEP
@@ -37,7 +37,7 @@ _KEY = r"[0-9a-z]{1,40}"
 _JOB = rf"{_KEY}(?:-[0-9]{{1,6}})*"
 _OWN = re.compile(
     rf"sweep\.json|trial|jobs/[0-9]{{5}}-{_JOB}\.json|jobs/{_JOB}|(?:points|packs)/{_KEY}\.h5|failed/{_KEY}\.json"
-    rf"|parts/{_JOB}/(?:{OWN})|workers/[a-z]+(?:-[0-9]+)?\.(?:json|log|run)"
+    rf"|parts/{_JOB}/(?:{PART_FILES})|workers/[a-z]+(?:-[0-9]+)?\.(?:json|log|run)"
 )
 
 

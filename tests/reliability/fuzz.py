@@ -429,7 +429,7 @@ def _without_runs() -> None:
     from gmem_jax.command import sweep
     from gmem_jax.reading import training
 
-    recalls.run = packs.prepare = measure.run_benchmark = training.train = _stop  # type: ignore[assignment]
+    recalls.run = packs.prepare = measure.run_benchmark = training.train_net = _stop  # type: ignore[assignment]
     sweep.SweepRunner.run = _stop  # type: ignore[method-assign]
     for name in ("value_and_grad", "prefix_of", "memory_kernel", "simulate", "design_waveforms", "design_drive"):
         setattr(derive, name, _stop)

@@ -26,7 +26,7 @@ import gmem_jax as gm
 from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import remove_leftovers
 from gmem_jax.reading.lessons import TrainingConfig
-from gmem_jax.reading.training import Training, initial, save, train
+from gmem_jax.reading.training import Training, initial, save, train_net
 from gmem_jax.sweeps.processes import RUNNER
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.table import rows
@@ -162,7 +162,7 @@ def _read_parts(folder: Path) -> None:
 
 def _read_nets(folder: Path) -> None:
     for seed in (0, 1):
-        train(TrainingConfig(2), seed, budget=0.0, most_steps=0, checkpoint=folder / f"net-{seed}")
+        train_net(TrainingConfig(2), seed, budget=0.0, most_steps=0, checkpoint=folder / f"net-{seed}")
 
 
 def concurrency(tries: int) -> Counter[str]:

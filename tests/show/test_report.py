@@ -24,7 +24,7 @@ from gmem_jax.experiment import analysis
 from gmem_jax.show import render_plotly
 from gmem_jax.show.recalls import signals_figure
 from gmem_jax.show.report import Report, html_table
-from gmem_jax.show.scene import Colouring, at_rest, links, packed, quantities
+from gmem_jax.show.scene import Colouring, links, packed, quantities, rest_frames
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import MEASURED, Sample
 
@@ -88,7 +88,7 @@ def one_after_the_other(*some: Frames) -> Frames:
 
 def squeezed() -> Frames:
     """The pack, and three times the same in a smaller box, where a grain has moved by itself and contacts rub."""
-    rest = at_rest(PACK)
+    rest = rest_frames(PACK)
 
     def after(number: int) -> Frames:
         shrink = np.array([1.0 - 0.01 * number, 1.0 - 0.01 * number, 1.0])
@@ -174,7 +174,7 @@ def test_contacts_of_one_pair_of_grains_are_one_link_with_their_sum() -> None:
 
 def test_forces_in_a_pack_at_rest_balance_on_every_grain_that_touches_no_wall() -> None:
     pack = gm.load_pack("tetra-325-a")
-    rest = at_rest(pack)
+    rest = rest_frames(pack)
     centres = rest.centres(0)
     one, other = rest.spheres.T
     normal = (centres[other] - centres[one]) / np.linalg.norm(centres[other] - centres[one], axis=1, keepdims=True)
