@@ -835,8 +835,8 @@ MUTATIONS = (
     mutation(
         "list-not-resumed",
         "simulation/runner.py",
-        '= snapshot["state"], self.simulation.with_pairs(snapshot["pairs"])',
-        '= snapshot["state"], self.simulation',
+        'listed = self.simulation.with_pairs(snapshot["pairs"])',
+        "listed = self.simulation",
         "test_a_run_goes_on_with_the_lists_it_had",
     ),
     mutation(

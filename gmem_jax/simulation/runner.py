@@ -119,8 +119,8 @@ class Runner:
     def restore(self, snapshot: Mapping[str, Any]) -> None:
         """Stand where a runner of the same simulation stood when it gave `snapshot`."""
         mark = Mark(*snapshot["mark"]) if snapshot["mark"] else None
-        self.state, self.simulation = snapshot["state"], self.simulation.with_pairs(snapshot["pairs"])
-        self.simulation = replace(self.simulation, mark=mark)
+        listed = self.simulation.with_pairs(snapshot["pairs"])
+        self.state, self.simulation = snapshot["state"], replace(listed, mark=mark)
         self.place_on(self.placement)
         self.time, self.work, rebuilds, self.skin, chunk, lasted = snapshot["counters"].tolist()
         self.rebuilds, self.chunk, self._lasted = int(rebuilds), int(chunk), int(lasted)
