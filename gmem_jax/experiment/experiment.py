@@ -182,6 +182,9 @@ class Experiment:
                 raise ValueError(
                     f"{odd[0]} makes the paper's protocol, and another one was given: say it in a stage of that"
                 )
+            if protocol.stages[0].start != 0.0:
+                first = protocol.stages[0]
+                raise ValueError(f"the pack rests at u = 0, and stage {first.name!r} begins at u = {first.start:g}")
             if not protocol.reads:
                 raise ValueError("the protocol has no stage that reads, as gm.read() is one")
             if not protocol.channels:

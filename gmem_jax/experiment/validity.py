@@ -100,9 +100,9 @@ def compression_speed(experiment: Experiment) -> jax.Array:
 def _restlessness(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.Array:
     """Speed of the fastest grain over that of the walls, for half of a stage in which these move, [B]."""
     slow, bin_time = compression_speed(experiment), jnp.asarray(experiment.t0) / BINS
-    moving = [stage.name for stage in experiment.protocol if stage.start != stage.stop]
+    moving = [stage.name for stage in experiment.protocol if stage.moves]
     found = [jnp.zeros((1, 1))]
-    for sample in (stages[name] for name in moving if name in stages):
+    for sample in (stages[name] for name in moving if name in stages and len(stages[name].filling) > 1):
         walls = 0.5 * jnp.max(jnp.abs(jnp.diff(sample.lengths, axis=0)), axis=(0, 1)) / bin_time
         found.append(jnp.median(sample.largest_speed, axis=0) / jnp.maximum(walls, slow)[None])
     return _most(found)

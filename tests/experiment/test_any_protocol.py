@@ -113,6 +113,7 @@ def test_what_makes_no_drive_is_refused(arguments: tuple[Any, ...], reason: str)
         ({"store": 1.0}, "store makes the paper's protocol, and another one was given"),
         ({"background": "sub2"}, "takes the second read for the background of the first; the protocol has 1"),
         ({"protocol": gm.Protocol(gm.write())}, "no stage that reads"),
+        ({"protocol": Protocol(Stage("a", 1.0, 0.0), *READ)}, "rests at u = 0, and stage 'a' begins at u = 1"),
         ({"protocol": gm.Protocol(gm.write([0.5, 1.0, 0.5]), gm.read())}, "writes no waveforms of the replicas"),
         ({"protocol": gm.Protocol(gm.write("first"), gm.read())}, "writes 'first', and the sets of waveforms are xy"),
         ({"protocol": READ.stages}, "must be a gm.Protocol, got a tuple"),

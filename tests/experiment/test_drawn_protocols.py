@@ -20,7 +20,7 @@ EARLY = gm.Bumps(jnp.asarray([[-1.0]]), jnp.asarray([[0.4]]), 0.6)
 SETS = gm.signals(xy=BUMP, z=EARLY)
 
 U = st.sampled_from([None, 0.0, 0.25, 0.5, 1.0, 1.5])
-LENGTH = st.sampled_from([0.0, 0.004, 0.01, 0.03, -1.0])
+LENGTH = st.sampled_from([0.0, 0.003, 0.01, 0.03, -1.0])
 AMPLITUDE = st.sampled_from([0.0, 0.5, 1.0, -1.0])
 CHANNEL = st.sampled_from(["xy", "z", "compression"])
 MORE = st.fixed_dictionaries(
