@@ -18,6 +18,7 @@ from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
+from gmem_jax.physics.numbers import whole
 from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, Status, combined_status, explain
@@ -300,9 +301,7 @@ def run(
         )
     began, tell = time.perf_counter(), callback(progress)
     count = experiment.signals.count
-    size = count if batch is None else batch
-    if size < 1:
-        raise ValueError(f"batch must be at least 1, got {batch}")
+    size = count if batch is None else whole("batch", batch, 1)
     if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
         raise ValueError("parameters with a value for each replica need all signals in one batch")
     schedule = frame_schedule(experiment, frames, frames_of, frames_at)
@@ -358,7 +357,8 @@ def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[fl
     Raises:
         ValueError: for too many or too few, a u beyond 0 and 1, or a signal that there is not.
     """
-    if not 0 <= of <= experiment.signals.count:
+    frames, of = whole("frames", frames), whole("frames_of", of)
+    if of > experiment.signals.count:
         raise ValueError(f"frames of signal {of}: there are signals 1 to {experiment.signals.count}, and 0 for none")
     stages = experiment.protocol.stages
     along = [places(stages, frames, CHUNK)] if frames else []
