@@ -24,7 +24,7 @@ from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.packs import load_pack, load_stages, pack_called
 from gmem_jax.files.recalls import load_recall, to_csv
 from gmem_jax.files.results import load_result
-from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL, TUNED
+from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL, TUNED, other_kind
 from gmem_jax.files.validation import is_number, refusing
 from gmem_jax.files.waveforms import load_design, load_target, load_waveforms
 from gmem_jax.physics.material import Material
@@ -143,8 +143,7 @@ def _summary_of(file: Path, against: str, signals: Sequence[int], each: bool, ch
         return _stored_pack(file, against)
     if schema_name == RECALL.name:
         return of_recall(load_recall(file), file.name, against=against, signals=signals, each=each)
-    known = ", ".join(schema.name for schema in (RECALL, PACK, KERNEL))
-    raise FileFormatError(f"{file}: schema is {schema_name[:40]!r}, expected one of {known}")
+    raise FileFormatError(f"{file}: {other_kind(schema_name, RECALL.name, PACK.name, KERNEL.name)}")
 
 
 def of_recall(
