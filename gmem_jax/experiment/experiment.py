@@ -135,7 +135,7 @@ class Experiment:
         step = self.timing.dt
         if not traced(step) and not np.all(np.asarray(step) <= LARGEST_STEP):
             raise ValueError(
-                f"{self.steps_per_bin} steps in a bin make a time step of {np.max(step):g} t_c, which must be at most "
+                f"steps = {self.steps_per_bin} makes a time step of {np.max(step):g} t_c, which must be at most "
                 f"{LARGEST_STEP}; give more steps, or none to have them chosen"
             )
 

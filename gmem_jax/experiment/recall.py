@@ -18,7 +18,7 @@ from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
-from gmem_jax.physics.numbers import whole
+from gmem_jax.physics.numbers import plural, whole
 from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, Status, combined_status, explain
@@ -110,7 +110,7 @@ class Recall:
         rows = {**measures, "F over T1": self.windowed_fidelity, "T1 (t_c)": self.window}
         if not traced(self.status):
             rows["status"] = explain(combined_status(self.status))
-        return f"Recall of {self.J.shape[-2]} signals", rows
+        return f"Recall of {plural(self.J.shape[-2], 'signal')}", rows
 
     def __repr__(self) -> str:
         return html.line(self, self._facts)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.html import line
-from gmem_jax.physics.numbers import is_real, require_numbers, said
+from gmem_jax.physics.numbers import is_real, plural, require_numbers, said
 from gmem_jax.physics.pytree import Scalar, pytree, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import BINS
@@ -84,7 +84,9 @@ class Bumps:
         _require_arrays(self)
 
     def __repr__(self) -> str:
-        return line(self, lambda: (f"{self.count} signals", {"bumps": self.centres.shape[-1], "width": self.width}))
+        return line(
+            self, lambda: (plural(self.count, "signal"), {"bumps": self.centres.shape[-1], "width": self.width})
+        )
 
     @property
     def count(self) -> int:
@@ -122,7 +124,7 @@ class Spline:
         _require_arrays(self)
 
     def __repr__(self) -> str:
-        return line(self, lambda: (f"{self.count} signals", {"nodes": self.nodes.shape[-1]}))
+        return line(self, lambda: (plural(self.count, "signal"), {"nodes": self.nodes.shape[-1]}))
 
     @property
     def count(self) -> int:

@@ -27,6 +27,7 @@ from gmem_jax.files.validation import (
     title,
     whole,
 )
+from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, Status
 from gmem_jax.simulation.protocol import BINS, Protocol
@@ -128,7 +129,10 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
 def _check(recall: Recall) -> None:
     signals, replicas = len(recall.J), len(recall.status)
     status = np.asarray(recall.status)
-    require(signals > 0 and replicas == signals + 1, f"it has {signals} signals and {replicas} replicas, not one more")
+    require(
+        signals > 0 and replicas == signals + 1,
+        f"it has {plural(signals, 'signal')} and {plural(replicas, 'replica')}, not one more",
+    )
     require((status >= 0) & (status & ~_EVERY_BIT == 0), "its status is none that there is")
     require(np.abs(np.asarray(recall.u) - (np.arange(BINS) + 0.5) / BINS) < 1e-12, "its u are not the centres of bins")
     require_finite({name: getattr(recall, name) for name in ("J", "window", "dt")})
@@ -149,6 +153,8 @@ def _check(recall: Recall) -> None:
 
 def _check_stage(name: str, stage: Sample, replicas: int, *, read: bool) -> None:
     bins, wide = np.shape(stage.pressure)[0], np.shape(stage.pressure)[-1]
-    require(bins > 0 and wide in (1, replicas), f"stage {name!r} has {wide} replicas, must have 1 or {replicas}")
+    require(
+        bins > 0 and wide in (1, replicas), f"stage {name!r} has {plural(wide, 'replica')}, must have 1 or {replicas}"
+    )
     if read:
         require((bins, wide) == (BINS, replicas), f"stage {name!r} must have {BINS} bins of {replicas} replicas")

@@ -12,6 +12,7 @@ from typing import BinaryIO
 from gmem_jax.errors import FileFormatError
 
 BLOCK = 512  # the smallest user block of HDF5
+PART = "part of a run"
 HDF5 = "HDF5 file"  # what `require_sealed` may be asked for
 _MARK = b"gmem sha256 "
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -69,5 +70,6 @@ def require_sealed(file: BinaryIO, what: str) -> None:
     if not found.startswith(_MARK):
         raise FileFormatError(f"not a readable {what}: {_foreign(file, what)}")
     if found != _block(file):
-        raise FileFormatError("damaged, its checksum does not fit its content; restore it, or make it anew")
+        advice = "" if what == PART else "; restore it, or make it anew"
+        raise FileFormatError(f"damaged, its checksum does not fit its content{advice}")
     file.seek(BLOCK)

@@ -1,4 +1,4 @@
-"""What counts as a number where one is asked for: a text, a yes or no and a complex number do not."""
+"""What counts as a number where one is asked for (a text, a yes or no and a complex number do not); counts in words."""
 
 import operator
 from decimal import Decimal
@@ -55,3 +55,8 @@ def whole(name: str, value: Any, least: int = 0) -> int:
     if number < least:
         raise ValueError(f"{name} must be a whole number from {least}, got {said(value)}")
     return number
+
+
+def plural(number: int, what: str) -> str:
+    """So many of something whose plural ends in s: "1 signal", "2 signals"."""
+    return f"{number} {what}{'s' * (number != 1)}"

@@ -297,7 +297,7 @@ def read_words(folder: Path, store: Store, points: Sequence[Point], scale: Scale
         for seed in range(scale.nets):
             file = folder / "nets" / f"words-{length}-{seed}.msgpack"
             nets.append(train(TrainingConfig(length), seed, budget=scale.budget, checkpoint=file))
-            say(f"net {seed} for {length} bits: {nets[-1].step} steps, held-out accuracy {nets[-1].validation:.4f}")
+            say(f"net {seed} for L = {length}: {nets[-1].step} steps, held-out accuracy {nets[-1].validation:.4f}")
         for point in points:
             if point.conditions.bits == length:
                 read = reading(stored_words(store.load(point.key)), nets)["readers"]
