@@ -59,9 +59,21 @@ def test_a_wrong_number_of_threads_is_told_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, threads: str
 ) -> None:
     monkeypatch.setenv("GMEM_THREADS", threads)
-    assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "x.h5", *SHORT) == 2
-    expected = f'gmem: GMEM_THREADS should be a number of threads from 1 to 4096; it is "{threads}"'
-    assert capsys.readouterr().err.splitlines()[-1] == expected
+    (tmp_path / "mu.toml").write_text(f'[experiment]\npack = "{PACK}"\n[vary]\nmu = [0.5]\n')
+    for command in (["recall", PACK, "-o", tmp_path / "x.h5", *SHORT], ["sweep", tmp_path / "mu.toml"]):
+        assert gmem(monkeypatch, *command) == 2
+        expected = f'gmem: GMEM_THREADS should be a number of threads from 1 to 4096; it is "{threads}"'
+        assert capsys.readouterr().err.splitlines() == [expected]  # before its cost is told
+    assert [path.name for path in tmp_path.iterdir()] == ["mu.toml"]
+
+
+def test_a_chosen_folder_of_programs_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    folder = tmp_path / "file" / "programs"
+    first, *others = said("sweep", "status", tmp_path, code=2, GMEM_COMPILE_CACHE=str(folder)).splitlines()
+    why = f"GMEM_COMPILE_CACHE={folder}: cannot write there (Not a directory)"
+    assert first == f"warning: {why}; compiled programs are not kept"
+    assert len(others) == 1
 
 
 def test_ctrl_c_while_it_is_imported_is_one_line() -> None:
