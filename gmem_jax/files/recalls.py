@@ -47,8 +47,7 @@ def save_recall(path: str | Path, recall: Recall) -> None:
     configuration = recall.configuration
     if not configuration:
         raise ValueError(
-            "a recall of a traced experiment does not say what it is of: save "
-            "recall.described(gm.describe(experiment, 0.0))"
+            "a recall of a traced experiment does not say what it is of: save recall.described(gm.describe(experiment))"
         )
     names = np.asarray([name.encode() for name in recall.names])
     if names.dtype.itemsize == 1:

@@ -87,9 +87,10 @@ def combined_status(status: npt.ArrayLike) -> int:
     return int(np.bitwise_or.reduce(np.asarray(status), axis=None))
 
 
-def explain(status: int) -> str:
-    """The set bits of `status` as one readable line ("ok" when none is set)."""
-    return "; ".join(text for bit, text in SENTENCES.items() if status & bit) or "ok"
+def explain(status: npt.ArrayLike) -> str:
+    """The bits of `status` as one readable line ("ok" when none is set): of one replica, or of several together."""
+    bits = combined_status(status)
+    return "; ".join(text for bit, text in SENTENCES.items() if bits & bit) or "ok"
 
 
 @pytree

@@ -103,7 +103,9 @@ def test_progress_rises_to_one_and_names_the_stage() -> None:
 
 
 def test_every_status_bit_has_a_sentence() -> None:
-    assert gm.explain(0) == "ok"
+    assert gm.explain(0) == gm.explain(np.zeros(3, int)) == "ok"
+    one, other = Status.RINGING, Status.RESTLESS  # of two replicas of a run
+    assert gm.explain(jnp.asarray([int(one), 0, int(other)])) == gm.explain(one | other)
     for bit in Status:
         assert ";" in gm.explain(int(bit))
         assert "use" in gm.explain(int(bit)) or "allocate" in gm.explain(int(bit))
