@@ -40,7 +40,7 @@ reliability: install-dev
 # Sweeps on a SLURM of this one machine: a worker is killed, one requeued, one waits. Needs root, slurm-wlm and munge.
 cluster: install-dev
 	$(REBUILD)
-	tests/cluster/one_node.sh $(abspath $(BIN))/python tests/cluster/sweep_on_slurm.py
+	tests/cluster/one_node.sh $(abspath $(BIN))/python tests/cluster/sweep_on_slurm.py $(CASES)
 
 check: install-dev
 	$(BIN)/ruff check .

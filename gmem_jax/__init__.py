@@ -11,6 +11,7 @@ Units are R = E = rho = 1 (time in t_c = R sqrt(rho/E)); `Material` converts. As
 import importlib
 from typing import TYPE_CHECKING, Any
 
+import gmem_start  # noqa: F401 - first: where this is `python -m gmem_jax`, it answers Ctrl-C from now on
 from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.derivatives.jacobian import exact as jacobian
 from gmem_jax.design.kernel import KernelMatrix, MemoryKernel, kernel_matrix, memory_kernel

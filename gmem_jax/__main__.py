@@ -1,6 +1,6 @@
 """`python -m gmem_jax`: the `gmem` command."""
 
-from gmem_jax.command.app import main
+from gmem_start import main
 
 if __name__ == "__main__":
     main()

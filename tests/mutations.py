@@ -1294,15 +1294,15 @@ MUTATIONS = (
     mutation(
         "parts-run-again",
         "files/checkpoints.py",
-        "if path.is_file():\n            return load_part",
-        "if False:\n            return load_part",
+        "if path.is_file():\n            try:",
+        "if False:\n            try:",
         "test_a_part_that_is_kept_is_not_run_again",
     ),
     mutation(
         "parts-of-another-run",
         "files/checkpoints.py",
-        "if found.get(name) != wanted.get(name)]",
-        "if False]",
+        "if not found or found == wanted:",
+        "if True:",
         "test_parts_of_another_run_are_refused",
     ),
     mutation(

@@ -110,8 +110,8 @@ def main() -> None:
     """The `gmem` command, once all is imported; see `gmem_start`."""
     _open_streams()
     jax.config.update("jax_enable_x64", True)
-    keep_programs()
     warnings.showwarning = _one_line
+    keep_programs()
     if getattr(jax.config, "jax_disable_jit", False):
         log("warning: JAX_DISABLE_JIT is set: nothing is compiled, and a run takes hours for seconds", style="yellow")
     try:

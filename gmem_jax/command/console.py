@@ -25,6 +25,7 @@ from gmem_jax.files.ours import promise
 from gmem_jax.files.results import finite
 from gmem_jax.files.sizes import in_bytes, in_time
 from gmem_jax.files.validation import NAME, printable, title
+from gmem_jax.native import require_threads
 from gmem_jax.show.figure import Figure
 from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.simulation.progress import Progress
@@ -117,14 +118,31 @@ def print_result(as_json: bool, result: Any, *tables: Any) -> None:
             sys.stdout.write(json.dumps(finite(result), allow_nan=False) + "\n")
         else:
             for table in tables:
-                if isinstance(table, Table):
-                    _keep_whole(table)
                 words = isinstance(table, str)
-                out.print(printable(table) if words else table, soft_wrap=words, crop=False)
+                for part in [table] if words else _fitted(table):
+                    out.print(printable(part) if words else part, soft_wrap=words, crop=False)
 
 
-def _keep_whole(table: Table) -> None:
-    """Let a table be as wide as its numbers and words, if the terminal is not: rich would cut them."""
+def _fitted(table: Table) -> list[Table]:
+    """A table that is no wider than the terminal; where its columns do not fit side by side, a table for each row."""
+    if _keep_whole(table) <= out.width or not (out.is_terminal or os.environ.get("COLUMNS")):
+        return [table]
+    if len(table.columns) < 3:
+        return [table]
+    rows = [Table(title=table.title if not number else None, show_header=False) for number in range(table.row_count)]
+    for column in table.columns:
+        for row, cell in zip(rows, column.cells, strict=True):
+            row.add_row(str(column.header), cell)
+    for row in rows:
+        row.columns[1].overflow = "fold"
+        _keep_whole(row)
+    if rows:
+        rows[-1].caption = table.caption
+    return rows
+
+
+def _keep_whole(table: Table) -> int:
+    """Let a table be as wide as its numbers and words, if the terminal is not: rich would cut them; that width."""
     least = 1
     for column in table.columns:
         breaks = column.overflow == "fold" and not column.no_wrap  # anywhere, but for its head
@@ -133,6 +151,7 @@ def _keep_whole(table: Table) -> None:
         column.min_width = max([column.min_width or 0, *map(cell_len, pieces)])
         least += column.min_width + 3  # a blank on either side, and a rule
     table.width = least if least > out.width else table.width
+    return least
 
 
 def require_name(name: str) -> None:
@@ -202,7 +221,10 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
 
     Raises:
         InputError: saying what is needed and what there is.
+        ValueError: if GMEM_THREADS is no number of threads.
     """
+    if backend == "native":
+        require_threads()
     free = psutil.virtual_memory().available
     seconds = 1e-6 * STEP_COST[backend][replicas > 1] * grain_steps
     if not seconds < LONGEST_DURATION:

@@ -25,7 +25,7 @@ from gmem_jax.command.console import (
     require_name,
 )
 from gmem_jax.command.options import with_recipe
-from gmem_jax.command.resuming import Restart, resumable
+from gmem_jax.command.resuming import Restart, foresee, resumable
 from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.experiment.provenance import provenance, sources
 from gmem_jax.experiment.record import fingerprint
@@ -143,13 +143,14 @@ def prepare_command(
     check_output(output, ".h5", force=force)
     backend = native.name(backend, Frictionless())
     cost = announce(f"{recipe.grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * recipe.grains, backend)
+    key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
     if dry_run:
+        foresee(output, key, restart=restart)
         emit_cost(as_json, cost, output, pack_bytes(recipe.grains, frames))
         return
     began = time.perf_counter()
     stages: dict[str, Sample] = {}
     film: list[Frames] = []
-    key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
     with resumable(output, key, restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             kept: Any = {"log": stages, "frames": frames, "film": film}

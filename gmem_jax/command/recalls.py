@@ -28,7 +28,7 @@ from gmem_jax.command.console import (
     reporting,
 )
 from gmem_jax.command.options import ExperimentOptions, with_experiment
-from gmem_jax.command.resuming import Restart, batch_for, resumable
+from gmem_jax.command.resuming import Restart, batch_for, foresee, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import frame_schedule, replica_bins, run, run_bytes
@@ -38,6 +38,7 @@ from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
 from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import combined_status
 from gmem_jax.show import tables
 from gmem_jax.show.summaries import Summary, of_recall
@@ -55,7 +56,7 @@ def _announce(experiment: Experiment, batch: int) -> dict[str, float]:
     work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
     backend = native.name(experiment.backend, experiment.friction)
     side_by_side = min(batch, experiment.signals.count)
-    what = f"{experiment.pack.grains} grains, {experiment.signals.count} signals"
+    what = f"{experiment.pack.grains} grains, {plural(experiment.signals.count, 'signal')}"
     return announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
 
 
@@ -117,11 +118,13 @@ def recall_command(
     if not frames and not at:
         refuse_idle("without --frames or --frames-at, which say how many", "frames_of")
     frame_schedule(experiment, frames, frames_of, at)  # refuses what cannot be before anything is begun
+    film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": at}
     if dry_run:
-        cost = _announce(experiment, batch_for(experiment, output, batch, restart=restart))
+        batch = batch_for(experiment, output, batch, restart=restart)
+        cost = _announce(experiment, batch)
+        foresee(output, key_of_run(experiment, batch=batch, **film), restart=restart)
         emit_cost(as_json, cost, output, recall_bytes(experiment, frames))
         return
-    film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": at}
     summary = _run(experiment, output, drawn, batch, restart=restart, target=target, **film)
     print_result(as_json, summary.facts, *summary.lines)
 

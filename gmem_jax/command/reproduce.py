@@ -75,7 +75,7 @@ def reproduce_command(
 
     with locked(output / "figures"):
         if retry and (count := Store(output / RUNS).clear_failures()):
-            log(f"{count} points and packs that failed are tried again")
+            log(f"trying what failed again: {count} of the points and packs")
         for name in wanted((GALLERY, *SCHEMATICS)):
             with _going_on(broken), reporting(goes_on=True) as progress:
                 drawn += reproduction(progress).picture(name)
@@ -106,7 +106,7 @@ def reproduce_command(
     print_result(as_json, result, *lines, *more, *map(_table, outcomes))
     broken += weighed.failed + [reason for outcome in outcomes for reason in outcome.failed]
     if broken:
-        raise RunFailedError(f"{len(broken)} points or packs; --retry tries them again")
+        raise RunFailedError(f"{len(broken)} of the points and packs; again with --retry")
 
 
 def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) -> None:

@@ -14,6 +14,7 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import default_batch
 from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import remove_leftovers
+from gmem_jax.physics.numbers import plural
 
 Restart = Annotated[bool, typer.Option("--restart", help="Discard what an interrupted run left, and begin anew.")]
 
@@ -28,6 +29,18 @@ def batch_for(experiment: Experiment, output: Path, wanted: int | None = None, *
     kept = None if restart else Checkpoints.key_of(folder_of(output)).get("batch")
     known = wanted or (kept if isinstance(kept, int) and kept > 0 else None)
     return known or default_batch(experiment, psutil.virtual_memory().available)
+
+
+def foresee(output: Path, key: dict[str, Any], *, restart: bool) -> None:
+    """Say in a dry run what the parts beside an output would mean; arguments are those of `resumable`."""
+    parts = folder_of(output)
+    if not Checkpoints.key_of(parts):
+        return
+    other = Checkpoints.other_run(parts, key)
+    if restart:
+        log(f"{parts}: what is there would be discarded (--restart)")
+    else:
+        log(f"{parts}: {other}; the run is refused without --restart" if other else f"the run would go on from {parts}")
 
 
 @contextmanager
@@ -53,7 +66,7 @@ def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[C
         parts = Checkpoints(folder_of(output), key, restart=restart)
         if parts.finished() or parts.begun():
             begun = " and one that is begun" if parts.begun() else ""
-            log(f"going on from {parts.folder}: {parts.finished()} finished parts{begun}")
+            log(f"going on from {parts.folder}: {plural(parts.finished(), 'finished part')}{begun}")
         done = False
         try:
             yield parts

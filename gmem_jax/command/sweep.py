@@ -22,6 +22,7 @@ from gmem_jax.command.console import (
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
+from gmem_jax.physics.numbers import plural
 from gmem_jax.show.sweeps import means_table, points_table, sweep_facts
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
@@ -103,7 +104,7 @@ def sweep_command(
     with locked(target), reporting(goes_on=True) as progress:
         runner = planned(path, spec, target)
         if retry and (count := runner.store.clear_failures()):
-            log(f"{count} points that failed are tried again")
+            log(f"trying {plural(count, 'failed point')} again")
         runner.run(chosen, progress)
     table = rows(runner.store)
     failed = [row for row in table if row["state"] == "failed"]
@@ -111,10 +112,10 @@ def sweep_command(
         log(f"failed: {_values(row, spec.names)}: {row['why']}", style="yellow")
     for line in _doubtful(table):
         log(f"warning: {line}", style="yellow")
-    log(f"{len(table) - len(failed)} of {len(table)} points in {target}; gmem sweep show {target}")
+    log(f"{len(table) - len(failed)} of {plural(len(table), 'point')} in {target}; gmem sweep show {target}")
     print_result(as_json, sweep_facts(runner.store, table), points_table(table, spec.names))
     if failed:
-        raise RunFailedError(f"{len(failed)} of {len(table)} points; again with --retry")
+        raise RunFailedError(f"{len(failed)} of {plural(len(table), 'point')}; again with --retry")
 
 
 def planned(path: Path, spec: Spec, folder: Path) -> SweepRunner:
@@ -170,7 +171,7 @@ def _status(store: Store, as_json: bool) -> None:
 def _doubtful(table: list[dict[str, Any]]) -> list[str]:
     """How many points are doubtful, and why: a line for each reason."""
     counts = Counter(reason for row in table if (reason := warnings_of(row)))
-    return [f"{count} of {len(table)} points: {reason}" for reason, count in counts.items()]
+    return [f"{count} of {plural(len(table), 'point')}: {reason}" for reason, count in counts.items()]
 
 
 def split_names(text: str) -> list[str]:
@@ -186,7 +187,7 @@ def _stop(store: Store, as_json: bool) -> None:
     told = [f"ended {one}" for one in ended] or ["nobody is at work here"]
     print_result(as_json, {"folder": str(store.folder), "ended": ended, "left": left}, *told)
     if left:
-        raise RunFailedError(f"{len(left)} workers cannot be ended from here")
+        raise RunFailedError(f"{plural(len(left), 'worker')} cannot be ended from here")
 
 
 def show_sweep(store: Store, over: str, as_json: bool) -> None:

@@ -25,6 +25,7 @@ from gmem_jax.design.waveforms import (
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import PREFIX, prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline
+from gmem_jax.physics.numbers import plural, require_numbers, require_whole
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress
@@ -116,9 +117,13 @@ def design_by_kernel(
     """
     tell = callback(progress)
     refuse_several_scales(experiment)
+    iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
+    measured = require_whole("measured", measured)
+    require_numbers(width=width, gain=gain, damping=damping)
     if start is not None and start.count != experiment.signals.count:
         raise ValueError(
-            f"{start.count} waveforms to start from, for {experiment.signals.count} signals; give one for each"
+            f"{plural(start.count, 'waveform')} to start from, for {plural(experiment.signals.count, 'signal')}; "
+            "give one for each"
         )
     if kernel is not None:
         refuse_another_drive(kernel, experiment)

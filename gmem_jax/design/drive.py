@@ -8,6 +8,7 @@ import numpy as np
 
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import run
+from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
@@ -46,6 +47,7 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
         raise ValueError("a drive is designed for at least one pack")
     found = []
     for name, (low, high) in bounds.items():
+        require_numbers(**{f"{name} (lowest)": low, f"{name} (highest)": high})
         value = float(value_at(experiments[0], PARAMETERS.get(name, name)))
         if not 0.0 < low <= value <= high:
             raise ValueError(
@@ -86,7 +88,8 @@ def design_drive(
         ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
         RunFailedError: if a simulation broke down.
     """
-    tell = callback(progress)
+    tell, iterations = callback(progress), require_whole("iterations", iterations)
+    require_numbers(spread=spread)
     names = list(bounds)
     paths = [PARAMETERS.get(name, name) for name in names]
     start = start_within(experiments, bounds)

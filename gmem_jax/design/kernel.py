@@ -16,6 +16,7 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import Prefix, run
 from gmem_jax.experiment.signals import Bumps, Signals, bin_average, signals
+from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
@@ -175,6 +176,8 @@ def memory_kernel(
         RunFailedError: if the simulation broke down.
     """
     tell = callback(progress)
+    n = require_whole("n", n)
+    require_numbers(width=width)
     if n < 2:
         raise ValueError(f"a kernel needs at least 2 basis waveforms, got {n}")
     both = bumps(np.concatenate([np.eye(n), -np.eye(n)]), width)

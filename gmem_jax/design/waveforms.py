@@ -17,6 +17,7 @@ from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline, waveform
+from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
@@ -171,6 +172,8 @@ def design_waveforms(
     """
     tell = callback(progress)
     refuse_several_scales(experiment)
+    iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
+    require_numbers(width=width, gain=gain, **{f"damping {number}": one for number, one in enumerate(damping, 1)})
     work, share = Work(cost(experiment, iterations, n), tell), _prefix(experiment)
     prefix = prefix_of(experiment, cache=cache, progress=work.next(share))
     target = np.asarray(experiment.integral())

@@ -27,6 +27,7 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.own_law import require_law
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.numbers import require_numbers, require_whole, said
 from gmem_jax.physics.pytree import Scalar, out_of_range, parameter, pytree, static, traced, validate
 from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
@@ -134,8 +135,8 @@ class Experiment:
         native.require_precision(self.precision, self.backend, self.friction)
         if not 0.0 < self.dt <= LARGEST_STEP:
             raise ValueError(f"dt must be in (0, {LARGEST_STEP}], got {self.dt:g}")
-        if self.steps is not None and not (isinstance(self.steps, int) and self.steps >= 1):
-            raise ValueError(f"steps must be a whole number from 1, got {self.steps!r}")
+        if self.steps is not None:
+            object.__setattr__(self, "steps", require_whole("steps", self.steps, 1))
         object.__setattr__(self, "steps_per_bin", self._whole_steps())
         self._check_shapes()
         if jax.config.read("jax_enable_x64"):
@@ -146,7 +147,7 @@ class Experiment:
         step = self.timing.dt
         if not traced(step) and not np.all(np.asarray(step) <= LARGEST_STEP):
             raise ValueError(
-                f"{self.steps_per_bin} steps in a bin make a time step of {np.max(step):g} t_c, which must be at most "
+                f"steps = {self.steps_per_bin} makes a time step of {np.max(step):g} t_c, which must be at most "
                 f"{LARGEST_STEP}; give more steps, or none to have them chosen"
             )
 
@@ -419,10 +420,10 @@ def _probe(signals: Signals) -> tuple[jax.Array, jax.Array]:
 
 
 def _static_number(name: str, value: Any) -> float:
-    try:
-        number = float(value)
-    except TypeError:
-        raise ValueError(f"{name} is fixed when a program is compiled: it must be a number, got {value!r}") from None
+    if traced(value) or value is None or np.ndim(value):
+        raise ValueError(f"{name} is fixed when a program is compiled: it must be a number, got {said(value)}")
+    require_numbers(**{name: value})
+    number = float(value)
     if not 0.0 <= number < math.inf:
         raise ValueError(f"{name} must be in [0, inf), got {value}")
     return number

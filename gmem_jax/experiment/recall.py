@@ -18,6 +18,7 @@ from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
+from gmem_jax.physics.numbers import plural, require_whole
 from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, State, Status, combined_status, explain, replicate
@@ -145,7 +146,7 @@ class Recall:
             rows = {"reads": ", ".join(self.reads), "channels": ", ".join(self.channels), **rows}
         if not traced(self.status):
             rows["status"] = explain(combined_status(self.status))
-        return f"Recall of {self.J.shape[-2]} signals", rows
+        return f"Recall of {plural(self.J.shape[-2], 'signal')}", rows
 
     def __repr__(self) -> str:
         return html.line(self, self._facts)
@@ -364,9 +365,7 @@ def run(
         )
     began, tell = time.perf_counter(), callback(progress)
     count = experiment.signals.count
-    size = count if batch is None else batch
-    if size < 1:
-        raise ValueError(f"batch must be at least 1, got {batch}")
+    size = count if batch is None else require_whole("batch", batch, 1)
     if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
         raise ValueError("parameters with a value for each replica need all signals in one batch")
     schedule = frame_schedule(experiment, frames, frames_of, frames_at)
@@ -422,7 +421,8 @@ def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[fl
     Raises:
         ValueError: for too many or too few, a u beyond 0 and 1, or a signal that there is not.
     """
-    if not 0 <= of <= experiment.signals.count:
+    frames, of = require_whole("frames", frames), require_whole("frames_of", of)
+    if of > experiment.signals.count:
         raise ValueError(f"frames of signal {of}: there are signals 1 to {experiment.signals.count}, and 0 for none")
     stages = experiment.protocol.stages
     along = [places(stages, frames, CHUNK)] if frames else []

@@ -140,8 +140,13 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
 
 
 @usual_rules()
-def describe(experiment: Experiment, seconds: float) -> dict[str, Any]:
-    """All that is to be known of a result: the experiment as written, what its defaults came to, and where it ran."""
+def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
+    """All that is to be known of a result: the experiment as written, what its defaults came to, and where it ran.
+
+    Args:
+        experiment: what was run.
+        seconds: wall time that the run took; 0 where nobody measured it.
+    """
     pack, law, entry = experiment.pack, experiment.friction, entry_of(experiment.friction)
     dt, steps = experiment.timing
     clump = pack.clump

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.signals import Spline, waveform
+from gmem_jax.physics.numbers import is_real, require_numbers, said
 from gmem_jax.simulation.protocol import BINS
 
 STEEPEST = 0.2  # of its largest value, that a waveform may change by within a bin. Words of 12 bits, the steepest there
@@ -54,6 +55,10 @@ def waveform_from(
             is none; if a waveform does not begin or end at zero, or is steeper than a pack can follow: the line says
             what would help.
     """
+    for name, given in (("t", t), ("x", x)):
+        if not is_real(given):
+            raise ValueError(f"{name} must be real numbers, got {said(given)}")
+    require_numbers(smooth=smooth, taper=taper)
     places, values = np.asarray(t, float), np.atleast_2d(np.asarray(x, float))
     if places.ndim != 1 or values.ndim != 2 or values.shape[1:] != places.shape or places.size < 2:
         raise ValueError(
@@ -93,9 +98,9 @@ def waveform_from(
 
 def _placed(places: np.ndarray, span: tuple[float, float]) -> np.ndarray:
     """Times as u."""
+    if not is_real(span) or np.shape(span) != (2,) or not span[0] < span[1] or not np.all(np.isfinite(span)):
+        raise ValueError(f"span must be two times, the later one last, got {said(span)}")
     first, last = map(float, span)
-    if not first < last or not np.all(np.isfinite(span)):
-        raise ValueError(f"span must be two times, the later one last, got {span}")
     u: np.ndarray = (places - first) / (last - first)
     if u[0] < 0.0 or u[-1] > 1.0:
         raise ValueError(f"times from {places[0]:g} to {places[-1]:g} lie outside {first:g} to {last:g}")

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.html import line
+from gmem_jax.physics.numbers import is_real, plural, require_numbers, said
 from gmem_jax.physics.pytree import Scalar, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import BINS
@@ -100,6 +101,19 @@ def part(signals: Chosen, first: int, last: int) -> Chosen:
     return chosen
 
 
+def _require_arrays(made: "Bumps | Spline") -> None:
+    """Refuse what is made of no numbers; numbers in lists become arrays.
+
+    Raises:
+        ValueError: naming the field and what was given.
+    """
+    for name, value in vars(made).items():
+        if not is_real(value):
+            raise ValueError(f"{name} must be numbers, got {said(value)}")
+        if isinstance(value, list | tuple):
+            object.__setattr__(made, name, jnp.asarray(value, float))
+
+
 @pytree
 @dataclass(frozen=True)
 class Bumps:
@@ -115,8 +129,13 @@ class Bumps:
     centres: jax.Array
     width: Scalar
 
+    def __post_init__(self) -> None:
+        _require_arrays(self)
+
     def __repr__(self) -> str:
-        return line(self, lambda: (f"{self.count} signals", {"bumps": self.centres.shape[-1], "width": self.width}))
+        return line(
+            self, lambda: (plural(self.count, "signal"), {"bumps": self.centres.shape[-1], "width": self.width})
+        )
 
     @property
     def count(self) -> int:
@@ -150,8 +169,11 @@ class Spline:
 
     nodes: jax.Array
 
+    def __post_init__(self) -> None:
+        _require_arrays(self)
+
     def __repr__(self) -> str:
-        return line(self, lambda: (f"{self.count} signals", {"nodes": self.nodes.shape[-1]}))
+        return line(self, lambda: (plural(self.count, "signal"), {"nodes": self.nodes.shape[-1]}))
 
     @property
     def count(self) -> int:
@@ -235,6 +257,7 @@ def words(bits: int, pad: float = PAD, width: float = WIDTH) -> Bumps:
         ValueError: if `bits` is not a whole number from 1 to 12, or bumps of this width do not fit into [0, 1].
     """
     value = word_bits(bits)
+    require_numbers(pad=pad, width=width)
     if not 0.0 < width <= 2.0 * pad < math.inf:
         raise ValueError(f"the bumps of a word must be in (0, 2 pad] = (0, {2.0 * pad:g}] bits wide, got {width:g}")
     bit = bit_width(bits, pad)
@@ -260,8 +283,8 @@ def waveform(samples: jax.typing.ArrayLike) -> Spline:
         ValueError: if the shape is not [n] or [S, n] with n >= 2, or a concrete sample is not a finite real number.
     """
     known = samples if traced(samples) else np.asarray(samples)
-    if jnp.iscomplexobj(known):
-        raise ValueError("a waveform is made of real samples, got complex ones")
+    if jnp.iscomplexobj(known) or (isinstance(known, np.ndarray) and known.dtype.kind not in "fiub"):
+        raise ValueError(f"a waveform is made of real samples, got {said(samples)}")
     if jnp.ndim(known) not in (1, 2) or jnp.shape(known)[-1] < 2 or jnp.shape(known)[0] < 1:
         raise ValueError(f"a waveform needs at least 2 samples, as [n] or [signals, n]; got shape {jnp.shape(known)}")
     if isinstance(known, np.ndarray) and not np.all(np.isfinite(known)):

@@ -71,7 +71,8 @@ def validity(
         Status.LARGE_WAVEFORM: waveform > LARGEST_WAVEFORM,
         Status.LARGE_FRICTION: friction > LARGEST_FRICTION,
         Status.LARGE_STIFFNESS: stiffness > LARGEST_STIFFNESS * experiment.material.normal_stiffness,
-        Status.RESTLESS: ((_restlessness(experiment, stages) > FASTEST_GRAIN) & rubs)
+        Status.RESTLESS: (rubs & (_restlessness(experiment, stages) > FASTEST_GRAIN))
+        | (rubs & (_dashpots(experiment, stages, deepest) * experiment.timing.dt > 1.0))
         | (jnp.asarray(experiment.drag) * experiment.timing.dt > 1.0),
         Status.ROUNDED: jnp.concatenate([jnp.zeros(1, bool), noise >= LARGEST_NOISE]),
         Status.UNLOADED: least <= 0.0,
@@ -106,6 +107,23 @@ def _restlessness(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.A
         walls = 0.5 * jnp.max(jnp.abs(jnp.diff(sample.lengths, axis=0)), axis=(0, 1)) / bin_time
         found.append(jnp.median(sample.largest_speed, axis=0) / jnp.maximum(walls, slow)[None])
     return _most(found)
+
+
+def _dashpots(experiment: Experiment, stages: Mapping[str, Sample], deepest: jax.Array) -> jax.Array:
+    """How fast friction's dashpots slow the turning (or the moving) of a grain among others, in 1 / t_c, [B].
+
+    The fastest mode: neighbours move oppositely, so that twice the speed is at each of its contacts; a dashpot acts
+    along two of three axes, and turns a grain by the arm of its outer radius. Forces take velocities predicted to the
+    end of a step, which overshoots if this times dt exceeds 1: damping then drives what it should damp.
+    """
+    law: Any = experiment.friction
+    if not isinstance(law, Hooke | MindlinRescaled | Mindlin):
+        return jnp.zeros(1)
+    clump, contacts = experiment.pack.clump, _most([sample.contacts for sample in stages.values()])
+    spring = law.stiffness * (1.0 if isinstance(law, Hooke) else jnp.sqrt(jnp.maximum(deepest, 0.0)))
+    inverse = jnp.maximum(1.0 / clump.mass, 0.25 * clump.diameter**2 / jnp.min(clump.inertia))
+    rate: jax.Array = 2.0 * (2.0 / 3.0) * contacts * spring * law.damping_time * inverse
+    return rate
 
 
 def rounding(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.Array:

@@ -25,7 +25,7 @@ import numpy as np
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.ours import Folder, release, remove_leftovers
-from gmem_jax.files.seal import BLOCK, require_sealed, seal
+from gmem_jax.files.seal import BLOCK, PART, require_sealed, seal
 from gmem_jax.files.validation import json_of, read_npy, refusing, require
 from gmem_jax.physics.pytree import REGISTERED
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
@@ -35,6 +35,7 @@ PARTS_SCHEMA = "gmem-parts/0.1"
 RUN_MARKER = "run.json"
 PART_FILES = r"[\w.+-]+\.(?:npz|now|before)|(?:run|job)\.json"
 """Names of files in a folder of parts; a sweep puts the job there that they belong to."""
+ANEW = "remove it, or begin anew with --restart"
 FIRST = 5.0  # s before the first checkpoint of an unfinished part; each next one takes twice as long to come
 CHECKPOINT_INTERVAL = 120.0  # s between checkpoints at most: doing it again must cost more than writing them
 AT_MILESTONES = 20.0  # s likewise, where a stage has just ended
@@ -103,8 +104,8 @@ def load_part(path: Path, of: str = "") -> Any:
         FileNotFoundError: if there is no such file.
         FileFormatError: if the file is damaged, none of this schema, or something else than `of`.
     """
-    with refusing(path, "part of a run"), path.open("rb") as opened:
-        require_sealed(opened, "part of a run")
+    with refusing(path, PART), path.open("rb") as opened:
+        require_sealed(opened, PART)
         with zipfile.ZipFile(opened) as archive:
             found = _members(archive, path.stat().st_size)
         head = json_of(found.pop("head", np.zeros(0, np.uint8)).tobytes(), "head")
@@ -112,8 +113,7 @@ def load_part(path: Path, of: str = "") -> Any:
             raise FileFormatError(f"{path}: schema is {head.get('schema')!r}, expected {PART_SCHEMA!r}")
         if head.get("of") != of:
             raise FileFormatError(
-                f"{path}: says that it is {_short(head.get('of'))}, not {_short(of)}: files were exchanged; "
-                "remove it, or begin anew with --restart"
+                f"{path}: says that it is {_short(head.get('of'))}, not {_short(of)}: files were exchanged"
             )
         return _put_together(head["form"], [found[name] for name in sorted(found)])
 
@@ -187,29 +187,33 @@ class Checkpoints(ResultCache):
         folder: made if it is not there.
         key: what the parts depend on; stored with them.
         restart: discard what is there.
+        advice: what to do about a part that cannot be read.
 
     Raises:
         FileFormatError: if the folder holds finished parts of another run, or is not one of parts.
         OSError: if it cannot be written.
     """
 
-    def __init__(self, folder: Path, key: dict[str, Any], *, restart: bool = False) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: Path, key: dict[str, Any], *, restart: bool = False, advice: str = ANEW) -> None:
+        self.folder, self._advice = Path(folder), advice
         wanted = json.loads(json.dumps(key))
         self._run = hashlib.sha256(json.dumps(wanted, sort_keys=True).encode()).hexdigest()[:20]
         self._own = Folder(self.folder, RUN_MARKER, PARTS_SCHEMA, re.compile(PART_FILES), {"key": wanted})
         if restart or not (self.finished() or self.begun()):
             self._own.clear(keep=True)
-        elif found := self.key_of(self.folder):
-            other = [name for name in {**found, **wanted} if found.get(name) != wanted.get(name)]
-            if other:
-                raise FileFormatError(
-                    f"{self.folder}: holds parts of an interrupted run with another {other[0]} "
-                    f"({_short(found.get(other[0]))}, now {_short(wanted.get(other[0]))}); begin anew with "
-                    "--restart, or choose another output"
-                )
+        elif other := self.other_run(self.folder, wanted):
+            raise FileFormatError(f"{self.folder}: {other}; begin anew with --restart, or choose another output")
         remove_leftovers(self.folder)
         self._own.mark({"key": wanted})
+
+    @classmethod
+    def other_run(cls, folder: Path, key: dict[str, Any]) -> str:
+        """Of which other run a folder holds parts, by the first number that is another; "" if it holds none of one."""
+        found, wanted = cls.key_of(folder), json.loads(json.dumps(key))
+        if not found or found == wanted:
+            return ""
+        name, there, now = _difference(found, wanted)
+        return f"holds parts of an interrupted run with another {name} ({_short(there)}, now {_short(now)})"
 
     @staticmethod
     def key_of(folder: Path) -> dict[str, Any]:
@@ -225,7 +229,10 @@ class Checkpoints(ResultCache):
         """
         path, of = self._own.at(f"{name}.npz"), f"part {name} of run {self._run}"
         if path.is_file():
-            return load_part(path, of)
+            try:
+                return load_part(path, of)
+            except FileFormatError as error:
+                raise FileFormatError(f"{error}; {self._advice}") from error
         checkpoint = _StoredCheckpoint(self._own, name, of)
         try:
             result = jax.tree.map(np.asarray, run(checkpoint))
@@ -249,6 +256,14 @@ class Checkpoints(ResultCache):
         """Remove the folder; of one that holds other files too, only what is ours."""
         if left := self._own.clear():
             warnings.warn(f"{self.folder}: left there, since it holds {left[0]}, which is not ours", stacklevel=2)
+
+
+def _difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any]:
+    """The dotted name of the first value in which two JSON objects differ, and both values."""
+    if not (isinstance(one, dict) and isinstance(other, dict)):
+        return name, one, other
+    differs = next(own for own in {**one, **other} if one.get(own) != other.get(own))
+    return _difference(one.get(differs), other.get(differs), f"{name}.{differs}" if name else differs)
 
 
 def _short(value: Any) -> str:

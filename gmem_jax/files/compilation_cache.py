@@ -1,5 +1,6 @@
 """Compiled programs kept between runs: half of the time of a short command is XLA compiling the same programs again."""
 
+import errno
 import hashlib
 import os
 import platform
@@ -26,7 +27,7 @@ def _processor() -> str:
 def keep_programs() -> None:
     """Turn on JAX's persistent compilation cache, unless the user turned it off or chose one; before JAX computes.
 
-    A folder that cannot be written is no error: then nothing is kept.
+    A folder that cannot be written is no error: then nothing is kept, and a warning says so of a chosen one.
     """
     chosen = os.environ.get(SWITCH, "")
     if chosen == "off" or getattr(jax.config, "jax_compilation_cache_dir", None):
@@ -39,9 +40,12 @@ def keep_programs() -> None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return
-    if not os.access(folder, os.W_OK):
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except OSError as error:
+        if chosen:
+            why = f"{SWITCH}={chosen}: cannot write there ({error.strerror})"
+            warnings.warn(f"{why}; compiled programs are not kept", stacklevel=2)
         return
     # XLA logs an error for every program that it finds: features of its own that no CPU's list has.
     if getattr(jax.config, "jax_logging_level", None) == "NOTSET":

@@ -16,8 +16,8 @@ import numpy as np
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.schemas import DIMENSIONS, STAGE
-from gmem_jax.files.seal import BLOCK, require_sealed, seal
+from gmem_jax.files.schemas import DIMENSIONS, STAGE, other_kind
+from gmem_jax.files.seal import BLOCK, HDF5, require_sealed, seal
 from gmem_jax.files.tree import Tree
 from gmem_jax.files.validation import Array, fit, refusing
 from gmem_jax.simulation.protocol import BINS
@@ -119,12 +119,12 @@ def reading(path: Path, schema: str = "") -> Iterator[Content]:
             goes wrong in the block.
     """
     path = Path(path)
-    with refusing(path, "HDF5 file"), path.open("rb") as raw:
-        require_sealed(raw, "HDF5 file")
+    with refusing(path, HDF5), path.open("rb") as raw:
+        require_sealed(raw, HDF5)
         with h5py.File(raw, "r") as file:
             content = Content(file)
             if schema and content.schema != schema:
-                raise FileFormatError(f"{path}: schema is {content.schema[:40]!r}, expected {schema!r}")
+                raise FileFormatError(f"{path}: {other_kind(content.schema, schema)}")
             yield content
 
 

@@ -27,6 +27,7 @@ from gmem_jax.files.validation import (
     whole,
 )
 from gmem_jax.files.waveforms import signals_from_dict
+from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, Status
 from gmem_jax.simulation.channels import CHANNELS
@@ -47,8 +48,7 @@ def save_recall(path: str | Path, recall: Recall) -> None:
     configuration = recall.configuration
     if not configuration:
         raise ValueError(
-            "a recall of a traced experiment does not say what it is of: save "
-            "recall.described(gm.describe(experiment, 0.0))"
+            "a recall of a traced experiment does not say what it is of: save recall.described(gm.describe(experiment))"
         )
     names = np.asarray([name.encode() for name in recall.names])
     if names.dtype.itemsize == 1:
@@ -126,7 +126,10 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
 def _check(recall: Recall) -> None:
     signals, replicas = recall.J.shape[-2], len(recall.status)
     status = np.asarray(recall.status)
-    require(signals > 0 and replicas == signals + 1, f"it has {signals} signals and {replicas} replicas, not one more")
+    require(
+        signals > 0 and replicas == signals + 1,
+        f"it has {plural(signals, 'signal')} and {plural(replicas, 'replica')}, not one more",
+    )
     require((status >= 0) & (status & ~_EVERY_BIT == 0), "its status is none that there is")
     require(np.abs(np.asarray(recall.u) - (np.arange(BINS) + 0.5) / BINS) < 1e-12, "its u are not the centres of bins")
     require_finite({name: getattr(recall, name) for name in ("J", "window", "dt")})
@@ -152,6 +155,8 @@ def _check(recall: Recall) -> None:
 def _check_stage(name: str, stage: Sample, replicas: int, *, bins: int) -> None:
     """Refuse a stage of odd shape; one that reads has the `bins` of the protocol, others any (0)."""
     found, wide = np.shape(stage.pressure)[0], np.shape(stage.pressure)[-1]
-    require(found > 0 and wide in (1, replicas), f"stage {name!r} has {wide} replicas, must have 1 or {replicas}")
+    require(
+        found > 0 and wide in (1, replicas), f"stage {name!r} has {plural(wide, 'replica')}, must have 1 or {replicas}"
+    )
     if bins:
         require((found, wide) == (bins, replicas), f"stage {name!r} must have {bins} bins of {replicas} replicas")

@@ -8,7 +8,7 @@ from typing import Any
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.schemas import GRADIENT, READING, TUNED, Schema
+from gmem_jax.files.schemas import GRADIENT, READING, TUNED, Schema, other_kind
 from gmem_jax.files.validation import is_number, json_of, refusing, require, title, whole
 
 _LARGEST = 1 << 28  # bytes
@@ -64,8 +64,7 @@ def _schema_of(found: dict[str, Any]) -> Schema:
     for schema in _KINDS:
         if told == schema.name:
             return schema
-    names = ", ".join(schema.name for schema in _KINDS)
-    raise FileFormatError(f"schema is {str(told)[:40]!r}, expected one of {names}")
+    raise FileFormatError(other_kind(told, *(schema.name for schema in _KINDS)))
 
 
 def _at(found: Any, path: str) -> tuple[Any, bool]:

@@ -1,7 +1,7 @@
 """What every kind of file holds, with units: the one table to write from, read by, and print in docs/files.md."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from gmem_jax.files.validation import FIXED_LENGTHS, Array
 from gmem_jax.simulation.sample import MEASURED
@@ -263,6 +263,18 @@ SWEEP = Schema(
 )
 
 SCHEMAS = (RECALL, PACK, KERNEL, GRADIENT, TUNED, READING, DESIGN, NET, SWEEP)
+
+
+def other_kind(found: Any, *wanted: str) -> str:
+    """Why a file of one schema does not do where others are wanted, all by name: which it is, and which is needed."""
+    kinds = {schema.name: schema.title.partition(" (")[0].lower() for schema in SCHEMAS}
+    needed = " or ".join(f"a {kinds[name]}" for name in wanted)
+    if found in kinds:
+        return f"this is a {kinds[found]}; {needed} is needed"
+    here = ", ".join(wanted)
+    if str(found).partition("/")[0] in (name.partition("/")[0] for name in wanted):
+        return f"its schema is {str(found)[:40]!r}, of another version; this one reads {here}"
+    return f"its schema is {str(found)[:40]!r}, which is none of ours; {needed} is needed ({here})"
 
 
 def schema_page() -> str:

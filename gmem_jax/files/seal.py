@@ -5,13 +5,17 @@ bytes, before any parser sees them. It tells damage, not forgery: whoever can wr
 """
 
 import hashlib
+import os
 from pathlib import Path
 from typing import BinaryIO
 
 from gmem_jax.errors import FileFormatError
 
 BLOCK = 512  # the smallest user block of HDF5
+PART = "part of a run"
+HDF5 = "HDF5 file"  # what `require_sealed` may be asked for
 _MARK = b"gmem sha256 "
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 _PIECE = 1 << 20
 
 
@@ -36,6 +40,21 @@ def seal(path: Path) -> None:
         file.write(block)
 
 
+def _foreign(file: BinaryIO, what: str) -> str:
+    """What a file without a seal is."""
+    size = file.seek(0, os.SEEK_END)
+    places = [0, *(BLOCK << shift for shift in range(max(0, (size // BLOCK).bit_length())))]  # where HDF5 may begin
+    for place in places:
+        file.seek(place)
+        if file.read(len(_HDF5)) == _HDF5:
+            return "it is HDF5 without our checksum, made or changed by another program"
+    file.seek(0)
+    begins = file.read(BLOCK)
+    if not any(begins) or _MARK.startswith(begins):
+        return "it was cut off" if size else "it is empty"
+    return "it is not HDF5 at all" if what == HDF5 else "it has no checksum of ours: another program made it"
+
+
 def require_sealed(file: BinaryIO, what: str) -> None:
     """Refuse a file, open for reading, whose seal does not fit.
 
@@ -49,7 +68,8 @@ def require_sealed(file: BinaryIO, what: str) -> None:
     file.seek(0)
     found = file.read(BLOCK)
     if not found.startswith(_MARK):
-        raise FileFormatError(f"not a readable {what}: it has no checksum (truncated, or made by another program?)")
+        raise FileFormatError(f"not a readable {what}: {_foreign(file, what)}")
     if found != _block(file):
-        raise FileFormatError("damaged, its checksum does not fit its content; restore it, or make it anew")
+        advice = "" if what == PART else "; restore it, or make it anew"
+        raise FileFormatError(f"damaged, its checksum does not fit its content{advice}")
     file.seek(BLOCK)

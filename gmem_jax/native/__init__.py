@@ -30,7 +30,7 @@ from gmem_jax.native.backend import (
     resolve,
     supports,
 )
-from gmem_jax.native.library import available, needs
+from gmem_jax.native.library import available, needs, require_threads
 from gmem_jax.native.march import March, march
 from gmem_jax.native.primitives import TARGETS
 from gmem_jax.native.search import search
@@ -49,6 +49,7 @@ __all__ = [
     "name",
     "needs",
     "require_precision",
+    "require_threads",
     "resolve",
     "search",
     "supports",

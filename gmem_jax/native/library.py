@@ -2,6 +2,8 @@
 
 import ctypes
 import functools
+import os
+import re
 from pathlib import Path
 
 import jax
@@ -9,6 +11,8 @@ import jax
 from gmem_jax.native import cuda, primitives
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import Entry, entry_of
+
+MOST_THREADS = 4096  # of a call, as in cpu/team.cc
 
 
 def path() -> Path:
@@ -54,6 +58,17 @@ def require_library() -> None:
     possible, reason = available()
     if not possible:
         raise ValueError(f"the native backend is not available: {reason}")
+
+
+def require_threads() -> None:
+    """Refuse a GMEM_THREADS that the library would refuse in its first call: what is planned before says its cost.
+
+    Raises:
+        ValueError: if it is no number of threads.
+    """
+    told = os.environ.get("GMEM_THREADS", "")
+    if told and not (re.fullmatch(r"\s*\+?[0-9]{1,9}", told) and 1 <= int(told) <= MOST_THREADS):
+        raise ValueError(f'GMEM_THREADS should be a number of threads from 1 to {MOST_THREADS}; it is "{told}"')
 
 
 def entry(law: FrictionLaw) -> Entry:

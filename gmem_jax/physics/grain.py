@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.numbers import is_real, require_numbers, said
 from gmem_jax.physics.pytree import label, pytree, static
 from gmem_jax.physics.rules import usual_rules
 
@@ -93,6 +94,8 @@ def clump(offsets: Sequence[Sequence[float]] | np.ndarray, shape: str = "clump")
     Raises:
         ValueError: if `offsets` is not a finite [K, 3] array with K >= 1.
     """
+    if not is_real(offsets):
+        raise ValueError(f"clump offsets must be numbers, [K, 3], got {said(offsets)}")
     centres = np.asarray(offsets, dtype=float)
     if centres.ndim != 2 or centres.shape[0] < 1 or centres.shape[1] != 3 or not np.all(np.isfinite(centres)):
         raise ValueError(f"clump offsets must be a finite [K, 3] array, got shape {centres.shape}")
@@ -142,6 +145,7 @@ def tetra(overlap: float = 0.6) -> Clump:
     Raises:
         ValueError: if `overlap` is outside [0, 1).
     """
+    require_numbers(**{"tetra overlap": overlap})
     if not 0.0 <= overlap < 1.0:
         raise ValueError(f"tetra overlap must be in [0, 1), got {overlap}")
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=float)

@@ -15,6 +15,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.numbers import is_real, said
 from gmem_jax.physics.rules import usual_rules
 
 Scalar = float | jax.Array
@@ -179,7 +180,7 @@ def _number(value: Any) -> Any:
 
 def _parameters(made: Any) -> Iterator[tuple[str, Interval]]:
     for entry in fields(made):
-        if "interval" in entry.metadata and getattr(made, entry.name) is not None:
+        if "interval" in entry.metadata and not entry.default is getattr(made, entry.name) is None:
             yield entry.name, entry.metadata["interval"]
 
 
@@ -195,10 +196,9 @@ def validate(made: Any) -> None:
         given = getattr(made, name)
         if type(given) is object:  # JAX's own placeholder, in a subclass that `pytree` did not register
             continue
-        try:
-            value = _number(given)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name} must be a number or an array of numbers, got {given!r}") from None
+        if not is_real(given):
+            raise ValueError(f"{name} must be a number or an array of numbers, got {said(given)}")
+        value = _number(given)
         if not traced(value) and not np.all(interval.holds(np.asarray(value))):
             raise ValueError(f"{name} must be in {interval.words}, got {_shown(given)}")
         object.__setattr__(made, name, value)

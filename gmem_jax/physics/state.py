@@ -75,7 +75,7 @@ SENTENCES = {
     Status.LARGE_WAVEFORM: "a waveform exceeds 2, and gains are per gamma0; use waveforms up to 1 and a larger gamma0",
     Status.LARGE_FRICTION: "mu exceeds 10, as no material does, so that contacts hardly slide; use a smaller mu",
     Status.LARGE_STIFFNESS: "tangential springs are stiffer than Hertz contacts; use stiffness < 1.5 normal_stiffness",
-    Status.RESTLESS: "grains move far faster than the walls, as in unstable steps; use a smaller dt or hold_drag",
+    Status.RESTLESS: "steps look unstable (fast grains or strong dampers); use a smaller dt, damping_time or hold_drag",
     Status.ROUNDED: "round-off is 1 % of p_sig or more; use a larger gamma0, or precision double if it was mixed",
     Status.UNLOADED: "the walls carried nothing during a whole bin, and lost the pack; use a larger t0",
     Status.OTHER_COMPRESSION: "the pack was cycled with another delta0; use one that was prepared for this delta0",
@@ -87,9 +87,10 @@ def combined_status(status: npt.ArrayLike) -> int:
     return int(np.bitwise_or.reduce(np.asarray(status, int), axis=None))
 
 
-def explain(status: int) -> str:
-    """The set bits of `status` as one readable line ("ok" when none is set)."""
-    return "; ".join(text for bit, text in SENTENCES.items() if status & bit) or "ok"
+def explain(status: npt.ArrayLike) -> str:
+    """The bits of `status` as one readable line ("ok" when none is set): of one replica, or of several together."""
+    bits = combined_status(status)
+    return "; ".join(text for bit, text in SENTENCES.items() if bits & bit) or "ok"
 
 
 @pytree

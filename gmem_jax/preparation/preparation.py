@@ -307,7 +307,7 @@ def _warn_of_another_pressure(pack: Pack) -> None:
     if met is not None and not MET[0] < met < MET[1]:
         recipe = pack.info["recipe"]
         warnings.warn(
-            f"{pack.name}: p_z is {met:.2g} times the wanted {recipe['pressure']:g} E: {recipe['cycles']} cycles by "
+            f"{pack.name}: p_z is {met:.2g} times the wanted {recipe['pressure']:g} E: cycling by "
             f"delta0 = {recipe['delta0']:g} changed it after it was met; ask for another pressure, or for less delta0",
             stacklevel=3,
         )

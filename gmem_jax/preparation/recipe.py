@@ -11,6 +11,7 @@ import numpy as np
 from gmem_jax.experiment.stages import cycle
 from gmem_jax.files.validation import is_number
 from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.numbers import is_real
 from gmem_jax.physics.pytree import interval
 from gmem_jax.simulation.protocol import BINS, Stage
 
@@ -98,7 +99,7 @@ class Recipe:
 
 def _plain(kind: Any, given: Any) -> float | int:
     """A number of one kind, however it was written."""
-    if isinstance(given, bool | str):
+    if not is_real(given) or np.ndim(given):
         raise TypeError
     return operator.index(given) if kind is int else float(given)
 

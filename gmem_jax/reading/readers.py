@@ -12,6 +12,7 @@ import numpy as np
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import LONGEST_WORD, Signals, bin_average, word_bits, words
+from gmem_jax.physics.numbers import plural
 
 FOLDS = 16  # parts that the words are split into for the linear decoder; fewer words are left out one by one
 PENALTIES = np.logspace(-6, 1, 15)  # tried for the ridge, in units of the largest singular value squared
@@ -49,7 +50,7 @@ def stored_words(recall: Recall, target: Signals | None = None) -> Stored:
     expected = np.asarray(bin_average(words(bits))) if 1 <= bits <= LONGEST_WORD else np.zeros(0)
     # J of a word is of order u_b / pi: a tenth of a thousandth of it is far above round-off, far below another word.
     if expected.shape != templates.shape or not np.allclose(templates, expected, atol=1e-4 / (np.pi * (bits + 4))):
-        raise ValueError(f"the recall holds {len(templates)} signals that are not the words of one length")
+        raise ValueError(f"the recall holds {plural(len(templates), 'signal')}, not the words of one length")
     if recall.second_readout is None:
         return Stored(bits, "sub0", np.asarray(recall.p_sig), templates)
     first = analysis.recalled(jnp.asarray(recall.stages[recall.reads[0]].pressure))

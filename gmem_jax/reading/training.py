@@ -15,7 +15,7 @@ from flax import serialization
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.signals import LONGEST_WORD
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.schemas import NET
+from gmem_jax.files.schemas import NET, other_kind
 from gmem_jax.files.seal import BLOCK, require_sealed, seal
 from gmem_jax.files.validation import (
     Array,
@@ -203,7 +203,7 @@ def load(path: Path) -> Training:
         content = serialization.msgpack_restore(file.read())
         found = content.get("schema", "none") if isinstance(content, dict) else "none"
         if found != NET.name:
-            raise FileFormatError(f"{path}: schema is {found!r}, expected {NET.name!r}")
+            raise FileFormatError(f"{path}: {other_kind(found, NET.name)}")
         recipe = json_of(content.get("recipe"), "recipe")
         require_fields(recipe, "recipe", **_RECIPE)
         require(set(recipe) == set(_RECIPE), "its recipe has fields that lessons have not")

@@ -13,6 +13,7 @@ from gmem_jax.experiment.analysis import BACKGROUNDS
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import Bumps, six_signals, words
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.numbers import plural
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, counted
 from gmem_jax.show.recalls import MEAN, PALE, mean_over_ringing
@@ -63,7 +64,7 @@ def _sizes(sizes: Iterable[int]) -> str:
 def said_of(rows: Sequence[Compared], rate: str) -> str:
     """The line under a title: our sizes, rate (t0 in t_c) and packs, and what error bars are."""
     counts = sorted({row.ours.packs for row in rows})
-    over = f"{counts[0]} to {counts[-1]} packs" if len(counts) > 1 else f"{counts[0]} packs"
+    over = f"{counts[0]} to {counts[-1]} packs" if len(counts) > 1 else plural(counts[0], "pack")
     own = "one pack" if counts == [1] else f"mean ± SE over {over}"
     sizes = sorted({row.conditions.grains for row in rows})
     size = _sizes(sizes) if len(sizes) < 3 else f"N = {sizes[0]:,} to {sizes[-1]:,}"

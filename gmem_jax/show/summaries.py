@@ -24,10 +24,11 @@ from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.packs import load_pack, load_stages, pack_called
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import load_result
-from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL, TUNED
+from gmem_jax.files.schemas import GRADIENT, KERNEL, PACK, READING, RECALL, TUNED, other_kind
 from gmem_jax.files.validation import is_number, refusing
 from gmem_jax.files.waveforms import load_design, load_target, load_waveforms, signals_from_dict
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.numbers import plural
 from gmem_jax.reading.readers import confusion
 from gmem_jax.show import figures, sweeps, tables
 from gmem_jax.show.figure import Figure
@@ -143,8 +144,7 @@ def _summary_of(file: Path, against: str, signals: Sequence[int], each: bool, ch
         return _stored_pack(file, against)
     if schema_name == RECALL.name:
         return of_recall(load_recall(file), file.name, against=against, signals=signals, each=each)
-    known = ", ".join(schema.name for schema in (RECALL, PACK, KERNEL))
-    raise FileFormatError(f"{file}: schema is {schema_name[:40]!r}, expected one of {known}")
+    raise FileFormatError(f"{file}: {other_kind(schema_name, RECALL.name, PACK.name, KERNEL.name)}")
 
 
 def of_recall(
@@ -171,7 +171,7 @@ def _parts_of_recall(recall: Recall, row: dict[str, Any]) -> Iterator[Part]:
     names, t0 = recall.names, configuration["t0"]
     yield Part(tables.errors_table(recall))
     if len(names) > tables.FEW:
-        yield Part(tables.signals_table(row), f"each of {len(names)} signals", folded=True)
+        yield Part(tables.signals_table(row), f"each of {plural(len(names), 'signal')}", folded=True)
     scale, wanted = np.asarray(relative_scale(configuration)), configuration.get("target")
     target = None if wanted is None else np.asarray(bin_average(signals_from_dict(wanted)))
     shown = f" (the first {MOST_OF_PAGE} of {len(names)})" if len(names) > MOST_OF_PAGE else ""
@@ -272,9 +272,9 @@ def of_kernel(
 def of_reading(facts: dict[str, Any], name: str = "") -> Summary:
     """What is said of a classification, from its result."""
     words, readers = facts["words"], facts["readers"]
-    title, net = f"{cell(facts['pack'])}, {facts['bits']} bits", readers["net"]
+    title, net = f"{cell(facts['pack'])}, {plural(facts['bits'], 'bit')}", readers["net"]
     nets = len(np.asarray(net["read"]).reshape(-1, words))
-    right = f"{title}: accuracy {net['accuracy']:.3f} ({nets} nets)"
+    right = f"{title}: accuracy {net['accuracy']:.3f} ({plural(nets, 'net')})"
     drawn: dict[str, Draw] = {
         "confusion": lambda: figures.confusion_figure({right: confusion(net["read"], words)}),
         "bits": partial(figures.bits_figure, readers, title),
@@ -337,7 +337,7 @@ def _net(file: Path) -> Summary:
     facts |= {name: getattr(found, name) for name in names}
     state = "trained" if found.finished else "not finished"
     line = (
-        f"net for words of {lessons.bits} bits, seed {found.seed}: {state}, {found.step} steps, "
+        f"net for words of {plural(lessons.bits, 'bit')}, seed {found.seed}: {state}, {found.step} steps, "
         f"held-out accuracy {found.validation:.4f}, loss {found.loss:.3g} nats"
     )
     weights = np.asarray(found.net.parameters["Dense_0"]["kernel"])
@@ -350,7 +350,10 @@ def _waveforms(file: Path) -> Summary:
     target, design = (load_target(file), load_design(file)) if commented else (None, {})
     samples = load_waveforms(file)
     facts: dict[str, Any] = {"signals": len(samples), "samples": samples.shape[1], **design}
-    lines = [f"{len(samples)} waveforms of {samples.shape[1]} samples" + (", designed" if target is not None else "")]
+    lines = [
+        f"{plural(len(samples), 'waveform')} of {samples.shape[1]} samples"
+        + (", designed" if target is not None else "")
+    ]
     drawn: dict[str, Draw] = {"waveforms": partial(figures.waves_figure, waveform(samples), target, file.name)}
     if design:
         pack = cell(design["pack"])

@@ -8,6 +8,7 @@ import numpy as np
 from rich.table import Table
 
 from gmem_jax.files.validation import is_number
+from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import SENTENCES, Status, combined_status
 from gmem_jax.show.figure import Curve, Figure, Panel, ramp
 from gmem_jax.show.tables import cell
@@ -126,7 +127,7 @@ def sweep_figure(
     several = f"mean ± SE over {', '.join(axes.over) or 'points'}, {samples}" if max(counts) > 1 else ""
     few = len(lines) <= FEW_LINES
     panel = Panel(tuple(marks), "", axes.x, _LABELS[measure], x_names=[cell(value)[:24] for value in ticks])
-    over = (f"{title}: {len(done)} of {len(rows)} points", several)
+    over = (f"{title}: {len(done)} of {plural(len(rows), 'point')}", several)
     return Figure((panel,), size=(6.4 if few else 8.6, 4.0), title=over, legend="panel" if few else "right")
 
 

@@ -20,6 +20,7 @@ from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.measures import of_each, relative_scale
 from gmem_jax.files.waveforms import signals_from_dict
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import Status, combined_status, explain
 from gmem_jax.preparation.recipe import pressure_over_wanted
 from gmem_jax.simulation.protocol import BINS
@@ -278,8 +279,8 @@ def conditions(configuration: dict[str, Any]) -> str:
     known = ", ".join(f"{name} = {_amount(configuration[name])}" for name in amounts)
     form = configuration.get("experiment", {}).get("signals", {})
     count = len(configuration.get("signals", ()))
-    named = {"six": "the six signals", "words": f"all {count} words of {form.get('bits')} bits"}
-    stored = named.get(str(form.get("kind")), f"{count} signals" if count else "")
+    named = {"six": "the six signals", "words": f"all {count} words of {plural(form.get('bits'), 'bit')}"}
+    stored = named.get(str(form.get("kind")), plural(count, "signal") if count else "")
     background = configuration.get("background", "sub0")
     subtracted = "" if background == "sub0" else background.upper()
     return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", stored, subtracted)))
@@ -312,7 +313,7 @@ def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:
 def reading_tables(result: dict[str, Any]) -> list[Table]:
     """The readers beside each other and the published accuracy, and the bits' error rates, from a `reading_report`."""
     bits = result["bits"]
-    title = f"Reading {result['words']} words of {bits} bits ({result['background'].upper()})"
+    title = f"Reading {result['words']} words of {plural(bits, 'bit')} ({result['background'].upper()})"
     readers_table = Table(
         title=title,
         caption="information in bits: plug-in, the most; bitwise, bit by bit; Fano, the least for these errors",
@@ -326,7 +327,7 @@ def reading_tables(result: dict[str, Any]) -> list[Table]:
     for name, row in result["readers"].items():
         deviation = "" if row["accuracy_sd"] is None else f" ± {row['accuracy_sd']:.3f}"
         known = (f"{row['information'][key]:.2f}" for key in ("plug_in", "bitwise", "fano"))
-        label = f"{name} ({len(result['nets'])} seeds)" if name == "net" else name
+        label = f"{name} ({plural(len(result['nets']), 'seed')})" if name == "net" else name
         readers_table.add_row(label, f"{row['accuracy']:.3f}{deviation}", *known)
         errors_table.add_row(name, *(f"{error:.3f}" for error in row["bit_errors"]))
     for point in published("binary_words.csv", word_bits=float(bits)):

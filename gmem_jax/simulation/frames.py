@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.numbers import require_numbers
 from gmem_jax.physics.pytree import pytree, static
 from gmem_jax.physics.state import State
 from gmem_jax.physics.step import System, contact_loads, relative_motion, sphere_table
@@ -241,6 +242,7 @@ def places_at(stages: Sequence[Stage], compressions: Sequence[float]) -> dict[st
     """
     found: dict[str, set[int]] = {}
     for u in compressions:
+        require_numbers(**{"u of a frame": u})
         if not 0.0 <= u <= 1.0:
             raise ValueError(f"frames at u = {u:g}: u goes from 0, not compressed, to 1, fully compressed")
         for number, stage in enumerate(stages):

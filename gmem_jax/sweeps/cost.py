@@ -7,6 +7,7 @@ from typing import NamedTuple
 import psutil
 
 from gmem_jax.files.sizes import in_bytes, in_time, pack_bytes, recall_bytes
+from gmem_jax.physics.numbers import plural
 from gmem_jax.sweeps.plan import plan
 from gmem_jax.sweeps.spec import Spec
 from gmem_jax.sweeps.sweep import SweepRunner, seconds_of
@@ -24,6 +25,9 @@ class Cost(NamedTuple):
         grain_steps: of all that.
         seconds: that it takes two free cores, with the native backend and law H.
         disk_bytes: that its results take.
+        damaged: of those that are there, or another point's: they are computed again.
+        others: results in the folder that are not asked for, and stay.
+        begun: runs in the folder that are unfinished, and are gone on with.
     """
 
     points: int
@@ -34,13 +38,22 @@ class Cost(NamedTuple):
     grain_steps: float
     seconds: float
     disk_bytes: float
+    damaged: int
+    others: int
+    begun: int
 
     @property
     def lines(self) -> list[str]:
         """In words."""
         counts = [f"{self.there} there", *([f"{self.failed} failed or impossible"] if self.failed else [])]
+        found = {
+            f"{plural(self.damaged, 'file')} damaged, or another point's: to be computed again": self.damaged,
+            f"{plural(self.others, 'result')} of points that are not asked for, which stay": self.others,
+            f"{plural(self.begun, 'unfinished run')} to be gone on with": self.begun,
+        }
         return [
-            f"points: {self.points}, {', '.join(counts)}; {self.runs} runs at most",
+            f"points: {self.points}, {', '.join(counts)}; {plural(self.runs, 'run')} at most",
+            *(f"in the folder: {words}" for words, count in found.items() if count),
             f"packs to be made: {self.packs}",
             f"time: {self.grain_steps:.2g} grain-steps, {in_time(self.seconds)} of two free cores (native, law H)",
             f"disk: {in_bytes(self.disk_bytes)}; nothing was run or written",
@@ -60,8 +73,11 @@ def cost_of(spec: Spec, folder: Path, *, workers: int = 1, only_packs: bool = Fa
         runner.check()
         makes = runner.pack_jobs()
         later, points = ([], []) if only_packs else (runner.points_to_come(), runner.points())
-        known, failed = runner.store.done(), set(runner.store.failed())
-    asked = {one.key: one for one in points}
+        asked = {one.key: one for one in points}
+        failed, kept = set(runner.store.failed()), runner.store.done()
+        damaged = set(runner.store.unreadable(set(asked)))
+        begun = len(runner.store.begun(asked.keys() - failed))
+    known = kept - damaged
     missing = [one for key, one in asked.items() if key not in known | failed]
     memory = psutil.virtual_memory().available // workers
     jobs = [job.asdict() for job in plan(missing, set(), memory, workers=workers)]
@@ -75,5 +91,8 @@ def cost_of(spec: Spec, folder: Path, *, workers: int = 1, only_packs: bool = Fa
         runs=len(jobs) + len(later),
         grain_steps=float(sum(job["work"] for job in work)),
         seconds=seconds_of(work),
+        damaged=len(damaged),
+        others=0 if only_packs else len(kept - asked.keys()),
+        begun=begun,
         disk_bytes=disk + sum(recall_bytes(one.experiment) for one in missing),
     )

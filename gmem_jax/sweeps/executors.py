@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from gmem_jax import native
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.validation import optional
 from gmem_jax.sweeps import slurm, work
@@ -253,8 +254,9 @@ def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executo
     """An executor by name.
 
     Raises:
-        ValueError: if there is none of that name, or it cannot be had here.
+        ValueError: if there is none of that name, it cannot be had here, or GMEM_THREADS is no number of threads.
     """
+    native.require_threads()
     if kind == "processes":
         if options:
             raise ValueError(f"processes have no option {min(options)!r}")

@@ -23,6 +23,7 @@ import math
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -142,8 +143,9 @@ def _values(name: str, value: Any) -> list[Any]:
         low, high, last = float(numbers[0]), float(numbers[1]), value["count"] - 1
         if value.get("factors", False):
             _require(low > 0.0 and high > 0.0, f"{name}: equal factors need positive numbers")
-            return [low * (high / low) ** (step / last) for step in range(last)] + [high]
-        return [low + (high - low) * step / last for step in range(last)] + [high]
+            return [low, *(float(f"{low * (high / low) ** (step / last):.14g}") for step in range(1, last)), high]
+        exact = [Fraction(str(number)) for number in (low, high)]  # 0.6, not 0.6000000000000001
+        return [float(exact[0] + (exact[1] - exact[0]) * Fraction(step, last)) for step in range(last + 1)]
     _require(isinstance(value, list), f"{name}: give a list of values, got {value!r}")
     _require(bool(value), f"{name}: the list is empty, so there are no points")
     return list(value)

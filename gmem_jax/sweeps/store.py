@@ -146,10 +146,16 @@ class Store:
         own = found.configuration.get("key")
         if own != key:
             raise FileFormatError(
-                f"{self.at(key)}: says that it is point {printable(own)[:NAME]}, not the one of its name: files "
-                "were exchanged; remove it, and the sweep computes it again"
+                f"{self.at(key)}: holds {self._named(own)}, not {self._named(key)}: files were exchanged; give each "
+                "its own name (KEY.h5) again, or remove it, and the sweep computes what is missing"
             )
         return found
+
+    def _named(self, key: Any) -> str:
+        """A point by its key and its values, for a message."""
+        values = [row["values"] for row in self.card()["points"] if row["key"] == key]
+        told = ", ".join(f"{name} = {value}" for name, value in values[0].items()) if values else "not of this sweep"
+        return f"point {printable(key)[:NAME]} ({printable(told)[:NAME]})"
 
     def unreadable(self, keys: set[str]) -> list[str]:
         """Those of some points that are computed whose files cannot be read."""

@@ -26,6 +26,7 @@ from gmem_jax.files.packs import load_pack
 from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.files.validation import require_kinds
 from gmem_jax.files.waveforms import named_signals, waveforms_of
+from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within, work_of_bin
@@ -64,7 +65,7 @@ class Results(list[Result]):
             ]
             for one in self
         ]
-        return listing(f"Sweep of {len(self)} points", [*names, "G", "F", "status"], rows)
+        return listing(f"Sweep of {plural(len(self), 'point')}", [*names, "G", "F", "status"], rows)
 
 
 @usual_rules()
@@ -250,7 +251,7 @@ class SweepRunner:
             FileNotFoundError: if there is no such pack.
         """
         if makes := self.pack_jobs():
-            self._announce(f"{len(makes)} packs to be made", makes, executor)
+            self._announce(f"{plural(len(makes), 'pack')} to be made", makes, executor)
             self._finish(executor, makes, progress, "packs")
         return [self.pack_of({**self.spec.shared, **values}) for values in self.spec.combinations()]
 
@@ -274,9 +275,9 @@ class SweepRunner:
             OSError: if none can be started.
         """
         if makes := self.pack_jobs():
-            self._announce(f"{len(makes)} packs to be made", makes, executor)
+            self._announce(f"{plural(len(makes), 'pack')} to be made", makes, executor)
             if later := self.points_to_come():
-                self._announce(f"then {len(later)} points on them", later, executor)
+                self._announce(f"then {plural(len(later), 'point')} on them", later, executor)
             self._finish(executor, makes, progress, "packs")
         points = self.points()
         failed = [(digest([self.spec.shared, values]), values, reason) for values, reason in self.impossible]
@@ -296,10 +297,10 @@ class SweepRunner:
         kept = len({one.key for one in points} & known)
         if jobs:
             count = sum(len(job["points"]) for job in jobs)
-            self._announce(f"{count} of {len(points)} points in {len(jobs)} runs", jobs, executor)
+            self._announce(f"{count} of {plural(len(points), 'point')} in {plural(len(jobs), 'run')}", jobs, executor)
             self._finish(executor, jobs, progress, "points")
         else:
-            self.say(f"all {kept} points are there")
+            self.say(f"nothing to do: {kept} of {plural(len(points), 'point')} there")
 
     def points_to_come(self) -> list[dict[str, Any]]:
         """What will be run on packs that do not exist yet: work, replicas and bytes of each point by itself."""
@@ -322,7 +323,7 @@ class SweepRunner:
         minutes = max(1, round(seconds_of(jobs, self.cost) / 60.0))
         where = "here" if self.cost != SECONDS_PER_GRAIN_STEP else "of two free cores (native, law H)"
         cost = f"{work:.2g} grain-steps, some {minutes} min {where}"
-        self.say(f"{what}, {widest} replicas side by side at most, workers: {workers}; {cost}")
+        self.say(f"{what}, {plural(widest, 'replica')} side by side at most, workers: {workers}; {cost}")
 
     def _finish(self, executor: Executor, jobs: list[dict[str, Any]], progress: Progress, what: str) -> None:
         self.store.order(jobs)

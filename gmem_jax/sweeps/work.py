@@ -112,11 +112,9 @@ class _Worker:
                 print(f"{keys[0]}: {reason}", file=sys.stderr, flush=True)
 
     def _parts(self, job: dict[str, Any]) -> Checkpoints:
-        key = {"job": job["name"], "batch": job.get("batch")}
-        try:
-            return Checkpoints(self.store.parts(job), key)
-        except FileFormatError:  # begun with another batch
-            return Checkpoints(self.store.parts(job), key, restart=True)
+        key, advice = {"job": job["name"], "batch": job.get("batch")}, "remove it, and do the sweep with --retry"
+        folder = self.store.parts(job)
+        return Checkpoints(folder, key, restart=bool(Checkpoints.other_run(folder, key)), advice=advice)
 
     def _prepare(self, job: dict[str, Any]) -> None:
         parts = self._parts(job)

@@ -54,3 +54,18 @@ def test_no_number_of_a_table_is_cut_however_narrow_the_terminal(
     said = capsys.readouterr().out
     for number in ("0.259", "0.658", "0.261", "0.901", "40", "123456789.25"):
         assert f" {number} " in said
+
+
+@pytest.mark.parametrize("width", [40, 60, 80])
+def test_a_table_is_no_wider_than_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, width: int
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setattr(console, "out", Console(highlight=False, markup=False))
+    console.print_result(False, {}, tables.recall_table([ROW, {**ROW, "gain": 0.1234}], CONDITIONS))
+    said = capsys.readouterr().out
+    assert max(map(len, said.splitlines())) <= width
+    assert said.count("Recall of the waveforms") == 1
+    assert " ".join(said.split()).count("t0 = 1800") == 1  # the caption
+    for number in ("0.259", "0.123", "0.658", "0.261", "0.901", "40"):
+        assert f" {number} " in said

@@ -119,7 +119,7 @@ def test_a_net_is_shown(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, net: Path
 ) -> None:
     assert gmem(monkeypatch, "show", net) == 0
-    assert "words of 1 bits, seed 0: not finished" in capsys.readouterr().out
+    assert "words of 1 bit, seed 0: not finished" in capsys.readouterr().out
     assert gmem(monkeypatch, "show", net, "--plot", "weights", "-o", tmp_path / "w.svg") == 0
     assert "<svg" in (tmp_path / "w.svg").read_text()
 

@@ -4,12 +4,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
+from scenes import ROOT
 from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
@@ -59,23 +59,58 @@ def test_a_wrong_number_of_threads_is_told_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, threads: str
 ) -> None:
     monkeypatch.setenv("GMEM_THREADS", threads)
-    assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "x.h5", *SHORT) == 2
-    expected = f'gmem: GMEM_THREADS should be a number of threads from 1 to 4096; it is "{threads}"'
-    assert capsys.readouterr().err.splitlines()[-1] == expected
+    (tmp_path / "mu.toml").write_text(f'[experiment]\npack = "{PACK}"\n[vary]\nmu = [0.5]\n')
+    for command in (["recall", PACK, "-o", tmp_path / "x.h5", *SHORT], ["sweep", tmp_path / "mu.toml"]):
+        assert gmem(monkeypatch, *command) == 2
+        expected = f'gmem: GMEM_THREADS should be a number of threads from 1 to 4096; it is "{threads}"'
+        assert capsys.readouterr().err.splitlines() == [expected]  # before its cost is told
+    assert [path.name for path in tmp_path.iterdir()] == ["mu.toml"]
 
 
-def test_ctrl_c_while_it_is_imported_is_one_line() -> None:
+def test_a_chosen_folder_of_programs_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    folder = tmp_path / "file" / "programs"
+    first, *others = said("sweep", "status", tmp_path, code=2, GMEM_COMPILE_CACHE=str(folder)).splitlines()
+    why = f"GMEM_COMPILE_CACHE={folder}: cannot write there (Not a directory)"
+    assert first == f"warning: {why}; compiled programs are not kept"
+    assert len(others) == 1
+
+
+SLOW = """import sys, time
+class Slow:
+    def find_spec(name, *_):
+        if name == "jax":
+            print(flush=True)
+        time.sleep(0.05 * name.startswith("jax"))
+sys.meta_path.insert(0, Slow)
+"""
+
+
+@pytest.mark.parametrize("entry", [["-c", "from gmem_start import main; main()"], ["-m", "gmem_jax"]])
+def test_ctrl_c_while_it_is_imported_is_one_line(tmp_path: Path, entry: list[str]) -> None:
     # Imports as slow as on a cold disk, so that the signal comes while they run.
-    slow = "import sys, time; sys.meta_path.insert(0, type('Slow', (), {'find_spec': lambda *_: time.sleep(0.05)}))"
-    begun = "print(flush=True)"
-    command = [sys.executable, "-c", f"{slow}; {begun}; from gmem_start import main; main()"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    (tmp_path / "sitecustomize.py").write_text(SLOW)
+    paths = os.pathsep.join([str(tmp_path), str(ROOT)])
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(
+        [sys.executable, *entry], **pipes, text=True, env={**os.environ, "PYTHONPATH": paths}
+    ) as process:
         process.stdout.readline()
-        time.sleep(1.0)
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=60)
     assert error == "gmem: interrupted; nothing was begun\n"
     assert process.returncode == 130
+
+
+@pytest.mark.parametrize("moment", ["keep_programs", "app", "atexit"])
+def test_ctrl_c_at_either_end_of_a_command_leaves_no_traceback(moment: str) -> None:
+    stop = "lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)"
+    where = f"atexit.register({stop})" if moment == "atexit" else f"app.{moment} = {stop}"
+    code = f"import atexit, os, signal, gmem_start; from gmem_jax.command import app; {where}; gmem_start.main()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.splitlines()) <= 1
 
 
 def no_home() -> Path:

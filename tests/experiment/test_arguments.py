@@ -1,10 +1,13 @@
 """What a user puts in the wrong place is answered in one line that says what is right; types say it before it runs."""
 
+import dataclasses
+import functools
 import importlib.util
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +65,7 @@ def test_names_values_and_batches_in_the_wrong_form_are_refused_with_the_right_o
         (lambda: gm.value_and_grad(EXPERIMENT, ["dt"]), "dt is fixed when a program is compiled"),
         (lambda: gm.value_and_grad(EXPERIMENT, ["background"]), "background is fixed .*; numbers like gamma0"),
         (lambda: gm.value_and_grad(EXPERIMENT, ["pack.name"]), "pack.name is fixed"),
-        (lambda: gm.run(EXPERIMENT, batch=0), "batch must be at least 1, got 0"),
+        (lambda: gm.run(EXPERIMENT, batch=0), "batch must be a whole number from 1, got 0"),
         (lambda: gm.replace(EXPERIMENT, {"gamma0": 1e-3}, gamma0=2e-3), "gamma0 is given twice"),
         (
             lambda: gm.replace(EXPERIMENT, {"friction.mu": 0.5, "friction": gm.Hooke()}),
@@ -77,6 +80,82 @@ def test_names_values_and_batches_in_the_wrong_form_are_refused_with_the_right_o
         assert "\n" not in str(refused.value)
     with_part = gm.replace(EXPERIMENT, {"friction": gm.Hooke(), "friction.mu": 0.5})
     assert with_part.friction == gm.Hooke(mu=0.5)
+
+
+@pytest.mark.parametrize(
+    "given", ["1", b"1", np.array("1"), np.array(["1", "2"]), [1.0, "2"], True, 1.0 + 1.0j, None, {}]
+)
+@pytest.mark.parametrize("made", [gm.Hooke, gm.Mindlin, gm.MindlinRescaled, gm.Material])
+def test_a_parameter_of_a_law_or_a_material_is_a_number_and_no_text_of_one(made: Any, given: Any) -> None:
+    for field in dataclasses.fields(made):
+        if "interval" in field.metadata:
+            with pytest.raises(
+                ValueError, match=f"^{field.name} must be a number or an array of numbers, got "
+            ) as refused:
+                made(**{field.name: given})
+            assert repr(given) in str(refused.value)
+
+
+def test_numbers_may_be_written_in_any_way_that_is_one() -> None:
+    for one in (1, 1.0, np.float32(1), np.array(1.0), jnp.asarray(1.0), Fraction(1)):
+        assert gm.Hooke(mu=one) == gm.Hooke(mu=1.0)
+    assert gm.Hooke(mu=[1, 2]) == gm.Hooke(mu=np.array([1.0, 2.0]))
+    assert gm.Bumps([[1, -1]], [[0.3, 0.7]], 0.2).count == 1
+    assert gm.Mindlin(points=np.int64(9)) == gm.Mindlin(points=9)
+
+
+def test_every_number_that_is_asked_for_is_a_number_and_no_text_of_one() -> None:
+    t, x = [0, 1, 2, 3, 4], [0.0, 0.5, 1.0, 0.5, 0.0]
+    wrong: list[tuple[Callable[[], Any], str]] = [
+        *(
+            (functools.partial(gm.replace, EXPERIMENT, {name: "0.2"}), f"{name.rpartition('.')[2]} must be a number")
+            for name in (
+                "t0",
+                "gamma0",
+                "delta0",
+                "hold_drag",
+                "friction.mu",
+                "material.poisson",
+                "rest",
+                "dt",
+                "store",
+            )
+        ),
+        (lambda: gm.replace(EXPERIMENT, gamma0=None), "gamma0 must be a number or an array of numbers, got None"),
+        (lambda: gm.replace(EXPERIMENT, rest=True), "rest must be a number, got True"),
+        (lambda: gm.replace(EXPERIMENT, steps="9"), "steps must be a whole number from 1, got '9'"),
+        (lambda: gm.replace(EXPERIMENT, steps=True), "steps must be a whole number from 1, got True"),
+        (lambda: gm.Mindlin(points="100"), "points must be a whole number from 0, got '100'"),  # type: ignore[arg-type]
+        (lambda: gm.Mindlin(points=9.5), "points must be a whole number from 0, got 9.5"),  # type: ignore[arg-type]
+        (lambda: gm.tetra("0.5"), "tetra overlap must be a number, got '0.5'"),  # type: ignore[arg-type]
+        (lambda: gm.clump(np.eye(3).astype(str)), r"clump offsets must be numbers, \[K, 3\], got array"),
+        (lambda: gm.words(3, pad="2"), "pad must be a number, got '2'"),  # type: ignore[arg-type]
+        (lambda: gm.words(3, width="1"), "width must be a number, got '1'"),  # type: ignore[arg-type]
+        (lambda: gm.Bumps([["1"]], [[0.5]], 0.2), r"amplitudes must be numbers, got \[\['1'\]\]"),  # type: ignore[arg-type]
+        (lambda: gm.Spline("01"), "nodes must be numbers, got '01'"),  # type: ignore[arg-type]
+        (lambda: gm.waveform(["0", "1"]), r"a waveform is made of real samples, got \['0', '1'\]"),  # type: ignore[arg-type]
+        (lambda: gm.waveform([None, 1.0]), "a waveform is made of real samples"),  # type: ignore[arg-type]
+        (lambda: gm.waveform_from(t, list(map(str, x))), "x must be real numbers, got"),  # type: ignore[arg-type]
+        (lambda: gm.waveform_from(t, [0, 1j, 0, 0, 0]), "x must be real numbers, got"),  # type: ignore[arg-type]
+        (lambda: gm.waveform_from(t, x, smooth="0.1"), "smooth must be a number, got '0.1'"),  # type: ignore[arg-type]
+        (lambda: gm.waveform_from(t, x, span=("0", "4")), "span must be two times"),  # type: ignore[arg-type]
+        (lambda: gm.run(EXPERIMENT, batch="2"), "batch must be a whole number from 1, got '2'"),  # type: ignore[arg-type]
+        (lambda: gm.run(EXPERIMENT, batch=2.0), "batch must be a whole number from 1, got 2.0"),  # type: ignore[arg-type]
+        (lambda: gm.run(EXPERIMENT, frames=2.5), "frames must be a whole number from 0, got 2.5"),  # type: ignore[arg-type]
+        (lambda: gm.run(EXPERIMENT, frames_of="1"), "frames_of must be a whole number from 0"),  # type: ignore[arg-type]
+        (lambda: gm.run(EXPERIMENT, frames_at=["1"]), "u of a frame must be a number, got '1'"),  # type: ignore[list-item]
+        (lambda: gm.Recipe(delta0=b"0.05"), r"delta0 must be a number in \(0, 0.5\), got b'0.05'"),  # type: ignore[arg-type]
+        (lambda: gm.Recipe(hold=np.array("0.1")), r"hold must be a number in \[0, inf\), got array"),  # type: ignore[arg-type]
+        (lambda: gm.memory_kernel(EXPERIMENT, "3"), "n must be a whole number from 0, got '3'"),  # type: ignore[arg-type]
+        (lambda: gm.memory_kernel(EXPERIMENT, 3, "0.2"), "width must be a number, got '0.2'"),  # type: ignore[arg-type]
+        (lambda: gm.design_waveforms(EXPERIMENT, iterations="1"), "iterations must be a whole number from 0, got '1'"),
+        (lambda: gm.design_by_kernel(EXPERIMENT, gain="1"), "gain must be a number, got '1'"),
+        (lambda: gm.design_drive([EXPERIMENT], {"t0": ("1", 99.0)}), r"t0 \(lowest\) must be a number, got '1'"),
+    ]
+    for make, words in wrong:
+        with pytest.raises(ValueError, match=words) as refused:
+            make()
+        assert "\n" not in str(refused.value)
 
 
 def test_what_is_no_experiment_is_not_run() -> None:

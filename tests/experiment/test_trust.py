@@ -37,6 +37,7 @@ def judged(
     speed: object = 0.0,
     unloaded: object = 1.0,
     noise: object = (0.0, 0.0),
+    contacts: float = 0.0,
     **changes: object,
 ) -> list[int]:
     """The validity about three replicas (the zero signal, half of the waveform and the whole) of an invented run.
@@ -48,6 +49,7 @@ def judged(
         speed: of the fastest grain for most of a stage, in speeds of the walls, [3].
         unloaded: the pressure in one bin, [3].
         noise: round-off over p_sig of both signals.
+        contacts: of the spheres of a grain, times two.
         changes: of the experiment.
     """
     bumps = gm.Bumps(jnp.asarray([[0.5, -0.5], [1.0, -1.0]]), jnp.asarray([[0.3, 0.7]] * 2), 0.2)
@@ -61,6 +63,7 @@ def judged(
         inertial_number=nothing.inertial_number.at[1].set(jnp.asarray(inertial)),
         largest_speed=nothing.largest_speed.at[:3].set(fast),
         pressure=nothing.pressure.at[3].multiply(jnp.asarray(unloaded)),
+        contacts=nothing.contacts + contacts,
     )
     prefix = jax.tree.map(lambda leaf: leaf[:, :1], nothing)
     stages = OrderedDict(compress=prefix, encode=middle, readout=nothing)
@@ -88,6 +91,15 @@ LOUD = gm.Bumps(jnp.asarray([[1.0, 0.0], [1.01 * limits.LARGEST_WAVEFORM, 0.0]])
         ({"signals": LOUD, "gamma0": 1e-4}, Status.LARGE_WAVEFORM),
         ({"speed": around(limits.FASTEST_GRAIN)}, Status.RESTLESS),
         ({"hold_drag": jnp.asarray([1.0, 3.4, 3.5])}, Status.RESTLESS),  # times dt = 0.293
+        ({"friction.damping_time": jnp.asarray([3.0, 6.0, 6.5]), "contacts": 10.0}, Status.RESTLESS),
+        (
+            {
+                "friction": gm.MindlinRescaled(damping_time=jnp.asarray([1.0, 3.1, 3.4])),
+                "contacts": 10.0,
+                "overlap": [0.15] * 3,
+            },
+            Status.RESTLESS,
+        ),
         ({"noise": around(limits.LARGEST_NOISE)[1:]}, Status.ROUNDED),
         ({"noise": [0.0, np.inf]}, Status.ROUNDED),
         ({"unloaded": [1.0, 1e-9, 0.0]}, Status.UNLOADED),
@@ -101,6 +113,17 @@ def test_each_doubt_is_that_of_its_replica_alone(given: dict[str, object], bit: 
 def test_grains_without_friction_may_turn_freely() -> None:
     assert judged(speed=[10.0] * 3, friction=gm.Frictionless()) == judged(speed=[10.0] * 3, **{"friction.mu": 0.0})
     assert judged(speed=[10.0] * 3, friction=gm.Frictionless()) == [0, 0, 0]
+
+
+def test_a_dashpot_that_its_steps_cannot_follow_is_told_and_one_that_they_can_is_not() -> None:
+    """What the bound says is what happens: nothing is recalled above it."""
+    found = [
+        gm.run(gm.Experiment(PACK, two_bumps(1.0, -0.6), gm.Hooke(damping_time=time), t0=450.0, store=0.2))
+        for time in (3.0, 1e9)
+    ]
+    statuses = [int(np.bitwise_or.reduce(one.status)) & int(Status.RESTLESS) for one in found]
+    assert statuses == [0, int(Status.RESTLESS)]
+    assert found[1].fidelity < 0.1 * found[0].fidelity
 
 
 def test_one_fast_moment_is_not_unrest() -> None:

@@ -14,6 +14,7 @@ from scenes import TESTS, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.files.checkpoints import load_part, save_part
+from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.seal import BLOCK, seal
 
 PACK = TETRA_27
@@ -157,8 +158,33 @@ def test_a_file_without_a_seal_is_refused(tmp_path: Path) -> None:
     """What another program wrote, or rewrote without the first 512 bytes."""
     bare = tmp_path / "bare.h5"
     bare.write_bytes(PACK.read_bytes()[BLOCK:])
-    with pytest.raises(gm.FileFormatError, match=r"bare\.h5: not a readable HDF5 file: it has no checksum"):
+    with pytest.raises(
+        gm.FileFormatError, match=r"bare\.h5: not a readable HDF5 file: it is HDF5 without our checksum"
+    ):
         gm.load_pack(bare)
+
+
+def test_a_file_of_another_kind_is_refused_with_what_it_is_and_what_is_needed(tmp_path: Path) -> None:
+    foreign, shifted, picture, text = (tmp_path / name for name in ("a.h5", "b.h5", "c.png", "d.json"))
+    for path, block in ((foreign, 0), (shifted, 1024)):
+        with h5py.File(path, "w", userblock_size=block) as file:
+            file["x"] = np.arange(3)
+    picture.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 8)
+    text.write_text("{}")
+    for path in (foreign, shifted):
+        with pytest.raises(gm.FileFormatError, match="it is HDF5 without our checksum, made or changed by another"):
+            gm.load_pack(path)
+    for path in (picture, text):
+        with pytest.raises(gm.FileFormatError, match=r"not a readable HDF5 file: it is not HDF5 at all$"):
+            gm.load_pack(path)
+    for name, words in (
+        ("gmem-recall/0.1", "this is a recall; a pack is needed"),
+        ("x", "none of ours; a pack is needed"),
+    ):
+        with writing(tmp_path / "kind.h5", name):
+            pass
+        with pytest.raises(gm.FileFormatError, match=rf"kind\.h5: .*{words}"):
+            gm.load_pack(tmp_path / "kind.h5")
 
 
 def test_a_recall_keeps_its_waveforms_and_their_names_and_is_refused_when_its_parts_do_not_fit(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import Folder, remove_leftovers, temporary
 from gmem_jax.files.packs import load_pack
+from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.spec import spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SweepRunner
@@ -318,8 +319,11 @@ def test_points_that_were_exchanged_give_no_numbers(swept: Path, tmp_path: Path)
     try:
         store = Store(swept, make=False)
         for read in (lambda: rows(store), lambda: export_table(store, tmp_path / "o.csv")):
-            with pytest.raises(gm.FileFormatError, match="files were exchanged"):
+            with pytest.raises(gm.FileFormatError, match="files were exchanged") as refused:
                 read()
+            key = {row["values"]["friction.mu"]: row["key"] for row in store.card()["points"]}
+            there, wanted = (f"point {key[mu]} (friction.mu = {mu})" for mu in (1.0, 0.2))
+            assert f"{key[0.2]}.h5: holds {there}, not {wanted}" in str(refused.value)
         assert set(store.unreadable({one.stem, other.stem})) == {one.stem, other.stem}  # so a sweep runs them again
     finally:
         exchange(one, other)
@@ -337,6 +341,42 @@ def test_parts_that_were_exchanged_or_are_of_another_run_are_refused(tmp_path: P
     exchange(tmp_path / "1" / "one.npz", tmp_path / "2" / "one.npz")
     with pytest.raises(gm.FileFormatError, match="exchanged"):
         Checkpoints(tmp_path / "2", {"seed": 2})("one", lambda _: np.zeros(3))
+
+
+def test_a_dry_run_says_what_lies_in_the_folder_of_a_sweep(swept: Path) -> None:
+    shared = {"pack": str(PACK), "t0": 60.0, "store": 0.1, "rest": 0.05, "hold": 0.05}
+    spec = spec_of({"experiment": shared, "vary": {"mu": [0.2, 0.3]}})
+    found = cost_of(spec, swept)
+    assert (found.points, found.there, found.damaged, found.others, found.runs) == (2, 1, 0, 1, 1)
+    assert "in the folder: 1 result of points that are not asked for, which stay" in found.lines
+    assert "1 run at most" in found.lines[0]
+    one, other = sorted((swept / "points").iterdir())
+    exchange(one, other)
+    try:
+        found = cost_of(spec, swept)
+        assert (found.there, found.damaged) == (0, 1)
+        assert "in the folder: 1 file damaged, or another point's: to be computed again" in found.lines
+    finally:
+        exchange(one, other)
+
+
+def test_a_damaged_part_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    for more, advice in (({}, "remove it, or begin anew with --restart"), ({"advice": "do so"}, "do so")):
+        parts = Checkpoints(tmp_path / "parts", {"seed": 1}, restart=True, **more)
+        parts("one", lambda _: np.zeros(3))
+        part = tmp_path / "parts" / "one.npz"
+        part.write_bytes(part.read_bytes()[:-9])
+        with pytest.raises(gm.FileFormatError, match=f"one.npz: damaged, .* its content; {advice}$"):
+            parts("one", lambda _: np.zeros(3))
+        part.unlink()
+        assert parts("one", lambda _: np.ones(3)).sum() == 3.0  # so the advice is right
+
+
+def test_parts_of_another_run_are_told_by_the_name_of_what_differs(tmp_path: Path) -> None:
+    laws = [{"friction": {"law": "H", "mu": mu, "stiffness": 0.13}, "batch": 6} for mu in (0.5, 1.0)]
+    Checkpoints(tmp_path / "parts", laws[0])("one", lambda _: np.zeros(3))
+    with pytest.raises(gm.FileFormatError, match=r"run with another friction\.mu \(0\.5, now 1\.0\); begin anew"):
+        Checkpoints(tmp_path / "parts", laws[1])
 
 
 def test_a_checkpoint_of_another_part_is_not_gone_on_from(tmp_path: Path) -> None:

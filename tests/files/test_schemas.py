@@ -134,8 +134,12 @@ def test_a_json_result_says_what_its_fields_are_and_what_is_none_is_refused(tmp_
     assert (schema, again["gradient"]["waveform"][1]) == (schemas.GRADIENT, [2.0, None])
     for change, words in (
         ({"fidelity": "high"}, "an impossible 'fidelity'"),
-        ({"schema": "gmem-other/1"}, "schema is 'gmem-other/1', expected one of gmem-gradient/0.1"),
-        ({"schema": None}, "schema is 'None', expected one of gmem-gradient/0.1"),
+        (
+            {"schema": "gmem-other/1"},
+            "its schema is 'gmem-other/1', which is none of ours; a gradient or a tuned drive or",
+        ),
+        ({"schema": None}, "its schema is 'None', which is none of ours; .* is needed"),
+        ({"schema": "gmem-pack/0.1"}, "this is a pack; a gradient or .* is needed"),
         ({"gradient": {"waveform": [[1.0]]}}, "'gradient/gamma0' is missing"),
     ):
         path.write_text(json.dumps({**stored, **change}))

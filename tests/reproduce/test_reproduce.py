@@ -183,7 +183,7 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     assert float(table[2]["published_mean"]) == 0.8996
     assert "2 of 2 points" in said[0]
     Reproduction(tmp_path, "tiny", Here(), say=said.append).figure("fig06")
-    assert said[1:] == ["all 1 points are there"]
+    assert said[1:] == ["nothing to do: 1 of 1 point there"]
     assert (tmp_path / "fig06-tiny.svg").is_file()
 
 

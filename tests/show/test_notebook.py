@@ -27,7 +27,7 @@ def test_objects_are_shown_as_short_tables(recalled: tuple[gm.Experiment, gm.Rec
         (recall, ("Recall of 2 signals", f"<td>{float(recall.gain):.4g}</td>", "F over T1")),
         (
             Results([Result({"friction.mu": 0.5}, recall)]),
-            ("Sweep of 1 points", "<th>friction.mu</th>", "<td>0.5</td>"),
+            ("Sweep of 1 point<", "<th>friction.mu</th>", "<td>0.5</td>"),
         ),
     ):
         table = shown._repr_html_()
@@ -45,7 +45,7 @@ def test_objects_are_one_line_in_a_terminal(recalled: tuple[gm.Experiment, gm.Re
         (recall, f"<Recall of 2 signals: G = {float(recall.gain):.4g}, "),
         (gm.load_recall(tmp_path / "r.h5"), "<Recall of 2 signals: "),
         (gm.six_signals(), "<6 signals: bumps = 3, width = 0.2>"),
-        (gm.waveform([0.1, 0.2]), "<1 signals: nodes = 4>"),
+        (gm.waveform([0.1, 0.2]), "<1 signal: nodes = 4>"),
         (jax.tree.map(lambda _: None, experiment), "<Experiment>"),
     ):
         assert words in repr(shown)

@@ -103,7 +103,9 @@ def test_progress_rises_to_one_and_names_the_stage() -> None:
 
 
 def test_every_status_bit_has_a_sentence() -> None:
-    assert gm.explain(0) == "ok"
+    assert gm.explain(0) == gm.explain(np.zeros(3, int)) == "ok"
+    one, other = Status.RINGING, Status.RESTLESS  # of two replicas of a run
+    assert gm.explain(jnp.asarray([int(one), 0, int(other)])) == gm.explain(one | other)
     for bit in Status:
         assert ";" in gm.explain(int(bit))
         assert "use" in gm.explain(int(bit)) or "allocate" in gm.explain(int(bit))
@@ -141,6 +143,36 @@ def test_a_run_that_broke_names_the_number_that_made_its_steps_unstable(name: st
     words = rf"rest: grains moved by most of R within one bin: {name} = 1e\+09 makes steps beyond .* unstable"
     with pytest.raises(gm.RunFailedError, match=words):
         gm.run(gm.Experiment(PACK, gm.words(1), **FAST, **UNSTABLE[name]))
+
+
+SOFTER = {  # other numbers, other laws, and one replica alone
+    "hold_drag": {"hold_drag": jnp.asarray([0.05, 0.05, 9.0])},
+    "material.wall_rigidity": {"material": gm.Material(wall_rigidity=400.0)},
+    "material.normal_damping": {"material": gm.Material(normal_damping=100.0), "friction": gm.Frictionless()},
+    "friction.stiffness": {"friction": gm.Mindlin(stiffness=jnp.asarray([0.6, 400.0, 0.6]))},
+    "friction.damping_time": {"friction": gm.MindlinRescaled(damping_time=90.0)},
+}
+
+
+@pytest.mark.parametrize("name", SOFTER)
+def test_the_number_that_makes_steps_unstable_is_found_by_any_law_and_in_any_replica(name: str) -> None:
+    sound = gm.Experiment(PACK, gm.words(1), dt=0.5)
+    assert stability.cause(sound.simulation(sheared=True)) == ""
+    told = stability.cause(gm.replace(sound, **SOFTER[name]).simulation(sheared=True))
+    assert re.match(rf"{name} = [\d.]+ makes steps beyond 0\.\d+ t_c unstable, and dt is 0\.\d+; use a smaller", told)
+
+
+def test_a_run_that_broke_for_no_number_that_is_known_says_what_to_try() -> None:
+    stiff = gm.Experiment(PACK, gm.words(1), material=gm.Material(poisson=-0.9999), **FAST)
+    with pytest.raises(gm.RunFailedError, match="one bin: the steps are unstable; use a smaller dt, or check pack"):
+        gm.run(stiff)
+
+
+def test_a_step_that_is_too_large_for_one_of_several_traced_rates_is_told_of_that_alone() -> None:
+    experiment = gm.Experiment(PACK, gm.words(1), t0=100.0, steps=1, rest=0.01, hold=0.01, store=0.01)
+    bits = jax.vmap(lambda t0: gm.replace(experiment, t0=t0).begin().status)(jnp.asarray([127.9, 128.1]))
+    assert (np.asarray(bits) & int(Status.STEP_TOO_LARGE) > 0).all(axis=1).tolist() == [False, True]
+    assert (np.asarray(bits) & int(Status.STEP_TOO_LARGE) > 0).any(axis=1).tolist() == [False, True]
 
 
 def test_a_run_in_sound_steps_has_no_cause() -> None:

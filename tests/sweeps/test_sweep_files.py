@@ -62,6 +62,20 @@ def test_combinations_are_products_of_axes_and_single_points() -> None:
     assert [one["mu"] for one in even.combinations()] == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
+@pytest.mark.parametrize(
+    ("axis", "values"),
+    [
+        ({"from": 0.2, "to": 1.0, "count": 5}, [0.2, 0.4, 0.6, 0.8, 1.0]),
+        ({"from": -0.1, "to": 0.2, "count": 4}, [-0.1, 0.0, 0.1, 0.2]),
+        ({"from": 1, "to": 1000, "count": 4, "factors": True}, [1.0, 10.0, 100.0, 1000.0]),
+        ({"from": 1e-4, "to": 1.6e-3, "count": 5, "factors": True}, [1e-4, 2e-4, 4e-4, 8e-4, 1.6e-3]),
+    ],
+)
+def test_values_of_a_grid_are_those_that_were_asked_for_and_no_neighbours(axis: dict, values: list[float]) -> None:
+    spec = spec_of({"vary": {"mu": axis}})
+    assert [one["mu"] for one in spec.combinations()] == values
+
+
 BAD = {
     "[vary]\nmu = []": "mu: the list is empty",
     "[vary]\nmu = 0.3": "mu: give a list",

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from gmem_jax.physics.contact.friction import TANGENTIAL_DAMPING, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.numbers import require_whole
 from gmem_jax.physics.pytree import Scalar, parameter, pytree, static, validate
 from gmem_jax.physics.rotation import cross, dot
 
@@ -84,6 +85,7 @@ class Mindlin:
 
     def __post_init__(self) -> None:
         validate(self)
+        object.__setattr__(self, "points", require_whole("Mindlin.points", self.points))
         if not 2 <= self.points <= MOST_POINTS:
             raise ValueError(f"Mindlin.points must be 2 to {MOST_POINTS}, got {self.points}")
         if self.variant not in ("averaged", "exact", "paper"):
