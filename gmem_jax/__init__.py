@@ -22,6 +22,7 @@ from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
 from gmem_jax.experiment.record import describe, to_dict
 from gmem_jax.experiment.samples import waveform_from
 from gmem_jax.experiment.signals import Bumps, Signals, Spline, six_signals, waveform, words
+from gmem_jax.experiment.stepping import stable_step
 from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
 from gmem_jax.files.recalls import load_recall, save_recall, to_csv, to_xarray
@@ -122,6 +123,7 @@ __all__ = [
     "save_waveforms",
     "six_signals",
     "sphere",
+    "stable_step",
     "stack",
     "sweep",
     "tetra",
