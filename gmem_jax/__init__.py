@@ -24,6 +24,7 @@ from gmem_jax.experiment.record import describe, to_dict
 from gmem_jax.experiment.samples import waveform_from
 from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, signals, six_signals, waveform, words
 from gmem_jax.experiment.stages import compress, cycle, hold, read, rest, shake, train, write
+from gmem_jax.experiment.stepping import stable_step
 from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.datasets import to_csv, to_xarray
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
@@ -142,6 +143,7 @@ __all__ = [
     "signals",
     "six_signals",
     "sphere",
+    "stable_step",
     "stack",
     "sweep",
     "tetra",

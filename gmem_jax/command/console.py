@@ -145,8 +145,9 @@ def _keep_whole(table: Table) -> int:
     """Let a table be as wide as its numbers and words, if the terminal is not: rich would cut them; that width."""
     least = 1
     for column in table.columns:
-        breaks = column.overflow == "fold" and not column.no_wrap  # anywhere, but for its head
-        texts = [str(column.header), *map(str, () if breaks else column.cells)]
+        breaks = column.overflow == "fold" and not column.no_wrap  # anywhere, but for its head and numbers
+        cells = (cell for cell in map(str, column.cells) if not breaks or cell[:1] in "-+.0123456789")
+        texts = [str(column.header), *cells]
         pieces = [piece for text in texts for piece in (text.splitlines() if column.no_wrap else text.split())]
         column.min_width = max([column.min_width or 0, *map(cell_len, pieces)])
         least += column.min_width + 3  # a blank on either side, and a rule

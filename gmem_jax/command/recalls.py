@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import jax
+import numpy as np
 import typer
 
 from gmem_jax import native
@@ -34,6 +35,7 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import frame_schedule, replica_bins, run, run_bytes
 from gmem_jax.experiment.record import key_of_run, signals_to_dict
 from gmem_jax.experiment.signals import Signals, six_signals
+from gmem_jax.experiment.stepping import stable_step
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
 from gmem_jax.files.sizes import recall_bytes
@@ -122,6 +124,8 @@ def recall_command(
     if dry_run:
         batch = batch_for(experiment, output, batch, restart=restart)
         cost = _announce(experiment, batch)
+        dt, cost["stable_step"] = float(np.max(experiment.timing.dt)), stable_step(experiment)
+        log(f"steps of {dt:.3g} t_c; up to {cost['stable_step']:.3g} t_c are stable")
         foresee(output, key_of_run(experiment, batch=batch, **film), restart=restart)
         emit_cost(as_json, cost, output, recall_bytes(experiment, frames))
         return

@@ -17,6 +17,7 @@ from gmem_jax.experiment import html
 from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
 from gmem_jax.experiment.record import describe
+from gmem_jax.experiment.stepping import require_stable
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
 from gmem_jax.physics.numbers import plural, require_whole
 from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
@@ -257,13 +258,15 @@ def runner_of(experiment: Experiment, **options: Any) -> Runner:
     """A runner at the beginning of the experiment.
 
     Raises:
-        ValueError: if 64-bit mode is off, or was when the pack or the signals were made; or the experiment is traced.
+        ValueError: if 64-bit mode is off, or was when the pack or the signals were made; or the experiment is traced;
+            or its time step is not stable.
     """
     require_x64()
     require_double(pack=experiment.pack, signals=experiment.signals)
     if traced(experiment):
         raise ValueError("gm.run works on the host; inside jax.jit, jax.vmap or jax.grad use gm.recall")
     require_inside(experiment.pack)
+    require_stable(experiment)
     pack, deepest = experiment.pack, float(np.max(np.asarray(experiment.compression)))
     smallest = smallest_box(np.asarray(pack.lower), np.asarray(pack.upper), deepest)
     state = _begin(experiment)
@@ -353,8 +356,8 @@ def run(
 
     Raises:
         ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
-            for too many or too few frames, a u beyond 0 and 1, frames of a prefix that was run before, or a signal that
-            there is not.
+            for a time step that is not stable (see `stable_step`); for too many or too few frames, a u beyond 0 and 1,
+            frames of a prefix that was run before, or a signal that there is not.
         TypeError: if it is no `Experiment`.
         RunFailedError: if the simulation broke down.
     """

@@ -272,6 +272,8 @@ def other_kind(found: Any, *wanted: str) -> str:
     if found in kinds:
         return f"this is a {kinds[found]}; {needed} is needed"
     here = ", ".join(wanted)
+    if found is None:
+        return f"it has no schema; {needed} is needed ({here})"
     if str(found).partition("/")[0] in (name.partition("/")[0] for name in wanted):
         return f"its schema is {str(found)[:40]!r}, of another version; this one reads {here}"
     return f"its schema is {str(found)[:40]!r}, which is none of ours; {needed} is needed ({here})"

@@ -187,9 +187,7 @@ def test_a_recall_that_holds_no_words_cannot_be_classified(
     capsys.readouterr()
     assert gmem(monkeypatch, "classify", file, "-o", tmp_path / "out.json") == 2
     said = capsys.readouterr()
-    assert (
-        "holds 6 signals that are not the words of one length; make one with gmem recall --signals words:L" in said.err
-    )
+    assert "holds 6 signals, not the words of one length; make one with gmem recall --signals words:L" in said.err
     assert len(said.err.strip().splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["six.h5"]
 

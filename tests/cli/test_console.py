@@ -43,10 +43,12 @@ ROW = {
 CONDITIONS = {"mu": 1.0, "gamma0": 1e-3, "delta0": 0.05, "t0": 1800.0, "friction": "hooke"}
 
 
+@pytest.mark.parametrize("columns", ["", "1"])
 @pytest.mark.parametrize("width", [1, 20, 40, 80, 200])
 def test_no_number_of_a_table_is_cut_however_narrow_the_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, width: int
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, width: int, columns: str
 ) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
     monkeypatch.setattr(console, "out", Console(highlight=False, markup=False, width=width))
     other = Table("name", "value")
     other.add_row("a long name", "123456789.25")

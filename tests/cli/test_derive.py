@@ -43,7 +43,7 @@ def test_a_design_goes_on_from_a_file(
     assert "--start: designs by Jacobians have no use for it" in capsys.readouterr().err
     on = ["design", PACK, "--by", "kernel", "--bumps", 5, "--width", 0.4, "--iterations", 1, "--no-picture", *SHORT]
     assert gmem(monkeypatch, *on, "--start", few) == 2
-    assert "1 waveforms to start from, for 6 signals; give one for each" in capsys.readouterr().err
+    assert "1 waveform to start from, for 6 signals; give one for each" in capsys.readouterr().err
     assert gmem(monkeypatch, *on, "--start", waves, "-o", waves, "--force") == 2
     assert "is an input of this command" in capsys.readouterr().err
     assert gmem(monkeypatch, *on, "--start", waves, "--json") == 0

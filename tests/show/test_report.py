@@ -293,7 +293,7 @@ def test_the_command_writes_a_page_and_says_where(
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [("{}", "expected one of gmem-gradient"), ("[", "not JSON")],
+    [("{}", "it has no schema; a gradient or a tuned drive or a classification is needed"), ("[", "not JSON")],
 )
 def test_what_no_report_shows_is_refused_in_a_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, content: str, words: str

@@ -1,0 +1,79 @@
+"""The largest stable time step of an experiment, and its refusal of longer ones."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.record import fingerprint, pack_fingerprint
+from gmem_jax.physics.contact.friction import CoulombLaw
+from gmem_jax.physics.contact.frictionless import Frictionless
+from gmem_jax.physics.contact.laws import entry_of
+from gmem_jax.physics.rotation import unit
+from gmem_jax.physics.rules import usual_rules
+from gmem_jax.physics.state import still_box
+from gmem_jax.simulation.stable_step import largest_stable_step
+
+UNASKED = 0.3  # t_c; the default step, less than half of what is stable under the default law
+ENOUGH_RINGS = 10  # rings of a history: their number hardly matters to its stiffness, and 100 take minutes
+
+_known: dict[tuple[str, ...], float] = {}
+
+
+@usual_rules()
+def stable_step(experiment: Experiment) -> float:
+    """The largest stable time step of a pack, law, material and compression, in t_c.
+
+    It is that of the steps made linear around the pack at rest, uncompressed and compressed as a whole, with contacts
+    that stick; the smallest of all replicas. Found once for each of these in a process.
+
+    Args:
+        experiment: what is to be run, not traced.
+
+    Returns:
+        At most 2.
+    """
+    law: Any = experiment.friction
+    if isinstance(law, CoulombLaw) and not np.any(law.mu):
+        law = Frictionless()
+    if (row := entry_of(law)) and row.layered:
+        law = replace(law, points=min(law.points, ENOUGH_RINGS))
+    parts = (law, experiment.material, experiment.compression)
+    key = (pack_fingerprint(experiment.pack), fingerprint(parts), str(jax.tree.structure(law)), experiment.backend)
+    if key not in _known:
+        _known[key] = _found(experiment, law)
+    return _known[key]
+
+
+def _found(experiment: Experiment, law: Any) -> float:
+    """`stable_step` under a law: every replica at u = 0, and every one at u = 1."""
+    pack, single = experiment.pack, max(map(jnp.size, jax.tree.leaves((law, experiment.compression))))
+    law = jax.tree.map(lambda leaf: jnp.tile(leaf, 2) if jnp.ndim(leaf) else leaf, law)
+    compression, replicas = jnp.broadcast_to(experiment.compression, (single,)), 2 * single
+    shrink = jnp.concatenate([jnp.ones(single), jnp.sqrt(1.0 - compression)])
+    scale = jnp.stack([shrink, shrink, jnp.ones(replicas)])
+    centre, half = 0.5 * (pack.lower + pack.upper)[:, None], 0.5 * (pack.upper - pack.lower)[:, None]
+    position = centre + scale * (pack.position[..., None] - centre)
+    quaternion = jnp.broadcast_to(unit(pack.quaternion[..., None]), (pack.grains, 4, replicas))
+    simulation = experiment.simulation(sheared=False)
+    system = replace(simulation.system, friction=law)
+    simulation = replace(simulation, system=system, dt=1.0, drag=0.0, steps=1, precision="double")
+    box = still_box(centre - scale * half, centre + scale * half)
+    return largest_stable_step(simulation, position, quaternion, box)
+
+
+def require_stable(experiment: Experiment) -> None:
+    """Refuse a time step that is longer than the default and than what is stable.
+
+    Raises:
+        ValueError: saying both numbers.
+    """
+    dt = float(np.max(np.asarray(experiment.timing.dt)))
+    if dt > UNASKED and dt > (stable := stable_step(experiment)):
+        raise ValueError(
+            f"dt = {dt:.3g} t_c exceeds the largest stable step of this pack, law and compression, {stable:.3g} t_c; "
+            "use a smaller dt"
+        )

@@ -1,0 +1,118 @@
+"""The largest stable time step: the one-step map of a pack at rest, made linear, must let nothing grow.
+
+What ends the stability of packs with friction is not the period of the stiffest mode. The histories of contacts grow
+by velocities that are predicted to the ends of steps. A tangential mode of frequency w gains (w dt)^4 / 8 in every
+step by that, and its dashpot gamma = tau k takes tau w^2 dt / 2: it grows beyond dt^3 = 4 tau / w^2
+(docs/decisions/physics.md).
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from gmem_jax.physics.state import Box, State
+from gmem_jax.physics.step import start
+from gmem_jax.simulation.compiled import Compiled
+from gmem_jax.simulation.loop import Simulation
+
+SHORTEST_STEP, LONGEST_STEP = 0.1, 2.0  # t_c; beyond the latter p_sig is some 10 % off, if anything is stable
+CLOSE = 1.2  # ratio of two steps between which growth follows its formula
+GROWTH = 1e-4  # in a step; what grows less needs ten thousand steps, and sliding contacts take it away
+ROUNDS = 20  # of the power iteration, each with
+DECAY = 8  # steps, in which what is damped vanishes,
+RISE = 2  # and differences of steps, in which what is slow does
+
+
+def largest_stable_step(simulation: Simulation, position: jax.Array, quaternion: jax.Array, box: Box) -> float:
+    """The largest stable step of grains at rest, in t_c; of replicas the smallest of theirs.
+
+    Contacts stick: sliding ones are no stiffer. It takes some 1,200 steps with their tangents.
+
+    Args:
+        simulation: system and backend; its parameters are scalars or [B].
+        position: grain centres, [N, 3, B], in R.
+        quaternion: orientations, [N, 4, B].
+        box: walls at rest, [3, B].
+
+    Returns:
+        At most `LONGEST_STEP`; 0 if not even `SHORTEST_STEP` is stable.
+    """
+
+    def growth(dt: float) -> float:
+        return float(np.max(np.asarray(_growth(simulation, position, quaternion, box, jnp.asarray(dt)))))
+
+    return largest_without(growth)
+
+
+def largest_without(growth: Callable[[float], float]) -> float:
+    """The dt up to which there is no `growth` in a step, which is a dt^4 - b dt where it begins."""
+    low, high = SHORTEST_STEP, LONGEST_STEP
+    at_low, at_high = growth(low), growth(high)
+    if at_high <= GROWTH:
+        return LONGEST_STEP
+    if not at_low <= GROWTH:
+        return 0.0
+    while high > CLOSE * low:
+        middle = (low * high) ** 0.5
+        found = growth(middle)
+        if found <= GROWTH:
+            low, at_low = middle, found
+        else:
+            high, at_high = middle, found
+    rates, cubes = (at_low / low, at_high / high), (low**3, high**3)
+    root = float(np.interp(0.0, rates, cubes) ** (1.0 / 3.0))
+    return root if np.isfinite(root) else low
+
+
+def _dot(one: Any, other: Any) -> jax.Array:
+    """Of two trees in every replica, [B]."""
+    parts = jax.tree.map(lambda a, b: jnp.sum(a * b, axis=tuple(range(a.ndim - 1))), one, other)
+    return sum(jax.tree.leaves(parts), jnp.zeros(()))
+
+
+def _measured(simulation: Simulation, position: jax.Array, quaternion: jax.Array, box: Box, dt: jax.Array) -> jax.Array:
+    """ln |z| of the mode that grows most in steps of `dt`, [B]."""
+    rest = start(simulation.system, position, quaternion, box)
+    still = jnp.zeros_like(position)
+    at = (replace(rest.grains, acceleration=still, spin_rate=still), rest.history)
+    walls = jax.tree.map(lambda leaf: leaf[None], box)
+
+    def one_step(changing: Any) -> Any:
+        grains, history = changing
+        now = State(grains, history, rest.status)
+        state, _ = simulation.resolved.march(simulation.system, now, walls, dt, 0.0)
+        return state.grains, state.history
+
+    def step(change: Any) -> Any:
+        return jax.jvp(one_step, (at,), (change,))[1]
+
+    def difference(change: Any) -> Any:
+        return jax.tree.map(jnp.subtract, step(change), change)
+
+    def one_round(_: Any, change: Any) -> Any:
+        change = lax.fori_loop(0, DECAY, lambda _, now: step(now), change)
+        change = lax.fori_loop(0, RISE, lambda _, now: difference(now), change)
+        size = jnp.sqrt(_dot(change, change))
+        return jax.tree.map(lambda leaf: leaf / size, change)
+
+    kicks = jax.random.normal(jax.random.key(0), (2, *position.shape[:2], 1), position.dtype) + still
+    blank = jax.tree.map(jnp.zeros_like, at)
+    first = lax.fori_loop(0, ROUNDS, one_round, (replace(blank[0], velocity=kicks[0], spin=kicks[1]), blank[1]))
+    second = step(first)
+    third = step(second)
+    # A pair of modes z: third = (sum of both) second - (their product) first.
+    one, both, two = _dot(first, first), _dot(first, second), _dot(second, second)
+    ahead, behind = _dot(third, second), _dot(third, first)
+    apart = one * two - both * both
+    total, product = (ahead * one - behind * both) / apart, (ahead * both - behind * two) / apart
+    root = jnp.sqrt((0.25 * total * total - product).astype(complex))
+    pair = jnp.maximum(jnp.abs(0.5 * total + root), jnp.abs(0.5 * total - root))
+    return jnp.log(jnp.where(apart > 1e-12 * one * two, pair, jnp.sqrt(two / one)))
+
+
+_growth = Compiled(_measured)
