@@ -22,6 +22,7 @@ from gmem_jax.experiment.protocols import Shear, memory_protocol
 from gmem_jax.experiment.readings import Readings
 from gmem_jax.experiment.signals import Signals, SignalSets, bin_average, part, sets_of, waveform
 from gmem_jax.native import Backend, Precision
+from gmem_jax.physics.contact.creep import RelaxingLaw
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
@@ -38,6 +39,7 @@ from gmem_jax.simulation.loop import Observe, Simulation, at_rest
 from gmem_jax.simulation.protocol import BINS, Columns, Drive, Lane, Protocol, Stage
 from gmem_jax.simulation.strain import Sine, StrainPath, Waveforms
 
+FASTEST_CREEP = 0.05  # of an elastic force in a bin: it relaxes once in each
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
 MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
@@ -70,6 +72,8 @@ class Experiment:
         delta0: areal compression; default the pack's own. Another value makes `run` warn.
         t0: duration of one compression, in t_c. The paper's is 1.8e4.
         hold_drag: viscous drag while the walls stand still, 1 / t_c; default 0.05 for t0 below the paper's, else 0.
+        creep: rate at which elastic tangential forces relax, 1 / t_c; default never. A twentieth of a bin's at most.
+        creep_fades: time in a stage after which that rate falls as 1 / t, in t_c; default it stays.
         dt: largest time step, in t_c.
         steps: steps in a bin of t0 / 256; default the fewest that `dt` allows. Needed where t0 is a tracer.
         steps_per_bin: what follows from that.
@@ -102,6 +106,12 @@ class Experiment:
     t0: Scalar = parameter(1.8e3, "(0, inf)", "Duration of one compression (the paper's is 18000)", "t_c", varies=True)
     hold_drag: Scalar | None = parameter(
         None, "[0, inf)", "Viscous drag in holds; default 0.05 if t0 < 18000", "1/t_c", varies=True
+    )
+    creep: Scalar | None = parameter(
+        None, "[0, inf)", "Rate at which elastic tangential forces relax; default never", "1/t_c", varies=True
+    )
+    creep_fades: Scalar | None = parameter(
+        None, "(0, inf)", "Time in a stage after which creep falls as 1/t; default it stays", "t_c", varies=True
     )
     dt: float = static(0.3, "Largest time step", "t_c")
     steps: int | None = static(None, "Steps in a bin of t0 / 256, in the place of dt", no_option=True)
@@ -144,11 +154,26 @@ class Experiment:
         if not native.supports(self.friction) and not traced(self.friction):
             require_law(self.friction, self.replicas)
         self._check_waveforms()
+        self._check_creep()
         step = self.timing.dt
         if not traced(step) and not np.all(np.asarray(step) <= LARGEST_STEP):
             raise ValueError(
                 f"steps = {self.steps_per_bin} makes a time step of {np.max(step):g} t_c, which must be at most "
                 f"{LARGEST_STEP}; give more steps, or none to have them chosen"
+            )
+
+    def _check_creep(self) -> None:
+        if self.creep is None:
+            if self.creep_fades is not None:
+                raise ValueError("creep_fades says when creep becomes slower, and there is none: give creep, a rate")
+            return
+        if not isinstance(self.friction, RelaxingLaw):
+            raise ValueError(f"creep: {type(self.friction).__name__} has no elastic forces that could relax")
+        in_a_bin = self.creep * self.t0 / BINS
+        if not traced(in_a_bin) and np.max(np.asarray(in_a_bin)) > FASTEST_CREEP:
+            raise ValueError(
+                f"creep relaxes {np.max(np.asarray(in_a_bin)):.2g} of a force in a bin of t0 / 256, must be at most "
+                f"{FASTEST_CREEP}; use a smaller creep"
             )
 
     def _whole_steps(self) -> int:
@@ -324,6 +349,8 @@ class Experiment:
             steps=steps,
             backend=self.backend,
             precision=self.precision,
+            creep=self.creep,
+            creep_fades=self.creep_fades,
             columns=columns,
             observe=self.observe,
         )

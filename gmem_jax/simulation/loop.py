@@ -15,6 +15,7 @@ from jax import lax
 
 from gmem_jax import native
 from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.creep import RelaxingLaw, relaxation
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.pairs import Pairs
 from gmem_jax.physics.pytree import Scalar, pytree, static
@@ -50,6 +51,8 @@ class Simulation:
         steps: steps in a bin.
         backend: who does them; see `native.resolve`.
         precision: of contacts, likewise.
+        creep: rate at which elastic tangential forces relax, 1 / t_c; scalar or [B], None for never.
+        creep_fades: time in a stage after which that rate falls, in t_c; see `relaxation`.
         columns: what the stages make use of.
         observe: names and functions of (simulation, state), called at the end of each bin: what they give, a tree of
             arrays [..., B], is kept in `Sample.observed`. They find the walls in `box` and the sample in `sample`.
@@ -65,6 +68,8 @@ class Simulation:
     steps: int = static(1)
     backend: str = static("auto")
     precision: str = static("double")
+    creep: Scalar | None = None
+    creep_fades: Scalar | None = None
     columns: Columns = static(Columns())
     observe: tuple[tuple[str, Observe], ...] = static(())
     mark: Mark | None = None
@@ -147,6 +152,7 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
         dt = _padded(simulation.dt, state.replicas)
         system = _rubbing(simulation.system, row)
         state, total = simulation.resolved.march(system, replace(state, servo=None), boxes, dt, drag)
+        state = _crept(simulation, state, row)
     with jax.named_scope("sample"):
         pressure = total / simulation.steps
         if servo is not None:
@@ -157,6 +163,18 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
             return state, sample
         seen = replace(simulation, box=last, sample=sample)
         return state, replace(sample, observed={name: reduce(seen, state) for name, reduce in simulation.observe})
+
+
+def _crept(simulation: Simulation, state: State, row: Bin) -> State:
+    """The state after the creep of a bin."""
+    law = simulation.system.friction
+    if simulation.creep is None or not isinstance(law, RelaxingLaw):
+        return state
+    length = simulation.steps * jnp.asarray(simulation.dt)
+    begun = jnp.asarray(row.number * length)
+    factor = relaxation(simulation.creep, simulation.creep_fades, begun, begun + length)
+    relaxed = law.relaxed(state.history, _padded(factor, state.replicas))
+    return replace(state, history=jax.tree.map(lambda new, old: new.astype(old.dtype), relaxed, state.history))
 
 
 def _rubbing(system: System, row: Bin) -> System:

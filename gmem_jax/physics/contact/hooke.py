@@ -40,6 +40,10 @@ class Hooke:
         """No elastic force yet: zeros, [contacts, 3, replicas]."""
         return jnp.zeros((contacts, 3, replicas), dtype)
 
+    def relaxed(self, history: jax.Array, factor: jax.Array) -> jax.Array:
+        """See `gmem_jax.physics.contact.creep.RelaxingLaw`."""
+        return history * factor
+
     def __call__(self, kin: Kinematics, normal_force: jax.Array, history: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Tangential force on sphere i and the new history; see `FrictionLaw`."""
         half_step = (0.5 * self.stiffness * kin.dt) * kin.sliding

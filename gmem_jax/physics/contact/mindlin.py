@@ -1,6 +1,6 @@
 """M2: the Mindlin contact with its whole history, resolved by the overlap at which each part was attached."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import jax
@@ -108,6 +108,10 @@ class Mindlin:
             jnp.zeros((contacts, 3, replicas), dtype),
             jnp.zeros((contacts, 1, replicas), dtype),
         )
+
+    def relaxed(self, history: LayeredHistory, factor: jax.Array) -> LayeredHistory:
+        """See `gmem_jax.physics.contact.creep.RelaxingLaw`."""
+        return replace(history, layers=history.layers * factor)
 
     def outermost(self, x: jax.Array) -> jax.Array:
         """The ring jp that a contact reaching to x = sqrt(p) / dq fills in part; a whole number, in the shape of x."""

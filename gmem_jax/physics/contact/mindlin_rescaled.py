@@ -1,6 +1,6 @@
 """M1: the Mindlin contact whose elastic force is rescaled on unloading, so that it cannot create energy."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -56,6 +56,10 @@ class MindlinRescaled:
     def init(self, contacts: int, replicas: int, dtype: Any) -> RescaledHistory:
         """No elastic force and no overlap yet."""
         return RescaledHistory(jnp.zeros((contacts, 3, replicas), dtype), jnp.zeros((contacts, 1, replicas), dtype))
+
+    def relaxed(self, history: RescaledHistory, factor: jax.Array) -> RescaledHistory:
+        """See `gmem_jax.physics.contact.creep.RelaxingLaw`."""
+        return replace(history, force=history.force * factor)
 
     def __call__(
         self, kin: Kinematics, normal_force: jax.Array, history: RescaledHistory

@@ -1,0 +1,35 @@
+"""Creep: the elastic tangential forces of contacts relax with time, as in viscoelastic grains."""
+
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+
+from gmem_jax.physics.pytree import Scalar
+
+
+@runtime_checkable
+class RelaxingLaw(Protocol):
+    """A friction law that can say what a history becomes when its elastic forces relax."""
+
+    def relaxed(self, history: Any, factor: jax.Array) -> Any:
+        """The history whose elastic force is `factor` [B] times as large."""
+        ...
+
+
+def relaxation(rate: Scalar, fades: Scalar | None, begun: jax.Array, ended: jax.Array) -> jax.Array:
+    """What is left of an elastic force between two times of a stage: it solves df/dt = -r(t) f.
+
+    Args:
+        rate: r at the beginning of the stage, 1 / t_c; scalar or [B].
+        fades: time tau after which the rate falls as 1 / t, in t_c: r(t) = rate / (1 + t / tau), so that forces fall by
+            a logarithm of time. None for a rate that stays, the solid of Maxwell.
+        begun: time since the stage began, in t_c.
+        ended: later time.
+
+    Returns:
+        The factor, scalar or [B].
+    """
+    if fades is None:
+        return jnp.exp(-rate * (ended - begun))
+    return ((1.0 + begun / fades) / (1.0 + ended / fades)) ** (rate * fades)
