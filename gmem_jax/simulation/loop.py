@@ -155,7 +155,7 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
         state, sample = end_bin(simulation.system, state, last, pressure, row.u)
         if not simulation.observe:
             return state, sample
-        seen = replace(simulation, box=last, sample=sample)
+        seen = replace(simulation, system=system, drag=drag, box=last, sample=sample)
         return state, replace(sample, observed={name: reduce(seen, state) for name, reduce in simulation.observe})
 
 
