@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from gmem_jax.reading import capacity, classify
     from gmem_jax.show.recalls import plot
     from gmem_jax.show.view import view
+    from gmem_jax.simulation import observables
     from gmem_jax.simulation.progress import ProgressBar
     from gmem_jax.sweeps.sweep import sweep
 
@@ -61,18 +62,20 @@ _LATER = {  # what loads flax or optax, or is seldom asked for, or stands above 
     "capacity": "gmem_jax.reading.capacity",
     "classify": "gmem_jax.reading.classify",
     "protocols": "gmem_jax.experiment.protocols",
+    "observables": "gmem_jax.simulation.observables",
     "ProgressBar": "gmem_jax.simulation.progress",
     "sweep": "gmem_jax.sweeps.sweep",
     "plot": "gmem_jax.show.recalls",
     "view": "gmem_jax.show.view",
 }
+_MODULES = ("capacity", "classify", "observables", "protocols")
 
 
 def __getattr__(name: str) -> Any:
     if name not in _LATER:
         raise AttributeError(f"module 'gmem_jax' has no attribute {name!r}")
     module = importlib.import_module(_LATER[name])
-    return module if name in ("capacity", "classify", "protocols") else getattr(module, name)
+    return module if name in _MODULES else getattr(module, name)
 
 
 def __dir__() -> list[str]:
@@ -126,6 +129,7 @@ __all__ = [
     "load_recall",
     "load_waveforms",
     "memory_kernel",
+    "observables",
     "pack_from",
     "plot",
     "prepare",

@@ -9,9 +9,10 @@ import typer
 from gmem_jax.command import sweep
 from gmem_jax.command.console import AsJson, Force, InputError, check_output, heard, log, print_result, refuse_idle
 from gmem_jax.show.render_matplotlib import PICTURE_FORMATS, to_matplotlib
-from gmem_jax.show.stages import AGAINST, QUANTITIES
+from gmem_jax.show.stages import AGAINST, OBSERVED_PLOT, QUANTITIES
 from gmem_jax.show.summaries import PLOTS, Draw, summary_of
 
+SEEN = "what an observer gave, over the stages"
 _OF_STAGES = {name.lower() for name in QUANTITIES}
 
 
@@ -52,7 +53,7 @@ def show(
         refuse_idle("beside --plot", "csv")
     if not plot or plot == "list":
         refuse_idle("unless something is drawn with --plot", "against", "force", "signal")
-    elif plot.lower() not in _OF_STAGES:
+    elif plot.lower() not in _OF_STAGES and not plot.lower().startswith(OBSERVED_PLOT):
         refuse_idle(f"with --plot {plot}: only pictures of stages ({', '.join(QUANTITIES)}) have it", "against")
     if csv:
         refuse_idle("beside --csv", "as_json")
@@ -94,7 +95,7 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
     names = {name.lower(): name for name in pictures}
     if plot == "list":
         refuse_idle("with --plot list, which draws nothing", "output")
-        lines = "\n".join(f"{name:17}  {PLOTS[name]}" for name in pictures)
+        lines = "\n".join(f"{name:17}  {PLOTS.get(name, SEEN)}" for name in pictures)
         return print_result(as_json, {"pictures": list(pictures), "status": 0}, lines)
     if plot.lower() not in names:
         raise InputError(f"--plot {plot}: there is no such picture of {file}; there are {', '.join(pictures)}")

@@ -36,6 +36,29 @@ def require_parts(pack: Any, signals: Any, friction: Any) -> None:
         raise ValueError(f"friction must be a friction law, got {_said(friction)}; {made}")
 
 
+def named_observers(observe: Any) -> tuple[tuple[str, Any], ...]:
+    """Observers with their names: a mapping, pairs, or observers that have a `name`, as `gm.observables` makes them.
+
+    Raises:
+        ValueError: for what is none of these, or two of one name.
+    """
+    try:
+        given: Any = observe.items() if isinstance(observe, Mapping) else observe
+        named = tuple((one.name, one) if hasattr(one, "name") else (one[0], one[1]) for one in given)
+    except (TypeError, LookupError):
+        named = (("", observe),)
+    for name, reduce in named:
+        if not (isinstance(name, str) and name and name.isprintable() and "/" not in name and callable(reduce)):
+            raise ValueError(
+                "observe takes functions of (simulation, state) by name, as {'sliding': gm.observables.sliding()}, or "
+                f"a list of gm.observables; got {_said(reduce)} called {name!r}"
+            )
+    names = [name for name, _ in named]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"two observers are called {twice[0]!r}; name them, as in observe={{'one': ..., 'two': ...}}")
+    return named
+
+
 def require_names(names: Any, argument: str) -> None:
     """Refuse one name in the place of several.
 

@@ -14,7 +14,7 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
-from gmem_jax.experiment.arguments import require_once, require_parts
+from gmem_jax.experiment.arguments import named_observers, require_once, require_parts
 from gmem_jax.experiment.asked import require_double, require_seen, require_told_apart
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
@@ -132,8 +132,7 @@ class Experiment:
         for name in ("dt", "rest", "hold", "store"):
             object.__setattr__(self, name, _static_number(name, getattr(self, name)))
         object.__setattr__(self, "background", str(self.background).lower())
-        observe = self.observe.items() if isinstance(self.observe, Mapping) else self.observe
-        object.__setattr__(self, "observe", tuple(observe))
+        object.__setattr__(self, "observe", named_observers(self.observe))
         validate(self)
         if self.background not in analysis.BACKGROUNDS:
             raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {self.background!r}")

@@ -27,6 +27,7 @@ from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.rules import usual_rules
+from gmem_jax.simulation.observables import Observable
 
 SIGNALS = {"bumps": Bumps, "spline": Spline}
 PARTS = ("pack", "signals", "friction", "material", "protocol", "observe")
@@ -159,6 +160,9 @@ def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
         "signals": names_of(experiment.signals),
         "reads": list(experiment.readings.reads),
         "channels": list(experiment.readings.channels),
+        "observed": {
+            name: {"units": of.unit, "words": of.words} for name, of in experiment.observe if isinstance(of, Observable)
+        },
         "friction": entry.name if entry else type(law).__name__,
         "mu": plain(law.mu) if isinstance(law, CoulombLaw) else 0.0,
         **{name: plain(value_at(experiment, name)) for name in NUMBERS},

@@ -42,10 +42,10 @@ def to_xarray(recall: Recall) -> Any:
         wide = [np.broadcast_to(values, (*values.shape[:-1], replicas)) for values in own]
         data[name] = (array.shape, np.concatenate(wide), array.attributes)
     for name in next(iter(stages.values())).observed or {}:
-        about = configuration.get("observed", {}).get(name, {})
         own = (np.asarray((sample.observed or {})[name]) for sample in stages.values())
         wide = [np.broadcast_to(values, (*values.shape[:-1], replicas)) for values in own]
-        array = observed_array(OBSERVED + name, wide[0].ndim)
+        array = observed_array(OBSERVED + name, wide[0].ndim, **configuration.get("observed", {}).get(name, {}))
+        about = {"units": array.units, "description": array.words}
         data[OBSERVED + name] = (array.shape, np.concatenate(wide), about)
     derived = of_each(recall)
     declared = declared_of_recall(len(recall.reads), len(recall.channels), own_steps=np.ndim(recall.dt) > 0)

@@ -118,6 +118,11 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
     signals, form = configuration.get("signals", []), experiment.get("signals", {})
     require(isinstance(signals, list) and isinstance(form, dict), "its configuration has impossible 'signals'")
     require(isinstance(configuration.get("warnings", []), list), "its configuration has impossible 'warnings'")
+    observed = configuration.get("observed", {})
+    require(isinstance(observed, dict), "its configuration has impossible 'observed'")
+    for told in observed.values():
+        require_fields(told, "configuration's 'observed'", units=title, words=title)
+        require(len(told) == 2, "its configuration has more in 'observed' than units and words")
     if "target" in configuration:
         require_fields(configuration["target"], "target", kind=title)
         signals_from_dict(configuration["target"])

@@ -157,7 +157,7 @@ def rearranges(packs: dict[str, Pack], t0: float) -> Verdict:
     )
 
 
-def normal_forces(experiment: Experiment, state: State) -> np.ndarray:
+def normal_force_spread(experiment: Experiment, state: State) -> np.ndarray:
     """Overlaps to the power 3/2 of all sphere contacts, to which Hertz' forces are proportional, [P, B]; 0 apart."""
     centres = np.asarray(sphere_centres(state.grains, experiment.pack.clump))
     pairs = experiment.pack.pairs
@@ -179,7 +179,7 @@ def forces_tell_nothing(experiment: Experiment) -> Verdict:
     on.run_stages(*common)
     apply_waveforms(on, experiment)
     on.run_stages(own[0])
-    forces = normal_forces(experiment, on.state)
+    forces = normal_force_spread(experiment, on.state)
     samples = [np.sort(column[column > 0.0]) for column in forces.T]
     scaled = [sample / sample.mean() for sample in samples]
     distance = max(_kolmogorov(scaled[0], other) for other in scaled[1:])

@@ -18,7 +18,7 @@ from gmem_jax.physics.pytree import Scalar
 from gmem_jax.show import tables
 from gmem_jax.show.figure import Curve, Figure, Image, Panel, U, grid, shown_part, u_label
 from gmem_jax.show.render_matplotlib import Drawing, to_matplotlib
-from gmem_jax.show.stages import AGAINST, QUANTITIES, ZERO, stages_figure
+from gmem_jax.show.stages import AGAINST, QUANTITIES, ZERO, observed_quantities, stages_figure
 
 MOST_PANELS = 64  # panels of one picture
 MOST_OF_PAGE = 12  # panels of a page
@@ -42,7 +42,7 @@ def plot(
     Args:
         recall: the recall.
         what: "signals", recalled; "waveforms", stored; "all", an image of all; or a quantity of the stages, like
-            "pressure", "p_xy", "Z" or "phi".
+            "pressure", "p_xy", "Z" or "phi"; or what an observer gave, like "observed:sliding".
         experiment: that it is of, for names, conditions and t0, if the recall does not say them itself.
         against: "time" or "u", for the stages.
         signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
@@ -66,7 +66,7 @@ def recall_figure(
 
     Args:
         recall: the recall.
-        what: one of `PICTURES`.
+        what: one of `PICTURES`, or "observed:NAME".
         configuration: for names, conditions and t0; default the recall's own.
         against: "time" or "u", for the stages.
         signals: numbers of those to draw.
@@ -77,16 +77,18 @@ def recall_figure(
     known = dict(configuration or recall.configuration)
     names = recall.described(known).names
     title = tables.heading(known) if known else "recall"
-    found = {name.lower(): name for name in PICTURES}.get(what.lower())
+    quantities = QUANTITIES | observed_quantities(recall.stages, known.get("observed", {}))
+    pictures = dict.fromkeys((*PICTURES, *quantities))
+    found = {name.lower(): name for name in pictures}.get(what.lower())
     if found is None or against not in AGAINST:
         raise ValueError(
-            f"{what!r} against {against!r}: pictures of a recall are {', '.join(PICTURES)}, against time or u"
+            f"{what!r} against {against!r}: pictures of a recall are {', '.join(pictures)}, against time or u"
         )
-    _refuse_unknown(signals, len(names), lowest=0 if found in QUANTITIES else 1)
+    _refuse_unknown(signals, len(names), lowest=0 if found in quantities else 1)
     t0 = known.get("t0")
-    if found in QUANTITIES:
+    if found in quantities:
         chosen = {names[number - 1] if number else ZERO: number for number in signals}
-        return stages_figure(recall.stages, found, title, against=against, t0=t0, chosen=chosen)
+        return stages_figure(recall.stages, quantities[found], title, against=against, t0=t0, chosen=chosen)
     scale = relative_scale(known) if known else None
     if signals:
         rows = np.asarray(signals) - 1

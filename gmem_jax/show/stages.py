@@ -69,12 +69,37 @@ QUANTITIES |= {
     ),
 }
 
+OBSERVED_PLOT = "observed:"  # before the name of an observer
+
+
+def observed_quantities(stages: Mapping[str, Sample], told: Mapping[str, Any]) -> dict[str, Quantity]:
+    """What can be drawn of what observers gave, as "observed:NAME": a curve, or one for each component.
+
+    Args:
+        stages: samples by name.
+        told: units and words by name, where an observer has them.
+    """
+    names = next(iter(stages.values())).observed or {}
+    return {OBSERVED_PLOT + name: _observed(name, told.get(name, {})) for name in names}
+
+
+def _observed(name: str, told: Mapping[str, str]) -> Quantity:
+    units = told.get("units", "1")
+
+    def curves(sample: Sample) -> dict[str, np.ndarray]:
+        values = np.asarray((sample.observed or {})[name])
+        places = np.ndindex(values.shape[1:-1])
+        return {", ".join(map(str, place)): values[:, *place] for place in places}
+
+    return Quantity(told.get("words", name) + ("" if units == "1" else f" ({units})"), curves)
+
+
 PAGE = ("p_x", "p_y", "p_z", "p_xy", "Z", "phi")  # of QUANTITIES
 
 
 def stages_figure(
     stages: Mapping[str, Sample],
-    what: str,
+    quantity: Quantity,
     title: str,
     *,
     against: str = "time",
@@ -87,13 +112,13 @@ def stages_figure(
 
     Args:
         stages: samples by name, in order.
-        what: one of `QUANTITIES`.
+        quantity: one of `QUANTITIES`, or of `observed_quantities`.
         title: over the picture.
         against: "time", or "u" for the stages in which it changes.
         t0: duration of a compression in t_c, which time is given in; in t0 without it.
         chosen: numbers of the signals to draw, 0 for the zero signal, by what they are called.
     """
-    quantity, marks = QUANTITIES[what], []
+    marks = []
     time, spans = _times(stages, t0)
     moving = [name for name, sample in stages.items() if np.ptp(np.asarray(sample.u)[:, 0]) > 0.0]
     for name in stages if against == "time" else moving:

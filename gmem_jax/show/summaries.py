@@ -34,7 +34,7 @@ from gmem_jax.show import figures, sweeps, tables
 from gmem_jax.show.figure import Figure
 from gmem_jax.show.recalls import MOST_OF_PAGE, PICTURES, recall_figure, signals_figure
 from gmem_jax.show.scene import rest_frames
-from gmem_jax.show.stages import QUANTITIES, series_figures, stages_figure
+from gmem_jax.show.stages import QUANTITIES, observed_quantities, series_figures, stages_figure
 from gmem_jax.show.tables import Fact, cell
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import Sample
@@ -153,7 +153,8 @@ def of_recall(
     """What is said of a recall; see `summary_of`."""
     configuration, row = recall.configuration, tables.summary(recall)
     choice: dict[str, Any] = {"against": against, "signals": signals}
-    drawn: dict[str, Draw] = {what: partial(recall_figure, recall, what, configuration, **choice) for what in PICTURES}
+    pictures = (*PICTURES, *observed_quantities(recall.stages, configuration.get("observed", {})))
+    drawn: dict[str, Draw] = {what: partial(recall_figure, recall, what, configuration, **choice) for what in pictures}
     lines = tables.recall_lines(row, configuration, each=each)
     return Summary(
         f"Recall {name}, pack {cell(configuration['pack'])}",
@@ -213,7 +214,9 @@ def of_pack(
     kept, t0 = dict(stages or {}), pack.info.get("recipe", {}).get("t0")
     drawn: dict[str, Draw] = {"grains": partial(figures.grains_figure, pack)}
     title = f"{pack.name}: preparation"
-    drawn |= {what: partial(stages_figure, kept, what, title, against=against, t0=t0) for what in QUANTITIES if kept}
+    if kept:
+        own: dict[str, Any] = {"against": against, "t0": t0}
+        drawn |= {what: partial(stages_figure, kept, quantity, title, **own) for what, quantity in QUANTITIES.items()}
 
     def parts() -> Iterator[Part]:
         yield Part(GrainView(lambda: rest_frames(pack), Material(), pack_fingerprint(pack)))

@@ -55,7 +55,8 @@ class Simulation:
         creep_fades: time in a stage after which that rate falls, in t_c; see `relaxation`.
         columns: what the stages make use of.
         observe: names and functions of (simulation, state), called at the end of each bin: what they give, a tree of
-            arrays [..., B], is kept in `Sample.observed`. They find the walls in `box` and the sample in `sample`.
+            arrays [..., B], is kept in `Sample.observed`. They find the walls in `box`, the sample in `sample`, and the
+            drag and the friction that act in the bin.
         mark: the state and walls that they may compare with.
         box: walls at the end of the bin, for them.
         sample: of the bin, for them.
@@ -161,7 +162,7 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
         state, sample = end_bin(simulation.system, state, last, pressure, row.u)
         if not simulation.observe:
             return state, sample
-        seen = replace(simulation, box=last, sample=sample)
+        seen = replace(simulation, system=system, dt=dt, drag=drag, box=last, sample=sample)
         return state, replace(sample, observed={name: reduce(seen, state) for name, reduce in simulation.observe})
 
 
