@@ -36,7 +36,7 @@ def make(**changes: Any) -> gm.Experiment:
         ({"delta0": 1.0}, r"delta0 must be in \(0, 0.5\), got 1"),
         ({"t0": 0.0}, r"t0 must be in \(0, inf\), got 0"),
         ({"t0": float("inf")}, "t0 must be in"),
-        ({"dt": 5.0}, r"dt must be in \(0, 0.5\], got 5"),
+        ({"dt": 5.0}, r"dt must be in \(0, 1.0\], got 5"),
         ({"hold_drag": -0.1}, r"hold_drag must be in \[0, inf\)"),
         ({"store": -1.0}, r"store must be in \[0, inf\), got -1"),
         ({"background": "sub9"}, "background must be one of sub0, sub2, sub2-bl; got 'sub9'"),
