@@ -28,6 +28,7 @@ from gmem_jax.experiment.stepping import stable_step
 from gmem_jax.files.configuration import from_dict
 from gmem_jax.files.datasets import to_csv, to_xarray
 from gmem_jax.files.packs import list_packs, load_pack, save_pack
+from gmem_jax.files.protocols import load_protocol, save_protocol
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.files.waveforms import load_waveforms, save_waveforms
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -123,6 +124,7 @@ __all__ = [
     "kernel_matrix",
     "list_packs",
     "load_pack",
+    "load_protocol",
     "load_recall",
     "load_waveforms",
     "memory_kernel",
@@ -137,6 +139,7 @@ __all__ = [
     "run",
     "running_mean",
     "save_pack",
+    "save_protocol",
     "save_recall",
     "save_waveforms",
     "shake",

@@ -12,10 +12,11 @@ import typer
 from gmem_jax.command.console import check_output, log, refuse_idle
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.experiment import NUMBERS, Experiment
-from gmem_jax.experiment.signals import Signals
-from gmem_jax.files.configuration import OF_LAW, OF_MATERIAL, named_experiment
+from gmem_jax.experiment.signals import Signals, SignalSets
+from gmem_jax.files.configuration import OF_LAW, OF_MATERIAL, OF_PAPER, named_experiment
 from gmem_jax.files.packs import load_pack
-from gmem_jax.files.waveforms import load_target, named_signals, waveforms_of
+from gmem_jax.files.protocols import named_protocol, ready_protocols
+from gmem_jax.files.waveforms import OF_SAMPLES, OF_WORDS, load_target, named_signals, sets_named, waveforms_of
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.laws import LAWS, law_named
@@ -28,7 +29,8 @@ _OTHERS: _Options = {
     "signals": (
         "six",
         str,
-        "six; words:L, all words of L bits; or a .npy or .csv file (a column per signal, one may be time).",
+        "six; words:L, all words of L bits; or a .npy or .csv file (a column per signal, one may be time). "
+        "For several channels or writes NAME=six,NAME=words:L.",
         (),
     ),
     "word_pad": (None, float | None, "words: bits left free at either end; default 2.", ()),
@@ -41,6 +43,12 @@ _OTHERS: _Options = {
         (),
     ),
     "scale": (None, bool | None, "Samples in a file: divide them by the largest.", ("--scale",)),
+    "protocol": (
+        None,
+        str | None,
+        f"Another protocol than the paper's: {', '.join(['a .toml file', *ready_protocols()])}.",
+        (),
+    ),
     "friction": ("hooke", str, f"Friction law: {_NAMES}, or the paper's H, M1, M2.", ()),
 }
 
@@ -66,7 +74,16 @@ class ExperimentOptions:
     """What the options of a command chose; a pack makes an experiment of it."""
 
     def __init__(self, values: dict[str, Any]) -> None:
-        self._values = values
+        self._values, self._inputs = values, [values["signals"]]
+        if not isinstance(values["protocol"], str):
+            return
+        refuse_idle(f"with --protocol {values['protocol']}, whose stages say that", *OF_PAPER)
+        written = named_protocol(values["protocol"])
+        self._inputs.append(values["protocol"])
+        self._values = {**values, "protocol": written.protocol, **dict.fromkeys(OF_PAPER)}
+        if written.signals:
+            refuse_idle(f"beside [signals] in {values['protocol']}", "signals", *OF_WORDS, *OF_SAMPLES)
+            self._values["signals"] = written.signals
 
     def with_signals(self, name: str) -> "ExperimentOptions":
         """The same, but for the signals."""
@@ -82,7 +99,8 @@ class ExperimentOptions:
             FileNotFoundError: if there is no such pack.
         """
         experiments = [self.experiment(pack) for pack in packs]
-        inputs = (*packs, self._values["signals"])
+        of_sets = [file for _, file in sets_named(self._values["signals"])]
+        inputs = (*packs, *self._inputs, *of_sets)
         check_output(output, suffix, inputs=inputs, force=force)
         drawn = check_output(output.with_suffix(".png"), ".png", inputs=inputs, force=force) if picture else None
         return experiments, drawn
@@ -94,7 +112,8 @@ class ExperimentOptions:
             FileFormatError: if their file has another target.
         """
         name = self._values["signals"]
-        target = load_target(Path(name)) if Path(name).suffix.lower() == ".csv" else None
+        alone = not sets_named(name) and Path(name).suffix.lower() == ".csv"
+        target = load_target(Path(name)) if alone else None
         if target is not None and target.count != count:
             raise FileFormatError(f"{name}: its target has {target.count} signals, must have {count}")
         return target
@@ -113,7 +132,7 @@ class ExperimentOptions:
         return named_experiment(load_pack(pack), values, self._signals)
 
     @functools.cached_property
-    def _signals(self) -> Signals:
+    def _signals(self) -> Signals | SignalSets:
         return named_signals(*waveforms_of(self._values), told=log)
 
 

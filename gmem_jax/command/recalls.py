@@ -38,7 +38,7 @@ from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.experiment.stepping import stable_step
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
-from gmem_jax.files.sizes import recall_bytes
+from gmem_jax.files.sizes import recall_bytes, sample_bytes
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import combined_status
@@ -59,7 +59,8 @@ def _announce(experiment: Experiment, batch: int) -> dict[str, float]:
     backend = native.name(experiment.backend, experiment.friction)
     side_by_side = min(batch, experiment.signals.count)
     what = f"{experiment.pack.grains} grains, {plural(experiment.signals.count, 'signal')}"
-    return announce(what, work, run_bytes(experiment, side_by_side), backend, side_by_side + 1)
+    memory = run_bytes(experiment, side_by_side) + sample_bytes(experiment)
+    return announce(what, work, memory, backend, side_by_side + 1)
 
 
 def _run(

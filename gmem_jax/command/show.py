@@ -94,7 +94,7 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
     names = {name.lower(): name for name in pictures}
     if plot == "list":
         refuse_idle("with --plot list, which draws nothing", "output")
-        lines = "\n".join(f"{name:17}  {PLOTS[name]}" for name in pictures)
+        lines = "\n".join(f"{name:17}  {_words(name)}" for name in pictures)
         return print_result(as_json, {"pictures": list(pictures), "status": 0}, lines)
     if plot.lower() not in names:
         raise InputError(f"--plot {plot}: there is no such picture of {file}; there are {', '.join(pictures)}")
@@ -106,6 +106,12 @@ def _draw(file: Path, pictures: dict[str, Draw], plot: str, output: Path | None,
     drawn.save(check_output(output, "", inputs=(file,), force=force))
     log(f"wrote {output}")
     print_result(as_json, {"output": str(output), "status": 0})
+
+
+def _words(picture: str) -> str:
+    """What a picture shows, in words."""
+    what, *part = picture.split("/")
+    return ": ".join(filter(None, (PLOTS[what], ", ".join(part))))
 
 
 COMMANDS = {"show": show}

@@ -31,7 +31,7 @@ from gmem_jax.sweeps.processes import stop, waiting
 from gmem_jax.sweeps.spec import Spec, read_spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SweepRunner
-from gmem_jax.sweeps.table import TABLE_FORMATS, export_table, means, rows, warnings_of
+from gmem_jax.sweeps.table import TABLE_FORMATS, export_table, means, names_in, points_in, rows, warnings_of
 
 VERBS = ("status", "show", "export", "stop")
 RUN = ("executor", "workers", AS_THEY_ARE)
@@ -112,10 +112,11 @@ def sweep_command(
         log(f"failed: {_values(row, spec.names)}: {row['why']}", style="yellow")
     for line in _doubtful(table):
         log(f"warning: {line}", style="yellow")
-    log(f"{len(table) - len(failed)} of {plural(len(table), 'point')} in {target}; gmem sweep show {target}")
+    count = len(points_in(table))
+    log(f"{count - len(failed)} of {plural(count, 'point')} in {target}; gmem sweep show {target}")
     print_result(as_json, sweep_facts(runner.store, table), points_table(table, spec.names))
     if failed:
-        raise RunFailedError(f"{len(failed)} of {plural(len(table), 'point')}; again with --retry")
+        raise RunFailedError(f"{len(failed)} of {plural(count, 'point')}; again with --retry")
 
 
 def planned(path: Path, spec: Spec, folder: Path) -> SweepRunner:
@@ -170,8 +171,9 @@ def _status(store: Store, as_json: bool) -> None:
 
 def _doubtful(table: list[dict[str, Any]]) -> list[str]:
     """How many points are doubtful, and why: a line for each reason."""
-    counts = Counter(reason for row in table if (reason := warnings_of(row)))
-    return [f"{count} of {plural(len(table), 'point')}: {reason}" for reason, count in counts.items()]
+    points = points_in(table)
+    counts = Counter(reason for row in points if (reason := warnings_of(row)))
+    return [f"{count} of {plural(len(points), 'point')}: {reason}" for reason, count in counts.items()]
 
 
 def split_names(text: str) -> list[str]:
@@ -192,7 +194,8 @@ def _stop(store: Store, as_json: bool) -> None:
 
 def show_sweep(store: Store, over: str, as_json: bool) -> None:
     """Print the points of a sweep, or means over some names, separated by commas."""
-    table, names = rows(store), store.card()["names"]
+    table = rows(store)
+    names = names_in(table, store.card()["names"])
     averaged = split_names(over)
     if unknown := sorted(set(averaged) - set(names)):
         raise InputError(f"--over {unknown[0]}: does not vary here; {', '.join(names)} do")

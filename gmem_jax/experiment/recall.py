@@ -117,7 +117,8 @@ class Recall:
     def second_readout(self) -> str | None:
         """The stage that was read for the background, if there is one."""
         known, reads = self.protocol.reads, self.reads
-        return known[1] if len(known) == 2 and reads == known[:1] else None
+        whole = tuple(self.configuration.get("reads", reads))  # what `at` gives is a part
+        return known[1] if len(known) == 2 and reads == known[:1] == whole else None
 
     def at(self, read: str | int = 0, channel: str | int = 0) -> "Recall":
         """The recall of one channel in one read, as of a run that has no others: p_sig [S, 256], one G and one F.

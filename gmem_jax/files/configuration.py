@@ -3,18 +3,19 @@
 The command line and sweep files give those names to the fields of an experiment and to those of its law.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
 
 import jax.numpy as jnp
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.experiment.experiment import NUMBERS, Experiment
+from gmem_jax.experiment.experiment import NUMBERS, Experiment, replace
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.record import PARTS, pack_fingerprint
 from gmem_jax.experiment.signals import Signals, SignalSets, signals
 from gmem_jax.files.packs import load_pack
+from gmem_jax.files.protocols import ProtocolFile, named_protocol, stage_value
 from gmem_jax.files.validation import numbers, require, require_kinds
 from gmem_jax.files.waveforms import OF_SAMPLES, OF_WORDS, named_signals, signals_from_dict, waveforms_of
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -25,7 +26,9 @@ from gmem_jax.simulation.protocol import Protocol
 
 OF_LAW = {entry.name: entry for law in reversed(LAWS) for entry in fields(law.kind)}
 OF_MATERIAL = {entry.name: entry for entry in fields(Material) if entry.metadata.get("option")}
-NAMES = ("signals", *OF_WORDS, *OF_SAMPLES, "friction", *OF_LAW, *OF_MATERIAL, *NUMBERS)
+OF_PAPER = ("rest", "hold", "store", "shear")  # of the paper's protocol; another one says it in its stages
+NAMES = ("signals", *OF_WORDS, *OF_SAMPLES, "protocol", "friction", *OF_LAW, *OF_MATERIAL, *NUMBERS)
+STAGES = "protocol."  # begins the name of a value of a stage, as "protocol.store.length"
 
 
 def sets_from_dict(written: Mapping[str, Any]) -> Signals | SignalSets:
@@ -97,19 +100,59 @@ def material_from(written: Mapping[str, Any]) -> Material:
     return Material(**{name: _number(value) for name, value in written.items() if name in known})
 
 
-def named_experiment(pack: Pack, values: Mapping[str, Any], signals: Signals | None = None) -> Experiment:
+def with_protocol(values: Mapping[str, Any], named: Callable[[Any], ProtocolFile] = named_protocol) -> dict[str, Any]:
+    """Named values with the protocol itself, and the sets of waveforms that its file asks for as `signals`.
+
+    Args:
+        values: by name; None stands for the default.
+        named: gives the protocol of a name.
+
+    Raises:
+        ValueError: if it is no protocol, or one of the values does nothing beside it.
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if a file makes no protocol.
+    """
+    found, name = dict(values), values.get("protocol")
+    if name is None or isinstance(name, Protocol):
+        return found
+    written = named(name)
+    if written.signals:
+        _refuse_beside("the protocol has [signals] of its own", values, ("signals", *OF_WORDS, *OF_SAMPLES))
+        found["signals"] = written.signals
+    return {**found, "protocol": written.protocol}
+
+
+def _refuse_beside(why: str, values: Mapping[str, Any], names: tuple[str, ...]) -> None:
+    if idle := [name for name in names if values.get(name) is not None]:
+        raise ValueError(f"{idle[0]} does nothing: {why}")
+
+
+def named_experiment(pack: Pack, values: Mapping[str, Any], signals: Signals | SignalSets | None = None) -> Experiment:
     """An experiment on a pack.
 
     Args:
         pack: the pack.
-        values: by name (`NAMES`; dotted ones like "friction.mu" too); None stands for the default.
+        values: by name (`NAMES`; dotted ones like "friction.mu" and "protocol.store.length" too); None stands for the
+            default.
         signals: in the place of those that `values` names.
 
     Raises:
         ValueError: for an unknown name, or impossible values.
+        FileNotFoundError: if there is no such file of a protocol.
+        FileFormatError: if it makes no protocol.
     """
-    require_kinds(values)
-    given = {name.removeprefix("friction."): value for name, value in values.items() if value is not None}
+    require_kinds({name: value for name, value in values.items() if not isinstance(value, tuple)})  # a protocol's sets
+    values = with_protocol(values)
+    stages = {
+        name: stage_value(name.rpartition(".")[2], value)
+        for name, value in values.items()
+        if name.startswith(STAGES) and value is not None
+    }
+    given = {
+        name.removeprefix("friction."): value
+        for name, value in values.items()
+        if value is not None and name not in stages
+    }
     twice = [name for name in given if values.get(name) is not None and values.get(f"friction.{name}") is not None]
     if twice:
         raise ValueError(f"{twice[0]} and friction.{twice[0]} are one; give one of them")
@@ -117,8 +160,12 @@ def named_experiment(pack: Pack, values: Mapping[str, Any], signals: Signals | N
         raise ValueError(f"an experiment has no {unknown[0]!r}; it has {', '.join(NAMES)}")
     of_law = {name: given[name] for name in OF_LAW if name in given}
     law = law_named(str(given.get("friction", "hooke")), **of_law)
+    if "protocol" in given or stages:
+        _refuse_beside("stages of the protocol say that", given, OF_PAPER)
     own = {name: given[name] for name in NUMBERS if name in given}
     if {"steps", "dt"} <= set(own):
         raise ValueError("steps and dt: steps in a bin say what the time step is, so that dt does nothing; give one")
     material = Material(**{name: given[name] for name in OF_MATERIAL if name in given})
-    return Experiment(pack, signals or named_signals(*waveforms_of(given)), law, material, **own)
+    signals = signals or named_signals(*waveforms_of(given))
+    found = Experiment(pack, signals, law, material, protocol=given.get("protocol"), **own)  # type: ignore[arg-type]
+    return replace(found, stages) if stages else found

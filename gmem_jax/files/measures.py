@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.readings import placed
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.simulation.channels import CHANNELS
 
 EACH = ("signal_gain", "signal_fidelity", "signal_windowed_fidelity", "signal_correlation")
 
@@ -17,6 +19,12 @@ def relative_scale(configuration: Mapping[str, Any]) -> jax.Array:
     """delta0 gamma0, what gains are measured in; scalar, or [S, 1] where it differs between signals; NaN if unknown."""
     numbers = np.multiply(*(configuration.get(name, np.nan) for name in ("delta0", "gamma0")))
     return jnp.asarray(numbers if np.ndim(numbers) == 0 else numbers[1:, None])
+
+
+def read_stress(recall: Recall, read: str) -> jax.Array:
+    """The stress of the first channel in a stage that reads, in ascending u, of every replica, [S + 1, 256], in E."""
+    stage = next(stage for stage in recall.protocol if stage.name == read)
+    return placed(stage, CHANNELS[recall.channels[0]].stress(jnp.asarray(recall.stages[read].pressure)))
 
 
 def of_each(recall: Recall) -> dict[str, np.ndarray]:

@@ -10,10 +10,19 @@ FRAME_BYTES = 460.0  # of a grain in a configuration, with its ten contacts
 _SAMPLE = 8 * sum(3 if "axis" in array.shape else 1 for array in STAGE.values())  # of a replica in a bin
 
 
+def sample_bytes(experiment: Experiment, *, written: bool = False) -> float:
+    """Of the samples of all stages, in memory, or of those that are `written` to a file."""
+    before, after = (
+        sum(stage.bins for stage in stages if stage.recorded or not written) for stages in experiment.phases
+    )
+    return _SAMPLE * (before + after * experiment.replicas)
+
+
 def recall_bytes(experiment: Experiment, frames: int = 0) -> float:
     """Of the file of a recall with so many configurations, about."""
-    before, after = (sum(stage.bins for stage in stages) for stages in experiment.phases)
-    curves, samples = 3 * 8 * BINS * experiment.signals.count, _SAMPLE * (before + after * experiment.replicas)
+    parts = len(experiment.readings.reads) * len(experiment.readings.channels)
+    curves = 3 * 8 * BINS * parts * experiment.signals.count
+    samples = sample_bytes(experiment, written=True)
     return FIXED_BYTES + curves + samples + FRAME_BYTES * experiment.pack.grains * frames
 
 

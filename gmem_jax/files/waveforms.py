@@ -2,6 +2,7 @@
 
 import codecs
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,18 @@ import numpy as np
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.record import SIGNALS, signals_to_dict
 from gmem_jax.experiment.samples import Told, require_gentle, untold, waveform_from
-from gmem_jax.experiment.signals import LONGEST_WORD, PAD, WIDTH, Signals, Spline, six_signals, waveform, words
+from gmem_jax.experiment.signals import (
+    LONGEST_WORD,
+    PAD,
+    WIDTH,
+    Signals,
+    SignalSets,
+    Spline,
+    signals,
+    six_signals,
+    waveform,
+    words,
+)
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.columns import SampleTable, read_columns
 from gmem_jax.files.validation import json_of, numbers, read_npy, refusing, require_fields, require_kinds, title
@@ -21,6 +33,7 @@ from gmem_jax.simulation.protocol import BINS
 
 OF_WORDS = ("word_pad", "word_width")
 OF_SAMPLES = ("smooth", "taper", "scale")
+_SET = r"[A-Za-z_]\w*="  # begins each of several sets
 _LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB
 _TARGET, _DESIGN = "# target: ", "# design: "
 
@@ -178,8 +191,12 @@ def signals_from_dict(written: Mapping[str, Any]) -> Signals:
     return made
 
 
+Sets = tuple[tuple[str, str], ...]
+"""Sets of waveforms by name, each by what the command line calls it."""
+
+
 def named_signals(
-    name: str,
+    name: str | Sets,
     pad: float | None = None,
     width: float | None = None,
     smooth: float | None = None,
@@ -187,11 +204,11 @@ def named_signals(
     scale: bool | None = None,
     *,
     told: Told = untold,
-) -> Signals:
+) -> Signals | SignalSets:
     """Waveforms by what the command line calls them.
 
     Args:
-        name: "six", "words:3" or a file.
+        name: "six", "words:3" or a file; or several sets by name, as "xy=six,z=words:3".
         pad: of words; None stands for the default.
         width: of their bumps.
         smooth: of the samples in a file: see `load_waveforms`.
@@ -204,6 +221,38 @@ def named_signals(
         FileNotFoundError: if there is no such file.
         FileFormatError: if a file cannot be read.
     """
+    shape = (pad, width, smooth, taper, scale)
+    if named := sets_named(name):
+        return signals(**{one: _one_set(what, *shape, told=told) for one, what in named})
+    return _one_set(str(name), *shape, told=told)
+
+
+def sets_named(name: str | Sets) -> Sets:
+    """The names of several sets of waveforms, and what makes each; () for one set.
+
+    Raises:
+        ValueError: if two have one name.
+    """
+    if not isinstance(name, str):
+        return name
+    if not re.match(_SET, name) or Path(name).is_file():
+        return ()
+    found = tuple((one.partition("=")[0], one.partition("=")[2]) for one in re.split(rf",(?={_SET})", name))
+    if len(dict(found)) < len(found) or "kind" in dict(found):
+        raise ValueError(f"--signals {name}: sets of waveforms have different names, and none is called kind")
+    return found
+
+
+def _one_set(
+    name: str,
+    pad: float | None,
+    width: float | None,
+    smooth: float | None,
+    taper: float | None,
+    scale: bool | None,
+    *,
+    told: Told,
+) -> Signals:
     kind, _, length = name.lower().partition(":")
     shape = {name: float(value) for name, value in (("pad", pad), ("width", width)) if value is not None}
     done: dict[str, Any] = {"smooth": smooth, "taper": taper, "scale": scale}
@@ -225,4 +274,4 @@ def named_signals(
 
 def waveforms_of(values: Mapping[str, Any]) -> tuple[Any, ...]:
     """The arguments of `named_signals` among named values."""
-    return str(values.get("signals", "six")), *(values.get(name) for name in (*OF_WORDS, *OF_SAMPLES))
+    return values.get("signals") or "six", *(values.get(name) for name in (*OF_WORDS, *OF_SAMPLES))

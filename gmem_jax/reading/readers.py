@@ -6,12 +6,12 @@ Signals and templates are [S, 256], row k holding word number k; answers are num
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import LONGEST_WORD, Signals, bin_average, word_bits, words
+from gmem_jax.files.measures import read_stress
 from gmem_jax.physics.numbers import plural
 
 FOLDS = 16  # parts that the words are split into for the linear decoder; fewer words are left out one by one
@@ -43,8 +43,14 @@ def stored_words(recall: Recall, target: Signals | None = None) -> Stored:
         target: the words, if they were designed.
 
     Raises:
-        ValueError: if its signals are not all the words of one length, in order, of the default pad and width.
+        ValueError: if its signals are not all the words of one length, in order, of the default pad and width; or it
+            has several reads or channels.
     """
+    if len(recall.reads) * len(recall.channels) > 1:
+        raise ValueError(
+            f"the recall has reads {', '.join(recall.reads)} and channels {', '.join(recall.channels)}: choose one of "
+            f"each, as recall.at({recall.reads[-1]!r}, {recall.channels[-1]!r})"
+        )
     templates = np.asarray(recall.J if target is None else bin_average(target))
     bits = len(templates).bit_length() - 1
     expected = np.asarray(bin_average(words(bits))) if 1 <= bits <= LONGEST_WORD else np.zeros(0)
@@ -53,8 +59,7 @@ def stored_words(recall: Recall, target: Signals | None = None) -> Stored:
         raise ValueError(f"the recall holds {plural(len(templates), 'signal')}, not the words of one length")
     if recall.second_readout is None:
         return Stored(bits, "sub0", np.asarray(recall.p_sig), templates)
-    first = analysis.recalled(jnp.asarray(recall.stages[recall.reads[0]].pressure))
-    second = analysis.recalled(jnp.asarray(recall.stages[recall.second_readout].pressure))
+    first, second = (read_stress(recall, read) for read in (recall.reads[0], recall.second_readout))
     return Stored(bits, "sub2-bl", np.asarray(analysis.subtract("sub2-bl", first, second)), templates)
 
 

@@ -25,7 +25,8 @@ MOST_OF_PAGE = 12  # panels of a page
 MEAN, PALE = "its mean over the ringing period $T_1$", "#a9c6e6"
 SHEAR = r"$I(u) = \gamma / \gamma_0$"
 
-PICTURES = ("signals", "waveforms", "all", *QUANTITIES)
+OF_SIGNALS = ("signals", "waveforms", "all")
+PICTURES = (*OF_SIGNALS, *QUANTITIES)
 """What can be drawn of a recall."""
 
 
@@ -38,6 +39,8 @@ def plot(
     signals: Sequence[int] = (),
 ) -> Drawing:
     """A picture of a recall, which a notebook shows: `.save(path)` writes it, `.figure` is matplotlib's.
+
+    Of several reads or channels all are in one picture; `gm.plot(recall.at(read, channel))` draws one.
 
     Args:
         recall: the recall.
@@ -94,10 +97,46 @@ def recall_figure(
         names = [names[row] for row in rows]
         if scale is not None and np.ndim(scale):
             scale = np.asarray(scale)[rows]
-        recall = replace(recall, **{name: np.asarray(getattr(recall, name))[rows] for name in ("p_sig", "J", "shear")})
-    if found == "signals":
-        return signals_figure(recall, names, title, scale, t0)
-    return waveforms_figure(recall, names, title) if found == "waveforms" else image_figure(recall, names, title)
+        curves: dict[str, Any] = {
+            name: np.asarray(getattr(recall, name))[..., rows, :] for name in ("p_sig", "J", "shear")
+        }
+        recall = replace(recall, **curves)
+
+    def of(one: Recall, title: str) -> Figure:
+        if found == "signals":
+            return signals_figure(one, names, title, scale, t0)
+        return waveforms_figure(one, names, title) if found == "waveforms" else image_figure(one, names, title)
+
+    parts = [*recall.each()]
+    if len(parts) == 1:
+        return of(recall, title)
+    return joined_figure([(place_of(recall, one).removeprefix(", "), of(one, "")) for one in parts], title)
+
+
+def place_of(recall: Recall, one: Recall) -> str:
+    """Which of the reads and channels of a recall one is of, as ", second, xy"; "" if there are no others."""
+    several = [name for name in ("reads", "channels") if len(getattr(recall, name)) > 1]
+    return "".join(f", {getattr(one, name)[0]}" for name in several)
+
+
+def joined_figure(parts: Sequence[tuple[str, Figure]], title: str) -> Figure:
+    """Figures of each read and channel as one of at most 64 panels; what each is of stands in its title.
+
+    Args:
+        parts: where each belongs, and its figure.
+        title: over all.
+    """
+    first, most = parts[0][1], max(1, MOST_PANELS // len(parts))
+    panels = [
+        replace(panel, title=", ".join(filter(None, (place, panel.title))), behind_label="")
+        for place, figure in parts
+        for panel in figure.panels[:most]
+    ]
+    told = "; ".join(f"{place}: {line}" for place, figure in parts for line in figure.title if line)
+    told += shown_part(most, len(first.panels))
+    rows = -(-len(panels) // first.columns)
+    size = (first.size[0], first.size[1] * rows / first.rows)
+    return replace(first, panels=tuple(panels), size=size, title=(title, told), shared=("x",))
 
 
 def _refuse_unknown(signals: Sequence[int], count: int, lowest: int) -> None:
@@ -147,7 +186,7 @@ def signals_figure(
     pascal = float(Material().modulus)
     u, signals, integrals, waves = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J, recall.shear))
     if scale is None:
-        fitted = integrals * np.sum(integrals * signals) / np.sum(integrals * integrals)
+        fitted = integrals * np.sum(integrals * signals) / (np.sum(integrals * integrals) or np.nan)
     else:
         fitted = float(recall.gain) * np.asarray(scale) * integrals
     smooth = mean_over_ringing(recall, signals, t0)
@@ -214,4 +253,5 @@ def image_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
 
 
 def _measures(recall: Recall, shown: int, count: int) -> str:
-    return f"G = {float(recall.gain):.3f}, F = {float(recall.fidelity):.3f}{shown_part(shown, count)}"
+    gain, fidelity = (tables.decimal(float(value)) for value in (recall.gain, recall.fidelity))
+    return f"G = {gain}, F = {fidelity}{shown_part(shown, count)}"

@@ -32,7 +32,7 @@ from gmem_jax.physics.numbers import plural
 from gmem_jax.reading.readers import confusion
 from gmem_jax.show import figures, sweeps, tables
 from gmem_jax.show.figure import Figure
-from gmem_jax.show.recalls import MOST_OF_PAGE, PICTURES, recall_figure, signals_figure
+from gmem_jax.show.recalls import MOST_OF_PAGE, OF_SIGNALS, PICTURES, place_of, recall_figure, signals_figure
 from gmem_jax.show.scene import rest_frames
 from gmem_jax.show.stages import QUANTITIES, series_figures, stages_figure
 from gmem_jax.show.tables import Fact, cell
@@ -154,6 +154,12 @@ def of_recall(
     configuration, row = recall.configuration, tables.summary(recall)
     choice: dict[str, Any] = {"against": against, "signals": signals}
     drawn: dict[str, Draw] = {what: partial(recall_figure, recall, what, configuration, **choice) for what in PICTURES}
+    if row.get("each"):
+        drawn |= {
+            f"{what}/{one.reads[0]}/{one.channels[0]}": partial(recall_figure, one, what, configuration, **choice)
+            for one in recall.each()
+            for what in OF_SIGNALS
+        }
     lines = tables.recall_lines(row, configuration, each=each)
     return Summary(
         f"Recall {name}, pack {cell(configuration['pack'])}",
@@ -170,13 +176,14 @@ def _parts_of_recall(recall: Recall, row: dict[str, Any]) -> Iterator[Part]:
     configuration = recall.configuration
     names, t0 = recall.names, configuration["t0"]
     yield Part(tables.errors_table(recall))
-    if len(names) > tables.FEW:
+    if tables.signals_told(row) > tables.FEW:
         yield Part(tables.signals_table(row), f"each of {plural(len(names), 'signal')}", folded=True)
     scale, wanted = np.asarray(relative_scale(configuration)), configuration.get("target")
     target = None if wanted is None else np.asarray(bin_average(signals_from_dict(wanted)))
     shown = f" (the first {MOST_OF_PAGE} of {len(names)})" if len(names) > MOST_OF_PAGE else ""
-    figure = signals_figure(recall, names, "", scale, t0, target=target, page=True)
-    yield Part(figure, f"Recalled signals{shown}")
+    for one in recall.each():
+        figure = signals_figure(one, names, "", scale, t0, target=target, page=True)
+        yield Part(figure, f"Recalled signals{place_of(recall, one)}{shown}")
     yield from _series(recall.stages, names, t0, "Along the run")
     yield from _grains(recall, names, configuration.get("experiment", {}))
 
@@ -374,7 +381,7 @@ def of_sweep(store: Store, **chosen: Any) -> Summary:
         FileFormatError: if there is no sweep, or a result is damaged.
     """
     card, rows = store.card(), table.rows(store)
-    names, name = card["names"], store.folder.name
+    names, name = table.names_in(rows, card["names"]), store.folder.name
     drawn: dict[str, Draw] = {
         measure: partial(sweeps.sweep_figure, rows, names, measure, name, **chosen) for measure in sorted(MEASURES)
     }

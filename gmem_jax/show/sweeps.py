@@ -11,9 +11,10 @@ from gmem_jax.files.validation import is_number
 from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import SENTENCES, Status, combined_status
 from gmem_jax.show.figure import Curve, Figure, Panel, ramp
-from gmem_jax.show.tables import cell
+from gmem_jax.show.tables import cell, decimal
 from gmem_jax.sweeps.curves import Line, axes_of, is_sample, lines_of
 from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.table import names_in, points_in
 
 ABOUT = "F(T1): F after a running mean over the ringing period"
 FEW_LINES = 6  # whose names fit inside the axes
@@ -27,8 +28,9 @@ _LABELS = {
 
 def sweep_facts(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
     """What is said of a sweep, and its points."""
-    states = {state: sum(row["state"] == state for row in table) for state in ("done", "failed", "open")}
-    done = [row for row in table if row["state"] == "done"]
+    points = points_in(table)
+    states = {state: sum(row["state"] == state for row in points) for state in ("done", "failed", "open")}
+    done = [row for row in points if row["state"] == "done"]
     status = combined_status([row["status"] for row in done])
     seconds = sum(row["seconds"] for row in done)
     return {"folder": str(store.folder), **states, "status": status, "seconds": seconds, "points": table}
@@ -36,13 +38,13 @@ def sweep_facts(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
 
 def points_table(table: list[dict[str, Any]], names: list[str]) -> Table:
     """The points of a sweep: what varies, G, F and the status, from `gmem_jax.sweeps.table.rows`."""
-    drawn = Table()
+    drawn, names = Table(), names_in(table, names)
     for name in (*names, "G", "F", "F(T1)", "status"):
         drawn.add_column(name, no_wrap=name != "status")
     for row in table:
         state = _state(row) if row["state"] == "done" else row["state"]
         numbers = [row[name] for name in ("gain", "fidelity", "windowed_fidelity")]
-        measured = ("" if number is None else f"{number:.3f}" for number in numbers)
+        measured = ("" if number is None else decimal(number) for number in numbers)
         drawn.add_row(*(cell(row[name]) for name in names), *measured, state)
     drawn.caption = "; ".join([ABOUT, *_reasons(table)])
     return drawn
@@ -88,7 +90,7 @@ def _with_error(row: dict[str, Any], measure: str) -> str:
     if row[measure] is None:
         return ""
     error = row[f"{measure}_se"]
-    return f"{row[measure]:.3f}" + (f" +- {error:.3f}" if math.isfinite(error) else "")
+    return decimal(row[measure]) + (f" +- {error:.3f}" if math.isfinite(error) else "")
 
 
 def sweep_figure(
@@ -127,7 +129,7 @@ def sweep_figure(
     several = f"mean ± SE over {', '.join(axes.over) or 'points'}, {samples}" if max(counts) > 1 else ""
     few = len(lines) <= FEW_LINES
     panel = Panel(tuple(marks), "", axes.x, _LABELS[measure], x_names=[cell(value)[:24] for value in ticks])
-    over = (f"{title}: {len(done)} of {plural(len(rows), 'point')}", several)
+    over = (f"{title}: {len(points_in(done))} of {plural(len(points_in(rows)), 'point')}", several)
     return Figure((panel,), size=(6.4 if few else 8.6, 4.0), title=over, legend="panel" if few else "right")
 
 

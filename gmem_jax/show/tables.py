@@ -17,7 +17,8 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average
-from gmem_jax.files.measures import of_each, relative_scale
+from gmem_jax.files.measures import of_each, read_stress, relative_scale
+from gmem_jax.files.validation import printable
 from gmem_jax.files.waveforms import signals_from_dict
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.numbers import plural
@@ -27,6 +28,7 @@ from gmem_jax.simulation.protocol import BINS
 
 LARGE_FOR_SPHERES = 3000  # grains: see `note_on_size`
 FEW = 8  # signals that are told of one by one unasked
+NONE = "-"  # in the place of a measure of what was not written
 SLOW_ENOUGH = 1.8e3  # t0, in t_c: G and F agree with those at ten times slower drives where nothing rings
 
 
@@ -69,19 +71,37 @@ def errors_table(recall: Recall) -> Table:
     scale = np.asarray(relative_scale(configuration))
     bins = window * BINS / float(np.max(configuration["t0"]))
     told = "G: gain; F: fidelity, 1 if what is recalled is the integral of what was stored; errors: standard errors "
-    table = Table("", "G", "F", caption=f"{told}over the signals stored in this pack (jackknife)")
-    for name, values, smooth in (
-        ("as recalled", (recall.gain, recall.fidelity), None),
-        (f"averaged over T1 = {window:.0f} t_c", (recall.windowed_gain, recall.windowed_fidelity), bins),
-    ):
-        curves = [jnp.asarray(curve) for curve in (recall.p_sig, recall.J)]
-        if smooth is not None:
-            curves = [analysis.running_mean(curve, smooth) for curve in curves]
-        signal, integral = map(np.asarray, curves)
-        errors = analysis.errors_over_signals(signal, integral, scale)
-        pairs = zip(values, errors, strict=True)
-        table.add_row(name, *(f"{float(value):.3f} ± {error:.3f}" for value, error in pairs))
+    parts = [*recall.each()]
+    where = _where(parts)
+    table = Table("", *where, "G", "F", caption=f"{told}over the signals stored in this pack (jackknife)")
+    for one in parts:
+        for name, values, smooth in (
+            ("as recalled", (one.gain, one.fidelity), None),
+            (f"averaged over T1 = {window:.0f} t_c", (one.windowed_gain, one.windowed_fidelity), bins),
+        ):
+            curves = [jnp.asarray(curve) for curve in (one.p_sig, one.J)]
+            if smooth is not None:
+                curves = [analysis.running_mean(curve, smooth) for curve in curves]
+            signal, integral = map(np.asarray, curves)
+            errors = analysis.errors_over_signals(signal, integral, scale)
+            pairs = zip(values, errors, strict=True)
+            place = (str(getattr(one, f"{name}s")[0]) for name in where)
+            table.add_row(name, *place, *(_with_error(float(value), error) for value, error in pairs))
     return table
+
+
+def _where(parts: Sequence[Recall]) -> list[str]:
+    """What tells recalls of one read and channel each apart: "read", "channel", both or neither."""
+    return [name for name in ("read", "channel") if len({getattr(one, f"{name}s") for one in parts}) > 1]
+
+
+def _with_error(value: float, error: float) -> str:
+    return f"{value:.3f} ± {error:.3f}" if not math.isnan(value) else NONE
+
+
+def decimal(value: float, digits: int = 3) -> str:
+    """A measure; NaN, where nothing can be said, as "-"."""
+    return NONE if math.isnan(value) else f"{value:.{digits}f}"
 
 
 def published(file: str = "six_signals.csv", **conditions: str | float) -> list[dict[str, Any]]:
@@ -102,7 +122,49 @@ def _number(cell: str) -> str | float:
 
 
 def summary(recall: Recall) -> dict[str, Any]:
-    """The numbers of one recall and its resolved configuration, for JSON output and `recall_table`."""
+    """The numbers of one recall, for JSON output and `recall_table`.
+
+    Of several reads and channels the measures are lists, as in the recall; "each" has the numbers of one each, and
+    "gains" its row of the gain matrix, by the channel that was written on.
+    """
+    parts = [*recall.each()]
+    rows = [_summary(one) for one in parts]
+    if len(rows) == 1:
+        return rows[0]
+    common = {name: value for name, value in rows[0].items() if name not in _OF_READ}
+    gains = np.asarray(recall.gain).reshape(len(rows), -1)
+    each = [
+        {
+            "read": one.reads[0],
+            "channel": one.channels[0],
+            **{name: row[name] for name in _OF_READ if name in row},
+            "gains": dict(zip(recall.channels, own.tolist(), strict=True)),
+        }
+        for one, row, own in zip(parts, rows, gains, strict=True)
+    ]
+    measures = {name: np.asarray(getattr(recall, name)).tolist() for name in analysis.MEASURES}
+    return {**common, "reads": list(recall.reads), "channels": list(recall.channels), **measures, "each": each}
+
+
+_OF_READ = (
+    *analysis.MEASURES,
+    "inertial_number",
+    "filling",
+    "coordination",
+    "contacts_per_grain",
+    "pressure_pa",
+    "largest_signal_pa",
+    "signals",
+    "backgrounds",
+    "second_readout",
+    "target_gain",
+    "target_fidelity",
+)
+"""What a `summary` has for each read and channel."""
+
+
+def _summary(recall: Recall) -> dict[str, Any]:
+    """The numbers of one read and channel."""
     configuration = recall.configuration
     readout = recall.stages[recall.reads[0]]
     pressure = np.asarray(readout.pressure)
@@ -183,7 +245,7 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
     """
     if recall.second_readout is None:
         return {}
-    first, second = (analysis.recalled(recall.stages[name].pressure) for name in recall.protocol.reads)
+    first, second = (read_stress(recall, name) for name in recall.protocol.reads)
     scale = relative_scale(configuration)
     rows: dict[str, dict[str, float]] = {name: {} for name in analysis.BACKGROUNDS}
     for prefix, window in (("", None), ("windowed_", recall.window / np.max(configuration["t0"]))):
@@ -196,24 +258,55 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
 
 def recall_lines(row: dict[str, Any], configuration: dict[str, Any], *, each: bool = False) -> list[Any]:
     """What to print of one recall, from its `summary`: each of more than a few signals only if that is asked for."""
-    more: list[Any] = [signals_table(row)] if each or 1 < len(row["signals"]) <= FEW else []
-    if "backgrounds" in row:
-        more += [backgrounds_table(row), second_readout_lines(row)]
-    if "target_fidelity" in row:
-        more += [target_line(row)]
+    more: list[Any] = [signals_table(row)] if each or 1 < signals_told(row) <= FEW else []
+    if len(row.get("channels", ())) > 1:
+        more = [gains_table(row), *more]
+    for one in parts_of(row):
+        if "backgrounds" in one:
+            more += [backgrounds_table(one), second_readout_lines(one)]
+        if "target_fidelity" in one:
+            more += [target_line(one)]
     if row["note"]:
         more += [f"note: {row['note']}"]
     return [recall_table([row], configuration), *more]
 
 
+def parts_of(row: dict[str, Any]) -> list[dict[str, Any]]:
+    """The numbers of each read and channel, from the `summary` of a recall."""
+    found: list[dict[str, Any]] = row.get("each", [row])
+    return found
+
+
+def _named(row: dict[str, Any]) -> list[str]:
+    """Which of read and channel there are several of, so that their names are told, in such a `summary`."""
+    return [name for name in ("read", "channel") if len(row.get(f"{name}s", ())) > 1]
+
+
+def signals_told(row: dict[str, Any]) -> int:
+    """How many rows `signals_table` has."""
+    return sum(len(one["signals"]) for one in parts_of(row))
+
+
 def signals_table(row: dict[str, Any]) -> Table:
     """Gain and fidelity of each signal by itself, from the `summary` of a recall."""
-    table = Table(title="By signal", caption="each with a gain of its own")
-    for column in ("signal", "G", "F", "F over T1", "correlation with J"):
-        table.add_column(column, justify="left" if column == "signal" else "right")
-    for own in row["signals"]:
-        values = (own[name] for name in ("gain", "fidelity", "windowed_fidelity", "correlation"))
-        table.add_row(own["signal"], *("" if math.isnan(value) else f"{value:.3f}" for value in values))
+    table, named = Table(title="By signal", caption="each with a gain of its own"), _named(row)
+    for column in (*named, "signal", "G", "F", "F over T1", "correlation with J"):
+        table.add_column(column, justify="left" if column in (*named, "signal") else "right")
+    for one in parts_of(row):
+        for own in one["signals"]:
+            values = (own[name] for name in ("gain", "fidelity", "windowed_fidelity", "correlation"))
+            table.add_row(*(one[name] for name in named), own["signal"], *map(decimal, values))
+    return table
+
+
+def gains_table(row: dict[str, Any]) -> Table:
+    """The gain matrix of several channels, from the `summary` of a recall: off its diagonal is the cross-talk."""
+    named, channels = _named(row), row["channels"]
+    table = Table(title="Gain by channel", caption="what a channel gives back of what was written on each")
+    for column in (*named, *(f"of {name}" for name in channels)):
+        table.add_column(column, justify="left" if column in named else "right")
+    for one in row["each"]:
+        table.add_row(*(one[name] for name in named), *(decimal(one["gains"][name]) for name in channels))
     return table
 
 
@@ -243,17 +336,24 @@ def recall_table(rows: list[dict[str, Any]], configuration: dict[str, Any]) -> T
         rows: a `summary` for each pack; several get a line of mean and standard deviation.
         configuration: resolved, of any of them.
     """
-    table = Table(title="Recall of the waveforms", caption=conditions(configuration))
-    for column in ("pack", "G", "F", "G over T1", "F over T1", "T1 (t_c)", "status"):
-        words = column in ("pack", "status")  # may wrap in a narrow terminal; numbers are never cut
+    table, named = Table(title="Recall of the waveforms", caption=conditions(configuration)), _named(rows[0])
+    texts = ("pack", *named, "status")  # may wrap in a narrow terminal; numbers are never cut
+    for column in ("pack", *named, "G", "F", "G over T1", "F over T1", "T1 (t_c)", "status"):
+        words = column in texts
         table.add_column(column, justify="left" if words else "right", no_wrap=not words, overflow="fold")
     for row in rows:
-        numbers = [f"{row[key]:.3f}" for key in analysis.MEASURES]
-        table.add_row(cell(row["pack"]), *numbers, f"{row['ringing_period']:.0f}", row["status_names"])
+        ends = (cell(row["pack"]), f"{row['ringing_period']:.0f}", row["status_names"])
+        for one in parts_of(row):
+            places = (one[name] for name in named)
+            numbers = [decimal(one[key]) for key in analysis.MEASURES]
+            table.add_row(ends[0], *places, *numbers, *ends[1:])
+            ends = ("",) * 3  # they are of all reads and channels
     if len(rows) > 1:
-        means = [spread([row[key] for row in rows]) for key in analysis.MEASURES]
         table.add_section()
-        table.add_row(f"mean ± SD ({len(rows)})", *(f"{mean:.3f}\n± {sd:.3f}" for mean, sd, _ in means))
+        for several in zip(*map(parts_of, rows), strict=True):
+            means = [spread([one[key] for one in several]) for key in analysis.MEASURES]
+            told = (NONE if math.isnan(mean) else f"{mean:.3f}\n± {sd:.3f}" for mean, sd, _ in means)
+            table.add_row(f"mean ± SD ({len(rows)})", *(several[0][name] for name in named), *told)
     for point in _comparable(configuration):
         table.add_section()
         gain = f"{point['gain_mean']:.3f}\n± {point['gain_sd']:.3f}"
@@ -274,16 +374,29 @@ def cell(value: Any) -> str:
 
 
 def conditions(configuration: dict[str, Any]) -> str:
-    """What a recall depends on first of all: law, mu, gamma0, delta0, t0, signals; its background if not SUB0."""
+    """What a recall depends on first of all: law, mu, gamma0, delta0, t0, signals; its background if not SUB0.
+
+    Of another protocol than the paper's its stages, too.
+    """
     amounts = ("mu", "gamma0", "delta0", "t0")
     known = ", ".join(f"{name} = {_amount(configuration[name])}" for name in amounts)
     form = configuration.get("experiment", {}).get("signals", {})
     count = len(configuration.get("signals", ()))
     named = {"six": "the six signals", "words": f"all {count} words of {plural(form.get('bits'), 'bit')}"}
+    named["sets"] = f"{len(form) - 1} sets of {plural(count, 'signal')}"
     stored = named.get(str(form.get("kind")), plural(count, "signal") if count else "")
     background = configuration.get("background", "sub0")
     subtracted = "" if background == "sub0" else background.upper()
-    return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", stored, subtracted)))
+    stages = _stages(configuration.get("experiment", {}).get("protocol"))
+    return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", stored, subtracted, stages)))
+
+
+def _stages(protocol: Any) -> str:
+    """The stages of a written protocol that is not the paper's, in words."""
+    given = protocol if isinstance(protocol, list) else ()
+    names = [str(stage.get("name")) for stage in given if isinstance(stage, Mapping)]
+    more = f", ... ({len(names)} in all)" if len(names) > FEW else ""
+    return printable(f"stages {', '.join(names[:FEW])}{more}") if names else ""
 
 
 def _amount(value: Any) -> str:
@@ -302,7 +415,7 @@ def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:
         return []
     if configuration["friction"] != "hooke" or not np.min(configuration["t0"]) >= SLOW_ENOUGH:
         return []
-    if any(written.get(name) != getattr(Experiment, name) for name in ("shear", "store", "hold")):
+    if any(written.get(name) != getattr(Experiment, name) for name in ("shear", "store", "hold", "protocol")):
         return []
     same = {key: configuration[key] for key in ("mu", "delta0", "gamma0")}
     shape = configuration["grain"]["shape"]

@@ -10,17 +10,19 @@
     delta0 = [0.05, 0.05]
     [[points]]                      # further points, one by one
     mu = 2.0
+    [[protocol.stage]]              # another protocol than the paper's: see `gmem_jax.files.protocols`; also a file
+    kind = "write"                  # or a name, by protocol = "mine.toml" in [experiment]
     [prepare]                       # packs to be made, where no pack is named: the options of `gmem prepare`
     grains = 325
     [run]                           # how it is done: the options of `gmem sweep`
     executor = "processes"
 
-A name is an option of `gmem recall`, or one of `gmem prepare` as "prepare.seed".
+A name is an option of `gmem recall`, one of `gmem prepare` as "prepare.seed", or a number of a stage as
+"protocol.store.length".
 """
 
 import itertools
 import math
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -28,9 +30,10 @@ from pathlib import Path
 from typing import Any
 
 from gmem_jax.errors import FileFormatError
+from gmem_jax.files.protocols import toml_of
 from gmem_jax.files.validation import is_number, whole
 
-TABLES = ("experiment", "vary", "zip", "points", "prepare", "run")
+TABLES = ("experiment", "vary", "zip", "points", "protocol", "prepare", "run")
 PREPARE = "prepare."
 MOST_SWEEP_POINTS = 100_000  # points: more are a mistake
 
@@ -74,12 +77,7 @@ def read_spec(path: Path) -> Spec:
         FileFormatError: if it is no TOML, has an unknown table, or a list that is empty or fits no other.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: not TOML ({error})") from error
+    tables = toml_of(path)
     try:
         return spec_of(tables)
     except ValueError as error:
@@ -108,6 +106,9 @@ def spec_of(tables: Mapping[str, Any]) -> Spec:
     own = {PREPARE + name: value for name, value in prepare.items()}
     both = sorted(set(own) & set(shared))
     _require(not both, f"{both[:1]}: give it in [prepare] or in [experiment], not in both")
+    if "protocol" in tables:
+        _require("protocol" not in shared, "give the protocol in [protocol] or in [experiment], not in both")
+        own["protocol"] = tables["protocol"]
     spec = Spec({**shared, **own}, tuple(axes), tuple(extra), run)
     grid = set().union(*axes) if axes else set.intersection(*map(set, extra)) if extra else set()
     if idle := sorted(set(spec.shared) & grid):

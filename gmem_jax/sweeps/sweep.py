@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import itertools
+import json
 import numbers
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,8 +22,9 @@ from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall, replica_bins
 from gmem_jax.files.checkpoints import Checkpoints
-from gmem_jax.files.configuration import named_experiment
+from gmem_jax.files.configuration import named_experiment, with_protocol
 from gmem_jax.files.packs import load_pack
+from gmem_jax.files.protocols import named_protocol
 from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.files.validation import require_kinds
 from gmem_jax.files.waveforms import named_signals, waveforms_of
@@ -56,16 +58,19 @@ class Results(list[Result]):
 
     def _repr_html_(self) -> str:
         names = list(self[0].values) if self else []
+        several = ["read", "channel"] * any(len([*one.recall.each()]) > 1 for one in self)
         rows = [
             [
                 *(_label(one.values[name]) for name in names),
-                one.recall.gain,
-                one.recall.fidelity,
-                explain(combined_status(one.recall.status)),
+                *((part.reads[0], part.channels[0]) if several else ()),
+                part.gain,
+                part.fidelity,
+                explain(combined_status(part.status)),
             ]
             for one in self
+            for part in one.recall.each()
         ]
-        return listing(f"Sweep of {plural(len(self), 'point')}", [*names, "G", "F", "status"], rows)
+        return listing(f"Sweep of {plural(len(self), 'point')}", [*names, *several, "G", "F", "status"], rows)
 
 
 @usual_rules()
@@ -154,6 +159,7 @@ class SweepRunner:
         self.spec, self.folder, self.say, self.cost = spec, folder, say, cost
         self._packs = functools.cache(load_pack)
         self._signals = functools.cache(functools.partial(named_signals, told=say))
+        self._protocols = functools.cache(lambda written: named_protocol(json.loads(written)))
         self.impossible: list[tuple[dict[str, Any], str]] = []
         self.as_they_are = spec.run.get(AS_THEY_ARE, False)
         if not isinstance(self.as_they_are, bool):
@@ -212,6 +218,7 @@ class SweepRunner:
         own = {name: value for name, value in values.items() if name != "pack" and not name.startswith(PREPARE)}
         if "pack" in values and (odd := [name for name in values if name.startswith(PREPARE)]):
             raise ValueError(f"a point has a pack and {odd[0]!r} of one to be made; give one of them")
+        own = with_protocol(own, lambda name: self._protocols(json.dumps(name, default=str)))
         found = named_experiment(pack, own, self._signals(*waveforms_of(own)))
         if "pack" in values and not self.as_they_are:
             require_prepared(found, str(values["pack"]))

@@ -1,10 +1,11 @@
 """The results of a sweep as a table: a row for each point, and means over what is only a sample, like packs."""
 
 import csv
+import functools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,19 +20,22 @@ from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import WARNED
 
 TABLE_SCHEMA = "gmem-sweep-table/0.1"
+READ_AND_CHANNEL = ("read", "channel")
+_Row = TypeVar("_Row", bound=Mapping[str, Any])
 TABLE_FORMATS = (".csv", ".parquet", ".h5", ".nc")
 
 
 def rows(store: Store) -> list[dict[str, Any]]:
     """A row for each point of a sweep, in its order: what varies, the measures, status.
 
-    Points that are not computed yet have the state "open", those that failed "failed" and their reason.
+    Points that are not computed yet have the state "open", those that failed "failed" and their reason. Where a
+    protocol has several reads or channels a point has a row for each, and all have the names "read" and "channel".
 
     Raises:
         FileFormatError: if there is no sweep, or a result is damaged.
     """
     card, failed = store.card(), store.failed()
-    found = []
+    found: list[tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = []  # what varies; of which part; the rest
     for point in card["points"]:
         key = point["key"]
         row: dict[str, Any] = {name: _cell(point["values"].get(name)) for name in card["names"]}
@@ -39,14 +43,35 @@ def rows(store: Store) -> list[dict[str, Any]]:
             recall = store.load(key)
             configuration = recall.configuration
             status = combined_status(recall.status)
-            row |= {"state": "done", **{name: float(getattr(recall, name)) for name in MEASURES}}
-            row |= {"status": status, "why": explain(status) if status else ""}
+            told = {"status": status, "why": explain(status) if status else ""}
             warned = "; ".join(map(str, configuration.get(WARNED, ())))
-            row |= {"warnings": warned, "seconds": configuration["seconds"]}
+            told |= {"warnings": warned, "seconds": configuration["seconds"], "key": key}
+            for one in recall.each():
+                measures = {"state": "done", **{name: float(getattr(one, name)) for name in MEASURES}}
+                found.append((row, {"read": one.reads[0], "channel": one.channels[0]}, {**measures, **told}))
         else:
-            row |= {"state": "failed" if key in failed else "open", **dict.fromkeys(MEASURES)}
-            row |= {"status": None, "why": failed.get(key, ""), "warnings": "", "seconds": None}
-        found.append({**row, "key": key})
+            measures = {"state": "failed" if key in failed else "open", **dict.fromkeys(MEASURES)}
+            told = {"status": None, "why": failed.get(key, ""), "warnings": "", "seconds": None, "key": key}
+            found.append((row, dict.fromkeys(READ_AND_CHANNEL), {**measures, **told}))
+    several = len(found) > len(card["points"])
+    return [{**row, **(part if several else {}), **rest} for row, part, rest in found]
+
+
+def names_in(table: Sequence[Mapping[str, Any]], names: Sequence[str]) -> list[str]:
+    """What tells the rows of a sweep apart: the names that vary, and read and channel where there are several."""
+    return [*names, *(part for part in READ_AND_CHANNEL if part not in names and any(part in row for row in table))]
+
+
+def points_in(table: Sequence[_Row]) -> list[_Row]:
+    """The first row of each point."""
+    found: list[_Row] = []
+    seen: set[Any] = set()
+    for row in table:
+        part = tuple(row.get(name) for name in READ_AND_CHANNEL)
+        if not found or row.get("key") != found[-1].get("key") or part in seen:  # a point may be asked for twice
+            found.append(row)
+            seen = set()
+        seen.add(part)
     return found
 
 
@@ -120,7 +145,12 @@ def _dataset(store: Store, table: Sequence[dict[str, Any]]) -> Any:
     columns = {name: ("point", _column([row[name] for row in table])) for name in table[0]}
     about = {"schema": TABLE_SCHEMA, "shared": json.dumps(card["shared"])}
     data = xarray.Dataset(columns, attrs=about)
-    loaded = {place: store.load(row["key"]) for place, row in enumerate(table) if row["state"] == "done"}
+    whole = functools.lru_cache(1)(store.load)
+    loaded = {
+        place: whole(row["key"]).at(*(row.get(name) or 0 for name in READ_AND_CHANNEL))
+        for place, row in enumerate(table)
+        if row["state"] == "done"
+    }
     if not loaded:
         return data
     counts = np.zeros(len(table), int)

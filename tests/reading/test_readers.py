@@ -146,6 +146,7 @@ def recall(bits: int, second: bool) -> Recall:
             "protocol": protocol,
             "reads": ("readout",),
             "channels": ("xy",),
+            "record": "{}",
         }
     )
 
