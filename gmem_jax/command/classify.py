@@ -22,6 +22,7 @@ from gmem_jax.command.console import (
     print_result,
     stderr,
 )
+from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.recalls import load_recall
 from gmem_jax.files.results import save_result
 from gmem_jax.files.schemas import READING
@@ -60,6 +61,14 @@ def _training(budget: float) -> Iterator["training.Listener"]:
         yield lambda one: bar.update(task, completed=min(time.perf_counter() - began, budget), description=words(one))
 
 
+def _chosen(found: Recall, file: Path, read: str, channel: str) -> Recall:
+    """The read and channel that were asked for, of a recall that may have several."""
+    for option, known, wanted in (("read", found.reads, read), ("channel", found.channels, channel)):
+        if wanted not in known and (wanted or len(known) > 1):
+            raise InputError(f"{file}: say --{option}, one of {', '.join(known)}")
+    return found.at(read or 0, channel or 0)
+
+
 def classify_command(
     recall: Annotated[Path, typer.Argument(help="A recall of binary words (gmem recall --signals words:L).")],
     output: Output = Path("classify.json"),
@@ -69,6 +78,8 @@ def classify_command(
         Path | None,
         typer.Option(help="Folder of trained nets, used and added to; default gmem-nets beside the recall."),
     ] = None,
+    read: Annotated[str, typer.Option(help="Of several reads, the one that is read.")] = "",
+    channel: Annotated[str, typer.Option(help="Of several channels, the one that is read.")] = "",
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,
@@ -78,7 +89,7 @@ def classify_command(
     A net depends on the length of the words and its seed, not on the recall: nets in the folder are used again, and
     those that ran out of time are trained on.
     """
-    kept = load_recall(recall)
+    kept = _chosen(load_recall(recall), recall, read, channel)
     configuration = kept.configuration
     # Here, not above: flax takes a second to load, and no other command needs it.
     from gmem_jax.reading import report, training

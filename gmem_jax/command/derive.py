@@ -70,6 +70,16 @@ def _announce(experiment: Experiment, what: str, runs: float, side_by_side: int,
     announce(f"{what}, {experiment.pack.grains} grains", runs * steps, needs, backend, side_by_side + 1)
 
 
+def _require_one_fidelity(experiment: Experiment) -> None:
+    """Refuse a protocol of several reads or channels, and several sets of waveforms."""
+    reads, channels = experiment.readings.reads, experiment.readings.channels
+    if len(reads) * len(channels) > 1 or len(experiment.sets) > 1:
+        raise InputError(
+            f"this takes one set of waveforms with one F, and the protocol has reads {', '.join(reads)}, channels "
+            f"{', '.join(channels)} and sets {', '.join(experiment.sets)}; gm.value_and_grad differentiates any loss"
+        )
+
+
 def _waveform_of(experiment: Experiment) -> tuple[str, np.ndarray]:
     """The field that holds the heights of the waveforms, and where in u each of them acts, [S, n]."""
     signals = experiment.signals
@@ -92,6 +102,7 @@ def gradient_command(
 ) -> None:
     """Exact derivatives of the fidelity by waveforms, gamma0, mu and stiffness (reverse mode; minutes)."""
     (experiment,), drawn = chosen.check_output([pack], output, ".json", picture=picture, force=force)
+    _require_one_fidelity(experiment)
     began = time.perf_counter()
     waves, places = _waveform_of(experiment)
     law = experiment.friction
@@ -169,6 +180,7 @@ def kernel_command(
 ) -> None:
     """The linear memory kernel of a pack: singular values, resolution, capacity, and what it predicts."""
     (experiment,), drawn = chosen.check_output([pack], output, ".h5", picture=picture, force=force)
+    _require_one_fidelity(experiment)
     began = time.perf_counter()
     runs = 2.0 * n / experiment.signals.count
     _announce(experiment, "kernel", 1.0 + runs, 2 * n)
@@ -260,6 +272,7 @@ def design_command(
         refuse_idle("beside --words, which says what they are", "signals")
     chosen = chosen if words is None else chosen.with_signals(f"words:{words}")
     (experiment,), drawn = chosen.check_output([pack], output, ".csv", picture=picture, force=force)
+    _require_one_fidelity(experiment)
     _needs_sub0(experiment)
     if start is not None:
         check_output(output, ".csv", inputs=(start,), force=force)
@@ -343,6 +356,7 @@ def tune_command(
     """Choose gamma0, mu and the friction stiffness within bounds so that the mean fidelity of packs grows."""
     names, limits = packs.split(","), parse_bounds(bounds)
     experiments, drawn = chosen.check_output(names, output, ".json", picture=picture, force=force)
+    _require_one_fidelity(experiments[0])
     _needs_sub0(experiments[0])
     start_within(experiments, limits)
     began = time.perf_counter()

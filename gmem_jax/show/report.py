@@ -16,7 +16,7 @@ from gmem_jax.show.figure import Figure
 from gmem_jax.show.summaries import GrainView, Part, Summary, summary_of
 
 _CELL = 300  # characters of a value in a configuration
-_NUMBER = re.compile(r"[-+]?\d[\d.,e±\s+-]*|nan|")
+_NUMBER = re.compile(r"[-+]?\d[\d.,e±\s+-]*|nan|-|")
 Shown = dict[str, Any]  # what the template is given of a part
 
 

@@ -83,7 +83,8 @@ def errors_table(recall: Recall) -> Table:
             if smooth is not None:
                 curves = [analysis.running_mean(curve, smooth) for curve in curves]
             signal, integral = map(np.asarray, curves)
-            errors = analysis.errors_over_signals(signal, integral, scale)
+            known = np.any(integral)
+            errors = analysis.errors_over_signals(signal, integral, scale) if known else (math.nan, math.nan)
             pairs = zip(values, errors, strict=True)
             place = (str(getattr(one, f"{name}s")[0]) for name in where)
             table.add_row(name, *place, *(_with_error(float(value), error) for value, error in pairs))
