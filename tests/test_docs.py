@@ -188,12 +188,28 @@ def test_the_tutorial_needs_no_setting_but_double_precision() -> None:
     assert jax.config.jax_enable_x64
 
 
-def test_sweeps_that_pages_write_down_could_be_begun(tmp_path: Path) -> None:
-    path, written = tmp_path / "sweep.toml", [block for page in PAGES for block in blocks(page, "toml")]
-    assert len(written) > 1
-    for block in written:
+def test_sweeps_and_protocols_that_pages_write_down_could_be_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    written = [block for page in PAGES for block in blocks(page, "toml")]
+    alone = [block for block in written if re.search(r"^\[\[stage\]\]", block, re.MULTILINE)]
+    assert len(written) > len(alone) + 1 > 1
+    for block in alone:
+        path = Path(re.match(r"# (\w+\.toml)\n", block)[1])  # type: ignore[index]
+        path.write_text(block)
+        assert gm.load_protocol(path).reads
+    for block in (block for block in written if block not in alone):
+        path = Path("sweep.toml")
         path.write_text(block)
         planned(path, read_spec(path), tmp_path / "sweep")
+
+
+def test_the_protocol_of_the_tutorial_is_the_same_in_toml(tmp_path: Path) -> None:
+    page, (path, names) = DOCS / "tutorial_protocols.md", (tmp_path / "mine.toml", {"gm": gm})
+    path.write_text(blocks(page, "toml")[0])
+    made = re.search(r"^protocol = (gm.Protocol\(.*?^\))", blocks(page, "python")[0], re.DOTALL | re.MULTILINE)
+    assert eval(made[1], names) == gm.load_protocol(path)  # type: ignore[index]
 
 
 @pytest.mark.slow
@@ -208,7 +224,12 @@ def test_examples_run(
     small, experiment, train = gm.load_pack(SMALL), gm.Experiment, gm.classify.train
     monkeypatch.setattr(gm, "load_pack", lambda _: small)
     monkeypatch.setattr(gm, "prepare", lambda **_: small)
-    monkeypatch.setattr(gm, "Experiment", lambda *parts, **fields: experiment(*parts, **{**fields, **SHORT}))
+
+    def short(*parts: Any, **fields: Any) -> gm.Experiment:
+        own = {"t0": SHORT["t0"]} if "protocol" in fields else SHORT
+        return experiment(*parts, **{**fields, **own})
+
+    monkeypatch.setattr(gm, "Experiment", short)
     monkeypatch.setattr(gm.classify, "train", lambda *parts, **given: train(*parts, **{**given, "budget": 1.0}))
     names: dict[str, Any] = {"__name__": "example"}
     for number, block in enumerate(blocks(page, "python")):

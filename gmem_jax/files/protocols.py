@@ -102,7 +102,7 @@ def named_protocol(name: Any) -> ProtocolFile:
 
 @usual_rules()
 def load_protocol(path: str | Path) -> Protocol:
-    """Read a protocol from TOML; the form is described in docs/protocols.md.
+    """Read a protocol from TOML; the form is described in docs/tutorial_protocols.md.
 
     Its table [signals], if it has one, is for `gmem recall --protocol` and sweeps.
 
