@@ -163,7 +163,8 @@ def run_several(
     found = []
     for number, each in enumerate(experiments):
         begun, ended = side.first[number : number + 2]
-        alone = int(side.prefix[number]) if np.shape(before[common[0].name].pressure)[-1] > 1 else 0
+        wide = any(np.shape(sample.pressure)[-1] > 1 for sample in before.values())
+        alone = int(side.prefix[number]) if wide else 0
         samples = OrderedDict(
             [(name, jax.tree.map(lambda leaf, at=alone: leaf[..., at : at + 1], before[name])) for name in before]
             + [(name, jax.tree.map(lambda leaf, a=begun, b=ended: leaf[..., a:b], after[name])) for name in after]

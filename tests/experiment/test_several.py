@@ -52,6 +52,17 @@ def test_points_side_by_side_are_the_points_alone(base: gm.Experiment, backend: 
     assert len({float(recall.fidelity) for recall in together}) == len(changes)
 
 
+def test_a_protocol_that_begins_with_a_waveform_runs_side_by_side() -> None:
+    two = gm.Protocol(gm.write(), gm.read("half", to=0.5, length=0.5), gm.read("whole", length=0.5))
+    first = gm.Experiment(gm.load_pack(PACK), gm.words(1), protocol=two, t0=20.0, gamma0=0.01)
+    experiments = [first, gm.replace(first, {"friction.mu": 0.3})]
+    for found, experiment in zip(run_several(experiments), experiments, strict=True):
+        wanted = gm.run(experiment, progress=False)
+        np.testing.assert_allclose(found.p_sig, wanted.p_sig, atol=1e-9 * float(jnp.abs(wanted.p_sig).max()))
+        np.testing.assert_allclose(found.gain, wanted.gain, rtol=1e-8)
+        assert found.reads == ("half", "whole")
+
+
 def test_what_cannot_run_side_by_side_does_not_match(base: gm.Experiment) -> None:
     assert match(base, gm.replace(base, gamma0=5e-3, friction=gm.Hooke(mu=0.1)))
     others = [
