@@ -49,8 +49,9 @@ BUILDERS: dict[str, Callable[..., Stage | tuple[Stage, ...]]] = {
 }
 MOST_STAGES = 10_000  # stages: more are a mistake
 STAY = "stay"
-_MORE = {"cycle": ("drag", "friction", "recorded"), "train": ("drag", "friction", "recorded")}  # fields of all of these
-_OTHERS = ("name", "drag", "friction", "pressure", "mark", "recorded")  # fields of any other kind
+_BUILT = ("start", "stop", "length", "role", "drives", "along", "of")  # fields that are for builders to say
+_MORE = [entry.name for entry in fields(Stage) if entry.name not in _BUILT]
+_OF_ALL = [name for name in _MORE if name not in ("name", "pressure", "mark")]  # where a kind is several stages
 _AXES = ("x", "y", "z")
 _SHOWN = 80  # characters of a value that is refused
 
@@ -200,7 +201,7 @@ def _built(table: Mapping[str, Any]) -> tuple[Stage, ...]:
     signature = inspect.signature(builder).parameters
     own = [name for name, one in signature.items() if one.kind != one.VAR_KEYWORD]
     needed = [name for name in own if signature[name].default is inspect.Parameter.empty]
-    more = [name for name in _MORE.get(kind, _OTHERS) if name not in own]
+    more = [name for name in (_OF_ALL if kind in ("cycle", "train") else _MORE) if name not in own]
     more += ["along"] if kind == "read" else []
     written = [*own, *(CHANNELS if "channels" in signature else ())]
     given = {name: value for name, value in table.items() if name != "kind"}
