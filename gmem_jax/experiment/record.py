@@ -137,6 +137,8 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
         **more: what else they depend on, like the batch.
     """
     own = {**to_dict(experiment), "pack": pack_fingerprint(experiment.pack)}
+    if experiment.observe:  # what was kept of another run lacks what these give
+        own["observe"] = [name for name, _ in experiment.observe]
     return {**own, **more, "backend": native.name(experiment.backend, experiment.friction), **sources()}
 
 

@@ -80,8 +80,10 @@ def signals(**sets: Signals) -> Signals | SignalSets:
             `first=..., second=...` with `gm.write(xy="first")`.
 
     Raises:
-        ValueError: if there is none, or they differ in length.
+        ValueError: if there is none, one is called "kind", or they differ in length.
     """
+    if "kind" in sets:
+        raise ValueError('a set of waveforms cannot be called "kind"; call it by what it is for')
     counts = {name: one.count for name, one in sets.items()}
     if len(set(counts.values())) != 1:
         raise ValueError(f"sets of waveforms have one length, got {counts or 'none'}")

@@ -14,6 +14,7 @@ import gmem_jax as gm
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.protocols import memory_protocol
 from gmem_jax.experiment.readings import placed
+from gmem_jax.experiment.record import key_of_run
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.protocol import Drive, Protocol, Stage
 
@@ -126,6 +127,14 @@ def test_experiments_that_make_no_sense_are_refused(changes: dict[str, Any], rea
         experiment(**changes)
 
 
+def test_sets_have_one_length_and_a_name() -> None:
+    with pytest.raises(ValueError, match="sets of waveforms have one length"):
+        gm.signals(first=ONE, second=gm.six_signals())
+    with pytest.raises(ValueError, match='cannot be called "kind"'):
+        gm.signals(kind=ONE)
+    assert gm.signals(xy=ONE) is ONE
+
+
 def test_each_read_is_compared_with_what_was_written_last() -> None:
     sets = gm.signals(first=ONE, second=OTHER)
     stages = (gm.write("first"), gm.read("one"), gm.write("second"), gm.read("two"), gm.write("first", amplitude=2.0))
@@ -233,6 +242,9 @@ def moved(simulation: Any, state: Any) -> jax.Array:
 
 
 def test_observers_see_every_bin_and_change_nothing() -> None:
+    plain, watched = experiment(), experiment(observe={"moved": moved})
+    assert key_of_run(plain) != key_of_run(watched)
+    assert gm.to_dict(plain) == gm.to_dict(watched)
     base, seen = run(), run(observe={"moved": moved, "box": lambda simulation, state: simulation.box.lengths})
     np.testing.assert_array_equal(seen.p_sig, base.p_sig)
     for name, sample in seen.stages.items():
