@@ -14,6 +14,12 @@ import gmem_jax as gm
 jax.config.update("jax_enable_x64", True)
 
 
+@pytest.fixture(autouse=True)
+def no_terminal() -> None:
+    """Tables are as wide as they are: some libraries say COLUMNS when they start another process."""
+    os.environ.pop("COLUMNS", None)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def few_programs() -> Iterator[None]:
     """Programs are forgotten before they fill the memory maps of a process (65,530 on Linux): XLA crashes there."""
