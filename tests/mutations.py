@@ -522,6 +522,20 @@ MUTATIONS = (
         f"{ACROSS}[M2]",
     ),
     mutation(
+        "program-select-passes-both",
+        "program.h",
+        "to_a(zero_unless(mask[now.c], g))",
+        "to_a(g)",
+        "test_unit_tests_in_cpp[programs]",
+    ),
+    mutation(
+        "program-reached-bars-overwritten",
+        "program.h",
+        "a_there ? fma(g, value[now.b], bar[now.a]) : g * value[now.b]",
+        "g * value[now.b]",
+        "test_unit_tests_in_cpp[programs]",
+    ),
+    mutation(
         "native-chunk-of-an-empty-share",
         "team.cc",
         "if (any(taken)) return true;",

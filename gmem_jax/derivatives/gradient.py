@@ -33,7 +33,7 @@ Loss = Callable[[Experiment, jax.Array], jax.Array]
 """From an experiment and its p_sig [S, 256] to a number."""
 
 STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
-FORWARDS = 0.1  # of a gradient's time is the way forward
+FORWARDS = 0.17  # of a gradient's time is the way forward
 
 Moving = tuple[Any, Any, Any]  # grains, history and held walls: what of a state can be differentiated
 
@@ -325,7 +325,7 @@ def value_and_grad(
     """Reverse mode: a number and its derivatives by all parameters, through the whole experiment.
 
     The way forward keeps the state at the start of each chunk; the way back replays chunk after chunk and, within it,
-    bin after bin. On the native backend both happen in the library, for some ten forward runs in all.
+    bin after bin. On the native backend both happen in the library, for some six forward runs in all.
 
     Args:
         experiment: where.
@@ -333,7 +333,7 @@ def value_and_grad(
             "friction.mu", "t0" or "pack.position". None within another. "pack.clump" and its offsets take as long as
             `jax.grad` of plain JAX does: the native library has no derivatives by the shape of a grain.
         loss: what is differentiated; default the fidelity.
-        checkpoint: where to go on and to keep how far it is on the way back; the way forward, a tenth, is done again.
+        checkpoint: where to go on and to keep how far it is on the way back; the way forward, a sixth, is done again.
         progress: told about every chunk of both ways; default a bar in a terminal or a notebook, False for none.
 
     Raises:

@@ -34,7 +34,7 @@ V* touch(Law law, V apart, V* to) {
   StoredSegments<V> segments{segment, 1, &stored, kPoints};
   if constexpr (Law::kLayered) {
     const auto ring = [&](int j) { return splat<V>(1e-4) * Flat<V>{splat<V>(j / 2), splat<V>(1 - j / 3)}; };
-    const V outer = Reach<V, Law::variant>(history[kLastOverlap], parameters, kPoints).outer;
+    const V outer = Reach<V, Law::variant>(history[kLastOverlap], parameters, splat<V>(kPoints - 2.0)).outer;
     store_layers(history + kLayers, segments.load(outer, kLacking<Law::variant>, false, ring));
     friction(law, &contact, 1, parameters, [&](int) { return segments; });
   } else {
@@ -44,7 +44,7 @@ V* touch(Law law, V apart, V* to) {
   for (const Vec<V>& part : {found.force, found.torque_one, found.torque_other}) store_vec(to, part), to += 3;
   for (int q = 0; q < Law::kHistory; ++q) *to++ = history[q];
   if constexpr (Law::kLayered) {
-    const V outer = Reach<V, Law::variant>(history[kLastOverlap], parameters, kPoints).outer;
+    const V outer = Reach<V, Law::variant>(history[kLastOverlap], parameters, splat<V>(kPoints - 2.0)).outer;
     segments.unload(load_layers(history + kLayers), outer, kPoints, [&](int, Flat<V> f) { *to++ = f.along, *to++ = f.across; });
   }
   return to;

@@ -44,13 +44,14 @@ def instruction_sets() -> dict[str, tuple[str, ...]]:
     return {name: build.INSTRUCTION_SETS[name] for name in known}
 
 
-@pytest.mark.parametrize("name", ["numbers", "physics", "segments", "threads"])
+@pytest.mark.parametrize("name", ["numbers", "physics", "programs", "segments", "threads"])
 def test_unit_tests_in_cpp(name: str, tmp_path: Path) -> None:
     more = [str(build.SOURCES / source) for source in THREADS] if name == "threads" else []
     sets = instruction_sets() if name != "threads" else {"baseline": ()}
     for instructions, flags in sets.items():
         program = tmp_path / instructions
-        compiled(compiler(), "-O1", *flags, str(HERE / f"{name}.cc"), *more, "-o", str(program))
+        level = "-O0" if name == "programs" else "-O1"  # where g++ 12 stops with an error of its own
+        compiled(compiler(), level, *flags, str(HERE / f"{name}.cc"), *more, "-o", str(program))
         done = subprocess.run([program], capture_output=True, text=True, timeout=60)
         assert done.returncode == 0, f"{instructions}: {done.stdout[:4000]}"
 

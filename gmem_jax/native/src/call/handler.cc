@@ -36,7 +36,8 @@ namespace {
 
 namespace ffi = xla::ffi;
 
-const Kernel& best_kernel(Task task) {
+// The lanes of derivatives are replicas: few of them are done sooner in narrow vectors.
+const Kernel& best_kernel(Task task, std::size_t replicas) {
   const auto of_task = [task](const Kernel& steps, const Kernel& derivatives) -> const Kernel& {
     return task == Task::forward ? steps : derivatives;
   };
@@ -46,7 +47,9 @@ const Kernel& best_kernel(Task task) {
   const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
   const bool avx512 = __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
                       __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
-  if (avx512 && limit != "avx2" && limit != "baseline") return of_task(avx512::kernel, avx512_derivatives::kernel);
+  const bool narrow = task != Task::forward && replicas <= static_cast<std::size_t>(avx2::kernel.width);
+  if (avx512 && !narrow && limit != "avx2" && limit != "baseline")
+    return of_task(avx512::kernel, avx512_derivatives::kernel);
   if (avx2 && limit != "baseline") return of_task(avx2::kernel, avx2_derivatives::kernel);
 #endif
   return of_task(baseline::kernel, baseline_derivatives::kernel);
@@ -176,7 +179,9 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
     for (int axis = static_cast<int>(batch.size()) - 1; axis >= 0 && ++index[axis] == batch[axis]; --axis) index[axis] = 0;
   }
 
-  const Kernel& kernel = best_kernel(task);
+  std::size_t most = 0;
+  for (const auto& of_pack : lanes) most = std::max(most, of_pack.size());
+  const Kernel& kernel = best_kernel(task, most);
   std::vector<Block> whole, packed;
   for (std::size_t i = 0; i < packs.size(); ++i) {
     const int count = static_cast<int>(lanes[i].size());
@@ -214,4 +219,4 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_adjoint, gmem::handle<gmem::Task::adjoint>, g
 extern "C" const char* gmem_source_hash() { return GMEM_SOURCE_HASH; }
 
 // Name of the instruction set in use.
-extern "C" const char* gmem_instruction_set() { return gmem::best_kernel(gmem::Task::forward).name; }
+extern "C" const char* gmem_instruction_set() { return gmem::best_kernel(gmem::Task::forward, 1).name; }

@@ -1,5 +1,6 @@
 // Reverse mode: all steps of one block gone through forwards, then backwards. The physics is that of the other headers,
-// read with numbers that are recorded on a tape (`Taped`); here stands only who gets which derivative.
+// recorded by the compiler (calculations.h) or, where a contact comes to another of Mindlin's rings, on a tape (`Taped`);
+// here stands only who gets which derivative.
 // "Bar" x is the derivative of the final result by x.
 //
 // Grains and contacts are shared among the threads of a team as in the forward steps, and sums are taken in the same
@@ -7,28 +8,23 @@
 
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <cstring>
 #include <vector>
 
+#include "cpu/calculations.h"
 #include "cpu/replicas.h"
 #include "numbers/tape.h"
 
 namespace gmem {
 namespace GMEM_ISA {
 
-// Rows of what is kept, and of the bars, of one grain: at the beginning of a step, the fields in order ...
-enum StateRow { kStatePosition = 0, kStateQuaternion = 3, kStateVelocity = 7, kStateSpin = 10, kStateAcceleration = 13,
-                kStateSpinRate = 16, kState = 19 };
-// ... and midway, with the force and torque found there.
-enum MidRow { kMidPosition = 0, kMidQuaternion = 3, kMidVelocity = 7, kMidSpin = 10, kMidHalfVelocity = 13,
-              kMidHalfSpin = 16, kMidForce = 19, kMidTorque = 22, kMid = 25 };
 // What a contact adds to the bars of a grain of another domain.
 enum RemoteRow { kRemoteCentre = 0, kRemotePosition = 3, kRemoteVelocity = 6, kRemoteSpin = 9, kRemote = 12 };
 
 inline void add_vec(Real* to, Vec<Real> a) { store_vec(to, load_vec(to) + a); }
 
-inline Quaternion<Taped> leaf(Quaternion<Real> q) { return {leaf(q.w), leaf(q.v)}; }
 inline Vec<Real> bars(int slot) { return load_vec(&tape->bar(slot)); }
 inline void seed(Taped a, Real bar) {
   if (a.slot) tape->bar(a.slot) += bar;
@@ -75,8 +71,9 @@ struct AdjointLayout {
   V* sphere_bar;    // [S, 3]
   V* remote_bar;    // [remotes, kRemote]
   V* history_bar;   // [candidates, kHistory and the forces of Mindlin's segments, 2 Q]
-  V* domain_bar;    // [domains, kParameters]
-  V* chunk_bar;     // [chunks, kParameters]
+  bool* has_bar;    // [candidates]: whether their bars, and those of their remotes, may be other than zero
+  V* domain_bar;    // [domains, kParameters + kLawNumbers]
+  V* chunk_bar;     // [chunks, kGrainNumbers]
   V* wall_bar;      // [chunks, kWalls], of one step
 
   // Numbers in the history of a contact.
@@ -93,7 +90,8 @@ struct AdjointLayout {
     trace = arena.take<Trace<V>>(steps);
     for (std::size_t step = 0; step < steps; ++step) {
       Trace<V> t;
-      t.touched = arena.take<bool>(candidates + 1);
+      t.touching = arena.take<int>(candidates);
+      t.end = arena.take<int>(candidates);
       t.history = arena.take<V>(candidates * Law::kHistory);
       t.segment = arena.take<Segment<V>>(layered * p.points);
       t.segments = arena.take<int>(layered);
@@ -104,8 +102,9 @@ struct AdjointLayout {
     sphere_bar = arena.take<V>(static_cast<std::size_t>(p.spheres()) * 3);
     remote_bar = arena.take<V>(static_cast<std::size_t>(plan.remotes) * kRemote);
     history_bar = arena.take<V>(candidates * remembered(p));
-    domain_bar = arena.take<V>(static_cast<std::size_t>(plan.domains) * kParameters);
-    chunk_bar = arena.take<V>(chunks * kParameters);
+    has_bar = arena.take<bool>(candidates);
+    domain_bar = arena.take<V>(static_cast<std::size_t>(plan.domains) * (kParameters + kLawNumbers));
+    chunk_bar = arena.take<V>(chunks * kGrainNumbers);
     wall_bar = arena.take<V>(chunks * kWalls);
   }
 };
@@ -114,7 +113,8 @@ template <class Law>
 struct Adjoint : AdjointLayout<Law> {
   using Layout = AdjointLayout<Law>;
   using Layout::state, Layout::total, Layout::trace, Layout::state_bar, Layout::mid_bar, Layout::sphere_bar;
-  using Layout::remote_bar, Layout::history_bar, Layout::domain_bar, Layout::chunk_bar, Layout::wall_bar;
+  using Layout::remote_bar, Layout::history_bar, Layout::has_bar, Layout::domain_bar;
+  using Layout::chunk_bar, Layout::wall_bar;
   using Layout::remembered;
   using V = Real;
   using Forward = Engine<Replicas<Law, Real>>;
@@ -125,19 +125,26 @@ struct Adjoint : AdjointLayout<Law> {
   const Plan& plan;
   Team& team;
   const int rank, steps;
+  const bool adjacent;  // the lanes are neighbours in every array of bars
   Tape recorded;
+  V law_numbers[kLawNumbers], grain_numbers[kGrainNumbers], last_ring;
 
   Adjoint(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : forward(problem, block, team, rank, scratch), problem(problem), block(block), plan(*block.pack->plan), team(team),
-        rank(rank), steps(block.lanes[0].steps) {
+        rank(rank), steps(block.lanes[0].steps), adjacent(forward.mode.neighbours(block.slopes)) {
     Arena arena{static_cast<char*>(scratch)};
     this->place(problem, block, arena, rank == 0);  // `forward` has found the same at the beginning
     forward.mode.apart = true;
+    store_numbers(law_numbers, LawParameters<V>(forward.parameter + kLaw, forward.parameter[kDt]));
+    store_numbers(grain_numbers, forward.constants);
+    last_ring = splat<V>(problem.points - 2.0);
   }
 
   V* history_of(std::size_t c) const { return history_bar + c * remembered(problem); }
 
   int chunks() const { return gmem::GMEM_ISA::chunks(problem); }
+  V* of_domain(int domain) const { return domain_bar + static_cast<std::size_t>(domain) * (kParameters + kLawNumbers); }
+  V* of_chunk(int chunk) const { return chunk_bar + static_cast<std::size_t>(chunk) * kGrainNumbers; }
   V* of_grain(V* array, int u, int rows) const { return array + static_cast<std::size_t>(u) * rows; }
 
   // Calls `each(u)` for this rank's grains.
@@ -152,12 +159,6 @@ struct Adjoint : AdjointLayout<Law> {
     team.share(Team::kGrains, rank, chunks());
     for (int chunk; team.take(Team::kGrains, rank, &chunk);) each(chunk);
     team.barrier();
-  }
-
-  static Grain<V> grain_of(const V* s) {
-    return {load_vec(s + kStatePosition), {s[kStateQuaternion], load_vec(s + kStateQuaternion + 1)},
-            load_vec(s + kStateVelocity), load_vec(s + kStateSpin),
-            load_vec(s + kStateAcceleration), load_vec(s + kStateSpinRate)};
   }
 
   // Between the rows of a state and where the forward steps keep them.
@@ -176,8 +177,6 @@ struct Adjoint : AdjointLayout<Law> {
     forward.load();
     for (int step = 0; step < steps; ++step) {
       for_grains([&](int u) { move_state(u, state_of(step, u), [](V& kept, V now) { kept = now; }); });
-      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
-        trace[step].touched[c] = false;
       team.barrier();
       forward.grains(false, true, step);
       forward.mode.trace = trace[step];
@@ -189,7 +188,7 @@ struct Adjoint : AdjointLayout<Law> {
         store_vec(total_of(step, u) + 3, torque);
       });
       team.barrier();
-      forward.grains(true, false, 0);
+      if (step + 1 < steps) forward.grains(true, false, 0);
     }
   }
 
@@ -197,6 +196,8 @@ struct Adjoint : AdjointLayout<Law> {
 
   template <class Pointer>
   void write(const Pointer& pointer, std::ptrdiff_t row, V a) const {
+    double* const to = pointer(block.slopes[0]) + row * problem.stride;
+    if (adjacent) return block.count < W ? store(to, a, block.count) : store(to, a);
     for (int l = 0; l < block.count; ++l) pointer(block.slopes[l])[row * problem.stride] = a[l];
   }
 
@@ -223,18 +224,21 @@ struct Adjoint : AdjointLayout<Law> {
     for_grains([&](int u) {
       for_fields(u, [&](int f, std::ptrdiff_t row, int number) {
         of_grain(state_bar, u, kState)[number] =
-            forward.mode.gather(block.slopes, [f](const Lane& lane) { return lane.grains_in[f]; }, row);
+            forward.mode.read_lanes(block.slopes, adjacent, [f](const Lane& lane) { return lane.grains_in[f]; }, row);
       });
     });
     for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
       for_history(plan.candidate[c].row, [&](int leaf, std::ptrdiff_t row, int q) {
-        history_of(c)[q] = forward.mode.gather(block.slopes, [leaf](const Lane& lane) { return lane.history_in[leaf]; }, row);
+        const auto array = [leaf](const Lane& lane) { return lane.history_in[leaf]; };
+        history_of(c)[q] = forward.mode.read_lanes(block.slopes, adjacent, array, row);
       });
+    const int first = forward.share_begin(plan.candidates);
+    std::fill_n(has_bar + first, forward.share_begin(plan.candidates, 1) - first, true);
     if constexpr (Law::kLayered)
       for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c) to_layers(c);
     if (rank == 0) {
-      std::memset(domain_bar, 0, sizeof(V) * plan.domains * kParameters);
-      std::memset(chunk_bar, 0, sizeof(V) * chunks() * kParameters);
+      std::memset(domain_bar, 0, sizeof(V) * plan.domains * (kParameters + kLawNumbers));
+      std::memset(chunk_bar, 0, sizeof(V) * chunks() * kGrainNumbers);
     }
     team.barrier();
   }
@@ -263,7 +267,7 @@ struct Adjoint : AdjointLayout<Law> {
     const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
     const Place place = place_of<Law>(plan.candidate[c].row, kLastOverlap);
     const V overlap = forward.mode.read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row);
-    const V outer = Reach<V, Law::variant>(overlap, law, problem.points).outer;
+    const V outer = Reach<V, Law::variant>(overlap, law, last_ring).outer;
     const V *layers = history_of(c) + kLayers;
     V* ring = history_of(c) + Law::kHistory;
     for (int j = 0; j < problem.points; ++j) {
@@ -291,47 +295,45 @@ struct Adjoint : AdjointLayout<Law> {
       for_history(plan.padding_row[n], [&](int leaf, std::ptrdiff_t row, int) {
         write([leaf](const Lane& lane) { return lane.history_out[leaf]; }, row, V{});
       });
-    for (int r = 0; rank == 0 && r < kParameters; ++r) {
-      V sum{};
-      for (int domain = 0; domain < plan.domains; ++domain) sum += domain_bar[domain * kParameters + r];
-      for (int chunk = 0; chunk < chunks(); ++chunk) sum += chunk_bar[chunk * kParameters + r];
-      write([](const Lane& lane) { return lane.parameters_out; }, r, sum);
-    }
+    if (rank == 0) unload_parameter_bars();
     team.barrier();
+  }
+
+  void unload_parameter_bars() {
+    recorded.clear();
+    const TapedParameters parameter(forward.parameter);
+    LawParameters<Taped> law(parameter.row + kLaw, parameter.row[kDt]);
+    GrainParameters<Taped> of_grains(parameter.row);
+    for (int domain = 0; domain < plan.domains; ++domain) {
+      const V* bar = of_domain(domain);
+      for (Taped number : parameter.row) seed(number, *bar++);
+      for_numbers(law, [&](Taped number) { seed(number, *bar++); });
+    }
+    for (int chunk = 0; chunk < chunks(); ++chunk) {
+      const V* bar = of_chunk(chunk);
+      for_numbers(of_grains, [&](Taped number) { seed(number, *bar++); });
+    }
+    recorded.reverse({});
+    V sum[kParameters] = {};
+    parameter.add_bars(sum);
+    for (int r = 0; r < kParameters; ++r) write([](const Lane& lane) { return lane.parameters_out; }, r, sum[r]);
   }
 
   // --- backwards
 
   // The second half of a step, of one chunk of grains.
   void end_back(int chunk, int step) {
-    recorded.clear();
-    const TapedParameters parameter(forward.parameter);
-    const GrainParameters<Taped> constants(parameter.row);
-    const auto mark = recorded.mark();
+    const int of_spheres = 3 * problem.spheres_per_grain;
     for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
-      const HalfStep<V> m = forward.half_step_of(u);
-      const V* before = total_of(step, u);
-      const int first = recorded.mark().slots;
-      const HalfStep<Taped> half{leaf(m.position), leaf(m.orientation), leaf(m.velocity),
-                                 leaf(m.spin), leaf(m.half_velocity), leaf(m.half_spin)};
-      const Vec<Taped> force = leaf(load_vec(before)), torque = leaf(load_vec(before + 3));
-      const Grain<Taped> g = end_step(constants, problem.isotropic, half, force, torque);
-      const Grain<V> bar = grain_of(of_grain(state_bar, u, kState));
-      seed(g.position, bar.position);
-      seed(g.orientation.w, bar.orientation.w);
-      seed(g.orientation.v, bar.orientation.v);
-      seed(g.velocity, bar.velocity);
-      seed(g.spin, bar.spin);
-      seed(g.acceleration, bar.acceleration);
-      seed(g.spin_rate, bar.spin_rate);
-      recorded.reverse(mark);
-      for (int q = 0; q < kMid; ++q) of_grain(mid_bar, u, kMid)[q] = recorded.bar(first + q);
-      for (int q = 0; q < 3 * problem.spheres_per_grain; ++q)
-        of_grain(sphere_bar, u, 3 * problem.spheres_per_grain)[q] = V{};
-      recorded.rewind(mark);
+      V mid[kMid];
+      store_numbers(mid, forward.half_step_of(u));
+      std::copy_n(total_of(step, u), 6, mid + kMidForce);
+      const V* in[] = {mid, grain_numbers};
+      V* bar[] = {of_grain(mid_bar, u, kMid), of_chunk(chunk)};
+      if (problem.isotropic) pull_back<StepEnd<true>>(in, of_grain(state_bar, u, kState), bar);
+      else pull_back<StepEnd<false>>(in, of_grain(state_bar, u, kState), bar);
+      std::fill_n(of_grain(sphere_bar, u, of_spheres), of_spheres, V{});
     }
-    recorded.reverse({});
-    parameter.add_bars(chunk_bar + static_cast<std::size_t>(chunk) * kParameters);
   }
 
   // Mindlin's segments of one contact, on the tape: as they were, then as the law left them.
@@ -339,7 +341,7 @@ struct Adjoint : AdjointLayout<Law> {
     int rings;
     std::vector<Segment<Taped>>* now;
 
-    int points() const { return rings; }
+    Taped last() const { return splat<Taped>(rings - 2.0); }
     int count() const { return static_cast<int>(now->size()); }
     const Segment<Taped>& get(int k) const { return (*now)[k]; }
     void set(int k, const Segment<Taped>& segment) {
@@ -352,82 +354,128 @@ struct Adjoint : AdjointLayout<Law> {
 
   // The contacts of one domain.
   void contacts_back(int domain, int step) {
-    recorded.clear();
-    const TapedParameters parameter(forward.parameter);
-    const LawParameters<Taped> law(parameter.row + kLaw, parameter.row[kDt]);
-    const auto mark = recorded.mark();
-    for (int c = plan.domain_candidate[domain]; c < plan.domain_candidate[domain + 1]; ++c) {
-      if (!trace[step].touched[c]) {
-        forget(c);
-        continue;
-      }
-      contact_back(c, parameter.row, law, trace[step]);
-      recorded.rewind(mark);
+    constexpr int kAhead = 4;
+    const Trace<V>& seen = trace[step];
+    const int first = plan.domain_candidate[domain], end = plan.domain_candidate[domain + 1];
+    if (first == end) return;
+    int c = first;
+    for (int n = first; n < seen.end[first]; ++n) {
+      for (; c < seen.touching[n]; ++c) forget(c);
+      if (n + kAhead < seen.end[first]) ask_for(seen.touching[n + kAhead]);
+      const V* history = seen.history + static_cast<std::size_t>(n) * Law::kHistory;
+      if (Law::kLayered && seen.segments[c] >= 0) rings_back(c, of_domain(domain), history, seen);
+      else contact_back(c, of_domain(domain), history);
+      has_bar[c++] = true;
     }
-    recorded.reverse({});
-    parameter.add_bars(domain_bar + static_cast<std::size_t>(domain) * kParameters);
+    for (; c < end; ++c) forget(c);
+  }
+
+  // Of what a contact needs, that which does not lie in a row with what others want.
+  void ask_for(std::size_t c) const {
+    const Candidate& pair = plan.candidate[c];
+    const auto ask = [](const V* from, int count) {
+      for (int n = 0; n < count; ++n) __builtin_prefetch(from + n);
+    };
+    const V* mid = of_grain(mid_bar, pair.grain_other, kMid);
+    ask(history_of(c), Law::kHistory);
+    ask(forward.mode.sphere + 3 * static_cast<std::size_t>(pair.other), 3);
+    ask(forward.hot + static_cast<std::size_t>(pair.grain_other) * kHot, kForce);
+    ask(sphere_bar + 3 * static_cast<std::size_t>(pair.other), 3);
+    ask(mid + kMidPosition, 3), ask(mid + kMidVelocity, 6), ask(mid + kMidForce, 6);
   }
 
   // A contact apart has a blank history, whatever it was before.
   void forget(std::size_t c) {
+    if (!has_bar[c]) return;
+    has_bar[c] = false;
     for (int q = 0; q < remembered(problem); ++q) history_of(c)[q] = V{};
     const int remote = plan.candidate[c].remote;
     if (remote >= 0)
       for (int q = 0; q < kRemote; ++q) of_grain(remote_bar, remote, kRemote)[q] = V{};
   }
 
-  void contact_back(std::size_t c, const Taped* parameter, const LawParameters<Taped>& law, const Trace<V>& seen) {
-    constexpr int kInputs = 18;
-    const auto mark = recorded.mark();
-    const Candidate& pair = plan.candidate[c];
+  ContactInput<V> input_of(const Candidate& pair) const {
     const auto centre = [&](int i) { return load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(i)); };
-    const ContactInput<V> m = forward.mode.contact_input(pair, centre(pair.one), centre(pair.other));
+    return forward.mode.contact_input(pair, centre(pair.one), centre(pair.other));
+  }
+
+  // The bars of the loads of a contact.
+  ContactLoads<V> loads_bar(const Candidate& pair) const {
+    const V* one = of_grain(mid_bar, pair.grain_one, kMid);
+    const V* other = of_grain(mid_bar, pair.grain_other, kMid);
+    return {load_vec(one + kMidForce) - load_vec(other + kMidForce), load_vec(one + kMidTorque),
+            load_vec(other + kMidTorque)};
+  }
+
+  void contact_back(std::size_t c, V* parameter_bar, const V* history) {
+    using Calculation = OneContact<Law>;
+    const Candidate& pair = plan.candidate[c];
+    const ContactLoads<V> loads = loads_bar(pair);
+    V own[Calculation::kNumbers], own_bar[Calculation::kNumbers], result_bar[Calculation::kResults];
+    store_numbers(own, input_of(pair));
+    store_vec(result_bar, loads.force), store_vec(result_bar + 3, loads.torque_one);
+    store_vec(result_bar + 6, loads.torque_other);
+    for (int q = 0; q < Law::kHistory; ++q) {
+      own[kInputs + q] = history[q];
+      result_bar[9 + q] = history_of(c)[q];
+    }
+    const V* in[] = {own, forward.parameter, law_numbers, &last_ring};
+    V* bar[] = {own_bar, parameter_bar, parameter_bar + kParameters};
+    pull_back<Calculation>(in, result_bar, bar);
+    std::copy_n(own_bar + kInputs, Law::kHistory, history_of(c));
+    share_out(pair, load_numbers<ContactInput<V>>(own_bar));
+  }
+
+  // A contact that comes to another of Mindlin's rings.
+  void rings_back(std::size_t c, V* parameter_bar, const V* history, const Trace<V>& seen) {
+    recorded.clear();
+    const TapedParameters parameter(forward.parameter);
+    const LawParameters<Taped> law(parameter.row + kLaw, parameter.row[kDt]);
+    const int first = recorded.mark().slots;
+    const Candidate& pair = plan.candidate[c];
+    const ContactInput<V> m = input_of(pair);
     const ContactInput<Taped> input{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
                                     leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
     Taped memory[Law::kHistory + 1];
-    for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(seen.history[c * Law::kHistory + q]);
+    for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(history[q]);
     Contact<Taped> contact;
     contact.history = memory;
     relative_motion(input, dot(input.separation, input.separation), contact);
-    close(&contact, 1, parameter);
+    close(&contact, 1, parameter.row);
     std::vector<Segment<Taped>> now;
-    const int leaves = recorded.mark().slots, before = Law::kLayered ? seen.segments[c] : -1;
+    const int leaves = recorded.mark().slots, before = seen.segments[c];
     for (int k = 0; k < before; ++k) {
       const Segment<V>& segment = seen.segment[c * problem.points + k];
       now.push_back({{leaf(segment.force.along), leaf(segment.force.across)}, constant(segment.start)});
     }
-    if constexpr (Law::kLayered) {
+    if constexpr (Law::kLayered)
       friction(Law{}, &contact, 1, law, [&](int) { return Segments{problem.points, &now}; });
-    } else {
-      friction(Law{}, &contact, 1, law);
-    }
 
     const ContactLoads<Taped> found = push(contact);
-    const V* one = of_grain(mid_bar, pair.grain_one, kMid);
-    const V* other = of_grain(mid_bar, pair.grain_other, kMid);
+    const ContactLoads<V> loads = loads_bar(pair);
     V* bar = history_of(c);
-    seed(found.force, load_vec(one + kMidForce) - load_vec(other + kMidForce));
-    seed(found.torque_one, load_vec(one + kMidTorque));
-    seed(found.torque_other, load_vec(other + kMidTorque));
+    seed(found.force, loads.force);
+    seed(found.torque_one, loads.torque_one), seed(found.torque_other, loads.torque_other);
     for (int q = 0; q < Law::kHistory; ++q) seed(memory[q], bar[q]);
     V* of_segments = bar + Law::kHistory;
     for (std::size_t k = 0; k < now.size(); ++k)
       seed(now[k].force.along, of_segments[2 * k]), seed(now[k].force.across, of_segments[2 * k + 1]);
-    recorded.reverse(mark);
+    recorded.reverse({});
 
-    for (int q = 0; q < Law::kHistory; ++q) bar[q] = recorded.bar(mark.slots + kInputs + q);
-    for (int q = 0; before >= 0 && q < 2 * problem.points; ++q) of_segments[q] = q < 2 * before ? recorded.bar(leaves + q) : V{};
-    share_out(pair, mark.slots);
+    parameter.add_bars(parameter_bar);
+    for (int q = 0; q < Law::kHistory; ++q) bar[q] = recorded.bar(first + kInputs + q);
+    for (int q = 0; q < 2 * problem.points; ++q) of_segments[q] = q < 2 * before ? recorded.bar(leaves + q) : V{};
+    share_out(pair, {bars(first), bars(first + 3), bars(first + 6), bars(first + 9), bars(first + 12), bars(first + 15)});
   }
 
   // The bars of a contact's input go to the two grains and spheres it was made from.
-  void share_out(const Candidate& pair, int first) {
-    const Vec<V> separation = bars(first), lever_one = bars(first + 3), lever_other = bars(first + 6);
-    const Vec<V> velocity = bars(first + 9), spin_one = bars(first + 12), spin_other = bars(first + 15);
-    const Vec<V> point = splat<V>(0.5) * (lever_one + lever_other);
+  void share_out(const Candidate& pair, const ContactInput<V>& bar) {
+    const Vec<V> point = splat<V>(0.5) * (bar.lever_one + bar.lever_other);
     const bool away_is_one = pair.away_is_one();
-    give(pair, !away_is_one, pair.one, pair.grain_one, {point - separation, -lever_one, -velocity, spin_one});
-    give(pair, away_is_one, pair.other, pair.grain_other, {point + separation, -lever_other, velocity, spin_other});
+    give(pair, !away_is_one, pair.one, pair.grain_one,
+         {point - bar.separation, -bar.lever_one, -bar.velocity, bar.spin_one});
+    give(pair, away_is_one, pair.other, pair.grain_other,
+         {point + bar.separation, -bar.lever_other, bar.velocity, bar.spin_other});
   }
 
   struct Given {
@@ -452,45 +500,41 @@ struct Adjoint : AdjointLayout<Law> {
 
   // The first half of a step, of one chunk of grains; `on_wall` is the bar of the force on either wall of an axis.
   void begin_back(int chunk, int step, Vec<V> on_wall) {
-    recorded.clear();
-    const TapedParameters parameter(forward.parameter);
-    const GrainParameters<Taped> constants(parameter.row);
-    const TapedWalls walls(forward.walls_at(step));
-    const auto mark = recorded.mark();
+    const WallState<V> box = forward.walls_at(step);
+    V walls[kWalls];
+    store_numbers(walls, box);
+    V* const of_walls = wall_bar + static_cast<std::size_t>(chunk) * kWalls;
+    std::fill_n(of_walls, kWalls, V{});
     const int spheres = problem.spheres_per_grain;
     for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
-      const V* s = state_of(step, u);
-      const Grain<V> g = grain_of(s);
-      const int first = recorded.mark().slots;
-      const Grain<Taped> grain{leaf(g.position), leaf(g.orientation), leaf(g.velocity),
-                               leaf(g.spin), leaf(g.acceleration), leaf(g.spin_rate)};
-      const HalfStep<Taped> m = begin_step(constants, grain);
-      WallForces<Taped> on{};
-      V* of_spheres = of_grain(sphere_bar, u, 3 * spheres);
-      V* bar = of_grain(mid_bar, u, kMid);
-      take_remotes(u, bar);
-      spheres_of(constants, m, block.pack->offsets, spheres, forward.arm, walls.box, on,
-                 [&](int k, Vec<Taped> centre) { seed(centre, load_vec(of_spheres + 3 * k)); });
-      seed(on.force, load_vec(bar + kMidForce));
-      seed(on.torque, load_vec(bar + kMidTorque));
-      seed(on.lower, on_wall);
-      seed(on.upper, on_wall);
-      seed(m.position, load_vec(bar + kMidPosition));
-      seed(m.orientation.w, bar[kMidQuaternion]);
-      seed(m.orientation.v, load_vec(bar + kMidQuaternion + 1));
-      seed(m.velocity, load_vec(bar + kMidVelocity));
-      seed(m.spin, load_vec(bar + kMidSpin));
-      seed(m.half_velocity, load_vec(bar + kMidHalfVelocity));
-      seed(m.half_spin, load_vec(bar + kMidHalfSpin));
-      recorded.reverse(mark);
-      for (int q = 0; q < kState; ++q) of_grain(state_bar, u, kState)[q] = recorded.bar(first + q);
-      recorded.rewind(mark);
+      V* const of_spheres = of_grain(sphere_bar, u, 3 * spheres);
+      V* const mid = of_grain(mid_bar, u, kMid);
+      take_remotes(u, mid);
+      V turned[kTurned], turned_bar[kTurned] = {};
+      const HalfStep<V> half = forward.half_step_of(u);
+      store_numbers(turned, half);
+      store_numbers(turned + kTurnedRotation, matrix(half.orientation));
+      std::copy_n(mid, kMidForce, turned_bar);
+      for (int k = 0; k < spheres; ++k) {
+        const double* offset = block.pack->offsets + 3 * k;
+        const V body[] = {splat<V>(offset[0]), splat<V>(offset[1]), splat<V>(offset[2])};
+        const V* in[] = {turned, grain_numbers, body, walls};
+        V* bar[] = {turned_bar, of_chunk(chunk), nullptr, of_walls};
+        const Vec<V> centre = load_vec(forward.mode.sphere + 3 * (static_cast<std::size_t>(u) * spheres + k));
+        if (bits_less(V{}, deepest(splat<V>(1.0), centre, box))) {
+          V result_bar[OneSphere<true>::kResults];
+          std::copy_n(of_spheres + 3 * k, 3, result_bar);
+          std::copy_n(mid + kMidForce, 6, result_bar + 3);
+          store_vec(result_bar + 9, on_wall), store_vec(result_bar + 12, on_wall);
+          pull_back<OneSphere<true>>(in, result_bar, bar);
+        } else {
+          pull_back<OneSphere<false>>(in, of_spheres + 3 * k, bar);
+        }
+      }
+      const V* in[] = {state_of(step, u), grain_numbers};
+      V* bar[] = {of_grain(state_bar, u, kState), of_chunk(chunk)};
+      pull_back<StepBegin>(in, turned_bar, bar);
     }
-    recorded.reverse({});
-    parameter.add_bars(chunk_bar + static_cast<std::size_t>(chunk) * kParameters);
-    V* to = wall_bar + static_cast<std::size_t>(chunk) * kWalls;
-    for (int row = 0; row < kWalls; ++row) to[row] = V{};
-    walls.add_bars(to);
   }
 
   void take_remotes(int u, V* bar) {
@@ -504,9 +548,11 @@ struct Adjoint : AdjointLayout<Law> {
   }
 
   void step_back(int step, Vec<V> pressure_bar) {
-    for_grains([&](int u) { move_state(u, state_of(step, u), [](V kept, V& now) { now = kept; }); });
-    team.barrier();
-    forward.grains(false, true, step);
+    if (step + 1 < steps) {  // the way forward ended midway in the last one
+      for_grains([&](int u) { move_state(u, state_of(step, u), [](V kept, V& now) { now = kept; }); });
+      team.barrier();
+      forward.grains(false, true, step);
+    }
     for_chunks([&](int chunk) { end_back(chunk, step); });
     team.share(Team::kContacts, rank, plan.domains);
     for (int domain; team.take(Team::kContacts, rank, &domain);) contacts_back(domain, step);

@@ -100,7 +100,7 @@ struct Packed : PackedLayout<Law> {
   // Number q of the history of a contact.
   double& remembered(std::size_t c, int q) const { return reinterpret_cast<double*>(history + c * kHistoryRows)[q]; }
   double outermost(std::size_t c, const LawParameters<V>& law) const {
-    return Reach<V, Law::variant>(splat<V>(remembered(c, kLastOverlap)), law, problem.points).outer[0];
+    return Reach<V, Law::variant>(splat<V>(remembered(c, kLastOverlap)), law, splat<V>(problem.points - 2.0)).outer[0];
   }
 
   double history_in(Place place) const { return lane.history_in[place.leaf][place.row * problem.stride]; }
@@ -185,7 +185,7 @@ struct Packed : PackedLayout<Law> {
     std::ptrdiff_t stride;
     int rings, most, lanes;
 
-    int points() const { return rings; }
+    V last() const { return splat<V>(rings - 2.0); }
     int count() const { return most; }
     Segment<V> get(int k) const {
       const Row none{0.0, 0.0, kNowhere};

@@ -17,8 +17,9 @@ namespace GMEM_ISA {
 // What the histories of the contacts were when a step looked at them; kept where the step is to be gone through backwards.
 template <class V>
 struct Trace {
-  bool* touched = nullptr;  // [candidates]
-  V* history;               // [candidates, kHistory] of the law
+  int* touching = nullptr;  // [candidates]: those of each domain that touch, in order, from its first candidate on
+  int* end;                 // [candidates]: where these end, at the first candidate of each domain
+  V* history;               // [candidates, kHistory] of the law: theirs, in the places of `touching`
   Segment<V>* segment;      // [candidates, Q], where a contact came to another ring
   int* segments;            // [candidates]; -1 where it did not
 };
@@ -96,18 +97,24 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   bool apart = false;  // Mindlin's rings each by itself, for their derivatives
 
   Replicas(const Problem& problem, const Block& block) : problem(problem), block(block), plan(*block.pack->plan) {
-    adjacent = true;
+    adjacent = neighbours(block.lanes);
     together = true;
-    const Lane& a = block.lanes[0];
+    for (int l = 1; l < block.count; ++l) together &= block.lanes[l].steps == block.lanes[0].steps;
+  }
+
+  // Whether the lanes are neighbours in every array.
+  bool neighbours(const Lane* lanes) const {
+    bool found = true;
+    const Lane& a = lanes[0];
     for (int l = 1; l < block.count; ++l) {
-      const Lane& b = block.lanes[l];
-      together &= b.steps == a.steps;
+      const Lane& b = lanes[l];
       for (int f = 0; f < kFields; ++f)
-        adjacent &= b.grains_in[f] == a.grains_in[f] + l && b.grains_out[f] == a.grains_out[f] + l;
+        found &= b.grains_in[f] == a.grains_in[f] + l && b.grains_out[f] == a.grains_out[f] + l;
       for (int leaf = 0; leaf < kMaxHistory; ++leaf)
         if (a.history_in[leaf])
-          adjacent &= b.history_in[leaf] == a.history_in[leaf] + l && b.history_out[leaf] == a.history_out[leaf] + l;
+          found &= b.history_in[leaf] == a.history_in[leaf] + l && b.history_out[leaf] == a.history_out[leaf] + l;
     }
+    return found;
   }
 
   static int units(const Problem& p) { return p.grains; }
@@ -137,11 +144,16 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   template <class Pointer>
   V read(const Pointer& pointer, std::ptrdiff_t row) const {
     return of_lanes<V>(block, [&](const Lane* lanes, int first) {
-      const int count = block.count - first;
-      if (!adjacent || count < 1) return gather(lanes, pointer, row, first);
-      const double* from = pointer(lanes[first]) + row * problem.stride;
-      return count < W ? load(from, count) : load(from);
+      return read_lanes(lanes, adjacent, pointer, row, first);
     });
+  }
+
+  template <class Pointer>
+  Real read_lanes(const Lane* lanes, bool adjacent, const Pointer& pointer, std::ptrdiff_t row, int first = 0) const {
+    const int count = block.count - first;
+    if (!adjacent || count < 1) return gather(lanes, pointer, row, first);
+    const double* from = pointer(lanes[first]) + row * problem.stride;
+    return count < W ? load(from, count) : load(from);
   }
 
   // Only lanes that have done all their steps.
@@ -180,12 +192,12 @@ struct Replicas : ReplicasLayout<Law, V, C> {
 
   StoredSegments<V> segments_of(std::size_t c) const {
     int* const stored = marks.segments + c;
-    if (!trace.touched) return {segment + c, plan.candidates, stored, problem.points};
+    if (!trace.touching) return {segment + c, plan.candidates, stored, problem.points};
     Segment<V>* const seen = trace.segment + c * problem.points;
     return {segment + c, plan.candidates, stored, problem.points, seen, trace.segments + c};
   }
   V outermost(std::size_t c, const LawParameters<V>& law) const {
-    return Reach<V, Law::variant>(history[c * Law::kHistory + kLastOverlap], law, problem.points).outer;
+    return Reach<V, Law::variant>(history[c * Law::kHistory + kLastOverlap], law, splat<V>(problem.points - 2.0)).outer;
   }
 
   // Number q of the history of a contact.
@@ -255,9 +267,9 @@ struct Replicas : ReplicasLayout<Law, V, C> {
 
   // --- contacts
 
-  void remember(std::size_t c) {
-    trace.touched[c] = true;
-    for (int q = 0; q < Law::kHistory; ++q) trace.history[c * Law::kHistory + q] = history[c * Law::kHistory + q];
+  void remember(std::size_t c, std::size_t place) {
+    trace.touching[place] = static_cast<int>(c);
+    for (int q = 0; q < Law::kHistory; ++q) trace.history[place * Law::kHistory + q] = history[c * Law::kHistory + q];
     if constexpr (Law::kLayered) trace.segments[c] = -1;
   }
 
@@ -266,7 +278,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     const V contact_square = splat<V>(4.0);
     int near[kLook + 1], touching[kBatch];
     Contact<C> contact[kBatch];
-    int count = 0;
+    int count = 0, remembered = first;
     for (int look = first; look < end; look += kLook) {
       const int found = marks.find_near(look, end, travel, near);
       for (int n = 0; n < found; ++n) {
@@ -292,7 +304,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
           continue;
         }
         marks.touched[c] = true;
-        if (trace.touched) remember(c);
+        if (trace.touching) remember(c, remembered++);
         relative_motion(contact_input(pair, one, other), convert<C>(square), contact[count]);
         if constexpr (kMixed) contact[count].before = convert<C>(contact_square - square);
         contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
@@ -303,6 +315,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
       }
     }
     compute(touching, count, contact, parameter, law);
+    if (trace.touching && first < end) trace.end[first] = remembered;
   }
 
   void compute(const int* touching, int count, Contact<C>* contact, const C* parameter, const LawParameters<C>& law) {

@@ -77,7 +77,7 @@ struct Segments {
   int* stored;
   int rings;
 
-  int points() const { return rings; }
+  V last() const { return splat<V>(rings - 2.0); }
   int count() const { return *stored; }
   Segment<V> get(int k) const { return {{at[3 * k], at[3 * k + 1]}, at[3 * k + 2]}; }
   void set(int k, const Segment<V>& segment) const {
@@ -119,7 +119,7 @@ struct Segments {
 template <class V, class Law>
 int outermost(const ReplicaView<V>& on, long long side, const LawParameters<V>& law) {
   const V overlap = on.in(on.a.history)[side * Law::kHistory + kLastOverlap];
-  return static_cast<int>(largest(Reach<V, Law::variant>(overlap, law, on.a.points).outer));
+  return static_cast<int>(largest(Reach<V, Law::variant>(overlap, law, splat<V>(on.a.points - 2.0)).outer));
 }
 
 template <class V>

@@ -25,7 +25,7 @@ template <class V>
 using Mask = decltype(V{} < V{});
 
 template <class V>
-inline V splat(double a) {
+constexpr V splat(double a) {
   if constexpr (__is_class(V)) {
     return V::of(a);
   } else {

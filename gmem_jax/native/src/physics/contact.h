@@ -19,7 +19,7 @@ struct ContactInput {
 // Levers and relative motion, unprojected. The first part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
 template <class V>
-GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, Contact<V>& c) {
+constexpr GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, Contact<V>& c) {
   c.normal = m.separation;
   c.square = square;
   c.sliding = add_cross(add_cross(m.velocity, m.spin_other, m.lever_other), m.lever_one, m.spin_one);
@@ -30,12 +30,12 @@ GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, Contact<V>&
 
 // From the square of the distance and the inverse distance.
 template <class V>
-GMEM_INLINE V overlap_of(const Contact<V>& c) { return fnma(c.square, c.inverse, splat<V>(2.0)); }
+constexpr GMEM_INLINE V overlap_of(const Contact<V>& c) { return fnma(c.square, c.inverse, splat<V>(2.0)); }
 
 // From what `relative_motion` left to normals, sliding velocities and normal forces. The second part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
 template <class V>
-inline void close(Contact<V>* c, int count, const V* parameter) {
+constexpr void close(Contact<V>* c, int count, const V* parameter) {
   const V quarter_dt = splat<V>(0.25) * parameter[kDt] * parameter[kSpinning];
   invert_roots(c, count);
   for (int n = 0; n < count; ++n) {
@@ -64,7 +64,7 @@ struct ContactLoads {
 };
 
 template <class V>
-GMEM_INLINE ContactLoads<V> push(const Contact<V>& c) {
+constexpr GMEM_INLINE ContactLoads<V> push(const Contact<V>& c) {
   const Vec<V> force = fnma(c.normal_force, c.normal, c.force);
   return {force, cross(c.lever_one, force), cross(force, c.lever_other)};
 }

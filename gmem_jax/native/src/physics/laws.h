@@ -28,13 +28,13 @@ struct Contact {
   V before;                       // square of the force before it was flattened
   V* history;
 
-  Mask<V> touching() const { return overlap > V{}; }
-  V safe_overlap() const { return select(touching(), overlap, splat<V>(1.0)); }
+  constexpr Mask<V> touching() const { return overlap > V{}; }
+  constexpr V safe_overlap() const { return select(touching(), overlap, splat<V>(1.0)); }
 };
 
 // 1 / sqrt(square) of a batch.
 template <class V>
-inline void invert_roots(Contact<V>* c, int count) {
+constexpr void invert_roots(Contact<V>* c, int count) {
   for (int n = 0; n < count; ++n) c[n].inverse = inverse_root(c[n].square);
 }
 
@@ -58,7 +58,9 @@ struct LawParameters {
   V dashpot;    // stiffness times damping time
   V half_dt;
 
-  LawParameters(const V* rows, V dt)
+  LawParameters() = default;
+
+  constexpr LawParameters(const V* rows, V dt)
       : mu(rows[0]), stiffness(rows[1]), damping_time(rows[2]), spacing(rows[4]),
         inverse_spacing(splat<V>(1.0) / rows[4]),
         half_step(splat<V>(0.5) * rows[1] * dt), dashpot(rows[1] * rows[2]), half_dt(splat<V>(0.5) * dt) {}
@@ -67,7 +69,7 @@ struct LawParameters {
 // f = k p^1.5 + gamma p^0.5 dp/dt, never attractive.
 // gmem_jax/physics/contact/normal.py: hertz
 template <class V>
-GMEM_INLINE V hertz(Mask<V> touching, V overlap, V root_overlap, V closing, V stiffness, V damping_time) {
+constexpr GMEM_INLINE V hertz(Mask<V> touching, V overlap, V root_overlap, V closing, V stiffness, V damping_time) {
   const V force = stiffness * root_overlap * fma(damping_time, closing, overlap);
   return zero_unless(touching & (force > V{}), force);
 }
@@ -80,7 +82,7 @@ struct Transport {
   Vec<V> normal;
   V cosine, sine, denominator2;
 
-  GMEM_INLINE explicit Transport(const Contact<V>& c) : normal(c.normal) {
+  constexpr GMEM_INLINE explicit Transport(const Contact<V>& c) : normal(c.normal) {
     const V one = splat<V>(1.0), denominator = fma(c.turned, c.turned, one);
     cosine = fnma(c.turned, c.turned, one);
     sine = c.turned + c.turned;
@@ -88,14 +90,14 @@ struct Transport {
   }
 
   // First part: flattens `force`; returns the square whose inverse root the second part wants.
-  GMEM_INLINE V flatten(Vec<V>& force, V& before) const {
+  constexpr GMEM_INLINE V flatten(Vec<V>& force, V& before) const {
     const V along_normal = dot(force, normal);
     before = dot(force, force);
     force = fnma(along_normal, normal, force);
     return (before * denominator2) * fnma(along_normal, along_normal, before);
   }
 
-  GMEM_INLINE Vec<V> restore(Vec<V> flat, V before, V square, V inverse) const {
+  constexpr GMEM_INLINE Vec<V> restore(Vec<V> flat, V before, V square, V inverse) const {
     const V scale = select(square > splat<V>(kTiny<V>), before * inverse, splat<V>(1.0));
     return fma(scale * sine, cross(normal, flat), (scale * cosine) * flat);
   }
@@ -103,7 +105,7 @@ struct Transport {
 
 // Carry vectors of a batch, `from(contact)`, along with their contacts; their forces become `then(contact, carried)`.
 template <class V, class From, class Then>
-inline void carry(Contact<V>* c, int count, const From& from, const Then& then) {
+constexpr void carry(Contact<V>* c, int count, const From& from, const Then& then) {
   for (int n = 0; n < count; ++n) {
     c[n].force = from(c[n]);
     c[n].square = Transport<V>(c[n]).flatten(c[n].force, c[n].before);
@@ -116,20 +118,20 @@ inline void carry(Contact<V>* c, int count, const From& from, const Then& then) 
 // The vector that a history begins with.
 struct Remembered {
   template <class V>
-  GMEM_INLINE Vec<V> operator()(const Contact<V>& c) const { return load_vec(c.history); }
+  constexpr GMEM_INLINE Vec<V> operator()(const Contact<V>& c) const { return load_vec(c.history); }
 };
 
 // By what a trial force is to be multiplied, of which `square` and `inverse` are the square and its inverse root.
 // gmem_jax/physics/contact/friction.py: coulomb
 template <class V>
-GMEM_INLINE V limited(const Contact<V>& c, V mu) {
+constexpr GMEM_INLINE V limited(const Contact<V>& c, V mu) {
   const V limit = mu * c.normal_force;
   return select(c.square > limit * limit, limit * c.inverse, splat<V>(1.0));
 }
 
 // Take the trial forces of a batch back to the friction limit.
 template <class V>
-inline void coulomb(Contact<V>* c, int count, V mu) {
+constexpr void coulomb(Contact<V>* c, int count, V mu) {
   for (int n = 0; n < count; ++n) c[n].square = dot(c[n].force, c[n].force);
   invert_roots(c, count);
   for (int n = 0; n < count; ++n) c[n].force = zero_unless(c[n].touching(), limited(c[n], mu) * c[n].force);
@@ -137,13 +139,13 @@ inline void coulomb(Contact<V>* c, int count, V mu) {
 
 // gmem_jax/physics/contact/frictionless.py: Frictionless.__call__
 template <class V>
-GMEM_INLINE void friction(Frictionless, Contact<V>* c, int count, const LawParameters<V>&) {
+constexpr GMEM_INLINE void friction(Frictionless, Contact<V>* c, int count, const LawParameters<V>&) {
   for (int n = 0; n < count; ++n) c[n].force = Vec<V>{};
 }
 
 // gmem_jax/physics/contact/hooke.py: Hooke.__call__
 template <class V>
-GMEM_INLINE void friction(Hooke, Contact<V>* c, int count, const LawParameters<V>& law) {
+constexpr GMEM_INLINE void friction(Hooke, Contact<V>* c, int count, const LawParameters<V>& law) {
   const V push = law.half_step + law.dashpot, rest = law.half_step - law.dashpot;
   carry(c, count, Remembered{}, [&](const Contact<V>& now, Vec<V> carried) { return fma(push, now.sliding, carried); });
   coulomb(c, count, law.mu);
@@ -153,7 +155,7 @@ GMEM_INLINE void friction(Hooke, Contact<V>* c, int count, const LawParameters<V
 
 // gmem_jax/physics/contact/mindlin_rescaled.py: MindlinRescaled.__call__
 template <class V>
-GMEM_INLINE void friction(Rescaled, Contact<V>* c, int count, const LawParameters<V>& law) {
+constexpr GMEM_INLINE void friction(Rescaled, Contact<V>* c, int count, const LawParameters<V>& law) {
   const V one = splat<V>(1.0);
   const V push = law.stiffness * (law.half_dt + law.damping_time), rest = law.stiffness * (law.half_dt - law.damping_time);
   // sqrt(p / p_old) on unloading; sqrt(p) has been left in `root_overlap`.
@@ -177,9 +179,10 @@ template <class V, Variant variant>
 struct Reach {
   V x, outer;
 
-  Reach(V overlap, const LawParameters<V>& law, int points)
+  // Rings number `last` and beyond are one.
+  constexpr Reach(V overlap, const LawParameters<V>& law, V last)
       : x(root(zero_unless(overlap > V{}, overlap)) * law.inverse_spacing) {
-    const V last = splat<V>(points - 2.0), begin = splat<V>(variant == Variant::paper ? 0.5 : 0.0);
+    const V begin = splat<V>(variant == Variant::paper ? 0.5 : 0.0);
     const V ring = select(x < last, floor_of(select(x < last, x, V{})), last);
     outer = select(x > begin, ring, splat<V>(-1.0));
   }
@@ -192,17 +195,18 @@ constexpr double kLacking = variant == Variant::paper ? 0.5 : 0.0;
 // A vector that is not along the unit vector `normal`.
 // gmem_jax/physics/contact/mindlin.py: any_tangent
 template <class V>
-GMEM_INLINE Vec<V> any_tangent(Vec<V> normal) {
+constexpr GMEM_INLINE Vec<V> any_tangent(Vec<V> normal) {
   const V one = splat<V>(1.0), near = splat<V>(0.6);
   const Mask<V> near_x = (near < normal.x) | (near < -normal.x);
   return {select(near_x, V{}, one), zero_unless(near_x, one), V{}};
 }
 
-// `segments_of(n)` are those of contact n: with `points()`; `count()`, of the lane that has most; `get(k)` and `set(k, run)`;
-// `keep(counts)`, of each lane; and `remember()`, called before they change.
+// `segments_of(n)` are those of contact n: with `last()`, see `Reach`; `count()`, of the lane that has most; `get(k)` and
+// `set(k, run)`; `keep(counts)`, of each lane; and `remember()`, called before they change.
 // gmem_jax/physics/contact/mindlin.py: Mindlin.__call__
 template <class V, Variant variant, class SegmentsOf>
-GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, const LawParameters<V>& law, const SegmentsOf& segments_of) {
+constexpr GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, const LawParameters<V>& law,
+                                    const SegmentsOf& segments_of) {
   const V one = splat<V>(1.0), lacking = splat<V>(kLacking<variant>);
   const auto frame = [](const Contact<V>& now) {
     return select(now.history[kLastOverlap] > V{}, load_vec(now.history), any_tangent(now.normal));
@@ -214,8 +218,8 @@ GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, const LawP
   Mask<V> attached[kTogether];
   for (int n = 0; n < count; ++n) {
     auto segments = segments_of(n);
-    const int points = segments.points();
-    const Reach<V, variant> before(c[n].history[kLastOverlap], law, points), now(c[n].overlap, law, points);
+    const V last = segments.last();
+    const Reach<V, variant> before(c[n].history[kLastOverlap], law, last), now(c[n].overlap, law, last);
     Layers<V> layers = load_layers(c[n].history + kLayers);
     if (variant == Variant::averaged) {  // the force in a ring that fills stays: Mindlin._diluted
       const V filled = before.x - before.outer, fills = select(before.outer < now.outer, one, now.x - before.outer);

@@ -36,7 +36,7 @@ struct GrainParameters {
 
   GrainParameters() = default;
 
-  explicit GrainParameters(const V* parameter)
+  constexpr explicit GrainParameters(const V* parameter)
       : dt(parameter[kDt]), half_dt(splat<V>(0.5) * dt), drag(parameter[kDrag]),
         inverse_mass(splat<V>(1.0) / parameter[kMass]), wall_stiffness(parameter[kWallStiffness]),
         normal_damping(parameter[kNormalDamping]) {
@@ -50,7 +50,7 @@ struct GrainParameters {
 // First half of a step: positions and orientations at its end, and velocities predicted for it.
 // gmem_jax/physics/step.py: step (up to the forces)
 template <class V>
-GMEM_INLINE HalfStep<V> begin_step(const GrainParameters<V>& p, const Grain<V>& g) {
+constexpr GMEM_INLINE HalfStep<V> begin_step(const GrainParameters<V>& p, const Grain<V>& g) {
   const Vec<V> half_velocity = fma(p.half_dt, g.acceleration, g.velocity), half_spin = fma(p.half_dt, g.spin_rate, g.spin);
   return {fma(p.dt, half_velocity, g.position),
           turn(g.orientation, p.dt * half_spin),
@@ -62,8 +62,8 @@ GMEM_INLINE HalfStep<V> begin_step(const GrainParameters<V>& p, const Grain<V>& 
 
 // gmem_jax/physics/step.py: _angular_acceleration
 template <class V>
-inline Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropic, Quaternion<V> orientation, Vec<V> spin,
-                                   Vec<V> torque) {
+constexpr Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropic, Quaternion<V> orientation,
+                                      Vec<V> spin, Vec<V> torque) {
   if (isotropic) return p.inverse_inertia[0] * torque;
   const Matrix<V> rotation = matrix(orientation);
   const Vec<V> body_spin = transposed(rotation, spin);
@@ -75,7 +75,8 @@ inline Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropic, 
 // Second half: accelerations and velocities; position and orientation stay.
 // gmem_jax/physics/step.py: step (from the forces on)
 template <class V>
-GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const HalfStep<V>& m, Vec<V> force, Vec<V> torque) {
+constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const HalfStep<V>& m, Vec<V> force,
+                                        Vec<V> torque) {
   const Vec<V> acceleration = fnma(p.drag, m.velocity, p.inverse_mass * force);
   const Vec<V> spin_rate = fnma(p.drag, m.spin, angular_acceleration(p, isotropic, m.orientation, m.spin, torque));
   return {m.position,   m.orientation, fma(p.half_dt, acceleration, m.half_velocity), fma(p.half_dt, spin_rate, m.half_spin),
@@ -90,7 +91,7 @@ struct WallForces {
 
 // Largest overlap with any wall of a sphere of radius `reach` around `centre`.
 template <class V>
-inline V deepest(V reach, Vec<V> centre, const WallState<V>& box) {
+constexpr V deepest(V reach, Vec<V> centre, const WallState<V>& box) {
   const Vec<V> all{reach, reach, reach};
   const Vec<V> lower = all - (centre - box.lower), upper = all - (box.upper - centre);
   return max(max(max(lower.x, upper.x), max(lower.y, upper.y)), max(lower.z, upper.z));
@@ -98,7 +99,7 @@ inline V deepest(V reach, Vec<V> centre, const WallState<V>& box) {
 
 // gmem_jax/physics/contact/wall.py: wall_forces
 template <class V>
-inline Vec<V> wall_force(const GrainParameters<V>& parameters, Vec<V> overlap, Vec<V> closing) {
+constexpr Vec<V> wall_force(const GrainParameters<V>& parameters, Vec<V> overlap, Vec<V> closing) {
   const auto axis = [&](V p, V c) {
     const Mask<V> touching = p > V{};
     if (!bits_less(V{}, p)) return V{};
@@ -111,7 +112,7 @@ inline Vec<V> wall_force(const GrainParameters<V>& parameters, Vec<V> overlap, V
 // Adds to `on` the forces of the walls on one sphere of a grain.
 // gmem_jax/physics/step.py: _forces
 template <class V>
-inline void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
+constexpr void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
                         const WallState<V>& box, WallForces<V>& on) {
   const Vec<V> one{splat<V>(1.0), splat<V>(1.0), splat<V>(1.0)};
   if (!bits_less(V{}, deepest(one.x, centre, box))) return;
@@ -124,6 +125,15 @@ inline void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> lever
   on.torque = add_cross(on.torque, lever, low - up);
 }
 
+// The centre of a sphere of a grain, and what the walls do to it if they are near.
+template <class V>
+constexpr GMEM_INLINE Vec<V> sphere_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Matrix<V>& rotation,
+                                       Vec<V> body, bool near, const WallState<V>& box, WallForces<V>& on) {
+  const Vec<V> lever = rotation * body, centre = m.position + lever;
+  if (near) touch_walls(p, centre, lever, add_cross(m.velocity, m.spin, lever), box, on);
+  return centre;
+}
+
 // Finds the spheres of a grain, handed to `put(k, centre)`, and what the walls do to them; whether they are near them.
 // gmem_jax/physics/step.py: sphere_table
 template <class V, class Put>
@@ -133,10 +143,7 @@ GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, c
   const bool near = bits_less(V{}, deepest(splat<V>(1.0 + arm), m.position, box)) != 0;
   for (int k = 0; k < spheres; ++k) {
     const double* body = offsets + 3 * k;
-    const Vec<V> lever = rotation * Vec<V>{splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])};
-    const Vec<V> centre = m.position + lever;
-    put(k, centre);
-    if (near) touch_walls(p, centre, lever, add_cross(m.velocity, m.spin, lever), box, on);
+    put(k, sphere_of(p, m, rotation, {splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])}, near, box, on));
   }
   return near;
 }
@@ -144,7 +151,7 @@ GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, c
 // p of each axis from the sum of the forces on its two walls: (F_lower + F_upper) / (2 A).
 // gmem_jax/physics/step.py: wall_pressure
 template <class V>
-inline Vec<V> pressure(const WallState<V>& box, Vec<V> force) {
+constexpr Vec<V> pressure(const WallState<V>& box, Vec<V> force) {
   const Vec<V> lengths = box.upper - box.lower;
   const V two = splat<V>(2.0);
   return {force.x / (two * (lengths.y * lengths.z)), force.y / (two * (lengths.x * lengths.z)),

@@ -16,7 +16,7 @@ struct Quaternion {
 // Rotate by the small lab-frame angle (Cayley map) and normalise.
 // gmem_jax/physics/rotation.py: turn
 template <class V>
-inline Quaternion<V> turn(Quaternion<V> q, Vec<V> angle) {
+constexpr Quaternion<V> turn(Quaternion<V> q, Vec<V> angle) {
   const Vec<V> half = splat<V>(0.5) * angle;
   const V w = q.w - dot(half, q.v);
   const Vec<V> v = add_cross(fma(q.w, half, q.v), half, q.v);
@@ -31,15 +31,15 @@ struct Matrix {
 };
 
 template <class V>
-inline Vec<V> operator*(const Matrix<V>& m, Vec<V> a) { return {dot(m.row[0], a), dot(m.row[1], a), dot(m.row[2], a)}; }
+constexpr Vec<V> operator*(const Matrix<V>& m, Vec<V> a) { return {dot(m.row[0], a), dot(m.row[1], a), dot(m.row[2], a)}; }
 
 template <class V>
-inline Vec<V> transposed(const Matrix<V>& m, Vec<V> a) { return fma(a.z, m.row[2], fma(a.y, m.row[1], a.x * m.row[0])); }
+constexpr Vec<V> transposed(const Matrix<V>& m, Vec<V> a) { return fma(a.z, m.row[2], fma(a.y, m.row[1], a.x * m.row[0])); }
 
 // Lab components of body vectors.
 // gmem_jax/physics/rotation.py: matrix
 template <class V>
-inline Matrix<V> matrix(Quaternion<V> q) {
+constexpr Matrix<V> matrix(Quaternion<V> q) {
   const V one = splat<V>(1.0), two = splat<V>(2.0);
   const V x = two * q.v.x, y = two * q.v.y, z = two * q.v.z;
   const V xx = x * q.v.x, yy = y * q.v.y, zz = z * q.v.z;

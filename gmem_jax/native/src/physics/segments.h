@@ -21,7 +21,7 @@ struct Segment {
 constexpr double kNowhere = 1e9;
 
 template <class V>
-inline Segment<V> no_segment() { return {Flat<V>{}, splat<V>(kNowhere)}; }
+constexpr Segment<V> no_segment() { return {Flat<V>{}, splat<V>(kNowhere)}; }
 
 template <class V>
 inline void copy_lane(Segment<V>& to, int l, const Segment<V>& from) {
@@ -39,9 +39,9 @@ struct Layers {
 };
 
 template <class V>
-inline Layers<V> load_layers(const V* p) { return {{p[0], p[1]}, {p[2], p[3]}, {p[4], p[5]}}; }
+constexpr Layers<V> load_layers(const V* p) { return {{p[0], p[1]}, {p[2], p[3]}, {p[4], p[5]}}; }
 template <class V>
-inline void store_layers(V* p, const Layers<V>& a) {
+constexpr void store_layers(V* p, const Layers<V>& a) {
   p[0] = a.common.along, p[1] = a.common.across;
   p[2] = a.inside.along, p[3] = a.inside.across;
   p[4] = a.rim.along, p[5] = a.rim.across;
@@ -92,7 +92,7 @@ struct StoredSegments {
   Segment<V>* seen = nullptr;  // where `remember` copies them, one after the other, and how many they are
   int* seen_count = nullptr;
 
-  int points() const { return rings; }
+  V last() const { return splat<V>(rings - 2.0); }
   int count() const { return *stored; }
   const Segment<V>& get(int k) const { return first[k * stride]; }
   void set(int k, const Segment<V>& segment) { static_cast<Segment<V>&>(first[k * stride]) = segment; }
