@@ -57,9 +57,9 @@ def rest(length: float = 0.2, **more: Any) -> Stage:
     return Stage("rest", length=length, role="hold", **more)
 
 
-def hold(length: float = 2.0, **more: Any) -> Stage:
+def hold(length: float = 2.0, *, name: str = "hold", **more: Any) -> Stage:
     """Walls stand still where they are: storage. `more` are fields of `Stage`, as pressure=(None, None, 2e-3)."""
-    return Stage("hold", length=length, role="hold", **more)
+    return Stage(name, length=length, role="hold", **more)
 
 
 def compress(to: float, length: float | None = None, *, name: str = "compress", **more: Any) -> Stage:
@@ -97,7 +97,14 @@ def write(
 
 
 def read(
-    name: str = "read", *, to: float | None = 0.0, length: float = 1.0, of: str | None = None, **channels: Any
+    name: str = "read",
+    *,
+    to: float | None = 0.0,
+    length: float = 1.0,
+    amplitude: float = 1.0,
+    of: str | None = None,
+    mark: bool = False,
+    **channels: Any,
 ) -> Stage:
     """Stresses are read while u goes to `to`; or, with `to` None, while waveforms (`channels`) shear the pack.
 
@@ -105,11 +112,13 @@ def read(
         name: of the stage.
         to: u at the end.
         length: of the stage.
+        amplitude: what waveforms are multiplied with.
         of: the stage that the recall is compared with; default the last that wrote on each channel.
+        mark: whether observers compare with its beginning.
         channels: waveforms by channel that are applied meanwhile.
     """
-    drives = _drives(channels, 1.0) if channels else ()
-    return Stage(name, stop=to, length=length, role="read", drives=drives, of=of)
+    drives = _drives(channels, amplitude) if channels else ()
+    return Stage(name, stop=to, length=length, role="read", drives=drives, of=of, mark=mark)
 
 
 def train(
@@ -135,7 +144,9 @@ def train(
     return (Stage("train", length=length, role=role, drives=_drives(given, amplitude), along="time"),) * times
 
 
-def shake(amplitude: float, periods: int, *, length: float = 1.0, channel: str = "xy", **more: Any) -> Stage:
+def shake(
+    amplitude: float, periods: int, *, length: float = 1.0, channel: str = "xy", name: str = "shake", **more: Any
+) -> Stage:
     """Walls swing by a sine of whole periods where u stands; the amplitude is a multiple of gamma0.
 
     Args:
@@ -143,7 +154,8 @@ def shake(amplitude: float, periods: int, *, length: float = 1.0, channel: str =
         periods: how many of them.
         length: of the stage.
         channel: the mode of strain.
+        name: of the stage.
         more: fields of `Stage`.
     """
     drives = (Drive(channel, f"{SINE}{periods}", amplitude),)
-    return Stage("shake", length=length, drives=drives, along="time", **more)
+    return Stage(name, length=length, drives=drives, along="time", **more)
