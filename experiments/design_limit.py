@@ -42,7 +42,9 @@ def main() -> None:
         """Recalls of rows of amplitudes, as samples of their bumps are written."""
         return np.asarray(gm.run(gm.replace(experiment, signals=sampled(bumps(amplitudes, width))), batch=64).p_sig)
 
-    amplitudes = nearest(sampled(bumps(np.eye(n), width)), named_signals(arguments.waveforms))
+    amplitudes = nearest(
+        sampled(bumps(np.eye(n), width)), gm.replace(experiment, signals=named_signals(arguments.waveforms)).waveforms
+    )
     found = recalled(amplitudes)
     match = experiment.compare(jnp.asarray(found))
     wanted = float(match.gain * experiment.scale) * np.asarray(experiment.integral())

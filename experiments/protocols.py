@@ -21,6 +21,7 @@ import numpy as np
 
 import gmem_jax as gm
 from gmem_jax import protocols
+from gmem_jax.design.kernel import MemoryKernel
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.recall import Prefix, prefix_of
 from gmem_jax.reading import capacity
@@ -167,7 +168,11 @@ def held(case: Case) -> Found:
     """What one channel and two can carry at most at a noise; the odd part, and how large the even part is beside it."""
     sets = gm.signals(xy=SIX, z=chosen(SIX, ORDER))
     matrix = gm.kernel_matrix(case.experiment(protocols.two_channels(store=STORE), sets), KERNEL, WIDTH, progress=False)
-    kernels = {"xy": matrix.blocks[0][0], "z": matrix.blocks[1][1], "both with the power of one": matrix}
+    kernels: dict[str, MemoryKernel | gm.KernelMatrix] = {
+        "xy": matrix.blocks[0][0],
+        "z": matrix.blocks[1][1],
+        "both with the power of one": matrix,
+    }
     found: Found = {}
     for noise in NOISES:
         for name, kernel, power in (*((*each, 1.0) for each in kernels.items()), ("both", matrix, 2.0)):
@@ -217,7 +222,7 @@ def sines() -> gm.Bumps:
 
 def after_each(recall: gm.Recall, name: str) -> np.ndarray:
     """What was observed at the end of each read, [R, S + 1]."""
-    return np.stack([np.asarray(recall.stages[read].observed[name])[-1] for read in recall.reads])
+    return np.stack([np.asarray((recall.stages[read].observed or {})[name])[-1] for read in recall.reads])
 
 
 def bend(curve: np.ndarray, at: float) -> float:
@@ -289,7 +294,7 @@ def sheared(case: Case) -> Found:
         for number, read in enumerate(recall.reads, 1):
             sample = recall.stages[read]
             for what, unit in (("moved", "R"), ("turned", "rad")):
-                seen = np.asarray(sample.observed[what]).mean(axis=1)
+                seen = np.asarray((sample.observed or {})[what]).mean(axis=1)
                 found |= {f"largest {what} ({unit}), cycle {number}, {name}": float(seen.max()),
                           f"left of it, {what}, cycle {number}, {name}": float(seen[-1] / seen.max())}  # fmt: skip
             lengths, pressure = np.asarray(sample.lengths)[:, :, 0], np.asarray(sample.pressure)[:, :, 0]

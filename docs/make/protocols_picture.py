@@ -3,6 +3,7 @@
 python docs/make/protocols_picture.py
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
@@ -16,7 +17,7 @@ from gmem_jax.experiment import protocols
 from gmem_jax.simulation.protocol import Drive, Protocol
 
 OUTPUT = Path(__file__).parents[1] / "protocols.png"
-SHELF = (
+SHELF: tuple[Callable[[], Protocol], ...] = (
     protocols.paper,
     protocols.paper_twice_read,
     protocols.write_read_write_read,

@@ -15,7 +15,7 @@ from gmem_jax.simulation.protocol import OWN, Protocol, Stage
 Shear = Literal["during", "before"]
 """When waveforms are applied: during the compression, or before it."""
 
-SINE = "sine:1"
+ONE_SINE = "sine:1"
 ONE_SIDED = tuple(math.sin(math.pi * place / 16) for place in range(1, 16))
 """A shear to one side and back: half a sine, as samples."""
 READOUT = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5)
@@ -174,7 +174,7 @@ def several_amplitudes(
     """
     rounds = [train(1, amplitude=amplitude, length=length) for _ in range(times) for amplitude in amplitudes]
     reads = [
-        read(f"read-{amplitude:g}", to=None, length=length, amplitude=amplitude, mark=place == 0, xy=SINE)
+        read(f"read-{amplitude:g}", to=None, length=length, amplitude=amplitude, mark=place == 0, xy=ONE_SINE)
         for place, amplitude in enumerate(readout)
     ]
     return Protocol(_compressed(), rounds, reads)
@@ -238,7 +238,7 @@ def read_by_shear(
         store: before them, in t0.
     """
     reads = [
-        read(to=None, length=length, amplitude=amplitude, mark=place == 0, xy=ONE_SIDED if one_sided else SINE)
+        read(to=None, length=length, amplitude=amplitude, mark=place == 0, xy=ONE_SIDED if one_sided else ONE_SINE)
         for place in range(times)
     ]
     return Protocol(cycle(), rest(), write(), hold(store, name="store"), reads)
