@@ -35,7 +35,7 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import frame_schedule, replica_bins, run, run_bytes
 from gmem_jax.experiment.record import key_of_run, signals_to_dict
 from gmem_jax.experiment.signals import Signals, six_signals
-from gmem_jax.experiment.stepping import stable_step
+from gmem_jax.experiment.stepping import require_stable, stable_step
 from gmem_jax.files.packs import list_packs, load_pack
 from gmem_jax.files.recalls import save_recall
 from gmem_jax.files.sizes import recall_bytes, sample_bytes
@@ -120,7 +120,8 @@ def recall_command(
     at = _compressions(frames_at)
     if not frames and not at:
         refuse_idle("without --frames or --frames-at, which say how many", "frames_of")
-    frame_schedule(experiment, frames, frames_of, at)  # refuses what cannot be before anything is begun
+    require_stable(experiment)  # what cannot be is refused before anything is begun
+    frame_schedule(experiment, frames, frames_of, at)
     film: Any = {"frames": frames, "frames_of": frames_of, "frames_at": at}
     if dry_run:
         batch = batch_for(experiment, output, batch, restart=restart)
