@@ -138,3 +138,20 @@ def test_a_run_that_failed_leaves_nothing_to_go_on_from(tmp_path: Path) -> None:
         kept("part", fail)
     assert kept.begun() == kept.finished() == 0
     Checkpoints(tmp_path / "parts", {"with": "another key"})
+
+
+def test_a_protocol_of_ones_own_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    """Held walls, two channels, shaking, a mark and an observer: all of it is in a checkpoint."""
+    sets = gm.signals(xy=ONE, z=gm.Bumps(-ONE.amplitudes, ONE.centres + 0.1, ONE.width))
+    protocol = gm.Protocol(
+        gm.compress(0.5, 0.2),
+        gm.compress(0.0, 0.2),
+        gm.write(length=0.3),
+        gm.shake(0.5, 2, length=0.1, channel="z"),
+        gm.hold(0.2, pressure=(None, None, 3e-3), mark=True),
+        gm.read("half", to=0.5, length=0.2),
+        gm.read("whole", length=0.2),
+    )
+    watched = {"nonaffine": gm.observables.nonaffine(), "made": gm.observables.contacts_made()}
+    experiment = gm.Experiment(gm.load_pack(PACK), sets, protocol=protocol, observe=watched, t0=100.0)
+    _same(lambda cache: gm.run(experiment, cache=cache), tmp_path / "parts", [2, 4, 6])
