@@ -81,7 +81,7 @@ class Content(Tree):
             own: Any = {name: found[path + name] for name in MEASURED}
             seen = {name.removeprefix(OBSERVED): found[path + name] for name in observed}
             u = np.broadcast_to(own["u"][:, None], own["filling"].shape)
-            stages[stage] = Sample(**{**own, "u": u}, observed=seen or None)
+            stages[stage] = Sample(**{**own, "u": u}, observed=OrderedDict(seen) or None)
         return stages
 
 

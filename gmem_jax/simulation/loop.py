@@ -4,6 +4,7 @@ Everything that moves grains along a protocol goes through `bin_step`: the rollo
 computation, and the chunks of the host (`simulation.runner`), forwards and for derivatives.
 """
 
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -27,7 +28,7 @@ from gmem_jax.simulation.sample import Sample, end_bin, overlaps
 from gmem_jax.simulation.strain import StrainPath, servo_strain, stretched
 
 Observe = Callable[["Simulation", State], Any]
-"""A reduction of a state to arrays [..., B], in plain JAX: jitted, vmapped and differentiated with the steps."""
+"""A reduction of a state to an array [..., B], in plain JAX: jitted, vmapped and differentiated with the steps."""
 
 
 class Mark(NamedTuple):
@@ -54,9 +55,9 @@ class Simulation:
         creep: rate at which elastic tangential forces relax, 1 / t_c; scalar or [B], None for never.
         creep_fades: time in a stage after which that rate falls, in t_c; see `relaxation`.
         columns: what the stages make use of.
-        observe: names and functions of (simulation, state), called at the end of each bin: what they give, a tree of
-            arrays [..., B], is kept in `Sample.observed`. They find the walls in `box`, the sample in `sample`, and the
-            drag and the friction that act in the bin.
+        observe: names and functions of (simulation, state), called at the end of each bin: what they give, an array
+            [..., B], is kept in `Sample.observed`. They find the walls in `box`, the sample in `sample`, and the drag
+            and the friction that act in the bin.
         mark: the state and walls that they may compare with.
         box: walls at the end of the bin, for them.
         sample: of the bin, for them.
@@ -163,7 +164,9 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
         if not simulation.observe:
             return state, sample
         seen = replace(simulation, system=system, dt=dt, drag=drag, box=last, sample=sample)
-        return state, replace(sample, observed={name: reduce(seen, state) for name, reduce in simulation.observe})
+        # Ordered, as what checkpoints keep is.
+        observed = OrderedDict((name, reduce(seen, state)) for name, reduce in simulation.observe)
+        return state, replace(sample, observed=observed)
 
 
 def _crept(simulation: Simulation, state: State, row: Bin) -> State:
