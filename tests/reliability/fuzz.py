@@ -427,12 +427,19 @@ def _without_runs() -> None:
     """Every command up to where it would compute."""
     from gmem_jax.bench import measure
     from gmem_jax.command import sweep
+    from gmem_jax.design import by_kernel, waveforms
     from gmem_jax.reading import training
 
     recalls.run = packs.prepare = measure.run_benchmark = training.train_net = _stop  # type: ignore[assignment]
     sweep.SweepRunner.run = _stop  # type: ignore[method-assign]
-    for name in ("value_and_grad", "prefix_of", "memory_kernel", "simulate", "design_waveforms", "design_drive"):
-        setattr(derive, name, _stop)
+    for module, *names in (
+        (derive, "value_and_grad", "prefix_of", "memory_kernel", "design_drive"),
+        (by_kernel, "design_by_kernel"),
+        (waveforms, "design_waveforms"),
+    ):
+        for name in names:
+            assert hasattr(module, name), name
+            setattr(module, name, _stop)
 
 
 def judge_line(folder: Path, case: Case) -> tuple[str, str]:
