@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from gmem_jax.physics import chance
 from gmem_jax.physics.state import Box, State
 from gmem_jax.physics.step import start
 from gmem_jax.simulation.compiled import Compiled
@@ -100,7 +101,7 @@ def _measured(simulation: Simulation, position: jax.Array, quaternion: jax.Array
         size = jnp.sqrt(_dot(change, change))
         return jax.tree.map(lambda leaf: leaf / size, change)
 
-    kicks = jax.random.normal(jax.random.key(0), (2, *position.shape[:2], 1), position.dtype) + still
+    kicks = jax.random.normal(chance.key(0), (2, *position.shape[:2], 1), position.dtype) + still
     blank = jax.tree.map(jnp.zeros_like, at)
     first = lax.fori_loop(0, ROUNDS, one_round, (replace(blank[0], velocity=kicks[0], spin=kicks[1]), blank[1]))
     second = step(first)

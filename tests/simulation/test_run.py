@@ -170,7 +170,7 @@ def test_a_run_that_broke_for_no_number_that_is_known_says_what_to_try() -> None
 
 def test_a_step_that_is_too_large_for_one_of_several_traced_rates_is_told_of_that_alone() -> None:
     experiment = gm.Experiment(PACK, gm.words(1), t0=100.0, steps=1, rest=0.01, hold=0.01, store=0.01)
-    bits = jax.vmap(lambda t0: gm.replace(experiment, t0=t0).begin().status)(jnp.asarray([127.9, 128.1]))
+    bits = jax.vmap(lambda t0: gm.replace(experiment, t0=t0).begin().status)(jnp.asarray([255.9, 256.1]))
     assert (np.asarray(bits) & int(Status.STEP_TOO_LARGE) > 0).all(axis=1).tolist() == [False, True]
     assert (np.asarray(bits) & int(Status.STEP_TOO_LARGE) > 0).any(axis=1).tolist() == [False, True]
 
