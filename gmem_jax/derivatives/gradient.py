@@ -52,12 +52,12 @@ def _needs_offsets(names: Iterable[str]) -> bool:
 
 
 def _is_moving(path: Any, leaf: Any, offsets: bool) -> bool:
-    """Whether a number of a simulation is differentiated by: not the list, and the sphere offsets only if asked for.
+    """Whether a number of a simulation is differentiated by: not the list or the mark, offsets only if asked for.
 
     The native library has no derivatives by offsets: with them all steps are differentiated in plain JAX.
     """
     place = jax.tree_util.keystr(path)
-    fixed = place.startswith(".system.pairs") or (place == ".system.clump.offsets" and not offsets)
+    fixed = place.startswith((".system.pairs", ".mark")) or (place == ".system.clump.offsets" and not offsets)
     return not fixed and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
 
 
@@ -337,7 +337,7 @@ def value_and_grad(
         progress: told about every chunk of both ways; default a bar in a terminal or a notebook, False for none.
 
     Raises:
-        ValueError: for a name that is no field.
+        ValueError: for a name that is no field, or a loss that is not one number.
         RunFailedError: if the simulation broke down.
     """
     tell = callback(progress)
@@ -358,7 +358,13 @@ def value_and_grad(
     def final(theta: Any, pressures: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
         changed = along(theta)
         p_sig = changed.recalled(pressures)
-        return loss(changed, p_sig), p_sig
+        value = loss(changed, p_sig)
+        if jnp.ndim(value):
+            raise ValueError(
+                f"a loss is one number, got {jnp.shape(value)}: with several reads or channels give one, as "
+                "loss=lambda experiment, p_sig: experiment.compare(p_sig).fidelity[0]"
+            )
+        return value, p_sig
 
     pressures = {name: jnp.asarray(samples[name].pressure) for name in experiment.protocol.reads}
     # Not compiled: it is another function in every call, and compiling it takes longer than doing it.

@@ -175,19 +175,23 @@ def memory_kernel(
         ValueError: if n < 2, or gamma0 or delta0 differ between replicas.
         RunFailedError: if the simulation broke down.
     """
-    tell = callback(progress)
+    tell, both = callback(progress), _basis(experiment, n, width)
+    wanted = replace(experiment, signals=both)
+    if len(wanted.readings.reads) * len(wanted.readings.channels) > 1:
+        raise ValueError("a kernel is of one read and one channel; gm.kernel_matrix measures those of several channels")
+    p_sig = np.asarray(run(wanted, prefix=prefix, cache=cache.scoped("basis"), progress=tell).p_sig)
+    return _kernel_of(wanted, both, p_sig)
+
+
+def _basis(experiment: Experiment, n: int, width: float) -> Bumps:
+    """n bumps and their opposites, once it is sure that they make a kernel."""
     n = require_whole("n", n)
     require_numbers(width=width)
     if n < 2:
         raise ValueError(f"a kernel needs at least 2 basis waveforms, got {n}")
-    both = bumps(np.concatenate([np.eye(n), -np.eye(n)]), width)
-    wanted = replace(experiment, signals=both)
-    if jnp.ndim(wanted.scale):
+    if jnp.ndim(experiment.scale):
         raise ValueError("a kernel is measured at one gamma0 and one delta0, not one for each replica")
-    p_sig = np.asarray(run(wanted, prefix=prefix, cache=cache.scoped("basis"), progress=tell).p_sig)
-    if p_sig.ndim > 2:
-        raise ValueError("a kernel is of one read and one channel; gm.kernel_matrix measures those of several channels")
-    return _kernel_of(wanted, both, p_sig)
+    return bumps(np.concatenate([np.eye(n), -np.eye(n)]), width)
 
 
 @comparable
@@ -236,18 +240,15 @@ def kernel_matrix(
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
-        ValueError: if n < 2, the experiment has several reads, or as many sets as channels are not written.
+        ValueError: as of `memory_kernel`; or if there are several reads, or not a set of waveforms for each channel.
         RunFailedError: if the simulation broke down.
     """
     channels, sets = experiment.readings.channels, experiment.sets
     written = experiment.protocol.written(experiment.readings.reads[0])
-    if (
-        n < 2
-        or len(experiment.readings.reads) > 1
-        or len({drive.waveform for drive in written.values()}) < len(channels)
-    ):
-        raise ValueError("a kernel matrix needs 2 or more basis waveforms, one read, and a set for each channel")
-    loud, silent = bumps(np.concatenate([np.eye(n), -np.eye(n)]), width), bumps(np.zeros((2 * n, n)), width)
+    if len(experiment.readings.reads) > 1 or len({drive.waveform for drive in written.values()}) < len(channels):
+        raise ValueError("a kernel matrix is of one read, and needs a set of waveforms for each channel")
+    loud = _basis(experiment, n, width)
+    silent = bumps(jnp.zeros_like(loud.amplitudes), width)
     tell, columns = callback(progress), []
     for number, channel in enumerate(channels):
         alone = {name: loud if name == written[channel].waveform else silent for name in sets}

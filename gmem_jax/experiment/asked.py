@@ -10,6 +10,7 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.readings import Readings
 from gmem_jax.physics.pairs import sphere_offsets
 from gmem_jax.physics.rotation import unit
+from gmem_jax.simulation.protocol import Protocol
 
 
 def require_double(**parts: Any) -> None:
@@ -47,6 +48,26 @@ def require_inside(pack: Pack) -> None:
         raise ValueError(
             f"pack {pack.name}: grain {grain + 1} does not lie in the box: its centre is at {place}, the box is from "
             f"{lower} to {upper} (R)"
+        )
+
+
+def require_memory(protocol: Protocol, background: str) -> None:
+    """Refuse a protocol that no pack at rest can go through, or that is none of a memory.
+
+    Raises:
+        ValueError: saying what it lacks.
+    """
+    first = protocol.stages[0]
+    if first.start != 0.0:
+        raise ValueError(f"the pack rests at u = 0, and stage {first.name!r} begins at u = {first.start:g}")
+    if not protocol.reads:
+        raise ValueError("the protocol has no stage that reads, as gm.read() is one")
+    if not protocol.channels:
+        raise ValueError("the protocol writes no waveforms of the replicas, as gm.write() does")
+    if background != "sub0" and len(protocol.reads) != 2:
+        raise ValueError(
+            f"background {background!r} takes the second read for the background of the first; the protocol has "
+            f"{len(protocol.reads)}"
         )
 
 

@@ -15,7 +15,7 @@ from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
 from gmem_jax.experiment.arguments import named_observers, require_once, require_parts
-from gmem_jax.experiment.asked import require_double, require_seen, require_told_apart
+from gmem_jax.experiment.asked import require_double, require_memory, require_seen, require_told_apart
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocols import Shear, memory_protocol
@@ -207,18 +207,7 @@ class Experiment:
                 raise ValueError(
                     f"{odd[0]} makes the paper's protocol, and another one was given: say it in a stage of that"
                 )
-            if protocol.stages[0].start != 0.0:
-                first = protocol.stages[0]
-                raise ValueError(f"the pack rests at u = 0, and stage {first.name!r} begins at u = {first.start:g}")
-            if not protocol.reads:
-                raise ValueError("the protocol has no stage that reads, as gm.read() is one")
-            if not protocol.channels:
-                raise ValueError("the protocol writes no waveforms of the replicas, as gm.write() does")
-            if self.background != "sub0" and len(protocol.reads) != 2:
-                raise ValueError(
-                    f"background {self.background!r} takes the second read for the background of the first; the "
-                    f"protocol has {len(protocol.reads)}"
-                )
+            require_memory(protocol, self.background)
         if protocol.columns.friction and not isinstance(self.friction, CoulombLaw | Frictionless):
             raise ValueError(
                 f"the protocol switches friction off, and {type(self.friction).__name__} has no mu to switch"

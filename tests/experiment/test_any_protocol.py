@@ -11,6 +11,7 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
+from gmem_jax.derivatives.gradient import push
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.protocols import memory_protocol
 from gmem_jax.experiment.readings import placed
@@ -262,6 +263,22 @@ def test_observers_see_every_bin_and_change_nothing() -> None:
     np.testing.assert_allclose(
         batches.stages["read"].observed["moved"], late.stages["read"].observed["moved"], rtol=1e-9
     )
+
+
+def test_observers_do_not_disturb_derivatives() -> None:
+    one = experiment(t0=20.0)
+    plain, watched = (
+        gm.value_and_grad(e, ["gamma0"], progress=False) for e in (one, gm.replace(one, observe={"moved": moved}))
+    )
+    np.testing.assert_array_equal(watched.slope["gamma0"], plain.slope["gamma0"])
+    pushed = [push(e, {"gamma0": 1.0}).p_sig_slope for e in (one, gm.replace(one, observe={"moved": moved}))]
+    np.testing.assert_array_equal(*pushed)
+
+
+def test_a_loss_of_several_numbers_is_refused_with_one_that_would_do() -> None:
+    twice = experiment(gm.Protocol(gm.write(length=0.1), gm.read("a", length=0.1), gm.write(length=0.1), gm.read("b")))
+    with pytest.raises(ValueError, match=r"a loss is one number, got \(2,\): with several reads or channels give one"):
+        gm.value_and_grad(twice, ["gamma0"], progress=False)
 
 
 def test_a_recall_of_several_reads_and_channels_is_kept_whole(tmp_path: Any) -> None:
