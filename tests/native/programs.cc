@@ -174,7 +174,8 @@ void sphere() {
   const int first_wall = m.recorded.mark().slots;
   const auto box = leaves<WallState<Taped>>(walls);
   WallForces<Taped> on{};
-  const Vec<Taped> centre = sphere_of(parameters, half, rotation, constant(load_vec(body)), near, box, on);
+  const Vec<Taped> offset{constant(body[0]), constant(body[1]), constant(body[2])};
+  const Vec<Taped> centre = sphere_of(parameters, half, rotation, offset, near, box, on);
   const Real* seeds = m.result_bar;
   for (const Vec<Taped>& part : {centre, on.force, on.torque, on.lower, on.upper}) seed(part, seeds);
   m.recorded.reverse({});

@@ -363,8 +363,12 @@ struct Adjoint : AdjointLayout<Law> {
       for (; c < seen.touching[n]; ++c) forget(c);
       if (n + kAhead < seen.end[first]) ask_for(seen.touching[n + kAhead]);
       const V* history = seen.history + static_cast<std::size_t>(n) * Law::kHistory;
-      if (Law::kLayered && seen.segments[c] >= 0) rings_back(c, of_domain(domain), history, seen);
-      else contact_back(c, of_domain(domain), history);
+      bool changes = false;
+      if constexpr (Law::kLayered) {
+        changes = seen.segments[c] >= 0;
+        if (changes) rings_back(c, of_domain(domain), history, seen);
+      }
+      if (!changes) contact_back(c, of_domain(domain), history);
       has_bar[c++] = true;
     }
     for (; c < end; ++c) forget(c);
@@ -407,26 +411,33 @@ struct Adjoint : AdjointLayout<Law> {
             load_vec(other + kMidTorque)};
   }
 
-  void contact_back(std::size_t c, V* parameter_bar, const V* history) {
+  // By the program. Where `in_lanes` is not set, the bars of the contact's numbers are zero, and others get nothing.
+  void contact_back(std::size_t c, const ContactInput<V>& input, const V* history, Bits in_lanes, V* parameter_bar,
+                    V* own_bar) const {
     using Calculation = OneContact<Law>;
-    const Candidate& pair = plan.candidate[c];
-    const ContactLoads<V> loads = loads_bar(pair);
-    V own[Calculation::kNumbers], own_bar[Calculation::kNumbers], result_bar[Calculation::kResults];
-    store_numbers(own, input_of(pair));
+    const ContactLoads<V> loads = loads_bar(plan.candidate[c]);
+    V own[Calculation::kNumbers], result_bar[Calculation::kResults];
+    store_numbers(own, input);
+    std::copy_n(history, Law::kHistory, own + kInputs);
     store_vec(result_bar, loads.force), store_vec(result_bar + 3, loads.torque_one);
     store_vec(result_bar + 6, loads.torque_other);
-    for (int q = 0; q < Law::kHistory; ++q) {
-      own[kInputs + q] = history[q];
-      result_bar[9 + q] = history_of(c)[q];
-    }
+    std::copy_n(history_of(c), Law::kHistory, result_bar + 9);
+    for (V& bar : result_bar) bar = zero_unless(in_lanes, bar);
     const V* in[] = {own, forward.parameter, law_numbers, &last_ring};
     V* bar[] = {own_bar, parameter_bar, parameter_bar + kParameters};
     pull_back<Calculation>(in, result_bar, bar);
-    std::copy_n(own_bar + kInputs, Law::kHistory, history_of(c));
-    share_out(pair, load_numbers<ContactInput<V>>(own_bar));
   }
 
-  // A contact that comes to another of Mindlin's rings.
+  void contact_back(std::size_t c, V* parameter_bar, const V* history) {
+    V own_bar[OneContact<Law>::kNumbers];
+    const ContactInput<V> input = input_of(plan.candidate[c]);
+    contact_back(c, input, history, ~Bits{}, parameter_bar, own_bar);
+    std::copy_n(own_bar + kInputs, Law::kHistory, history_of(c));
+    share_out(plan.candidate[c], load_numbers<ContactInput<V>>(own_bar));
+  }
+
+  // A contact that comes to another of Mindlin's rings in some lanes: by the tape in these, by the program in the others,
+  // so that what happens in a lane leaves the bits of the others as they are.
   void rings_back(std::size_t c, V* parameter_bar, const V* history, const Trace<V>& seen) {
     recorded.clear();
     const TapedParameters parameter(forward.parameter);
@@ -448,24 +459,41 @@ struct Adjoint : AdjointLayout<Law> {
       const Segment<V>& segment = seen.segment[c * problem.points + k];
       now.push_back({{leaf(segment.force.along), leaf(segment.force.across)}, constant(segment.start)});
     }
-    if constexpr (Law::kLayered)
-      friction(Law{}, &contact, 1, law, [&](int) { return Segments{problem.points, &now}; });
+    friction(Law{}, &contact, 1, law, [&](int) { return Segments{problem.points, &now}; });
 
     const ContactLoads<Taped> found = push(contact);
     const ContactLoads<V> loads = loads_bar(pair);
-    V* bar = history_of(c);
-    seed(found.force, loads.force);
-    seed(found.torque_one, loads.torque_one), seed(found.torque_other, loads.torque_other);
-    for (int q = 0; q < Law::kHistory; ++q) seed(memory[q], bar[q]);
-    V* of_segments = bar + Law::kHistory;
-    for (std::size_t k = 0; k < now.size(); ++k)
-      seed(now[k].force.along, of_segments[2 * k]), seed(now[k].force.across, of_segments[2 * k + 1]);
+    const Bits moves = changes_ring(history[kLastOverlap], contact.overlap.value);
+    V own_bar[OneContact<Law>::kNumbers];
+    contact_back(c, m, history, ~moves, parameter_bar, own_bar);
+    const auto seed_moving = [moves](Taped a, V bar) { seed(a, zero_unless(moves, bar)); };
+    const auto seed_vec = [&](const Vec<Taped>& a, const Vec<V>& bar) {
+      seed_moving(a.x, bar.x), seed_moving(a.y, bar.y), seed_moving(a.z, bar.z);
+    };
+    V *const bar = history_of(c), *const of_segments = bar + Law::kHistory;
+    seed_vec(found.force, loads.force);
+    seed_vec(found.torque_one, loads.torque_one), seed_vec(found.torque_other, loads.torque_other);
+    for (int q = 0; q < Law::kHistory; ++q) seed_moving(memory[q], bar[q]);
+    for (std::size_t k = 0; k < now.size(); ++k) {
+      seed_moving(now[k].force.along, of_segments[2 * k]);
+      seed_moving(now[k].force.across, of_segments[2 * k + 1]);
+    }
     recorded.reverse({});
 
     parameter.add_bars(parameter_bar);
-    for (int q = 0; q < Law::kHistory; ++q) bar[q] = recorded.bar(first + kInputs + q);
-    for (int q = 0; q < 2 * problem.points; ++q) of_segments[q] = q < 2 * before ? recorded.bar(leaves + q) : V{};
-    share_out(pair, {bars(first), bars(first + 3), bars(first + 6), bars(first + 9), bars(first + 12), bars(first + 15)});
+    for (int q = 0; q < kInputs + Law::kHistory; ++q) own_bar[q] = select(moves, recorded.bar(first + q), own_bar[q]);
+    std::copy_n(own_bar + kInputs, Law::kHistory, bar);
+    for (int q = 0; q < 2 * problem.points; ++q)
+      of_segments[q] = select(moves, q < 2 * before ? recorded.bar(leaves + q) : V{}, of_segments[q]);
+    share_out(pair, load_numbers<ContactInput<V>>(own_bar));
+  }
+
+  // Whether a contact comes to another ring as its overlap changes from one value to another.
+  Bits changes_ring(V from, V to) const {
+    const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
+    const V before = Reach<V, Law::variant>(from, law, last_ring).outer;
+    const V now = Reach<V, Law::variant>(to, law, last_ring).outer;
+    return (before < now) | (now < before);
   }
 
   // The bars of a contact's input go to the two grains and spheres it was made from.
