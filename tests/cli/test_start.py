@@ -93,7 +93,7 @@ def test_ctrl_c_while_it_is_imported_is_one_line(tmp_path: Path, entry: list[str
     paths = os.pathsep.join([str(tmp_path), str(ROOT)])
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(
-        [sys.executable, *entry], **pipes, text=True, env={**os.environ, "PYTHONPATH": paths}
+        [sys.executable, *entry, "info"], **pipes, text=True, env={**os.environ, "PYTHONPATH": paths}
     ) as process:
         process.stdout.readline()
         process.send_signal(signal.SIGINT)
@@ -105,9 +105,14 @@ def test_ctrl_c_while_it_is_imported_is_one_line(tmp_path: Path, entry: list[str
 @pytest.mark.parametrize("moment", ["keep_programs", "app", "atexit"])
 def test_ctrl_c_at_either_end_of_a_command_leaves_no_traceback(moment: str) -> None:
     stop = "lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)"
-    where = f"atexit.register({stop})" if moment == "atexit" else f"app.{moment} = {stop}"
-    code = f"import atexit, os, signal, gmem_start; from gmem_jax.command import app; {where}; gmem_start.main()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    where = {
+        "keep_programs": f"compilation_cache.keep_programs = {stop}",
+        "app": f"app.app = {stop}",
+        "atexit": f"atexit.register({stop})",
+    }[moment]
+    modules = "from gmem_jax.command import app; from gmem_jax.files import compilation_cache"
+    code = f"import atexit, os, signal, gmem_start; {modules}; {where}; gmem_start.main()"
+    done = subprocess.run([sys.executable, "-c", code, "info"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 130
     assert "Traceback" not in done.stderr
     assert len(done.stderr.splitlines()) <= 1
