@@ -4,8 +4,10 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import matplotlib
 import numpy as np
 import pytest
@@ -122,6 +124,16 @@ def no_home() -> Path:
     raise RuntimeError("Could not determine home directory.")
 
 
+@pytest.fixture
+def no_programs() -> Iterator[None]:
+    """JAX keeps no programs yet, as in a process that has just begun."""
+    folder = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    yield
+    jax.config.update("jax_compilation_cache_dir", folder)
+
+
+@pytest.mark.usefixtures("no_programs")
 def test_a_user_without_a_home_keeps_nothing_and_is_told_where_a_home_is_needed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -132,6 +144,7 @@ def test_a_user_without_a_home_keeps_nothing_and_is_told_where_a_home_is_needed(
     assert kept_pack("tetra-31680-a") is None
     assert gmem(monkeypatch, "--help") == 0
     assert gmem(monkeypatch, "show", "tetra-325-a") == 0
+    assert jax.config.jax_compilation_cache_dir is None
     capsys.readouterr()
     assert gmem(monkeypatch, "prepare", "tetra-31680-a") == 2
     assert "there is no home folder to keep it in; set XDG_CACHE_HOME" in capsys.readouterr().err
