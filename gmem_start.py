@@ -1,8 +1,9 @@
-"""The start and the end of the `gmem` command, outside the package: importing that takes a second or two.
+"""The start and the end of the `gmem` command, outside the package: what a command imports takes a second.
 
-What happens in them is told in one line: Ctrl-C, and a setting that JAX refuses as soon as it is imported.
+Ctrl-C in them is told in one line.
 """
 
+import gc
 import os
 import signal
 import sys
@@ -28,21 +29,28 @@ def _answer(handler: object) -> None:
         signal.signal(signal.SIGINT, handler)  # type: ignore[arg-type]
 
 
-# `python -m gmem_jax` imports the package, and that this module, before it comes to `main`.
-if sys.argv[:1] == ["-m"] and "gmem_jax" in sys.orig_argv:
+# Whether this process is the command: `python -m gmem_jax` imports the package, and that this module, before `main`.
+alone = sys.argv[:1] == ["-m"] and "gmem_jax" in sys.orig_argv
+if alone:
     _answer(_interrupted)
+
+
+def imported() -> None:
+    """Leave Ctrl-C to the command, and garbage to Python, from now on: all that it needs is imported."""
+    if alone:
+        gc.enable()
+        _answer(BEFORE)
 
 
 def main() -> None:
     """Entry point of the `gmem` command."""
+    global alone
+    alone = True
     _answer(_interrupted)
+    gc.disable()  # an import makes no garbage, and looking for it takes a tenth of a second
     try:
         from gmem_jax.command.app import main as begin
-    except ValueError as error:  # JAX's, for JAX_ENABLE_X64=maybe and the like
-        sys.stderr.write(f"gmem: cannot start: {' '.join(str(error).split())}\n")
-        sys.exit(2)
-    try:
-        _answer(BEFORE)
+
         begin()
     except KeyboardInterrupt:  # before it listens, or once more while it tells of the first
         _leave()

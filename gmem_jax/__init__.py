@@ -11,36 +11,40 @@ Units are R = E = rho = 1 (time in t_c = R sqrt(rho/E)); `Material` converts. As
 import importlib
 from typing import TYPE_CHECKING, Any
 
-import gmem_start  # noqa: F401 - first: where this is `python -m gmem_jax`, it answers Ctrl-C from now on
-from gmem_jax.derivatives.gradient import value_and_grad
-from gmem_jax.derivatives.jacobian import exact as jacobian
-from gmem_jax.design.kernel import KernelMatrix, MemoryKernel, kernel_matrix, memory_kernel
-from gmem_jax.errors import FileFormatError, RunFailedError
-from gmem_jax.experiment.analysis import running_mean
-from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.pack import Pack, pack_from, stack
-from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
-from gmem_jax.experiment.record import describe, to_dict
-from gmem_jax.experiment.samples import waveform_from
-from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, signals, six_signals, waveform, words
-from gmem_jax.experiment.stages import compress, cycle, hold, read, rest, shake, train, write
-from gmem_jax.experiment.stepping import stable_step
-from gmem_jax.files.configuration import from_dict
-from gmem_jax.files.datasets import to_csv, to_xarray
-from gmem_jax.files.packs import list_packs, load_pack, save_pack
-from gmem_jax.files.protocols import load_protocol, save_protocol
-from gmem_jax.files.recalls import load_recall, save_recall
-from gmem_jax.files.waveforms import load_waveforms, save_waveforms
-from gmem_jax.physics.contact.frictionless import Frictionless
-from gmem_jax.physics.contact.hooke import Hooke
-from gmem_jax.physics.contact.mindlin import Mindlin
-from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
-from gmem_jax.physics.grain import Clump, clump, sphere, tetra
-from gmem_jax.physics.material import Material
-from gmem_jax.physics.state import Status, explain
-from gmem_jax.preparation.preparation import prepare
-from gmem_jax.preparation.recipe import Recipe
-from gmem_jax.simulation.protocol import Drive, Protocol, Stage
+import gmem_start  # first: where this is `python -m gmem_jax`, it answers Ctrl-C from now on
+
+# In a process of the command a module loads what it needs, and `gmem --help` nothing.
+if TYPE_CHECKING or not gmem_start.alone:
+    from gmem_jax.derivatives.gradient import value_and_grad
+    from gmem_jax.derivatives.jacobian import exact as jacobian
+    from gmem_jax.design.kernel import KernelMatrix, MemoryKernel, kernel_matrix, memory_kernel
+    from gmem_jax.errors import FileFormatError, RunFailedError
+    from gmem_jax.experiment.analysis import running_mean
+    from gmem_jax.experiment.experiment import Experiment, replace
+    from gmem_jax.experiment.pack import Pack, pack_from, stack
+    from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
+    from gmem_jax.experiment.record import describe, to_dict
+    from gmem_jax.experiment.samples import waveform_from
+    from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, signals, six_signals, waveform, words
+    from gmem_jax.experiment.stages import compress, cycle, hold, read, rest, shake, train, write
+    from gmem_jax.experiment.stepping import stable_step
+    from gmem_jax.files.cache import list_packs
+    from gmem_jax.files.configuration import from_dict
+    from gmem_jax.files.datasets import to_csv, to_xarray
+    from gmem_jax.files.packs import load_pack, save_pack
+    from gmem_jax.files.protocols import load_protocol, save_protocol
+    from gmem_jax.files.recalls import load_recall, save_recall
+    from gmem_jax.files.waveforms import load_waveforms, save_waveforms
+    from gmem_jax.physics.contact.frictionless import Frictionless
+    from gmem_jax.physics.contact.hooke import Hooke
+    from gmem_jax.physics.contact.mindlin import Mindlin
+    from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
+    from gmem_jax.physics.grain import Clump, clump, sphere, tetra
+    from gmem_jax.physics.material import Material
+    from gmem_jax.physics.state import Status, explain
+    from gmem_jax.preparation.preparation import prepare
+    from gmem_jax.preparation.recipe import Recipe
+    from gmem_jax.simulation.protocol import Drive, Protocol, Stage
 
 if TYPE_CHECKING:
     from gmem_jax.design.by_kernel import design_by_kernel

@@ -1,17 +1,26 @@
-"""Double precision everywhere, no programs kept or delayed, and what many tests read."""
+"""Double precision everywhere, every program compiled once, and what many tests read."""
 
+import atexit
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-os.environ["GMEM_COMPILE_CACHE"] = "off"  # before the package, which tells its library as soon as it is imported
+# Workers of xdist, and the processes that tests start, find what others have compiled. It is gone at the end.
+# Set before the package is imported, which tells its library of the folder at once.
+if "GMEM_COMPILE_CACHE" not in os.environ:
+    programs = tempfile.TemporaryDirectory(prefix="gmem-programs-")
+    os.environ["GMEM_COMPILE_CACHE"] = programs.name
+    atexit.register(programs.cleanup)
 
 import jax
 import pytest
 
 import gmem_jax as gm
+from gmem_jax.files.compilation_cache import keep_programs
 
 jax.config.update("jax_enable_x64", True)
+keep_programs()
 
 
 @pytest.fixture(autouse=True)

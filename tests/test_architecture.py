@@ -115,7 +115,10 @@ import sys
 import gmem_jax
 from jax._src import xla_bridge
 heavy = [name for name in ("flax", "optax", "matplotlib", "plotly", "rich", "jax_md") if name in sys.modules]
-import gmem_jax.command.app
+from gmem_jax.command.app import app, command_named
+from typer.main import get_command
+for name in get_command(app).commands:
+    command_named(name)
 heavy += [name for name in ("scipy", "matplotlib", "jax_md") if name in sys.modules]
 print(xla_bridge.backends_are_initialized(), *heavy)
 """
@@ -124,6 +127,25 @@ print(xla_bridge.backends_are_initialized(), *heavy)
 def test_importing_the_package_or_its_command_starts_no_backend_and_loads_nothing_heavy() -> None:
     done = subprocess.run([sys.executable, "-c", LOADING], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False"]
+
+
+STARTING = """
+import sys
+import gmem_start
+sys.argv = ["gmem", *sys.argv[1].split()]
+try:
+    gmem_start.main()
+except SystemExit:
+    slow = ("jax", "numpy", "h5py", "pydantic", "gmem_jax.experiment.experiment")
+    sys.stderr.write(" ".join(name for name in slow if name in sys.modules))
+"""
+
+
+@pytest.mark.parametrize(("arguments", "loaded"), [("--help", ""), ("--version", ""), ("info", "jax numpy")])
+def test_what_is_told_at_once_loads_no_more_than_it_needs(arguments: str, loaded: str) -> None:
+    done = subprocess.run([sys.executable, "-c", STARTING, arguments], capture_output=True, text=True, check=True)
+    assert done.stdout
+    assert done.stderr == loaded
 
 
 def text_without_encoding(source: str) -> list[int]:

@@ -14,7 +14,7 @@ import pytest
 import typer
 
 import gmem_jax as gm
-from gmem_jax.command.app import app
+from gmem_jax.command.app import app, command_named
 from gmem_jax.command.sweep import planned
 from gmem_jax.sweeps.spec import read_spec
 
@@ -103,7 +103,7 @@ def test_tests_that_are_named_are_there(file: str) -> None:
 
 
 ROOT_COMMAND: Any = typer.main.get_command(app)
-COMMANDS = ROOT_COMMAND.commands
+COMMANDS = {name: command_named(name) for name in ROOT_COMMAND.commands}
 
 
 def parsed(words: list[str]) -> None:

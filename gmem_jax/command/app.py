@@ -3,22 +3,39 @@
 import os
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from typing import Annotated, Any
 
-import jax
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
-from gmem_jax.command import benchmark, classify, derive, exchange, packs, recalls, report, reproduce, show, sweep
+import gmem_start
 from gmem_jax.command.console import GIVEN, RunInterruptedError, UnheardError, log, print_result
 from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.provenance import versions
-from gmem_jax.files.compilation_cache import keep_programs
-from gmem_jax.physics.rules import StartError, usual_rules, why_not_started
-from gmem_jax.simulation.progress import no_further_bar
 
 INTERRUPTED = 130
+_LISTED = {  # the commands in their order: the module of each, and the beginning of its help for `gmem --help`
+    "info": ("info", "Versions, devices, backend and shipped packs."),
+    "prepare": ("packs", "Prepare a pack: gas, pressure, frictionless cycles, rest."),
+    "recall": ("recalls", "Store waveforms in a pack and recall them."),
+    "demo": ("recalls", "The main job: six waveforms stored in a pack and recalled."),
+    "show": ("show", "What a file holds; with --plot, a picture of it."),
+    "export": ("exchange", "Write a pack or the frames of a recall for other programs."),
+    "import": ("exchange", "Make a pack of equal clumps of equal spheres at rest in a box."),
+    "classify": ("classify", "Read recalled binary words."),
+    "gradient": ("derive", "Exact derivatives of the fidelity."),
+    "kernel": ("derive", "The linear memory kernel of a pack."),
+    "design": ("derive", "Pre-distort waveforms so that recalls follow their integrals."),
+    "tune": ("derive", "Choose gamma0, mu and the friction stiffness within bounds."),
+    "sweep": ("sweep", "Vary anything: packs made once, points side by side."),
+    "report": ("report", "One page of all that files hold, to be looked at in a browser."),
+    "reproduce": ("reproduce", "Run a figure of the paper again, beside the published points."),
+    "bench": ("benchmark", "Measure what a grain-step costs."),
+}
 _ELSEWHERE = {  # what is not a command and near none, and how it is done
     "view": "gm.view shows a pack or a recall in a notebook, gmem report FILE as a page for a browser",
     "run": "gmem recall runs an experiment, gmem sweep many",
@@ -31,16 +48,35 @@ _ELSEWHERE = {  # what is not a command and near none, and how it is done
 }
 
 
+def _typer_s_own_are_off(params: list[Any]) -> list[Any]:
+    """The same: --help and the like, not given, are False; for a None typer imports pydantic, a tenth of a second."""
+    for one in params:
+        if not one.expose_value and one.default is None:
+            one.default = False
+    return params
+
+
 class _Commands(TyperGroup):
+    """The list of commands. What each needs, JAX and all, is imported when it is called or asked for its own help."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        for name, (_, line) in _LISTED.items():
+            self.add_command(TyperCommand(name, help=line, rich_markup_mode=None))
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        return _typer_s_own_are_off(super().get_params(ctx))
+
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         try:
-            return super().resolve_command(ctx, args)
+            name, command, others = super().resolve_command(ctx, args)
         except TyperException as error:
             if args[0] in _ELSEWHERE:
                 error.message = f"No such command {args[0]!r}: {_ELSEWHERE[args[0]]}"
             elif "Did you mean" not in error.message:
                 error.message = f"No such command {args[0]!r}; there are {', '.join(self.commands)}"
             raise
+        return name, command and command_named(str(name)), others
 
 
 def _longest(names: list[str]) -> list[str]:
@@ -48,16 +84,50 @@ def _longest(names: list[str]) -> list[str]:
 
 
 class _Command(TyperCommand):
+    def get_params(self, ctx: Any) -> list[Any]:
+        return _typer_s_own_are_off(super().get_params(ctx))
+
     def invoke(self, ctx: Any) -> Any:
         typed = [one for one in self.params if "COMMANDLINE" in str(ctx.get_parameter_source(str(one.name)))]
         GIVEN.set({str(one.name): "/".join(_longest(one.opts) + _longest(one.secondary_opts)) for one in typed})
-        return super().invoke(ctx)
+        gmem_start.imported()
+        with _rules_of_commands():
+            return super().invoke(ctx)
+
+
+def command_named(name: str) -> Any:
+    """A command with its options.
+
+    Raises:
+        ValueError: if JAX refuses a setting of the user's.
+    """
+    try:
+        module = import_module(f"gmem_jax.command.{_LISTED[name][0]}")
+    except ValueError as error:  # JAX's, for JAX_ENABLE_X64=maybe and the like
+        raise ValueError(f"cannot start: {error}") from error
+    only = typer.Typer(rich_markup_mode=None, add_completion=False)
+    only.command(name, cls=_Command)(module.COMMANDS[name])
+    return typer.main.get_command(only)
+
+
+@contextmanager
+def _rules_of_commands() -> Iterator[None]:
+    """JAX as commands need it: in double precision, with programs that are kept."""
+    import jax
+
+    from gmem_jax.files.compilation_cache import keep_programs
+    from gmem_jax.physics.rules import usual_rules
+    from gmem_jax.simulation.progress import no_further_bar
+
+    jax.config.update("jax_enable_x64", True)
+    keep_programs()
+    if getattr(jax.config, "jax_disable_jit", False):
+        log("warning: JAX_DISABLE_JIT is set: nothing is compiled, and a run takes hours for seconds", style="yellow")
+    with no_further_bar(), usual_rules():
+        yield
 
 
 app = typer.Typer(cls=_Commands, rich_markup_mode=None, help="Waveform memory in granular packs.")
-for group in (packs, recalls, show, exchange, classify, derive, sweep, report, reproduce, benchmark):
-    for name, command in group.COMMANDS.items():
-        app.command(name, cls=_Command)(command)
 
 
 def _version(wanted: bool) -> None:
@@ -85,6 +155,10 @@ _NATIVE = "gmem_jax native: "  # what the library's own refusals begin with
 
 def _of_jax(error: Exception) -> str:
     """What an error says that no line of ours raised, where the machine or its settings are at fault; else ""."""
+    import jax
+
+    from gmem_jax.physics.rules import StartError, why_not_started
+
     said = " ".join(str(error).split())
     if isinstance(error, StartError):
         return said
@@ -107,16 +181,11 @@ def _open_streams() -> None:
 
 
 def main() -> None:
-    """The `gmem` command, once all is imported; see `gmem_start`."""
+    """The `gmem` command, between its start and its end in `gmem_start`."""
     _open_streams()
-    jax.config.update("jax_enable_x64", True)
     warnings.showwarning = _one_line
-    keep_programs()
-    if getattr(jax.config, "jax_disable_jit", False):
-        log("warning: JAX_DISABLE_JIT is set: nothing is compiled, and a run takes hours for seconds", style="yellow")
     try:
-        with no_further_bar(), usual_rules():
-            code = app(args=sys.argv[1:] or ["--help"], prog_name="gmem", standalone_mode=False)
+        code = app(args=sys.argv[1:] or ["--help"], prog_name="gmem", standalone_mode=False)
         if code == INTERRUPTED:  # typer's word for Ctrl-C outside of a run
             raise KeyboardInterrupt
         sys.exit(code if isinstance(code, int) else 0)

@@ -8,7 +8,8 @@ import typer
 from gmem_jax.bench import gpu, measure
 from gmem_jax.bench.table import markdown, save_benchmark
 from gmem_jax.command.console import AsJson, InputError, check_output, print_result, refuse_idle, reporting
-from gmem_jax.files.packs import list_packs, load_pack
+from gmem_jax.files.cache import list_packs
+from gmem_jax.files.packs import load_pack
 from gmem_jax.files.validation import json_of, refusing
 
 

@@ -11,24 +11,20 @@ from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import psutil
 import typer
-from rich import progress
 from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 
 from gmem_jax.files.atomic import probe
 from gmem_jax.files.ours import promise
-from gmem_jax.files.results import finite
-from gmem_jax.files.sizes import in_bytes, in_time
-from gmem_jax.files.validation import NAME, printable, title
-from gmem_jax.native import require_threads
-from gmem_jax.show.figure import Figure
-from gmem_jax.show.render_matplotlib import to_matplotlib
-from gmem_jax.simulation.progress import Progress
+from gmem_jax.files.printing import finite, printable
+
+if TYPE_CHECKING:  # what JAX is imported for, is imported where it is used: `gmem --help` needs none
+    from gmem_jax.show.figure import Figure
+    from gmem_jax.simulation.progress import Progress
 
 stderr = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
 out = Console(highlight=False, markup=False)
@@ -161,6 +157,8 @@ def require_name(name: str) -> None:
     Raises:
         InputError: saying so.
     """
+    from gmem_jax.files.validation import NAME, title
+
     if not title(name):
         raise InputError(f"--name: must be a line of at most {NAME} printable characters")
 
@@ -224,6 +222,11 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
         InputError: saying what is needed and what there is.
         ValueError: if GMEM_THREADS is no number of threads.
     """
+    import psutil
+
+    from gmem_jax.files.sizes import in_bytes, in_time
+    from gmem_jax.native import require_threads
+
     if backend == "native":
         require_threads()
     free = psutil.virtual_memory().available
@@ -241,11 +244,13 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
 
 def emit_cost(as_json: bool, cost: dict[str, float], output: Path, disk_bytes: float) -> None:
     """The result of a dry run: what `announce` returned, and what the output takes of the disk."""
+    from gmem_jax.files.sizes import in_bytes
+
     line = f"disk: {in_bytes(disk_bytes)} for {output}; nothing was run or written"
     print_result(as_json, {**cost, "disk_bytes": disk_bytes, "status": 0}, line)
 
 
-def draw_beside(picture: Path | None, figure: Callable[[], Figure]) -> str:
+def draw_beside(picture: Path | None, figure: "Callable[[], Figure]") -> str:
     """Draw a picture beside a result that is written already: what goes wrong is a warning, and nothing is lost.
 
     Args:
@@ -255,6 +260,8 @@ def draw_beside(picture: Path | None, figure: Callable[[], Figure]) -> str:
     Returns:
         " and FILE", for the line that says what was written; "" if nothing was.
     """
+    from gmem_jax.show.render_matplotlib import to_matplotlib
+
     if picture is None:
         return ""
     try:
@@ -267,7 +274,7 @@ def draw_beside(picture: Path | None, figure: Callable[[], Figure]) -> str:
 
 
 @contextlib.contextmanager
-def reporting(*, goes_on: bool = False) -> Iterator[Progress]:
+def reporting(*, goes_on: bool = False) -> "Iterator[Progress]":
     """Progress of a run: a bar on a terminal; elsewhere a line for every stage, and one at least every 30 s.
 
     Args:
@@ -283,7 +290,9 @@ def reporting(*, goes_on: bool = False) -> Iterator[Progress]:
 
 
 @contextlib.contextmanager
-def _reporting() -> Iterator[Progress]:
+def _reporting() -> "Iterator[Progress]":
+    from rich import progress
+
     if not stderr.is_terminal:
         told, at = "", -math.inf
         first: tuple[float, float] | None = None  # when the first chunk was done: what came before is compiling

@@ -265,7 +265,7 @@ def design_command(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Pre-distort waveforms so that the recall follows their integrals; writes a CSV for `gmem recall` (minutes)."""
+    """Pre-distort waveforms so that recalls follow their integrals; writes a CSV for `gmem recall` (minutes)."""
     if by not in (None, "jacobian", "kernel"):
         raise InputError(f"--by must be jacobian or kernel, got {by!r}")
     if words is not None:

@@ -34,7 +34,7 @@ def export(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a pack, or the configurations along a recall, for other programs (docs/exchange.md)."""
+    """Write a pack or the frames of a recall for other programs (docs/exchange.md)."""
     file = pack_called(str(file)) or file
     if schema_of(file) == PACK.name:
         pack = load_pack(file)

@@ -1,11 +1,10 @@
-"""`gmem info`, `gmem prepare`."""
+"""`gmem prepare`."""
 
 import time
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import typer
 
 from gmem_jax import native
@@ -27,10 +26,10 @@ from gmem_jax.command.console import (
 from gmem_jax.command.options import with_recipe
 from gmem_jax.command.resuming import Restart, foresee, resumable
 from gmem_jax.experiment.experiment import PAPER_T0
-from gmem_jax.experiment.provenance import provenance, sources
+from gmem_jax.experiment.provenance import sources
 from gmem_jax.experiment.record import fingerprint
-from gmem_jax.files.cache import kept_pack
-from gmem_jax.files.packs import STANDARD_NAME, list_packs, save_pack
+from gmem_jax.files.cache import kept_pack, list_packs
+from gmem_jax.files.packs import STANDARD_NAME, save_pack
 from gmem_jax.files.sizes import pack_bytes
 from gmem_jax.files.spheres import load_clump
 from gmem_jax.physics import grain
@@ -41,23 +40,6 @@ from gmem_jax.preparation.recipe import Recipe, grain_steps, pressure_over_wante
 from gmem_jax.show import tables
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import Sample
-
-
-def info(as_json: AsJson = False) -> None:
-    """Versions, devices, backend and shipped packs."""
-    built, why = native.available()
-    facts: dict[str, Any] = {
-        **provenance(),
-        "devices": [f"{d.platform}: {d.device_kind}" for d in jax.devices()],
-        "backend": f"native ({why})" if built else f"jax (no native backend: {why})",
-        "packs": list_packs(),
-    }
-    lines = [f"{key}: {value}" for key, value in facts["versions"].items()]
-    lines += [f"commit: {facts['commit']}", f"backend: {facts['backend']}"]
-    lines += [f"device: {device}" for device in facts["devices"]]
-    lines += ["shipped packs: " + ", ".join(facts["packs"])]
-    print_result(as_json, facts, "\n".join(lines))
-
 
 PREPARATION_BYTES = 2e4  # of memory a grain: lists while grains fly, at N = 10,240
 CLUMP_OVERLAP = 0.6
@@ -164,4 +146,4 @@ def prepare_command(
     print_result(as_json, result, tables.pack_table(pack))
 
 
-COMMANDS = {"info": info, "prepare": prepare_command}
+COMMANDS = {"prepare": prepare_command}

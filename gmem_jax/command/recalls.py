@@ -36,7 +36,8 @@ from gmem_jax.experiment.recall import frame_schedule, replica_bins, run, run_by
 from gmem_jax.experiment.record import key_of_run, signals_to_dict
 from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.experiment.stepping import require_stable, stable_step
-from gmem_jax.files.packs import list_packs, load_pack
+from gmem_jax.files.cache import list_packs
+from gmem_jax.files.packs import load_pack
 from gmem_jax.files.recalls import save_recall
 from gmem_jax.files.sizes import recall_bytes, sample_bytes
 from gmem_jax.physics.contact.hooke import Hooke
@@ -152,7 +153,7 @@ def demo(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """The main job: six waveforms stored in a shipped pack and recalled; table, recall.h5 and recall.png."""
+    """The main job: six waveforms stored in a pack and recalled; table, recall.h5 and recall.png."""
     shipped = list_packs()
     default = [name for name in shipped if name.startswith("tetra-325")]
     names = default if packs == "all" else packs.split(",") if packs else [TYPICAL]

@@ -8,6 +8,7 @@ import numpy as np
 
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.readings import Readings
+from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import sphere_offsets
 from gmem_jax.physics.rotation import unit
 from gmem_jax.simulation.protocol import Protocol
@@ -35,9 +36,7 @@ def require_inside(pack: Pack) -> None:
     Raises:
         ValueError: naming the first grain that does not, and where it lies; or whose place is no number.
     """
-    position, quaternion = jnp.asarray(pack.position)[..., None], unit(jnp.asarray(pack.quaternion)[..., None])
-    arms = sphere_offsets(quaternion, pack.clump)
-    spheres = np.asarray(position[:, None] + arms)[..., 0]
+    spheres = np.asarray(_spheres(pack.position, pack.quaternion, pack.clump))
     inside = (spheres >= np.asarray(pack.lower)) & (spheres <= np.asarray(pack.upper))
     out = ~np.all(inside, axis=(1, 2))
     if np.any(out):
@@ -49,6 +48,12 @@ def require_inside(pack: Pack) -> None:
             f"pack {pack.name}: grain {grain + 1} does not lie in the box: its centre is at {place}, the box is from "
             f"{lower} to {upper} (R)"
         )
+
+
+@jax.jit
+def _spheres(position: jax.Array, quaternion: jax.Array, clump: Clump) -> jax.Array:
+    """Centres of spheres, [N, K, 3]."""
+    return (position[:, None, :, None] + sphere_offsets(unit(quaternion[..., None]), clump))[..., 0]
 
 
 def require_memory(protocol: Protocol, background: str) -> None:

@@ -7,8 +7,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import jax
-
 
 def _commit() -> str | None:
     """The git commit of a source checkout, read without running git; None for an installed package."""
@@ -60,5 +58,7 @@ def sources() -> dict[str, Any]:
 
 def provenance() -> dict[str, Any]:
     """Versions, git commit and device."""
+    import jax  # here: the version is told without it
+
     device = jax.devices()[0]
     return {**code(), "device": f"{device.platform}: {device.device_kind}"}

@@ -166,8 +166,8 @@ def _number(kind: str, known: tuple[str, ...], wanted: str | int) -> int:
     raise ValueError(f"the recall has no {kind} {wanted!r}; it has {', '.join(known)}")
 
 
-def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
-    """Subtract the background and compare with the integrals."""
+def _compared(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> tuple[Recall, jax.Array]:
+    """Subtract the background and compare with the integrals; and round-off in p_sig over its size, [S]."""
     pack, t0 = experiment.pack, experiment.t0
     step = experiment.timing.dt
     residual = stages[experiment.protocol.before_read].largest_speed[-1] / compression_speed(experiment)
@@ -177,11 +177,10 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
     found = experiment.recalled({name: stages[name].pressure for name in experiment.protocol.reads})
     p_sig = sound * found
     noise = rounding(experiment, stages)
-    part = noise / readable(experiment, found)
     unrecorded = [stage.name for stage in experiment.protocol if not stage.recorded]
     match = experiment.compare(p_sig)
     smooth = experiment.compare(p_sig, pack.ringing_period / jnp.max(jnp.asarray(t0)))
-    return Recall(
+    made = Recall(
         u=(jnp.arange(BINS) + 0.5) / BINS,
         shear=experiment.readings.shears(experiment.sets),
         J=experiment.integral(),
@@ -193,13 +192,25 @@ def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax
         windowed_fidelity=smooth.fidelity,
         window=pack.ringing_period,
         residual_speed=residual,
-        status=status | validity(experiment, stages, match.fidelity, smooth.fidelity, part),
+        status=status,
         stages=OrderedDict((name, sample) for name, sample in stages.items() if name not in unrecorded),
         dt=step,
         protocol=experiment.protocol,
         reads=experiment.readings.reads,
         channels=experiment.readings.channels,
     )
+    return made, noise / readable(experiment, found)
+
+
+def _judged(experiment: Experiment, stages: OrderedDict[str, Sample], found: Recall, noise: jax.Array) -> jax.Array:
+    """The status of a recall, and what makes it doubtful."""
+    return found.status | validity(experiment, stages, found.fidelity, found.windowed_fidelity, noise)
+
+
+def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
+    """The recall that the samples of all stages make."""
+    found, noise = _compared(experiment, stages, status)
+    return dataclasses.replace(found, status=_judged(experiment, stages, found, noise))
 
 
 def _by_stage(sample: Sample, stages: tuple[Stage, ...]) -> "OrderedDict[str, Sample]":
@@ -252,7 +263,15 @@ def gain(experiment: Experiment) -> jax.Array:
 
 _begin = Experiment.begin
 _fan_out = Compiled(Experiment.fan_out)
-finished = Compiled(finish)
+_compare = Compiled(_compared)
+_judge = Compiled(_judged, quick=True)
+
+
+def finished(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
+    """`finish` on the host, in two programs, of which one need not be fast."""
+    found, noise = _compare(experiment, stages, status)
+    judged: Recall = dataclasses.replace(found, status=_judge(experiment, stages, found, noise))
+    return judged
 
 
 def runner_of(experiment: Experiment, **options: Any) -> Runner:

@@ -1,6 +1,7 @@
-"""Where things are kept between runs that no user named: compiled programs, and packs made by name."""
+"""Where things are that no user named: packs that ship, and what is kept between runs, compiled programs and packs."""
 
 import os
+from importlib import resources
 from pathlib import Path
 
 
@@ -18,3 +19,11 @@ def kept_pack(name: str) -> Path | None:
     """Where `gmem prepare NAME` keeps a standard pack; it need not be there. None as in `kept`."""
     folder = kept()
     return folder and folder / "packs" / f"{name}.h5"
+
+
+def list_packs() -> list[str]:
+    """Names of the packs that ship with the package."""
+    folder = resources.files("gmem_jax") / "packs"
+    if not folder.is_dir():
+        return []
+    return sorted(entry.name.removesuffix(".h5") for entry in folder.iterdir() if entry.name.endswith(".h5"))

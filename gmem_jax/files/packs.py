@@ -12,7 +12,7 @@ import numpy as np
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files import pack_validation
-from gmem_jax.files.cache import kept_pack
+from gmem_jax.files.cache import kept_pack, list_packs
 from gmem_jax.files.frames import check_frames, write_frames
 from gmem_jax.files.hdf5 import reading, write_arrays, write_samples, writing
 from gmem_jax.files.schemas import PACK
@@ -155,11 +155,3 @@ def pack_called(name: str) -> Path | None:
         return Path(str(resources.files("gmem_jax") / "packs" / f"{name}.h5"))
     made = kept_pack(name)
     return made if made and STANDARD_NAME.fullmatch(name) and made.is_file() else None
-
-
-def list_packs() -> list[str]:
-    """Names of the packs that ship with the package."""
-    folder = resources.files("gmem_jax") / "packs"
-    if not folder.is_dir():
-        return []
-    return sorted(entry.name.removesuffix(".h5") for entry in folder.iterdir() if entry.name.endswith(".h5"))

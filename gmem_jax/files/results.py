@@ -1,27 +1,18 @@
 """Results as JSON: of a schema, with every field's units and description beside it."""
 
 import json
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.files.atomic import atomic
+from gmem_jax.files.printing import finite
 from gmem_jax.files.schemas import GRADIENT, READING, TUNED, Schema, other_kind
 from gmem_jax.files.validation import is_number, json_of, refusing, require, title, whole
 
 _LARGEST = 1 << 28  # bytes
 _KINDS = (GRADIENT, TUNED, READING)
-
-
-def finite(value: Any) -> Any:
-    """The same with null for numbers that are none, which JSON does not have."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def save_result(path: Path, schema: Schema, result: dict[str, Any]) -> None:

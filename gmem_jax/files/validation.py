@@ -218,11 +218,6 @@ def title(value: Any, most: int = NAME) -> bool:
     return isinstance(value, str) and len(value) <= most and value.isprintable()
 
 
-def printable(text: Any) -> str:
-    """A text in which nothing acts on a terminal: control characters, as in the names of foreign files, are escaped."""
-    return "".join(one if one.isprintable() or one in "\n\t" else ascii(one)[1:-1] for one in str(text))
-
-
 def source(value: Any) -> bool:
     """Whether it can be the path of a file, or the name of a pack."""
     return title(value, PATH)

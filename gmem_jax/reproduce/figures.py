@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from gmem_jax.experiment.experiment import PAPER_T0
-from gmem_jax.files.packs import list_packs
+from gmem_jax.files.cache import list_packs
 from gmem_jax.sweeps.spec import PREPARE, Spec
 
 Values = dict[str, Any]

@@ -12,7 +12,8 @@ from gmem_jax.bench.measure import rival
 from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.packs import list_packs, load_pack
+from gmem_jax.files.cache import list_packs
+from gmem_jax.files.packs import load_pack
 from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.readers import stored_words

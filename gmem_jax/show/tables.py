@@ -18,7 +18,7 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.measures import of_each, read_stress, relative_scale
-from gmem_jax.files.validation import printable
+from gmem_jax.files.printing import printable
 from gmem_jax.files.waveforms import signals_from_dict
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.numbers import plural

@@ -9,13 +9,13 @@ import numpy as np
 
 
 @functools.cache
-def _settings() -> dict[str, Any] | None:
-    """Compiler settings that suit this code on the default device.
+def _settings(quick: bool) -> dict[str, Any] | None:
+    """Compiler settings that suit this code on the default device; `quick` to compile, in a third of the time.
 
     On CPUs XLA's newer fusion emitters do not vectorise the contact law over the replicas; the older ones do, and
     make a step of plain JAX 1.3 times faster (8 replicas, jax 0.9.2). Later releases have no others to choose.
     """
-    settings = {"xla_cpu_use_fusion_emitters": False}
+    settings = {"xla_cpu_use_fusion_emitters": False, **({"xla_backend_optimization_level": 0} if quick else {})}
     if jax.default_backend() != "cpu":
         return None
     try:
@@ -26,15 +26,18 @@ def _settings() -> dict[str, Any] | None:
 
 
 class Compiled:
-    """`jax.jit` with settings chosen when it is first called: importing must not start a backend."""
+    """`jax.jit` with settings chosen when it is first called: importing must not start a backend.
 
-    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
-        self._function, self._options = function, options
+    `quick` is for what is called once in a run, on small arrays, for answers that round-off does not change.
+    """
+
+    def __init__(self, function: Callable[..., Any], *, quick: bool = False, **options: Any) -> None:
+        self._function, self._quick, self._options = function, quick, options
 
     @functools.cached_property
     def program(self) -> Any:
         """What `jax.jit` made."""
-        return jax.jit(self._function, compiler_options=_settings(), **self._options)
+        return jax.jit(self._function, compiler_options=_settings(self._quick), **self._options)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Call it."""

@@ -23,9 +23,10 @@ from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import PART_FILES, is_locked, locked
 from gmem_jax.files.ours import Folder, remove_leftovers
+from gmem_jax.files.printing import printable
 from gmem_jax.files.recalls import load_recall, save_recall
 from gmem_jax.files.schemas import SWEEP
-from gmem_jax.files.validation import NAME, is_number, printable, source, title, whole
+from gmem_jax.files.validation import NAME, is_number, source, title, whole
 from gmem_jax.sweeps.plan import Point
 
 SWEEP_MARKER = "sweep.json"

@@ -1,6 +1,7 @@
 """The `gmem` command as a user meets it: results, JSON, and one clear line for every kind of bad input."""
 
 import json
+import re
 import subprocess
 import sys
 from importlib import metadata
@@ -70,9 +71,15 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, command: str) -> None:
+def test_every_command_has_help_that_begins_with_its_line_in_the_list(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, command: str
+) -> None:
+    assert gmem(monkeypatch, "--help") == 0
+    [line] = re.findall(rf"^  {command} +(.*)\.$", capsys.readouterr().out, re.MULTILINE)
     assert gmem(monkeypatch, command, "--help") == 0
-    assert "--json" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "--json" in told
+    assert " ".join(told.partition("\n\n")[2].split()).startswith(line)
 
 
 def test_a_recall_writes_data_and_picture_and_prints_json(

@@ -285,8 +285,12 @@ def test_more_signals_than_fit_are_said_to_be_more(
     assert [axis.get_title() for axis in figure.axes[:3]] == ["0000000", "0000001", "0000010"]
 
 
-def test_commands_are_completed_in_a_shell(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    for name, value in (("_GMEM_COMPLETE", "complete_bash"), ("COMP_WORDS", "gmem sh"), ("COMP_CWORD", "1")):
+@pytest.mark.parametrize(("words", "completed"), [("gmem sh", "show"), ("gmem show --pl", "--plot")])
+def test_commands_and_options_are_completed_in_a_shell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, words: str, completed: str
+) -> None:
+    last = str(len(words.split()) - 1)
+    for name, value in (("_GMEM_COMPLETE", "complete_bash"), ("COMP_WORDS", words), ("COMP_CWORD", last)):
         monkeypatch.setenv(name, value)
     assert gmem(monkeypatch) == 0
-    assert capsys.readouterr().out.split() == ["show"]
+    assert capsys.readouterr().out.split() == [completed]

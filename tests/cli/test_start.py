@@ -4,8 +4,10 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import jax
 import matplotlib
 import numpy as np
 import pytest
@@ -93,7 +95,7 @@ def test_ctrl_c_while_it_is_imported_is_one_line(tmp_path: Path, entry: list[str
     paths = os.pathsep.join([str(tmp_path), str(ROOT)])
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(
-        [sys.executable, *entry], **pipes, text=True, env={**os.environ, "PYTHONPATH": paths}
+        [sys.executable, *entry, "info"], **pipes, text=True, env={**os.environ, "PYTHONPATH": paths}
     ) as process:
         process.stdout.readline()
         process.send_signal(signal.SIGINT)
@@ -105,9 +107,14 @@ def test_ctrl_c_while_it_is_imported_is_one_line(tmp_path: Path, entry: list[str
 @pytest.mark.parametrize("moment", ["keep_programs", "app", "atexit"])
 def test_ctrl_c_at_either_end_of_a_command_leaves_no_traceback(moment: str) -> None:
     stop = "lambda *_, **__: os.kill(os.getpid(), signal.SIGINT)"
-    where = f"atexit.register({stop})" if moment == "atexit" else f"app.{moment} = {stop}"
-    code = f"import atexit, os, signal, gmem_start; from gmem_jax.command import app; {where}; gmem_start.main()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    where = {
+        "keep_programs": f"compilation_cache.keep_programs = {stop}",
+        "app": f"app.app = {stop}",
+        "atexit": f"atexit.register({stop})",
+    }[moment]
+    modules = "from gmem_jax.command import app; from gmem_jax.files import compilation_cache"
+    code = f"import atexit, os, signal, gmem_start; {modules}; {where}; gmem_start.main()"
+    done = subprocess.run([sys.executable, "-c", code, "info"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 130
     assert "Traceback" not in done.stderr
     assert len(done.stderr.splitlines()) <= 1
@@ -117,6 +124,16 @@ def no_home() -> Path:
     raise RuntimeError("Could not determine home directory.")
 
 
+@pytest.fixture
+def no_programs() -> Iterator[None]:
+    """JAX keeps no programs yet, as in a process that has just begun."""
+    folder = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    yield
+    jax.config.update("jax_compilation_cache_dir", folder)
+
+
+@pytest.mark.usefixtures("no_programs")
 def test_a_user_without_a_home_keeps_nothing_and_is_told_where_a_home_is_needed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -127,6 +144,7 @@ def test_a_user_without_a_home_keeps_nothing_and_is_told_where_a_home_is_needed(
     assert kept_pack("tetra-31680-a") is None
     assert gmem(monkeypatch, "--help") == 0
     assert gmem(monkeypatch, "show", "tetra-325-a") == 0
+    assert jax.config.jax_compilation_cache_dir is None
     capsys.readouterr()
     assert gmem(monkeypatch, "prepare", "tetra-31680-a") == 2
     assert "there is no home folder to keep it in; set XDG_CACHE_HOME" in capsys.readouterr().err
