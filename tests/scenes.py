@@ -26,6 +26,7 @@ from gmem_jax.simulation.strain import StrainPath
 TESTS = Path(__file__).parent
 ROOT = TESTS.parent
 TETRA_27 = TESTS / "data" / "tetra-27.h5"
+PERIODIC_27 = TESTS / "data" / "periodic-27.h5"
 
 ELASTIC = Material(normal_damping=0.0)
 SPHERE = sphere()

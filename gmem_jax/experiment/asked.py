@@ -39,7 +39,7 @@ def require_inside(pack: Pack) -> None:
     arms = sphere_offsets(quaternion, pack.clump)
     spheres = np.asarray(position[:, None] + arms)[..., 0]
     inside = (spheres >= np.asarray(pack.lower)) & (spheres <= np.asarray(pack.upper))
-    out = ~np.all(inside, axis=(1, 2))
+    out = ~np.all(inside | (np.asarray(pack.periodic) & np.isfinite(spheres)), axis=(1, 2))
     if np.any(out):
         grain = int(np.argmax(out))
         if not np.all(np.isfinite(spheres[grain])):
