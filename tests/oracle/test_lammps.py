@@ -24,6 +24,7 @@ from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.rotation import cross, dot
+from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box
 from gmem_jax.simulation.compiled import Compiled
 
@@ -331,3 +332,57 @@ def test_a_dense_pack_under_strain_agrees_with_our_own_arms_within_their_differe
     # The rolling part of the sliding velocity differs by p / 2R, 5 % here. Measured: 1.4e-3 and 2e-5.
     assert position < 4e-3
     assert force < 5e-5
+
+
+# ---------------------------------------------------------------- a periodic box
+
+
+def forces_in_a_cell(system, grains, box, folder):
+    """Forces on all spheres at the beginning, ours and theirs, [S, 3] each, in a periodic box that may grow."""
+
+    def ours(grains):
+        table, _ = dynamics.sphere_table(system.clump, grains, box)
+        history = system.friction.init(system.pairs.capacity, 1, float)
+        return dynamics.contact_forces(system, table, history, jnp.zeros(()), jnp.asarray(True), box)[0], table
+
+    found, table = jax.jit(ours)(grains)
+    planes = (leaf[:, 0] for leaf in map(np.asarray, (box.lower, box.upper, box.lower_velocity, box.upper_velocity)))
+    spheres, velocity, spin = (np.asarray(table)[:, start : start + 3, 0] for start in (0, 3, 6))
+    quaternion = np.asarray(grains.quaternion)[..., 0]
+    if system.clump.spheres == 1:  # LAMMPS wraps places, and leaves velocities as they are
+        lengths, growth = (np.asarray(of)[:, 0] for of in (box.lengths, box.growth))
+        images = np.floor((spheres - np.asarray(box.lower)[:, 0]) / lengths)
+        at = (spheres - images * lengths, quaternion, velocity - images * growth, spin)
+    else:
+        at = (np.asarray(grains.position)[..., 0], quaternion, np.zeros((len(quaternion), 3)), 0.0 * quaternion[:, 1:])
+    scene = lammps.Scene(system.clump, *at, *planes, periodic=box.periodic)
+    script = lammps.scene_script(scene, system.friction, MATERIAL, 0.3, folder)
+    run = lammps.run_lammps(script, folder, steps=1, every=1, per_grain=system.clump.spheres)  # 0 steps have no rates
+    return np.asarray(found)[:, :3, 0], run.force[0]
+
+
+def test_forces_in_a_periodic_pack_at_rest_are_those_of_lammps(tmp_path):
+    pack = gm.load_pack(scenes.PERIODIC_27)
+    system = dynamics.System(pack.clump, HOOKE, pack.pairs)
+    grains = scenes.make_grains(pack.position, pack.quaternion)
+    ours, theirs = forces_in_a_cell(system, grains, pack.box, tmp_path)
+    assert np.abs(ours).max() > 1e-3
+    np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-10 * np.abs(ours).max())
+
+
+@pytest.mark.usefixtures("lammps_kinematics")
+def test_forces_between_moving_spheres_in_a_cell_that_is_strained_are_those_of_lammps(tmp_path):
+    """Damping and friction see the velocities of images: LAMMPS adds the growth of the cell to those ("remap v")."""
+    random, edges = np.random.default_rng(2), np.array([6.0, 6.3, 6.6])
+    lattice = (np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / 4.0
+    place = lattice * edges + 0.1 * random.normal(size=(64, 3)) - 0.7
+    velocity, spin = (1e-3 * random.normal(size=(64, 3)) for _ in range(2))
+    lower, upper = jnp.zeros((3, 1)), jnp.asarray(edges)[:, None]
+    growth = upper * jnp.asarray([-3e-3, 2e-3, -1e-3])[:, None]
+    box = Box(lower, upper, -0.5 * growth, 0.5 * growth, (True, True, True))
+    grains = scenes.make_grains(place, None, velocity, spin)
+    pairs = PairFinder(gm.sphere(), edges, 0.5)(grains, gm.sphere(), box)
+    system = dynamics.System(gm.sphere(), MindlinRescaled(), pairs)
+    ours, theirs = forces_in_a_cell(system, grains, box, tmp_path)
+    assert np.abs(ours).max() > 1e-2
+    np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-10 * np.abs(ours).max())
