@@ -129,3 +129,21 @@ def test_a_periodic_pack_recalls_what_was_written() -> None:
     rest, read = recall.stages["rest"], recall.stages["readout"]
     np.testing.assert_allclose(rest.pressure[0, :, 0], PACK.info["at_rest"]["pressure"], rtol=1e-3)
     assert np.all(read.pressure[0, :2, 0] > 3.0 * rest.pressure[0, :2, 0])
+
+
+@pytest.mark.slow
+def test_the_gradient_through_a_recall_of_a_periodic_pack_is_its_differences() -> None:
+    bumps = gm.Bumps(jnp.asarray([[1.0, -0.6]]), jnp.asarray([[0.3, 0.7]]), 0.2)
+    short = {"t0": 75.0, "dt": 0.3, "rest": 0.1, "hold": 0.1, "store": 0.2}
+    experiment = gm.Experiment(PACK, bumps, gm.Hooke(mu=0.8), **short)
+
+    def moment(_: gm.Experiment, p_sig: jnp.ndarray) -> jnp.ndarray:
+        return 1e6 * jnp.sum(p_sig * jnp.linspace(0.0, 1.0, p_sig.shape[-1]))
+
+    def value(**changes: float) -> float:
+        return float(moment(experiment, gm.run(gm.replace(experiment, changes), progress=False).p_sig))
+
+    found = gm.value_and_grad(experiment, ("gamma0", "friction.stiffness"), loss=moment, progress=False).slope
+    for name, at, by, within in (("gamma0", 1e-3, 1e-8, 1e-5), ("friction.stiffness", 0.13, 1e-6, 1e-4)):
+        difference = (value(**{name: at + by}) - value(**{name: at - by})) / (2.0 * by)
+        assert float(found[name]) == pytest.approx(difference, rel=within)
