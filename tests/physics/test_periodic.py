@@ -142,6 +142,26 @@ def test_two_grains_that_meet_through_an_image_feel_what_the_same_two_feel_unwra
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-14)
 
 
+def test_a_free_grain_goes_straight_on_while_its_cell_grows_steadily() -> None:
+    """Newton: dx/dt is constant, and v = dx/dt - x dL/dt / L is what changes; to second order in the step."""
+    rate, box = np.array([-2e-3, 3e-3, -1e-3]), cell(np.array([20.0, 24.0, 22.0]), origin=-10.0)
+    at, own = np.array([3.0, -4.0, 5.0]), np.array([0.02, -0.01, 0.03])
+    centre = np.asarray(0.5 * (box.lower + box.upper))[:, 0]
+    straight = at + 100.0 * (own + rate * (at - centre))
+    errors = []
+    for dt in (2.0, 1.0):
+        grains = make_grains([at], None, [own])
+        system = dynamics.System(SPHERE, Hooke(), PairFinder(SPHERE, EDGES, 1.0)(grains, SPHERE, box))
+        state = dynamics.start(system, grains.position, grains.quaternion, box)
+        moving = strained(box, 1, 0.0, rate)  # at its beginning, but growing
+        state = replace(state, grains=grains, cell=jax.tree.map(lambda leaf: leaf[0], moving))
+        state = dynamics.accelerate(system, state, state.cell)
+        state, _ = march(system, state, strained(box, round(100.0 / dt), dt, rate), dt, 0.0)
+        errors.append(np.abs(np.asarray(state.grains.position)[0, :, 0] - straight).max())
+    assert errors[1] < 1e-4
+    assert errors[1] < 0.3 * errors[0]
+
+
 def test_momentum_stays_zero_to_round_off_while_the_cell_is_strained() -> None:
     system, state, box = packed()
     state, total = march(system, state, strained(box, STEPS, DT), DT, 0.0)
