@@ -4,10 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import h5py
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import PERIODIC_27, TETRA_27
+from scenes import PERIODIC_27, PERIODIC_XY_27, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -16,6 +17,7 @@ from gmem_jax.experiment.record import pack_fingerprint
 from gmem_jax.files.exporters import EXPORT_FORMATS, format_of, frames_of_pack
 from gmem_jax.files.loads import frame_wall_forces, pressure_tensor
 from gmem_jax.files.seal import seal
+from gmem_jax.simulation.loop import at_rest
 
 PACK = gm.load_pack(PERIODIC_27)
 EDGES = np.asarray(PACK.upper - PACK.lower)
@@ -110,6 +112,18 @@ def test_the_pressure_tensor_of_a_frame_is_what_was_measured_at_rest() -> None:
     rest = PACK.info["at_rest"]
     np.testing.assert_allclose(np.diag(pressure_tensor(frames, 0, walls)), rest["pressure"], rtol=1e-5)
     assert rest["wall_contacts"] == 0.0
+
+
+@pytest.mark.parametrize("source", [TETRA_27, PERIODIC_27, PERIODIC_XY_27], ids=["walls", "periodic", "both"])
+def test_at_rest_walls_and_virial_say_one_stress(source: Path) -> None:
+    experiment = gm.Experiment(gm.load_pack(source), gm.six_signals(), backend="jax")
+    state, simulation = experiment.begin(), experiment.simulation(sheared=False)
+    measured = np.asarray(at_rest(simulation, state, experiment.pack.box).pressure)[:, 0]
+    seen = replace(simulation, box=experiment.pack.box)
+    tensor = np.asarray(jax.jit(gm.observables.stress().reduce)(seen, state))[..., 0]
+    np.testing.assert_allclose(np.diag(tensor), measured, rtol=1e-4)
+    np.testing.assert_allclose(tensor, tensor.T, atol=1e-4 * measured.max())
+    assert np.abs(tensor - np.diag(np.diag(tensor))).max() > 1e-3 * measured.max()
 
 
 def test_the_native_backend_refuses_a_periodic_pack_and_auto_runs_plain_jax_and_says_so() -> None:
