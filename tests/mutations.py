@@ -179,6 +179,34 @@ MUTATIONS = (
         "(spheres > box.upper - 0.01)",
         "test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall",
     ),
+    mutation(
+        "images-do-not-move-with-the-cell",
+        "physics/step.py",
+        "velocity += image_shifts(pairs, cell.growth)",
+        "velocity += 0.0",
+        "test_where_the_cell_is_cut_changes_nothing[shift1]",
+    ),
+    mutation(
+        "grains-left-behind-by-the-cell",
+        "physics/step.py",
+        "cell.lower + stretch * (position - before.lower)",
+        "position",
+        "test_what_the_strain_of_the_cell_does_is_kept_by_grains_without_damping",
+    ),
+    mutation(
+        "pressure-without-momentum-flux",
+        "physics/step.py",
+        "force * place + clump.mass * grains.velocity**2",
+        "force * place",
+        "test_the_pressure_of_a_step_is_the_stress_of_its_contacts_and_the_flux_of_momentum",
+    ),
+    mutation(
+        "images-of-the-other-side",
+        "physics/pairs.py",
+        "-np.rint(apart), 0.0)",
+        "np.rint(apart), 0.0)",
+        "test_the_list_holds_every_pair_of_nearest_images_in_reach_and_says_which[cells-x and z]",
+    ),
     # ---------------------------------------------------------------- physics: candidates
     mutation(
         "slack-of-one-sphere",
@@ -1116,8 +1144,8 @@ MUTATIONS = (
     mutation(
         "cotangent-forgotten-at-renewal",
         "derivatives/gradient.py",
-        "(slope[0], pull(slope[1])[0], slope[2])",
-        "(slope[0], jax.tree.map(jnp.zeros_like, history), slope[2])",
+        "(slope[0], pull(slope[1])[0], *slope[2:])",
+        "(slope[0], jax.tree.map(jnp.zeros_like, history), *slope[2:])",
         "test_derivatives_do_not_mind_lists_that_are_made_anew[friction.mu]",
     ),
     mutation(
@@ -1413,7 +1441,7 @@ MUTATIONS = (
     mutation(
         "a-list-with-gaps",
         "files/pack_validation.py",
-        "pairs_within(mapped, reach - GRAZING, per_grain) <= len(keys),",
+        "pairs_within(mapped, reach - GRAZING, per_grain, smallest, periodic) <= len(keys),",
         "True,",
         "test_an_impossible_pack_is_refused_whoever_sealed_it",
     ),

@@ -26,6 +26,8 @@ from gmem_jax.simulation.strain import StrainPath
 TESTS = Path(__file__).parent
 ROOT = TESTS.parent
 TETRA_27 = TESTS / "data" / "tetra-27.h5"
+PERIODIC_27 = TESTS / "data" / "periodic-27.h5"
+PERIODIC_XY_27 = TESTS / "data" / "periodic-xy-27.h5"  # between walls along z
 
 ELASTIC = Material(normal_damping=0.0)
 SPHERE = sphere()

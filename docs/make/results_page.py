@@ -119,7 +119,7 @@ def heading(name: str, scale: str) -> list[str]:
     at = ""
     if named:
         size = scale_of(",".join([named, *changes]), weighed.SIZES if name == "choices" else SCALES)
-        grains = f"{size.sizes[0]:,} to {size.sizes[-1]:,}" if name == "fig12b" else f"{size.grains:,}"
+        grains = f"{size.sizes[0]:,} to {size.sizes[-1]:,}" if name in ("fig12b", "bulk") else f"{size.grains:,}"
         at = f": {grains} grains, t0 of {RATES.get(f'{name}-{scale}', f'{size.t0:,.0f}')}"
     return [f"## {what}{at}", "", command, ""]
 

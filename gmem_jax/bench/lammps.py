@@ -16,6 +16,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
@@ -89,6 +90,7 @@ class Scene:
         upper: planes, [3]; inf for none.
         lower_velocity: [3].
         upper_velocity: [3].
+        periodic: axes along which the planes are none: the box is periodic there, and grows with them.
     """
 
     clump: Clump
@@ -100,6 +102,7 @@ class Scene:
     upper: np.ndarray
     lower_velocity: np.ndarray
     upper_velocity: np.ndarray
+    periodic: PeriodicAxes = WALLS
 
     @classmethod
     def free(
@@ -151,7 +154,8 @@ def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1
     low = np.where(np.isfinite(scene.lower), scene.lower, flat.min(axis=0) - margin)
     high = np.where(np.isfinite(scene.upper), scene.upper, flat.max(axis=0) + margin)
     lines = ["gmem_jax scene", "", f"{len(flat)} atoms", "1 atom types", ""]
-    lines += [f"{_row(low[k] - 0.1, high[k] + 0.1)} {'xyz'[k]}lo {'xyz'[k]}hi" for k in range(3)]
+    beyond = np.where(scene.periodic, 0.0, 0.1)
+    lines += [f"{_row(low[k] - beyond[k], high[k] + beyond[k])} {'xyz'[k]}lo {'xyz'[k]}hi" for k in range(3)]
     lines += ["", "Atoms # sphere", ""]
     lines += [f"{n + 1} 1 2.0 1.0 {_row(*x)}" for n, x in enumerate(flat)]
     lines += ["", "Velocities", ""]
@@ -164,7 +168,7 @@ def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1
         "units lj",
         "atom_style sphere",
         "atom_modify map array",
-        "boundary f f f",
+        f"boundary {' '.join('fp'[axis] for axis in scene.periodic)}",
         "newton off",
         "comm_modify vel yes",
         "fix prop all property/atom mol ghost yes",
@@ -221,7 +225,7 @@ def wall_lines(scene: Scene, material: Material, dt: float) -> list[str]:
     for face in range(6):
         axis, upper = divmod(face, 2)
         plane = (scene.upper if upper else scene.lower)[axis]
-        if not np.isfinite(plane):
+        if not np.isfinite(plane) or scene.periodic[axis]:
             continue
         speed = (scene.upper_velocity if upper else scene.lower_velocity)[axis]
         name = f"face{face}"
@@ -255,6 +259,10 @@ def scene_script(
     script += pair_lines(friction, material, float(scene.clump.mass))
     # The integrator comes after the walls: it sums the initial forces when it is set up, in the order of the fixes.
     script += wall_lines(scene, material, dt)
+    growth = (scene.upper_velocity - scene.lower_velocity) / (scene.upper - scene.lower)
+    if any(scene.periodic) and np.any(growth):
+        strains = (f"{'xyz'[axis]} erate {_number(growth[axis])}" for axis in np.flatnonzero(scene.periodic))
+        script.append(f"fix cell all deform 1 {' '.join(strains)} remap v")
     if scene.clump.spheres > 1:
         script += ["fix move all rigid/small molecule infile scene.bodies"]
     else:

@@ -57,7 +57,7 @@ SHIPPED: dict[str, Any] = {
 def _announce(experiment: Experiment, batch: int) -> dict[str, float]:
     """Say what a recall in batches will need."""
     work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
-    backend = native.name(experiment.backend, experiment.friction)
+    backend = native.name(experiment.backend, experiment.friction, experiment.pack.periodic)
     side_by_side = min(batch, experiment.signals.count)
     what = f"{experiment.pack.grains} grains, {plural(experiment.signals.count, 'signal')}"
     memory = run_bytes(experiment, side_by_side) + sample_bytes(experiment)

@@ -35,7 +35,7 @@ Loss = Callable[[Experiment, jax.Array], jax.Array]
 STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
 FORWARDS = 0.17  # of a gradient's time is the way forward
 
-Moving = tuple[Any, Any, Any]  # grains, history and held walls: what of a state can be differentiated
+Moving = tuple[Any, ...]  # grains, history, held walls and periodic cell: what of a state can be differentiated
 
 
 def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
@@ -78,11 +78,11 @@ def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array], offsets:
 
 
 def _moving(state: State) -> Moving:
-    return state.grains, state.history, state.servo
+    return state.grains, state.history, state.servo, state.cell
 
 
 def _state(moving: Moving, status: jax.Array) -> State:
-    return State(moving[0], moving[1], status, moving[2])
+    return State(moving[0], moving[1], status, moving[2], moving[3])
 
 
 def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int, offsets: bool) -> Any:
@@ -150,8 +150,8 @@ class _Pushing(Observer):
     def rebuild(self, history: Any, move: Move, blank: Any) -> None:
         """Move the tangent of the history too."""
         if self.moving is not None:
-            grains, history, servo = self.moving
-            self.moving = grains, move(history, jax.tree.map(jnp.zeros_like, blank)), servo
+            grains, history, *others = self.moving
+            self.moving = grains, move(history, jax.tree.map(jnp.zeros_like, blank)), *others
 
 
 class _Piece(NamedTuple):
@@ -191,7 +191,7 @@ class _Remembering(Observer):
     def rebuild(self, history: Any, move: Move, blank: Any) -> None:
         """Remember how the history was moved."""
         _, pull = jax.vjp(lambda old: move(old, blank), history)
-        self.tape.append(_Piece(lambda slope: (slope[0], pull(slope[1])[0], slope[2])))
+        self.tape.append(_Piece(lambda slope: (slope[0], pull(slope[1])[0], *slope[2:])))
 
 
 @dataclass(frozen=True)

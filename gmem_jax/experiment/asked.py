@@ -38,7 +38,7 @@ def require_inside(pack: Pack) -> None:
     """
     spheres = np.asarray(_spheres(pack.position, pack.quaternion, pack.clump))
     inside = (spheres >= np.asarray(pack.lower)) & (spheres <= np.asarray(pack.upper))
-    out = ~np.all(inside, axis=(1, 2))
+    out = ~np.all(inside | (np.asarray(pack.periodic) & np.isfinite(spheres)), axis=(1, 2))
     if np.any(out):
         grain = int(np.argmax(out))
         if not np.all(np.isfinite(spheres[grain])):

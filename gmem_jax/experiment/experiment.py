@@ -141,7 +141,7 @@ class Experiment:
         self._set_protocol()
         if self.backend not in native.BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(native.BACKENDS)}; got {self.backend!r}")
-        native.require_precision(self.precision, self.backend, self.friction)
+        native.require_precision(self.precision, self.backend, self.friction, self.pack.periodic)
         if not 0.0 < self.dt <= LARGEST_STEP:
             raise ValueError(f"dt must be in (0, {LARGEST_STEP}], got {self.dt:g}")
         if self.steps is not None:
@@ -331,7 +331,7 @@ class Experiment:
         dt, steps = self.timing
         return Simulation(
             System(self.pack.clump, self.friction, self.pack.pairs, self.material),
-            StrainPath(lower, upper, self.compression, *drive),
+            StrainPath(lower, upper, self.compression, *drive, self.pack.periodic),
             dt,
             self.drag,
             steps=steps,

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.html import Facts, brief, facts, line
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes, boundary_of
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, listed_candidates, tabulate
-from gmem_jax.physics.pytree import label, pytree
+from gmem_jax.physics.pytree import label, pytree, static
 from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Box, Grains, still_box
@@ -34,6 +35,7 @@ class Pack:
         delta0: areal compression the pack was cycled with.
         ringing_period: T_1, period of the slowest shear mode of the box that wall motion excites, in t_c.
         pairs: candidate contacts for a compression by delta0.
+        periodic: the periodic axes of the box; centres of grains are between its planes, and spheres may be beyond.
         name: for logs and files.
         record: JSON of the resolved configuration and of what was measured at the end of the preparation.
         source: the file it was read from, or the name of a shipped pack.
@@ -49,6 +51,7 @@ class Pack:
     delta0: jax.Array
     ringing_period: jax.Array
     pairs: Pairs
+    periodic: PeriodicAxes = static(WALLS)
     name: str = label("pack")
     record: str = label("{}")
     source: str = label("")
@@ -61,7 +64,7 @@ class Pack:
     @property
     def box(self) -> Box:
         """The walls at u = 0, one replica."""
-        return still_box(self.lower[:, None], self.upper[:, None])
+        return still_box(self.lower[:, None], self.upper[:, None], self.periodic)
 
     @property
     def info(self) -> dict[str, Any]:
@@ -75,6 +78,7 @@ class Pack:
         rows = {
             "grains": f"{self.grains} {self.clump.shape}",
             "box (R)": brief(self.upper - self.lower),
+            **({"boundary": boundary_of(self.periodic)} if any(self.periodic) else {}),
             "delta0": self.delta0,
             "T1 (t_c)": self.ringing_period,
             **{label: rest[name] for label, name in measured.items() if name in rest},
@@ -122,7 +126,7 @@ def stack(packs: Sequence[Pack]) -> Pack:
     """Packs of one size and grain as one `Pack` with a leading axis on every array, for `jax.vmap`.
 
     Raises:
-        ValueError: if there is no pack, or the packs differ in size or in the grain.
+        ValueError: if there is no pack, or the packs differ in size, in the grain, or in the boundary.
     """
     if not packs:
         raise ValueError("stack needs at least one pack")
@@ -132,6 +136,11 @@ def stack(packs: Sequence[Pack]) -> Pack:
             raise ValueError(
                 f"packs to be stacked must have one size and grain: {first.name} has {first.grains} "
                 f"{first.clump.shape}, {pack.name} has {pack.grains} {pack.clump.shape}"
+            )
+        if pack.periodic != first.periodic:
+            raise ValueError(
+                f"packs to be stacked must have one boundary: {first.name} has {boundary_of(first.periodic)}, "
+                f"{pack.name} has {boundary_of(pack.periodic)}"
             )
     capacity = max(pack.pairs.capacity for pack in packs)
     per_sphere = max(pack.pairs.incidence.shape[-1] for pack in packs)
@@ -152,4 +161,5 @@ def _widen(pack: Pack, capacity: int, per_sphere: int) -> Pairs:
         pack.clump.spheres,
         capacity=capacity,
         per_sphere=per_sphere,
+        periodic=pack.periodic,
     )

@@ -435,7 +435,9 @@ def run(
     if not schedule.wanted:
         return found
     offsets = np.asarray(experiment.pack.clump.offsets)
-    return dataclasses.replace(found, frames=concatenate(recorded, offsets, frames_of))
+    return dataclasses.replace(
+        found, frames=concatenate(recorded, offsets, frames_of, periodic=experiment.pack.periodic)
+    )
 
 
 def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[float] = ()) -> FrameSchedule:

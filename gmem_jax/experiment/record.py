@@ -48,7 +48,8 @@ def fingerprint(tree: Any) -> str:
 def pack_fingerprint(pack: Pack) -> str:
     """SHA-256 of what makes a pack: grain, centres, orientations, box, T1; not of its list of candidates."""
     at = (pack.position, pack.quaternion, pack.lower, pack.upper)
-    return fingerprint((pack.clump, *at, pack.delta0, pack.ringing_period))
+    beyond = (np.asarray(pack.periodic),) if any(pack.periodic) else ()
+    return fingerprint((pack.clump, *at, pack.delta0, pack.ringing_period, *beyond))
 
 
 def plain(value: Any) -> Any:
@@ -139,7 +140,12 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
     own = {**to_dict(experiment), "pack": pack_fingerprint(experiment.pack)}
     if experiment.observe:  # what was kept of another run lacks what these give
         own["observe"] = [name for name, _ in experiment.observe]
-    return {**own, **more, "backend": native.name(experiment.backend, experiment.friction), **sources()}
+    return {
+        **own,
+        **more,
+        "backend": native.name(experiment.backend, experiment.friction, experiment.pack.periodic),
+        **sources(),
+    }
 
 
 @usual_rules()
@@ -172,5 +178,5 @@ def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
         "steps": steps,
         "seconds": seconds,
         **provenance(),
-        "backend": native.name(experiment.backend, experiment.friction),
+        "backend": native.name(experiment.backend, experiment.friction, experiment.pack.periodic),
     }

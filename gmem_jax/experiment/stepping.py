@@ -61,7 +61,7 @@ def _found(experiment: Experiment, law: Any) -> float:
     simulation = experiment.simulation(sheared=False)
     system = replace(simulation.system, friction=law)
     simulation = replace(simulation, system=system, dt=1.0, drag=0.0, steps=1, precision="double")
-    box = still_box(centre - scale * half, centre + scale * half)
+    box = still_box(centre - scale * half, centre + scale * half, pack.periodic)
     return largest_stable_step(simulation, position, quaternion, box)
 
 

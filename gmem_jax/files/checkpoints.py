@@ -45,13 +45,15 @@ def _taken_apart(tree: Any, arrays: list[np.ndarray]) -> Any:
     """How a tree of arrays is made up, as JSON; its arrays are added to the list.
 
     Raises:
-        TypeError: for what is neither an array, a tuple, a dictionary nor a pytree of this package.
+        TypeError: for what is neither an array, a truth value, a tuple, a dictionary nor a pytree of this package.
     """
     if isinstance(tree, np.ndarray | np.generic | jax.Array):
         arrays.append(np.asarray(tree))
         return {"array": len(arrays) - 1}
     if tree is None:
         return {"none": 0}
+    if isinstance(tree, bool):
+        return {"truth": tree}
     if isinstance(tree, tuple):
         return {"tuple": [_taken_apart(item, arrays) for item in tree]}
     if isinstance(tree, dict):
@@ -66,6 +68,8 @@ def _put_together(form: Any, arrays: list[np.ndarray]) -> Any:
     """The tree that `_taken_apart` took apart."""
     if "none" in form:
         return None
+    if "truth" in form:
+        return bool(form["truth"])
     if "array" in form:
         return arrays[form["array"]]
     if "tuple" in form:

@@ -18,7 +18,7 @@ from gmem_jax.files.ours import place
 from gmem_jax.files.validation import optional
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import listed_candidates
-from gmem_jax.simulation.frames import Frames, sphere_places
+from gmem_jax.simulation.frames import Frames, images_met, sphere_places
 
 RADIUS = 1.0
 
@@ -28,7 +28,10 @@ def frames_of_pack(pack: Pack, material: Material = Material()) -> Frames:
     position, quaternion, offsets = (np.asarray(x) for x in (pack.position, pack.quaternion, pack.clump.offsets))
     spheres = listed_candidates(pack.pairs).T
     centres = sphere_places(position, quaternion, offsets)
-    overlap = 2.0 - np.linalg.norm(centres[spheres[:, 1]] - centres[spheres[:, 0]], axis=1)
+    apart = centres[spheres[:, 1]] - centres[spheres[:, 0]]
+    if pack.pairs.image is not None:
+        apart += np.asarray(pack.pairs.image)[np.asarray(pack.pairs.valid)] * np.asarray(pack.upper - pack.lower)
+    overlap = 2.0 - np.linalg.norm(apart, axis=1)
     touching = overlap > 0.0
     return Frames(
         time=np.zeros(1),
@@ -43,6 +46,7 @@ def frames_of_pack(pack: Pack, material: Material = Material()) -> Frames:
         friction_force=np.zeros((int(touching.sum()), 3)),
         offsets=offsets,
         stages=("at rest",),
+        periodic=pack.periodic,
     )
 
 
@@ -75,6 +79,10 @@ def write_gsd(path: Path, frames: Frames, mass: float, material: Material) -> No
             frame.configuration.box = [*(upper - lower), 0.0, 0.0, 0.0]  # its origin is the centre
             frame.particles.N, frame.particles.types = len(grain), ["sphere"]
             frame.particles.position = frames.centres(number) - 0.5 * (lower + upper)
+            if any(frames.periodic):
+                image = np.where(frames.periodic, np.rint(frame.particles.position / (upper - lower)), 0.0)
+                frame.particles.position -= image * (upper - lower)
+                frame.particles.image = image.astype(np.int32)
             frame.particles.orientation = np.repeat(frames.quaternion[number], each, axis=0)
             frame.particles.diameter = np.full(len(grain), 2.0 * RADIUS)
             frame.particles.mass = np.full(len(grain), mass / each)
@@ -108,7 +116,7 @@ def write_xyz(path: Path, frames: Frames, mass: float, material: Material) -> No
                 "Lattice": " ".join(f"{edge:.17g}" for edge in np.diag(lengths).ravel()),
                 "Origin": " ".join(f"{plane:.17g}" for plane in lower),
                 "Properties": "species:S:1:pos:R:3:radius:R:1:molecule:I:1",
-                "pbc": "F F F",
+                "pbc": " ".join("FT"[axis] for axis in frames.periodic),
                 "Time": f"{frames.time[number]:.17g}",
                 "u": f"{frames.u[number]:.17g}",
                 "stage": frames.stages[number].replace("\\", "\\\\").replace('"', '\\"'),
@@ -129,7 +137,8 @@ def write_lammps(path: Path, frames: Frames, mass: float, material: Material) ->
     grain, each = _grain_numbers(frames), len(frames.offsets)
     density = mass / (each * 4.0 * np.pi / 3.0 * RADIUS**3)
     with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        file.write(f"gmem: {frames.position.shape[1]} grains of {each} spheres, lengths in R\n\n")
+        bounds = f", boundary {' '.join('fp'[axis] for axis in frames.periodic)}" if any(frames.periodic) else ""
+        file.write(f"gmem: {frames.position.shape[1]} grains of {each} spheres, lengths in R{bounds}\n\n")
         file.write(f"{len(grain)} atoms\n1 atom types\n\n")
         for axis, lower, upper in zip("xyz", frames.lower[0], frames.upper[0], strict=True):
             file.write(f"{lower:.17g} {upper:.17g} {axis}lo {axis}hi\n")
@@ -147,7 +156,8 @@ def write_dump(path: Path, frames: Frames, mass: float, material: Material) -> N
     grain = _grain_numbers(frames)
     with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for number in range(frames.count):
-            file.write(f"ITEM: TIMESTEP\n{number}\nITEM: NUMBER OF ATOMS\n{len(grain)}\nITEM: BOX BOUNDS ff ff ff\n")
+            bounds = " ".join(("ff", "pp")[axis] for axis in frames.periodic)
+            file.write(f"ITEM: TIMESTEP\n{number}\nITEM: NUMBER OF ATOMS\n{len(grain)}\nITEM: BOX BOUNDS {bounds}\n")
             for lower, upper in zip(frames.lower[number], frames.upper[number], strict=True):
                 file.write(f"{lower:.17g} {upper:.17g}\n")
             file.write("ITEM: ATOMS id mol type x y z radius\n")
@@ -220,6 +230,10 @@ def _lines(frames: Frames, number: int) -> Any:
     pairs = frames.spheres[own]
     mesh = optional("pyvista", "vtk").PolyData()
     mesh.points = frames.centres(number)
+    if any(frames.periodic):  # a line to an image has an end of its own
+        centres = frames.centres(number)
+        mesh.points = np.concatenate([centres, centres[pairs[:, 1]] + images_met(frames, number)])
+        pairs = np.column_stack([pairs[:, 0], len(centres) + np.arange(len(pairs))])
     mesh.lines = np.column_stack([np.full(len(pairs), 2), pairs]).ravel()  # one made with no lines would have vertices
     for name in ("normal_force", "friction_force"):  # by VTK itself: pyvista refuses vectors where there are none
         array = optional("vtkmodules.util.numpy_support", "vtk").numpy_to_vtk(getattr(frames, name)[own], deep=True)

@@ -7,9 +7,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gmem_jax.files.hdf5 import Content, reading, write_arrays
+from gmem_jax.files.hdf5 import Content, reading, stored_axes, write_arrays
 from gmem_jax.files.schemas import FRAMES
 from gmem_jax.files.validation import fit, refusing, require, require_finite, title, whole
+from gmem_jax.physics.boundary import boundary_of
 from gmem_jax.simulation.frames import Frames
 
 GROUP = "frames"
@@ -20,6 +21,8 @@ def write_frames(file: h5py.File, frames: Frames) -> None:
     group = file.create_group(GROUP)
     group.attrs["stages"] = json.dumps(frames.stages)
     group.attrs["signal"] = frames.signal
+    if any(frames.periodic):
+        group.attrs["boundary"] = boundary_of(frames.periodic)
     write_arrays(group, FRAMES, vars(frames))
 
 
@@ -36,7 +39,8 @@ def read_frames(content: Content) -> Frames | None:
     require(isinstance(stages, list), "the stages of its frames are no names")
     require(isinstance(signal, np.integer) and whole(int(signal)), "the signal of its frames is no number")
     own = {name: found[f"{GROUP}/{name}"] for name in FRAMES}
-    frames = Frames(**own, stages=tuple(stages), signal=int(signal))  # type: ignore[arg-type]
+    periodic = stored_axes(content, GROUP)
+    frames = Frames(**own, stages=tuple(stages), signal=int(signal), periodic=periodic)  # type: ignore[arg-type]
     check_frames(frames)
     return frames
 

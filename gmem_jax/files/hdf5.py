@@ -20,6 +20,7 @@ from gmem_jax.files.schemas import DIMENSIONS, STAGE, other_kind
 from gmem_jax.files.seal import BLOCK, HDF5, require_sealed, seal
 from gmem_jax.files.tree import Tree
 from gmem_jax.files.validation import Array, fit, refusing
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes, periodic_axes
 from gmem_jax.simulation.protocol import BINS
 from gmem_jax.simulation.sample import MEASURED, Sample
 
@@ -137,6 +138,20 @@ def schema_of(path: Path) -> str:
     """
     with reading(path) as content:
         return content.schema
+
+
+def stored_axes(content: Content, group: str = "") -> PeriodicAxes:
+    """The periodic axes that the attribute `boundary` tells; none where it is missing.
+
+    Raises:
+        FileFormatError: if it tells nothing.
+    """
+    if "boundary" not in content.attributes.get(group, {}):
+        return WALLS
+    try:
+        return periodic_axes(content.text("boundary", group))
+    except ValueError as error:
+        raise FileFormatError(str(error)) from error
 
 
 def write_arrays(group: h5py.Group, declared: Mapping[str, Array], values: Mapping[str, Any]) -> None:

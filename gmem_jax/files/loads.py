@@ -3,7 +3,7 @@
 import numpy as np
 
 from gmem_jax.physics.material import Material
-from gmem_jax.simulation.frames import Frames
+from gmem_jax.simulation.frames import Frames, images_met
 
 
 def frame_wall_forces(frames: Frames, number: int, material: Material) -> np.ndarray:
@@ -14,7 +14,7 @@ def frame_wall_forces(frames: Frames, number: int, material: Material) -> np.nda
     centres = frames.centres(number)
     overlaps = (1.0 - (centres - frames.lower[number]), 1.0 - (frames.upper[number] - centres))
     lower, upper = (np.maximum(overlap, 0.0) ** 1.5 for overlap in overlaps)
-    return np.asarray(float(material.wall_stiffness) * (lower - upper))
+    return np.asarray(np.where(frames.periodic, 0.0, float(material.wall_stiffness) * (lower - upper)))
 
 
 def pressure_tensor(frames: Frames, number: int, walls: np.ndarray) -> np.ndarray:
@@ -32,10 +32,11 @@ def pressure_tensor(frames: Frames, number: int, walls: np.ndarray) -> np.ndarra
     own, each = slice(*frames.start[number : number + 2]), len(frames.offsets)
     centres, position = frames.centres(number), frames.position[number]
     one, other = frames.spheres[own].T
-    normal = centres[other] - centres[one]
+    image = images_met(frames, number)
+    normal = centres[other] - centres[one] + image
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     force = frames.normal_force[own, None] * normal - frames.friction_force[own]
-    total = force.T @ (position[other // each] - position[one // each])
+    total = force.T @ (position[other // each] - position[one // each] + image)
     planes = np.where(walls > 0.0, frames.lower[number], frames.upper[number])
     total += walls.T @ (np.repeat(position, each, axis=0) - centres)
     total += np.diag(np.sum(walls * (centres - planes), axis=0))

@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from gmem_jax.errors import FileFormatError
 from gmem_jax.files.validation import is_number, numbers, require, require_fields, require_finite, title, whole
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes, require_room
+from gmem_jax.physics.pairs import nearest_images
 from gmem_jax.simulation.frames import sphere_places
 
 UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
@@ -26,13 +29,14 @@ Found = Mapping[str, np.ndarray]
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def check_arrays(found: Found, *, isotropic: bool, record: dict[str, Any]) -> None:
+def check_arrays(found: Found, *, isotropic: bool, record: dict[str, Any], periodic: PeriodicAxes = WALLS) -> None:
     """Refuse a pack that is impossible.
 
     Args:
         found: the arrays of a pack by their path in its file, of the right shapes.
         isotropic: what the clump says of itself.
         record: what was measured at the end of the preparation; may be empty.
+        periodic: the periodic axes of its box.
 
     Raises:
         FileFormatError: saying what is wrong.
@@ -41,12 +45,20 @@ def check_arrays(found: Found, *, isotropic: bool, record: dict[str, Any]) -> No
     _check_clump(found, isotropic)
     _check_box(found)
     spheres = sphere_places(found["position"], found["quaternion"], found["clump/offsets"])
-    lower, upper = found["lower"], found["upper"]
-    require((spheres > lower) & (spheres < upper), "a grain lies outside the box")
-    _check_list(found, spheres)
+    lower, upper, axes = found["lower"], found["upper"], np.asarray(periodic)
+    require((spheres > lower) & (spheres < upper) | axes, "a grain lies outside the box")
+    centres = found["position"]
+    require((centres >= lower) & (centres <= upper), "a grain's centre lies outside the box")
+    _check_list(found, spheres, periodic)
     first, second = found["pairs/candidates"]
-    overlap = 2.0 - np.linalg.norm(spheres[second] - spheres[first], axis=1)
-    walls = 1.0 - min(np.min(spheres - lower), np.min(upper - spheres))
+    apart = spheres[second] - spheres[first]
+    if any(periodic):
+        reference = found["pairs/reference"][..., None]
+        apart += nearest_images(found["pairs/candidates"], reference, found["pairs/smallest"], periodic) * (
+            upper - lower
+        )
+    overlap = 2.0 - np.linalg.norm(apart, axis=1)
+    walls = 1.0 - np.min(np.where(axes, 1.0, np.minimum(spheres - lower, upper - spheres)))
     deepest = max(overlap.max(initial=0.0), walls)
     require(
         deepest < LARGEST_OVERLAP,
@@ -105,7 +117,7 @@ def _filling(found: Found) -> float:
     return len(found["position"]) * float(found["clump/mass"]) / float(np.prod(found["upper"] - found["lower"]))
 
 
-def _check_list(found: Found, spheres: np.ndarray) -> None:
+def _check_list(found: Found, spheres: np.ndarray, periodic: PeriodicAxes) -> None:
     """The list of candidates is sorted, in range, and holds every pair in reach, as at the list's own configuration."""
     listed, reference = found["pairs/candidates"].astype(np.int64), found["pairs/reference"]
     smallest, reach = found["pairs/smallest"], float(found["pairs/reach"])
@@ -114,7 +126,12 @@ def _check_list(found: Found, spheres: np.ndarray) -> None:
     require(len(reference) == count, f"its list is of {len(reference)} spheres, not {count}")
     require(2.0 < reach < 4.0, f"the reach of its list must be in (2, 4) R, got {reach:g}")
     require((smallest > 0.5 * lengths) & (smallest <= lengths * (1.0 + UNIT)), "its list is of another box")
-    require((reference > 0.0) & (reference < 1.0), "its list was made of spheres outside the box")
+    within = (reference > 0.0) & (reference < 1.0)
+    require(within | np.asarray(periodic), "its list was made of spheres outside the box")
+    try:
+        require_room(smallest, periodic, reach, float(found["clump/diameter"]))
+    except ValueError as error:
+        raise FileFormatError(str(error)) from error
     require((listed >= 0) & (listed < count), f"a candidate is none of the {count} spheres")
     require(
         listed[0] // per_grain < listed[1] // per_grain, "a candidate pairs a grain with itself, or is out of order"
@@ -124,28 +141,52 @@ def _check_list(found: Found, spheres: np.ndarray) -> None:
     moved = float(np.linalg.norm(spheres - found["lower"] - reference * lengths, axis=1).max())
     require(2.0 * moved < reach - 2.0, f"its list is stale: a sphere has moved by {moved:.2f} R since it was made")
     mapped = reference * smallest
-    apart = np.linalg.norm(mapped[listed[0]] - mapped[listed[1]], axis=1)
+    lines = mapped[listed[1]] - mapped[listed[0]]
+    if any(periodic):
+        lines += nearest_images(listed, reference[..., None], smallest, periodic) * smallest
+    apart = np.linalg.norm(lines, axis=1)
     require(apart < reach + GRAZING, "its list pairs spheres that are out of reach of each other")
     # Nothing listed is out of reach or listed twice: then it is complete if there are no more pairs than listed ones.
     require(
-        pairs_within(mapped, reach - GRAZING, per_grain) <= len(keys),
+        pairs_within(mapped, reach - GRAZING, per_grain, smallest, periodic) <= len(keys),
         "its list misses spheres that are in reach of each other",
     )
 
 
-def pairs_within(centres: np.ndarray, reach: float, per_grain: int) -> int:
+def pairs_within(
+    centres: np.ndarray,
+    reach: float,
+    per_grain: int,
+    edges: np.ndarray | None = None,
+    periodic: PeriodicAxes = WALLS,
+) -> int:
     """Number of pairs of spheres of different grains within reach, by cells of that edge; scipy takes longer to load.
+
+    Args:
+        centres: of the spheres, [S, 3].
+        reach: how far apart they may be.
+        per_grain: spheres of a grain.
+        edges: of the box, [3], if any of its axes is periodic.
+        periodic: those axes.
 
     Raises:
         FileFormatError: if the spheres lie in a heap, which has more pairs than there is time and memory for.
     """
+    owner = np.arange(len(centres))
+    for axis in np.flatnonzero(periodic) if edges is not None else ():
+        # Images of what is near the lower face, beyond the upper one. A pair may be found twice, but is one: there is
+        # room for no two of its images.
+        centres = np.where(np.arange(3) == axis, centres % edges, centres)
+        low = np.flatnonzero(centres[:, axis] < reach)
+        centres = np.concatenate([centres, centres[low] + edges * (np.arange(3) == axis)])
+        owner = np.concatenate([owner, owner[low]])
     cell = np.floor((centres - centres.min(axis=0)) / reach).astype(np.int64) + 1
     rows, columns = cell[:, 1].max() + 2, cell[:, 2].max() + 2
     key = (cell[:, 0] * rows + cell[:, 1]) * columns + cell[:, 2]
     order = np.argsort(key, kind="stable")
-    key, centres, grain = key[order], centres[order], order // per_grain
-    here = np.arange(len(key))
-    found = 0
+    key, centres, owner = key[order], centres[order], owner[order]
+    here, grain = np.arange(len(key)), owner // per_grain
+    found: list[np.ndarray] = []
     for over, along in ((0, 0), (0, 1), (1, -1), (1, 0), (1, 1)):  # half of the columns of cells around
         column = key + (over * rows + along) * columns
         first = np.searchsorted(key, column - 1) if over or along else here + 1
@@ -154,8 +195,11 @@ def pairs_within(centres: np.ndarray, reach: float, per_grain: int) -> int:
         one = np.repeat(here, count)
         other = np.arange(len(one)) + np.repeat(first - (np.cumsum(count) - count), count)
         far = centres[one] - centres[other]
-        found += int(np.sum((np.einsum("pi,pi->p", far, far) < reach**2) & (grain[one] != grain[other])))
-    return found
+        near = (np.einsum("pi,pi->p", far, far) < reach**2) & (grain[one] != grain[other])
+        pair = np.stack([owner[one[near]], owner[other[near]]])
+        found.append(pair.min(axis=0) * len(key) + pair.max(axis=0))
+    pairs = np.concatenate(found)
+    return len(np.unique(pairs) if any(periodic) else pairs)
 
 
 def _check_record(found: Found, record: dict[str, Any], overlap: np.ndarray) -> None:

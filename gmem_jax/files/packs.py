@@ -14,9 +14,10 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.files import pack_validation
 from gmem_jax.files.cache import kept_pack, list_packs
 from gmem_jax.files.frames import check_frames, write_frames
-from gmem_jax.files.hdf5 import reading, write_arrays, write_samples, writing
+from gmem_jax.files.hdf5 import reading, stored_axes, write_arrays, write_samples, writing
 from gmem_jax.files.schemas import PACK
 from gmem_jax.files.validation import fit, json_of, refusing, require, title
+from gmem_jax.physics.boundary import PeriodicAxes, boundary_of
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import listed_candidates, tabulate
 from gmem_jax.physics.rules import usual_rules
@@ -62,6 +63,8 @@ def save_pack(
     with writing(Path(path), PACK.name) as file:
         file.attrs["name"] = pack.name
         file.attrs["record"] = pack.record
+        if any(pack.periodic):
+            file.attrs["boundary"] = boundary_of(pack.periodic)
         write_arrays(file, PACK.arrays, values)
         file["clump"].attrs["shape"] = clump.shape
         file["clump"].attrs["isotropic"] = clump.isotropic
@@ -83,16 +86,18 @@ def check_pack(pack: Pack) -> None:
         all(arrays[path].dtype != np.float32 for path in PACK.arrays),
         'its numbers are in single precision: call jax.config.update("jax_enable_x64", True) before it is made or read',
     )
-    _check(arrays, pack.clump.isotropic, pack.name, pack.clump.shape, pack.record)
+    _check(arrays, pack.periodic, pack.clump.isotropic, pack.name, pack.clump.shape, pack.record)
 
 
-def _check(found: dict[str, np.ndarray], isotropic: Any, label: Any, shape: Any, record: Any) -> None:
+def _check(
+    found: dict[str, np.ndarray], periodic: PeriodicAxes, isotropic: Any, label: Any, shape: Any, record: Any
+) -> None:
     """What a pack must be to be written, and to be read."""
     require(
         isinstance(isotropic, bool | np.bool_), "incomplete file, attribute 'isotropic' is missing or not a truth value"
     )
     require(title(label) and title(shape), "its name or that of its grain is not a short line of text")
-    pack_validation.check_arrays(found, isotropic=bool(isotropic), record=json_of(record, "record"))
+    pack_validation.check_arrays(found, isotropic=bool(isotropic), record=json_of(record, "record"), periodic=periodic)
 
 
 @usual_rules()
@@ -112,8 +117,8 @@ def load_pack(source: str | Path) -> Pack:
         with reading(path, PACK.name) as content:
             found = content.arrays(PACK.arrays)
             label, record, shape = content.text("name"), content.text("record"), content.text("shape", "clump")
-            isotropic = content.attributes["clump"].get("isotropic")
-        _check(found, isotropic, label, shape, record)
+            isotropic, periodic = content.attributes["clump"].get("isotropic"), stored_axes(content)
+        _check(found, periodic, isotropic, label, shape, record)
         require(
             path != pack_called(str(source)) or label == str(source),
             f"it is the pack {label}, not {source}: files were exchanged; make it again with gmem prepare",
@@ -122,9 +127,11 @@ def load_pack(source: str | Path) -> Pack:
             **{key: jnp.asarray(found[f"clump/{key}"]) for key in _CLUMP}, isotropic=bool(isotropic), shape=shape
         )
         listed, reference, smallest, reach = (found[f"pairs/{key}"] for key in _PAIRS)
-        pairs = tabulate(listed, reference[..., None], smallest, float(reach), clump.spheres)
+        pairs = tabulate(listed, reference[..., None], smallest, float(reach), clump.spheres, periodic=periodic)
         numbers: dict[str, Any] = {key: jnp.asarray(found[key]) for key in _OWN}
-        return Pack(clump=clump, pairs=pairs, name=label, record=record, source=str(source), **numbers)
+        return Pack(
+            clump=clump, pairs=pairs, periodic=periodic, name=label, record=record, source=str(source), **numbers
+        )
 
 
 def load_stages(source: str | Path) -> OrderedDict[str, Sample]:

@@ -93,6 +93,7 @@ PACK = Schema(
     {
         "name": "of the pack",
         "record": "JSON: the recipe with its seed, what was measured at rest, versions, commit, device",
+        "boundary": 'of a box that is periodic: "periodic", or like "periodic,periodic,walls"; else it is missing',
         "clump: shape": 'like "tetra(0.6)"',
         "clump: isotropic": "whether its three moments are equal",
     },

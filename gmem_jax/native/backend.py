@@ -7,8 +7,9 @@ from typing import Literal, cast, get_args
 from jax.extend.backend import get_backend
 
 from gmem_jax.native import cuda, library
-from gmem_jax.native.march import March, march, march_anywhere, march_mixed, require_mixed
+from gmem_jax.native.march import NO_PERIODIC, March, march, march_anywhere, march_mixed, require_mixed
 from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of
 
@@ -40,48 +41,52 @@ def supports(law: FrictionLaw) -> bool:
     return entry_of(law) is not None
 
 
-def resolve(backend: str, precision: str, law: FrictionLaw) -> ResolvedBackend:
+def resolve(backend: str, precision: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS) -> ResolvedBackend:
     """What does the steps for a friction law; the same object for the same arguments.
 
     Args:
         backend: as of `marcher`.
         precision: likewise.
         law: its class matters, and not its parameters.
+        periodic: the periodic axes of the box.
 
     Raises:
         ValueError: if the backend is unknown or not available, or the precision is not to be had with it.
     """
-    return _resolve(backend, precision, type(law), supports(law), *library.available())
+    lacks = "" if supports(law) else f"the friction law {type(law).__name__}"
+    return _resolve(backend, precision, "periodic boxes" if any(periodic) else lacks, *library.available())
 
 
 @functools.cache
-def _resolve(backend: str, precision: str, law: type, known: bool, built: bool, said: str) -> ResolvedBackend:
+def _resolve(backend: str, precision: str, lacks: str, built: bool, said: str) -> ResolvedBackend:
     steps = marcher(backend, precision)
-    why = "it was asked for" if backend == "jax" else _why_not(law, known, built, said) if backend == "auto" else ""
+    why = "it was asked for" if backend == "jax" else _why_not(lacks, built, said) if backend == "auto" else ""
     name: Backend = "jax" if why else "native"
     return ResolvedBackend(name, cast(Precision, precision), steps, why or said)
 
 
-def _why_not(law: type, known: bool, built: bool, said: str) -> str:
-    """Why "auto" means plain JAX on the default device; "" if it does not."""
+def _why_not(lacks: str, built: bool, said: str) -> str:
+    """Why "auto" means plain JAX on the default device, where the library lacks something; "" if it does not."""
     if not built:
         return said
-    if not known:
-        return f"the native backend does not know the friction law {law.__name__}"
+    if lacks:
+        return f"the native backend does not know {lacks}"
     client = get_backend()
     if client.platform == "gpu" and "cuda" in client.platform_version:
         return cuda.missing()
     return "" if client.platform == "cpu" else f"the native backend does not run on {client.platform}"
 
 
-def name(backend: str, law: FrictionLaw) -> Backend:
-    """What "auto" means for this friction law on JAX's default device, "jax" or "native"; others are themselves.
+def name(backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS) -> Backend:
+    """What "auto" means on JAX's default device for a friction law and periodic axes, "jax" or "native".
+
+    Others are themselves.
 
     Raises:
         ValueError: if there is no such backend.
     """
     _require_known(backend)
-    return resolve(backend, "double", law).name if backend == "auto" else cast(Backend, backend)
+    return resolve(backend, "double", law, periodic).name if backend == "auto" else cast(Backend, backend)
 
 
 def _require_known(backend: str) -> None:
@@ -89,17 +94,19 @@ def _require_known(backend: str) -> None:
         raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {backend!r}")
 
 
-def require_precision(precision: str, backend: str, law: FrictionLaw) -> None:
-    """Refuse a precision that is unknown, or not to be had.
+def require_precision(precision: str, backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS) -> None:
+    """Refuse a precision that is unknown, or not to be had; and the native backend where a box is periodic.
 
     Raises:
         ValueError: saying why.
     """
     if precision not in PRECISIONS:
         raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
+    if backend == "native" and any(periodic):
+        raise ValueError(NO_PERIODIC)
     if precision == "double":
         return
-    if name(backend, law) != "native":
+    if name(backend, law, periodic) != "native":
         built, said = library.available()
         why = "" if backend == "jax" or built else f", which is not available: {said}"
         raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")

@@ -26,6 +26,8 @@ from gmem_jax.physics.step import System
 March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 """The signature of `gmem_jax.physics.step.march`."""
 
+NO_PERIODIC = "the native backend does not know periodic boxes; use backend='auto' or 'jax'"
+
 _LAW_NUMBERS = max(len(entry.numbers) for entry in LAWS)  # rows of the parameter array for a law's own
 
 
@@ -44,7 +46,7 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
 
     Raises:
         ValueError: if the backend is not available, does not know the friction law, or the state is not float64; or if
-            an argument does not fit the number of replicas.
+            an argument does not fit the number of replicas; or if the boxes are periodic.
         NotImplementedError: if it is compiled for anything but a CPU or a CUDA GPU, or for that without NVRTC.
     """
     return _march(system, state, boxes, dt, drag, _Mode())
@@ -77,7 +79,7 @@ def require_mixed(law: FrictionLaw) -> None:
 
 def march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
     """`march` on CPUs and CUDA GPUs, its definition elsewhere."""
-    if entry_of(system.friction) is None:
+    if entry_of(system.friction) is None or any(boxes.periodic):
         return dynamics.march(system, state, boxes, dt, drag)
     built, reason = library.available()
     if not built:
@@ -107,6 +109,8 @@ class _Mode(NamedTuple):
 def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, mode: _Mode) -> tuple[State, jax.Array]:
     library.require_library()
     library.entry(system.friction)
+    if any(boxes.periodic):
+        raise ValueError(NO_PERIODIC)
     if state.grains.position.dtype != jnp.float64:
         raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
     law = {field.name: getattr(system.friction, field.name) for field in fields(system.friction)}  # type: ignore[arg-type]
@@ -114,7 +118,7 @@ def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, m
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
     system, state, boxes, dt, drag = dynamics.mark_varying((system, state, boxes, jnp.asarray(dt), jnp.asarray(drag)))
     grains, history, total = _bin(mode, system, state.grains, state.history, boxes, (dt, drag))
-    return State(grains, history, state.status), total
+    return replace(state, grains=grains, history=history), total
 
 
 _Result = tuple[Grains, Any, jax.Array]
@@ -211,7 +215,8 @@ class PlainDefinition:
         material: Any = _Solid(*arrays.parameters[6:9])
         lists = ("first", "second", "valid", "incidence")
         pairs = replace(empty.pairs, **{field: getattr(fixed, field) for field in lists})
-        boxes = Box(*jnp.split(arrays.walls, 4, axis=1))
+        lower, upper, *speeds = jnp.split(arrays.walls, 4, axis=1)
+        boxes = Box(lower, upper, speeds[0], speeds[1])
         history = jax.tree.unflatten(self.history, arrays.history)
         system = replace(empty, clump=clump, friction=law, pairs=pairs, material=material)
         grains, history, total = _plain(system, Grains(*arrays.fields), history, boxes, (dt, drag))

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pytree import pytree
 from gmem_jax.physics.rotation import matrix
@@ -38,6 +39,8 @@ class Pairs:
             replicas that had not parted yet.
         smallest: edge lengths of the box the distances were measured in, [3].
         reach: largest centre distance listed there, 2 R + skin.
+        image: which image of sphere j meets sphere i: by how many edges of the box it is moved along each axis, int8
+            [P, 3]; None between walls.
     """
 
     first: jax.Array
@@ -48,6 +51,7 @@ class Pairs:
     reference: jax.Array
     smallest: jax.Array
     reach: jax.Array
+    image: jax.Array | None = None
 
     @property
     def capacity(self) -> int:
@@ -80,6 +84,28 @@ def slack(pairs: Pairs, spheres: jax.Array, box: Box) -> jax.Array:
     return ratio * pairs.reach - 2.0 - 2.0 * deviation
 
 
+def image_shifts(pairs: Pairs, lengths: jax.Array) -> jax.Array | float:
+    """What is to be added to the separation x_j - x_i of each candidate in a box of these edges [3, B], [P, 3, B].
+
+    With the velocities at which the edges grow it is what is to be added to relative velocities.
+    """
+    return 0.0 if pairs.image is None else pairs.image[..., None] * lengths
+
+
+def nearest_images(
+    found: np.ndarray, reference: np.ndarray, smallest: np.ndarray, periodic: PeriodicAxes
+) -> np.ndarray:
+    """The images of `Pairs.image` of sphere pairs [2, n]: those that are nearest, in the replica where they are.
+
+    Other arguments are those of `Pairs` and `Box`.
+    """
+    apart = reference[found[1]] - reference[found[0]]
+    turns = np.where(np.asarray(periodic)[:, None], -np.rint(apart), 0.0)
+    nearest = np.argmin(np.sum(((apart + turns) * np.asarray(smallest)[:, None]) ** 2, axis=1), axis=-1)
+    images: np.ndarray = np.take_along_axis(turns, nearest[:, None, None], axis=-1)[..., 0].astype(np.int8)
+    return images
+
+
 def tabulate(
     found: np.ndarray,
     reference: np.ndarray,
@@ -89,6 +115,7 @@ def tabulate(
     *,
     capacity: int = 0,
     per_sphere: int = 0,
+    periodic: PeriodicAxes = WALLS,
 ) -> Pairs:
     """`Pairs` from sorted sphere pairs [2, n]: padded, with the incidence table.
 
@@ -100,6 +127,7 @@ def tabulate(
         spheres_per_grain: K.
         capacity: rows to allocate at least; rounded up (see `bucket`), and raised to what was found.
         per_sphere: columns of the incidence table to allocate at least; likewise, to multiples of four.
+        periodic: the periodic axes of the box.
     """
     pairs, count = found.shape[1], reference.shape[0]
     capacity = bucket(max(8, capacity, pairs))  # a gas may have no candidates, but arrays need rows
@@ -120,6 +148,10 @@ def tabulate(
     order = np.argsort(keys, kind="stable")
     grain_pair = np.zeros(capacity, dtype=np.int32)
     grain_pair[order] = int(pairs < capacity) + np.cumsum(np.diff(keys[order], prepend=keys[order[:1]]) != 0)
+    image = None
+    if any(periodic):
+        image = np.zeros((capacity, 3), dtype=np.int8)
+        image[:pairs] = nearest_images(found, reference, smallest, periodic)
     return Pairs(
         first=jnp.asarray(padded[0]),
         second=jnp.asarray(padded[1]),
@@ -129,6 +161,7 @@ def tabulate(
         reference=jnp.asarray(reference),
         smallest=jnp.asarray(smallest),
         reach=jnp.asarray(float(reach)),
+        image=None if image is None else jnp.asarray(image),
     )
 
 

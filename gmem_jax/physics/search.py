@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.boundary import PeriodicAxes, require_room
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import Pairs, sphere_centres, tabulate
 from gmem_jax.physics.state import Box, Grains
@@ -64,53 +65,82 @@ class PairFinder:
         self._neighbors: Any = None
         body = np.asarray(clump.offsets)
         self._cutoff = 2.0 * (1.0 + float(np.linalg.norm(body - body.mean(axis=0), axis=1).max())) + skin
+        self._diameter = float(clump.diameter)
 
     @functools.cached_property
     def _list(self) -> tuple[Any, Any]:
         """How jax-md makes a list from positions, and a jitted way to make another like it."""
         # Imported here because jax-md takes seconds to load, and most commands never look for neighbours.
-        from jax_md import partition, space
+        from jax_md import space
 
-        free_displacement, _ = space.free()
+        # jax-md keeps box and cutoff in float32 and wraps its cells around: a margin keeps every centre inside, and the
+        # float32 rounding of the cutoff harmless.
+        allocate, update = self._functions(space.free()[0], self._extent + 1.0)
+        return allocate, jax.jit(lambda positions, neighbors: update(positions, neighbors))
+
+    @functools.cached_property
+    def _periodic_list(self) -> tuple[Any, Any]:
+        """The same in a periodic box: it takes places in units of the edges, and the edges."""
+        from jax_md import space
+
+        edges = jnp.asarray(self._extent)
+        displacement, _ = space.periodic_general(edges, fractional_coordinates=True)
+        allocate, update = self._functions(displacement, edges, fractional_coordinates=True)
+        return allocate, jax.jit(lambda places, neighbors, box: update(places, neighbors, box=box))
+
+    def _functions(self, displacement: Any, edges: Any, **more: bool) -> tuple[Any, Any]:
+        from jax_md import partition
+
         functions = partition.neighbor_list(
-            free_displacement,
-            # jax-md keeps box and cutoff in float32 and wraps its cells around: a margin keeps every centre inside,
-            # and the float32 rounding of the cutoff harmless.
-            self._extent + 1.0,
+            displacement,
+            edges,
             r_cutoff=self._cutoff + 1e-4,
             dr_threshold=0.0,
             capacity_multiplier=_SPARE,
             format=partition.OrderedSparse,
+            **more,
         )
-        return functions.allocate, jax.jit(lambda positions, neighbors: neighbors.update(positions))
+        return functions.allocate, functions.update
 
     def kept(self) -> dict[str, np.ndarray]:
         """Arguments, apart from the grain, of a finder whose lists have the capacities of this one's."""
         numbers = {"skin": self.skin, "capacity": self._capacity, "per_sphere": self._per_sphere}
         return {"extent": self._extent, **{name: np.asarray(number) for name, number in numbers.items()}}
 
-    def _grain_pairs(self, centres: np.ndarray) -> np.ndarray:
+    def _grain_pairs(self, centres: np.ndarray, smallest: np.ndarray, periodic: PeriodicAxes) -> np.ndarray:
         """Pairs (i < j) of grains whose centres [N, 3] are within the cutoff, [2, n]."""
-        positions = jnp.asarray(centres)
-        allocate, update = self._list
         with warnings.catch_warnings():
             # jax-md 0.2.29 scatters 64-bit indices into its 32-bit tables, and jax warns of it.
             warnings.filterwarnings("ignore", message="scatter inputs have incompatible types")
-            if self._neighbors is not None:
-                self._neighbors = update(positions, self._neighbors)
-            if self._neighbors is None or bool(self._neighbors.did_buffer_overflow):
-                self._neighbors = allocate(positions)
+            if any(periodic):
+                # Along an axis with walls the box is so long that nothing meets an image.
+                edges = np.where(periodic, smallest, self._extent + self._cutoff + 1.0)
+                self._renew(self._periodic_list, jnp.asarray(centres / edges % 1.0), box=jnp.asarray(edges))
+            else:
+                self._renew(self._list, jnp.asarray(centres))
         found = np.sort(np.asarray(self._neighbors.idx), axis=0)
         return found[:, found[1] < len(centres)]
 
-    def _keys(self, mapped: np.ndarray) -> np.ndarray:
+    def _renew(self, functions: tuple[Any, Any], positions: jax.Array, **box: jax.Array) -> None:
+        """Bring jax-md's list to new positions, with larger arrays if it needs them."""
+        allocate, update = functions
+        if self._neighbors is not None:
+            self._neighbors = update(positions, self._neighbors, **box)
+        known = self._neighbors
+        # Arrays too small, or cells too narrow for a box that shrank.
+        if known is None or bool(known.did_buffer_overflow) or bool(known.cell_size_too_small):
+            self._neighbors = allocate(positions, **box)
+
+    def _keys(self, mapped: np.ndarray, smallest: np.ndarray, periodic: PeriodicAxes) -> np.ndarray:
         """Pairs i < j of spheres of different grains within reach, of centres [S, 3], as sorted numbers i S + j."""
-        if self._search:
+        if self._search and not any(periodic):
             return self._search(mapped, self._spheres_per_grain, 2.0 + self.skin)
         spheres = np.int64(len(mapped))
         mapped = mapped.reshape(-1, self._spheres_per_grain, 3)
-        one, other = self._grain_pairs(mapped.mean(axis=1))
-        distance = np.linalg.norm(mapped[one][:, :, None] - mapped[other][:, None, :], axis=-1)
+        one, other = self._grain_pairs(mapped.mean(axis=1), smallest, periodic)
+        apart = mapped[one][:, :, None] - mapped[other][:, None, :]
+        apart -= np.where(periodic, smallest * np.rint(apart / smallest), 0.0)
+        distance = np.linalg.norm(apart, axis=-1)
         pair, sphere_i, sphere_j = np.nonzero(distance < 2.0 + self.skin)
         first, second = (side[pair] * self._spheres_per_grain for side in (one, other))
         keys: np.ndarray = np.sort((first + sphere_i) * spheres + second + sphere_j)
@@ -124,15 +154,19 @@ class PairFinder:
             clump: their shape.
             box: the walls now.
             smallest: edge lengths of the smallest box of the coming motion, [3]; default the present box.
+
+        Raises:
+            ValueError: if a periodic box is too small; see `require_room`.
         """
         lengths = np.asarray(box.lengths)
         now = lengths.min(axis=1)  # shear makes the boxes of replicas differ
         smallest = now if smallest is None else np.minimum(smallest, now)
+        require_room(smallest, box.periodic, 2.0 + self.skin, self._diameter)
         reference = (np.asarray(sphere_centres(grains, clump)) - np.asarray(box.lower)) / lengths
         if np.all(reference == reference[..., :1]):
             reference = reference[..., :1]
         spheres = reference.shape[0]
-        keys = [self._keys(reference[..., b] * smallest) for b in range(reference.shape[-1])]
+        keys = [self._keys(reference[..., b] * smallest, smallest, box.periodic) for b in range(reference.shape[-1])]
         found = np.stack(np.divmod(functools.reduce(np.union1d, keys), spheres))
         if found.shape[1] > self._capacity > 0:
             self._capacity = int(_SPARE * found.shape[1])
@@ -144,6 +178,7 @@ class PairFinder:
             self._spheres_per_grain,
             capacity=self._capacity,
             per_sphere=self._per_sphere,
+            periodic=box.periodic,
         )
         self._capacity, self._per_sphere = pairs.capacity, int(pairs.incidence.shape[-1])
         return pairs

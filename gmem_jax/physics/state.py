@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmem_jax.physics.pytree import pytree
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes
+from gmem_jax.physics.pytree import pytree, static
 
 
 class Status(enum.IntFlag):
@@ -118,17 +119,32 @@ class Grains:
 @pytree
 @dataclass(frozen=True)
 class Box:
-    """Six rigid planes and their velocities; [3, B] each (x, y, z), in R and R / t_c."""
+    """Six planes and their velocities; [3, B] each (x, y, z), in R and R / t_c.
+
+    They are rigid walls, but for the planes of a periodic axis: what leaves through one of them comes in through the
+    other, and what is beyond them are images of what is between.
+    """
 
     lower: jax.Array
     upper: jax.Array
     lower_velocity: jax.Array
     upper_velocity: jax.Array
+    periodic: PeriodicAxes = static(WALLS)
 
     @property
     def lengths(self) -> jax.Array:
         """Edge lengths, [3, B]."""
         return self.upper - self.lower
+
+    @property
+    def growth(self) -> jax.Array:
+        """By how much each edge grows in a unit of time, [3, B]."""
+        return self.upper_velocity - self.lower_velocity
+
+    @property
+    def images(self) -> np.ndarray:
+        """Where the box is periodic, truth values [3, 1]."""
+        return np.asarray(self.periodic)[:, None]
 
 
 @pytree
@@ -155,12 +171,14 @@ class State:
         history: what the friction law remembers of each candidate contact, a pytree with leaves [P, ..., B].
         status: sticky bits of `Status`, int32 [B].
         servo: of walls that are held at a pressure; None where none ever are.
+        cell: the box that the positions are in, if any of its axes is periodic; else None.
     """
 
     grains: Grains
     history: Any
     status: jax.Array
     servo: HeldWalls | None = None
+    cell: Box | None = None
 
     @property
     def replicas(self) -> int:
@@ -168,9 +186,9 @@ class State:
         return int(self.status.shape[-1])
 
 
-def still_box(lower: jax.Array, upper: jax.Array) -> Box:
+def still_box(lower: jax.Array, upper: jax.Array, periodic: PeriodicAxes = WALLS) -> Box:
     """Walls at rest; `lower` and `upper` are [3, B]."""
-    return Box(lower, upper, jnp.zeros_like(lower), jnp.zeros_like(upper))
+    return Box(lower, upper, jnp.zeros_like(lower), jnp.zeros_like(upper), periodic)
 
 
 def replicate(tree: Any, replicas: int) -> Any:

@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gmem_jax.physics.boundary import WALLS, boundary_of
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.kinematics import Kinematics, kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.contact.wall import wall_forces
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import Pairs, sphere_offsets
+from gmem_jax.physics.pairs import Pairs, image_shifts, sphere_offsets
 from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import cross, matrix, turn
 from gmem_jax.physics.state import Box, Grains, State
@@ -65,21 +66,50 @@ def mark_varying(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: lax.pcast(leaf, tuple(sorted(union - axes(leaf))), to="varying"), tree)
 
 
-def sphere_table(clump: Clump, grains: Grains) -> tuple[jax.Array, jax.Array]:
-    """Sphere centres, their velocities and spins as rows [S, 9, B], and the arms from the grain centre [N, K, 3, B]."""
+def sphere_table(clump: Clump, grains: Grains, cell: Box | None = None) -> tuple[jax.Array, jax.Array]:
+    """Sphere centres, their velocities and spins as rows [S, 9, B], and the arms from the grain centre [N, K, 3, B].
+
+    Grains of a periodic `cell` move with it, and beside that with their own velocities.
+    """
     arms = sphere_offsets(grains.quaternion, clump)
     spin = jnp.broadcast_to(grains.spin[:, None], arms.shape)
-    rows = jnp.concatenate(
-        [grains.position[:, None] + arms, grains.velocity[:, None] + cross(spin, arms), spin], axis=2
-    )
+    velocity = grains.velocity if cell is None else grains.velocity + _flow(cell, grains.position)
+    rows = jnp.concatenate([grains.position[:, None] + arms, velocity[:, None] + cross(spin, arms), spin], axis=2)
     return rows.reshape(-1, *rows.shape[2:]), arms
 
 
-def relative_motion(pairs: Pairs, table: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Separations and relative velocities of candidates, and the sums of their spins, [P, 3, B] each."""
+def relative_motion(pairs: Pairs, table: jax.Array, cell: Box | None = None) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Separations and relative velocities of candidates, and the sums of their spins, [P, 3, B] each.
+
+    Of the second sphere of a pair it is the listed image in the periodic `cell` that counts.
+    """
     one, other = table[pairs.first], table[pairs.second]
     difference = other[:, :6] - one[:, :6]
-    return difference[:, :3], difference[:, 3:], other[:, 6:] + one[:, 6:]
+    separation, velocity, spin_sum = difference[:, :3], difference[:, 3:], other[:, 6:] + one[:, 6:]
+    if cell is not None:
+        separation += image_shifts(pairs, cell.lengths)
+        velocity += image_shifts(pairs, cell.growth)
+    return separation, velocity, spin_sum
+
+
+def _strain_rate(cell: Box) -> jax.Array:
+    """Of each axis, [3, B], in 1 / t_c; 0 where there are walls."""
+    return jnp.where(cell.images, cell.growth / cell.lengths, 0.0)
+
+
+def _flow(cell: Box, position: jax.Array) -> jax.Array:
+    """Velocity of the affine motion of a periodic cell at positions [..., 3, B]; 0 along axes with walls."""
+    return jnp.where(cell.images, cell.lower_velocity, 0.0) + _strain_rate(cell) * (position - cell.lower)
+
+
+def _carried(before: Box, cell: Box, position: jax.Array, displacement: jax.Array) -> jax.Array:
+    """Positions [N, 3, B] after a step in which a periodic cell went from `before` to `cell`.
+
+    They keep their places in the cell, but for a displacement of their own, which is stretched on its way by half.
+    """
+    stretch = jnp.where(cell.images, cell.lengths / before.lengths, 1.0)
+    moved = cell.lower + stretch * (position - before.lower)
+    return jnp.where(cell.images, moved, position) + 0.5 * (1.0 + stretch) * displacement
 
 
 def contact_loads(
@@ -106,8 +136,8 @@ def contact_loads(
 
 
 def contact_forces(
-    system: System, table: jax.Array, history: Any, dt: jax.Array, alive: jax.Array
-) -> tuple[jax.Array, Any]:
+    system: System, table: jax.Array, history: Any, dt: jax.Array, alive: jax.Array, cell: Box | None = None
+) -> tuple[jax.Array, Any, jax.Array | None]:
     """Force and tangential torque (about the sphere centre) on every sphere from the others.
 
     Args:
@@ -116,52 +146,81 @@ def contact_forces(
         history: the friction law's.
         dt: time step.
         alive: see `_fusion_barrier`.
+        cell: the box, if any of its axes is periodic.
 
     Returns:
-        [S, 6, B], and the new history.
+        [S, 6, B], the new history, and the forces that act through the faces of the cell, [3, B] (None without it).
     """
     pairs = system.pairs
 
-    def law(separation: jax.Array, velocity: jax.Array, spin_sum: jax.Array, history: Any) -> tuple[jax.Array, Any]:
+    def law(separation: jax.Array, velocity: jax.Array, spin_sum: jax.Array, history: Any) -> tuple[Any, ...]:
         kin, normal_force, tangential, new_history = contact_loads(system, separation, velocity, spin_sum, history, dt)
         force = tangential - normal_force * kin.normal
         # The surface force on j is opposite and so is its arm: the tangential torque is the same on both.
         torque = kin.arm * cross(kin.normal, tangential)
         nothing = jnp.zeros((1, 6, force.shape[-1]), force.dtype)
         stack = [jnp.concatenate([force, torque], axis=1), jnp.concatenate([-force, torque], axis=1), nothing]
-        return jnp.concatenate(stack, axis=0), new_history
+        through = None if pairs.image is None else -jnp.sum(pairs.image[..., None] * force, axis=0)
+        return jnp.concatenate(stack, axis=0), new_history, through
 
-    stack, history = _fusion_barrier(
-        alive, law, *_fusion_barrier(alive, lambda table: relative_motion(pairs, table), table), history
-    )
-    return _fusion_barrier(alive, lambda rows: jnp.sum(rows[pairs.incidence], axis=1), stack), history
+    motion = _fusion_barrier(alive, lambda table, cell: relative_motion(pairs, table, cell), table, cell)
+    stack, history, through = _fusion_barrier(alive, law, *motion, history)
+    return _fusion_barrier(alive, lambda rows: jnp.sum(rows[pairs.incidence], axis=1), stack), history, through
 
 
 @jax.jit
 def _loads(
     system: System, grains: Grains, history: Any, box: Box, dt: jax.Array, alive: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Any]:
-    """Of every sphere: its arm [N, K, 3, B], contact forces and torques [S, 6, B], wall forces; and the new history."""
-    material = system.material
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Any, jax.Array | None]:
+    """Of every sphere: its arm [N, K, 3, B], contact forces and torques [S, 6, B], wall forces; the new history; and
+    forces through the faces of a periodic cell.
+    """
+    material, cell = system.material, box if any(box.periodic) else None
     with jax.named_scope("spheres"):
-        table, arms = _fusion_barrier(alive, lambda grains: sphere_table(system.clump, grains), grains)
+        table, arms = _fusion_barrier(
+            alive, lambda grains, cell: sphere_table(system.clump, grains, cell), grains, cell
+        )
     with jax.named_scope("contacts"):
-        contact, history = contact_forces(system, table, history, dt, alive)
+        contact, history, through = contact_forces(system, table, history, dt, alive, cell)
     with jax.named_scope("walls"):
         lower, upper = wall_forces(table[:, :3], table[:, 3:6], box, material.wall_stiffness, material.normal_damping)
-    return arms, contact, lower, upper, history
+    return arms, contact, lower, upper, history, through
 
 
 def _forces(
     system: System, grains: Grains, history: Any, box: Box, dt: jax.Array, alive: jax.Array
 ) -> tuple[jax.Array, jax.Array, Any, jax.Array]:
-    """Total force and torque on every grain [N, 3, B], the new history, and the wall forces [2, 3, B]."""
-    arms, contact, lower, upper, history = _loads(system, grains, history, box, dt, alive)
+    """Total force and torque on every grain [N, 3, B], the new history, and the wall forces [2, 3, B].
+
+    In the place of a periodic axis' two walls stand its sections; see `section_force`.
+    """
+    arms, contact, lower, upper, history, through = _loads(system, grains, history, box, dt, alive)
     per_sphere = (*arms.shape[:2], -1, contact.shape[-1])
     force = (contact[:, :3] + lower - upper).reshape(per_sphere)
     torque = contact[:, 3:].reshape(per_sphere) + cross(arms, force)
     walls = jnp.stack([jnp.sum(lower, axis=0), jnp.sum(upper, axis=0)])
-    return jnp.sum(force, axis=1), jnp.sum(torque, axis=1), history, walls
+    on_grains = jnp.sum(force, axis=1)
+    if through is not None:
+        walls = jnp.where(box.images, section_force(system.clump, grains, on_grains, through, box), walls)
+    return on_grains, jnp.sum(torque, axis=1), history, walls
+
+
+def section_force(clump: Clump, grains: Grains, force: jax.Array, through: jax.Array, cell: Box) -> jax.Array:
+    """The force that a periodic cell transmits across each axis, mean over all sections, [3, B].
+
+    It is the virial V p = sum_c f l + sum_g m v^2 of the axis over its edge L. With branch vectors l between centres of
+    grains, the sum over contacts is L times the force through the face, and sum_g x F over the forces on grains, which
+    vanish at rest. Velocities v are those beside the cell's own motion.
+
+    Args:
+        clump: the grain.
+        grains: the grains.
+        force: of the contacts on them, [N, 3, B].
+        through: of those contacts that go through the face of the axis, [3, B].
+        cell: the periodic box.
+    """
+    place = grains.position - cell.lower
+    return through + jnp.sum(force * place + clump.mass * grains.velocity**2, axis=0) / cell.lengths
 
 
 def _angular_acceleration(clump: Clump, grains: Grains, torque: jax.Array) -> jax.Array:
@@ -180,6 +239,10 @@ def step(
     system: System, state: State, box: Box, dt: jax.Array, drag: Scalar, alive: jax.Array
 ) -> tuple[State, jax.Array]:
     """One velocity-Verlet step; forces use velocities predicted to its end (docs/physics.md, "Time integration").
+
+    In a periodic box velocities are those beside its affine motion, v = dx/dt - (dL/dt / L) x, and
+    dv/dt = F / m - (dL/dt / L) v: Newton's equation for dx/dt as long as the edges L grow steadily (docs/physics.md,
+    "Periodic boxes").
 
     Args:
         system: the system.
@@ -203,8 +266,12 @@ def step(
         acceleration=old.acceleration,
         spin_rate=old.spin_rate,
     )
+    slowing = drag
+    if state.cell is not None:
+        predicted = replace(predicted, position=_carried(state.cell, box, old.position, dt * half_velocity))
+        state, slowing = replace(state, cell=_wide(box, state.replicas)), drag + _strain_rate(box)
     force, torque, history, walls = _forces(system, predicted, state.history, box, dt, alive)
-    acceleration = force / system.clump.mass - drag * predicted.velocity
+    acceleration = force / system.clump.mass - slowing * predicted.velocity
     spin_rate = _angular_acceleration(system.clump, predicted, torque) - drag * predicted.spin
     grains = replace(
         predicted,
@@ -233,9 +300,13 @@ def require_shapes(state: State, boxes: Box, **numbers: Any) -> None:
     for name, number in numbers.items():
         if jnp.shape(number) not in ((), (1,), (replicas,)):
             raise ValueError(f"{name} must be a number or one for each of {replicas} replicas, got {jnp.shape(number)}")
-    for name, walls in vars(boxes).items():
+    for name in ("lower", "upper", "lower_velocity", "upper_velocity"):
+        walls = getattr(boxes, name)
         if jnp.shape(walls)[1:] not in ((3, 1), (3, replicas)) or len(walls) != len(boxes.lower):
             raise ValueError(f"boxes.{name} must be [steps, 3, {replicas}], got {jnp.shape(walls)}")
+    known = WALLS if state.cell is None else state.cell.periodic
+    if boxes.periodic != known:
+        raise ValueError(f"the boxes are {boundary_of(boxes.periodic)}, and the state is one of {boundary_of(known)}")
 
 
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
@@ -270,23 +341,30 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
     return state, total
 
 
+def _wide(box: Box, replicas: int) -> Box:
+    """A box with one entry for each replica."""
+    wide: Box = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, replicas)), box)
+    return wide
+
+
 def start(system: System, position: jax.Array, quaternion: jax.Array, box: Box) -> State:
     """Grains at rest at `position` [N, 3, B], `quaternion` [N, 4, B], with blank histories and their accelerations."""
     still = jnp.zeros_like(position)
     grains = Grains(position, quaternion, still, still, still, still)
     replicas = position.shape[-1]
     history = system.friction.init(system.pairs.capacity, replicas, position.dtype)
-    state = State(grains, history, jnp.zeros(replicas, jnp.int32))
-    return accelerate(system, state, box)
+    cell = _wide(box, replicas) if any(box.periodic) else None
+    return accelerate(system, State(grains, history, jnp.zeros(replicas, jnp.int32), cell=cell), box)
 
 
 def accelerate(system: System, state: State, box: Box) -> State:
     """Recompute the accelerations of `state`, its histories untouched (after velocities or the law were changed)."""
     zero, alive = jnp.zeros(()), system.pairs.reach > 0.0
     force, torque, _, _ = _forces(system, state.grains, state.history, box, zero, alive)
+    slowing = 0.0 if state.cell is None else _strain_rate(box) * state.grains.velocity
     grains = replace(
         state.grains,
-        acceleration=force / system.clump.mass,
+        acceleration=force / system.clump.mass - slowing,
         spin_rate=_angular_acceleration(system.clump, state.grains, torque),
     )
     return replace(state, grains=grains)

@@ -1,4 +1,7 @@
-"""The +z wall under pressure: a speed-limited servo, and the free flight of the gas (a servo of zero speed)."""
+"""The +z wall under pressure: a speed-limited servo, and the free flight of the gas (a servo of zero speed).
+
+In a periodic box it is the cell that is strained along z, and its grains are carried along.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -78,7 +81,7 @@ def press(
         velocity = jnp.clip(servo.gain * (now.pressure / servo.target - 1.0), -servo.speed, servo.speed)
         climb = jnp.zeros_like(now.box.upper).at[2].set(velocity)
         still, (lower, upper) = jnp.zeros_like(climb), (now.box.lower, now.box.upper)
-        boxes = jax.vmap(lambda time: Box(lower, upper + time * climb, still, climb))(times)
+        boxes = jax.vmap(lambda time: Box(lower, upper + time * climb, still, climb, now.box.periodic))(times)
         state, total = march(system, now.state, boxes, dt, drag)
         box = jax.tree.map(lambda leaf: leaf[-1], boxes)
         state = check(system, state, box)

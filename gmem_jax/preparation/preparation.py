@@ -15,6 +15,7 @@ from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
 from gmem_jax.physics import chance, rotation
+from gmem_jax.physics.boundary import periodic_axes
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
@@ -25,6 +26,7 @@ from gmem_jax.physics.state import Grains, still_box
 from gmem_jax.physics.step import System, accelerate, start
 from gmem_jax.preparation.piston import STEPS_PER_CHECK, Pressed, Servo, largest_speed, press
 from gmem_jax.preparation.recipe import (
+    FREE_SKIN,
     SLOWEST_BINS,
     Recipe,
     bins_outside,
@@ -47,7 +49,6 @@ from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.strain import StrainPath, smallest_box
 
-FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
 FREE_CANDIDATES = 68  # a grain of a pressed pack with that skin: one program for all lists
 FREE_CONTACTS = 48  # a sphere
 DENSE_SKIN = 0.5  # of a pressed pack: half of the candidates, half of the time; yet frictionless grains turn freely, so
@@ -66,10 +67,12 @@ def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array
     cells = cells[np.argsort(cells[:, 2], kind="stable")][: recipe.grains]  # a last layer may be incomplete
     turn_key, velocity_key, spin_key = jax.random.split(chance.key(recipe.seed), 3)
     scale, shape = recipe.gas_speed / math.sqrt(3.0), (recipe.grains, 3)
+    velocity = scale * jax.random.normal(velocity_key, shape)
+    drift = jnp.where(jnp.asarray(periodic_axes(recipe.boundary)), jnp.mean(velocity, axis=0), 0.0)
     return (
         (cells + 0.5) * spacing,
         rotation.uniform(turn_key, recipe.grains),
-        scale * jax.random.normal(velocity_key, shape),
+        velocity - drift,  # which no wall would take
         scale * jax.random.normal(spin_key, shape),
         np.asarray(sites) * spacing,
     )
@@ -111,7 +114,8 @@ class _Preparation:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
         self.recipe, self.cache, self.filmed, self.lengths = recipe, cache, frames > 0, lengths
         self.frames = FrameRecorder(preparation_frames(recipe, frames))
-        self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None])
+        self.periodic = periodic_axes(recipe.boundary)
+        self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None], self.periodic)
         steps, self.dt = stepping(max(recipe.t0, SLOWEST_BINS), recipe.dt)
         finder = pair_finder(
             clump, lengths, FREE_SKIN, capacity=FREE_CANDIDATES * recipe.grains, per_sphere=FREE_CONTACTS
@@ -123,7 +127,7 @@ class _Preparation:
         state = start(system, at, grains.quaternion, self.box)
         state = accelerate(system, replace(state, grains=grains), self.box)
         expected = bins_outside(recipe, clump) * work_of_bin(1) + work_of(cycles_of(recipe), 1)
-        self.march = native.marcher(native.name(backend, system.friction))
+        self.march = native.marcher(native.name(backend, system.friction, self.periodic))
         simulation = Simulation(system, self._path(), self.dt, recipe.drag, steps=steps, backend=backend)
         self.runner = Runner(
             simulation, state, finder=finder, progress=progress, total_work=expected, observers=(self.frames,)
@@ -132,7 +136,7 @@ class _Preparation:
         self.record("gas")
 
     def _path(self) -> StrainPath:
-        return StrainPath(self.box.lower, self.box.upper, self.recipe.delta0)
+        return StrainPath(self.box.lower, self.box.upper, self.recipe.delta0, periodic=self.periodic)
 
     def record(self, name: str) -> None:
         """Record the configuration that there is now, at u = 0, if any are wanted."""
@@ -198,7 +202,7 @@ class _Preparation:
                 f"settle: p_z = {float(pressed.pressure[0]):.3e} E and largest speed "
                 f"{float(largest_speed(pressed.state)):.1e} R/t_c after {recipe.patience:g} t_c; allow more patience"
             )
-        self.box = still_box(self.box.lower, self.box.upper)
+        self.box = still_box(self.box.lower, self.box.upper, self.periodic)
         lengths, diameter = np.asarray(self.box.lengths)[:, 0], float(self.runner.simulation.system.clump.diameter)
         if lengths.min() < diameter:
             raise RunFailedError(
@@ -296,7 +300,8 @@ def prepare(
         log.update(preparation.log)
     if film is not None and frames:
         centre = np.asarray(0.5 * (preparation.box.lower + preparation.box.upper))[:, 0]  # the origin of the pack
-        film.append(concatenate(preparation.frames.recorded, np.asarray(clump.offsets), centre=centre))
+        offsets = np.asarray(clump.offsets)
+        film.append(concatenate(preparation.frames.recorded, offsets, centre=centre, periodic=preparation.periodic))
     pack = _finish(preparation, material, friction or Hooke(), name)
     _warn_of_another_pressure(pack)
     return pack
@@ -319,8 +324,10 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
     grains, clump = runner.state.grains, runner.simulation.system.clump
     position, quaternion = np.asarray(grains.position)[..., 0], np.asarray(grains.quaternion)[..., 0]
     centre = np.asarray(0.5 * (box.lower + box.upper))
-    box = still_box(box.lower - centre, box.upper - centre)
+    box = still_box(box.lower - centre, box.upper - centre, box.periodic)
     position = position - centre[:, 0]
+    edges = np.asarray(box.lengths)[:, 0]
+    position = position - np.where(box.periodic, edges * np.rint(position / edges), 0.0)
     pairs = find_pairs(clump, position, quaternion, box, recipe.delta0)
     system = System(clump, friction, pairs, material)
     backend = (
@@ -337,7 +344,7 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
         "simulated_time": runner.time,
         "at_rest": asdict(last),
         **provenance(),
-        "backend": native.name(runner.simulation.backend, Frictionless()),
+        "backend": native.name(runner.simulation.backend, Frictionless(), box.periodic),
     }
     return Pack(
         clump=clump,
@@ -348,6 +355,7 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
         delta0=jnp.asarray(recipe.delta0),
         ringing_period=jnp.asarray(period),
         pairs=pairs,
+        periodic=box.periodic,
         name=name or f"{clump.shape}-{recipe.grains}-seed{recipe.seed}",
         record=json.dumps(record),
     )

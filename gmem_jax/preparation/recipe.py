@@ -10,12 +10,14 @@ import numpy as np
 
 from gmem_jax.experiment.stages import cycle
 from gmem_jax.files.validation import is_number
+from gmem_jax.physics.boundary import boundary_of, periodic_axes, require_room
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.numbers import is_real
 from gmem_jax.physics.pytree import interval
 from gmem_jax.simulation.protocol import BINS, Stage
 
 SETTLING = 500.0  # t_c that coming to rest took per R of a dense pack's height (170 to 880, N = 325 to 10,240)
+FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
 FEWEST_GRAINS = 12  # grains of the smallest pack that was prepared
 DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with it all six are the paper's
 LATTICE_SPACING = 1.02  # outer diameters of the grain: the least spacing of the lattice, so that grains turn freely
@@ -58,6 +60,8 @@ class Recipe:
         quiet: largest grain speed of the finished pack, in R / t_c.
         pressure_error: relative error of p_z at which the piston is fixed.
         patience: longest time spent on coming to rest, in t_c; four times what 100,450 grains should need (`SETTLING`).
+        boundary: "walls", "periodic", or one for each axis, as in "periodic,periodic,walls". A periodic box is
+            compressed as one between walls is, and its grains are carried along.
     """
 
     grains: int = _number(325, "[12, inf)", "Number of grains N")
@@ -81,9 +85,15 @@ class Recipe:
     quiet: float = _number(1.0e-6, "(0, inf)", "Largest grain speed of the finished pack", "R/t_c")
     pressure_error: float = _number(0.01, "(0, inf)", "Relative error of p_z at which the piston is fixed")
     patience: float = _number(2.0e5, "(0, inf)", "Longest time spent on coming to rest", "t_c")
+    boundary: str = field(
+        default="walls", metadata={"help": "walls, periodic, or one for each axis: periodic,periodic,walls"}
+    )
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "boundary", boundary_of(periodic_axes(self.boundary)))
         for entry in fields(self):
+            if "interval" not in entry.metadata:
+                continue
             given, within, unit = getattr(self, entry.name), entry.metadata["interval"], entry.metadata["unit"]
             try:
                 value = _plain(entry.type, given)
@@ -106,6 +116,8 @@ def _plain(kind: Any, given: Any) -> float | int:
 
 def words_of(entry: Field[Any]) -> str:
     """What a field of a recipe means, in which unit, and where it must lie."""
+    if "interval" not in entry.metadata:
+        return f"{entry.metadata['help']}."
     unit = entry.metadata["unit"]
     return f"{entry.metadata['help']}{unit and ', ' + unit}; in {entry.metadata['interval'].words}."
 
@@ -135,7 +147,7 @@ def sites_of(recipe: Recipe, clump: Clump) -> tuple[tuple[int, int, int], np.nda
     apart as they are long, in columns in a box as wide as the pressed pack will be high.
 
     Raises:
-        ValueError: if the pressed pack would be flatter than its grains.
+        ValueError: if the pressed pack would be flatter than its grains, or too small for a periodic one.
     """
     mass, diameter = float(clump.mass), float(clump.diameter)
     count, least = recipe.grains, LATTICE_SPACING * diameter
@@ -152,6 +164,8 @@ def sites_of(recipe: Recipe, clump: Clump) -> tuple[tuple[int, int, int], np.nda
             f"{count} grains would make a pack of about {width:.1f} x {width:.1f} x {height:.1f} R, flatter than "
             f"a grain ({diameter:.1f} R): take more grains{', or a thicker gas' if spacing >= least else ''}"
         )
+    pressed = np.array([width, sites[1] * apart[1], height])
+    require_room(pressed, periodic_axes(recipe.boundary), 2.0 + FREE_SKIN, diameter)
     return sites, apart
 
 

@@ -15,9 +15,10 @@ from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.progress import Progress, silent, work_of
 from gmem_jax.simulation.protocol import BINS, Stage
 from gmem_jax.simulation.runner import Runner
-from gmem_jax.simulation.strain import StrainPath
+from gmem_jax.simulation.strain import StrainPath, stretched
 
 KICK = 2.0e-5  # strain rate of the kick, 1 / t_c: strains of about 1e-4, below which the response is linear enough
+SHIFT = 1.0e-4  # strain of a periodic cell, given at once: no wall is there for a wave to start at
 STEPS_PER_SAMPLE = 4  # steps per sample
 
 
@@ -58,6 +59,8 @@ def ringing_period(
 ) -> float:
     """T_1 in t_c: kick the resting pack with a uniform shear rate, and take the strongest period of p_xy.
 
+    A periodic cell is sheared by a little instead, with its grains: what rings is how they find their places in it.
+
     Args:
         system: with the friction law of the experiment.
         position: grain centres at rest, [N, 3, 1].
@@ -76,11 +79,16 @@ def ringing_period(
     lengths = box.lengths
     duration = LISTENED * float(jnp.max(lengths))
     bins = int(duration / (STEPS_PER_SAMPLE * float(dt)))
+    shear = jnp.asarray([-1.0, 1.0, 0.0])[:, None]
+    place = position - 0.5 * (box.lower + box.upper)
+    if any(box.periodic):
+        sheared = jnp.where(box.images, SHIFT * shear, 0.0)
+        box, position = stretched(box, sheared), position + sheared * place
     state = start(system, position, quaternion, box)
-    rate = KICK * jnp.asarray([-1.0, 1.0, 0.0])[:, None]
-    velocity = rate * (position - 0.5 * (box.lower + box.upper))
+    velocity = jnp.where(box.images, 0.0, KICK * shear) * place
     state = accelerate(system, replace(state, grains=replace(state.grains, velocity=velocity)), box)
-    still = Simulation(system, StrainPath(box.lower, box.upper, 0.0), dt, steps=STEPS_PER_SAMPLE, backend=backend)
+    path = StrainPath(box.lower, box.upper, 0.0, periodic=box.periodic)
+    still = Simulation(system, path, dt, steps=STEPS_PER_SAMPLE, backend=backend)
     ringing = Stage("ringing", 0.0, 0.0, bins / BINS, "hold")
     runner = Runner(still, state, progress=progress, total_work=work_of([ringing], 1))
     sample = runner.run_stages(ringing)["ringing"]

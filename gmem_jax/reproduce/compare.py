@@ -32,6 +32,7 @@ class Conditions:
         gamma0: amplitude.
         bits: length of words; 0 for the six signals.
         background: of the measure.
+        boundary: of the box; "walls", as in the paper, or see `gm.Recipe`.
     """
 
     law: str
@@ -43,6 +44,7 @@ class Conditions:
     gamma0: float
     bits: int
     background: str
+    boundary: str = "walls"
 
 
 class ComputedPoint(NamedTuple):
@@ -115,6 +117,7 @@ def conditions_of(configuration: dict[str, Any]) -> Conditions:
         gamma0=float(configuration["gamma0"]),
         bits=signals.get("bits", 0) if signals["kind"] == "words" else 0,
         background=configuration["background"],
+        boundary=configuration["pack_record"].get("recipe", {}).get("boundary", "walls"),
     )
 
 
@@ -175,6 +178,8 @@ def _beside(conditions: Conditions, measure: str, ours: Estimate, status: int) -
 
 def _published(at: Conditions, measure: str) -> tuple[Estimate | None, int]:
     """The published estimate of a measure, and its N: that of the same N if there is one, else the paper's usual."""
+    if at.boundary != "walls":
+        return None, 0
     if at.bits:
         column = f"fidelity_{at.background.replace('-', '_')}" if measure == "F" else "classifier_accuracy"
         if measure not in ("F", "accuracy net") or at.law != "H":
@@ -237,7 +242,8 @@ def read_csv(path: Path) -> list[Compared]:
     kinds, found = get_type_hints(Conditions), []
     with path.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
-            conditions = Conditions(**{name: kind(line[name]) for name, kind in kinds.items()})
+            # Tables of runs between walls alone were written before there were others.
+            conditions = Conditions(**{name: kind(line[name]) for name, kind in kinds.items() if name in line})
             ours = Estimate(float(line["mean"]), float(line["sd"] or math.nan), int(line["packs"]))
             found.append(_beside(conditions, line["measure"], ours, int(line["status"])))
     return found

@@ -250,10 +250,14 @@ def power(sizes: Mapping[int, Estimate]) -> tuple[float, float]:
 def _power_law(axis: Any, rows: Sequence[Compared]) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    of_both = {"ours": {row.conditions.grains: row.ours for row in rows}}
-    of_both["published"] = {row.grains: row.theirs for row in rows if row.theirs}
+    of_each: dict[str, dict[int, Estimate]] = {}
+    for row in rows:
+        boundary = row.conditions.boundary
+        whose = "ours" if boundary == "walls" else f"ours, {boundary}"
+        of_each.setdefault(whose, {})[row.conditions.grains] = row.ours
+    of_each["published"] = {row.grains: row.theirs for row in rows if row.theirs}
     said = []
-    for whose, sizes in of_both.items():
+    for whose, sizes in of_each.items():
         exponent, error = power(sizes)
         said.append(f"{whose} $N^{{{exponent:.3f}}}$" + ("" if math.isnan(error) else f" (± {error:.3f})"))
     axis.set_yscale("log")

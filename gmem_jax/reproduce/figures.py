@@ -110,7 +110,7 @@ def packs(scale: Scale, grains: int, count: int, delta0: float = DELTA0, **grain
         grains: N.
         count: how many.
         delta0: compression that they are cycled with.
-        grain: shape and overlap, if not the paper's tetra grain.
+        grain: shape and overlap, if not the paper's tetra grain; and the boundary, if not walls.
     """
     shipped = [name for name in list_packs() if name.startswith(f"tetra-{grains}-") and name not in CALIBRATED]
     if delta0 != DELTA0 or grain:
@@ -169,6 +169,12 @@ def _sizes(scale: Scale) -> list[Values]:
     ]
 
 
+def _bulk(scale: Scale) -> list[Values]:
+    sizes = [(grains, scale.packs if grains < 3000 else scale.few) for grains in scale.sizes]
+    without = [pack for grains, count in sizes for pack in packs(scale, grains, count, boundary="periodic")]
+    return [*_sizes(scale), *without]
+
+
 def _words(scale: Scale) -> list[Values]:
     lengths: list[Values] = [{"signals": f"words:{length}", "background": "sub2-bl"} for length in scale.lengths]
     return crossed(_one(scale), lengths)
@@ -184,6 +190,7 @@ FIGURES = {
     ),
     "fig12a": PaperFigure("G and F against compression", _compression, ("delta0",)),
     "fig12b": PaperFigure("G and F against the number of grains", _sizes, ("grains",)),
+    "bulk": PaperFigure("G and F of packs without walls, beside those between walls", _bulk, ("grains",)),
     "fig13": PaperFigure("Recalled words", _words),
     "fig14": PaperFigure("F by three backgrounds, and accuracy, against the length of words", _words, ("bits",)),
 }

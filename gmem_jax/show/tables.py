@@ -20,6 +20,7 @@ from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.measures import of_each, read_stress, relative_scale
 from gmem_jax.files.printing import printable
 from gmem_jax.files.waveforms import signals_from_dict
+from gmem_jax.physics.boundary import boundary_of
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import Status, combined_status, explain
@@ -465,6 +466,7 @@ def pack_table(pack: Pack) -> Table:
     rows = [
         Fact("grains", f"{pack.grains} {pack.clump.shape}"),
         Fact("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)), "R"),
+        *([Fact("boundary", boundary_of(pack.periodic))] if any(pack.periodic) else []),
         Fact("cycled with delta0", f"{float(pack.delta0):g}"),
         Fact("ringing period T1", f"{float(pack.ringing_period):.1f}", "t_c"),
         Fact("candidate contacts", int(np.asarray(pack.pairs.valid).sum())),

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.numbers import require_numbers
 from gmem_jax.physics.pytree import pytree, static
 from gmem_jax.physics.state import State
@@ -63,6 +64,7 @@ class Frames:
         offsets: sphere centres of a grain in its own frame, [K, 3], in R.
         stages: the stage that each frame ends or is in, [F].
         signal: whose replica it is: from 1, or 0 for no signal.
+        periodic: the periodic axes of the box; grains may have left it through these faces.
     """
 
     time: np.ndarray
@@ -78,6 +80,7 @@ class Frames:
     offsets: np.ndarray
     stages: tuple[str, ...] = static(())
     signal: int = static(0)
+    periodic: PeriodicAxes = static(WALLS)
 
     @property
     def count(self) -> int:
@@ -87,6 +90,14 @@ class Frames:
     def centres(self, frame: int) -> np.ndarray:
         """Sphere centres of a frame, [N K, 3], in R."""
         return sphere_places(self.position[frame], self.quaternion[frame], self.offsets)
+
+
+def images_met(frames: Frames, number: int) -> np.ndarray:
+    """What the second sphere of each contact of a frame is moved by to be the image that the first meets, [M, 3]."""
+    centres, lengths = frames.centres(number), frames.upper[number] - frames.lower[number]
+    one, other = frames.spheres[slice(*frames.start[number : number + 2])].T
+    nearest = -lengths * np.rint((centres[other] - centres[one]) / lengths)
+    return np.where(frames.periodic, nearest, 0.0)
 
 
 def sphere_places(position: np.ndarray, quaternion: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -258,9 +269,9 @@ def places_at(stages: Sequence[Stage], compressions: Sequence[float]) -> dict[st
 @jax.jit
 def _contacts(system: System, state: State) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Of every candidate: whether it touches, its normal force and its friction, [P, 1, B] and [P, 3, B]."""
-    table, _ = sphere_table(system.clump, state.grains)
+    table, _ = sphere_table(system.clump, state.grains, state.cell)
     still = jnp.zeros(())  # in no time a history stays as it is
-    motion = relative_motion(system.pairs, table)
+    motion = relative_motion(system.pairs, table, state.cell)
     kin, normal, friction, _ = contact_loads(system, *motion, state.history, still)
     return kin.touching, normal, friction
 
@@ -293,7 +304,13 @@ def configuration(system: System, state: State, lower: np.ndarray, upper: np.nda
     )
 
 
-def concatenate(recorded: Recorded, offsets: np.ndarray, signal: int = 0, centre: np.ndarray | float = 0.0) -> Frames:
+def concatenate(
+    recorded: Recorded,
+    offsets: np.ndarray,
+    signal: int = 0,
+    centre: np.ndarray | float = 0.0,
+    periodic: PeriodicAxes = WALLS,
+) -> Frames:
     """Frames as one.
 
     Args:
@@ -301,6 +318,7 @@ def concatenate(recorded: Recorded, offsets: np.ndarray, signal: int = 0, centre
         offsets: of a grain's spheres, [K, 3].
         signal: whose replica it is.
         centre: what becomes the origin, [3].
+        periodic: the periodic axes of the box.
     """
     every = [frame for frames in recorded.values() for frame in frames]
     stacked = {name: np.stack([getattr(frame, name) for frame in every]) for name in ("time", "u", "quaternion")}
@@ -319,4 +337,5 @@ def concatenate(recorded: Recorded, offsets: np.ndarray, signal: int = 0, centre
         offsets=np.asarray(offsets),
         stages=tuple(name for name, frames in recorded.items() for _ in frames),
         signal=signal,
+        periodic=periodic,
     )

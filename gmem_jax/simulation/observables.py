@@ -23,6 +23,7 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.kinematics import Kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.contact.wall import wall_forces
+from gmem_jax.physics.pairs import image_shifts
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.rotation import cross, dot
 from gmem_jax.physics.state import State
@@ -77,7 +78,9 @@ def stress() -> Observable:
 
     sigma_ij = sum_c f_i l_j / V, over sphere contacts and wall contacts. f is the force of a contact on what lies
     beyond it, seen from a grain; l is the branch from the grain's centre to the centre of the other grain, or to the
-    point of the wall. Pairs are counted once. Where grains are accelerated it differs from the stress on the walls.
+    point of the wall. Pairs are counted once, in a periodic box with the image that they meet. Where grains are
+    accelerated it differs from the stress on the walls, and where they move from that of a periodic box, which has
+    their momentum flux in it.
     """
     return Observable("stress", "E", "stress tensor of the contacts, by branches between grain centres", _stress)
 
@@ -87,6 +90,7 @@ def _stress(simulation: Simulation, state: State) -> jax.Array:
     seen, spheres, pairs = _contacts(simulation, state), system.clump.spheres, system.pairs
     push = seen.normal_force * seen.kin.normal - seen.friction
     branch = position[pairs.second // spheres] - position[pairs.first // spheres]
+    branch += image_shifts(pairs, box.lengths)
     lower, upper = seen.walls(simulation)
     arms = seen.table[:, :3] - jnp.repeat(position, spheres, axis=0)
     total = _tensor(push, branch) + _tensor(upper - lower, arms)
@@ -96,7 +100,10 @@ def _stress(simulation: Simulation, state: State) -> jax.Array:
 
 
 def wall_stress() -> Observable:
-    """The stress on the walls, [3, 3, B], in E: p_x, p_y, p_z of the bin on the diagonal, for walls do not rub."""
+    """The stress on the walls, [3, 3, B], in E: p_x, p_y, p_z of the bin on the diagonal, for walls do not rub.
+
+    Along periodic axes, where there are no walls, it is the mean over all sections; see `section_force`.
+    """
     return Observable("wall_stress", "E", "stress on the walls, averaged over the steps of the bin", _wall_stress)
 
 
@@ -176,7 +183,9 @@ def _lost(simulation: Simulation, state: State) -> jax.Array:
 def _touching(simulation: Simulation, state: State) -> tuple[jax.Array, jax.Array]:
     """How many pairs touch now, and how many of these did at the mark, [B]. All of both are in the list of now."""
     now = overlaps(simulation.system, state) > 0.0
-    then = overlaps(simulation.system, replace(state, grains=_known(simulation.mark).grains)) > 0.0
+    mark = _known(simulation.mark)
+    cell = None if state.cell is None else mark.box
+    then = overlaps(simulation.system, replace(state, grains=mark.grains, cell=cell)) > 0.0
     return jnp.sum(now, axis=0, dtype=float), jnp.sum(now & then, axis=0, dtype=float)
 
 
@@ -344,9 +353,9 @@ class _Seen(NamedTuple):
 def _contacts(simulation: Simulation, state: State, *, ahead: bool = False) -> _Seen:
     """The contacts now; with tangential forces that are ahead by half a step, as the histories hold them, or not."""
     system = simulation.system
-    table, _ = sphere_table(system.clump, state.grains)
+    table, _ = sphere_table(system.clump, state.grains, state.cell)
     still = jnp.zeros(())  # in no time a history stays as it is
-    motion = relative_motion(system.pairs, table)
+    motion = relative_motion(system.pairs, table, state.cell)
     kin, normal_force, friction, _ = contact_loads(system, *motion, state.history, still)
     if not ahead:
         back = replace(kin, dt=-jnp.asarray(simulation.dt), twist=jnp.zeros_like(kin.twist))

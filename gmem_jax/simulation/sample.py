@@ -9,7 +9,7 @@ from jax import lax
 
 from gmem_jax.physics.contact.friction import largest_overlap
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import slack, sphere_centres
+from gmem_jax.physics.pairs import image_shifts, slack, sphere_centres
 from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import dot, matrix
 from gmem_jax.physics.state import Box, State, Status
@@ -63,7 +63,7 @@ class Sample:
     u: jax.Array = measured("1", "compression variable at the end of the bin", ())
     pressure: jax.Array = measured(
         "E",
-        "p_x, p_y, p_z, mean of two opposite walls, averaged over the steps of the bin",
+        "p_x, p_y, p_z, mean of two opposite walls, averaged over the steps of the bin; of periodic axes by the virial",
         _VECTOR,
         plot="pressure",
         label="pressure",
@@ -137,7 +137,8 @@ def check(system: System, state: State, box: Box) -> State:
     """Set the status bits for what can be seen in one configuration: stale list, escaped grain, non-finite number."""
     grains = state.grains
     spheres = sphere_centres(grains, system.clump)
-    outside = jnp.any((spheres < box.lower) | (spheres > box.upper), axis=(0, 1))
+    beyond = (spheres < box.lower) | (spheres > box.upper)
+    outside = jnp.any(beyond & ~box.images if any(box.periodic) else beyond, axis=(0, 1))
     numbers = grains.position.sum((0, 1)) + grains.acceleration.sum((0, 1)) + grains.spin_rate.sum((0, 1))
     bits = (
         jnp.where(slack(system.pairs, spheres, box) <= 0.0, int(Status.STALE_PAIRS), 0)
@@ -150,7 +151,10 @@ def check(system: System, state: State, box: Box) -> State:
 def overlaps(system: System, state: State) -> jax.Array:
     """Overlap of every candidate pair of spheres, [P, B], in R; negative where they are apart."""
     pairs, spheres = system.pairs, sphere_centres(state.grains, system.clump)
-    square = dot(spheres[pairs.second] - spheres[pairs.first], spheres[pairs.second] - spheres[pairs.first])[:, 0]
+    apart = spheres[pairs.second] - spheres[pairs.first]
+    if state.cell is not None:
+        apart += image_shifts(pairs, state.cell.lengths)
+    square = dot(apart, apart)[:, 0]
     return jnp.where(pairs.valid[:, None], 2.0 - jnp.sqrt(jnp.where(pairs.valid[:, None], square, 1.0)), -1.0)
 
 
@@ -165,6 +169,9 @@ def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scal
     body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)
     energy = clump.mass * jnp.sum(grains.velocity**2, axis=1) + jnp.sum(clump.inertia[:, None] * body_spin**2, axis=1)
     lengths = jnp.broadcast_to(box.lengths, pressure.shape)
+    at_walls = (spheres - box.lower < 1.0) * 1 + (box.upper - spheres < 1.0)
+    if any(box.periodic):
+        at_walls = at_walls * ~box.images
     rate = jnp.abs(box.upper_velocity[0] - box.lower_velocity[0]) / lengths[0]
     squeezing = 0.5 * (pressure[0] + pressure[1])
     loaded = squeezing > 0.0
@@ -177,7 +184,7 @@ def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scal
         largest_speed=jnp.sqrt(jnp.max(jnp.sum(lax.stop_gradient(grains.velocity) ** 2, axis=1), axis=0)),
         coordination=2.0 * jnp.sum(jnp.maximum(touching_pairs, 0), axis=0) / count,
         contacts=2.0 * jnp.sum(touching, axis=0) / count,
-        wall_contacts=jnp.sum((spheres - box.lower < 1.0) * 1 + (box.upper - spheres < 1.0), axis=(0, 1)) / count,
+        wall_contacts=jnp.sum(at_walls, axis=(0, 1)) / count,
         filling=count * clump.mass / jnp.prod(lengths, axis=0),
         largest_overlap=jnp.max(lax.stop_gradient(overlap), axis=0),
         inertial_number=jnp.where(loaded, inertial, 0.0),

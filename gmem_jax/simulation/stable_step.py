@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 
 from gmem_jax.physics import chance
-from gmem_jax.physics.state import Box, State
+from gmem_jax.physics.state import Box
 from gmem_jax.physics.step import start
 from gmem_jax.simulation.compiled import Compiled
 from gmem_jax.simulation.loop import Simulation
@@ -85,7 +85,7 @@ def _measured(simulation: Simulation, position: jax.Array, quaternion: jax.Array
 
     def one_step(changing: Any) -> Any:
         grains, history = changing
-        now = State(grains, history, rest.status)
+        now = replace(rest, grains=grains, history=history)
         state, _ = simulation.resolved.march(simulation.system, now, walls, dt, 0.0)
         return state.grains, state.history
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.pytree import Scalar, pytree, static
 from gmem_jax.physics.state import Box, HeldWalls
 from gmem_jax.simulation.channels import CHANNELS
@@ -58,6 +59,7 @@ class StrainPath:
         share: of gamma on each axis, scalar or [B]. The paper does not say; a half is this project's reading.
         lanes: which waveforms are applied on which channel; rows of a table say when.
         fixed: of each lane, whether its waveform is the same for all replicas.
+        periodic: the periodic axes of the box, whose edges are strained alike.
     """
 
     lower: jax.Array
@@ -68,6 +70,7 @@ class StrainPath:
     share: Scalar = 0.5
     lanes: tuple[Lane, ...] = static(())
     fixed: tuple[bool, ...] = static(())
+    periodic: PeriodicAxes = static(WALLS)
 
     def _shear(self, lane: int, at: jax.Array, amplitude: Numbers) -> jax.Array:
         """Share of gamma of one lane, [B] or [1]."""
@@ -105,16 +108,16 @@ class StrainPath:
 
         now, rate = jax.jvp(lengths, (time,), (jnp.ones_like(time),))
         centre = 0.5 * (self.lower + self.upper)
-        return Box(centre - 0.5 * now, centre + 0.5 * now, -0.5 * rate, 0.5 * rate)
+        return Box(centre - 0.5 * now, centre + 0.5 * now, -0.5 * rate, 0.5 * rate, self.periodic)
 
 
 def stretched(box: Box, stretch: jax.Array, rate: Scalar = 0.0) -> Box:
     """A box whose edges are longer by a factor 1 + stretch [3, B], which grows at a rate, in 1 / t_c."""
-    lengths, growth = box.lengths, box.upper_velocity - box.lower_velocity
+    lengths, growth = box.lengths, box.growth
     half = 0.5 * lengths * (1.0 + stretch)
     speed = 0.5 * (growth * (1.0 + stretch) + lengths * rate)
     centre = 0.5 * (box.lower + box.upper)
-    return Box(centre - half, centre + half, -speed, speed)
+    return Box(centre - half, centre + half, -speed, speed, box.periodic)
 
 
 def servo_strain(servo: HeldWalls, target: jax.Array) -> jax.Array:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import ROOT
+from scenes import PERIODIC_27, ROOT
 from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
@@ -65,6 +65,26 @@ def test_a_picture_that_is_there_counts_too(
     assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "out.h5", *SHORT) == 2
     assert "out.png: exists" in capsys.readouterr().err
     assert (tmp_path / "out.png").read_text() == "precious"
+
+
+def test_a_periodic_pack_is_asked_for_in_words_and_a_box_without_room_is_refused_at_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    for words in ("periodic", "periodic,periodic,walls"):
+        asked = ["--grains", 27, "--boundary", words, "-o", tmp_path / "bulk.h5"]
+        assert gmem(monkeypatch, "prepare", *asked, "--dry-run") == 0
+    capsys.readouterr()
+    for words, grains, refusal in (
+        ("open", 27, "boundary must be walls or periodic"),
+        ("periodic", 12, "is too small: its periodic edges must be 6.0 R at least"),
+    ):
+        asked = ["--grains", grains, "--boundary", words, "-o", tmp_path / "bulk.h5"]
+        assert gmem(monkeypatch, "prepare", *asked) == 2
+        said = capsys.readouterr().err
+        assert refusal in said
+    assert not list(tmp_path.iterdir())
+    assert gmem(monkeypatch, "show", PERIODIC_27) == 0
+    assert "periodic" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -171,6 +191,7 @@ def test_every_number_of_a_recipe_is_an_option_of_prepare(
         **{"grains": 13, "seed": 5, "delta0": 0.04, "t0": 70.0, "dt": 0.2, "filling": 0.25, "gas_speed": 0.03},
         **{"gas_time": 300.0, "pressure": 3e-3, "piston_speed": 0.03, "piston_gain": 0.006, "cycles": 1, "rest": 0.3},
         **{"hold": 0.1, "drag": 0.02, "settled_speed": 2e-5, "quiet": 2e-6, "pressure_error": 0.02, "patience": 1e5},
+        "boundary": "walls",
     }
     assert set(numbers) == {entry.name for entry in fields(gm.Recipe)}
     options = [word for name, value in numbers.items() for word in (f"--{name.replace('_', '-')}", value)]

@@ -23,7 +23,7 @@ from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.packs import load_stages
 from gmem_jax.files.waveforms import save_waveforms
-from gmem_jax.physics.state import Grains, State
+from gmem_jax.physics.state import Grains, State, still_box
 from gmem_jax.simulation.sample import MEASURED, Sample
 
 PACK = TETRA_27
@@ -193,7 +193,9 @@ def test_parts_of_another_run_are_refused(tmp_path: Path) -> None:
 
 def test_a_part_is_a_table_of_arrays(tmp_path: Path) -> None:
     """What cannot be told from its bytes alone is refused: no code."""
-    state = State(Grains(*(np.full((2, 3, 1), float(k)) for k in range(6))), (np.ones(4), ()), np.zeros(1, np.int32))
+    cell = still_box(np.zeros((3, 1)), np.ones((3, 1)), (True, False, True))
+    grains = Grains(*(np.full((2, 3, 1), float(k)) for k in range(6)))
+    state = State(grains, (np.ones(4), ()), np.zeros(1, np.int32), cell=cell)
     tree = (OrderedDict(rest=state, compress=state), np.arange(3))
     save_part(tmp_path / "part.npz", tree)
     found = load_part(tmp_path / "part.npz")

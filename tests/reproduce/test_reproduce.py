@@ -72,6 +72,18 @@ def test_published_points_are_found_by_their_conditions() -> None:
     assert compared(word, "G", [0.6], 0).theirs is None
 
 
+def test_bulk_packs_stand_beside_those_between_walls_and_nothing_is_published_of_them(tmp_path: Path) -> None:
+    both = [compared(at, "G", [0.3, 0.32], 0) for at in (STANDARD, replace(STANDARD, boundary="periodic"))]
+    assert [row.theirs is None for row in both] == [False, True]
+    write_csv(tmp_path / "bulk.csv", comparison_rows(both))
+    assert [row.conditions.boundary for row in read_csv(tmp_path / "bulk.csv")] == ["walls", "periodic"]
+    points = FIGURES["bulk"].points(SCALES["laptop"])
+    assert len([point for point in points if point.get("prepare.boundary") == "periodic"]) == len(points) // 2
+    draw.draw_comparison(tmp_path / "bulk.png", both, ("grains",), "two boundaries")
+    drawn = (tmp_path / "bulk.svg").read_text(encoding="utf-8")
+    assert "periodic" in drawn
+
+
 def test_a_scale_with_changes() -> None:
     assert scale_of("paper") == SCALES["paper"]
     changed = scale_of("paper,t0=5.4e3,packs=1,lengths=3+4")

@@ -145,7 +145,7 @@ def test_the_forces_of_a_frame_are_those_on_the_spheres() -> None:
     history = 1e-3 * jax.random.normal(keys[2], (PACK.pairs.capacity, 3, 1))
     state = State(grains, history, jnp.zeros(1, jnp.int32))
     table, _ = sphere_table(PACK.clump, grains)
-    on_spheres, _ = jax.jit(contact_forces)(system, table, history, jnp.zeros(()), jnp.asarray(True))
+    on_spheres, *_ = jax.jit(contact_forces)(system, table, history, jnp.zeros(()), jnp.asarray(True))
     lower, upper = np.asarray(PACK.lower), np.asarray(PACK.upper)
     frames = concatenate(
         {"rest": (configuration(system, state, lower, upper, 0.0, 0.0),)}, np.asarray(PACK.clump.offsets)

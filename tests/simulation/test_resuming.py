@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import TETRA_27, with_skin
+from scenes import PERIODIC_27, TETRA_27, with_skin
 
 import gmem_jax as gm
 from gmem_jax.derivatives.gradient import value_and_grad
@@ -77,8 +77,16 @@ def test_a_run_goes_on_with_the_lists_it_had(law: Any, tmp_path: Path) -> None:
     _same(lambda cache: gm.run(experiment, cache=cache, frames=8), tmp_path / "parts", [3, 9, 11])
 
 
-def test_a_preparation_goes_on(tmp_path: Path) -> None:
-    recipe = gm.Recipe(grains=12, gas_time=500.0, t0=300.0, cycles=1)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        pytest.param({"grains": 12}, id="walls"),
+        pytest.param({"grains": 56, "boundary": "periodic"}, id="periodic", marks=pytest.mark.slow),
+        pytest.param({"grains": 40, "boundary": "walls,periodic,walls"}, id="periodic along y", marks=pytest.mark.slow),
+    ],
+)
+def test_a_preparation_goes_on(changes: dict[str, Any], tmp_path: Path) -> None:
+    recipe = gm.Recipe(**{"gas_time": 500.0, "t0": 300.0, "cycles": 1, **changes})
 
     def run(cache: ResultCache) -> Any:
         log: dict = {}
@@ -140,8 +148,10 @@ def test_a_run_that_failed_leaves_nothing_to_go_on_from(tmp_path: Path) -> None:
     Checkpoints(tmp_path / "parts", {"with": "another key"})
 
 
-def test_a_protocol_of_ones_own_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+@pytest.mark.parametrize("source", [TETRA_27, PERIODIC_27], ids=["walls", "periodic"])
+def test_a_protocol_of_ones_own_goes_on_to_the_same_bits(source: Path, tmp_path: Path) -> None:
     """Held walls, two channels, shaking, a mark and an observer: all of it is in a checkpoint."""
+    pack = with_skin(gm.load_pack(source), 0.05) if source == PERIODIC_27 else gm.load_pack(source)
     sets = gm.signals(xy=ONE, z=gm.Bumps(-ONE.amplitudes, ONE.centres + 0.1, ONE.width))
     protocol = gm.Protocol(
         gm.compress(0.5, 0.2),
@@ -153,5 +163,5 @@ def test_a_protocol_of_ones_own_goes_on_to_the_same_bits(tmp_path: Path) -> None
         gm.read("whole", length=0.2),
     )
     watched = {"nonaffine": gm.observables.nonaffine(), "made": gm.observables.contacts_made()}
-    experiment = gm.Experiment(gm.load_pack(PACK), sets, protocol=protocol, observe=watched, t0=100.0)
+    experiment = gm.Experiment(pack, sets, protocol=protocol, observe=watched, t0=100.0)
     _same(lambda cache: gm.run(experiment, cache=cache), tmp_path / "parts", [2, 4, 6])

@@ -1,4 +1,4 @@
-"""Contacts of spheres with the six rigid, frictionless planes of the box."""
+"""Contacts of spheres with the rigid, frictionless walls of the box."""
 
 import jax
 import jax.numpy as jnp
@@ -21,12 +21,13 @@ def wall_forces(
         damping_time: gamma_w / k_w, in t_c.
 
     Returns:
-        The forces from the lower and from the upper planes (both as magnitudes >= 0), each [S, 3, B].
+        The forces from the lower and from the upper planes (both as magnitudes >= 0), each [S, 3, B]; 0 along periodic
+        axes, which have no walls.
     """
     lower = 1.0 - (position - box.lower)
     upper = 1.0 - (box.upper - position)
     forces = []
     for overlap, closing in ((lower, box.lower_velocity - velocity), (upper, velocity - box.upper_velocity)):
-        touching = overlap > 0.0
+        touching = (overlap > 0.0) & ~box.images if any(box.periodic) else overlap > 0.0
         forces.append(hertz(jnp.where(touching, overlap, 1.0), closing, touching, stiffness, damping_time))
     return forces[0], forces[1]
