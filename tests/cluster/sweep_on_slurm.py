@@ -32,7 +32,7 @@ workers = {{workers}}
 
 
 # What every Python in a folder begins with: no checkpoint comes by itself.
-SELDOM = "import gmem_jax.files.checkpoints as kept\nkept.FIRST = kept.EVERY = kept.AT_MILESTONES = 1e6\n"
+SELDOM = "import gmem_jax.files.checkpoints as kept\nkept.FIRST = kept.CHECKPOINT_INTERVAL = kept.AT_MILESTONES = 1e6\n"
 
 
 def gmem(*arguments: object, **environment: str) -> subprocess.Popen[str]:
