@@ -50,8 +50,11 @@ def ends(within: Interval) -> list[str]:
 
 def _options(entries: dict[str, Field[Any]]) -> dict[str, list[str]]:
     found = {name: ends(entry.metadata["interval"]) for name, entry in entries.items() if "interval" in entry.metadata}
-    whole = {name: [text for text in found[name] if text.isdecimal()] for name in ("grains", "seed", "cycles")
-             if name in found}
+    whole = {
+        name: [text for text in found[name] if text.isdecimal()]
+        for name in ("grains", "seed", "cycles")
+        if name in found
+    }
     return {f"--{name.replace('_', '-')}": values for name, values in {**found, **whole}.items()}
 
 

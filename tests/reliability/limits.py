@@ -14,9 +14,8 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
-from killed import COMMANDS, LONGEST, SWEEP, content, start, wait
+from killed import COMMANDS, LONGEST, content, start, wait
 
 LIMITS: dict[str, tuple[int, list[int]]] = {  # what the kernel limits, and to how much
     "memory beside what a start takes (MB)": (resource.RLIMIT_AS, [30, 200, 800]),
@@ -57,9 +56,8 @@ def tried(name: str, what: int, most: int, folder: Path, sound: str) -> str:
         return "wrong: another output"
     if there != (code == 0) or (code > 0 and len(lines) != 1):
         return f"wrong: exit {code}, {'an' if there else 'no'} output, {said[-300:]!r}"
-    if code < 0:
-        if wait(start([*arguments, "-o", str(output)], log), LONGEST) or content(output) != sound:
-            return f"wrong: does not go on, {log.read_text()[-300:]!r}"
+    if code < 0 and (wait(start([*arguments, "-o", str(output)], log), LONGEST) or content(output) != sound):
+        return f"wrong: does not go on, {log.read_text()[-300:]!r}"
     output.unlink(missing_ok=True)
     return "fitted" if code == 0 else "refused" if code > 0 else "ended by the system"
 

@@ -1,6 +1,7 @@
 """All of it, in under an hour on two cores, and docs/reliability.md with what was found: `make reliability`.
 
-Two lanes side by side: kills in one; hostile input, disks, sanitizers and numerical trust in the other.
+Two lanes side by side: kills and SLURM in one; hostile input, extremes, limits, disks, sanitizers and
+numerical trust in the other.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import gmem_jax as gm
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
+CLUSTER = ROOT / "tests" / "cluster"
 PAGE = ROOT / "docs" / "reliability.md"
 STUDIES = ["order", "skin", "dt"]
 
@@ -43,14 +45,24 @@ def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
         str(ROOT / "tests/native/test_sanitizers.py"),
     ]
     studies = [*STUDIES, "builds"] if shutil.which("clang++") else STUDIES
+    number = int(time.time()) % 100_000
     others = [
-        script(HERE / "fuzz.py", "fuzz", max(200, round(10_000 * scale)), "--seed", int(time.time()) % 100_000),
+        script(HERE / "fuzz.py", "fuzz", max(200, round(10_000 * scale)), "--seed", number),
+        script(HERE / "extremes.py", "extremes", max(60, round(400 * scale)), "--seed", number),
+        script(HERE / "limits.py", "limits"),
         script(HERE / "disks.py", "disks"),
         script(HERE / "ours.py", "ours", "--tries", max(80, round(800 * scale)), "--runs", max(4, round(16 * scale))),
         ("sanitizers", sanitizers),
         script(ROOT / "benchmarks/trust.py", "trust", "--folder", folder / "trust", "--studies", *studies),
     ]
-    return [kills], others
+    slurm = [str(CLUSTER / "one_node.sh"), sys.executable, str(CLUSTER / "sweep_on_slurm.py")]
+    clusters = [("slurm", [*slurm, "--json", str(folder / "slurm.json")])] if can_have_slurm() else []
+    return [kills, *clusters], others
+
+
+def can_have_slurm() -> bool:
+    """Whether tests/cluster/one_node.sh can start one here."""
+    return os.geteuid() == 0 and all(map(shutil.which, ("slurmctld", "slurmd", "munged", "sbatch")))
 
 
 def run(lane: list[Piece], folder: Path) -> dict[str, dict[str, Any]]:
@@ -89,6 +101,65 @@ def _inputs(found: dict[str, Any]) -> list[str]:
         "command that came up to its run. Lie: a damaged file that was accepted. Wordy: more than a line."
     )
     return [about, "", *lines]
+
+
+ENDS = {
+    "ok": "numbers and a status of ok",
+    "doubtful": "a status that says what is doubtful",
+    "broke": "broke, with the reason in one line",
+    "refused": "refused in one line",
+    "estimated": "too long: estimated only",
+}
+
+
+def _extremes(found: dict[str, Any]) -> list[str]:
+    bad = ("lie", "traceback", "wordy", "hang", "crash")
+    lines = ["| command | tried | " + " | ".join([*ENDS.values(), "wrong"]) + " |", "|---" * (3 + len(ENDS)) + "|"]
+    for name, one in found["by_kind"].items():
+        counts = [found["inputs"][name], *(one.get(word, 0) for word in ENDS), sum(one.get(word, 0) for word in bad)]
+        lines.append(f"| {name} | {' | '.join(map(str, counts))} |")
+    about = (
+        "One to three options, each at an end of its interval or far out in it (1e-300 to 1e300), N = 27 and, for "
+        "preparations, 12. Wrong: a traceback, more than a line, a file that cannot be read again, or ok beside "
+        "numbers that are none."
+    )
+    return [about, "", *lines]
+
+
+def _limits(found: dict[str, Any]) -> list[str]:
+    words = ("tried", "fitted", "refused", "ended by the system", "wrong")
+    lines = [f"| limit of | {' | '.join(words)} |", "|---" * (1 + len(words)) + "|"]
+    for name, counts in found["by_limit"].items():
+        lines.append(f"| {name} | {' | '.join(str(counts.get(word, 0)) for word in words)} |")
+    about = (
+        "Five commands under `setrlimit`. Refused: one line and no output. Ended by the system, as where the time is "
+        "over: nothing is left where the output would be, and the same command without the limit goes on to the same "
+        "numbers."
+    )
+    return [about, "", *lines]
+
+
+SLURM = {
+    "disturbed": "a sweep whose workers are cancelled, and told that their time is over",
+    "down": "a sweep whose node goes down, and later the controller",
+    "minute": "a run longer than a minute in jobs of a minute",
+    "waits": "a job that may begin in an hour",
+}
+
+
+def _slurm(found: dict[str, Any] | None) -> list[str]:
+    if found is None:
+        return ["Not tried here: it needs root, and Debian's slurm-wlm and munge."]
+    lines = ["| what | counts |", "|---|---|"]
+    for name, about in SLURM.items():
+        told = ", ".join(f"{what}: {count}" for what, count in found.get(name, {"FAILED": 1}).items())
+        lines.append(f"| {about} | {told} |")
+    return [
+        "`make cluster`: a SLURM of this one machine. All points were compared with those of the same sweep without "
+        "SLURM: they are equal, bit for bit.",
+        "",
+        *lines,
+    ]
 
 
 def _disks(found: dict[str, Any]) -> list[str]:
@@ -139,8 +210,11 @@ def page(found: dict[str, dict[str, Any]], minutes: float) -> str:
     parts = {
         "Killed": _kills(found["killed"]["found"]),
         "Hostile input": _inputs(found["fuzz"]["found"]),
+        "Extremes of legal options": _extremes(found["extremes"]["found"]),
+        "Limits": _limits(found["limits"]["found"]),
         "Full and read-only disks": _disks(found["disks"]["found"]),
         "What is not ours, and what is not itself": _ours(found["ours"]["found"]),
+        "SLURM": _slurm(found["slurm"]["found"] if "slurm" in found else None),
         "Native library under sanitizers": [f"ASan, UBSan and TSan over tests/reliability/drive.cc: {sound}."],
         "Numerical trust": _trust(found["trust"]["found"]),
     }
