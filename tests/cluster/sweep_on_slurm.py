@@ -158,7 +158,7 @@ def goes_on_after_outages(folder: Path) -> dict[str, int]:
     written(folder)
     (node,) = told("sinfo", "--noheader", "--format=%n")
     controller = Path(os.environ["SLURM_CONF"]).with_name("slurmctld.pid")
-    sweep, store = gmem("sweep", folder / "slurm.toml"), folder / "slurm", 0
+    sweep, store = gmem("sweep", folder / "slurm.toml"), folder / "slurm"
 
     def until(points: int) -> None:
         while len(list(store.glob("points/*.h5"))) < points or not running():

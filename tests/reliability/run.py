@@ -1,7 +1,6 @@
 """All of it, in under an hour on two cores, and docs/reliability.md with what was found: `make reliability`.
 
-Two lanes side by side: kills and SLURM in one; hostile input, extremes, limits, disks, sanitizers and
-numerical trust in the other.
+Two pieces run side by side; `--scale`, `--studies` and `--lanes` make it shorter.
 """
 
 import argparse
@@ -28,13 +27,12 @@ STUDIES = ["order", "skin", "dt"]
 Piece = tuple[str, list[str]]
 
 
-def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
-    """Name and command of each piece, by lane; what they find goes into JSON files of their names."""
+def pieces(folder: Path, scale: float, studies: list[str]) -> list[Piece]:
+    """Name and command of each piece, the longest first; what they find goes into JSON files of their names."""
 
     def script(path: Path, name: str, *more: object) -> Piece:
         return name, [sys.executable, str(path), *map(str, more), "--json", str(folder / f"{name}.json")]
 
-    kills = script(HERE / "killed.py", "killed", "--kills", max(8, round(104 * scale)))
     sanitizers = [
         sys.executable,
         "-m",
@@ -44,9 +42,10 @@ def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
         "no:cacheprovider",
         str(ROOT / "tests/native/test_sanitizers.py"),
     ]
-    studies = [*STUDIES, "builds"] if shutil.which("clang++") else STUDIES
     number = int(time.time()) % 100_000
-    others = [
+    slurm = [str(CLUSTER / "one_node.sh"), sys.executable, str(CLUSTER / "sweep_on_slurm.py")]
+    return [
+        script(HERE / "killed.py", "killed", "--kills", max(8, round(104 * scale))),
         script(HERE / "fuzz.py", "fuzz", max(200, round(10_000 * scale)), "--seed", number),
         script(HERE / "extremes.py", "extremes", max(60, round(400 * scale)), "--seed", number),
         script(HERE / "limits.py", "limits"),
@@ -54,10 +53,8 @@ def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
         script(HERE / "ours.py", "ours", "--tries", max(80, round(800 * scale)), "--runs", max(4, round(16 * scale))),
         ("sanitizers", sanitizers),
         script(ROOT / "benchmarks/trust.py", "trust", "--folder", folder / "trust", "--studies", *studies),
+        *([("slurm", [*slurm, "--json", str(folder / "slurm.json")])] if can_have_slurm() else []),
     ]
-    slurm = [str(CLUSTER / "one_node.sh"), sys.executable, str(CLUSTER / "sweep_on_slurm.py")]
-    clusters = [("slurm", [*slurm, "--json", str(folder / "slurm.json")])] if can_have_slurm() else []
-    return [kills, *clusters], others
 
 
 def can_have_slurm() -> bool:
@@ -65,21 +62,19 @@ def can_have_slurm() -> bool:
     return os.geteuid() == 0 and all(map(shutil.which, ("slurmctld", "slurmd", "munged", "sbatch")))
 
 
-def run(lane: list[Piece], folder: Path) -> dict[str, dict[str, Any]]:
-    """Run the pieces of a lane one after the other."""
-    found = {}
-    for name, command in lane:
-        began = time.perf_counter()
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
-        summary = folder / f"{name}.json"
-        content = json.loads(summary.read_text()) if summary.is_file() else {}
-        seconds = time.perf_counter() - began
-        found[name] = {"code": done.returncode, "seconds": seconds, "found": content, "said": done.stdout[-2000:]}
-        print(f"{name}: exit {done.returncode} after {seconds:.0f} s", flush=True)
-        if done.returncode:
-            print(done.stdout[-3000:], done.stderr[-3000:], flush=True)
-    return found
+def run(piece: Piece, folder: Path) -> dict[str, Any]:
+    """Run a piece."""
+    name, command = piece
+    began = time.perf_counter()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
+    summary = folder / f"{name}.json"
+    content = json.loads(summary.read_text()) if summary.is_file() else {}
+    seconds = time.perf_counter() - began
+    print(f"{name}: exit {done.returncode} after {seconds:.0f} s", flush=True)
+    if done.returncode:
+        print(done.stdout[-3000:], done.stderr[-3000:], flush=True)
+    return {"code": done.returncode, "found": content}
 
 
 def _kills(found: dict[str, Any]) -> list[str]:
@@ -233,13 +228,16 @@ def main() -> int:
     """Run all; 0 if nothing was wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scale", type=float, default=1.0, help="of the numbers of kills and inputs")
+    known = [*STUDIES, "builds"] if shutil.which("clang++") else STUDIES
+    parser.add_argument("--studies", nargs="+", choices=known, default=known, help="of numerical trust")
+    parser.add_argument("--lanes", type=int, default=2, help="pieces side by side")
     parser.add_argument("--page", type=Path, default=PAGE)
     options = parser.parse_args()
     began = time.perf_counter()
-    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(2) as lanes:
-        folder = Path(name)
-        running = [lanes.submit(run, lane, folder) for lane in pieces(folder, options.scale)]
-        found = {key: one for lane in running for key, one in lane.result().items()}
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(options.lanes) as lanes:
+        todo = pieces(Path(name), options.scale, options.studies)
+        ended = lanes.map(lambda piece: run(piece, Path(name)), todo)
+        found = {piece: one for (piece, _), one in zip(todo, ended, strict=True)}
     options.page.write_text(page(found, (time.perf_counter() - began) / 60.0))
     print(f"wrote {options.page}")
     return int(any(one["code"] for one in found.values()))
