@@ -99,7 +99,7 @@ class Experiment:
     signals: Signals | SignalSets = dataclasses.field(metadata={"after_prefix": True})
     friction: FrictionLaw = Hooke()
     material: Material = Material()
-    gamma0: Scalar = parameter(1e-3, "(0, 0.5)", "Shear amplitude", varies=True, after_prefix=True)
+    gamma0: Scalar = parameter(1e-3, "[1e-100, 0.5)", "Shear amplitude", varies=True, after_prefix=True)
     shear_share: Scalar = parameter(
         0.5, "(0, 1]", "Part of gamma by which L_x shrinks and L_y grows", varies=True, after_prefix=True
     )

@@ -24,7 +24,7 @@ PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
 ENTRY = "from gmem_jax.command.app import main; main()"
 SWEEP = f"""[experiment]
 pack = "{PACK}"
-t0 = 36000
+t0 = 18000
 [vary]
 mu = [0.2, 0.5, 1.0]
 friction = ["H", "M1"]
@@ -45,10 +45,14 @@ kept._StoredCheckpoint.maybe_save = lambda *which, **more: (time.sleep(1.5), ask
 """
 
 
+started: list[subprocess.Popen[str]] = []
+
+
 def gmem(*arguments: object, **environment: str) -> subprocess.Popen[str]:
     """Start a command."""
     command = [sys.executable, "-c", ENTRY, *map(str, arguments)]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **environment})
+    started.append(subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, **environment}))
+    return started[-1]
 
 
 def told(*command: str) -> list[str]:
@@ -85,7 +89,7 @@ def gets_on_by_the_minute(folder: Path) -> dict[str, int]:
     """Jobs of a minute do a run of several, which leaves a checkpoint only when SLURM warns of the end of one."""
     (folder / "sitecustomize.py").write_text(SELDOM)
     paths = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH")]))
-    text = SWEEP.replace("t0 = 36000", "t0 = 9000").replace("[0.2, 0.5, 1.0]", "[0.5]").replace('["H", "M1"]', '["H"]')
+    text = SWEEP.replace("t0 = 18000", "t0 = 9000").replace("[0.2, 0.5, 1.0]", "[0.5]").replace('["H", "M1"]', '["H"]')
     for name, executor, more in (("minute", "slurm", "timeout_min = 1"), ("whole", "processes", "")):
         (folder / f"{name}.toml").write_text(text.format(executor=executor, workers=1, more=more))
     sweep = gmem("sweep", folder / "minute.toml", PYTHONPATH=paths)
@@ -154,7 +158,7 @@ def goes_on_disturbed(folder: Path) -> dict[str, int]:
 
 
 def goes_on_after_outages(folder: Path) -> dict[str, int]:
-    """A sweep whose node goes down, and later the controller, for ten seconds each; the node may be back by itself."""
+    """A sweep whose node goes down, and later the controller, for 20 and 10 seconds; the node may be back by itself."""
     written(folder)
     (node,) = told("sinfo", "--noheader", "--format=%n")
     controller = Path(os.environ["SLURM_CONF"]).with_name("slurmctld.pid")
@@ -171,9 +175,9 @@ def goes_on_after_outages(folder: Path) -> dict[str, int]:
         time.sleep(0.5)
     ended = len(running())
     subprocess.run(["scontrol", "update", f"NodeName={node}", "State=DOWN", "Reason=tried"], check=True)
-    time.sleep(1.0)
+    time.sleep(2.0)
     assert not running()
-    time.sleep(9.0)
+    time.sleep(18.0)  # until its processes have ended; requeued jobs would wait for two minutes
     subprocess.run(["scontrol", "update", f"NodeName={node}", "State=RESUME"], stderr=subprocess.DEVNULL, check=False)
     until(2)
     os.kill(int(controller.read_text()), signal.SIGTERM)
@@ -206,7 +210,11 @@ def main() -> None:
     for case in options.cases or CASES:
         with tempfile.TemporaryDirectory() as name:
             began = time.monotonic()
-            found[case] = CASES[case](Path(name))
+            try:
+                found[case] = CASES[case](Path(name))
+            finally:
+                for process in started:
+                    process.kill()
         print(f"{case}, {time.monotonic() - began:.0f} s: {found[case]}", flush=True)
     if options.json:
         options.json.write_text(json.dumps(found, indent=1))

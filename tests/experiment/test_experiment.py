@@ -29,7 +29,7 @@ def make(**changes: Any) -> gm.Experiment:
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
-        ({"gamma0": -3.0}, r"gamma0 must be in \(0, 0.5\), got -3"),
+        ({"gamma0": -3.0}, r"gamma0 must be in \[1e-100, 0.5\), got -3"),
         ({"gamma0": float("nan")}, "gamma0 must be in"),
         ({"gamma0": "much"}, "gamma0 must be a number"),
         ({"gamma0": jnp.asarray([1e-3, -1e-3])}, "gamma0 must be in"),

@@ -239,7 +239,7 @@ def test_mixed_precision_says_where_it_ends() -> None:
 
 
 def test_no_signal_and_no_load_have_their_reasons(tmp_path: Path) -> None:
-    silent = gm.run(gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=60.0, gamma0=1e-300, **SHORT))
+    silent = gm.run(gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=60.0, gamma0=1e-100, **SHORT))
     assert np.isnan(float(silent.fidelity))
     assert "round-off is 1 % of p_sig or more; use a larger gamma0" in gm.explain(int(silent.status[1]))
     hurried = gm.run(gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=1e-3, **SHORT))
@@ -254,6 +254,8 @@ def test_no_signal_and_no_load_have_their_reasons(tmp_path: Path) -> None:
 def test_what_is_legal_in_each_number_and_senseless_is_refused() -> None:
     with pytest.raises(ValueError, match="t0 = 1e-300 is too short: steps must be 1e-100 t_c or longer"):
         gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=1e-300)
+    with pytest.raises(ValueError, match=r"gamma0 must be in \[1e-100, 0.5\), got 1e-300"):  # its square is zero
+        gm.Experiment(PACK, two_bumps(1.0, -0.6), gamma0=1e-300)
     with pytest.raises(ValueError, match=r"delta0 must be in \[1e-9, 0.5\), got 1e-17"):
         gm.Experiment(PACK, two_bumps(1.0, -0.6), delta0=1e-17)
     with pytest.raises(ValueError, match=r"wall_rigidity must be in \[0.1, inf\)"):

@@ -118,8 +118,8 @@ def _judged(folder: Path, case: fuzz.Case) -> tuple[str, str]:
 
 fuzz.KINDS.update(
     {
-        "recall": fuzz.Kind(0.85, lines(RECALL, _OF_RECALL), judge, 120.0),
-        "prepare": fuzz.Kind(0.15, lines(PREPARE, _OF_RECIPE), judge, 240.0),
+        "recall": fuzz.Kind(0.85, lines(RECALL, _OF_RECALL), judge, 60.0),
+        "prepare": fuzz.Kind(0.15, lines(PREPARE, _OF_RECIPE), judge, 120.0),
     }
 )
 

@@ -3,7 +3,7 @@
     python tests/reliability/fuzz.py 10000 --json fuzz.json
 
 Hypothesis makes the cases. They run in children of this process, which have little memory and ten seconds for each: a
-child that is killed by a signal has crashed (SIGSEGV and the like) or hung (SIGALRM). A new kind of input is one more
+child that is killed by a signal has crashed (SIGSEGV and the like) or hung (HUNG). A new kind of input is one more
 `Kind` in KINDS.
 """
 
@@ -60,6 +60,7 @@ friction = "M1"
 [run]
 workers = 2
 """
+HUNG = (signal.SIGPROF, signal.SIGALRM)
 GOOD = ("refused", "accepted")
 BAD = ("lie", "traceback", "wordy", "hang", "crash")
 
@@ -75,7 +76,7 @@ class Kind(NamedTuple):
         share: of all inputs.
         cases: makes them.
         judge: tries one.
-        patience: seconds for one.
+        patience: seconds of CPU time for one, and 20 times as long in all.
     """
 
     share: float
@@ -526,6 +527,11 @@ KINDS: dict[str, Kind] = {
 # ---- running ----
 
 
+def _patience(seconds: float) -> None:
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    signal.setitimer(signal.ITIMER_REAL, 20.0 * seconds)
+
+
 def _child(folder: Path, kind: Kind, number: int, count: int, pipe: int) -> None:
     """Try `count` cases; outcomes go into the pipe, each after its case."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -533,7 +539,8 @@ def _child(folder: Path, kind: Kind, number: int, count: int, pipe: int) -> None
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 2)  # what native code says
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    for one in HUNG:
+        signal.signal(one, signal.SIG_DFL)
     jax.config.update("jax_enable_x64", True)
 
     def tell(*what: Any) -> None:
@@ -551,9 +558,9 @@ def _child(folder: Path, kind: Kind, number: int, count: int, pipe: int) -> None
     @given(kind.cases)
     def one(case: Case) -> None:
         tell("case", repr(case)[:2000])
-        signal.setitimer(signal.ITIMER_REAL, kind.patience)
+        _patience(kind.patience)
         outcome, said = kind.judge(folder, case)
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        _patience(0.0)
         tell("outcome", outcome, said)
 
     one()
@@ -612,7 +619,7 @@ def fuzz(count: int, number: int = 0, kinds: tuple[str, ...] = tuple(KINDS)) -> 
                     if rest[0] in BAD:
                         failures.append({"kind": name, "case": case, "outcome": rest[0], "said": rest[1]})
                 if os.WIFSIGNALED(status):
-                    outcome = "hang" if os.WTERMSIG(status) == signal.SIGALRM else "crash"
+                    outcome = "hang" if os.WTERMSIG(status) in HUNG else "crash"
                     tally[outcome] += 1
                     failures.append(
                         {"kind": name, "case": case, "outcome": outcome, "said": f"signal {os.WTERMSIG(status)}"}

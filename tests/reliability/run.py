@@ -63,8 +63,12 @@ def can_have_slurm() -> bool:
 
 
 def run(piece: Piece, folder: Path) -> dict[str, Any]:
-    """Run a piece."""
+    """Run a piece, or read what it found earlier in that folder."""
     name, command = piece
+    kept = folder / f"{name}-ended.json"
+    if kept.is_file():
+        ended: dict[str, Any] = json.loads(kept.read_text())
+        return ended
     began = time.perf_counter()
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
@@ -74,7 +78,9 @@ def run(piece: Piece, folder: Path) -> dict[str, Any]:
     print(f"{name}: exit {done.returncode} after {seconds:.0f} s", flush=True)
     if done.returncode:
         print(done.stdout[-3000:], done.stderr[-3000:], flush=True)
-    return {"code": done.returncode, "found": content}
+    ended = {"code": done.returncode, "found": content, "seconds": seconds}
+    kept.write_text(json.dumps(ended))
+    return ended
 
 
 def _kills(found: dict[str, Any]) -> list[str]:
@@ -231,12 +237,15 @@ def main() -> int:
     known = [*STUDIES, "builds"] if shutil.which("clang++") else STUDIES
     parser.add_argument("--studies", nargs="+", choices=known, default=known, help="of numerical trust")
     parser.add_argument("--lanes", type=int, default=2, help="pieces side by side")
+    parser.add_argument("--folder", type=Path, help="what is found is kept there, and not tried again")
     parser.add_argument("--page", type=Path, default=PAGE)
     options = parser.parse_args()
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(options.lanes) as lanes:
-        todo = pieces(Path(name), options.scale, options.studies)
-        ended = lanes.map(lambda piece: run(piece, Path(name)), todo)
+        folder = options.folder or Path(name)
+        folder.mkdir(exist_ok=True)
+        todo = pieces(folder, options.scale, options.studies)
+        ended = lanes.map(lambda piece: run(piece, folder), todo)
         found = {piece: one for (piece, _), one in zip(todo, ended, strict=True)}
     options.page.write_text(page(found, (time.perf_counter() - began) / 60.0))
     print(f"wrote {options.page}")
