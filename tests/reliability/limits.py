@@ -19,7 +19,7 @@ from killed import COMMANDS, LONGEST, content, start, wait
 
 LIMITS: dict[str, tuple[int, list[int]]] = {  # what the kernel limits, and to how much
     "memory beside what a start takes (MB)": (resource.RLIMIT_AS, [30, 200, 800]),
-    "open files": (resource.RLIMIT_NOFILE, [4, 6, 8]),
+    "open files": (resource.RLIMIT_NOFILE, [5, 8, 16]),
     "size of a file (kB)": (resource.RLIMIT_FSIZE, [1, 8, 100]),
     "CPU time (s)": (resource.RLIMIT_CPU, [1, 2]),
 }

@@ -29,7 +29,7 @@ from gmem_jax.files.ours import remove_leftovers
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.training import Training, initial, save, train_net
 from gmem_jax.sweeps.processes import RUNNER
-from gmem_jax.sweeps.spec import SweepSpec, spec_of
+from gmem_jax.sweeps.spec import Spec, spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SweepRunner
 from gmem_jax.sweeps.table import rows
@@ -169,7 +169,7 @@ def identity(tries: int, chance: random.Random) -> Counter[str]:
     return found
 
 
-def _packs_of(spec: SweepSpec, folder: Path) -> None:
+def _packs_of(spec: Spec, folder: Path) -> None:
     runner = SweepRunner(spec, folder, lambda _: None)
     for seed in (1, 2):
         runner.pack_of({"prepare.grains": 16, "prepare.seed": seed})
