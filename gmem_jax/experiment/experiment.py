@@ -37,12 +37,13 @@ from gmem_jax.physics.step import System, start
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.loop import Observe, Simulation, at_rest
 from gmem_jax.simulation.protocol import BINS, Columns, Drive, Lane, Protocol, Stage
-from gmem_jax.simulation.strain import Sine, StrainPath, Waveforms
+from gmem_jax.simulation.strain import COMPRESSIONS, Sine, StrainPath, Waveforms
 
 FASTEST_CREEP = 0.05  # of an elastic force in a bin: it relaxes once in each
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
 MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
+LEAST_STEP = 1e-100  # t_c; its square is a number still
 LARGEST_STEP = 1.0  # t_c; `stable_step` says what a pack allows: 0.6 to 0.8 under the default law
 
 
@@ -98,11 +99,11 @@ class Experiment:
     signals: Signals | SignalSets = dataclasses.field(metadata={"after_prefix": True})
     friction: FrictionLaw = Hooke()
     material: Material = Material()
-    gamma0: Scalar = parameter(1e-3, "(0, 0.5)", "Shear amplitude", varies=True, after_prefix=True)
+    gamma0: Scalar = parameter(1e-3, "[1e-100, 0.5)", "Shear amplitude", varies=True, after_prefix=True)
     shear_share: Scalar = parameter(
         0.5, "(0, 1]", "Part of gamma by which L_x shrinks and L_y grows", varies=True, after_prefix=True
     )
-    delta0: Scalar | None = parameter(None, "(0, 0.5)", "Areal compression; default the pack's own", varies=True)
+    delta0: Scalar | None = parameter(None, COMPRESSIONS, "Areal compression; default the pack's own", varies=True)
     t0: Scalar = parameter(1.8e3, "(0, inf)", "Duration of one compression (the paper's is 18000)", "t_c", varies=True)
     hold_drag: Scalar | None = parameter(
         None, "[0, inf)", "Viscous drag in holds; default 0.05 if t0 < 18000", "1/t_c", varies=True
@@ -155,6 +156,8 @@ class Experiment:
         self._check_waveforms()
         self._check_creep()
         step = self.timing.dt
+        if not traced(step) and not np.all(np.asarray(step) >= LEAST_STEP):
+            raise ValueError(f"t0 = {np.min(self.t0):g} is too short: steps must be {LEAST_STEP:g} t_c or longer")
         if not traced(step) and not np.all(np.asarray(step) <= LARGEST_STEP):
             raise ValueError(
                 f"steps = {self.steps_per_bin} makes a time step of {np.max(step):g} t_c, which must be at most "

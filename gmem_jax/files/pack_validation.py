@@ -12,7 +12,9 @@ from gmem_jax.errors import FileFormatError
 from gmem_jax.files.validation import is_number, numbers, require, require_fields, require_finite, title, whole
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes, require_room
 from gmem_jax.physics.pairs import nearest_images
+from gmem_jax.physics.pytree import interval
 from gmem_jax.simulation.frames import sphere_places
+from gmem_jax.simulation.strain import COMPRESSIONS
 
 UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
 LARGEST_OVERLAP = 0.5  # R, overlap of spheres at rest; packs are at 0.1, and Hertz's law is long wrong at 0.5
@@ -91,7 +93,7 @@ def _check_box(found: Found) -> None:
     lower, upper, delta0 = found["lower"], found["upper"], float(found["delta0"])
     require(len(found["position"]) > 0, "it holds no grains")
     require(lower < upper, "a lower wall of the box is not below the upper one")
-    require(0.0 < delta0 < 0.5, f"delta0 must be in (0, 0.5), got {delta0:g}")
+    require(interval(COMPRESSIONS).holds(delta0), f"delta0 must be in {COMPRESSIONS}, got {delta0:g}")
     require(upper - lower < LARGEST_BOX, f"a box wider than {LARGEST_BOX:g} R is none of a pack at rest")
     filling = _filling(found)
     require(

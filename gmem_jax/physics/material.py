@@ -23,6 +23,7 @@ class Material:
         poisson: Poisson's ratio nu.
         normal_damping: ratio gamma_n / k_n of the Hertz contact, in t_c.
         wall_rigidity: stiffness of a wall contact over that with a rigid plane; 1/2 for walls as soft as the grains.
+            Through softer ones than 0.1 grains get out.
 
     Raises:
         ValueError: if a value is outside its physical range.
@@ -34,7 +35,7 @@ class Material:
     poisson: Scalar = parameter(0.49, "(-1, 0.5]")
     normal_damping: Scalar = parameter(0.23, "[0, inf)")
     wall_rigidity: Scalar = parameter(
-        1.0, "(0, inf)", "Stiffness of walls over that of rigid ones; default 1", option=True
+        1.0, "[0.1, inf)", "Stiffness of walls over that of rigid ones; default 1", option=True
     )
 
     def __post_init__(self) -> None:

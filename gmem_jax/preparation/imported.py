@@ -22,12 +22,14 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, clump, sphere, tetra
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.pytree import interval
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import still_box
 from gmem_jax.physics.step import System
 from gmem_jax.preparation.ringing import ringing_period
 from gmem_jax.simulation.neighbors import SKIN
 from gmem_jax.simulation.progress import Progress, silent
+from gmem_jax.simulation.strain import COMPRESSIONS
 
 MISFIT = 1e-3  # R, by which spheres may lie elsewhere than in a rigid grain
 _NAMED = 1e-4  # R, by which the edges of a tetra grain may differ from those of a whole number of 1e-4 in overlap
@@ -114,8 +116,8 @@ def import_pack(
     Warns:
         UserWarning: of what the file holds and the pack does not.
     """
-    if not 0.0 < delta0 < 0.5:
-        raise ValueError(f"delta0 must be in (0, 0.5), got {delta0:g}")
+    if not interval(COMPRESSIONS).holds(delta0):
+        raise ValueError(f"delta0 must be in {COMPRESSIONS}, got {delta0:g}")
     read = load_spheres(path, radius)
     try:
         return _pack_of(read, Path(path), delta0, name or Path(path).stem, friction or Hooke(), radius, progress)

@@ -15,6 +15,7 @@ from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.numbers import is_real
 from gmem_jax.physics.pytree import interval
 from gmem_jax.simulation.protocol import BINS, Stage
+from gmem_jax.simulation.strain import COMPRESSIONS
 
 SETTLING = 500.0  # t_c that coming to rest took per R of a dense pack's height (170 to 880, N = 325 to 10,240)
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
@@ -66,7 +67,7 @@ class Recipe:
 
     grains: int = _number(325, "[12, inf)", "Number of grains N")
     seed: int = _number(1, "[0, 9007199254740991]", "Random seed, a number that JSON holds exactly")
-    delta0: float = _number(0.05, "(0, 0.5)", "Areal compression of the cycles and of the experiment")
+    delta0: float = _number(0.05, COMPRESSIONS, "Areal compression of the cycles and of the experiment")
     t0: float = _number(1.8e3, "(0, inf)", "Duration of one compression", "t_c")
     dt: float = _number(0.3, "(0, 0.5]", "Largest time step", "t_c")
     filling: float = _number(0.30, "(0, 0.6)", "Of the lattice that the gas starts from; less for long grains")

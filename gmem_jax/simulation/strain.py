@@ -13,6 +13,7 @@ from gmem_jax.physics.state import Box, HeldWalls
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.protocol import Bin, Lane, Numbers
 
+COMPRESSIONS = "[1e-9, 0.5)"  # delta0 of a compression: of less, rounding leaves the walls where they are
 SERVO_GAIN = 2.5e-4  # strain in a bin for a relative error of 1: stresses follow within some 20 bins, and do not ring
 SERVO_STRAIN = 2.5e-4  # strain in a bin at most: some times that of a compression
 

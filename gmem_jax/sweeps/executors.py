@@ -17,7 +17,7 @@ from gmem_jax import native
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.validation import optional
 from gmem_jax.sweeps import slurm, work
-from gmem_jax.sweeps.processes import EXIT_TIMEOUT, RUNNER, job_name, known_by, python, safe_path
+from gmem_jax.sweeps.processes import EXIT_TIMEOUT, RUNNER, job_name, known_by, python, safe_path, stderr_into
 from gmem_jax.sweeps.store import Store
 
 POLL = 0.5  # s
@@ -202,7 +202,7 @@ class Submitted(Executor):
                 self._executor = self._submitting(store.folder / "workers" / "submitit")
             if "name" not in self._options:
                 self._executor.update_parameters(name=job_name(store, name))
-            with safe_path():
+            with safe_path(), stderr_into(store.log_of(name)):  # a local controller that is ended leaves a traceback
                 job = self._executor.submit(work.Requeued(), [str(store.folder.absolute()), name])
         except (self._submitit.core.utils.FailedJobError, subprocess.SubprocessError, FileNotFoundError) as error:
             raise OSError(f"the scheduler takes no job: {' '.join(str(error).split())[-300:]}") from error

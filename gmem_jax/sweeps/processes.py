@@ -6,6 +6,7 @@ import platform
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -37,6 +38,19 @@ def safe_path() -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def stderr_into(log: Path) -> Iterator[None]:
+    """Have the processes that are started in the block, by whomever, write to the end of a log what goes to stderr."""
+    kept = os.dup(2)
+    try:
+        with log.open("ab") as file:
+            os.dup2(file.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def end_with_parent() -> None:

@@ -133,6 +133,7 @@ def test_workers_that_are_killed_are_replaced_and_change_no_bit(swept: Path, tmp
         time.sleep(0.05)
     assert killed
     assert sweep.returncode == 0, (tmp_path / "log").read_text()
+    assert "Traceback" not in (tmp_path / "log").read_text()
     for path in (tmp_path / "mu" / "points").iterdir():
         one, other = (gm.load_recall(folder / "points" / path.name) for folder in (tmp_path / "mu", swept))
         np.testing.assert_array_equal(one.p_sig, other.p_sig)

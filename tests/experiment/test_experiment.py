@@ -29,11 +29,11 @@ def make(**changes: Any) -> gm.Experiment:
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
-        ({"gamma0": -3.0}, r"gamma0 must be in \(0, 0.5\), got -3"),
+        ({"gamma0": -3.0}, r"gamma0 must be in \[1e-100, 0.5\), got -3"),
         ({"gamma0": float("nan")}, "gamma0 must be in"),
         ({"gamma0": "much"}, "gamma0 must be a number"),
         ({"gamma0": jnp.asarray([1e-3, -1e-3])}, "gamma0 must be in"),
-        ({"delta0": 1.0}, r"delta0 must be in \(0, 0.5\), got 1"),
+        ({"delta0": 1.0}, r"delta0 must be in \[1e-9, 0.5\), got 1"),
         ({"t0": 0.0}, r"t0 must be in \(0, inf\), got 0"),
         ({"t0": float("inf")}, "t0 must be in"),
         ({"dt": 5.0}, r"dt must be in \(0, 1.0\], got 5"),

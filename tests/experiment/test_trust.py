@@ -3,6 +3,7 @@
 from collections import OrderedDict
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -237,14 +238,28 @@ def test_mixed_precision_says_where_it_ends() -> None:
     assert left > 0.01 * np.sqrt(np.mean(faint.p_sig**2))
 
 
-def test_no_signal_and_no_load_have_their_reasons() -> None:
-    silent = gm.run(gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=60.0, gamma0=1e-300, **SHORT))
+def test_no_signal_and_no_load_have_their_reasons(tmp_path: Path) -> None:
+    silent = gm.run(gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=60.0, gamma0=1e-100, **SHORT))
     assert np.isnan(float(silent.fidelity))
     assert "round-off is 1 % of p_sig or more; use a larger gamma0" in gm.explain(int(silent.status[1]))
     hurried = gm.run(gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=1e-3, **SHORT))
     assert "lost the pack; use a larger t0" in gm.explain(int(hurried.status[0]))
+    for name, recall in (("silent", silent), ("hurried", hurried)):  # such files are read again, too
+        gm.save_recall(tmp_path / f"{name}.h5", recall)
+        assert np.isnan(gm.load_recall(tmp_path / f"{name}.h5").fidelity)
     with pytest.raises(ValueError, match="waveform 2 is zero in the middle of every bin of u: make it wider than"):
         gm.Experiment(PACK, gm.Bumps(jnp.ones((2, 1)), jnp.full((2, 1), 0.3), jnp.asarray([[0.2], [1e-9]])))
+
+
+def test_what_is_legal_in_each_number_and_senseless_is_refused() -> None:
+    with pytest.raises(ValueError, match="t0 = 1e-300 is too short: steps must be 1e-100 t_c or longer"):
+        gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=1e-300)
+    with pytest.raises(ValueError, match=r"gamma0 must be in \[1e-100, 0.5\), got 1e-300"):  # its square is zero
+        gm.Experiment(PACK, two_bumps(1.0, -0.6), gamma0=1e-300)
+    with pytest.raises(ValueError, match=r"delta0 must be in \[1e-9, 0.5\), got 1e-17"):
+        gm.Experiment(PACK, two_bumps(1.0, -0.6), delta0=1e-17)
+    with pytest.raises(ValueError, match=r"wall_rigidity must be in \[0.1, inf\)"):
+        gm.Material(wall_rigidity=1e-3)
 
 
 def test_a_silent_waveform_of_a_set_is_no_noise() -> None:

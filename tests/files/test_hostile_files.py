@@ -127,7 +127,7 @@ CHANGES = [
     (scale("upper", 10.0), "grains fill"),
     (scale("clump/mass", 1.001), "the filling on record"),
     (scale("clump/diameter", 1.01), "the grain's diameter"),
-    (scale("delta0", 20.0), r"delta0 must be in \(0, 0.5\)"),
+    (scale("delta0", 20.0), r"delta0 must be in \[1e-9, 0.5\)"),
     (scale("ringing_period", 5e7), r"its ringing period is .* t_c, must be between 6.36 and 147 in a box of this size"),
     (scale("ringing_period", 0.1), "its ringing period is 1.96"),
     (squeeze, "its list misses spheres"),

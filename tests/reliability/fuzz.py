@@ -3,7 +3,7 @@
     python tests/reliability/fuzz.py 10000 --json fuzz.json
 
 Hypothesis makes the cases. They run in children of this process, which have little memory and ten seconds for each: a
-child that is killed by a signal has crashed (SIGSEGV and the like) or hung (SIGALRM). A new kind of input is one more
+child that is killed by a signal has crashed (SIGSEGV and the like) or hung (HUNG). A new kind of input is one more
 `Kind` in KINDS.
 """
 
@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,7 +43,6 @@ from gmem_jax.simulation.protocol import Drive, Protocol, Stage
 from gmem_jax.simulation.sample import MEASURED, Sample
 from gmem_jax.sweeps.spec import read_spec
 
-PATIENCE = 10.0  # seconds for one input
 MEMORY = 6 << 30  # bytes of address space that a child may add
 BATCH = 250  # inputs to a child
 PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
@@ -61,6 +60,7 @@ friction = "M1"
 [run]
 workers = 2
 """
+HUNG = (signal.SIGPROF, signal.SIGALRM)
 GOOD = ("refused", "accepted")
 BAD = ("lie", "traceback", "wordy", "hang", "crash")
 
@@ -76,11 +76,13 @@ class Kind(NamedTuple):
         share: of all inputs.
         cases: makes them.
         judge: tries one.
+        patience: seconds of CPU time for one, and 20 times as long in all.
     """
 
     share: float
     cases: st.SearchStrategy[Case]
     judge: Judge
+    patience: float = 10.0
 
 
 # ---- samples: one sound file of every kind ----
@@ -442,6 +444,19 @@ def _without_runs() -> None:
             setattr(module, name, _stop)
 
 
+def spoken(line: Sequence[str]) -> tuple[Any, str, str]:
+    """Exit code of a command line that is run in this process, and what it wrote to stdout and stderr."""
+    sys.argv = ["gmem", *line]
+    out, err = io.StringIO(), io.StringIO()
+    code: Any = 0
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            app.main()
+    except SystemExit as stop:
+        code = stop.code or 0
+    return code, out.getvalue(), err.getvalue()
+
+
 def judge_line(folder: Path, case: Case) -> tuple[str, str]:
     """Run a command line in this process, as the entry point does."""
     _without_runs()
@@ -451,19 +466,13 @@ def judge_line(folder: Path, case: Case) -> tuple[str, str]:
         for pipe in ("pipe.h5", "pipe.csv"):
             os.mkfifo(work / pipe)
     os.chdir(work)
-    sys.argv = ["gmem", *case]
-    out, err = io.StringIO(), io.StringIO()
-    code: Any = 0
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            app.main()
-    except SystemExit as stop:
-        code = stop.code or 0
+        code, out, err = spoken(case)
     except BaseException as error:
         return "traceback", f"{type(error).__name__}: {str(error)[:300]}"
-    said = [line for line in err.getvalue().splitlines() if line.strip() and not line.startswith("warning:")]
-    if code == 2 and (len(said) != 1 or out.getvalue()):
-        return "wordy", f"{len(said)} lines: {err.getvalue()[:300]!r}"
+    said = [line for line in err.splitlines() if line.strip() and not line.startswith("warning:")]
+    if code == 2 and (len(said) != 1 or out):
+        return "wordy", f"{len(said)} lines: {err[:300]!r}"
     return ("accepted" if code in (0, 1) else "refused"), f"exit {code}"
 
 
@@ -518,6 +527,11 @@ KINDS: dict[str, Kind] = {
 # ---- running ----
 
 
+def _patience(seconds: float) -> None:
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    signal.setitimer(signal.ITIMER_REAL, 20.0 * seconds)
+
+
 def _child(folder: Path, kind: Kind, number: int, count: int, pipe: int) -> None:
     """Try `count` cases; outcomes go into the pipe, each after its case."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
@@ -525,7 +539,8 @@ def _child(folder: Path, kind: Kind, number: int, count: int, pipe: int) -> None
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 2)  # what native code says
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    for one in HUNG:
+        signal.signal(one, signal.SIG_DFL)
     jax.config.update("jax_enable_x64", True)
 
     def tell(*what: Any) -> None:
@@ -543,9 +558,9 @@ def _child(folder: Path, kind: Kind, number: int, count: int, pipe: int) -> None
     @given(kind.cases)
     def one(case: Case) -> None:
         tell("case", repr(case)[:2000])
-        signal.setitimer(signal.ITIMER_REAL, PATIENCE)
+        _patience(kind.patience)
         outcome, said = kind.judge(folder, case)
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        _patience(0.0)
         tell("outcome", outcome, said)
 
     one()
@@ -604,7 +619,7 @@ def fuzz(count: int, number: int = 0, kinds: tuple[str, ...] = tuple(KINDS)) -> 
                     if rest[0] in BAD:
                         failures.append({"kind": name, "case": case, "outcome": rest[0], "said": rest[1]})
                 if os.WIFSIGNALED(status):
-                    outcome = "hang" if os.WTERMSIG(status) == signal.SIGALRM else "crash"
+                    outcome = "hang" if os.WTERMSIG(status) in HUNG else "crash"
                     tally[outcome] += 1
                     failures.append(
                         {"kind": name, "case": case, "outcome": outcome, "said": f"signal {os.WTERMSIG(status)}"}
@@ -622,15 +637,15 @@ def fuzz(count: int, number: int = 0, kinds: tuple[str, ...] = tuple(KINDS)) -> 
     }
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Entry point; 1 if anything ended badly."""
+def main(kinds: tuple[str, ...] = tuple(KINDS), argv: list[str] | None = None) -> int:
+    """Entry point, for some kinds of input; 1 if anything ended badly."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("count", type=int, nargs="?", default=10_000, help="inputs in all")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kind", action="append", choices=sorted(KINDS), help="only these")
+    parser.add_argument("--kind", action="append", choices=sorted(kinds), help="only these")
     parser.add_argument("--json", type=Path, help="write the summary there too")
     given_ = parser.parse_args(argv)
-    result = fuzz(given_.count, given_.seed, tuple(given_.kind or KINDS))
+    result = fuzz(given_.count, given_.seed, tuple(given_.kind or kinds))
     text = json.dumps(result, indent=1)
     if given_.json:
         given_.json.write_text(text + "\n")

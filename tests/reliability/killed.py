@@ -17,6 +17,8 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -51,8 +53,8 @@ background = ["sub0", "sub2"]
 LONGEST = 600.0  # s: a run that takes longer hangs
 
 
-def start(arguments: list[str], log: Path) -> int:
-    """A process that runs the command."""
+def start(arguments: list[str], log: Path, first: Callable[[], None] = lambda: None) -> int:
+    """A process that runs the command, after it has called `first`."""
     child = os.fork()
     if child:
         return child
@@ -63,9 +65,12 @@ def start(arguments: list[str], log: Path) -> int:
     sys.argv = ["gmem", *arguments]
     code = 99
     try:
+        first()
         app.main()
     except SystemExit as ended:
         code = int(ended.code or 0)
+    except BaseException:
+        traceback.print_exc()
     finally:
         os._exit(code)
 

@@ -16,6 +16,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -28,7 +29,9 @@ from gmem_jax.files.ours import remove_leftovers
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.training import Training, initial, save, train_net
 from gmem_jax.sweeps.processes import RUNNER
+from gmem_jax.sweeps.spec import Spec, spec_of
 from gmem_jax.sweeps.store import Store
+from gmem_jax.sweeps.sweep import SweepRunner
 from gmem_jax.sweeps.table import rows
 
 PACK = Path(__file__).parents[1] / "data" / "tetra-27.h5"
@@ -132,7 +135,19 @@ def identity(tries: int, chance: random.Random) -> Counter[str]:
                 Checkpoints(folder / f"{seed}", {"seed": seed})(part, lambda _: np.zeros(1))
         for seed in (0, 1):
             save(folder / f"net-{seed}", Training(initial(TrainingConfig(2), seed), seed))
+        os.environ["XDG_CACHE_HOME"] = f"{folder}/home"
+        named = [f"tetra-{grains}-a" for grains in (28, 29)]
+        pack = gm.load_pack(PACK)
+        (folder / "home" / "gmem_jax" / "packs").mkdir(parents=True)
+        for one in named:
+            gm.save_pack(folder / "home" / "gmem_jax" / "packs" / f"{one}.h5", replace(pack, name=one))
+        seeds = spec_of({"prepare": {"grains": 16}, "vary": {"prepare.seed": [1, 2]}})
+        made = SweepRunner(seeds, folder / "made", lambda _: None)
+        for job in made.pack_jobs():
+            gm.save_pack(made.store.pack_at(job["name"]), replace(pack, name=job["name"]))
         kinds = {
+            "packs by name": (sorted(folder.glob("home/*/packs/*")), lambda: [gm.load_pack(one) for one in named]),
+            "packs of a sweep": (sorted(folder.glob("made/packs/*")), lambda: _packs_of(seeds, folder / "made")),
             "points": (sorted((folder / "mu" / "points").iterdir()), lambda: rows(Store(folder / "mu", make=False))),
             "parts": (sorted(folder.glob("[12]/*.npz")), lambda: _read_parts(folder)),
             "nets": (sorted(folder.glob("net-*")), lambda: _read_nets(folder)),
@@ -152,6 +167,12 @@ def identity(tries: int, chance: random.Random) -> Counter[str]:
                 except ValueError:
                     found[f"refused {kind}" if first != contents[0] else f"wrong {kind}"] += 1
     return found
+
+
+def _packs_of(spec: Spec, folder: Path) -> None:
+    runner = SweepRunner(spec, folder, lambda _: None)
+    for seed in (1, 2):
+        runner.pack_of({"prepare.grains": 16, "prepare.seed": seed})
 
 
 def _read_parts(folder: Path) -> None:

@@ -1,6 +1,6 @@
 """All of it, in under an hour on two cores, and docs/reliability.md with what was found: `make reliability`.
 
-Two lanes side by side: kills in one; hostile input, disks, sanitizers and numerical trust in the other.
+Two pieces run side by side; `--scale`, `--studies` and `--lanes` make it shorter.
 """
 
 import argparse
@@ -20,19 +20,19 @@ import gmem_jax as gm
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
+CLUSTER = ROOT / "tests" / "cluster"
 PAGE = ROOT / "docs" / "reliability.md"
 STUDIES = ["order", "skin", "dt"]
 
 Piece = tuple[str, list[str]]
 
 
-def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
-    """Name and command of each piece, by lane; what they find goes into JSON files of their names."""
+def pieces(folder: Path, scale: float, studies: list[str]) -> list[Piece]:
+    """Name and command of each piece, the longest first; what they find goes into JSON files of their names."""
 
     def script(path: Path, name: str, *more: object) -> Piece:
         return name, [sys.executable, str(path), *map(str, more), "--json", str(folder / f"{name}.json")]
 
-    kills = script(HERE / "killed.py", "killed", "--kills", max(8, round(104 * scale)))
     sanitizers = [
         sys.executable,
         "-m",
@@ -42,32 +42,45 @@ def pieces(folder: Path, scale: float) -> tuple[list[Piece], list[Piece]]:
         "no:cacheprovider",
         str(ROOT / "tests/native/test_sanitizers.py"),
     ]
-    studies = [*STUDIES, "builds"] if shutil.which("clang++") else STUDIES
-    others = [
-        script(HERE / "fuzz.py", "fuzz", max(200, round(10_000 * scale)), "--seed", int(time.time()) % 100_000),
+    number = int(time.time()) % 100_000
+    slurm = [str(CLUSTER / "one_node.sh"), sys.executable, str(CLUSTER / "sweep_on_slurm.py")]
+    return [
+        script(HERE / "killed.py", "killed", "--kills", max(8, round(104 * scale))),
+        script(HERE / "fuzz.py", "fuzz", max(200, round(10_000 * scale)), "--seed", number),
+        script(HERE / "extremes.py", "extremes", max(60, round(400 * scale)), "--seed", number),
+        script(HERE / "limits.py", "limits"),
         script(HERE / "disks.py", "disks"),
         script(HERE / "ours.py", "ours", "--tries", max(80, round(800 * scale)), "--runs", max(4, round(16 * scale))),
         ("sanitizers", sanitizers),
         script(ROOT / "benchmarks/trust.py", "trust", "--folder", folder / "trust", "--studies", *studies),
+        *([("slurm", [*slurm, "--json", str(folder / "slurm.json")])] if can_have_slurm() else []),
     ]
-    return [kills], others
 
 
-def run(lane: list[Piece], folder: Path) -> dict[str, dict[str, Any]]:
-    """Run the pieces of a lane one after the other."""
-    found = {}
-    for name, command in lane:
-        began = time.perf_counter()
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
-        summary = folder / f"{name}.json"
-        content = json.loads(summary.read_text()) if summary.is_file() else {}
-        seconds = time.perf_counter() - began
-        found[name] = {"code": done.returncode, "seconds": seconds, "found": content, "said": done.stdout[-2000:]}
-        print(f"{name}: exit {done.returncode} after {seconds:.0f} s", flush=True)
-        if done.returncode:
-            print(done.stdout[-3000:], done.stderr[-3000:], flush=True)
-    return found
+def can_have_slurm() -> bool:
+    """Whether tests/cluster/one_node.sh can start one here."""
+    return os.geteuid() == 0 and all(map(shutil.which, ("slurmctld", "slurmd", "munged", "sbatch")))
+
+
+def run(piece: Piece, folder: Path) -> dict[str, Any]:
+    """Run a piece, or read what it found earlier in that folder."""
+    name, command = piece
+    kept = folder / f"{name}-ended.json"
+    if kept.is_file():
+        ended: dict[str, Any] = json.loads(kept.read_text())
+        return ended
+    began = time.perf_counter()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env=environment)
+    summary = folder / f"{name}.json"
+    content = json.loads(summary.read_text()) if summary.is_file() else {}
+    seconds = time.perf_counter() - began
+    print(f"{name}: exit {done.returncode} after {seconds:.0f} s", flush=True)
+    if done.returncode:
+        print(done.stdout[-3000:], done.stderr[-3000:], flush=True)
+    ended = {"code": done.returncode, "found": content, "seconds": seconds}
+    kept.write_text(json.dumps(ended))
+    return ended
 
 
 def _kills(found: dict[str, Any]) -> list[str]:
@@ -89,6 +102,65 @@ def _inputs(found: dict[str, Any]) -> list[str]:
         "command that came up to its run. Lie: a damaged file that was accepted. Wordy: more than a line."
     )
     return [about, "", *lines]
+
+
+ENDS = {
+    "ok": "numbers and a status of ok",
+    "doubtful": "a status that says what is doubtful",
+    "broke": "broke, with the reason in one line",
+    "refused": "refused in one line",
+    "estimated": "too long: estimated only",
+}
+
+
+def _extremes(found: dict[str, Any]) -> list[str]:
+    bad = ("lie", "traceback", "wordy", "hang", "crash")
+    lines = ["| command | tried | " + " | ".join([*ENDS.values(), "wrong"]) + " |", "|---" * (3 + len(ENDS)) + "|"]
+    for name, one in found["by_kind"].items():
+        counts = [found["inputs"][name], *(one.get(word, 0) for word in ENDS), sum(one.get(word, 0) for word in bad)]
+        lines.append(f"| {name} | {' | '.join(map(str, counts))} |")
+    about = (
+        "One to three options, each at an end of its interval or far out in it (1e-300 to 1e300), N = 27 and, for "
+        "preparations, 12. Wrong: a traceback, more than a line, a file that cannot be read again, or ok beside "
+        "numbers that are none."
+    )
+    return [about, "", *lines]
+
+
+def _limits(found: dict[str, Any]) -> list[str]:
+    words = ("tried", "fitted", "refused", "ended by the system", "wrong")
+    lines = [f"| limit of | {' | '.join(words)} |", "|---" * (1 + len(words)) + "|"]
+    for name, counts in found["by_limit"].items():
+        lines.append(f"| {name} | {' | '.join(str(counts.get(word, 0)) for word in words)} |")
+    about = (
+        "Five commands under `setrlimit`. Refused: one line and no output. Ended by the system, as where the time is "
+        "over: nothing is left where the output would be, and the same command without the limit goes on to the same "
+        "numbers."
+    )
+    return [about, "", *lines]
+
+
+SLURM = {
+    "disturbed": "a sweep whose workers are cancelled, and told that their time is over",
+    "down": "a sweep whose node goes down, and later the controller",
+    "minute": "a run longer than a minute in jobs of a minute",
+    "waits": "a job that may begin in an hour",
+}
+
+
+def _slurm(found: dict[str, Any] | None) -> list[str]:
+    if found is None:
+        return ["Not tried here: it needs root, and Debian's slurm-wlm and munge."]
+    lines = ["| what | counts |", "|---|---|"]
+    for name, about in SLURM.items():
+        told = ", ".join(f"{what}: {count}" for what, count in found.get(name, {"FAILED": 1}).items())
+        lines.append(f"| {about} | {told} |")
+    return [
+        "`make cluster`: a SLURM of this one machine. All points were compared with those of the same sweep without "
+        "SLURM: they are equal, bit for bit.",
+        "",
+        *lines,
+    ]
 
 
 def _disks(found: dict[str, Any]) -> list[str]:
@@ -139,8 +211,11 @@ def page(found: dict[str, dict[str, Any]], minutes: float) -> str:
     parts = {
         "Killed": _kills(found["killed"]["found"]),
         "Hostile input": _inputs(found["fuzz"]["found"]),
+        "Extremes of legal options": _extremes(found["extremes"]["found"]),
+        "Limits": _limits(found["limits"]["found"]),
         "Full and read-only disks": _disks(found["disks"]["found"]),
         "What is not ours, and what is not itself": _ours(found["ours"]["found"]),
+        "SLURM": _slurm(found["slurm"]["found"] if "slurm" in found else None),
         "Native library under sanitizers": [f"ASan, UBSan and TSan over tests/reliability/drive.cc: {sound}."],
         "Numerical trust": _trust(found["trust"]["found"]),
     }
@@ -159,13 +234,19 @@ def main() -> int:
     """Run all; 0 if nothing was wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scale", type=float, default=1.0, help="of the numbers of kills and inputs")
+    known = [*STUDIES, "builds"] if shutil.which("clang++") else STUDIES
+    parser.add_argument("--studies", nargs="+", choices=known, default=known, help="of numerical trust")
+    parser.add_argument("--lanes", type=int, default=2, help="pieces side by side")
+    parser.add_argument("--folder", type=Path, help="what is found is kept there, and not tried again")
     parser.add_argument("--page", type=Path, default=PAGE)
     options = parser.parse_args()
     began = time.perf_counter()
-    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(2) as lanes:
-        folder = Path(name)
-        running = [lanes.submit(run, lane, folder) for lane in pieces(folder, options.scale)]
-        found = {key: one for lane in running for key, one in lane.result().items()}
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(options.lanes) as lanes:
+        folder = options.folder or Path(name)
+        folder.mkdir(exist_ok=True)
+        todo = pieces(folder, options.scale, options.studies)
+        ended = lanes.map(lambda piece: run(piece, folder), todo)
+        found = {piece: one for (piece, _), one in zip(todo, ended, strict=True)}
     options.page.write_text(page(found, (time.perf_counter() - began) / 60.0))
     print(f"wrote {options.page}")
     return int(any(one["code"] for one in found.values()))
