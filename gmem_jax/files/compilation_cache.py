@@ -51,6 +51,7 @@ def keep_programs() -> None:
     if getattr(jax.config, "jax_logging_level", None) == "NOTSET":
         jax.config.update("jax_logging_level", "CRITICAL")
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.05)
+    # Small ones too: a recall has a hundred, which take longer to compile than to read, and 0.5 MB.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     # What a killed process left half written is compiled again.
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")
