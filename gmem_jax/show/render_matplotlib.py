@@ -124,7 +124,8 @@ def _legend(canvas: Any, first: Any, figure: Figure, known: dict[str, Any]) -> N
     if figure.legend == "panel":
         first.legend(known.values(), known, **style)
     elif figure.legend == "below":
-        style |= {"fontsize": 8, "ncols": len(known)}
+        fitting = max(1, int(canvas.get_figwidth() / 2.4))  # inches of an entry
+        style |= {"fontsize": 8, "ncols": min(len(known), fitting)}
         canvas.legend(known.values(), known, loc="outside lower center", **style)
     else:
         canvas.legend(known.values(), known, loc="outside right upper", **style)

@@ -133,7 +133,7 @@ def _limits(found: dict[str, Any]) -> list[str]:
     for name, counts in found["by_limit"].items():
         lines.append(f"| {name} | {' | '.join(str(counts.get(word, 0)) for word in words)} |")
     about = (
-        "Five commands under `setrlimit`. Refused: one line and no output. Ended by the system, as where the time is "
+        "Long commands under `setrlimit`. Refused: one line and no output. Ended by the system, as where the time is "
         "over: nothing is left where the output would be, and the same command without the limit goes on to the same "
         "numbers."
     )

@@ -77,3 +77,13 @@ def test_the_unit_of_a_derivative_is_that_of_the_law_and_none_where_the_law_is_n
     for law, unit in (("hooke", " per E R"), ("mindlin", " per E R^0.5"), ("", "")):
         known = {"configuration": {"friction": law}} if law else {}
         assert f"dF/dstiffness = 2{unit}\n" in str(of_gradient({**result, **known}).lines[0])
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_a_legend_below_lies_within_the_picture(count: int) -> None:
+    u, words = np.linspace(0.0, 1.0, 5), "its mean over the ringing period"
+    curves = tuple(Curve(u, u * (1 + number), f"{words} {number}") for number in range(count))
+    drawn = render_matplotlib.to_matplotlib(Figure((Panel(curves),), legend="below")).figure
+    drawn.canvas.draw()
+    box = drawn.legends[0].get_window_extent()
+    assert 0.0 <= box.x0 < box.x1 <= drawn.bbox.width
