@@ -259,6 +259,8 @@ def _power_law(axis: Any, rows: Sequence[Compared]) -> None:
     said = []
     for whose, sizes in of_each.items():
         exponent, error = power(sizes)
+        if math.isnan(exponent):
+            continue
         said.append(f"{whose} $N^{{{exponent:.3f}}}$" + ("" if math.isnan(error) else f" (± {error:.3f})"))
     axis.set_yscale("log")
     axis.set_yticks(ticks := MaxNLocator(5).tick_values(*axis.get_ylim()), [f"{tick:g}" for tick in ticks])
