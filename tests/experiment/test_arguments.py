@@ -144,7 +144,7 @@ def test_every_number_that_is_asked_for_is_a_number_and_no_text_of_one() -> None
         (lambda: gm.run(EXPERIMENT, frames=2.5), "frames must be a whole number from 0, got 2.5"),  # type: ignore[arg-type]
         (lambda: gm.run(EXPERIMENT, frames_of="1"), "frames_of must be a whole number from 0"),  # type: ignore[arg-type]
         (lambda: gm.run(EXPERIMENT, frames_at=["1"]), "u of a frame must be a number, got '1'"),  # type: ignore[list-item]
-        (lambda: gm.Recipe(delta0=b"0.05"), r"delta0 must be a number in \(0, 0.5\), got b'0.05'"),  # type: ignore[arg-type]
+        (lambda: gm.Recipe(delta0=b"0.05"), r"delta0 must be a number in \[1e-9, 0.5\), got b'0.05'"),  # type: ignore[arg-type]
         (lambda: gm.Recipe(hold=np.array("0.1")), r"hold must be a number in \[0, inf\), got array"),  # type: ignore[arg-type]
         (lambda: gm.memory_kernel(EXPERIMENT, "3"), "n must be a whole number from 0, got '3'"),  # type: ignore[arg-type]
         (lambda: gm.memory_kernel(EXPERIMENT, 3, "0.2"), "width must be a number, got '0.2'"),  # type: ignore[arg-type]
