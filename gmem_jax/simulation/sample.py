@@ -63,7 +63,7 @@ class Sample:
     u: jax.Array = measured("1", "compression variable at the end of the bin", ())
     pressure: jax.Array = measured(
         "E",
-        "p_x, p_y, p_z, mean of two opposite walls, averaged over the steps of the bin; of periodic axes by the virial",
+        "p_x, p_y, p_z of the walls, or by the virial, averaged over the steps of the bin",
         _VECTOR,
         plot="pressure",
         label="pressure",

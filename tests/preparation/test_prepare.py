@@ -243,9 +243,16 @@ def test_impossible_recipes_are_refused(bad: dict, words: str) -> None:
         gm.Recipe(**bad)
 
 
+@pytest.mark.parametrize("wrong", ["open", "periodic,walls", 3, None])
+def test_a_boundary_is_walls_or_periodic(wrong: object) -> None:
+    assert gm.Recipe(boundary=("periodic", "walls", "walls")).boundary == "periodic,walls,walls"
+    with pytest.raises(ValueError, match="boundary must be walls or periodic"):
+        gm.Recipe(boundary=wrong)
+
+
 def test_every_number_of_a_recipe_says_what_it_means_and_where_it_must_lie() -> None:
     for entry in fields(gm.Recipe):
-        assert entry.metadata["interval"].holds(entry.default)
+        assert entry.name == "boundary" or entry.metadata["interval"].holds(entry.default)
         assert entry.metadata["help"]
         assert f"        {entry.name}: " in str(gm.Recipe.__doc__)
 
