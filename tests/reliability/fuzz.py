@@ -400,9 +400,12 @@ def _kind_of(entry: Any) -> str:
 
 _COMMANDS: dict[str, list[tuple[str, str]]] = {  # options and the kind of their value
     name: sorted(
-        (option, _kind_of(entry)) for entry in command.params for option in entry.opts if option.startswith("-")
+        (option, _kind_of(entry))
+        for entry in app.command_named(name).params
+        for option in entry.opts
+        if option.startswith("-")
     )
-    for name, command in app.typer.main.get_command(app.app).commands.items()  # type: ignore[attr-defined]
+    for name in app.typer.main.get_command(app.app).commands  # type: ignore[attr-defined]
 }
 _FIRST = {"recall": "pack.h5", "show": "recall.h5", "classify": "recall.h5", "prepare": "-o"}
 
