@@ -203,8 +203,8 @@ def test_what_belongs_to_the_preparation_follows_into_it(tmp_path: Path) -> None
 def test_a_pack_that_was_prepared_for_another_experiment_is_refused_unless_wanted(
     tmp_path: Path, name: str, was: str
 ) -> None:
-    tables = {"experiment": {"pack": "tetra-325-a"}, "vary": {name: [float(was), 0.08]}}
-    with pytest.raises(ValueError, match=rf"{name} = 0.08, and tetra-325-a was prepared with {was}: .*\[prepare\]"):
+    tables = {"experiment": {"pack": "tetra-325-a"}, "vary": {name: [float(was), 0.12]}}
+    with pytest.raises(ValueError, match=rf"{name} = 0.12, and tetra-325-a was prepared with {was}: .*\[prepare\]"):
         runner(tmp_path, **tables).check()
     wanted = runner(tmp_path, **tables, run={"packs_as_they_are": True})
     wanted.check()
