@@ -208,7 +208,7 @@ def test_a_pack_that_was_prepared_for_another_experiment_is_refused_unless_wante
         runner(tmp_path, **tables).check()
     wanted = runner(tmp_path, **tables, run={"packs_as_they_are": True})
     wanted.check()
-    assert [value_at(one.experiment, PATHS[name]) for one in wanted.points()] == [float(was), 0.08]
+    assert [value_at(one.experiment, PATHS[name]) for one in wanted.points()] == [float(was), 0.12]
     with pytest.raises(gm.FileFormatError, match=r"packs_as_they_are in \[run\] must be true or false, got 1"):
         runner(tmp_path, **tables, run={"packs_as_they_are": 1})
 
