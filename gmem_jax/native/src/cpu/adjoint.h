@@ -411,27 +411,28 @@ struct Adjoint : AdjointLayout<Law> {
             load_vec(other + kMidTorque)};
   }
 
-  // By the program. Where `in_lanes` is not set, the bars of the contact's numbers are zero, and others get nothing.
-  void contact_back(std::size_t c, const ContactInput<V>& input, const V* history, Bits in_lanes, V* parameter_bar,
-                    V* own_bar) const {
-    using Calculation = OneContact<Law>;
+  // The bars of what a contact's program results in.
+  void load_result_bars(std::size_t c, V* to) const {
     const ContactLoads<V> loads = loads_bar(plan.candidate[c]);
-    V own[Calculation::kNumbers], result_bar[Calculation::kResults];
+    store_vec(to, loads.force), store_vec(to + 3, loads.torque_one), store_vec(to + 6, loads.torque_other);
+    std::copy_n(history_of(c), Law::kHistory, to + 9);
+  }
+
+  // By the program, from the bars of its results to those of the contact's own numbers and of the parameters.
+  void contact_back(const ContactInput<V>& input, const V* history, const V* result_bar, V* parameter_bar,
+                    V* own_bar) const {
+    V own[OneContact<Law>::kNumbers];
     store_numbers(own, input);
     std::copy_n(history, Law::kHistory, own + kInputs);
-    store_vec(result_bar, loads.force), store_vec(result_bar + 3, loads.torque_one);
-    store_vec(result_bar + 6, loads.torque_other);
-    std::copy_n(history_of(c), Law::kHistory, result_bar + 9);
-    for (V& bar : result_bar) bar = zero_unless(in_lanes, bar);
     const V* in[] = {own, forward.parameter, law_numbers, &last_ring};
     V* bar[] = {own_bar, parameter_bar, parameter_bar + kParameters};
-    pull_back<Calculation>(in, result_bar, bar);
+    pull_back<OneContact<Law>>(in, result_bar, bar);
   }
 
   void contact_back(std::size_t c, V* parameter_bar, const V* history) {
-    V own_bar[OneContact<Law>::kNumbers];
-    const ContactInput<V> input = input_of(plan.candidate[c]);
-    contact_back(c, input, history, ~Bits{}, parameter_bar, own_bar);
+    V own_bar[OneContact<Law>::kNumbers], result_bar[OneContact<Law>::kResults];
+    load_result_bars(c, result_bar);
+    contact_back(input_of(plan.candidate[c]), history, result_bar, parameter_bar, own_bar);
     std::copy_n(own_bar + kInputs, Law::kHistory, history_of(c));
     share_out(plan.candidate[c], load_numbers<ContactInput<V>>(own_bar));
   }
@@ -462,18 +463,18 @@ struct Adjoint : AdjointLayout<Law> {
     friction(Law{}, &contact, 1, law, [&](int) { return Segments{problem.points, &now}; });
 
     const ContactLoads<Taped> found = push(contact);
-    const ContactLoads<V> loads = loads_bar(pair);
     const Bits moves = changes_ring(history[kLastOverlap], contact.overlap.value);
-    V own_bar[OneContact<Law>::kNumbers];
-    contact_back(c, m, history, ~moves, parameter_bar, own_bar);
+    V own_bar[OneContact<Law>::kNumbers], result_bar[OneContact<Law>::kResults], others[OneContact<Law>::kResults];
+    load_result_bars(c, result_bar);
+    for (int r = 0; r < OneContact<Law>::kResults; ++r) others[r] = zero_unless(~moves, result_bar[r]);
+    contact_back(m, history, others, parameter_bar, own_bar);
+
     const auto seed_moving = [moves](Taped a, V bar) { seed(a, zero_unless(moves, bar)); };
-    const auto seed_vec = [&](const Vec<Taped>& a, const Vec<V>& bar) {
-      seed_moving(a.x, bar.x), seed_moving(a.y, bar.y), seed_moving(a.z, bar.z);
-    };
+    const V* from = result_bar;
+    for (Vec<Taped> a : {found.force, found.torque_one, found.torque_other})
+      for_numbers(a, [&](Taped number) { seed_moving(number, *from++); });
+    for (int q = 0; q < Law::kHistory; ++q) seed_moving(memory[q], *from++);
     V *const bar = history_of(c), *const of_segments = bar + Law::kHistory;
-    seed_vec(found.force, loads.force);
-    seed_vec(found.torque_one, loads.torque_one), seed_vec(found.torque_other, loads.torque_other);
-    for (int q = 0; q < Law::kHistory; ++q) seed_moving(memory[q], bar[q]);
     for (std::size_t k = 0; k < now.size(); ++k) {
       seed_moving(now[k].force.along, of_segments[2 * k]);
       seed_moving(now[k].force.across, of_segments[2 * k + 1]);
