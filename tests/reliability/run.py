@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -83,25 +84,31 @@ def run(piece: Piece, folder: Path) -> dict[str, Any]:
     return ended
 
 
+def _table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> list[str]:
+    titles, *lines = [f"| {' | '.join(map(str, row))} |" for row in (head, *rows)]
+    return [titles, "|---" * len(head) + "|", *lines]
+
+
 def _kills(found: dict[str, Any]) -> list[str]:
-    lines = ["| command | kills | runs to the end | other than undisturbed |", "|---|---|---|---|"]
-    lines += [f"| {name} | {one['kills']} | {one['ends']} | {len(one['wrong'])} |" for name, one in found.items()]
+    rows = [(name, one["kills"], one["ends"], len(one["wrong"])) for name, one in found.items()]
+    lines = _table(("command", "kills", "runs to the end", "other than undisturbed"), rows)
     total = sum(one["kills"] for one in found.values())
     return [f"{total} kills at random moments.", "", *lines]
 
 
 def _inputs(found: dict[str, Any]) -> list[str]:
     bad = ("lie", "traceback", "wordy", "hang", "crash")
-    lines = ["| input | tried | refused | accepted | " + " | ".join(bad) + " |", "|---" * (4 + len(bad)) + "|"]
-    for name, count in found["inputs"].items():
-        one = found["by_kind"].get(name, {})
-        cells = [count, one.get("refused", 0), one.get("accepted", 0), *(one.get(word, 0) for word in bad)]
-        lines.append(f"| {name} | " + " | ".join(map(str, cells)) + " |")
+    words = ("refused", "accepted", *bad)
+    by_kind = found["by_kind"]
+    rows = [
+        (name, count, *(by_kind.get(name, {}).get(word, 0) for word in words))
+        for name, count in found["inputs"].items()
+    ]
     about = (
         "Refused: one line and exit 2. Accepted: plausible numbers in a file sealed anew, or a "
         "command that came up to its run. Lie: a damaged file that was accepted. Wordy: more than a line."
     )
-    return [about, "", *lines]
+    return [about, "", *_table(("input", "tried", *words), rows)]
 
 
 ENDS = {
@@ -115,29 +122,27 @@ ENDS = {
 
 def _extremes(found: dict[str, Any]) -> list[str]:
     bad = ("lie", "traceback", "wordy", "hang", "crash")
-    lines = ["| command | tried | " + " | ".join([*ENDS.values(), "wrong"]) + " |", "|---" * (3 + len(ENDS)) + "|"]
-    for name, one in found["by_kind"].items():
-        counts = [found["inputs"][name], *(one.get(word, 0) for word in ENDS), sum(one.get(word, 0) for word in bad)]
-        lines.append(f"| {name} | {' | '.join(map(str, counts))} |")
+    rows = [
+        (name, found["inputs"][name], *(one.get(word, 0) for word in ENDS), sum(one.get(word, 0) for word in bad))
+        for name, one in found["by_kind"].items()
+    ]
     about = (
         "One to three options, each at an end of its interval or far out in it (1e-300 to 1e300), N = 27 and, for "
         "preparations, 12. Wrong: a traceback, more than a line, a file that cannot be read again, or ok beside "
         "numbers that are none."
     )
-    return [about, "", *lines]
+    return [about, "", *_table(("command", "tried", *ENDS.values(), "wrong"), rows)]
 
 
 def _limits(found: dict[str, Any]) -> list[str]:
     words = ("tried", "fitted", "refused", "ended by the system", "wrong")
-    lines = [f"| limit of | {' | '.join(words)} |", "|---" * (1 + len(words)) + "|"]
-    for name, counts in found["by_limit"].items():
-        lines.append(f"| {name} | {' | '.join(str(counts.get(word, 0)) for word in words)} |")
+    rows = [(name, *(counts.get(word, 0) for word in words)) for name, counts in found["by_limit"].items()]
     about = (
         "Long commands under `setrlimit`. Refused: one line and no output. Ended by the system, as where the time is "
         "over: nothing is left where the output would be, and the same command without the limit goes on to the same "
         "numbers."
     )
-    return [about, "", *lines]
+    return [about, "", *_table(("limit of", *words), rows)]
 
 
 SLURM = {
@@ -151,15 +156,13 @@ SLURM = {
 def _slurm(found: dict[str, Any] | None) -> list[str]:
     if found is None:
         return ["Not tried here: it needs root, and Debian's slurm-wlm and munge."]
-    lines = ["| what | counts |", "|---|---|"]
-    for name, about in SLURM.items():
-        told = ", ".join(f"{what}: {count}" for what, count in found.get(name, {"FAILED": 1}).items())
-        lines.append(f"| {about} | {told} |")
+    told = {name: found.get(name, {"FAILED": 1}).items() for name in SLURM}
+    rows = [(about, ", ".join(f"{what}: {count}" for what, count in told[name])) for name, about in SLURM.items()]
     return [
         "`make cluster`: a SLURM of this one machine. All points were compared with those of the same sweep without "
         "SLURM: they are equal, bit for bit.",
         "",
-        *lines,
+        *_table(("what", "counts"), rows),
     ]
 
 
@@ -187,19 +190,26 @@ def _ours(found: dict[str, Any]) -> list[str]:
     lines = []
     for kind, about in CLASSES.items():
         counts = found.get(kind, {})
-        lines += [f"**{kind.capitalize()}.** {about}", "", "| what | tried | refused | wrong |", "|---|---|---|---|"]
-        for name in sorted(name.partition(" ")[2] for name in counts if name.startswith("tried ")):
-            cells = [counts.get(f"{word} {name}", 0) for word in ("tried", "refused", "wrong")]
-            lines.append(f"| {name} | {' | '.join(map(str, cells))} |")
-        lines.append("")
+        words = ("tried", "refused", "wrong")
+        names = sorted(name.partition(" ")[2] for name in counts if name.startswith("tried "))
+        rows = [(name, *(counts.get(f"{word} {name}", 0) for word in words)) for name in names]
+        lines += [f"**{kind.capitalize()}.** {about}", "", *_table(("what", *words), rows), ""]
     return lines[:-1]
 
 
 def _trust(found: list[dict[str, Any]]) -> list[str]:
-    lines = ["| varied | value | pack | G | F | p_sig differs by |", "|---|---|---|---|---|---|"]
-    for row in found:
-        away = f"{row['away']:.1e}" if row["away"] else "0"
-        lines.append(f"| {row['study']} | {row['value']} | {row['pack']} | {row['G']:.5f} | {row['F']:.5f} | {away} |")
+    rows = [
+        (
+            row["study"],
+            row["value"],
+            row["pack"],
+            f"{row['G']:.5f}",
+            f"{row['F']:.5f}",
+            f"{row['away']:.1e}" if row["away"] else "0",
+        )
+        for row in found
+    ]
+    lines = _table(("varied", "value", "pack", "G", "F", "p_sig differs by"), rows)
     law = f"with $k_H$ = {gm.Hooke().stiffness:g}"
     return [f"Relative to the first row of the same study and pack, {law}. More in [trust.md](trust.md).", "", *lines]
 
