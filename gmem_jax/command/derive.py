@@ -7,7 +7,6 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from gmem_jax import native
 from gmem_jax.command.console import (
     AsJson,
     Force,
@@ -65,7 +64,7 @@ def _announce(experiment: Experiment, what: str, runs: float, side_by_side: int,
         memory: in parts of what they take in a run.
     """
     steps = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, experiment.signals.count)
-    backend = native.name(experiment.backend, experiment.friction, experiment.pack.periodic)
+    backend = experiment.runs_on
     needs = memory * run_bytes(experiment, side_by_side)
     announce(f"{what}, {experiment.pack.grains} grains", runs * steps, needs, backend, side_by_side + 1)
 

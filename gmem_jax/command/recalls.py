@@ -9,7 +9,6 @@ import jax
 import numpy as np
 import typer
 
-from gmem_jax import native
 from gmem_jax.command.console import (
     AsJson,
     DryRun,
@@ -57,7 +56,7 @@ SHIPPED: dict[str, Any] = {
 def _announce(experiment: Experiment, batch: int) -> dict[str, float]:
     """Say what a recall in batches will need."""
     work = experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
-    backend = native.name(experiment.backend, experiment.friction, experiment.pack.periodic)
+    backend = experiment.runs_on
     side_by_side = min(batch, experiment.signals.count)
     what = f"{experiment.pack.grains} grains, {plural(experiment.signals.count, 'signal')}"
     memory = run_bytes(experiment, side_by_side) + sample_bytes(experiment)

@@ -311,6 +311,11 @@ class Experiment:
         return jnp.where(self.t0 < 0.999 * PAPER_T0, HOLD_DRAG, 0.0)
 
     @property
+    def runs_on(self) -> native.Backend:
+        """What `backend` means for this law and box on JAX's default device."""
+        return native.name(self.backend, self.friction, self.pack.periodic)
+
+    @property
     def timing(self) -> Timing:
         """dt, a little smaller than asked for so that bins are whole, and the steps in a bin."""
         return Timing(self.t0 / (BINS * self.steps_per_bin), self.steps_per_bin)

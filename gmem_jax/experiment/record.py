@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from gmem_jax import native
 from gmem_jax.experiment.experiment import NUMBERS, Experiment, value_at
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance, sources
@@ -140,12 +139,7 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
     own = {**to_dict(experiment), "pack": pack_fingerprint(experiment.pack)}
     if experiment.observe:  # what was kept of another run lacks what these give
         own["observe"] = [name for name, _ in experiment.observe]
-    return {
-        **own,
-        **more,
-        "backend": native.name(experiment.backend, experiment.friction, experiment.pack.periodic),
-        **sources(),
-    }
+    return {**own, **more, "backend": experiment.runs_on, **sources()}
 
 
 @usual_rules()
@@ -178,5 +172,5 @@ def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
         "steps": steps,
         "seconds": seconds,
         **provenance(),
-        "backend": native.name(experiment.backend, experiment.friction, experiment.pack.periodic),
+        "backend": experiment.runs_on,
     }
