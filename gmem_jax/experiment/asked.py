@@ -8,8 +8,11 @@ import numpy as np
 
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.readings import Readings
+from gmem_jax.physics.boundary import PeriodicAxes
 from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import sphere_offsets
+from gmem_jax.physics.pytree import traced
 from gmem_jax.physics.rotation import unit
 from gmem_jax.simulation.protocol import Protocol
 
@@ -54,6 +57,17 @@ def require_inside(pack: Pack) -> None:
 def _spheres(position: jax.Array, quaternion: jax.Array, clump: Clump) -> jax.Array:
     """Centres of spheres, [N, K, 3]."""
     return (position[:, None, :, None] + sphere_offsets(unit(quaternion[..., None]), clump))[..., 0]
+
+
+def require_walls(periodic: PeriodicAxes, material: Material) -> None:
+    """Refuse a rigidity of walls, other than the default, where there are none.
+
+    Raises:
+        ValueError: saying so.
+    """
+    rigidity = material.wall_rigidity
+    if all(periodic) and not traced(rigidity) and np.any(np.asarray(rigidity) != Material.wall_rigidity):
+        raise ValueError("wall_rigidity: a box that is periodic along all axes has no walls")
 
 
 def require_memory(protocol: Protocol, background: str) -> None:

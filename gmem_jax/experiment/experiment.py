@@ -15,7 +15,7 @@ from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
 from gmem_jax.experiment.arguments import named_observers, require_once, require_parts
-from gmem_jax.experiment.asked import require_double, require_memory, require_seen, require_told_apart
+from gmem_jax.experiment.asked import require_double, require_memory, require_seen, require_told_apart, require_walls
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocols import Shear, memory_protocol
@@ -143,6 +143,7 @@ class Experiment:
         if self.backend not in native.BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(native.BACKENDS)}; got {self.backend!r}")
         native.require_precision(self.precision, self.backend, self.friction, self.pack.periodic)
+        require_walls(self.pack.periodic, self.material)
         if not 0.0 < self.dt <= LARGEST_STEP:
             raise ValueError(f"dt must be in (0, {LARGEST_STEP}], got {self.dt:g}")
         if self.steps is not None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from gmem_jax import native
 from gmem_jax.errors import RunFailedError
+from gmem_jax.experiment.asked import require_walls
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
 from gmem_jax.physics import chance, rotation
@@ -293,6 +294,7 @@ def prepare(
     require_x64()
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = grain or tetra(), material or Material()
+    require_walls(periodic_axes(recipe.boundary), material)
     preparation = _Preparation(recipe, clump, material, backend, frames, cache, tell)
     preparation.compact()
     preparation.cycle()

@@ -135,6 +135,15 @@ def test_the_native_backend_refuses_a_periodic_pack_and_auto_runs_plain_jax_and_
             gm.Experiment(PACK, gm.six_signals(), backend="native")
 
 
+def test_a_rigidity_of_walls_is_refused_where_there_are_none() -> None:
+    soft, where = gm.Material(wall_rigidity=0.5), "periodic along all axes has no walls"
+    with pytest.raises(ValueError, match=where):
+        gm.Experiment(PACK, gm.six_signals(), material=soft)
+    with pytest.raises(ValueError, match=where):
+        gm.prepare(gm.Recipe(grains=27, boundary="periodic"), material=soft)
+    gm.Experiment(gm.load_pack(PERIODIC_XY_27), gm.six_signals(), material=soft)
+
+
 def test_a_periodic_pack_recalls_what_was_written() -> None:
     recall = gm.run(gm.Experiment(PACK, gm.six_signals(), t0=20.0), progress=False)
     assert not gm.Status(int(np.bitwise_or.reduce(recall.status))).fatal
