@@ -28,13 +28,18 @@ class Budget:
         grains = states.grains
         self.velocity, self.spin = plain(grains.velocity), plain(grains.spin)
         arms = rotated(plain(grains.quaternion), offsets)
-        count = len(arms)
-        self.spheres = (plain(grains.position)[:, :, None] + arms).reshape(count, -1, 3)
-        self.speeds = (self.velocity[:, :, None] + np.cross(self.spin[:, :, None], arms)).reshape(count, -1, 3)
+        self.spheres = (plain(grains.position)[:, :, None] + arms).reshape(len(arms), -1, 3)
+        # At the end of the step that led to a record, and in its middle: what its forces have seen.
+        back = 0.5 * dt * plain(grains.acceleration), 0.5 * dt * plain(grains.spin_rate)
+        at_end, midway = (self.velocity, self.spin), (self.velocity - back[0], self.spin - back[1])
+        self.speeds, self.mid_speeds = (
+            (velocity[:, :, None] + np.cross(spin[:, :, None], arms)).reshape(len(arms), -1, 3)
+            for velocity, spin in (at_end, midway)
+        )
         self.walls, self.boxes = plain(walls), boxes
-        self._contacts(system.pairs, plain(states.history))
+        self._contacts(system.pairs, plain(states.history), midway[1])
 
-    def _contacts(self, pairs, history):
+    def _contacts(self, pairs, history, mid_spin):
         real = np.asarray(pairs.valid)
         i, j = np.asarray(pairs.first)[real], np.asarray(pairs.second)[real]
         separation = self.spheres[:, j] - self.spheres[:, i]
@@ -42,21 +47,33 @@ class Budget:
         self.normal = separation / distance
         self.overlap = 2.0 - distance
         self.touching = self.overlap > 0.0
-        spins = self.spin[:, i // 4] + self.spin[:, j // 4]
-        surface = self.speeds[:, j] - self.speeds[:, i] - np.cross(spins, 0.5 * distance * self.normal)
-        along = (surface * self.normal).sum(-1, keepdims=True)
-        self.closing = -along
-        self.sliding = np.where(self.touching, surface - along * self.normal, 0.0)
-        self.stored = history[:, real]
-        self.half_step = 0.5 * self.law.stiffness * self.dt * self.sliding
-        self.spring = np.where(self.touching, self.stored - self.half_step, 0.0)
-        self.dashpot = self.law.stiffness * self.law.damping_time * self.sliding
+        moving = []
+        for speeds, spin in ((self.speeds, self.spin), (self.mid_speeds, mid_spin)):
+            spins = spin[:, i // 4] + spin[:, j // 4]
+            surface = speeds[:, j] - speeds[:, i] - np.cross(spins, 0.5 * distance * self.normal)
+            along = (surface * self.normal).sum(-1, keepdims=True)
+            moving.append((-along, np.where(self.touching, surface - along * self.normal, 0.0)))
+        (self.closing, self.sliding), (self.mid_closing, self.mid_sliding) = moving
+        self.spring = history[:, real]
+        self.dashpot = self.law.stiffness * self.law.damping_time * self.mid_sliding
 
-    def _hertz(self, stiffness, overlap, closing):
+    def _hertz(self, stiffness, overlap, closing, mid_closing):
         """Elastic energy, force and viscous power, summed over contacts, of overlaps and closing speeds."""
         p = np.maximum(overlap, 0.0)
-        damped = np.maximum(0.0, stiffness * np.sqrt(p) * (p + self.solid.normal_damping * closing))
+        damped = np.maximum(0.0, stiffness * np.sqrt(p) * (p + self.solid.normal_damping * mid_closing))
         return 0.4 * stiffness * p**2.5, damped, (damped - stiffness * p**1.5) * closing
+
+    def _between(self):
+        """`_hertz` of the contacts between spheres."""
+        return self._hertz(self.solid.normal_stiffness, self.overlap, self.closing, self.mid_closing)
+
+    def _at_walls(self):
+        """`_hertz` of the contacts with the lower and with the upper walls."""
+        lower, upper = plain(self.boxes.lower)[:, None], plain(self.boxes.upper)[:, None]
+        speeds = plain(self.boxes.lower_velocity)[:, None], plain(self.boxes.upper_velocity)[:, None]
+        stiffness = self.solid.wall_stiffness
+        yield self._hertz(stiffness, 1.0 - (self.spheres - lower), speeds[0] - self.speeds, speeds[0] - self.mid_speeds)
+        yield self._hertz(stiffness, 1.0 - (upper - self.spheres), self.speeds - speeds[1], self.mid_speeds - speeds[1])
 
     @staticmethod
     def total(values):
@@ -65,22 +82,12 @@ class Budget:
     def kinetic(self):
         return 0.5 * (self.mass * self.total(self.velocity**2) + self.inertia * self.total(self.spin**2))
 
-    def _wall_overlaps(self):
-        lower, upper = plain(self.boxes.lower)[:, None], plain(self.boxes.upper)[:, None]
-        speeds = plain(self.boxes.lower_velocity)[:, None], plain(self.boxes.upper_velocity)[:, None]
-        yield 1.0 - (self.spheres - lower), speeds[0] - self.speeds
-        yield 1.0 - (upper - self.spheres), self.speeds - speeds[1]
-
     def elastic(self):
-        energy = self.total(self._hertz(self.solid.normal_stiffness, self.overlap, self.closing)[0])
-        for overlap, closing in self._wall_overlaps():
-            energy = energy + self.total(self._hertz(self.solid.wall_stiffness, overlap, closing)[0])
+        energy = self.total(self._between()[0]) + sum(self.total(wall[0]) for wall in self._at_walls())
         return energy + self.total(self.spring**2) / (2.0 * self.law.stiffness)
 
     def viscous_power(self):
-        power = self.total(self._hertz(self.solid.normal_stiffness, self.overlap, self.closing)[2])
-        for overlap, closing in self._wall_overlaps():
-            power = power + self.total(self._hertz(self.solid.wall_stiffness, overlap, closing)[2])
+        power = self.total(self._between()[2]) + sum(self.total(wall[2]) for wall in self._at_walls())
         return power + self.total(self.dashpot * self.sliding)
 
     def wall_work(self):
@@ -91,10 +98,11 @@ class Budget:
 
     def sliding_loss(self):
         """Energy lost by sliding in each step, [T - 1]: spring force times what Coulomb's limit took off the spring."""
-        carried = self.stored[:-1]
+        carried = self.spring[:-1]
         carried = carried - (carried * self.normal[1:]).sum(-1, keepdims=True) * self.normal[1:]
-        trial = np.where(self.touching[1:], carried + self.half_step[1:] + self.dashpot[1:], 0.0)
-        limit = self.law.mu * self._hertz(self.solid.normal_stiffness, self.overlap[1:], self.closing[1:])[1]
+        grown = self.law.stiffness * self.dt * self.mid_sliding[1:]
+        trial = np.where(self.touching[1:], carried + grown + self.dashpot[1:], 0.0)
+        limit = self.law.mu * self._between()[1][1:]
         size = np.linalg.norm(trial, axis=-1, keepdims=True)
         slid = trial * np.maximum(0.0, 1.0 - limit / np.where(size > 0.0, size, 1.0)) / self.law.stiffness
         # Springs of contacts that opened in this step were let go with what they held.

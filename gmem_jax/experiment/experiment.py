@@ -44,7 +44,8 @@ PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
 MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
 LEAST_STEP = 1e-100  # t_c; its square is a number still
-LARGEST_STEP = 1.0  # t_c; `stable_step` says what a pack allows: 0.6 to 0.8 under the default law
+USUAL_STEP = 0.6  # t_c; less than a third of what is stable under the default law
+LARGEST_STEP = 2.0  # t_c; `stable_step` says what a pack allows: this and more under the default law
 
 
 class Timing(NamedTuple):
@@ -114,7 +115,7 @@ class Experiment:
     creep_fades: Scalar | None = parameter(
         None, "(0, inf)", "Time in a stage after which creep falls as 1/t; default it stays", "t_c", varies=True
     )
-    dt: float = static(0.3, "Largest time step", "t_c")
+    dt: float = static(USUAL_STEP, "Largest time step", "t_c")
     steps: int | None = static(None, "Steps in a bin of t0 / 256, in the place of dt", no_option=True)
     rest: float = static(0.2, "Rests at u = 0", "t0")
     hold: float = static(0.2, "Holds at u = 1", "t0")

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import USUAL_STEP, Experiment
 from gmem_jax.experiment.record import fingerprint, pack_fingerprint
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -17,7 +17,6 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import still_box
 from gmem_jax.simulation.stable_step import largest_stable_step
 
-UNASKED = 0.3  # t_c; the default step, less than half of what is stable under the default law
 ENOUGH_RINGS = 10  # rings of a history: their number hardly matters to its stiffness, and 100 take minutes
 
 _known: dict[tuple[str, ...], float] = {}
@@ -72,7 +71,7 @@ def require_stable(experiment: Experiment) -> None:
         ValueError: saying both numbers.
     """
     dt = float(np.max(np.asarray(experiment.timing.dt)))
-    if dt > UNASKED and dt > (stable := stable_step(experiment)):
+    if dt > USUAL_STEP and dt > (stable := stable_step(experiment)):
         raise ValueError(
             f"dt = {dt:.3g} t_c exceeds the largest stable step of this pack, law and compression, {stable:.3g} t_c; "
             "use a smaller dt"

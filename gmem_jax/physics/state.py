@@ -67,7 +67,7 @@ SENTENCES = {
     Status.NOT_FINITE: "a position or a force is not a finite number; use a smaller dt, or check pack and friction law",
     Status.NOT_AT_REST: "grains still move when the readout begins; use a longer store or a larger hold_drag",
     Status.OVERLAP_RANGE: "an overlap exceeded what the friction law covers; use a larger p_max or a smaller delta0",
-    Status.STEP_TOO_LARGE: "the time step, t0 / (256 steps), exceeds 1 t_c; use more steps or a smaller t0",
+    Status.STEP_TOO_LARGE: "the time step, t0 / (256 steps), exceeds 2 t_c; use more steps or a smaller t0",
     Status.IMPOSSIBLE: "a parameter or a waveform is impossible; use numbers that `Experiment` accepts outside a trace",
     Status.DEEP_OVERLAP: "an overlap exceeded 0.2 R, and Hertz's law is for small ones; use a smaller delta0 or gamma0",
     Status.NOT_QUASI_STATIC: "the walls move too fast (inertial number above 5e-3); use a larger t0 or smaller gamma0",

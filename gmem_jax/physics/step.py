@@ -223,22 +223,25 @@ def section_force(clump: Clump, grains: Grains, force: jax.Array, through: jax.A
     return through + jnp.sum(force * place + clump.mass * grains.velocity**2, axis=0) / cell.lengths
 
 
-def _angular_acceleration(clump: Clump, grains: Grains, torque: jax.Array) -> jax.Array:
-    """d(spin)/dt: torque / I, with the gyroscopic term for grains whose moments differ."""
+def _angular_acceleration(clump: Clump, grains: Grains, torque: jax.Array, ahead: Scalar = 0.0) -> jax.Array:
+    """d(spin)/dt at a time `ahead` of that of the spins: torque / I, with the gyroscopic term where moments differ."""
     if clump.isotropic:
         return torque / clump.inertia[0]
     rotation = matrix(grains.quaternion)
     inertia = clump.inertia.reshape(3, -1)
     body_spin = jnp.sum(rotation * grains.spin[:, :, None], axis=1)
     body_torque = jnp.sum(rotation * torque[:, :, None], axis=1)
-    body_rate = (body_torque - cross(body_spin, inertia * body_spin)) / inertia
-    return jnp.sum(rotation * body_rate[:, None], axis=2)
+
+    def rate(spin: jax.Array) -> jax.Array:
+        return (body_torque - cross(spin, inertia * spin)) / inertia
+
+    return jnp.sum(rotation * rate(body_spin + ahead * rate(body_spin))[:, None], axis=2)
 
 
 def step(
     system: System, state: State, box: Box, dt: jax.Array, drag: Scalar, alive: jax.Array
 ) -> tuple[State, jax.Array]:
-    """One velocity-Verlet step; forces use velocities predicted to its end (docs/physics.md, "Time integration").
+    """One velocity-Verlet step; forces use the velocities of its middle (docs/physics.md, "Time integration").
 
     In a periodic box velocities are those beside its affine motion, v = dx/dt - (dL/dt / L) x, and
     dv/dt = F / m - (dL/dt / L) v: Newton's equation for dx/dt as long as the edges L grow steadily (docs/physics.md,
@@ -256,27 +259,28 @@ def step(
         The state at t + dt, and the forces on the lower and upper walls, [2, 3, B].
     """
     old = state.grains
-    half_velocity = old.velocity + (0.5 * dt) * old.acceleration
-    half_spin = old.spin + (0.5 * dt) * old.spin_rate
-    predicted = Grains(
-        position=old.position + dt * half_velocity,
-        quaternion=turn(old.quaternion, dt * half_spin),
-        velocity=old.velocity + dt * old.acceleration,
-        spin=old.spin + dt * old.spin_rate,
-        acceleration=old.acceleration,
-        spin_rate=old.spin_rate,
+    velocity = old.velocity + (0.5 * dt) * old.acceleration
+    spin = old.spin + (0.5 * dt) * old.spin_rate
+    midway = replace(
+        old,
+        position=old.position + dt * velocity,
+        quaternion=turn(old.quaternion, dt * spin),
+        velocity=velocity,
+        spin=spin,
     )
     slowing = drag
     if state.cell is not None:
-        predicted = replace(predicted, position=_carried(state.cell, box, old.position, dt * half_velocity))
+        midway = replace(midway, position=_carried(state.cell, box, old.position, dt * velocity))
         state, slowing = replace(state, cell=_wide(box, state.replicas)), drag + _strain_rate(box)
-    force, torque, history, walls = _forces(system, predicted, state.history, box, dt, alive)
-    acceleration = force / system.clump.mass - slowing * predicted.velocity
-    spin_rate = _angular_acceleration(system.clump, predicted, torque) - drag * predicted.spin
+    force, torque, history, walls = _forces(system, midway, state.history, box, dt, alive)
+    # Of drag on the velocities at the end, which are found with it.
+    acceleration = (force / system.clump.mass - slowing * velocity) / (1.0 + 0.5 * dt * slowing)
+    turning = _angular_acceleration(system.clump, midway, torque, 0.5 * dt)
+    spin_rate = (turning - drag * spin) / (1.0 + 0.5 * dt * drag)
     grains = replace(
-        predicted,
-        velocity=half_velocity + (0.5 * dt) * acceleration,
-        spin=half_spin + (0.5 * dt) * spin_rate,
+        midway,
+        velocity=velocity + (0.5 * dt) * acceleration,
+        spin=spin + (0.5 * dt) * spin_rate,
         acceleration=acceleration,
         spin_rate=spin_rate,
     )

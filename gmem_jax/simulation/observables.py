@@ -3,10 +3,10 @@
     gm.Experiment(pack, signals, observe=[gm.observables.stress(), gm.observables.fabric()])
 
 Each is a function of (simulation, state) with a name, a unit and words. It is plain JAX on the state, the same after
-every backend. Contact forces are taken again from the state. Histories hold half of the next step's increment, which
-frames leave in their forces; here laws are asked with a time step of -dt, which takes it off. With it the friction
-power would be twice too large at dt = 0.3. Whether a contact slides is asked with it: such a contact is at its limit to
-round-off then. Several observers share one evaluation of the contacts: the compiler sees that it is the same.
+every backend. Contact forces are taken again from the state: dashpots with the velocities at the end of the bin, where
+steps take those of their middle. Whether a contact slides is asked as if one more step had been made: one that does is
+at its limit to round-off then. Several observers share one evaluation of the contacts: the compiler sees that it is the
+same.
 """
 
 import operator
@@ -351,15 +351,12 @@ class _Seen(NamedTuple):
 
 
 def _contacts(simulation: Simulation, state: State, *, ahead: bool = False) -> _Seen:
-    """The contacts now; with tangential forces that are ahead by half a step, as the histories hold them, or not."""
+    """The contacts now, with tangential forces after another step of sliding, or not."""
     system = simulation.system
     table, _ = sphere_table(system.clump, state.grains, state.cell)
-    still = jnp.zeros(())  # in no time a history stays as it is
+    dt = jnp.asarray(simulation.dt) if ahead else jnp.zeros(())  # in no time a history stays as it is
     motion = relative_motion(system.pairs, table, state.cell)
-    kin, normal_force, friction, _ = contact_loads(system, *motion, state.history, still)
-    if not ahead:
-        back = replace(kin, dt=-jnp.asarray(simulation.dt), twist=jnp.zeros_like(kin.twist))
-        friction, _ = system.friction(back, normal_force, state.history)
+    kin, normal_force, friction, _ = contact_loads(system, *motion, state.history, dt)
     return _Seen(table, kin, normal_force, friction)
 
 

@@ -1,8 +1,7 @@
 """Which number of a run makes its steps unstable: what is said where a run broke.
 
-The steps are explicit. A spring k on a mass m needs dt < 2 sqrt(m / k) and a dashpot c needs dt < m / c, as the forces
-use velocities predicted to the end of a step. Here one contact is looked at, of an overlap as in a pack: what exceeds
-these bounds is a cause, what does not may still be one.
+The steps are explicit. A spring k on a mass m needs dt < 2 sqrt(m / k) and a dashpot c needs dt < 2 m / c. Here one
+contact is looked at, of an overlap as in a pack: what exceeds these bounds is a cause, what does not may still be one.
 """
 
 import math
@@ -17,7 +16,6 @@ from gmem_jax.simulation.sharding import to_host
 
 OVERLAP = 0.05  # R
 _USUAL = {  # what stands for a number that is asked whether it is the cause
-    "hold_drag": 0.0,
     "material.wall_rigidity": 1.0,
     "material.normal_damping": 0.23,
     "friction.stiffness": 0.13,
@@ -33,14 +31,13 @@ def longest_step(mass: float, plane_stiffness: float, numbers: Mapping[str, floa
         plane_stiffness: of its material.
         numbers: those in `_USUAL`.
     """
-    drag, rigidity, damping, spring, tangential_damping = (numbers[name] for name in _USUAL)
+    rigidity, damping, spring, tangential_damping = (numbers[name] for name in _USUAL)
     stiffness = plane_stiffness * math.sqrt(OVERLAP) * max(rigidity, 2.0**-0.5)  # or of two grains, of mass m / 2
     rates = (
-        drag,
         0.5 * math.sqrt(1.5 * stiffness / mass),
-        stiffness * damping / mass,
+        0.5 * stiffness * damping / mass,
         0.5 * math.sqrt(2.0 * spring / mass),
-        2.0 * spring * tangential_damping / mass,
+        spring * tangential_damping / mass,
     )
     return float(1.0 / max(rates))
 
@@ -48,8 +45,8 @@ def longest_step(mass: float, plane_stiffness: float, numbers: Mapping[str, floa
 def cause(simulation: Simulation) -> str:
     """The number that made a run unstable, as far as can be said; "" if none is beyond its bound."""
     material, law = simulation.system.material, simulation.system.friction
-    known: dict[str, Any] = {"hold_drag": simulation.drag}
-    known |= {f"material.{name}": getattr(material, name) for name in ("wall_rigidity", "normal_damping")}
+    of_material = ("wall_rigidity", "normal_damping")
+    known: dict[str, Any] = {f"material.{name}": getattr(material, name) for name in of_material}
     if entry_of(law):
         known |= {f"friction.{name}": getattr(law, name, 0.0) for name in ("stiffness", "damping_time")}
     numbers = {**_USUAL, **{name: _most(value) for name, value in known.items()}}

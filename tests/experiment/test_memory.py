@@ -144,10 +144,10 @@ def test_forward_and_reverse_derivatives_agree(pack: gm.Pack) -> None:
 
 def test_a_step_too_large_for_a_traced_run_gives_nan_and_says_so(pack: gm.Pack) -> None:
     experiment = gm.Experiment(pack, gm.six_signals(), t0=75.0, store=0.1)  # one step in a bin
-    recall = jax.jit(lambda t0: gm.recall(gm.replace(experiment, t0=t0)))(300.0)
+    recall = jax.jit(lambda t0: gm.recall(gm.replace(experiment, t0=t0)))(600.0)
     assert np.all(np.asarray(recall.status) & int(gm.Status.STEP_TOO_LARGE))
     assert np.isnan(float(recall.fidelity))
-    assert "1 t_c" in gm.explain(int(recall.status[0]))
+    assert "2 t_c" in gm.explain(int(recall.status[0]))
 
 
 def test_another_delta0_than_the_packs_own_warns(pack: gm.Pack) -> None:

@@ -91,11 +91,11 @@ LOUD = gm.Bumps(jnp.asarray([[1.0, 0.0], [1.01 * limits.LARGEST_WAVEFORM, 0.0]])
         ({"gamma0": 1.01 * limits.LARGEST_SHEAR * 0.05}, Status.SHEAR_BEYOND_COMPRESSION),
         ({"signals": LOUD, "gamma0": 1e-4}, Status.LARGE_WAVEFORM),
         ({"speed": around(limits.FASTEST_GRAIN)}, Status.RESTLESS),
-        ({"hold_drag": jnp.asarray([1.0, 3.4, 3.5])}, Status.RESTLESS),  # times dt = 0.293
-        ({"friction.damping_time": jnp.asarray([3.0, 6.0, 6.5]), "contacts": 10.0}, Status.RESTLESS),
+        ({"hold_drag": jnp.asarray([1.0, 2.5, 2.6])}, Status.RESTLESS),  # times dt = 0.586
+        ({"friction.damping_time": jnp.asarray([3.0, 4.5, 4.9]), "contacts": 10.0}, Status.RESTLESS),
         (
             {
-                "friction": gm.MindlinRescaled(damping_time=jnp.asarray([1.0, 3.1, 3.4])),
+                "friction": gm.MindlinRescaled(damping_time=jnp.asarray([1.0, 2.3, 2.6])),
                 "contacts": 10.0,
                 "overlap": [0.15] * 3,
             },
@@ -117,14 +117,14 @@ def test_grains_without_friction_may_turn_freely() -> None:
 
 
 def test_a_dashpot_that_its_steps_cannot_follow_is_told_and_one_that_they_can_is_not() -> None:
-    """What the bound says is what happens: nothing is recalled above it."""
+    """What the bound says is what happens: above it p_sig is large and means nothing."""
     found = [
         gm.run(gm.Experiment(PACK, two_bumps(1.0, -0.6), gm.Hooke(damping_time=time), t0=450.0, store=0.2))
         for time in (3.0, 1e9)
     ]
     statuses = [int(np.bitwise_or.reduce(one.status)) & int(Status.RESTLESS) for one in found]
     assert statuses == [0, int(Status.RESTLESS)]
-    assert found[1].fidelity < 0.1 * found[0].fidelity
+    assert abs(found[1].gain) > 10.0 * abs(found[0].gain)
 
 
 def test_one_fast_moment_is_not_unrest() -> None:
@@ -189,18 +189,19 @@ def test_a_run_that_deserves_a_doubt_has_it_and_its_numbers(changes: dict[str, f
 
 
 def test_steps_too_long_are_told_by_grains_that_do_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    """dt = 0.88 ended as "ok" with G = -0.4 where 0.3 and 0.78 have 0.18."""
+    """Steps of 1.76 t_c for springs that are stable up to 0.82 and 0.73 (27 and 325 grains)."""
     monkeypatch.setattr("gmem_jax.experiment.recall.require_stable", lambda _: None)
     short = {"rest": 0.02, "hold": 0.02, "store": 0.1}
     for pack in (PACK, LARGER):
-        experiments = [gm.Experiment(pack, two_bumps(1.0, -0.6), t0=900.0, dt=dt, **short) for dt in (0.59, 0.88)]
+        bumps, law = two_bumps(1.0, -0.6), gm.Hooke(stiffness=0.93)
+        experiments = [gm.Experiment(pack, bumps, law, t0=900.0, dt=dt, **short) for dt in (0.59, 1.76)]
         bits = [int(np.bitwise_or.reduce(gm.run(one).status)) & int(Status.RESTLESS) for one in experiments]
         assert bits == [0, int(Status.RESTLESS)]
 
 
 def test_steps_that_are_not_stable_are_refused_with_both_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    experiment = gm.Experiment(PACK, two_bumps(1.0, -0.6), t0=225.0, steps=1)
-    with pytest.raises(ValueError, match=r"dt = 0\.879 t_c exceeds the largest stable step .*, 0\.8[0-2]\d? t_c"):
+    experiment = gm.Experiment(PACK, two_bumps(1.0, -0.6), gm.Hooke(stiffness=0.93), t0=225.0, steps=1)
+    with pytest.raises(ValueError, match=r"dt = 0\.879 t_c exceeds the largest stable step .*, 0\.8[0-3]\d? t_c"):
         gm.run(experiment)
     monkeypatch.setattr("gmem_jax.experiment.stepping.stable_step", lambda _: 0.0)
     gm.run(gm.replace(experiment, t0=75.0, steps=None, store=0.1))  # at the default step nothing is estimated
@@ -329,12 +330,12 @@ OWN: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize(("kind", "most"), [(PAPER, 1e-6), (OWN, 2e-6)], ids=["paper", "own"])
-def test_the_energy_of_a_whole_recall_is_accounted_for_to_a_millionth_of_the_work(
+@pytest.mark.parametrize(("kind", "most"), [(PAPER, 3e-6), (OWN, 5e-6)], ids=["paper", "own"])
+def test_the_energy_of_a_whole_recall_is_accounted_for_to_millionths_of_the_work(
     kind: dict[str, Any], most: float
 ) -> None:
-    # Measured: 4.2e-6 of the walls' work (the magnitudes of all stages) at dt = 0.3, 7.9e-7 at 0.15; of the other
-    # protocol, whose walls move faster, 1.3e-6 at 0.15.
+    # Measured: 4.4e-6 of the walls' work (the magnitudes of all stages) at dt = 0.3, 2.4e-6 at 0.15; of the other
+    # protocol, whose walls move faster, 7.9e-6 and 4.1e-6.
     missing = {}
     for dt in (0.3, 0.15):
         terms, turned_over = energy_terms(gm.Experiment(PACK, **kind, t0=75.0, dt=dt, backend="jax"))

@@ -163,9 +163,9 @@ def test_the_kernels_give_the_values_and_tangents_of_the_definition(name: str) -
     both = functools.partial(jax.jvp, functools.partial(definition, fixed))
     value, slope = jax.jit(both, compiler_options=QUICKLY)((arrays,), (along,))
     assert not arrays.history or np.any(np.asarray(arrays.history[0]) != 0.0)
-    # Forces are summed in another order: 1e-16 of the largest, which 10 steps of contacts magnify (seen: 2e-12 in one
-    # number of 400,000, and 1e-13 else).
-    assert_close(emulate(call, fixed, arrays)[0], value, 1e-11)
+    # Forces are summed in another order: 1e-16 of the largest, which 10 steps of contacts magnify. (Seen: 4e-11 in two
+    # numbers of M2-paper, whose sliding is divided by the weights of a contact that begins to have any; 1e-13 else.)
+    assert_close(emulate(call, fixed, arrays)[0], value, 1e-10)
     # ... and in the derivative once more where the normal part of a carried force nearly cancels: see
     # test_native_derivatives.py.
     assert_close(emulate_tangent(call, fixed, arrays, along), slope, 1e-9)

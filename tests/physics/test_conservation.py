@@ -102,16 +102,15 @@ def test_every_term_of_the_energy_budget_takes_part():
 
 
 def test_work_of_the_walls_is_what_was_stored_damped_and_slid_away():
-    # Measured: 1.3e-4 at 0.3, 5.4e-5 at 0.15, 1.8e-5 at 0.075: order 1.5, as damped contacts that make and break allow.
-    coarse, fine = budget(0.3).residual(), budget(0.15).residual()
-    assert coarse < 2e-4
-    assert fine < 8e-5
-    assert fine < 0.6 * coarse
+    # Forces of half-step velocities do in every step the work that is counted here; contacts that begin and end within
+    # a step are what is left. Measured: 9e-7 at 0.3, 2.7e-6 at 0.15, 1.6e-6 at 0.075.
+    assert budget(0.3).residual() < 5e-6
+    assert budget(0.15).residual() < 5e-6
 
 
-def test_the_energy_budget_closes_better_without_damping():
-    # Measured: 1.4e-4 at 0.3 and 1.4e-5 at 0.15, the shortest period being ten steps of 0.3.
+def test_the_energy_budget_closes_without_damping():
+    # Measured: 1.1e-6 at 0.3 and 7e-7 at 0.15.
     undamped = budget(0.15, ELASTIC, 0.0)
-    assert undamped.residual() < 3e-5
+    assert undamped.residual() < 2e-6
     assert undamped.terms()["viscous"] < 1e-15
     assert undamped.terms()["slid"] > 0.05 * undamped.terms()["work"]

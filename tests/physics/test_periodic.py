@@ -192,10 +192,12 @@ def test_the_pressure_of_a_step_is_the_stress_of_its_contacts_and_the_flux_of_mo
     moved = jax.tree.map(lambda leaf: leaf[None], box)
     slow = replace(state, grains=replace(state.grains, acceleration=0.0 * state.grains.velocity))
     after, pressure = march(system, slow, moved, DT, 0.0)
-    # Forces are those at velocities predicted for the end, which without accelerations are those of the beginning.
+    # Forces are those at velocities of the middle of the step, which without accelerations are those of its beginning.
     seen = replace(
         after,
-        grains=replace(after.grains, velocity=slow.grains.velocity, spin=slow.grains.spin + DT * slow.grains.spin_rate),
+        grains=replace(
+            after.grains, velocity=slow.grains.velocity, spin=slow.grains.spin + 0.5 * DT * slow.grains.spin_rate
+        ),
     )
     contacts = observables.stress()(simulation_of(system, box), replace(seen, history=after.history))
     flux = jnp.sum(cached_tetra().mass * slow.grains.velocity**2, axis=0) / jnp.prod(box.lengths, axis=0)

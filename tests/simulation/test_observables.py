@@ -43,7 +43,7 @@ def mark_of(system: System, state: State, box: Box) -> Mark:
 def seen(
     system: System, state: State, box: Box, mark: Mark | None = None, dt: float = 0.0, drag: float = 0.0
 ) -> Simulation:
-    """A simulation as observers see it at the end of a bin, of steps `dt` of whose next one half is in the history."""
+    """A simulation as observers see it at the end of a bin, of steps `dt`."""
     simulation = Simulation(system, strain_path(box.lower, box.upper, 0.0), dt, drag)
     sample = jax.jit(measure)(system, state, box, jnp.zeros((3, 1)), 0.0)
     return replace(simulation, box=box, sample=sample, mark=mark or mark_of(system, state, box))
@@ -65,8 +65,8 @@ def two_spheres(mu: float) -> tuple[System, State, Box]:
 
 MATERIAL = Material()
 NORMAL = float(MATERIAL.normal_stiffness) * (0.2**1.5 + 0.23 * 0.2**0.5 * 0.01)
-AHEAD = 1e-3 + 0.13 * 0.069 * 0.02  # its history, and the dashpot
-TANGENTIAL = AHEAD - 0.5 * 0.13 * 0.1 * 0.02  # without half of the next step
+TANGENTIAL = 1e-3 + 0.13 * 0.069 * 0.02  # its history, and the dashpot
+AHEAD = TANGENTIAL + 0.13 * 0.1 * 0.02  # after another step
 
 
 def test_of_two_spheres_pressed_and_sheared_every_number_is_known() -> None:
@@ -171,14 +171,16 @@ def test_contacts_are_those_of_a_search_through_all_pairs_and_forces_those_of_th
         normal = max(0.0, spring + float(MATERIAL.normal_stiffness) * 0.23 * overlap**0.5 * closing)
         kept = np.asarray(state.history)[rows[i, j], :, 0]
         flat = kept - (kept @ n) * n
-        trial = np.linalg.norm(kept) * flat / np.linalg.norm(flat) + 0.13 * 0.069 * slide
-        limited = [each * min(1.0, normal / np.linalg.norm(each)) for each in (trial - 0.5 * 0.13 * 0.1 * slide, trial)]
-        friction, ahead = limited  # mu = 1
+        carried = np.linalg.norm(kept) * flat / np.linalg.norm(flat)
+        angle = 2.0 * np.arctan(0.25 * (spin[i] + spin[j]) @ n * 0.1)
+        turned = np.cos(angle) * carried + np.sin(angle) * np.cross(n, carried)
+        trials = carried + 0.13 * 0.069 * slide, turned + 0.13 * (0.069 + 0.1) * slide  # now, and after another step
+        friction, ahead = (each * min(1.0, normal / np.linalg.norm(each)) for each in trials)  # mu = 1
         tensor += np.outer(n, n)
         powers += friction @ slide, (normal - spring) * closing
         if normal > 0.0:
             shares.append(np.linalg.norm(ahead) / normal)
-            at_limit += np.linalg.norm(trial) > normal
+            at_limit += np.linalg.norm(trials[1]) > normal
         forces[i, j] = normal, friction
     for axis in range(3):
         for plane, side, own in ((box.lower, -1.0, box.lower_velocity), (box.upper, 1.0, box.upper_velocity)):
@@ -276,7 +278,8 @@ def test_powers_add_up_to_the_energy_that_a_collision_takes(law: Any) -> None:
     assert np.all(normal >= 0.0)
     assert friction[-1] == normal[-1] == 0.0 < friction.max()
     lost = kinetic(system, state) - kinetic(system, jax.tree.map(lambda leaf: leaf[-1], states))
-    assert dt * (friction.sum() + normal.sum()) == pytest.approx(lost, rel=1e-4)
+    # Dashpots are seen at the velocities of the ends of steps: measured 2.5e-4, in proportion to dt.
+    assert dt * (friction.sum() + normal.sum()) == pytest.approx(lost, rel=4e-4)
     assert 0.05 * lost < dt * friction.sum() < 0.8 * lost
 
 

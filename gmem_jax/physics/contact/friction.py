@@ -3,9 +3,8 @@
 A law is a frozen pytree of parameters with two methods, `init` and `__call__`, and nothing else; a user's law is
 one such class. `coulomb` and `kinematics.transport` are the shared pieces.
 
-The displacement of a step is the mean of its end-point velocities times dt (trapezoid): a history is stored with
-half of the next step's increment already in it, and `__call__` adds the other half. That makes the elastic law
-second order in dt at the cost of no extra memory.
+A law is called once in a step, with positions at its end and velocities of its middle: the sliding of the step is
+`kin.sliding` times `kin.dt`.
 """
 
 from typing import Any, Protocol, runtime_checkable

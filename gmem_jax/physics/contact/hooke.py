@@ -46,9 +46,8 @@ class Hooke:
 
     def __call__(self, kin: Kinematics, normal_force: jax.Array, history: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Tangential force on sphere i and the new history; see `FrictionLaw`."""
-        half_step = (0.5 * self.stiffness * kin.dt) * kin.sliding
         dashpot = (self.stiffness * self.damping_time) * kin.sliding
-        elastic = transport(history, kin, self.spinning) + half_step
+        elastic = transport(history, kin, self.spinning) + (self.stiffness * kin.dt) * kin.sliding
         force, _ = coulomb(elastic + dashpot, self.mu * normal_force)
         force = jnp.where(kin.touching, force, 0.0)
-        return force, jnp.where(kin.touching, force - dashpot + half_step, 0.0)
+        return force, jnp.where(kin.touching, force - dashpot, 0.0)

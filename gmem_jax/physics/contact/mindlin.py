@@ -22,7 +22,7 @@ class LayeredHistory:
     """What M2 remembers of a contact; zero for an untouched one.
 
     Attributes:
-        layers: f_j with half of the next step's increment, along the frame and across it, [P, Q, 2, B], in E R^1.5.
+        layers: f_j, along the frame and across it, [P, Q, 2, B], in E R^1.5.
         frame: a unit vector of the tangent plane that is carried along like a force, [P, 3, B]; n x frame is the other.
         overlap: overlap of the last step, [P, 1, B], in R.
     """
@@ -159,14 +159,14 @@ class Mindlin:
         frame = transport(before, kin, self.spinning)
         across = cross(kin.normal, frame)
         sliding = jnp.concatenate([dot(kin.sliding, frame), dot(kin.sliding, across)], axis=1)
-        half_step = (0.5 * self.stiffness * kin.dt) * sliding
+        growth = (self.stiffness * kin.dt) * sliding
         dashpot = (self.stiffness * self.damping_time) * root * sliding
 
         layers = self._diluted(history, x) if self.variant == "averaged" else history.layers
-        layers = jnp.where(inside, layers + half_step[:, None], 0.0)
+        layers = jnp.where(inside, layers + growth[:, None], 0.0)
         trial = self.spacing * jnp.sum(weight * layers, axis=1) + dashpot
         force, _ = coulomb(trial, self.mu * normal_force)
-        correction = (force - trial) / (self.spacing * total) + half_step
+        correction = (force - trial) / (self.spacing * total)
         layers = jnp.where(inside, layers + correction[:, None], 0.0)
         force = jnp.where(kin.touching, force[:, :1] * frame + force[:, 1:] * across, 0.0)
         return force, LayeredHistory(

@@ -18,7 +18,7 @@ class RescaledHistory:
     """What M1 remembers of a contact; zero for an untouched one.
 
     Attributes:
-        force: elastic force with half of the next step's increment, [P, 3, B], in E R^2.
+        force: elastic force, [P, 3, B], in E R^2.
         overlap: overlap of the last step, [P, 1, B], in R.
     """
 
@@ -32,9 +32,6 @@ class MindlinRescaled:
     """f_e *= sqrt(p / p_old) on unloading, then df_e = k p^0.5 dsigma, f_d = damping_time k p^0.5 dsigma/dt (Sec. II).
 
     The Coulomb limit |f_e + f_d| <= mu f_n applies as in the other laws.
-
-    The rescaling acts on the history with its half increment in it. While a contact unloads, f_e = sqrt(p) g and
-    dg = k dsigma, so this is the trapezoidal rule for g; while it loads, for f_e itself.
 
     Attributes:
         mu: friction coefficient; scalar or [B].
@@ -68,11 +65,10 @@ class MindlinRescaled:
         unloads = kin.touching & (kin.overlap < history.overlap)
         ratio = jnp.where(unloads, kin.safe_overlap, 1.0) / jnp.where(unloads, history.overlap, 1.0)
         spring = self.stiffness * jnp.sqrt(kin.safe_overlap)
-        half_step = (0.5 * kin.dt) * spring * kin.sliding
         dashpot = self.damping_time * spring * kin.sliding
-        elastic = jnp.sqrt(ratio) * transport(history.force, kin, self.spinning) + half_step
+        elastic = jnp.sqrt(ratio) * transport(history.force, kin, self.spinning) + kin.dt * spring * kin.sliding
         force, _ = coulomb(elastic + dashpot, self.mu * normal_force)
         force = jnp.where(kin.touching, force, 0.0)
         return force, RescaledHistory(
-            jnp.where(kin.touching, force - dashpot + half_step, 0.0), jnp.where(kin.touching, kin.overlap, 0.0)
+            jnp.where(kin.touching, force - dashpot, 0.0), jnp.where(kin.touching, kin.overlap, 0.0)
         )

@@ -45,7 +45,7 @@ def lead_contact(
     Args:
         law: the friction law.
         overlap: p at each step, [T], in R.
-        sliding: tangential velocity at each step, [T], in R / t_c.
+        sliding: tangential velocity of each step, [T], in R / t_c.
         dt: time step, in t_c.
         material: sets the normal force, that of a static overlap; default the paper's.
 
@@ -91,8 +91,7 @@ def contact_path(
         The force along the displacement, [T], in E R^2.
     """
     overlap, displacement = jnp.asarray(overlap), jnp.asarray(displacement)
-    # One law call at rest on each point and one in motion between; a call that moves at v alone covers v dt, half
-    # of it by its own call and half by the next (see `gmem_jax.physics.contact.friction`).
+    # One law call at rest on each point and one in motion between.
     halfway = 0.5 * (overlap[1:] + overlap[:-1])
     pulses = jnp.diff(displacement) / dt
     calls = 2 * overlap.shape[0] - 1

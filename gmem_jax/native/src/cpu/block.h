@@ -117,17 +117,13 @@ struct Engine : EngineLayout<Mode> {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
     const HalfStep<V> m = begin_step(constants, grain);
-    speeds[0] = max(speeds[0], dot(m.half_velocity, m.half_velocity));
-    speeds[1] = max(speeds[1], dot(m.half_spin, m.half_spin));
+    speeds[0] = max(speeds[0], dot(m.velocity, m.velocity));
+    speeds[1] = max(speeds[1], dot(m.spin, m.spin));
     c[kQuaternion] = m.orientation.w;
     store_vec(c + kQuaternion + 1, m.orientation.v);
-    store_vec(c + kAcceleration, m.half_velocity);
-    store_vec(c + kSpinRate, m.half_spin);
     store_vec(h + kPosition, m.position);
-    if constexpr (!Mode::kKeepsMotion) {
-      store_vec(h + kVelocity, m.velocity);
-      store_vec(h + kSpin, m.spin);
-    }
+    store_vec(h + kVelocity, m.velocity);
+    store_vec(h + kSpin, m.spin);
     WallForces<V> on{};
     const bool near = spheres_of(constants, m, block.pack->offsets, problem.spheres_per_grain, arm, box, on,
                                  [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
@@ -138,9 +134,7 @@ struct Engine : EngineLayout<Mode> {
   // What `begin` left of unit u: the same places.
   HalfStep<V> half_step_of(int u) const {
     const Grain<V> g = still(u);
-    HalfStep<V> m{g.position, g.orientation, g.velocity, g.spin, g.acceleration, g.spin_rate};
-    if constexpr (Mode::kKeepsMotion) mode.read_motion(u, m.velocity, m.spin);
-    return m;
+    return {g.position, g.orientation, g.velocity, g.spin};
   }
 
   // Second half: accelerations and velocities.

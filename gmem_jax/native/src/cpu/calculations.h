@@ -15,27 +15,26 @@ namespace GMEM_ISA {
 enum StateRow { kStatePosition = 0, kStateQuaternion = 3, kStateVelocity = 7, kStateSpin = 10, kStateAcceleration = 13,
                 kStateSpinRate = 16, kState = 19 };
 // ... and midway, with the force and torque found there ...
-enum MidRow { kMidPosition = 0, kMidQuaternion = 3, kMidVelocity = 7, kMidSpin = 10, kMidHalfVelocity = 13,
-              kMidHalfSpin = 16, kMidForce = 19, kMidTorque = 22, kMid = 25 };
+enum MidRow { kMidPosition = 0, kMidQuaternion = 3, kMidVelocity = 7, kMidSpin = 10, kMidForce = 13, kMidTorque = 16,
+              kMid = 19 };
 // ... or, instead of these, how it is turned.
-enum TurnedRow { kTurnedRotation = 19, kTurned = 28 };
+enum TurnedRow { kTurnedRotation = 13, kTurned = 22 };
 // Rows of a contact's input; its history follows.
 constexpr int kInputs = 18;
 
 // Calls `each` for all numbers of a structure, in order.
 template <class V, class Each>
 constexpr void for_numbers(LawParameters<V>& law, const Each& each) {
-  each(law.mu), each(law.stiffness), each(law.damping_time), each(law.spacing), each(law.inverse_spacing);
-  each(law.half_step), each(law.dashpot), each(law.half_dt);
+  each(law.mu), each(law.spacing), each(law.inverse_spacing), each(law.growth), each(law.dashpot);
 }
-constexpr int kLawNumbers = 8;
+constexpr int kLawNumbers = 5;
 
 template <class V, class Each>
 constexpr void for_numbers(GrainParameters<V>& p, const Each& each) {
-  each(p.dt), each(p.half_dt), each(p.drag), each(p.inverse_mass), each(p.wall_stiffness), each(p.normal_damping);
+  each(p.dt), each(p.half_dt), each(p.drag), each(p.slowed), each(p.inverse_mass), each(p.wall_stiffness), each(p.normal_damping);
   for (int axis = 0; axis < 3; ++axis) each(p.inertia[axis]), each(p.inverse_inertia[axis]);
 }
-constexpr int kGrainNumbers = 12;
+constexpr int kGrainNumbers = 13;
 
 template <class V, class Each>
 constexpr void for_numbers(Vec<V>& a, const Each& each) {
@@ -62,7 +61,7 @@ constexpr void for_numbers(Grain<V>& a, const Each& each) {
 template <class V, class Each>
 constexpr void for_numbers(HalfStep<V>& a, const Each& each) {
   for_numbers(a.position, each), for_numbers(a.orientation, each), for_numbers(a.velocity, each);
-  for_numbers(a.spin, each), for_numbers(a.half_velocity, each), for_numbers(a.half_spin, each);
+  for_numbers(a.spin, each);
 }
 template <class V, class Each>
 constexpr void for_numbers(WallState<V>& a, const Each& each) {

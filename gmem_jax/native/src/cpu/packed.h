@@ -49,7 +49,6 @@ struct Packed : PackedLayout<Law> {
   using Number = Real;
   using V = Real;
   using OfContacts = Real;
-  static constexpr bool kKeepsMotion = false;
   static constexpr bool apart = false;  // see `Replicas::apart`
   using Layout::kHistoryRows;
   using OfLaw = Law;

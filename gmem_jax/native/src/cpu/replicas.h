@@ -85,7 +85,6 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   using OfContacts = C;
   using OfLaw = Law;
   static constexpr bool kMixed = !std::is_same<V, C>::value;
-  static constexpr bool kKeepsMotion = kMixed;
 
   const Problem& problem;
   const Block& block;
@@ -232,12 +231,6 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     }
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kForce, force);
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque, torque);
-  }
-
-  // Velocities that `put_grain` left: drag and gyroscopic torques are in the precision of contacts.
-  void read_motion(int u, Vec<V>& velocity, Vec<V>& spin) const {
-    velocity = convert<V>(load_vec(motion[u].velocity));
-    spin = convert<V>(load_vec(motion[u].spin));
   }
 
   void total_force(int u, Vec<V>& force, Vec<V>& torque) const {

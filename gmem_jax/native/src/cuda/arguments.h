@@ -47,7 +47,7 @@ struct Arguments {
   // Between steps: a grain reads its neighbours' numbers of this step while they write those of the next.
   Table hot[2];     // position, velocity, spin, [N, 9, L]
   Table sphere[2];  // centres, [N K, 3, L]
-  Table cold;       // orientation, half-step velocity and spin, [N, 10, L]
+  Table cold;       // orientation, [N, 4, L]
   Table pressure;   // summed over steps, [N, 3, L]
   Table history;    // beside rings, [2 P, kHistory, L]
   Table segments;   // of rings of the Mindlin law: force and first ring, [2 P, Q, 3, L]

@@ -138,10 +138,9 @@ GMEM_INLINE void begin(const ReplicaView<V>& on, int grain, const GrainParameter
   const Arguments& a = on.a;
   const HalfStep<V> m = begin_step(constants, from);
   const Column<V> hot = on.in(a.hot[next]), cold = on.in(a.cold), sphere = on.in(a.sphere[next]);
-  const long long h = grain * 9ll, c = grain * 10ll;
+  const long long h = grain * 9ll, c = grain * 4ll;
   hot.put(h, m.position), hot.put(h + 3, m.velocity), hot.put(h + 6, m.spin);
   cold.put(c, m.orientation.w), cold.put(c + 1, m.orientation.v);
-  cold.put(c + 4, m.half_velocity), cold.put(c + 7, m.half_spin);
   const Matrix<V> rotation = matrix(m.orientation);
   for (int k = 0; k < a.spheres; ++k) {
     const double* body = a.offsets.of(on.entry) + 3 * k;
@@ -270,8 +269,8 @@ void advance(const Arguments& a, int step, int thread) {
   const GrainParameters<V> constants = read_parameters(on, parameter);
   const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
   const Column<V> hot = on.in(a.hot[now]), cold = on.in(a.cold), sphere = on.in(a.sphere[now]);
-  const long long h = grain * 9ll, c = grain * 10ll;
-  HalfStep<V> own{hot.vec(h), {}, hot.vec(h + 3), hot.vec(h + 6), {}, {}};
+  const long long h = grain * 9ll, c = grain * 4ll;
+  HalfStep<V> own{hot.vec(h), {}, hot.vec(h + 3), hot.vec(h + 6)};
   Load<V> load{};
   const int end = a.start.of(on.entry)[grain + 1];
   for (int number = a.start.of(on.entry)[grain]; number < end; ++number) {
@@ -286,7 +285,6 @@ void advance(const Arguments& a, int step, int thread) {
     }
   }
   own.orientation = {cold[c], cold.vec(c + 1)};
-  own.half_velocity = cold.vec(c + 4), own.half_spin = cold.vec(c + 7);
   const WallState<V> box = on.walls(step);
   WallForces<V> walls{};
   const double arm = *a.arm.of(on.entry);

@@ -53,17 +53,15 @@ inline Place place_of(long long row, int q) {
 // A law's parameters, and products of them that every contact needs.
 template <class V>
 struct LawParameters {
-  V mu, stiffness, damping_time, spacing, inverse_spacing;
-  V half_step;  // stiffness dt / 2: what half a step of sliding adds to an elastic force
-  V dashpot;    // stiffness times damping time
-  V half_dt;
+  V mu, spacing, inverse_spacing;
+  V growth;   // stiffness times dt: what a step of sliding adds to an elastic force
+  V dashpot;  // stiffness times damping time
 
   LawParameters() = default;
 
   constexpr LawParameters(const V* rows, V dt)
-      : mu(rows[0]), stiffness(rows[1]), damping_time(rows[2]), spacing(rows[4]),
-        inverse_spacing(splat<V>(1.0) / rows[4]),
-        half_step(splat<V>(0.5) * rows[1] * dt), dashpot(rows[1] * rows[2]), half_dt(splat<V>(0.5) * dt) {}
+      : mu(rows[0]), spacing(rows[4]), inverse_spacing(splat<V>(1.0) / rows[4]), growth(rows[1] * dt),
+        dashpot(rows[1] * rows[2]) {}
 };
 
 // f = k p^1.5 + gamma p^0.5 dp/dt, never attractive.
@@ -146,18 +144,17 @@ constexpr GMEM_INLINE void friction(Frictionless, Contact<V>* c, int count, cons
 // gmem_jax/physics/contact/hooke.py: Hooke.__call__
 template <class V>
 constexpr GMEM_INLINE void friction(Hooke, Contact<V>* c, int count, const LawParameters<V>& law) {
-  const V push = law.half_step + law.dashpot, rest = law.half_step - law.dashpot;
+  const V push = law.growth + law.dashpot;
   carry(c, count, Remembered{}, [&](const Contact<V>& now, Vec<V> carried) { return fma(push, now.sliding, carried); });
   coulomb(c, count, law.mu);
   for (int n = 0; n < count; ++n)
-    store_vec(c[n].history, zero_unless(c[n].touching(), fma(rest, c[n].sliding, c[n].force)));
+    store_vec(c[n].history, zero_unless(c[n].touching(), fnma(law.dashpot, c[n].sliding, c[n].force)));
 }
 
 // gmem_jax/physics/contact/mindlin_rescaled.py: MindlinRescaled.__call__
 template <class V>
 constexpr GMEM_INLINE void friction(Rescaled, Contact<V>* c, int count, const LawParameters<V>& law) {
-  const V one = splat<V>(1.0);
-  const V push = law.stiffness * (law.half_dt + law.damping_time), rest = law.stiffness * (law.half_dt - law.damping_time);
+  const V one = splat<V>(1.0), push = law.growth + law.dashpot;
   // sqrt(p / p_old) on unloading; sqrt(p) has been left in `root_overlap`.
   carry(c, count, Remembered{}, [&](const Contact<V>& now, Vec<V> carried) {
     const V last = now.history[kLastOverlap];
@@ -167,7 +164,7 @@ constexpr GMEM_INLINE void friction(Rescaled, Contact<V>* c, int count, const La
   });
   coulomb(c, count, law.mu);
   for (int n = 0; n < count; ++n) {
-    store_vec(c[n].history, zero_unless(c[n].touching(), fma(rest * c[n].root_overlap, c[n].sliding, c[n].force)));
+    store_vec(c[n].history, zero_unless(c[n].touching(), fnma(law.dashpot * c[n].root_overlap, c[n].sliding, c[n].force)));
     c[n].history[kLastOverlap] = zero_unless(c[n].touching(), c[n].overlap);
   }
 }
@@ -237,7 +234,7 @@ constexpr GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, 
     const V whole = weight[n] + rim;
     total[n] = select(attached[n], whole, one);
     sliding[n] = {dot(c[n].sliding, c[n].force), dot(c[n].sliding, cross(c[n].normal, c[n].force))};
-    const V pushed = fma(law.spacing, whole * law.half_step, law.dashpot * c[n].root_overlap);
+    const V pushed = fma(law.spacing, whole * law.growth, law.dashpot * c[n].root_overlap);
     trial[n] = fma(pushed, sliding[n], law.spacing * fma(rim, layers.rim, layers.inside));
     c[n].square = dot(trial[n], trial[n]);
   }
@@ -245,7 +242,7 @@ constexpr GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, 
   for (int n = 0; n < count; ++n) {
     const V scale = limited(c[n], law.mu);
     const Mask<V> touching = c[n].touching();
-    const Flat<V> push = fma((scale - one) / (law.spacing * total[n]), trial[n], (law.half_step + law.half_step) * sliding[n]);
+    const Flat<V> push = fma((scale - one) / (law.spacing * total[n]), trial[n], law.growth * sliding[n]);
     Layers<V> layers = load_layers(c[n].history + kLayers);
     layers.common = zero_unless(attached[n], layers.common + push);
     layers.inside = fma(weight[n], push, layers.inside);

@@ -21,24 +21,24 @@ struct Grain {
   Vec<V> velocity, spin, acceleration, spin_rate;
 };
 
-// ... with position and orientation at its end, velocities predicted for it, and those of the middle of the step.
+// ... with position and orientation at its end, and velocities of its middle.
 template <class V>
 struct HalfStep {
   Vec<V> position;
   Quaternion<V> orientation;
-  Vec<V> velocity, spin, half_velocity, half_spin;
+  Vec<V> velocity, spin;
 };
 
 // A grain's constants, of the parameter array.
 template <class V>
 struct GrainParameters {
-  V dt, half_dt, drag, inertia[3], inverse_mass, inverse_inertia[3], wall_stiffness, normal_damping;
+  V dt, half_dt, drag, slowed, inertia[3], inverse_mass, inverse_inertia[3], wall_stiffness, normal_damping;
 
   GrainParameters() = default;
 
   constexpr explicit GrainParameters(const V* parameter)
       : dt(parameter[kDt]), half_dt(splat<V>(0.5) * dt), drag(parameter[kDrag]),
-        inverse_mass(splat<V>(1.0) / parameter[kMass]), wall_stiffness(parameter[kWallStiffness]),
+        slowed(splat<V>(1.0) / fma(half_dt, drag, splat<V>(1.0))), inverse_mass(splat<V>(1.0) / parameter[kMass]), wall_stiffness(parameter[kWallStiffness]),
         normal_damping(parameter[kNormalDamping]) {
     for (int axis = 0; axis < 3; ++axis) {
       inertia[axis] = parameter[kInertia + axis];
@@ -47,17 +47,12 @@ struct GrainParameters {
   }
 };
 
-// First half of a step: positions and orientations at its end, and velocities predicted for it.
+// First half of a step.
 // gmem_jax/physics/step.py: step (up to the forces)
 template <class V>
 constexpr GMEM_INLINE HalfStep<V> begin_step(const GrainParameters<V>& p, const Grain<V>& g) {
-  const Vec<V> half_velocity = fma(p.half_dt, g.acceleration, g.velocity), half_spin = fma(p.half_dt, g.spin_rate, g.spin);
-  return {fma(p.dt, half_velocity, g.position),
-          turn(g.orientation, p.dt * half_spin),
-          fma(p.dt, g.acceleration, g.velocity),
-          fma(p.dt, g.spin_rate, g.spin),
-          half_velocity,
-          half_spin};
+  const Vec<V> velocity = fma(p.half_dt, g.acceleration, g.velocity), spin = fma(p.half_dt, g.spin_rate, g.spin);
+  return {fma(p.dt, velocity, g.position), turn(g.orientation, p.dt * spin), velocity, spin};
 }
 
 // gmem_jax/physics/step.py: _angular_acceleration
@@ -67,9 +62,12 @@ constexpr Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropi
   if (isotropic) return p.inverse_inertia[0] * torque;
   const Matrix<V> rotation = matrix(orientation);
   const Vec<V> body_spin = transposed(rotation, spin);
-  const Vec<V> momentum{p.inertia[0] * body_spin.x, p.inertia[1] * body_spin.y, p.inertia[2] * body_spin.z};
-  const Vec<V> rate = transposed(rotation, torque) - cross(body_spin, momentum);
-  return rotation * Vec<V>{p.inverse_inertia[0] * rate.x, p.inverse_inertia[1] * rate.y, p.inverse_inertia[2] * rate.z};
+  const Vec<V> body_torque = transposed(rotation, torque);
+  const auto rate = [&](Vec<V> spin) {
+    const Vec<V> left = body_torque - cross(spin, {p.inertia[0] * spin.x, p.inertia[1] * spin.y, p.inertia[2] * spin.z});
+    return Vec<V>{p.inverse_inertia[0] * left.x, p.inverse_inertia[1] * left.y, p.inverse_inertia[2] * left.z};
+  };
+  return rotation * rate(fma(p.half_dt, rate(body_spin), body_spin));
 }
 
 // Second half: accelerations and velocities; position and orientation stay.
@@ -77,9 +75,10 @@ constexpr Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropi
 template <class V>
 constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const HalfStep<V>& m, Vec<V> force,
                                         Vec<V> torque) {
-  const Vec<V> acceleration = fnma(p.drag, m.velocity, p.inverse_mass * force);
-  const Vec<V> spin_rate = fnma(p.drag, m.spin, angular_acceleration(p, isotropic, m.orientation, m.spin, torque));
-  return {m.position,   m.orientation, fma(p.half_dt, acceleration, m.half_velocity), fma(p.half_dt, spin_rate, m.half_spin),
+  const Vec<V> acceleration = p.slowed * fnma(p.drag, m.velocity, p.inverse_mass * force);
+  const Vec<V> spin_rate =
+      p.slowed * fnma(p.drag, m.spin, angular_acceleration(p, isotropic, m.orientation, m.spin, torque));
+  return {m.position,   m.orientation, fma(p.half_dt, acceleration, m.velocity), fma(p.half_dt, spin_rate, m.spin),
           acceleration, spin_rate};
 }
 
