@@ -61,7 +61,7 @@ def pieces(studies: list[str]) -> Iterator[Piece]:
         "skin": {"0.3": {}, "0.2": {"skin": 0.2}, "0.45": {"skin": 0.45}},
         "builds": {name: {"build": name} if name != SHIPPED else {} for name in BUILDS},
         "t0": {"3600": {"t0": 3600.0}, "1800": {}, "900": {"t0": 900.0}, "360": {"t0": 360.0}},
-        "dt": {"0.075": {"dt": 0.075}, "0.15": {"dt": 0.15}, "0.3": {}},
+        "dt": {"0.15": {"dt": 0.15}, "0.3": {"dt": 0.3}, "0.6": {}, "1.2": {"dt": 1.2}},
         "points": {f"{points}": {"points": points, "t0": 360.0} for points in (200, 100, 50)},
         "backends": {name: {"backend": name, "t0": 360.0} for name in ("native", "jax")},
     }

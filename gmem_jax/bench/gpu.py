@@ -66,7 +66,7 @@ def bytes_per_grain_step(pack: Pack) -> dict[str, float]:
     touching = float(sample.measure(simulation.system, state, pack.box, jnp.ones((3, 1)), 0.0).contacts[0])
     sides = 2.0 * float(np.asarray(pack.pairs.valid).sum()) / pack.grains
     remembered = 3  # numbers of a contact
-    spheres, own = pack.clump.spheres, 9 + 10
+    spheres, own = pack.clump.spheres, 9 + 4
     memory = 8.0 * (2 * own + 2 * 3 * spheres + remembered * (sides + touching))
     held = 8.0 * (9 + own + 6 * spheres + 3 + sides * remembered + 2 * own + sides * remembered / 2.0)
     return {"memory": memory, "gathered": 8.0 * (3 * sides + 9 * touching), "held": held}

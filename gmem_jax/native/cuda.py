@@ -164,7 +164,7 @@ def between_steps(fixed: Any, history: Sequence[Any], points: int, kinds: int, l
     spheres, sides = fixed.incidence.shape[1], 2 * fixed.first.shape[1]
     grains = spheres // fixed.offsets.shape[1]
     remembered = sum(leaf.shape[2] for leaf in history if leaf.ndim == 4) + (6 if points else 0)  # ... and `Layers`
-    shapes = [(2, kinds, grains, 9), (2, kinds, spheres, 3), (kinds, grains, 10), (kinds, grains, 3)]
+    shapes = [(2, kinds, grains, 9), (2, kinds, spheres, 3), (kinds, grains, 4), (kinds, grains, 3)]
     shapes += [(kinds, sides, remembered), *([(kinds, sides, points, 3)] if points else [])]
     found = [jax.ShapeDtypeStruct((1, *shape, lanes), jnp.float64) for shape in shapes]
     return [*found, jax.ShapeDtypeStruct((1, sides, lanes), jnp.int32)] if points else found

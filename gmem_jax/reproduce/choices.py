@@ -37,7 +37,7 @@ CHOICES = (
     Choice("wall_rigidity", "stiffness of walls over rigid ones", (1.0, 0.5, 2.0)),
     Choice("spinning", "history turns about the normal", (1.0, 0.0)),
     Choice("rest", "rests (t0)", (0.2, 0.05, 0.8)),
-    Choice("dt", "time step (t_c)", (0.3, 0.15, 0.365)),
+    Choice("dt", "time step (t_c)", (0.6, 0.365, 1.2)),
     Choice("variant", "M2's outermost ring", ("averaged", "exact", "paper"), {"friction": "M2"}),
     Choice("word_pad", "free bits at the ends of words", (2.0, 1.0, 3.0), _WORDS),
     Choice("word_width", "width of the bumps of words (bits)", (1.0, 0.5, 1.5), _WORDS),

@@ -239,7 +239,10 @@ BAD = [
     (["prepare", "tetra-64-a", "--seed", "2"], "the name of a standard pack says all about it"),
     (["recall", "tetra-64-a", "-o", "{out}"], "`gmem prepare tetra-64-a` makes it"),
     (["recall", "{pack}", "--mu", "-0.5", "-o", "{out}"], "mu must be in [0, inf), got -0.5"),
-    (["recall", "{pack}", "--dt", "0.9", "-o", "{out}"], "t_c exceeds the largest stable step of this pack, law and"),
+    (
+        ["recall", "{pack}", "--dt", "0.9", "--stiffness", "0.93", "-o", "{out}"],
+        "t_c exceeds the largest stable step of this pack, law and",
+    ),
     (["recall", "{pack}", "--dt", "2.2", "-o", "{out}"], "dt must be in (0, 2.0], got 2.2"),
     (["recall", "{pack}", "--signals", "seven", "-o", "{out}"], "--signals"),
     (["recall", "{pack}", "--signals", "{nan.csv}", "-o", "{out}"], "sample 2 of signal 1 is not a finite number"),

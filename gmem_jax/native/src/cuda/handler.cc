@@ -68,7 +68,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   reader.size('R') = kParameters;
   reader.size('W') = kWalls;
   reader.size('Q') = points;
-  reader.size('C') = 10;
+  reader.size('C') = 4;
   reader.size('D') = task == Task::forward ? 1 : 2;
   reader.size('H') = numbers_remembered(which.law);
   std::vector<Array> in, out;
@@ -126,7 +126,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   };
   both(a.hot, a.grains * int64_t{9});
   both(a.sphere, reader.size('S') * 3);
-  a.cold = between(next(), a.grains * int64_t{10});
+  a.cold = between(next(), a.grains * int64_t{4});
   a.pressure = between(next(), a.grains * int64_t{3});
   a.history = between(next(), reader.size('M') * reader.size('H'));
   if (is_layered(which.law)) {
