@@ -17,7 +17,7 @@ from gmem_jax.experiment.arguments import require_names
 from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, value_at
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.recall import apply_waveforms, runner_of
-from gmem_jax.physics.pytree import comparable
+from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint
@@ -310,6 +310,8 @@ class Gradient:
     value: jax.Array
     slope: dict[str, Any]
     p_sig: jax.Array
+
+    __repr__ = short_repr
 
 
 @usual_rules()

@@ -15,7 +15,7 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import Recall, run
 from gmem_jax.experiment.signals import Bumps
-from gmem_jax.physics.pytree import comparable
+from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within
 
@@ -39,6 +39,8 @@ class Jacobian:
     values: np.ndarray
     p_sig: np.ndarray
     p_xy: np.ndarray
+
+    __repr__ = short_repr
 
 
 def _copies(bumps: Bumps, amplitudes: Any) -> Bumps:

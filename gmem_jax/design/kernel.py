@@ -17,7 +17,7 @@ from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import Prefix, run
 from gmem_jax.experiment.signals import Bumps, Signals, bin_average, signals
 from gmem_jax.physics.numbers import require_numbers, require_whole
-from gmem_jax.physics.pytree import comparable
+from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
@@ -48,6 +48,8 @@ class MemoryKernel:
     even: np.ndarray
     gamma0: float
     delta0: float
+
+    __repr__ = short_repr
 
     @property
     def basis(self) -> Bumps:
@@ -206,6 +208,8 @@ class KernelMatrix:
 
     channels: tuple[str, ...]
     blocks: tuple[tuple[MemoryKernel, ...], ...]
+
+    __repr__ = short_repr
 
     def singular_values(self) -> np.ndarray:
         """RMS of p_sig over all channels (in E) for the best, second best, ... set of waveforms, [C n], falling.

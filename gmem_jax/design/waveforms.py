@@ -18,7 +18,7 @@ from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline, waveform
 from gmem_jax.physics.numbers import require_numbers, require_whole
-from gmem_jax.physics.pytree import comparable
+from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within
@@ -56,6 +56,8 @@ class Design:
     untouched: np.ndarray
     before: float
     history: tuple[float, ...]
+
+    __repr__ = short_repr
 
 
 def largest(amplitudes: np.ndarray, width: float) -> np.ndarray:

@@ -10,6 +10,7 @@ from string import Template
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.pytree import short_repr
 from gmem_jax.show.scene import packed, rest_frames
 from gmem_jax.simulation.frames import Frames
 
@@ -71,6 +72,8 @@ class View:
     """
 
     html: str
+
+    __repr__ = short_repr
 
     def _repr_html_(self) -> str:
         frame = f'width="100%" height="{HEIGHT}" style="border:0"'
