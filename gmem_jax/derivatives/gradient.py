@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.arguments import require_names
+from gmem_jax.experiment.arguments import require_kind, require_names
 from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, value_at
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.recall import apply_waveforms, runner_of
@@ -342,6 +342,7 @@ def value_and_grad(
         ValueError: for a name that is no field, or a loss that is not one number.
         RunFailedError: if the simulation broke down.
     """
+    require_kind("value_and_grad", experiment, Experiment)
     tell = callback(progress)
     theta, along = _theta(experiment, by), _along(experiment)
     common, own = experiment.phases

@@ -12,6 +12,7 @@ import numpy as np
 
 from gmem_jax.derivatives import gradient
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import Recall, run
 from gmem_jax.experiment.signals import Bumps
@@ -85,6 +86,7 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
         ValueError: if there is another number of signals, they are not bumps, or the background is not sub0.
         RunFailedError: if the simulation broke down.
     """
+    require_kind("jacobian", experiment, Experiment)
     tell = callback(progress)
     bumps, row = _one_signal(experiment)
     n = row.shape[1]

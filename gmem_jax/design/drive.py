@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import run
 from gmem_jax.physics.numbers import require_numbers, require_whole
@@ -45,6 +46,8 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
     """
     if not experiments:
         raise ValueError("a drive is designed for at least one pack")
+    for experiment in experiments:
+        require_kind("design_drive", experiment, Experiment)
     found = []
     for name, (low, high) in bounds.items():
         require_numbers(**{f"{name} (lowest)": low, f"{name} (highest)": high})

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import Prefix, run
 from gmem_jax.experiment.signals import Bumps, Signals, bin_average, signals
@@ -177,6 +178,7 @@ def memory_kernel(
         ValueError: if n < 2, or gamma0 or delta0 differ between replicas.
         RunFailedError: if the simulation broke down.
     """
+    require_kind("memory_kernel", experiment, Experiment)
     tell, both = callback(progress), _basis(experiment, n, width)
     wanted = replace(experiment, signals=both)
     if len(wanted.readings.reads) * len(wanted.readings.channels) > 1:
@@ -247,6 +249,7 @@ def kernel_matrix(
         ValueError: as of `memory_kernel`; or if there are several reads, or not a set of waveforms for each channel.
         RunFailedError: if the simulation broke down.
     """
+    require_kind("kernel_matrix", experiment, Experiment)
     channels, sets = experiment.readings.channels, experiment.sets
     written = experiment.protocol.written(experiment.readings.reads[0])
     if len(experiment.readings.reads) > 1 or len({drive.waveform for drive in written.values()}) < len(channels):

@@ -14,6 +14,7 @@ import numpy as np
 
 from gmem_jax.derivatives.gradient import push
 from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline, waveform
@@ -172,6 +173,7 @@ def design_waveforms(
     Raises:
         RunFailedError: if a simulation broke down.
     """
+    require_kind("design_waveforms", experiment, Experiment)
     tell = callback(progress)
     refuse_several_scales(experiment)
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)

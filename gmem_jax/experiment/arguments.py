@@ -11,6 +11,24 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import Signals, SignalSets
 from gmem_jax.physics.contact.friction import FrictionLaw
 
+_MADE_BY = {  # kinds of arguments, and what makes them
+    "Experiment": "gm.Experiment(pack, gm.six_signals()) makes one",
+    "Pack": "see gm.load_pack and gm.prepare",
+    "Recall": "gm.run(experiment) makes one, gm.load_recall(path) reads one",
+    "Recipe": "gm.prepare(grains=325) changes its fields",
+}
+
+
+def require_kind(function: str, value: Any, kind: type) -> None:
+    """Refuse an argument that is of another kind than a function takes.
+
+    Raises:
+        TypeError: naming the function, what was given, and what makes the right thing.
+    """
+    if not isinstance(value, kind):
+        name = kind.__name__
+        raise TypeError(f"gm.{function} takes a gm.{name}, got {_said(value)}; {_MADE_BY[name]}")
+
 
 def require_parts(pack: Any, signals: Any, friction: Any) -> None:
     """Refuse what is no pack, no waveforms or no law.
@@ -98,4 +116,6 @@ def _said(value: Any) -> str:
         return f"the class {value.__name__}"
     if isinstance(value, str | float | int | None):
         return repr(value)
-    return f"an array of shape {jnp.shape(value)}" if hasattr(value, "shape") else f"a {type(value).__name__}"
+    kind = type(value).__name__
+    article = "an" if kind[0] in "AEIOUaeiou" else "a"
+    return f"an array of shape {jnp.shape(value)}" if hasattr(value, "shape") else f"{article} {kind}"

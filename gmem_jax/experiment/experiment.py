@@ -14,7 +14,7 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
-from gmem_jax.experiment.arguments import named_observers, require_once, require_parts
+from gmem_jax.experiment.arguments import named_observers, require_kind, require_once, require_parts
 from gmem_jax.experiment.asked import require_double, require_memory, require_seen, require_told_apart, require_walls
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
@@ -198,7 +198,9 @@ class Experiment:
         paper, names = self._paper_protocol(), tuple(self.sets)
         given: Protocol | None = self.protocol
         if given is not None and not isinstance(given, Protocol):
-            raise ValueError(f"protocol must be a gm.Protocol, got a {type(given).__name__}")
+            raise ValueError(
+                f"protocol must be a gm.Protocol, got a {type(given).__name__}; see gm.protocols and gm.load_protocol"
+            )
         protocol = paper if given is None else given.with_sets(names)
         if protocol is None:
             raise ValueError(
@@ -489,6 +491,7 @@ def replace(experiment: Experiment, values: Mapping[str, Any] | None = None, /, 
     Raises:
         ValueError: if there is no such field, it is given twice, or the new experiment is impossible.
     """
+    require_kind("replace", experiment, Experiment)
     found: dict[str, Any] = dict(changes)
     require_once(values or {}, changes)
     for path, value in (values or {}).items():

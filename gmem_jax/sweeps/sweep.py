@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 
 from gmem_jax.errors import FileFormatError, RunFailedError
-from gmem_jax.experiment.arguments import require_values
+from gmem_jax.experiment.arguments import require_kind, require_values
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.html import listing
@@ -97,6 +97,7 @@ def sweep(
         ValueError: for a name that is no field, or an impossible value.
         RunFailedError: if a simulation broke down.
     """
+    require_kind("sweep", experiment, Experiment)
     tell = callback(progress)
     require_values(vary)
     packs = functools.cache(load_pack)  # points on one pack object can run side by side
