@@ -416,7 +416,7 @@ PLOTS = {
     "gain": "G of the points",
     "fidelity": "F of the points",
     "windowed_gain": "G after a running mean over the ringing period",
-    "windowed_fidelity": "F after the same",
+    "windowed_fidelity": "F after a running mean over the ringing period",
     **{name: f"{_plain(quantity.label)}, over the stages" for name, quantity in QUANTITIES.items()},
 }
 """What every picture shows, in words."""

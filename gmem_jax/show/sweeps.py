@@ -38,7 +38,7 @@ def sweep_facts(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
 
 def points_table(table: list[dict[str, Any]], names: list[str]) -> Table:
     """The points of a sweep: what varies, G, F and the status, from `gmem_jax.sweeps.table.rows`."""
-    drawn, names = Table(), names_in(table, names)
+    drawn, names = Table(caption_justify="left"), names_in(table, names)
     for name in (*names, "G", "F", "F(T1)", "status"):
         drawn.add_column(name, no_wrap=name != "status")
     for row in table:
@@ -46,7 +46,7 @@ def points_table(table: list[dict[str, Any]], names: list[str]) -> Table:
         numbers = [row[name] for name in ("gain", "fidelity", "windowed_fidelity")]
         measured = ("" if number is None else decimal(number) for number in numbers)
         drawn.add_row(*(cell(row[name]) for name in names), *measured, state)
-    drawn.caption = "; ".join([ABOUT, *_reasons(table)])
+    drawn.caption = "\n".join([ABOUT, *_reasons(table)])
     return drawn
 
 
@@ -72,7 +72,7 @@ def _bits(status: int) -> list[str]:
 
 def means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
     """Means over points, from `gmem_jax.sweeps.table.means`."""
-    drawn = Table()
+    drawn = Table(caption_justify="left")
     for name in (*names, "n", "G", "F", "F(T1)", "status"):
         drawn.add_column(
             name, no_wrap=name not in (*names, "status"), min_width=14 if name in ("G", "F", "F(T1)") else None
@@ -82,7 +82,7 @@ def means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
         drawn.add_row(
             *(cell(row[name]) for name in names), str(row["done"]), *shown, _state(row) if row["done"] else ""
         )
-    drawn.caption = "; ".join(["mean and standard error", ABOUT, *_reasons(table)])
+    drawn.caption = "\n".join(["mean and standard error", ABOUT, *_reasons(table)])
     return drawn
 
 

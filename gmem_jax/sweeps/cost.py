@@ -55,7 +55,7 @@ class Cost(NamedTuple):
             f"points: {self.points}, {', '.join(counts)}; {plural(self.runs, 'run')} at most",
             *(f"in the folder: {words}" for words, count in found.items() if count),
             f"packs to be made: {self.packs}",
-            f"time: {self.grain_steps:.2g} grain-steps, {in_time(self.seconds)} of two free cores (native, law H)",
+            f"time: {self.grain_steps:.2g} grain-steps, {in_time(self.seconds)} of two free cores once compiled (native, law H)",
             f"disk: {in_bytes(self.disk_bytes)}; nothing was run or written",
         ]
 

@@ -25,7 +25,7 @@ from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.configuration import named_experiment, with_protocol
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.protocols import named_protocol
-from gmem_jax.files.sizes import recall_bytes
+from gmem_jax.files.sizes import in_time, recall_bytes
 from gmem_jax.files.validation import require_kinds
 from gmem_jax.files.waveforms import named_signals, waveforms_of
 from gmem_jax.physics.numbers import plural
@@ -328,9 +328,8 @@ class SweepRunner:
         work = sum(job["work"] for job in jobs)
         widest = max(job["replicas"] for job in jobs)
         workers = min(executor.workers, len(jobs))
-        minutes = max(1, round(seconds_of(jobs, self.cost) / 60.0))
-        where = "here" if self.cost != SECONDS_PER_GRAIN_STEP else "of two free cores (native, law H)"
-        cost = f"{work:.2g} grain-steps, some {minutes} min {where}"
+        where = "here" if self.cost != SECONDS_PER_GRAIN_STEP else "of two free cores once compiled (native, law H)"
+        cost = f"{work:.2g} grain-steps, {in_time(seconds_of(jobs, self.cost))} {where}"
         self.say(f"{what}, {plural(widest, 'replica')} side by side at most, workers: {workers}; {cost}")
 
     def _finish(self, executor: Executor, jobs: list[dict[str, Any]], progress: Progress, what: str) -> None:
