@@ -11,7 +11,7 @@ from gmem_jax.files.validation import is_number
 from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import SENTENCES, Status, combined_status
 from gmem_jax.show.figure import Curve, Figure, Panel, ramp
-from gmem_jax.show.tables import cell, decimal
+from gmem_jax.show.tables import cell, decimal, status_words
 from gmem_jax.sweeps.curves import Line, axes_of, is_sample, lines_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.table import names_in, points_in
@@ -52,22 +52,14 @@ def points_table(table: list[dict[str, Any]], names: list[str]) -> Table:
 
 def _state(row: dict[str, Any]) -> str:
     """The status of a point, or of several, in words."""
-    return ", ".join([*_bits(row["status"] or 0), *(["warned"] if row["warnings"] else [])]) or "ok"
+    return ", ".join([*status_words(row["status"] or 0), *(["warned"] if row["warnings"] else [])]) or "ok"
 
 
 def _reasons(table: list[dict[str, Any]]) -> list[str]:
     """What the words of `_state` mean in a table."""
     bits = {bit for row in table for bit in Status if (row["status"] or 0) & bit}
     told = dict.fromkeys(f"warned: {row['warnings']}" for row in table if row["warnings"])
-    return [*(f"{_word(bit)}: {SENTENCES[bit]}" for bit in sorted(bits)), *told]
-
-
-def _word(bit: Status) -> str:
-    return str(bit.name).lower().replace("_", " ")
-
-
-def _bits(status: int) -> list[str]:
-    return [_word(bit) for bit in Status if status & bit]
+    return [*(f"{word}: {SENTENCES[bit]}" for bit in sorted(bits) for word in status_words(bit)), *told]
 
 
 def means_table(table: list[dict[str, Any]], names: list[str]) -> Table:

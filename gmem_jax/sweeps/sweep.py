@@ -39,6 +39,7 @@ from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import run_group
 
+FREE_CORES = "of two free cores once compiled (native, law H)"
 SECONDS_PER_GRAIN_STEP = 8e-8  # s a grain-step on two cores, of SIDE_BY_SIDE replicas; see docs/scaling.md
 SIDE_BY_SIDE = 8  # replicas: a block
 CHECKED = 50  # values of a name that are tried before a sweep begins
@@ -328,7 +329,7 @@ class SweepRunner:
         work = sum(job["work"] for job in jobs)
         widest = max(job["replicas"] for job in jobs)
         workers = min(executor.workers, len(jobs))
-        where = "here" if self.cost != SECONDS_PER_GRAIN_STEP else "of two free cores once compiled (native, law H)"
+        where = "here" if self.cost != SECONDS_PER_GRAIN_STEP else FREE_CORES
         cost = f"{work:.2g} grain-steps, {in_time(seconds_of(jobs, self.cost))} {where}"
         self.say(f"{what}, {plural(widest, 'replica')} side by side at most, workers: {workers}; {cost}")
 
