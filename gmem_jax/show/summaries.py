@@ -321,7 +321,7 @@ def of_gradient(facts: dict[str, Any], name: str = "") -> Summary:
 
 def of_tuned(facts: dict[str, Any], name: str = "") -> Summary:
     """What is said of a tuned drive, from its result."""
-    packs, history = " ".join(map(cell, facts["packs"])), facts["history"]
+    packs, history = ", ".join(map(cell, facts["packs"])), facts["history"]
     values = ", ".join(f"{key} = {value:.4g}" for key, value in facts["values"].items())
     line = f"{packs}: mean F {facts['before']:.4f} -> {facts['fidelity']:.4f} with {values}"
     fidelities = [float(one["fidelity"]) for one in history]
