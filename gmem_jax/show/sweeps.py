@@ -82,7 +82,7 @@ def _with_error(row: dict[str, Any], measure: str) -> str:
     if row[measure] is None:
         return ""
     error = row[f"{measure}_se"]
-    return decimal(row[measure]) + (f" +- {error:.3f}" if math.isfinite(error) else "")
+    return decimal(row[measure]) + (f" ± {error:.3f}" if math.isfinite(error) else "")
 
 
 def sweep_figure(
