@@ -16,6 +16,7 @@ import typer
 import gmem_jax as gm
 from gmem_jax.command.app import app, command_named
 from gmem_jax.command.sweep import planned
+from gmem_jax.physics.state import WARNINGS
 from gmem_jax.sweeps.spec import read_spec
 
 ROOT = Path(__file__).parents[1]
@@ -151,6 +152,13 @@ def test_a_command_that_is_not_there_is_noticed() -> None:
         parsed(["gmem", "remember"])
     with pytest.raises(Exception, match="--muu"):
         parsed(["gmem", "recall", "pack.h5", "--muu", "1"])
+
+
+def test_words_that_commands_print_are_explained() -> None:
+    glossary, trust = ((DOCS / page).read_text() for page in ("glossary.md", "trust.md"))
+    for word in ("Distance", "Asymmetry", "Resolution", "Gain", "Fidelity", "Plug-in, bitwise, Fano"):
+        assert re.search(rf"^(\*\*{word}\*\*|\| \${word[0]}\$ \| {word.lower()},)", glossary, re.MULTILINE), word
+    assert [bit for bit in gm.Status if bit & WARNINGS and f"\n| `{bit.name}` |" not in trust] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
