@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.arguments import require_kind, require_names
+from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, value_at
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.recall import apply_waveforms, runner_of
@@ -259,7 +259,7 @@ def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
     Raises:
         ValueError: if there is no such name, it holds what has no derivative, or it is within another.
     """
-    require_names(names, "by")
+    require_several(names, "by")
     found = {name: value_at(experiment, name) for name in names}
     for name, tree in found.items():
         if inside := next((other for other in found if name.startswith(f"{other}.")), ""):

@@ -1,5 +1,6 @@
 """What may stand where a pack, waveforms, a law or names belong: refused in one line that says what is right."""
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -16,10 +17,11 @@ _MADE_BY = {  # kinds of arguments, and what makes them
     "Pack": "see gm.load_pack and gm.prepare",
     "Recall": "gm.run(experiment) makes one, gm.load_recall(path) reads one",
     "Recipe": "gm.prepare(grains=325) changes its fields",
+    "Signals": "as gm.six_signals(), gm.words(3)",
 }
 
 
-def require_kind(function: str, value: Any, kind: type) -> None:
+def require_kind(function: str, value: Any, kind: Any) -> None:
     """Refuse an argument that is of another kind than a function takes.
 
     Raises:
@@ -77,14 +79,16 @@ def named_observers(observe: Any) -> tuple[tuple[str, Any], ...]:
     return named
 
 
-def require_names(names: Any, argument: str) -> None:
-    """Refuse one name in the place of several.
+def require_several(values: Any, argument: str) -> None:
+    """Refuse one thing in the place of several.
 
     Raises:
         ValueError: saying how to write it.
     """
-    if isinstance(names, str):
-        raise ValueError(f'{argument} is a sequence of names: write ["{names}"] for "{names}"')
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        one = json.dumps(values) if isinstance(values, str | int | float) else ""
+        right = f"write [{one}] for {one}" if one else f"got {_said(values)}"
+        raise ValueError(f"{argument} takes several, in a list: {right}")
 
 
 def require_values(vary: Mapping[str, Sequence[Any]]) -> None:

@@ -549,4 +549,7 @@ def value_at(experiment: Experiment, path: str) -> Any:
 def _require_field(tree: Any, name: str) -> None:
     names = [field.name for field in fields(tree)] if is_dataclass(tree) else []
     if name not in names:
-        raise ValueError(f"{type(tree).__name__} has no field {name!r}; it has {', '.join(names) or 'none'}")
+        parts = [part for part in names if is_dataclass(getattr(tree, part))]
+        near = [f"{part}.{name}" for part in parts if any(one.name == name for one in fields(getattr(tree, part)))]
+        meant = f" (meant is {' or '.join(near)}?)" if near else ""
+        raise ValueError(f"{type(tree).__name__} has no field {name!r}{meant}; it has {', '.join(names) or 'none'}")

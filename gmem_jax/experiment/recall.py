@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import html
-from gmem_jax.experiment.arguments import require_kind
+from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
 from gmem_jax.experiment.record import describe
@@ -445,6 +445,7 @@ def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[fl
         ValueError: for too many or too few, a u beyond 0 and 1, or a signal that there is not.
     """
     frames, of = require_whole("frames", frames), require_whole("frames_of", of)
+    require_several(at, "frames_at")
     if of > experiment.signals.count:
         raise ValueError(f"frames of signal {of}: there are signals 1 to {experiment.signals.count}, and 0 for none")
     stages = experiment.protocol.stages

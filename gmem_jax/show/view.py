@@ -98,5 +98,8 @@ def view(pack: Pack | Frames) -> View:
     Returns:
         What a notebook shows, and `save` writes as a page.
     """
+    if not isinstance(pack, Pack | Frames):
+        kept = "gm.run(experiment, frames=10) keeps frames in recall.frames"
+        raise TypeError(f"gm.view takes a gm.Pack or frames, got a {type(pack).__name__}; {kept}")
     frames, name = (rest_frames(pack), pack.name) if isinstance(pack, Pack) else (pack, "frames")
     return View(page(name, figure("pack", frames), three=True, bare=True))

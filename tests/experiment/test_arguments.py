@@ -194,12 +194,28 @@ def test_what_is_not_of_the_kind_that_is_kept_or_drawn_is_refused(tmp_path: Path
         (gm.plot, (path,), r"plot takes a gm\.Recall, got '.*a\.h5'; .*gm\.load_recall\(path\) reads one"),
         (gm.to_csv, (PACK,), r"to_csv takes a gm\.Recall, got a Pack"),
         (gm.to_xarray, (PACK,), r"to_xarray takes a gm\.Recall, got a Pack"),
+        (gm.save_waveforms, (gm.six_signals(), path), r"takes a gm\.Signals, got '.*a\.h5'; as gm\.six_signals\(\)"),
+        (gm.view, (EXPERIMENT,), r"view takes a gm\.Pack or frames, got a Experiment; .*recall\.frames"),
         (gm.prepare, (325,), r"prepare takes a gm\.Recipe, got 325; gm\.prepare\(grains=325\)"),
     ]
     for function, given, words in wrong:
         with pytest.raises(TypeError, match=words):
             function(*given)
     assert not list(tmp_path.iterdir())
+
+
+def test_one_thing_in_the_place_of_several_is_refused(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
+    several = "takes several(?: packs)?, in a list:"
+    wrong: list[tuple[Callable[[], Any], str]] = [
+        (lambda: gm.run(EXPERIMENT, frames_at=0.5), rf"frames_at {several} write \[0.5\] for 0.5"),  # type: ignore[arg-type]
+        (lambda: gm.plot(recalled[1], "p_xy", signals=3), rf"signals {several} write \[3\] for 3"),  # type: ignore[arg-type]
+        (lambda: gm.value_and_grad(EXPERIMENT, "gamma0"), rf'by {several} write \["gamma0"\] for "gamma0"'),
+        (lambda: gm.design_drive(EXPERIMENT, {"gamma0": (1e-4, 1e-2)}), f"experiments {several} got an Experiment"),
+        (lambda: gm.stack(PACK), f"stack {several} got tetra-27"),  # type: ignore[arg-type]
+    ]
+    for call, words in wrong:
+        with pytest.raises(ValueError, match=words):
+            call()
 
 
 def test_any_waveforms_can_be_written_and_read_back(tmp_path: Path) -> None:
