@@ -1341,6 +1341,20 @@ MUTATIONS = (
         "test_a_failed_write_leaves_nothing_behind",
     ),
     mutation(
+        "mass-of-a-larger-sphere",
+        "files/lammpsdata.py",
+        "mass / (4.0 * np.pi / 3.0 * radius**3)",
+        "mass / (4.0 * np.pi / 3.0)",
+        "test_free_particles_are_grains_of_their_own_of_the_density_they_have",
+    ),
+    mutation(
+        "wrong-kind-taken",
+        "experiment/arguments.py",
+        "    if not isinstance(value, kind):\n",
+        "    if value is None:\n",
+        "test_what_is_no_experiment_is_not_run",
+    ),
+    mutation(
         "any-schema",
         "files/hdf5.py",
         "if schema and content.schema != schema:",

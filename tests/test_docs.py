@@ -16,6 +16,7 @@ import typer
 import gmem_jax as gm
 from gmem_jax.command.app import app, command_named
 from gmem_jax.command.sweep import planned
+from gmem_jax.physics.state import WARNINGS
 from gmem_jax.sweeps.spec import read_spec
 
 ROOT = Path(__file__).parents[1]
@@ -106,13 +107,14 @@ ROOT_COMMAND: Any = typer.main.get_command(app)
 COMMANDS = {name: command_named(name) for name in ROOT_COMMAND.commands}
 
 
-def parsed(words: list[str]) -> None:
-    """Parse a command of gmem as the command line would, and run nothing.
+def parsed(words: list[str]) -> dict[str, Any]:
+    """What a command of gmem is told, parsed as the command line would; nothing is run.
 
     Raises:
         Exception: of typer, if there is no such command or option.
     """
-    COMMANDS[words[1]].make_context(words[1], words[2:])
+    told: dict[str, Any] = COMMANDS[words[1]].make_context(words[1], words[2:]).params
+    return told
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -137,11 +139,26 @@ def test_commands_are_there_with_the_options_that_pages_give_them(page: Path) ->
         assert {word for word in words if word.startswith("-")} <= {*options, "--help"}, told
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_a_page_can_be_done_word_for_word_with_no_output_in_the_way_of_another(page: Path) -> None:
+    given = [parsed(words).get("output") for words in commands(page) if words[0] == "gmem" and "--force" not in words]
+    outputs = [str(output) for output in given if output and Path(output).suffix]
+    written = re.findall(r"""save\w*\("([^"]+)""", "".join(blocks(page, "python")))
+    assert sorted({*outputs, *written}) == sorted([*outputs, *set(written)])
+
+
 def test_a_command_that_is_not_there_is_noticed() -> None:
     with pytest.raises(KeyError):
         parsed(["gmem", "remember"])
     with pytest.raises(Exception, match="--muu"):
         parsed(["gmem", "recall", "pack.h5", "--muu", "1"])
+
+
+def test_words_that_commands_print_are_explained() -> None:
+    glossary, trust = ((DOCS / page).read_text() for page in ("glossary.md", "trust.md"))
+    for word in ("Distance", "Asymmetry", "Resolution", "Gain", "Fidelity", "Plug-in, bitwise, Fano"):
+        assert re.search(rf"^(\*\*{word}\*\*|\| \${word[0]}\$ \| {word.lower()},)", glossary, re.MULTILINE), word
+    assert [bit for bit in gm.Status if bit & WARNINGS and f"\n| `{bit.name}` |" not in trust] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)

@@ -133,7 +133,7 @@ def _fitted(table: Table) -> list[Table]:
         row.columns[1].overflow = "fold"
         _keep_whole(row)
     if rows:
-        rows[-1].caption = table.caption
+        rows[-1].caption, rows[-1].caption_justify = table.caption, table.caption_justify
     return rows
 
 

@@ -203,8 +203,9 @@ def kernel_command(
         }
         save_kernel(output, kernel, configuration)
     draw_beside(drawn, summary.figures["kernel"])
-    error = "superposition's error: " + " ".join(f"{error:.2%}" for error in result["prediction_error"])
-    print_result(as_json, result, *summary.lines, error)
+    errors = " ".join(f"{error:.2%}" for error in result["prediction_error"])
+    told = f"superposition's error: {errors}  (of each signal's recall, against what the kernel says)"
+    print_result(as_json, result, *summary.lines, told)
 
 
 def _needs_sub0(experiment: Experiment) -> None:

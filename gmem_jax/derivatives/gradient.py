@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.arguments import require_names
+from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, value_at
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.recall import apply_waveforms, runner_of
-from gmem_jax.physics.pytree import comparable
+from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint
@@ -259,7 +259,7 @@ def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
     Raises:
         ValueError: if there is no such name, it holds what has no derivative, or it is within another.
     """
-    require_names(names, "by")
+    require_several(names, "by")
     found = {name: value_at(experiment, name) for name in names}
     for name, tree in found.items():
         if inside := next((other for other in found if name.startswith(f"{other}.")), ""):
@@ -311,6 +311,8 @@ class Gradient:
     slope: dict[str, Any]
     p_sig: jax.Array
 
+    __repr__ = short_repr
+
 
 @usual_rules()
 @shows_progress
@@ -340,6 +342,7 @@ def value_and_grad(
         ValueError: for a name that is no field, or a loss that is not one number.
         RunFailedError: if the simulation broke down.
     """
+    require_kind("value_and_grad", experiment, Experiment)
     tell = callback(progress)
     theta, along = _theta(experiment, by), _along(experiment)
     common, own = experiment.phases

@@ -12,10 +12,11 @@ import numpy as np
 
 from gmem_jax.derivatives import gradient
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import Recall, run
 from gmem_jax.experiment.signals import Bumps
-from gmem_jax.physics.pytree import comparable
+from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within
 
@@ -39,6 +40,8 @@ class Jacobian:
     values: np.ndarray
     p_sig: np.ndarray
     p_xy: np.ndarray
+
+    __repr__ = short_repr
 
 
 def _copies(bumps: Bumps, amplitudes: Any) -> Bumps:
@@ -83,6 +86,7 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
         ValueError: if there is another number of signals, they are not bumps, or the background is not sub0.
         RunFailedError: if the simulation broke down.
     """
+    require_kind("jacobian", experiment, Experiment)
     tell = callback(progress)
     bumps, row = _one_signal(experiment)
     n = row.shape[1]

@@ -22,6 +22,7 @@ from gmem_jax.design.waveforms import (
     sampled,
     verified,
 )
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import PREFIX, prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline
@@ -115,6 +116,7 @@ def design_by_kernel(
             are not as many waveforms to start from as signals.
         RunFailedError: if a simulation broke down.
     """
+    require_kind("design_by_kernel", experiment, Experiment)
     tell = callback(progress)
     refuse_several_scales(experiment)
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)

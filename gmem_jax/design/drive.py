@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.experiment import Experiment, replace, value_at
 from gmem_jax.experiment.recall import run
 from gmem_jax.physics.numbers import require_numbers, require_whole
@@ -43,8 +44,11 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
     Raises:
         ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
     """
+    require_several(experiments, "experiments")
     if not experiments:
         raise ValueError("a drive is designed for at least one pack")
+    for experiment in experiments:
+        require_kind("design_drive", experiment, Experiment)
     found = []
     for name, (low, high) in bounds.items():
         require_numbers(**{f"{name} (lowest)": low, f"{name} (highest)": high})

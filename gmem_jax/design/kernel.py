@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import analysis
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import Prefix, run
 from gmem_jax.experiment.signals import Bumps, Signals, bin_average, signals
 from gmem_jax.physics.numbers import require_numbers, require_whole
-from gmem_jax.physics.pytree import comparable
+from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
@@ -48,6 +49,8 @@ class MemoryKernel:
     even: np.ndarray
     gamma0: float
     delta0: float
+
+    __repr__ = short_repr
 
     @property
     def basis(self) -> Bumps:
@@ -175,6 +178,7 @@ def memory_kernel(
         ValueError: if n < 2, or gamma0 or delta0 differ between replicas.
         RunFailedError: if the simulation broke down.
     """
+    require_kind("memory_kernel", experiment, Experiment)
     tell, both = callback(progress), _basis(experiment, n, width)
     wanted = replace(experiment, signals=both)
     if len(wanted.readings.reads) * len(wanted.readings.channels) > 1:
@@ -206,6 +210,8 @@ class KernelMatrix:
 
     channels: tuple[str, ...]
     blocks: tuple[tuple[MemoryKernel, ...], ...]
+
+    __repr__ = short_repr
 
     def singular_values(self) -> np.ndarray:
         """RMS of p_sig over all channels (in E) for the best, second best, ... set of waveforms, [C n], falling.
@@ -243,6 +249,7 @@ def kernel_matrix(
         ValueError: as of `memory_kernel`; or if there are several reads, or not a set of waveforms for each channel.
         RunFailedError: if the simulation broke down.
     """
+    require_kind("kernel_matrix", experiment, Experiment)
     channels, sets = experiment.readings.channels, experiment.sets
     written = experiment.protocol.written(experiment.readings.reads[0])
     if len(experiment.readings.reads) > 1 or len({drive.waveform for drive in written.values()}) < len(channels):

@@ -14,11 +14,12 @@ import numpy as np
 
 from gmem_jax.derivatives.gradient import push
 from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline, waveform
 from gmem_jax.physics.numbers import require_numbers, require_whole
-from gmem_jax.physics.pytree import comparable
+from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within
@@ -56,6 +57,8 @@ class Design:
     untouched: np.ndarray
     before: float
     history: tuple[float, ...]
+
+    __repr__ = short_repr
 
 
 def largest(amplitudes: np.ndarray, width: float) -> np.ndarray:
@@ -170,6 +173,7 @@ def design_waveforms(
     Raises:
         RunFailedError: if a simulation broke down.
     """
+    require_kind("design_waveforms", experiment, Experiment)
     tell = callback(progress)
     refuse_several_scales(experiment)
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)

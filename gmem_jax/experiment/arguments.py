@@ -1,5 +1,6 @@
 """What may stand where a pack, waveforms, a law or names belong: refused in one line that says what is right."""
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +11,25 @@ import numpy as np
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import Signals, SignalSets
 from gmem_jax.physics.contact.friction import FrictionLaw
+
+_MADE_BY = {  # kinds of arguments, and what makes them
+    "Experiment": "gm.Experiment(pack, gm.six_signals()) makes one",
+    "Pack": "see gm.load_pack and gm.prepare",
+    "Recall": "gm.run(experiment) makes one, gm.load_recall(path) reads one",
+    "Recipe": "gm.prepare(grains=325) changes its fields",
+    "Signals": "as gm.six_signals(), gm.words(3)",
+}
+
+
+def require_kind(function: str, value: Any, kind: Any) -> None:
+    """Refuse an argument that is of another kind than a function takes.
+
+    Raises:
+        TypeError: naming the function, what was given, and what makes the right thing.
+    """
+    if not isinstance(value, kind):
+        name = kind.__name__
+        raise TypeError(f"gm.{function} takes a gm.{name}, got {_said(value)}; {_MADE_BY[name]}")
 
 
 def require_parts(pack: Any, signals: Any, friction: Any) -> None:
@@ -59,14 +79,16 @@ def named_observers(observe: Any) -> tuple[tuple[str, Any], ...]:
     return named
 
 
-def require_names(names: Any, argument: str) -> None:
-    """Refuse one name in the place of several.
+def require_several(values: Any, argument: str) -> None:
+    """Refuse one thing in the place of several.
 
     Raises:
         ValueError: saying how to write it.
     """
-    if isinstance(names, str):
-        raise ValueError(f'{argument} is a sequence of names: write ["{names}"] for "{names}"')
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        one = json.dumps(values) if isinstance(values, str | int | float) else ""
+        right = f"write [{one}] for {one}" if one else f"got {_said(values)}"
+        raise ValueError(f"{argument} takes several, in a list: {right}")
 
 
 def require_values(vary: Mapping[str, Sequence[Any]]) -> None:
@@ -98,4 +120,6 @@ def _said(value: Any) -> str:
         return f"the class {value.__name__}"
     if isinstance(value, str | float | int | None):
         return repr(value)
-    return f"an array of shape {jnp.shape(value)}" if hasattr(value, "shape") else f"a {type(value).__name__}"
+    kind = type(value).__name__
+    article = "an" if kind[0] in "AEIOUaeiou" else "a"
+    return f"an array of shape {jnp.shape(value)}" if hasattr(value, "shape") else f"{article} {kind}"

@@ -14,7 +14,7 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
-from gmem_jax.experiment.arguments import named_observers, require_once, require_parts
+from gmem_jax.experiment.arguments import named_observers, require_kind, require_once, require_parts
 from gmem_jax.experiment.asked import require_double, require_memory, require_seen, require_told_apart, require_walls
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
@@ -199,7 +199,9 @@ class Experiment:
         paper, names = self._paper_protocol(), tuple(self.sets)
         given: Protocol | None = self.protocol
         if given is not None and not isinstance(given, Protocol):
-            raise ValueError(f"protocol must be a gm.Protocol, got a {type(given).__name__}")
+            raise ValueError(
+                f"protocol must be a gm.Protocol, got a {type(given).__name__}; see gm.protocols and gm.load_protocol"
+            )
         protocol = paper if given is None else given.with_sets(names)
         if protocol is None:
             raise ValueError(
@@ -490,6 +492,7 @@ def replace(experiment: Experiment, values: Mapping[str, Any] | None = None, /, 
     Raises:
         ValueError: if there is no such field, it is given twice, or the new experiment is impossible.
     """
+    require_kind("replace", experiment, Experiment)
     found: dict[str, Any] = dict(changes)
     require_once(values or {}, changes)
     for path, value in (values or {}).items():
@@ -547,4 +550,7 @@ def value_at(experiment: Experiment, path: str) -> Any:
 def _require_field(tree: Any, name: str) -> None:
     names = [field.name for field in fields(tree)] if is_dataclass(tree) else []
     if name not in names:
-        raise ValueError(f"{type(tree).__name__} has no field {name!r}; it has {', '.join(names) or 'none'}")
+        parts = [part for part in names if is_dataclass(getattr(tree, part))]
+        near = [f"{part}.{name}" for part in parts if any(one.name == name for one in fields(getattr(tree, part)))]
+        meant = f" (meant is {' or '.join(near)}?)" if near else ""
+        raise ValueError(f"{type(tree).__name__} has no field {name!r}{meant}; it has {', '.join(names) or 'none'}")

@@ -128,6 +128,8 @@ def stack(packs: Sequence[Pack]) -> Pack:
     Raises:
         ValueError: if there is no pack, or the packs differ in size, in the grain, or in the boundary.
     """
+    if isinstance(packs, Pack):
+        raise ValueError(f"stack takes several packs, in a list: got {packs.name}")
     if not packs:
         raise ValueError("stack needs at least one pack")
     first = packs[0]

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import html
+from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
 from gmem_jax.experiment.record import describe
@@ -246,6 +247,7 @@ def recall(experiment: Experiment) -> Recall:
         ValueError: if 64-bit mode is off, or was when the pack or the signals were made.
     """
     require_x64()
+    require_kind("recall", experiment, Experiment)
     require_double(pack=experiment.pack, signals=experiment.signals)
     found: Recall = _recall(experiment)
     return found if traced(experiment) else found.described(describe(experiment, 0.0))
@@ -381,11 +383,7 @@ def run(
         TypeError: if it is no `Experiment`.
         RunFailedError: if the simulation broke down.
     """
-    if not isinstance(experiment, Experiment):
-        kind = type(experiment).__name__
-        raise TypeError(
-            f"gm.run takes a gm.Experiment, got a {kind}; make one with gm.Experiment(pack, gm.six_signals())"
-        )
+    require_kind("run", experiment, Experiment)
     began, tell = time.perf_counter(), callback(progress)
     count = experiment.signals.count
     size = count if batch is None else require_whole("batch", batch, 1)
@@ -447,6 +445,7 @@ def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[fl
         ValueError: for too many or too few, a u beyond 0 and 1, or a signal that there is not.
     """
     frames, of = require_whole("frames", frames), require_whole("frames_of", of)
+    require_several(at, "frames_at")
     if of > experiment.signals.count:
         raise ValueError(f"frames of signal {of}: there are signals 1 to {experiment.signals.count}, and 0 for none")
     stages = experiment.protocol.stages

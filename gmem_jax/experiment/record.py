@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import NUMBERS, Experiment, value_at
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance, sources
@@ -116,6 +117,7 @@ def to_dict(experiment: Experiment) -> dict[str, Any]:
 
     `files.configuration.from_dict` makes the same experiment of it.
     """
+    require_kind("to_dict", experiment, Experiment)
     pack = experiment.pack
     numbers = [entry.name for entry in fields(Experiment) if entry.init and entry.name not in PARTS]
     material = experiment.material

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import USUAL_STEP, Experiment
 from gmem_jax.experiment.record import fingerprint, pack_fingerprint
 from gmem_jax.physics.contact.friction import CoulombLaw
@@ -35,6 +36,7 @@ def stable_step(experiment: Experiment) -> float:
     Returns:
         At most 2.
     """
+    require_kind("stable_step", experiment, Experiment)
     law: Any = experiment.friction
     if isinstance(law, CoulombLaw) and not np.any(law.mu):
         law = Frictionless()

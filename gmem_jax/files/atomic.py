@@ -23,9 +23,13 @@ def atomic(path: Path, *, flush: bool = True) -> Iterator[Path]:
 
     Raises:
         FileExistsError: if there is something where a new file was promised.
-        OSError: if the folder cannot be written.
+        OSError: if there is no such folder, or it cannot be written.
     """
     path, made = Path(path), None
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: folder {path.parent} does not exist")
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: is a folder; name a file")
     try:
         made = temporary(path)
         yield made

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.hdf5 import OBSERVED, observed_array
 from gmem_jax.files.measures import of_each
@@ -24,6 +25,7 @@ def to_xarray(recall: Recall) -> Any:
     Raises:
         ValueError: if xarray is not installed.
     """
+    require_kind("to_xarray", recall, Recall)
     xarray, configuration = optional("xarray", "export"), recall.configuration
     stages, replicas = recall.stages, len(recall.status)
     bins = {name: len(sample.filling) for name, sample in stages.items()}
@@ -79,6 +81,7 @@ def plain_cell(value: Any) -> Any:
 
 def to_csv(recall: Recall, *, each: bool = False) -> str:
     """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F."""
+    require_kind("to_csv", recall, Recall)
     several = len(recall.reads) * len(recall.channels) > 1
     rows: list[list[Any]]
     if each:

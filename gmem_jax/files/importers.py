@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.files.lammpsdata import SAME, Read, one_value, read_lammps
+from gmem_jax.files.lammpsdata import SAME, Read, density_of, read_lammps
 from gmem_jax.files.validation import optional, refusing, require, require_finite
 
 LARGEST = 1 << 30  # bytes of a file
@@ -72,7 +72,7 @@ def load_spheres(path: Path, radius: float = 1.0) -> Spheres:
         gsd = gsd or begins.startswith(_GSD)
         for pattern, what, how in () if begins.startswith(_GSD) else _OTHERS:
             require(not re.match(pattern, begins, re.DOTALL), f"it is {what}; {how}")
-        centres, grain, radii, box, density, notes = _gsd(path) if gsd else read_lammps(path, radius)
+        centres, grain, radii, box, density, notes = _gsd(path, radius) if gsd else read_lammps(path, radius)
         require_finite({"positions": centres, "planes of the box": box})
         odd = np.abs(radii - radius) > SAME * radius
         require(
@@ -90,7 +90,7 @@ def load_spheres(path: Path, radius: float = 1.0) -> Spheres:
         return Spheres(shaped, lower, upper, density, notes)
 
 
-def _gsd(path: Path) -> Read:
+def _gsd(path: Path, radius: float) -> Read:
     with optional("gsd.hoomd", "export").open(path, "r") as file:
         frame = file[-1]
     own: Any = frame.particles
@@ -107,8 +107,10 @@ def _gsd(path: Path) -> Read:
     require(
         np.asarray(own.image)[kept] == 0, "its particles have images: a pack lies within walls, not in a periodic box"
     )
-    one_value("mass", np.asarray(own.mass, float)[kept])
-    centres, diameter = np.asarray(own.position, float), np.asarray(own.diameter, float)
-    notes = ("its velocities are left out",) if np.any(own.velocity) else ()
+    centres, radii = np.asarray(own.position, float)[kept], 0.5 * np.asarray(own.diameter, float)[kept]
+    density = density_of(np.asarray(own.mass, float)[kept], radius)
+    notes = ["its velocities are left out"] * bool(np.any(own.velocity))
+    if free.any():
+        notes.append(f"{free.sum()} of its particles belong to no body: each is a grain of one sphere")
     box = np.stack([-0.5 * lengths, 0.5 * lengths])
-    return Read(centres[kept], grain[kept], 0.5 * diameter[kept], box, notes=notes)
+    return Read(centres, grain[kept], radii, box, density, tuple(notes))

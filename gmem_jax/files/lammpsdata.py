@@ -107,7 +107,7 @@ def read_lammps(path: Path, radius: float) -> Read:
     density = one_value("density", named["density"]) if "density" in named else None
     if density is None and "Masses" in sections:
         masses = _table(sections["Masses"], ["type", "mass"], types, labels)
-        one_value("mass", masses["mass"][np.isin(masses["type"], named["type"])])
+        density = density_of(masses["mass"][np.isin(masses["type"], named["type"])], radius)
     radii = 0.5 * named["diameter"][order] if "diameter" in named else np.zeros(0)
     return Read(centres[order], grain[order], radii, box, density, tuple(notes))
 
@@ -121,6 +121,16 @@ def one_value(what: str, values: np.ndarray) -> float:
     low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
     require(high - low <= SAME * abs(high), f"its spheres have a {what} of {low:g} to {high:g}, all must have the same")
     return float(high)
+
+
+def density_of(masses: np.ndarray, radius: float) -> float | None:
+    """The density of spheres of these masses; None where all are 1, as programs write who know no masses.
+
+    Raises:
+        FileFormatError: if they differ.
+    """
+    mass = one_value("mass", masses)
+    return None if mass == 1.0 else mass / (4.0 * np.pi / 3.0 * radius**3)
 
 
 def _parts(lines: list[str]) -> tuple[dict[str, _Row], dict[str, _Section]]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files import pack_validation
 from gmem_jax.files.cache import kept_pack, list_packs
@@ -51,6 +52,7 @@ def save_pack(
         FileFormatError: if `load_pack` would refuse it, saying why; nothing is written.
         OSError: if the path cannot be written.
     """
+    require_kind("save_pack(path, pack)", pack, Pack)
     try:
         check_pack(pack)
         if frames is not None:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gmem_jax.experiment.analysis import MEASURES
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
@@ -45,6 +46,7 @@ def save_recall(path: str | Path, recall: Recall) -> None:
         ValueError: if the recall does not say what it is of.
         OSError: if the path cannot be written.
     """
+    require_kind("save_recall(path, recall)", recall, Recall)
     configuration = recall.configuration
     if not configuration:
         raise ValueError(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.record import SIGNALS, signals_to_dict
 from gmem_jax.experiment.samples import Told, require_gentle, untold, waveform_from
 from gmem_jax.experiment.signals import (
@@ -159,6 +160,7 @@ def save_waveforms(
     Raises:
         OSError: if the path cannot be written.
     """
+    require_kind("save_waveforms(path, signals)", signals, Signals)
     inner = jnp.arange(1, BINS) / BINS
     values = np.asarray(signals.nodes)[:, 1:-1].T if isinstance(signals, Spline) else np.asarray(signals.shear(inner))
     header = ",".join(f"signal_{number + 1}" for number in range(values.shape[1]))

@@ -110,6 +110,22 @@ def _equal(self: Any, other: Any) -> Any:
     return all(_alike(getattr(self, entry.name), getattr(other, entry.name)) for entry in fields(self))
 
 
+def _short(value: Any) -> str:
+    """A value in few letters: of an array its kind and shape."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{name!r}: {_short(each)}' for name, each in value.items())}}}"
+    if isinstance(value, np.ndarray | jax.Array):
+        alone = value.ndim == 0 and not isinstance(value, jax.core.Tracer)
+        return repr(value.item()) if alone else f"{value.dtype}[{', '.join(map(str, value.shape))}]"
+    return said(value)
+
+
+def short_repr(made: Any) -> str:
+    """What `__repr__` may be of a dataclass whose arrays would fill pages: its fields in one line."""
+    told = (f"{entry.name}={_short(getattr(made, entry.name))}" for entry in fields(made) if entry.repr)
+    return f"{type(made).__name__}({', '.join(told)})"
+
+
 def comparable(cls: type[_T]) -> type[_T]:
     """Let `==` of a dataclass that holds arrays be True or False; its hash stays, as equal objects have equal ones."""
     cls.__eq__ = _equal  # type: ignore[method-assign]

@@ -12,6 +12,7 @@ import numpy as np
 
 from gmem_jax import native
 from gmem_jax.errors import RunFailedError
+from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.asked import require_walls
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
@@ -292,6 +293,7 @@ def prepare(
     """
     tell = callback(progress)
     require_x64()
+    require_kind("prepare", recipe or Recipe(), Recipe)
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = grain or tetra(), material or Material()
     require_walls(periodic_axes(recipe.boundary), material)

@@ -89,8 +89,8 @@ def reading_erases(recall: Recall, scale: float) -> Verdict:
     return Verdict(
         "the first readout erases the memory",
         abs(left[0]) < LITTLE * gain,
-        f"gain of the second {left[0]:.4f} +- {left[2]:.4f} beside {gain:.3f}; "
-        f"correlation with J {correlation[0]:.2f} +- {correlation[2]:.2f} (mean and SE over signals)",
+        f"gain of the second {left[0]:.4f} ± {left[2]:.4f} beside {gain:.3f}; "
+        f"correlation with J {correlation[0]:.2f} ± {correlation[2]:.2f} (mean and SE over signals)",
         {"gain": gain, "second_gain": left[0], "correlation": correlation[0]},
     )
 

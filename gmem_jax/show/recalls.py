@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.analysis import running_mean
+from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.experiment import PAPER_T0, Experiment
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import describe
@@ -53,6 +54,8 @@ def plot(
     Raises:
         ValueError: if there is no such picture, or no such signal; it names those that there are.
     """
+    require_kind("plot", recall, Recall)
+    require_several(signals, "signals")
     known = None if experiment is None else describe(experiment, 0.0)
     return to_matplotlib(recall_figure(recall, what, known, against=against, signals=signals))
 

@@ -321,7 +321,7 @@ def of_gradient(facts: dict[str, Any], name: str = "") -> Summary:
 
 def of_tuned(facts: dict[str, Any], name: str = "") -> Summary:
     """What is said of a tuned drive, from its result."""
-    packs, history = " ".join(map(cell, facts["packs"])), facts["history"]
+    packs, history = ", ".join(map(cell, facts["packs"])), facts["history"]
     values = ", ".join(f"{key} = {value:.4g}" for key, value in facts["values"].items())
     line = f"{packs}: mean F {facts['before']:.4f} -> {facts['fidelity']:.4f} with {values}"
     fidelities = [float(one["fidelity"]) for one in history]
@@ -416,7 +416,7 @@ PLOTS = {
     "gain": "G of the points",
     "fidelity": "F of the points",
     "windowed_gain": "G after a running mean over the ringing period",
-    "windowed_fidelity": "F after the same",
+    "windowed_fidelity": "F after a running mean over the ringing period",
     **{name: f"{_plain(quantity.label)}, over the stages" for name, quantity in QUANTITIES.items()},
 }
 """What every picture shows, in words."""

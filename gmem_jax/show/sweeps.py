@@ -11,7 +11,7 @@ from gmem_jax.files.validation import is_number
 from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import SENTENCES, Status, combined_status
 from gmem_jax.show.figure import Curve, Figure, Panel, ramp
-from gmem_jax.show.tables import cell, decimal
+from gmem_jax.show.tables import cell, decimal, status_words
 from gmem_jax.sweeps.curves import Line, axes_of, is_sample, lines_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.table import names_in, points_in
@@ -38,7 +38,7 @@ def sweep_facts(store: Store, table: list[dict[str, Any]]) -> dict[str, Any]:
 
 def points_table(table: list[dict[str, Any]], names: list[str]) -> Table:
     """The points of a sweep: what varies, G, F and the status, from `gmem_jax.sweeps.table.rows`."""
-    drawn, names = Table(), names_in(table, names)
+    drawn, names = Table(caption_justify="left"), names_in(table, names)
     for name in (*names, "G", "F", "F(T1)", "status"):
         drawn.add_column(name, no_wrap=name != "status")
     for row in table:
@@ -46,33 +46,25 @@ def points_table(table: list[dict[str, Any]], names: list[str]) -> Table:
         numbers = [row[name] for name in ("gain", "fidelity", "windowed_fidelity")]
         measured = ("" if number is None else decimal(number) for number in numbers)
         drawn.add_row(*(cell(row[name]) for name in names), *measured, state)
-    drawn.caption = "; ".join([ABOUT, *_reasons(table)])
+    drawn.caption = "\n".join([ABOUT, *_reasons(table)])
     return drawn
 
 
 def _state(row: dict[str, Any]) -> str:
     """The status of a point, or of several, in words."""
-    return ", ".join([*_bits(row["status"] or 0), *(["warned"] if row["warnings"] else [])]) or "ok"
+    return ", ".join([*status_words(row["status"] or 0), *(["warned"] if row["warnings"] else [])]) or "ok"
 
 
 def _reasons(table: list[dict[str, Any]]) -> list[str]:
     """What the words of `_state` mean in a table."""
     bits = {bit for row in table for bit in Status if (row["status"] or 0) & bit}
     told = dict.fromkeys(f"warned: {row['warnings']}" for row in table if row["warnings"])
-    return [*(f"{_word(bit)}: {SENTENCES[bit]}" for bit in sorted(bits)), *told]
-
-
-def _word(bit: Status) -> str:
-    return str(bit.name).lower().replace("_", " ")
-
-
-def _bits(status: int) -> list[str]:
-    return [_word(bit) for bit in Status if status & bit]
+    return [*(f"{word}: {SENTENCES[bit]}" for bit in sorted(bits) for word in status_words(bit)), *told]
 
 
 def means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
     """Means over points, from `gmem_jax.sweeps.table.means`."""
-    drawn = Table()
+    drawn = Table(caption_justify="left")
     for name in (*names, "n", "G", "F", "F(T1)", "status"):
         drawn.add_column(
             name, no_wrap=name not in (*names, "status"), min_width=14 if name in ("G", "F", "F(T1)") else None
@@ -82,7 +74,7 @@ def means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
         drawn.add_row(
             *(cell(row[name]) for name in names), str(row["done"]), *shown, _state(row) if row["done"] else ""
         )
-    drawn.caption = "; ".join(["mean and standard error", ABOUT, *_reasons(table)])
+    drawn.caption = "\n".join(["mean and standard error", ABOUT, *_reasons(table)])
     return drawn
 
 
@@ -90,7 +82,7 @@ def _with_error(row: dict[str, Any], measure: str) -> str:
     if row[measure] is None:
         return ""
     error = row[f"{measure}_se"]
-    return decimal(row[measure]) + (f" +- {error:.3f}" if math.isfinite(error) else "")
+    return decimal(row[measure]) + (f" ± {error:.3f}" if math.isfinite(error) else "")
 
 
 def sweep_figure(

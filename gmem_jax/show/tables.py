@@ -165,6 +165,11 @@ _OF_READ = (
 """What a `summary` has for each read and channel."""
 
 
+def status_words(status: int) -> list[str]:
+    """The set bits of a status, each in a word or two."""
+    return [str(bit.name).lower().replace("_", " ") for bit in Status if status & bit]
+
+
 def _summary(recall: Recall) -> dict[str, Any]:
     """The numbers of one read and channel."""
     configuration = recall.configuration
@@ -189,7 +194,7 @@ def _summary(recall: Recall) -> dict[str, Any]:
         "largest_signal_pa": float(np.max(np.abs(np.asarray(recall.p_sig))) * unit),
         "dt": float(np.max(np.asarray(recall.dt))),
         "status": status,
-        "status_names": " ".join(bit.name.lower() for bit in Status if status & bit and bit.name) or "ok",
+        "status_names": ", ".join(status_words(status)) or "ok",
         "status_text": explain(status),
         "note": note_on_size(configuration),
         "signals": _signals(recall),
@@ -467,7 +472,7 @@ def pack_table(pack: Pack) -> Table:
         Fact("grains", f"{pack.grains} {pack.clump.shape}"),
         Fact("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)), "R"),
         *([Fact("boundary", boundary_of(pack.periodic))] if any(pack.periodic) else []),
-        Fact("cycled with delta0", f"{float(pack.delta0):g}"),
+        Fact("meant for delta0" if "imported" in pack.info else "cycled with delta0", f"{float(pack.delta0):g}"),
         Fact("ringing period T1", f"{float(pack.ringing_period):.1f}", "t_c"),
         Fact("candidate contacts", int(np.asarray(pack.pairs.valid).sum())),
     ]

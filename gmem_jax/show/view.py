@@ -10,6 +10,7 @@ from string import Template
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.pytree import short_repr
 from gmem_jax.show.scene import packed, rest_frames
 from gmem_jax.simulation.frames import Frames
 
@@ -72,6 +73,8 @@ class View:
 
     html: str
 
+    __repr__ = short_repr
+
     def _repr_html_(self) -> str:
         frame = f'width="100%" height="{HEIGHT}" style="border:0"'
         return f'<iframe srcdoc="{html.escape(self.html)}" {frame}></iframe>'
@@ -95,5 +98,8 @@ def view(pack: Pack | Frames) -> View:
     Returns:
         What a notebook shows, and `save` writes as a page.
     """
+    if not isinstance(pack, Pack | Frames):
+        kept = "gm.run(experiment, frames=10) keeps frames in recall.frames"
+        raise TypeError(f"gm.view takes a gm.Pack or frames, got a {type(pack).__name__}; {kept}")
     frames, name = (rest_frames(pack), pack.name) if isinstance(pack, Pack) else (pack, "frames")
     return View(page(name, figure("pack", frames), three=True, bare=True))

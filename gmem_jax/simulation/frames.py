@@ -14,7 +14,7 @@ import numpy as np
 
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.numbers import require_numbers
-from gmem_jax.physics.pytree import pytree, static
+from gmem_jax.physics.pytree import pytree, short_repr, static
 from gmem_jax.physics.state import State
 from gmem_jax.physics.step import System, contact_loads, relative_motion, sphere_table
 from gmem_jax.simulation.observers import Chunk, Observer
@@ -81,6 +81,8 @@ class Frames:
     stages: tuple[str, ...] = static(())
     signal: int = static(0)
     periodic: PeriodicAxes = static(WALLS)
+
+    __repr__ = short_repr
 
     @property
     def count(self) -> int:

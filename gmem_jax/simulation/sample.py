@@ -10,7 +10,7 @@ from jax import lax
 from gmem_jax.physics.contact.friction import largest_overlap
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import image_shifts, slack, sphere_centres
-from gmem_jax.physics.pytree import Scalar, pytree
+from gmem_jax.physics.pytree import Scalar, pytree, short_repr
 from gmem_jax.physics.rotation import dot, matrix
 from gmem_jax.physics.state import Box, State, Status
 from gmem_jax.physics.step import System
@@ -116,6 +116,8 @@ class Sample:
         log=True,
     )
     observed: dict[str, Any] | None = None
+
+    __repr__ = short_repr
 
     @property
     def contacts_per_grain(self) -> jax.Array:

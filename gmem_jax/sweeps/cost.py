@@ -10,7 +10,7 @@ from gmem_jax.files.sizes import in_bytes, in_time, pack_bytes, recall_bytes
 from gmem_jax.physics.numbers import plural
 from gmem_jax.sweeps.plan import plan
 from gmem_jax.sweeps.spec import Spec
-from gmem_jax.sweeps.sweep import SweepRunner, seconds_of
+from gmem_jax.sweeps.sweep import FREE_CORES, SweepRunner, seconds_of
 
 
 class Cost(NamedTuple):
@@ -55,7 +55,7 @@ class Cost(NamedTuple):
             f"points: {self.points}, {', '.join(counts)}; {plural(self.runs, 'run')} at most",
             *(f"in the folder: {words}" for words, count in found.items() if count),
             f"packs to be made: {self.packs}",
-            f"time: {self.grain_steps:.2g} grain-steps, {in_time(self.seconds)} of two free cores (native, law H)",
+            f"time: {self.grain_steps:.2g} grain-steps, {in_time(self.seconds)} {FREE_CORES}",
             f"disk: {in_bytes(self.disk_bytes)}; nothing was run or written",
         ]
 

@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 
 from gmem_jax.errors import FileFormatError, RunFailedError
-from gmem_jax.experiment.arguments import require_values
+from gmem_jax.experiment.arguments import require_kind, require_values
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.experiment import replace as with_values
 from gmem_jax.experiment.html import listing
@@ -25,7 +25,7 @@ from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.configuration import named_experiment, with_protocol
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.protocols import named_protocol
-from gmem_jax.files.sizes import recall_bytes
+from gmem_jax.files.sizes import in_time, recall_bytes
 from gmem_jax.files.validation import require_kinds
 from gmem_jax.files.waveforms import named_signals, waveforms_of
 from gmem_jax.physics.numbers import plural
@@ -39,6 +39,7 @@ from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import run_group
 
+FREE_CORES = "of two free cores once compiled (native, law H)"
 SECONDS_PER_GRAIN_STEP = 8e-8  # s a grain-step on two cores, of SIDE_BY_SIDE replicas; see docs/scaling.md
 SIDE_BY_SIDE = 8  # replicas: a block
 CHECKED = 50  # values of a name that are tried before a sweep begins
@@ -97,6 +98,7 @@ def sweep(
         ValueError: for a name that is no field, or an impossible value.
         RunFailedError: if a simulation broke down.
     """
+    require_kind("sweep", experiment, Experiment)
     tell = callback(progress)
     require_values(vary)
     packs = functools.cache(load_pack)  # points on one pack object can run side by side
@@ -327,9 +329,8 @@ class SweepRunner:
         work = sum(job["work"] for job in jobs)
         widest = max(job["replicas"] for job in jobs)
         workers = min(executor.workers, len(jobs))
-        minutes = max(1, round(seconds_of(jobs, self.cost) / 60.0))
-        where = "here" if self.cost != SECONDS_PER_GRAIN_STEP else "of two free cores (native, law H)"
-        cost = f"{work:.2g} grain-steps, some {minutes} min {where}"
+        where = "here" if self.cost != SECONDS_PER_GRAIN_STEP else FREE_CORES
+        cost = f"{work:.2g} grain-steps, {in_time(seconds_of(jobs, self.cost))} {where}"
         self.say(f"{what}, {plural(widest, 'replica')} side by side at most, workers: {workers}; {cost}")
 
     def _finish(self, executor: Executor, jobs: list[dict[str, Any]], progress: Progress, what: str) -> None:

@@ -38,7 +38,7 @@ ROW = {
     "windowed_gain": 0.2612,
     "windowed_fidelity": 0.9013,
     "ringing_period": 39.7,
-    "status_names": "not_at_rest ringing",
+    "status_names": "not at rest, ringing",
 }
 CONDITIONS = {"mu": 1.0, "gamma0": 1e-3, "delta0": 0.05, "t0": 1800.0, "friction": "hooke"}
 

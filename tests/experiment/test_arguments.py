@@ -158,9 +158,64 @@ def test_every_number_that_is_asked_for_is_a_number_and_no_text_of_one() -> None
         assert "\n" not in str(refused.value)
 
 
-def test_what_is_no_experiment_is_not_run() -> None:
-    with pytest.raises(TypeError, match=r"gm\.run takes a gm\.Experiment, got a Pack"):
-        gm.run(PACK)  # type: ignore[arg-type]
+EXPERIMENT_MADE = r"gm\.Experiment\(pack, gm\.six_signals\(\)\) makes one"
+TAKES_EXPERIMENT: dict[str, Callable[[Any], Any]] = {
+    "run": gm.run,
+    "recall": gm.fidelity,
+    "replace": functools.partial(gm.replace, gamma0=1e-3),
+    "to_dict": gm.to_dict,
+    "stable_step": gm.stable_step,
+    "value_and_grad": gm.value_and_grad,
+    "jacobian": gm.jacobian,
+    "memory_kernel": gm.memory_kernel,
+    "kernel_matrix": gm.kernel_matrix,
+    "design_waveforms": gm.design_waveforms,
+    "design_by_kernel": gm.design_by_kernel,
+    "design_drive": lambda wrong: gm.design_drive([wrong], {"gamma0": (1e-4, 1e-2)}),
+    "sweep": lambda wrong: gm.sweep(wrong, {"gamma0": [1e-3]}),
+}
+
+
+@pytest.mark.parametrize("function", TAKES_EXPERIMENT)
+def test_what_is_no_experiment_is_not_run(function: str) -> None:
+    with pytest.raises(TypeError, match=rf"^gm\.{function} takes a gm\.Experiment, got a Pack; {EXPERIMENT_MADE}$"):
+        TAKES_EXPERIMENT[function](PACK)
+
+
+def test_what_is_not_of_the_kind_that_is_kept_or_drawn_is_refused(tmp_path: Path) -> None:
+    path = str(tmp_path / "a.h5")
+    wrong: list[tuple[Callable[..., Any], tuple[Any, ...], str]] = [
+        (gm.save_pack, (PACK, path), r"save_pack\(path, pack\) takes a gm\.Pack, got '.*a\.h5'; see gm\.load_pack"),
+        (
+            gm.save_recall,
+            (path, EXPERIMENT),
+            r"save_recall\(path, recall\) takes a gm\.Recall, got an Experiment",
+        ),
+        (gm.plot, (path,), r"plot takes a gm\.Recall, got '.*a\.h5'; .*gm\.load_recall\(path\) reads one"),
+        (gm.to_csv, (PACK,), r"to_csv takes a gm\.Recall, got a Pack"),
+        (gm.to_xarray, (PACK,), r"to_xarray takes a gm\.Recall, got a Pack"),
+        (gm.save_waveforms, (gm.six_signals(), path), r"takes a gm\.Signals, got '.*a\.h5'; as gm\.six_signals\(\)"),
+        (gm.view, (EXPERIMENT,), r"view takes a gm\.Pack or frames, got a Experiment; .*recall\.frames"),
+        (gm.prepare, (325,), r"prepare takes a gm\.Recipe, got 325; gm\.prepare\(grains=325\)"),
+    ]
+    for function, given, words in wrong:
+        with pytest.raises(TypeError, match=words):
+            function(*given)
+    assert not list(tmp_path.iterdir())
+
+
+def test_one_thing_in_the_place_of_several_is_refused(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
+    several = "takes several(?: packs)?, in a list:"
+    wrong: list[tuple[Callable[[], Any], str]] = [
+        (lambda: gm.run(EXPERIMENT, frames_at=0.5), rf"frames_at {several} write \[0.5\] for 0.5"),  # type: ignore[arg-type]
+        (lambda: gm.plot(recalled[1], "p_xy", signals=3), rf"signals {several} write \[3\] for 3"),  # type: ignore[arg-type]
+        (lambda: gm.value_and_grad(EXPERIMENT, "gamma0"), rf'by {several} write \["gamma0"\] for "gamma0"'),
+        (lambda: gm.design_drive(EXPERIMENT, {"gamma0": (1e-4, 1e-2)}), f"experiments {several} got an Experiment"),
+        (lambda: gm.stack(PACK), f"stack {several} got tetra-27"),  # type: ignore[arg-type]
+    ]
+    for call, words in wrong:
+        with pytest.raises(ValueError, match=words):
+            call()
 
 
 def test_any_waveforms_can_be_written_and_read_back(tmp_path: Path) -> None:

@@ -269,6 +269,8 @@ def test_replace_knows_every_field_by_keyword_and_by_name() -> None:
     assert (experiment.signals.width, experiment.gamma0) == (0.1, 2e-3)
     with pytest.raises(ValueError, match="Experiment has no field 'gama0'"):
         gm.replace(experiment, gama0=1e-3)
+    with pytest.raises(ValueError, match=r"Experiment has no field 'mu' \(meant is friction.mu\?\); it has pack, "):
+        gm.replace(experiment, {"mu": 0.5})
     with pytest.raises(ValueError, match="Hooke has no field 'viscosity'"):
         gm.replace(experiment, {"friction.viscosity": 1.0})
 

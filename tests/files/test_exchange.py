@@ -363,6 +363,9 @@ def test_the_commands_there_and_back(
     assert gmem(monkeypatch, "import", data, "-o", pack, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["grain"], told["notes"]) == ("tetra(0.6)", [])
+    for file, words in ((SOURCE, "cycled with delta0"), (pack, "meant for delta0")):
+        assert gmem(monkeypatch, "show", file) == 0
+        assert words in capsys.readouterr().out
     assert gmem(monkeypatch, "export", pack, "--to", "pdb", "-o", data) == 2
     assert "must be one of gsd, vtk, xyz, lammps" in capsys.readouterr().err
     assert gmem(monkeypatch, "export", pack, "--to", "xyz", "--frames", "-o", tmp_path / "a.xyz") == 2

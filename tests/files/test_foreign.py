@@ -126,6 +126,29 @@ def test_a_pack_of_spheres_comes_back_from_gsd(tmp_path: Path) -> None:
     np.testing.assert_allclose(back.position, pack.position, atol=1e-6)
 
 
+@pytest.mark.parametrize(("mass", "density"), [(2.65 * np.pi / 6.0, 2.65), (1.0, None)])
+def test_free_particles_are_grains_of_their_own_of_the_density_they_have(
+    tmp_path: Path, mass: float, density: float | None
+) -> None:
+    hoomd = pytest.importorskip("gsd.hoomd")
+    frame = hoomd.Frame()
+    frame.configuration.box = [2.0, 0.99, 0.99, 0.0, 0.0, 0.0]
+    frame.particles.N, frame.particles.types = 2, ["sphere"]
+    frame.particles.position, frame.particles.mass = [[-0.505, 0, 0], [0.505, 0, 0]], [mass, mass]
+    with hoomd.open(tmp_path / "a.gsd", "w") as file:
+        file.append(frame)
+    found = load_spheres(tmp_path / "a.gsd", radius=0.5)
+    assert found.centres.shape == (2, 1, 3)
+    assert found.notes == ("2 of its particles belong to no body: each is a grain of one sphere",)
+    assert found.density == (density if density is None else pytest.approx(density, rel=1e-6))
+
+
+@pytest.mark.parametrize(("mass", "density"), [("1.0", None), (f"{8.0 * np.pi:.15g}", 6.0)])
+def test_masses_of_types_are_densities(tmp_path: Path, mass: str, density: float | None) -> None:
+    found = load_spheres(put(tmp_path, data(*ROWS).replace("\nAtoms", f"\nMasses\n\n1 {mass}\n\nAtoms")))
+    assert found.density == (density if density is None else pytest.approx(density, rel=1e-12))
+
+
 def test_particles_that_stand_for_a_rigid_body_are_left_out(tmp_path: Path) -> None:
     hoomd = pytest.importorskip("gsd.hoomd")
     frame = hoomd.Frame()

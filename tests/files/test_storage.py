@@ -125,6 +125,16 @@ def test_an_unknown_pack_name_lists_the_shipped_ones() -> None:
         gm.load_pack("no-such-pack")
 
 
+def test_a_place_where_no_file_can_be_is_named_as_it_was_given(tmp_path: Path) -> None:
+    for place, told in (
+        ("none/a.csv", r"none/a\.csv: folder .*none does not exist$"),
+        ("", ": is a folder; name a file"),
+    ):
+        with pytest.raises(OSError, match=told):
+            gm.save_waveforms(tmp_path / place, gm.six_signals())
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_failed_write_leaves_nothing_behind(tmp_path: Path) -> None:
     def write() -> None:
         with atomic(tmp_path / "file") as temporary:

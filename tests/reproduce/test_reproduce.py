@@ -326,9 +326,9 @@ def test_pictures_of_recalls_and_words(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 
 def test_the_physics_gives_the_stored_numbers() -> None:
-    """As when k_H was calibrated. Compilers and instruction sets move p_sig by 1e-9 of itself."""
+    """Compilers and instruction sets move p_sig by 1e-9 of itself."""
     recall = gm.run(gm.Experiment(gm.load_pack("tetra-325-a"), gm.six_signals()))
-    stored = (0.261164, 0.657920, 0.659413)
+    stored = (0.261092, 0.657701, 0.659159)
     found = (recall.gain, recall.fidelity, recall.windowed_fidelity)
     np.testing.assert_allclose([float(number) for number in found], stored, atol=1e-6)
 

@@ -8,13 +8,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import gmem_jax as gm
+from gmem_jax.derivatives.gradient import Gradient
 from gmem_jax.experiment.html import listing
 from gmem_jax.show import recalls
 from gmem_jax.show.render_matplotlib import to_matplotlib
+from gmem_jax.show.scene import rest_frames
 from gmem_jax.simulation.progress import ProgressChoice, callback, no_further_bar, shows_progress
 from gmem_jax.sweeps.sweep import Result, Results
 
@@ -47,11 +50,19 @@ def test_objects_are_one_line_in_a_terminal(recalled: tuple[gm.Experiment, gm.Re
         (gm.six_signals(), "<6 signals: bumps = 3, width = 0.2>"),
         (gm.waveform([0.1, 0.2]), "<1 signal: nodes = 4>"),
         (jax.tree.map(lambda _: None, experiment), "<Experiment>"),
+        (recall.stages["encode"], "Sample(u=float64[256, 3], pressure=float64[256, 3, 3], "),
+        (rest_frames(experiment.pack), "Frames(time=float64[1], u=float64[1], position=float64[1, 27, 3], "),
+        (gm.view(experiment.pack), "View(html='<!DOCTYPE html>"),
+        (
+            Gradient(jnp.asarray(0.5), {"mu": jnp.ones(2)}, jnp.ones((1, 4))),
+            "Gradient(value=0.5, slope={'mu': float64[2]}, p_sig=",
+        ),
     ):
         assert words in repr(shown)
         assert len(repr(shown)) < 400
         assert "\n" not in repr(shown)
     jax.jit(lambda each: repr(each) and each.gamma0)(experiment)
+    jax.jit(lambda each: repr(each) and each.u)(recall.stages["encode"])
 
 
 def test_objects_are_shown_inside_transformations_too(recalled: tuple[gm.Experiment, gm.Recall]) -> None:

@@ -17,6 +17,8 @@ import gmem_jax as gm
 from gmem_jax.experiment.experiment import value_at
 from gmem_jax.experiment.recall import OtherCompressionWarning, warn_of_another_compression
 from gmem_jax.files.atomic import atomic
+from gmem_jax.show.sweeps import points_table
+from gmem_jax.show.tables import status_words
 from gmem_jax.simulation.progress import silent
 from gmem_jax.sweeps.executors import Executor, Submitted, executor
 from gmem_jax.sweeps.plan import plan, point
@@ -237,6 +239,8 @@ def test_what_is_warned_of_in_a_run_stands_in_the_table(
     assert "cycled with another delta0" in row["why"]
     assert row["warnings"] == "something is odd"
     assert warnings_of(row) == f"{row['why']}; something is odd"
+    explained = [line.partition(": ")[0] for line in str(points_table([row], ["delta0"]).caption).splitlines()]
+    assert explained == ["F(T1)", *status_words(row["status"]), "warned"]
     (mean,) = means([row, row], ["delta0"], ["delta0"])
     assert (mean["status"], mean["warnings"]) == (row["status"], row["warnings"])
 
