@@ -13,7 +13,7 @@ import numpy as np
 
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.grain import Clump
-from gmem_jax.physics.pytree import pytree
+from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import matrix
 from gmem_jax.physics.state import Box, Grains
 
@@ -38,7 +38,8 @@ class Pairs:
         reference: sphere centres in box coordinates (0 to 1) when the list was built, [S, 3, B], or [S, 3, 1] for
             replicas that had not parted yet.
         smallest: edge lengths of the box the distances were measured in, [3].
-        reach: largest centre distance listed there, 2 R + skin.
+        reach: largest centre distance listed there, the diameter of the largest sphere + skin; pairs of smaller spheres
+            are listed up to R_i + R_j + skin.
         image: which image of sphere j meets sphere i: by how many edges of the box it is moved along each axis, int8
             [P, 3]; None between walls.
     """
@@ -62,6 +63,8 @@ class Pairs:
 def sphere_offsets(quaternion: jax.Array, clump: Clump) -> jax.Array:
     """Sphere centres relative to their grain's centre in the lab frame, [N, K, 3, B], of quaternions [N, 4, B]."""
     body = clump.offsets[None, :, None, :, None]
+    if clump.sizes is not None:
+        body = body * clump.sizes[:, None, None, None, None]
     return jnp.sum(matrix(quaternion)[:, None] * body, axis=-2)
 
 
@@ -71,17 +74,24 @@ def sphere_centres(grains: Grains, clump: Clump) -> jax.Array:
     return centres.reshape(-1, *centres.shape[2:])
 
 
-def slack(pairs: Pairs, spheres: jax.Array, box: Box) -> jax.Array:
+def touching_distance(pairs: Pairs, clump: Clump) -> jax.Array | float:
+    """R_i + R_j of every candidate, [P, 1], in R; 2 where all radii are 1."""
+    radii = clump.sphere_radii(pairs.incidence.shape[-2])
+    return 2.0 if radii is None else (radii[pairs.first] + radii[pairs.second])[:, None]
+
+
+def slack(pairs: Pairs, spheres: jax.Array, box: Box, widest: Scalar = 2.0) -> jax.Array:
     """How much closer two unlisted spheres may still come before they could touch, [B], in R.
 
     Positive while the list is certainly complete: unlisted spheres are at least ratio * reach apart after the affine
-    part of their motion, and the non-affine part brings them together by at most twice the largest deviation.
+    part of their motion, and the non-affine part brings them together by at most twice the largest deviation. As the
+    ratio is 1 at most, this is least for the largest spheres, of diameter `widest`.
     """
     lengths = box.lengths
     affine = box.lower + pairs.reference * lengths
     deviation = jnp.sqrt(jnp.max(jnp.sum((spheres - affine) ** 2, axis=1), axis=0))
     ratio = jnp.minimum(1.0, jnp.min(lengths / pairs.smallest[:, None], axis=0))
-    return ratio * pairs.reach - 2.0 - 2.0 * deviation
+    return ratio * pairs.reach - widest - 2.0 * deviation
 
 
 def image_shifts(pairs: Pairs, lengths: jax.Array) -> jax.Array | float:

@@ -271,7 +271,7 @@ def _contacts(system: System, state: State) -> tuple[jax.Array, jax.Array, jax.A
     """Of every candidate: whether it touches, its normal force and its friction, [P, 1, B] and [P, 3, B]."""
     table, _ = sphere_table(system.clump, state.grains, state.cell)
     still = jnp.zeros(())  # in no time a history stays as it is
-    motion = relative_motion(system.pairs, table, state.cell)
+    motion = relative_motion(system, table, state.cell)
     kin, normal, friction, _ = contact_loads(system, *motion, state.history, still)
     return kin.touching, normal, friction
 
