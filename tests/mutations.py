@@ -1441,7 +1441,7 @@ MUTATIONS = (
     mutation(
         "a-list-with-gaps",
         "files/pack_validation.py",
-        "pairs_within(mapped, reach - GRAZING, per_grain, smallest, periodic) <= len(keys),",
+        "pairs_within(mapped, reach - GRAZING, per_grain, smallest, periodic, radii) <= len(keys),",
         "True,",
         "test_an_impossible_pack_is_refused_whoever_sealed_it",
     ),

@@ -11,7 +11,7 @@ import numpy as np
 
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes, boundary_of
-from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.grain import Clump, words_of_sizes
 from gmem_jax.physics.pairs import Pairs, listed_candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree, static
 from gmem_jax.physics.rotation import unit
@@ -77,6 +77,7 @@ class Pack:
         measured = {"filling phi": "filling", "coordination Z": "coordination", "pressure (E)": "pressure"}
         rows = {
             "grains": f"{self.grains} {self.clump.shape}",
+            **({} if self.clump.equal else {"unequal": words_of_sizes(self.clump)}),
             "box (R)": brief(self.upper - self.lower),
             **({"boundary": boundary_of(self.periodic)} if any(self.periodic) else {}),
             "delta0": self.delta0,
@@ -137,6 +138,8 @@ def stack(packs: Sequence[Pack]) -> Pack:
                 f"packs to be stacked must have one size and grain: {first.name} has {first.grains} "
                 f"{first.clump.shape}, {pack.name} has {pack.grains} {pack.clump.shape}"
             )
+        if any((one is None) != (other is None) for one, other in zip(*map(_unequal, (first, pack)), strict=True)):
+            raise ValueError(f"packs to be stacked must have sizes all or none: {first.name} and {pack.name} differ")
         if pack.periodic != first.periodic:
             raise ValueError(
                 f"packs to be stacked must have one boundary: {first.name} has {boundary_of(first.periodic)}, "
@@ -148,6 +151,10 @@ def stack(packs: Sequence[Pack]) -> Pack:
     padded = [replace(pack, pairs=_widen(pack, capacity, per_sphere), name=name, record="{}") for pack in packs]
     stacked: Pack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
     return stacked
+
+
+def _unequal(pack: Pack) -> tuple[jax.Array | None, jax.Array | None]:
+    return pack.clump.radii, pack.clump.sizes
 
 
 def _widen(pack: Pack, capacity: int, per_sphere: int) -> Pairs:

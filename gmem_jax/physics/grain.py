@@ -101,6 +101,17 @@ class Clump:
         return grains * self.mass if self.sizes is None else jnp.sum(self.sizes**3) * self.mass
 
 
+def words_of_sizes(clump: Clump) -> str:
+    """How the spheres of a pack differ in radius, like "sizes 0.74 to 1.31, SD 0.1"; "" where all are of radius 1."""
+    found = []
+    if clump.sizes is not None:
+        sizes = np.asarray(clump.sizes)
+        found.append(f"sizes {sizes.min():.3g} to {sizes.max():.3g}, SD {sizes.std():.2g}")
+    if clump.radii is not None:
+        found.append(f"spheres of radii {float(clump.radii.min()):.3g} to {float(clump.radii.max()):.3g} R")
+    return "; ".join(found)
+
+
 def _sections(offsets: np.ndarray, radii: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Volume, first moment [3] and second moment [3, 3] of a union of spheres at [K, 3] of radii [K].
 

@@ -302,8 +302,7 @@ def prepare(
         log.update(preparation.log)
     if film is not None and frames:
         centre = np.asarray(0.5 * (preparation.box.lower + preparation.box.upper))[:, 0]  # the origin of the pack
-        offsets = np.asarray(clump.offsets)
-        film.append(concatenate(preparation.frames.recorded, offsets, centre=centre, periodic=preparation.periodic))
+        film.append(concatenate(preparation.frames.recorded, clump, centre=centre, periodic=preparation.periodic))
     pack = _finish(preparation, material, friction or Hooke(), name)
     _warn_of_another_pressure(pack)
     return pack
