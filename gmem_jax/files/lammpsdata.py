@@ -76,7 +76,7 @@ def read_lammps(path: Path, radius: float) -> Read:
 
     Args:
         path: the file.
-        radius: that its spheres should have; tells the columns of `Atoms # hybrid` apart.
+        radius: that equal spheres should have; tells the columns of `Atoms # hybrid` apart.
 
     Raises:
         OSError: if it cannot be read.
@@ -172,7 +172,10 @@ def _box(head: Mapping[str, _Row]) -> np.ndarray:
 
 
 def _style_of(atoms: _Section, radius: float) -> str:
-    """What the comment behind `Atoms` says; of LAMMPS' own "hybrid" the order in which diameters are those meant."""
+    """What the comment behind `Atoms` says; of LAMMPS' own "hybrid" the order in which diameters are those meant.
+
+    If they are in none, the spheres are unequal: the order in which all densities are one.
+    """
     if atoms.hint != "hybrid":
         require(
             atoms.hint in _STYLES,
@@ -180,14 +183,20 @@ def _style_of(atoms: _Section, radius: float) -> str:
             f"{', '.join(_STYLES)}",
         )
         return atoms.hint
-    fits = []
+    meant, dense = [], []
     for style in _HYBRID:
         names = _STYLES[style].split()
         rows = [dict(zip(names, row.words, strict=False)) for row in atoms.rows]
         whole = all(_WHOLE.fullmatch(row.get("mol", "")) for row in rows)
-        sizes = [row["diameter"] for row in rows if _REAL.fullmatch(row.get("diameter", ""))]
-        if whole and len(sizes) == len(rows) and np.all(np.abs(np.array(sizes, float) - 2.0 * radius) <= SAME * radius):
-            fits.append(style)
+        numbers = [[row.get(name, "") for row in rows] for name in ("diameter", "density")]
+        if not (whole and all(_REAL.fullmatch(word) for column in numbers for word in column)):
+            continue
+        sizes, densities = (np.array(column, float) for column in numbers)
+        if np.all(np.abs(sizes - 2.0 * radius) <= SAME * radius):
+            meant.append(style)
+        if np.ptp(densities) <= SAME * np.max(densities, initial=0.0):
+            dense.append(style)
+    fits = meant or dense
     require(len(fits) < 2, f"'Atoms # hybrid' does not tell its columns: write {' or '.join(_HYBRID)} in that comment")
     return fits[0] if fits else _HYBRID[0]
 

@@ -37,6 +37,8 @@ TEXTS = (
     "backend",
     "precision",
     "variant",
+    "sizes",
+    "shares",
 )
 WHOLE_NUMBERS = ("steps", "points", "grains", "seed", "cycles")
 YES_OR_NO = ("scale",)

@@ -32,6 +32,7 @@ from gmem_jax.preparation.recipe import (
     Recipe,
     bins_outside,
     cycles_of,
+    graded,
     last_rest,
     pressure_over_wanted,
     sites_of,
@@ -204,7 +205,8 @@ class _Preparation:
                 f"{float(largest_speed(pressed.state)):.1e} R/t_c after {recipe.patience:g} t_c; allow more patience"
             )
         self.box = still_box(self.box.lower, self.box.upper, self.periodic)
-        lengths, diameter = np.asarray(self.box.lengths)[:, 0], float(self.runner.simulation.system.clump.diameter)
+        clump = self.runner.simulation.system.clump
+        lengths, diameter = np.asarray(self.box.lengths)[:, 0], float(clump.diameter * clump.largest)
         if lengths.min() < diameter:
             raise RunFailedError(
                 f"settle: the pack is {' x '.join(f'{edge:.1f}' for edge in lengths)} R, flatter than a grain "
@@ -271,7 +273,7 @@ def prepare(
 
     Args:
         recipe: the numbers; default `Recipe()`.
-        grain: the grain; default `tetra(0.6)`.
+        grain: the grain; default `tetra(0.6)`. It may have sizes, one for each grain of the pack (`sized`).
         material: the elastic solid.
         friction: law under which the ringing period of the finished pack is measured; default `Hooke()`.
         name: of the pack; default from grain, size and seed.
@@ -293,7 +295,7 @@ def prepare(
     tell = callback(progress)
     require_x64()
     recipe = replace(recipe or Recipe(), **changes)
-    clump, material = grain or tetra(), material or Material()
+    clump, material = graded(recipe, grain or tetra()), material or Material()
     require_walls(periodic_axes(recipe.boundary), material)
     preparation = _Preparation(recipe, clump, material, backend, frames, cache, tell)
     preparation.compact()

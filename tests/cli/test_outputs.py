@@ -191,7 +191,7 @@ def test_every_number_of_a_recipe_is_an_option_of_prepare(
         **{"grains": 13, "seed": 5, "delta0": 0.04, "t0": 70.0, "dt": 0.2, "filling": 0.25, "gas_speed": 0.03},
         **{"gas_time": 300.0, "pressure": 3e-3, "piston_speed": 0.03, "piston_gain": 0.006, "cycles": 1, "rest": 0.3},
         **{"hold": 0.1, "drag": 0.02, "settled_speed": 2e-5, "quiet": 2e-6, "pressure_error": 0.02, "patience": 1e5},
-        "boundary": "walls",
+        **{"size_spread": 0.0, "sizes": "", "shares": "", "boundary": "walls"},
     }
     assert set(numbers) == {entry.name for entry in fields(gm.Recipe)}
     options = [word for name, value in numbers.items() for word in (f"--{name.replace('_', '-')}", value)]
@@ -210,7 +210,8 @@ def test_every_number_of_a_recipe_is_an_option_of_prepare(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("0 0 0 1\n1 0 0 0.5\n", "line 2: r is 0.5, must be 1"),
+        ("0 0 0 1\n1 0 0 0\n", "line 2: r is 0, must be positive"),
+        ("0 0 0 1\n1 0 0 0.05\n", "radii of spheres must be in [0.1, 10] R, got 0.05 to 1"),
         ("0 0 0\n", "line 1: must be four numbers x y z r, got '0 0 0'"),
         ("x y z r\n0 0 0 1\n", "line 1: must be four numbers"),
         ("0 0 nan 1\n", "line 1: must be four numbers"),

@@ -7,17 +7,19 @@ import h5py
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import TETRA_27
+from scenes import SPREAD_27, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment.pack import stack
 from gmem_jax.experiment.record import pack_fingerprint
 from gmem_jax.files.exporters import EXPORT_FORMATS, format_of, frames_of_pack
 from gmem_jax.files.frames import load_frames
+from gmem_jax.files.importers import load_spheres
 from gmem_jax.files.loads import frame_wall_forces, pressure_tensor
 from gmem_jax.files.seal import seal
 from gmem_jax.physics.grain import clump, sized
 from gmem_jax.physics.step import start
+from gmem_jax.preparation import imported
 from gmem_jax.show.render import pack_image
 from gmem_jax.simulation import observables
 
@@ -161,3 +163,72 @@ def test_a_picture_shows_large_spheres_larger() -> None:
     small, large = sorted(covered[1])
     assert large / small == pytest.approx(4.0, rel=0.1)
     assert covered[0][0] == pytest.approx(covered[0][1], rel=0.05)
+
+
+# ---------------------------------------------------------------- read from others, and run
+
+
+@pytest.mark.parametrize("name", ["lammps", "gsd"])
+@pytest.mark.parametrize("pack", [gm.load_pack(SPREAD_27), PACK], ids=["sizes", "sizes and radii"])
+def test_a_pack_of_unequal_grains_comes_back_from_others(
+    pack: gm.Pack, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name == "gsd":
+        pytest.importorskip("gsd.hoomd")
+    monkeypatch.setattr(imported, "ringing_period", lambda *_: 20.0)
+    path = tmp_path / f"pack{format_of(name, several=False).suffix}"
+    frames = frames_of_pack(pack)
+    format_of(name, several=False).write(path, frames, float(pack.clump.mass), gm.Material())
+    back = imported.import_pack(path)
+    within = 2e-6 if name == "gsd" else 1e-12  # GSD is in single precision
+    there, middle = frames_of_pack(back), 0.5 * np.asarray(back.lower + back.upper - pack.lower - pack.upper)
+    np.testing.assert_allclose(there.sphere_radii, frames.sphere_radii, rtol=within)
+    np.testing.assert_allclose(there.centres(0) - middle, frames.centres(0), atol=within)
+    volumes = [float(one.clump.volume(27)) for one in (back, pack)]
+    if pack is not PACK:  # whose offsets were moved after they had been those of its centre of mass
+        assert back.clump.shape == "tetra(0.6)"
+        np.testing.assert_allclose(back.clump.sizes, pack.clump.sizes, rtol=within)
+        np.testing.assert_allclose(*volumes, rtol=10.0 * within)
+    gm.save_pack(tmp_path / "back.h5", back)
+    assert back.info["imported"]["notes"] == []
+
+
+def test_grains_that_are_alike_but_for_one_radius_are_not_of_one_shape() -> None:
+    radii = np.array([[1.0, 0.6], [0.6, 1.0], [2.0, 1.2], [1.0, 0.7]])
+    sizes, own = imported.sizes_of(radii)
+    np.testing.assert_allclose(sizes, [1.0, 1.0, 2.0, 1.7 / 1.6])
+    offsets = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    centres = np.stack([offsets, offsets[::-1], offsets, offsets]) + np.arange(4.0)[:, None, None]
+    alike = radii / sizes[:, None]
+    position, _ = imported.lay(centres[:3], offsets, alike[:3], own)
+    np.testing.assert_allclose(position, np.arange(3.0)[:, None] * np.ones(3), atol=1e-12)
+    with pytest.raises(gm.FileFormatError, match=r"grain 4 has another shape than the first: .* or has another radius"):
+        imported.lay(centres, offsets, alike, own)
+
+
+def test_lammps_own_hybrid_is_read_by_its_densities_where_radii_differ(tmp_path: Path) -> None:
+    """Columns in the order sphere, molecular, under the bare word that LAMMPS writes."""
+    path = tmp_path / "pack.data"
+    chosen = format_of("lammps", several=False)
+    chosen.write(path, frames_of_pack(PACK), float(PACK.clump.mass), gm.Material())
+    path.write_text(path.read_text().replace("hybrid sphere molecular", "hybrid"))
+    np.testing.assert_allclose(load_spheres(path).radii.ravel(), RADII, rtol=1e-14)
+    with pytest.raises(gm.FileFormatError, match=r"radii of spheres must be in .* is given by --radius"):
+        load_spheres(path, 0.01)
+
+
+def test_a_prepared_pack_of_many_sizes_is_at_rest_and_remembers() -> None:
+    pack = gm.load_pack(SPREAD_27)
+    rest, sizes = pack.info["at_rest"], np.asarray(pack.clump.sizes)
+    assert sizes.std() / sizes.mean() == pytest.approx(0.1, rel=0.05)
+    np.testing.assert_array_equal(sizes, gm.lognormal(27, 0.1, seed=1))
+    assert rest["largest_speed"] < 1e-6
+    assert rest["pressure"][2] == pytest.approx(2e-3, rel=0.1)
+    frames = frames_of_pack(pack)
+    tensor = pressure_tensor(frames, 0, frame_wall_forces(frames, 0, gm.Material()))
+    np.testing.assert_allclose(np.diag(tensor), rest["pressure"], rtol=1e-4)  # contacts and walls balance
+    recall = gm.run(gm.Experiment(pack, gm.six_signals(), t0=60.0), progress=False)
+    assert recall.frames is None
+    assert recall.configuration["grain"]["sizes"].startswith("sizes 0.81")
+    assert float(recall.gain) > 0.02
+    assert float(recall.fidelity) > 0.05
