@@ -110,7 +110,7 @@ class Sample:
     )
     inertial_number: jax.Array = measured(
         "1",
-        "I = strain rate of x times sqrt(m / (D p)), p = (p_x + p_y) / 2, of grains of size 1; 0 without pressure",
+        "I = strain rate of x times sqrt(m / (D p)), p = (p_x + p_y) / 2; 0 without pressure",
         plot="inertial",
         label="inertial number I",
         log=True,
