@@ -6,7 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import ELASTIC, SPHERE, TETRA_27, cached_tetra, column, make_grains, orientations, record, scene, still
+from scenes import (
+    ELASTIC,
+    SPHERE,
+    TETRA_27,
+    blank_state,
+    cached_tetra,
+    column,
+    make_grains,
+    orientations,
+    record,
+    scene,
+    still,
+)
 from test_collisions import hertz_duration
 
 import gmem_jax as gm
@@ -277,12 +289,12 @@ def test_the_order_of_grains_of_unequal_size_changes_nothing() -> None:
 def test_derivatives_by_a_size_and_by_a_radius_are_differences_in_both_modes() -> None:
     pack = bidisperse()
     wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (20, 3, 1)), pack.box)
+    state = blank_state(dynamics.System(pack.clump, Hooke(), pack.pairs), make_grains(pack.position, pack.quaternion))
 
     def pressure(by: jax.Array) -> jax.Array:
         grain = pack.clump
         grain = replace(grain, sizes=grain.sizes.at[4].add(by[0]), radii=jnp.ones(4).at[2].add(by[1]))
         system = dynamics.System(grain, Hooke(), pack.pairs)
-        state = dynamics.start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
         return dynamics.march(system, state, wide, 0.3, 0.0)[1][0, 0]
 
     at, step = jnp.zeros(2), 1e-7
