@@ -297,6 +297,7 @@ def prepare(
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = graded(recipe, grain or tetra()), material or Material()
     require_walls(periodic_axes(recipe.boundary), material)
+    native.require_precision("double", backend, Frictionless(), periodic_axes(recipe.boundary), clump.equal)
     preparation = _Preparation(recipe, clump, material, backend, frames, cache, tell)
     preparation.compact()
     preparation.cycle()
