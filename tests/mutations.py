@@ -154,15 +154,15 @@ MUTATIONS = (
     mutation(
         "stale-too-late",
         "simulation/sample.py",
-        "slack(system.pairs, spheres, box, system.clump.widest) <= 0.0",
-        "slack(system.pairs, spheres, box, system.clump.widest) <= -0.01",
+        "slack(system.pairs, spheres, box, radii) <= 0.0",
+        "slack(system.pairs, spheres, box, radii) <= -0.01",
         "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
     ),
     mutation(
         "stale-too-early",
         "simulation/sample.py",
-        "slack(system.pairs, spheres, box, system.clump.widest) <= 0.0",
-        "slack(system.pairs, spheres, box, system.clump.widest) <= 0.01",
+        "slack(system.pairs, spheres, box, radii) <= 0.0",
+        "slack(system.pairs, spheres, box, radii) <= 0.01",
         "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
     ),
     mutation(
@@ -253,8 +253,8 @@ MUTATIONS = (
     mutation(
         "slack-of-one-sphere",
         "physics/pairs.py",
-        "widest - 2.0 * deviation",
-        "widest - 1.0 * deviation",
+        "touching - 2.0 * deviation",
+        "touching - 1.0 * deviation",
         "test_slack_is_negative_before_any_unlisted_pair_can_touch",
     ),
     mutation(

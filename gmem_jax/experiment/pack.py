@@ -94,7 +94,13 @@ class Pack:
 
 
 def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: Box, delta0: float) -> Pairs:
-    """The candidate contacts of a whole experiment on a pack (positions [N, 3], quaternions [N, 4])."""
+    """The candidate contacts of a whole experiment on a pack (positions [N, 3], quaternions [N, 4]).
+
+    Raises:
+        ValueError: if the grain has sizes, and not one for each.
+    """
+    if clump.sizes is not None and len(clump.sizes) != len(position):
+        raise ValueError(f"a pack of {len(position)} grains needs as many sizes, its grain has {len(clump.sizes)}")
     smallest = smallest_box(np.asarray(box.lower)[:, 0], np.asarray(box.upper)[:, 0], delta0)
     still = jnp.zeros((*np.shape(position), 1))
     grains = Grains(jnp.asarray(position)[..., None], jnp.asarray(quaternion)[..., None], still, still, still, still)
@@ -108,7 +114,7 @@ def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: s
     Quaternions are brought to length 1. What was measured of the old ones at rest is no part of the record.
 
     Raises:
-        ValueError: if a number is not finite, a quaternion is zero, or the shapes are not those of one pack.
+        ValueError: if a number is not finite, a quaternion is zero, or shapes and sizes are not those of one pack.
     """
     position, quaternion = jnp.asarray(position, float), jnp.asarray(quaternion, float)
     if position.ndim != 2 or (position.shape[1], quaternion.shape) != (3, (len(position), 4)):
@@ -169,4 +175,5 @@ def _widen(pack: Pack, capacity: int, per_sphere: int) -> Pairs:
         capacity=capacity,
         per_sphere=per_sphere,
         periodic=pack.periodic,
+        radii=pairs.radii,
     )

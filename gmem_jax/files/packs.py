@@ -127,7 +127,10 @@ def load_pack(source: str | Path) -> Pack:
         own = {key: jnp.asarray(found[f"clump/{key}"]) for key in (*_CLUMP, *UNEQUAL) if f"clump/{key}" in found}
         clump = Clump(**own, isotropic=bool(isotropic), shape=shape)
         listed, reference, smallest, reach = (found[f"pairs/{key}"] for key in _PAIRS)
-        pairs = tabulate(listed, reference[..., None], smallest, float(reach), clump.spheres, periodic=periodic)
+        radii = clump.sphere_radii(len(reference))
+        pairs = tabulate(
+            listed, reference[..., None], smallest, float(reach), clump.spheres, periodic=periodic, radii=radii
+        )
         numbers: dict[str, Any] = {key: jnp.asarray(found[key]) for key in _OWN}
         return Pack(
             clump=clump, pairs=pairs, periodic=periodic, name=label, record=record, source=str(source), **numbers

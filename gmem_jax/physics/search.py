@@ -196,6 +196,7 @@ class PairFinder:
             capacity=self._capacity,
             per_sphere=self._per_sphere,
             periodic=box.periodic,
+            radii=own,
         )
         self._capacity, self._per_sphere = pairs.capacity, int(pairs.incidence.shape[-1])
         return pairs

@@ -89,7 +89,8 @@ def press(
         fastest = largest_speed(state)
         spin = jnp.sqrt(jnp.max(jnp.sum(state.grains.spin**2, axis=1)))
         ahead = 2.0 * STEPS_PER_CHECK * dt * (1.2 * (fastest + reach * spin) + servo.speed)
-        room = jnp.min(slack(system.pairs, sphere_centres(state.grains, clump), box, clump.widest))
+        spheres = sphere_centres(state.grains, clump)
+        room = jnp.min(slack(system.pairs, spheres, box, clump.sphere_radii(len(spheres))))
         pressure = total[2] / STEPS_PER_CHECK
         met = jnp.max(jnp.abs(pressure / servo.target - 1.0)) < servo.error
         return Pressed(

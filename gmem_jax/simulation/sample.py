@@ -137,11 +137,12 @@ def check(system: System, state: State, box: Box) -> State:
     """Set the status bits for what can be seen in one configuration: stale list, escaped grain, non-finite number."""
     grains = state.grains
     spheres = sphere_centres(grains, system.clump)
+    radii = system.clump.sphere_radii(len(spheres))
     beyond = (spheres < box.lower) | (spheres > box.upper)
     outside = jnp.any(beyond & ~box.images if any(box.periodic) else beyond, axis=(0, 1))
     numbers = grains.position.sum((0, 1)) + grains.acceleration.sum((0, 1)) + grains.spin_rate.sum((0, 1))
     bits = (
-        jnp.where(slack(system.pairs, spheres, box, system.clump.widest) <= 0.0, int(Status.STALE_PAIRS), 0)
+        jnp.where(slack(system.pairs, spheres, box, radii) <= 0.0, int(Status.STALE_PAIRS), 0)
         | jnp.where(outside, int(Status.OUTSIDE_BOX), 0)
         | jnp.where(jnp.isfinite(numbers), 0, int(Status.NOT_FINITE))
     ).astype(jnp.int32)

@@ -243,15 +243,16 @@ def test_slack_of_unequal_spheres_is_negative_before_any_unlisted_pair_can_touch
     for seed in range(60):
         random = np.random.default_rng(seed)
         shrink = random.uniform(0.93, 1.0)
-        moved = shrink * at + random.normal(size=(40, 3)) * random.uniform(0.0, 0.3)
+        moved = shrink * at + random.normal(size=(40, 3)) * random.uniform(0.0, 0.4)
         narrowed = still_box(jnp.zeros((3, 1)), jnp.asarray(shrink * lengths)[:, None])
-        left = float(slack(pairs, jnp.asarray(moved)[..., None], narrowed, made.widest)[0])
-        gap = np.linalg.norm(moved - moved[:, None], axis=-1) - radii - radii[:, None]
+        grown = radii * random.uniform(0.9, random.choice([0.9, 1.1]), 40)  # since the list was made
+        left = float(slack(pairs, jnp.asarray(moved)[..., None], narrowed, jnp.asarray(grown))[0])
+        gap = np.linalg.norm(moved - moved[:, None], axis=-1) - grown - grown[:, None]
         unlisted = np.min(gap[np.triu(~listed, 1)])
         assert left <= unlisted
         touched += unlisted < 0.0
     assert touched > 5
-    assert float(slack(pairs, grains.position, box, made.widest)[0]) == pytest.approx(skin, rel=1e-12)
+    assert float(slack(pairs, grains.position, box, jnp.asarray(radii))[0]) == pytest.approx(skin, rel=1e-12)
 
 
 # ---------------------------------------------------------------- packs
@@ -345,6 +346,13 @@ def test_impossible_radii_are_refused_in_a_line(radii, said: str) -> None:
     with pytest.raises(ValueError, match=said) as error:
         clump([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], radii=radii)
     assert "\n" not in str(error.value)
+
+
+def test_a_pack_has_a_size_for_each_grain_or_none() -> None:
+    pack = gm.load_pack(TETRA_27)
+    few = replace(pack, clump=sized(pack.clump, np.full(26, 1.01)))
+    with pytest.raises(ValueError, match="a pack of 27 grains needs as many sizes, its grain has 26"):
+        gm.pack_from(few, position=pack.position, quaternion=pack.quaternion)
 
 
 def test_impossible_sizes_are_refused_in_a_line_by_the_grain_and_by_the_list() -> None:
