@@ -16,7 +16,7 @@ from gmem_jax.physics.numbers import is_real, require_numbers, require_whole, sa
 from gmem_jax.physics.rules import usual_rules
 
 CUT = 3.0  # standard deviations of ln(size) beyond which the lognormal has no grains
-LARGEST_SPREAD = 0.5
+LARGEST_SPREAD = 0.35  # whose sizes, so cut, can be listed together: the largest is 7.7 times the smallest
 _STREAM = 4  # of the random numbers of a seed: the first three are those of the gas
 
 
@@ -32,7 +32,7 @@ def lognormal(grains: int, spread: float, *, seed: int = 0) -> np.ndarray:
         seed: of the order.
 
     Raises:
-        ValueError: if the spread is not in [0, 0.5], or there are no grains.
+        ValueError: if the spread is not in [0, 0.35], or there are no grains.
     """
     require_numbers(spread=spread)
     if not 0.0 <= spread <= LARGEST_SPREAD:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import gmem_jax as gm
+from gmem_jax.physics.grain import LARGEST_RATIO
+from gmem_jax.preparation.grading import LARGEST_SPREAD
 from gmem_jax.preparation.preparation import _gas
 from gmem_jax.preparation.recipe import bins_outside, graded, grain_steps, sites_of
 
@@ -21,6 +23,12 @@ def test_sizes_are_lognormal_with_the_spread_that_was_asked_for(spread: float, g
     assert np.ptp(logs) > (5.9 if grains > 100 else 4.0) * width
     assert np.median(logs) == pytest.approx(-0.5 * width**2, abs=0.02 * width)
     np.testing.assert_allclose(np.quantile(logs, [0.1587, 0.8413]) - np.median(logs), [-width, width], rtol=0.1)
+
+
+def test_spheres_of_the_widest_spread_can_be_listed_together() -> None:
+    sizes = gm.lognormal(100_000, LARGEST_SPREAD)
+    assert 7.0 < sizes.max() / sizes.min() < LARGEST_RATIO
+    assert gm.sized(gm.sphere(), sizes).widest == 2.0 * sizes.max()
 
 
 def test_a_seed_orders_sizes_and_changes_none() -> None:
@@ -42,15 +50,15 @@ def test_a_mixture_has_its_shares() -> None:
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (lambda: gm.lognormal(10, -0.1), r"size_spread must be in \[0, 0.5\], got -0.1"),
-        (lambda: gm.lognormal(10, float("nan")), r"size_spread must be in \[0, 0.5\], got nan"),
+        (lambda: gm.lognormal(10, -0.1), r"size_spread must be in \[0, 0.35\], got -0.1"),
+        (lambda: gm.lognormal(10, float("nan")), r"size_spread must be in \[0, 0.35\], got nan"),
         (lambda: gm.lognormal(0, 0.1), "grains must be a whole number from 1"),
         (lambda: gm.mixture(10, [1.0, 0.0]), "sizes must be positive numbers"),
         (lambda: gm.mixture(10, [1.0, np.inf]), "sizes must be positive numbers"),
         (lambda: gm.mixture(10, [1.0, 1.4], [0.5]), "shares must be one for each of 2 sizes and sum to 1"),
         (lambda: gm.mixture(10, [1.0, 1.4], [0.5, 0.6]), "shares must be one for each of 2 sizes and sum to 1"),
         (lambda: gm.mixture(10, [1.0, 1.4], [0.99, 0.01]), "of 10 grains none would have size 1.4"),
-        (lambda: gm.Recipe(size_spread=0.6), r"size_spread must be in \[0, 0.5\]"),
+        (lambda: gm.Recipe(size_spread=0.6), r"size_spread must be in \[0, 0.35\]"),
         (lambda: gm.Recipe(size_spread=0.1, sizes="1,1.4"), "sizes and size_spread exclude each other"),
         (lambda: gm.Recipe(shares="0.5,0.5"), "shares are those of sizes"),
         (lambda: gm.Recipe(sizes="1;1.4"), "sizes must be numbers with commas between them"),
