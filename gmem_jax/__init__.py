@@ -39,9 +39,10 @@ if TYPE_CHECKING or not gmem_start.alone:
     from gmem_jax.physics.contact.hooke import Hooke
     from gmem_jax.physics.contact.mindlin import Mindlin
     from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
-    from gmem_jax.physics.grain import Clump, clump, sphere, tetra
+    from gmem_jax.physics.grain import Clump, clump, sized, sphere, tetra
     from gmem_jax.physics.material import Material
     from gmem_jax.physics.state import Status, explain
+    from gmem_jax.preparation.grading import lognormal, mixture
     from gmem_jax.preparation.preparation import prepare
     from gmem_jax.preparation.recipe import Recipe
     from gmem_jax.simulation.protocol import Drive, Protocol, Stage
@@ -134,7 +135,9 @@ __all__ = [
     "load_protocol",
     "load_recall",
     "load_waveforms",
+    "lognormal",
     "memory_kernel",
+    "mixture",
     "observables",
     "pack_from",
     "plot",
@@ -153,6 +156,7 @@ __all__ = [
     "shake",
     "signals",
     "six_signals",
+    "sized",
     "sphere",
     "stable_step",
     "stack",

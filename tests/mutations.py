@@ -112,15 +112,15 @@ MUTATIONS = (
     mutation(
         "energy-of-isotropic-grains",
         "simulation/sample.py",
-        "jnp.sum(clump.inertia[:, None] * body_spin**2, axis=1)",
-        "clump.inertia[0] * jnp.sum(body_spin**2, axis=1)",
+        "inertia = clump.scaled(clump.inertia[:, None], 5)",
+        "inertia = clump.scaled(clump.inertia[:1, None], 5)",
         "test_the_kinetic_energy_of_a_turned_anisotropic_grain_is_that_of_its_own_tensor",
     ),
     mutation(
         "energy-in-the-wrong-frame",
         "simulation/sample.py",
-        "body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)\n    energy",
-        "body_spin = grains.spin\n    energy",
+        "body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)\n    inertia",
+        "body_spin = grains.spin\n    inertia",
         "test_the_kinetic_energy_of_a_turned_anisotropic_grain_is_that_of_its_own_tensor",
     ),
     mutation(
@@ -154,15 +154,15 @@ MUTATIONS = (
     mutation(
         "stale-too-late",
         "simulation/sample.py",
-        "slack(system.pairs, spheres, box) <= 0.0",
-        "slack(system.pairs, spheres, box) <= -0.01",
+        "slack(system.pairs, spheres, box, radii) <= 0.0",
+        "slack(system.pairs, spheres, box, radii) <= -0.01",
         "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
     ),
     mutation(
         "stale-too-early",
         "simulation/sample.py",
-        "slack(system.pairs, spheres, box) <= 0.0",
-        "slack(system.pairs, spheres, box) <= 0.01",
+        "slack(system.pairs, spheres, box, radii) <= 0.0",
+        "slack(system.pairs, spheres, box, radii) <= 0.01",
         "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
     ),
     mutation(
@@ -196,9 +196,51 @@ MUTATIONS = (
     mutation(
         "pressure-without-momentum-flux",
         "physics/step.py",
-        "force * place + clump.mass * grains.velocity**2",
+        "force * place + clump.masses * grains.velocity**2",
         "force * place",
         "test_the_pressure_of_a_step_is_the_stress_of_its_contacts_and_the_flux_of_momentum",
+    ),
+    mutation(
+        "one-arm-for-two-radii",
+        "physics/step.py",
+        "else kin.other_arm * cross(kin.normal, tangential)",
+        "else torque",
+        "test_an_oblique_collision_of_unequal_spheres_keeps_momentum_and_angular_momentum[H]",
+    ),
+    mutation(
+        "rolling-of-equal-spheres",
+        "contact/kinematics.py",
+        "0.5 * (unequal.second - unequal.first) * normal)",
+        "0.0 * normal)",
+        "test_the_surfaces_of_unequal_spheres_meet_where_their_arms_end",
+    ),
+    mutation(
+        "contacts-as-curved-as-the-first",
+        "contact/kinematics.py",
+        "radius = 2.0 * unequal.first * unequal.second / reach",
+        "radius = unequal.first",
+        "test_forces_on_a_small_sphere_are_hertzs_with_its_own_radii",
+    ),
+    mutation(
+        "walls-of-unit-spheres",
+        "contact/wall.py",
+        "touching, stiffness, damping_time, wide)",
+        "touching, stiffness, damping_time)",
+        "test_forces_on_a_small_sphere_are_hertzs_with_its_own_radii",
+    ),
+    mutation(
+        "rings-of-unit-spheres",
+        "contact/mindlin.py",
+        "spacing = self.spacing if kin.radius is None else self.spacing * jnp.sqrt(kin.radius)",
+        "spacing = self.spacing",
+        "test_a_mindlin_contact_of_other_radii_is_one_that_is_stiffer_by_the_root_of_their_mean[averaged]",
+    ),
+    mutation(
+        "mass-with-the-square-of-the-size",
+        "physics/grain.py",
+        "return self.scaled(self.mass, 3)",
+        "return self.scaled(self.mass, 2)",
+        "test_an_elastic_collision_of_unequal_spheres_has_hertzs_duration_and_keeps_energy_and_momentum",
     ),
     mutation(
         "images-of-the-other-side",
@@ -211,8 +253,8 @@ MUTATIONS = (
     mutation(
         "slack-of-one-sphere",
         "physics/pairs.py",
-        "2.0 - 2.0 * deviation",
-        "2.0 - 1.0 * deviation",
+        "touching - 2.0 * deviation",
+        "touching - 1.0 * deviation",
         "test_slack_is_negative_before_any_unlisted_pair_can_touch",
     ),
     mutation(
@@ -232,8 +274,8 @@ MUTATIONS = (
     mutation(
         "cutoff-of-one-clump",
         "physics/search.py",
-        "cutoff = 2.0 * (1.0 + float(",
-        "cutoff = 2.0 + 1.0 * (float(",
+        "cutoff = 2.0 * largest * float((own + np.linalg.norm(body - body.mean(axis=0), axis=1)).max())",
+        "cutoff = 2.0 + largest * float((np.linalg.norm(body - body.mean(axis=0), axis=1)).max())",
         "test_clumps_that_reach_for_each_other_with_their_outermost_spheres_are_listed",
     ),
     mutation(
@@ -1455,7 +1497,7 @@ MUTATIONS = (
     mutation(
         "a-list-with-gaps",
         "files/pack_validation.py",
-        "pairs_within(mapped, reach - GRAZING, per_grain, smallest, periodic) <= len(keys),",
+        "pairs_within(mapped, reach - GRAZING, per_grain, smallest, periodic, radii) <= len(keys),",
         "True,",
         "test_an_impossible_pack_is_refused_whoever_sealed_it",
     ),

@@ -27,6 +27,7 @@ TESTS = Path(__file__).parent
 ROOT = TESTS.parent
 TETRA_27 = TESTS / "data" / "tetra-27.h5"
 PERIODIC_27 = TESTS / "data" / "periodic-27.h5"
+SPREAD_27 = TESTS / "data" / "spread-27.h5"  # grains whose sizes have an SD of 0.1
 PERIODIC_XY_27 = TESTS / "data" / "periodic-xy-27.h5"  # between walls along z
 
 ELASTIC = Material(normal_damping=0.0)

@@ -5,6 +5,7 @@ of it is linked into or shipped with this package. Units are ours (R = E = rho =
 """
 
 import importlib.util
+import itertools
 import os
 import re
 import subprocess
@@ -121,7 +122,8 @@ class Scene:
     @property
     def spheres(self) -> np.ndarray:
         """Sphere centres, [N, K, 3]."""
-        arms = np.einsum("nij,kj->nki", self.rotations, np.asarray(self.clump.offsets))
+        sizes = np.ones(1) if self.clump.sizes is None else np.asarray(self.clump.sizes)
+        arms = sizes[:, None, None] * np.einsum("nij,kj->nki", self.rotations, np.asarray(self.clump.offsets))
         centres: np.ndarray = self.position[:, None] + arms
         return centres
 
@@ -145,6 +147,10 @@ def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1
     """
     spheres = scene.spheres
     count, per_grain = spheres.shape[:2]
+    sizes = np.ones(count) if scene.clump.sizes is None else np.asarray(scene.clump.sizes)
+    kinds = np.repeat(np.unique(sizes, return_inverse=True)[1] + 1, per_grain)
+    found = scene.clump.sphere_radii(count * per_grain)
+    diameters = 2.0 * (np.ones(len(kinds)) if found is None else np.asarray(found))
     flat = spheres.reshape(-1, 3)
     arms = spheres - scene.position[:, None]
     velocity = (scene.velocity[:, None] + np.cross(scene.spin[:, None], arms)).reshape(-1, 3)
@@ -153,11 +159,11 @@ def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1
     margin = 5.0
     low = np.where(np.isfinite(scene.lower), scene.lower, flat.min(axis=0) - margin)
     high = np.where(np.isfinite(scene.upper), scene.upper, flat.max(axis=0) + margin)
-    lines = ["gmem_jax scene", "", f"{len(flat)} atoms", "1 atom types", ""]
+    lines = ["gmem_jax scene", "", f"{len(flat)} atoms", f"{kinds.max()} atom types", ""]
     beyond = np.where(scene.periodic, 0.0, 0.1)
     lines += [f"{_row(low[k] - beyond[k], high[k] + beyond[k])} {'xyz'[k]}lo {'xyz'[k]}hi" for k in range(3)]
     lines += ["", "Atoms # sphere", ""]
-    lines += [f"{n + 1} 1 2.0 1.0 {_row(*x)}" for n, x in enumerate(flat)]
+    lines += [f"{n + 1} {kinds[n]} {_number(diameters[n])} 1.0 {_row(*x)}" for n, x in enumerate(flat)]
     lines += ["", "Velocities", ""]
     lines += [f"{n + 1} {_row(*velocity[n], *spin[n])}" for n in range(len(flat))]
     lines += ["", "Molecules", ""]
@@ -182,21 +188,29 @@ def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1
         momentum = np.einsum("nij,nj->ni", inertia, scene.spin)
         bodies = [str(count)]
         for n in range(count):
-            tensor = inertia[n]
+            tensor = inertia[n] * sizes[n] ** 5
             components = (*np.diag(tensor), tensor[0, 1], tensor[0, 2], tensor[1, 2])
-            row = _row(float(scene.clump.mass), *scene.position[n], *components, *scene.velocity[n], *momentum[n])
+            mass, turning = float(scene.clump.mass) * sizes[n] ** 3, momentum[n] * sizes[n] ** 5
+            row = _row(mass, *scene.position[n], *components, *scene.velocity[n], *turning)
             bodies.append(f"{n + 1} {row} 0 0 0")
         (folder / "scene.bodies").write_text("\n".join(bodies) + "\n", encoding="utf-8")
     return script
 
 
-def pair_lines(friction: Frictionless | Hooke | MindlinRescaled, material: Material, mass: float) -> list[str]:
-    """Sphere-sphere contacts of grains of equal `mass`.
+def masses_of_types(clump: Clump) -> list[float]:
+    """Mass of a grain of each atom type: one for every size, in ascending order."""
+    sizes = np.ones(1) if clump.sizes is None else np.unique(np.asarray(clump.sizes))
+    return [float(clump.mass) * size**3 for size in sizes]
+
+
+def pair_lines(
+    friction: Frictionless | Hooke | MindlinRescaled, material: Material, masses: Sequence[float]
+) -> list[str]:
+    """Sphere-sphere contacts of grains of some masses, one for each atom type.
 
     Hooke's constant dashpot has no counterpart (LAMMPS' varies with the contact radius): its damping_time must be 0.
     """
-    effective_mass, root_radius = 0.5 * mass, np.sqrt(0.5)
-    damping = material.normal_damping * material.normal_stiffness / (root_radius * effective_mass)
+    root_radius = np.sqrt(0.5)
     if isinstance(friction, Hooke):
         if friction.damping_time != 0.0:
             raise ValueError("LAMMPS has no law with Hooke's dashpot; use damping_time=0")
@@ -207,15 +221,22 @@ def pair_lines(friction: Frictionless | Hooke | MindlinRescaled, material: Mater
         tangential = f"mindlin_rescale/force {_number(stiffness)} {_number(ratio)} {_number(friction.mu)}"
     else:
         tangential = "linear_nohistory 0.0 0.0"
-    return [
-        "pair_style granular",
-        f"pair_coeff * * hertz {_number(material.normal_stiffness / root_radius)} {_number(damping)} "
-        f"tangential {tangential} damping viscoelastic limit_damping",
-    ]
+    lines = ["pair_style granular"]
+    for one, other in itertools.combinations_with_replacement(range(len(masses)), 2):
+        effective_mass = masses[one] * masses[other] / (masses[one] + masses[other])
+        damping = material.normal_damping * material.normal_stiffness / (root_radius * effective_mass)
+        lines.append(
+            f"pair_coeff {one + 1} {other + 1} hertz {_number(material.normal_stiffness / root_radius)} "
+            f"{_number(damping)} tangential {tangential} damping viscoelastic limit_damping"
+        )
+    return lines
 
 
 def wall_lines(scene: Scene, material: Material, dt: float) -> list[str]:
-    """The finite planes of the scene; computes `c_wall0` (-x), `c_wall1` (+x), ... are the forces on grains."""
+    """The finite planes of the scene; computes `c_wall0` (-x), `c_wall1` (+x), ... are the forces on grains.
+
+    The damping is that of grains of size 1.
+    """
     damping = material.normal_damping * material.wall_stiffness / float(scene.clump.mass)
     law = (
         f"hertz {_number(material.wall_stiffness)} {_number(damping)} tangential linear_nohistory 0.0 0.0 "
@@ -256,7 +277,7 @@ def scene_script(
 ) -> list[str]:
     """Everything up to `run`: files written to `folder`, contacts, walls and integrator; see `write_scene`."""
     script = write_scene(scene, folder, skin=skin, every=every)
-    script += pair_lines(friction, material, float(scene.clump.mass))
+    script += pair_lines(friction, material, masses_of_types(scene.clump))
     # The integrator comes after the walls: it sums the initial forces when it is set up, in the order of the fixes.
     script += wall_lines(scene, material, dt)
     growth = (scene.upper_velocity - scene.lower_velocity) / (scene.upper - scene.lower)

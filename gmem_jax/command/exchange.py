@@ -66,13 +66,13 @@ def export(
 def import_command(
     file: Annotated[Path, typer.Argument(help="A LAMMPS data file (molecules are grains) or a .gsd file of clumps.")],
     output: Output,
-    radius: Annotated[float, typer.Option(help="Radius of the spheres in the file's unit of length.")] = 1.0,
+    radius: Annotated[float, typer.Option(help="R in the file's unit of length: the radius of equal spheres.")] = 1.0,
     delta0: Annotated[float, typer.Option(help="Areal compression that the pack is meant for.")] = 0.05,
     name: Annotated[str, typer.Option(help="Name of the pack; default the file's.")] = "",
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make a pack of equal clumps of equal spheres at rest in a box."""
+    """Make a pack of spheres or clumps of one shape, of any sizes, at rest in a box."""
     # Here, not above: scipy takes half a second to load, and no other command needs it.
     from gmem_jax.preparation.imported import import_pack
 

@@ -37,7 +37,7 @@ from gmem_jax.physics.boundary import periodic_axes
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.grain import Clump
 from gmem_jax.preparation.preparation import preparation_frames, prepare
-from gmem_jax.preparation.recipe import Recipe, grain_steps, pressure_over_wanted
+from gmem_jax.preparation.recipe import Recipe, graded, grain_steps, pressure_over_wanted
 from gmem_jax.show import tables
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import Sample
@@ -124,8 +124,9 @@ def prepare_command(
     require_name(name)
     preparation_frames(recipe, frames)  # refuses what cannot be before anything is begun
     check_output(output, ".h5", force=force)
-    backend = native.name(backend, Frictionless(), periodic_axes(recipe.boundary))
-    cost = announce(f"{recipe.grains} grains", grain_steps(recipe, clump), PREPARATION_BYTES * recipe.grains, backend)
+    made = graded(recipe, clump)
+    backend = native.name(backend, Frictionless(), periodic_axes(recipe.boundary), made.equal)
+    cost = announce(f"{recipe.grains} grains", grain_steps(recipe, made), PREPARATION_BYTES * recipe.grains, backend)
     key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
     if dry_run:
         foresee(output, key, restart=restart)

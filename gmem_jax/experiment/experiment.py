@@ -143,7 +143,8 @@ class Experiment:
         self._set_protocol()
         if self.backend not in native.BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(native.BACKENDS)}; got {self.backend!r}")
-        native.require_precision(self.precision, self.backend, self.friction, self.pack.periodic)
+        of_pack = self.pack.periodic, self.pack.clump.equal
+        native.require_precision(self.precision, self.backend, self.friction, *of_pack)
         require_walls(self.pack.periodic, self.material)
         if not 0.0 < self.dt <= LARGEST_STEP:
             raise ValueError(f"dt must be in (0, {LARGEST_STEP}], got {self.dt:g}")
@@ -317,7 +318,7 @@ class Experiment:
     @property
     def runs_on(self) -> native.Backend:
         """What `backend` means for this law and box on JAX's default device."""
-        return native.name(self.backend, self.friction, self.pack.periodic)
+        return native.name(self.backend, self.friction, self.pack.periodic, self.pack.clump.equal)
 
     @property
     def timing(self) -> Timing:

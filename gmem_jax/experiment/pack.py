@@ -11,7 +11,7 @@ import numpy as np
 
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes, boundary_of
-from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.grain import Clump, words_of_sizes
 from gmem_jax.physics.pairs import Pairs, listed_candidates, tabulate
 from gmem_jax.physics.pytree import label, pytree, static
 from gmem_jax.physics.rotation import unit
@@ -77,6 +77,7 @@ class Pack:
         measured = {"filling phi": "filling", "coordination Z": "coordination", "pressure (E)": "pressure"}
         rows = {
             "grains": f"{self.grains} {self.clump.shape}",
+            **({} if self.clump.equal else {"unequal": words_of_sizes(self.clump)}),
             "box (R)": brief(self.upper - self.lower),
             **({"boundary": boundary_of(self.periodic)} if any(self.periodic) else {}),
             "delta0": self.delta0,
@@ -93,7 +94,13 @@ class Pack:
 
 
 def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: Box, delta0: float) -> Pairs:
-    """The candidate contacts of a whole experiment on a pack (positions [N, 3], quaternions [N, 4])."""
+    """The candidate contacts of a whole experiment on a pack (positions [N, 3], quaternions [N, 4]).
+
+    Raises:
+        ValueError: if the grain has sizes, and not one for each.
+    """
+    if clump.sizes is not None and len(clump.sizes) != len(position):
+        raise ValueError(f"a pack of {len(position)} grains needs as many sizes, its grain has {len(clump.sizes)}")
     smallest = smallest_box(np.asarray(box.lower)[:, 0], np.asarray(box.upper)[:, 0], delta0)
     still = jnp.zeros((*np.shape(position), 1))
     grains = Grains(jnp.asarray(position)[..., None], jnp.asarray(quaternion)[..., None], still, still, still, still)
@@ -107,7 +114,7 @@ def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: s
     Quaternions are brought to length 1. What was measured of the old ones at rest is no part of the record.
 
     Raises:
-        ValueError: if a number is not finite, a quaternion is zero, or the shapes are not those of one pack.
+        ValueError: if a number is not finite, a quaternion is zero, or shapes and sizes are not those of one pack.
     """
     position, quaternion = jnp.asarray(position, float), jnp.asarray(quaternion, float)
     if position.ndim != 2 or (position.shape[1], quaternion.shape) != (3, (len(position), 4)):
@@ -139,6 +146,8 @@ def stack(packs: Sequence[Pack]) -> Pack:
                 f"packs to be stacked must have one size and grain: {first.name} has {first.grains} "
                 f"{first.clump.shape}, {pack.name} has {pack.grains} {pack.clump.shape}"
             )
+        if any((one is None) != (other is None) for one, other in zip(*map(_unequal, (first, pack)), strict=True)):
+            raise ValueError(f"packs to be stacked must have sizes all or none: {first.name} and {pack.name} differ")
         if pack.periodic != first.periodic:
             raise ValueError(
                 f"packs to be stacked must have one boundary: {first.name} has {boundary_of(first.periodic)}, "
@@ -150,6 +159,10 @@ def stack(packs: Sequence[Pack]) -> Pack:
     padded = [replace(pack, pairs=_widen(pack, capacity, per_sphere), name=name, record="{}") for pack in packs]
     stacked: Pack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
     return stacked
+
+
+def _unequal(pack: Pack) -> tuple[jax.Array | None, jax.Array | None]:
+    return pack.clump.radii, pack.clump.sizes
 
 
 def _widen(pack: Pack, capacity: int, per_sphere: int) -> Pairs:
@@ -164,4 +177,5 @@ def _widen(pack: Pack, capacity: int, per_sphere: int) -> Pairs:
         capacity=capacity,
         per_sphere=per_sphere,
         periodic=pack.periodic,
+        radii=pairs.radii,
     )

@@ -432,10 +432,8 @@ def run(
     found = found.described(describe(experiment, time.perf_counter() - began))
     if not schedule.wanted:
         return found
-    offsets = np.asarray(experiment.pack.clump.offsets)
-    return dataclasses.replace(
-        found, frames=concatenate(recorded, offsets, frames_of, periodic=experiment.pack.periodic)
-    )
+    pack = experiment.pack
+    return dataclasses.replace(found, frames=concatenate(recorded, pack.clump, frames_of, periodic=pack.periodic))
 
 
 def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[float] = ()) -> FrameSchedule:

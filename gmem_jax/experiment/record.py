@@ -25,6 +25,7 @@ from gmem_jax.experiment.signals import (
 )
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of
+from gmem_jax.physics.grain import words_of_sizes
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.observables import Observable
@@ -159,7 +160,12 @@ def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
         "experiment": to_dict(experiment),
         "pack": pack.source or pack.name,
         "grains": pack.grains,
-        "grain": {"shape": clump.shape, "mass": float(clump.mass), "diameter": float(clump.diameter)},
+        "grain": {
+            "shape": clump.shape,
+            "mass": float(clump.mass),
+            "diameter": float(clump.diameter),
+            **({} if clump.equal else {"sizes": words_of_sizes(clump)}),
+        },
         "pack_record": pack.info,
         "signals": names_of(experiment.signals),
         "reads": list(experiment.readings.reads),

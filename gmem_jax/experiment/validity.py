@@ -122,6 +122,7 @@ def _dashpots(experiment: Experiment, stages: Mapping[str, Sample], deepest: jax
     clump, contacts = experiment.pack.clump, _most([sample.contacts for sample in stages.values()])
     spring = law.stiffness * (1.0 if isinstance(law, Hooke) else jnp.sqrt(jnp.maximum(deepest, 0.0)))
     inverse = jnp.maximum(1.0 / clump.mass, 0.25 * clump.diameter**2 / jnp.min(clump.inertia))
+    inverse = inverse if clump.sizes is None else inverse / clump.smallest**3
     rate: jax.Array = 2.0 * (2.0 / 3.0) * contacts * spring * law.damping_time * inverse
     return rate
 

@@ -18,21 +18,22 @@ from gmem_jax.files.ours import place
 from gmem_jax.files.validation import optional
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import listed_candidates
-from gmem_jax.simulation.frames import Frames, images_met, sphere_places
-
-RADIUS = 1.0
+from gmem_jax.simulation.frames import Frames, images_met, radii_of_spheres, sphere_places
 
 
 def frames_of_pack(pack: Pack, material: Material = Material()) -> Frames:
     """A pack as the one configuration that it is: normal forces of its overlaps, and no friction, which no pack has."""
     position, quaternion, offsets = (np.asarray(x) for x in (pack.position, pack.quaternion, pack.clump.offsets))
+    own, sizes = (None if x is None else np.asarray(x) for x in (pack.clump.radii, pack.clump.sizes))
     spheres = listed_candidates(pack.pairs).T
-    centres = sphere_places(position, quaternion, offsets)
+    centres = sphere_places(position, quaternion, offsets, sizes)
+    radii = radii_of_spheres(len(position), len(offsets), own, sizes)[spheres]
     apart = centres[spheres[:, 1]] - centres[spheres[:, 0]]
     if pack.pairs.image is not None:
         apart += np.asarray(pack.pairs.image)[np.asarray(pack.pairs.valid)] * np.asarray(pack.upper - pack.lower)
-    overlap = 2.0 - np.linalg.norm(apart, axis=1)
+    overlap = radii.sum(axis=1) - np.linalg.norm(apart, axis=1)
     touching = overlap > 0.0
+    stiffness = float(material.normal_stiffness) * np.sqrt(2.0 * radii.prod(axis=1) / radii.sum(axis=1))
     return Frames(
         time=np.zeros(1),
         u=np.zeros(1),
@@ -42,11 +43,13 @@ def frames_of_pack(pack: Pack, material: Material = Material()) -> Frames:
         upper=np.asarray(pack.upper)[None],
         start=np.array([0, touching.sum()]),
         spheres=spheres[touching],
-        normal_force=float(material.normal_stiffness) * overlap[touching] ** 1.5,
+        normal_force=stiffness[touching] * overlap[touching] ** 1.5,
         friction_force=np.zeros((int(touching.sum()), 3)),
         offsets=offsets,
         stages=("at rest",),
         periodic=pack.periodic,
+        radii=own,
+        sizes=sizes,
     )
 
 
@@ -84,8 +87,8 @@ def write_gsd(path: Path, frames: Frames, mass: float, material: Material) -> No
                 frame.particles.position -= image * (upper - lower)
                 frame.particles.image = image.astype(np.int32)
             frame.particles.orientation = np.repeat(frames.quaternion[number], each, axis=0)
-            frame.particles.diameter = np.full(len(grain), 2.0 * RADIUS)
-            frame.particles.mass = np.full(len(grain), mass / each)
+            frame.particles.diameter = 2.0 * frames.sphere_radii
+            frame.particles.mass = _density(frames, mass) * 4.0 * np.pi / 3.0 * frames.sphere_radii**3
             frame.particles.body = grain
             own, walls = _contacts(frames, number), frame_wall_forces(frames, number, material)
             frame.bonds.N, frame.bonds.types = len(frames.spheres[own]), ["contact"]
@@ -123,7 +126,7 @@ def write_xyz(path: Path, frames: Frames, mass: float, material: Material) -> No
                 "pressure_tensor": " ".join(f"{part:.17g}" for part in tensor.ravel()),
             }
             file.write(f"{len(grain)}\n" + " ".join(f'{name}="{value}"' for name, value in facts.items()) + "\n")
-            _rows(file, "S %.17g %.17g %.17g 1 %d", frames.centres(number), grain)
+            _rows(file, "S %.17g %.17g %.17g %.17g %d", frames.centres(number), frames.sphere_radii, grain)
 
 
 def write_lammps(path: Path, frames: Frames, mass: float, material: Material) -> None:
@@ -134,8 +137,7 @@ def write_lammps(path: Path, frames: Frames, mass: float, material: Material) ->
     Raises:
         OSError: if the path cannot be written.
     """
-    grain, each = _grain_numbers(frames), len(frames.offsets)
-    density = mass / (each * 4.0 * np.pi / 3.0 * RADIUS**3)
+    grain, each, density = _grain_numbers(frames), len(frames.offsets), _density(frames, mass)
     with atomic(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         bounds = f", boundary {' '.join('fp'[axis] for axis in frames.periodic)}" if any(frames.periodic) else ""
         file.write(f"gmem: {frames.position.shape[1]} grains of {each} spheres, lengths in R{bounds}\n\n")
@@ -143,8 +145,8 @@ def write_lammps(path: Path, frames: Frames, mass: float, material: Material) ->
         for axis, lower, upper in zip("xyz", frames.lower[0], frames.upper[0], strict=True):
             file.write(f"{lower:.17g} {upper:.17g} {axis}lo {axis}hi\n")
         file.write("\nAtoms # hybrid sphere molecular\n\n")
-        row = f"%d 1 %.17g %.17g %.17g {2.0 * RADIUS:g} {density:.17g} %d"
-        _rows(file, row, np.arange(1, len(grain) + 1), frames.centres(0), grain)
+        row = f"%d 1 %.17g %.17g %.17g %.17g {density:.17g} %d"
+        _rows(file, row, np.arange(1, len(grain) + 1), frames.centres(0), 2.0 * frames.sphere_radii, grain)
 
 
 def write_dump(path: Path, frames: Frames, mass: float, material: Material) -> None:
@@ -161,7 +163,14 @@ def write_dump(path: Path, frames: Frames, mass: float, material: Material) -> N
             for lower, upper in zip(frames.lower[number], frames.upper[number], strict=True):
                 file.write(f"{lower:.17g} {upper:.17g}\n")
             file.write("ITEM: ATOMS id mol type x y z radius\n")
-            _rows(file, "%d %d 1 %.17g %.17g %.17g 1", np.arange(1, len(grain) + 1), grain, frames.centres(number))
+            columns = np.arange(1, len(grain) + 1), grain, frames.centres(number), frames.sphere_radii
+            _rows(file, "%d %d 1 %.17g %.17g %.17g %.17g", *columns)
+
+
+def _density(frames: Frames, mass: float) -> float:
+    """Of spheres that have the mass of their grain together; `mass` is that of a grain of size 1."""
+    radii = np.ones(len(frames.offsets)) if frames.radii is None else frames.radii
+    return mass / (float(np.sum(radii**3)) * 4.0 * np.pi / 3.0)
 
 
 def _rows(file: TextIO, form: str, *columns: np.ndarray) -> None:
@@ -212,7 +221,7 @@ def write_pvd(path: Path, frames: Frames, mass: float, material: Material) -> No
 def _points(frames: Frames, number: int, material: Material) -> Any:
     grain, walls = _grain_numbers(frames), frame_wall_forces(frames, number, material)
     mesh = optional("pyvista", "vtk").PolyData(frames.centres(number))
-    mesh["radius"], mesh["grain"], mesh["wall_force"] = np.full(len(grain), RADIUS), grain, walls
+    mesh["radius"], mesh["grain"], mesh["wall_force"] = frames.sphere_radii, grain, walls
     facts = {
         "lower": frames.lower[number],
         "upper": frames.upper[number],
@@ -256,7 +265,7 @@ class Format(NamedTuple):
 
     Attributes:
         suffix: of its files.
-        write: writes frames, of grains of a mass and a material.
+        write: writes frames, of grains of a mass (of those of size 1) and a material.
         series: likewise for several configurations, where that is another kind of file.
         folder: whether it writes a folder, too, of the file's name without its suffix.
     """

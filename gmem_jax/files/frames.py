@@ -1,15 +1,17 @@
 """Configurations along a run in HDF5 files: the group /frames."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from gmem_jax.files.hdf5 import Content, reading, stored_axes, write_arrays
-from gmem_jax.files.schemas import FRAMES
-from gmem_jax.files.validation import fit, refusing, require, require_finite, title, whole
+from gmem_jax.files.schemas import FRAMES, UNEQUAL
+from gmem_jax.files.validation import Array, fit, refusing, require, require_finite, require_sizes, title, whole
 from gmem_jax.physics.boundary import boundary_of
 from gmem_jax.simulation.frames import Frames
 
@@ -23,7 +25,12 @@ def write_frames(file: h5py.File, frames: Frames) -> None:
     group.attrs["signal"] = frames.signal
     if any(frames.periodic):
         group.attrs["boundary"] = boundary_of(frames.periodic)
-    write_arrays(group, FRAMES, vars(frames))
+    write_arrays(group, _declared(vars(frames)), vars(frames))
+
+
+def _declared(found: Mapping[str, Any]) -> dict[str, Array]:
+    """The arrays that frames of such fields have."""
+    return {**FRAMES, **{name: array for name, array in UNEQUAL.items() if found.get(name) is not None}}
 
 
 def read_frames(content: Content) -> Frames | None:
@@ -34,11 +41,12 @@ def read_frames(content: Content) -> Frames | None:
     """
     if GROUP not in content.attributes:
         return None
-    found = content.arrays({f"{GROUP}/{name}": array for name, array in FRAMES.items()})
+    declared = _declared({name: content.datasets.get(f"{GROUP}/{name}") for name in UNEQUAL})
+    found = content.arrays({f"{GROUP}/{name}": array for name, array in declared.items()})
     stages, signal = json.loads(content.text("stages", GROUP)), content.attributes[GROUP].get("signal")
     require(isinstance(stages, list), "the stages of its frames are no names")
     require(isinstance(signal, np.integer) and whole(int(signal)), "the signal of its frames is no number")
-    own = {name: found[f"{GROUP}/{name}"] for name in FRAMES}
+    own = {name: found[f"{GROUP}/{name}"] for name in declared}
     periodic = stored_axes(content, GROUP)
     frames = Frames(**own, stages=tuple(stages), signal=int(signal), periodic=periodic)  # type: ignore[arg-type]
     check_frames(frames)
@@ -51,11 +59,12 @@ def check_frames(frames: Frames) -> None:
     Raises:
         FileFormatError: saying what is wrong.
     """
-    fit(FRAMES, vars(frames))
+    fit(_declared(vars(frames)), vars(frames))
     require(all(map(title, frames.stages)), "the stages of its frames are no names")
     require_finite({f"frames/{entry.name}": getattr(frames, entry.name) for entry in fields(frames)[:11]})
     start, spheres = frames.start, frames.spheres
     count, per_grain = frames.position.shape[1] * len(frames.offsets), len(frames.offsets)
+    require_sizes(frames.radii, frames.sizes)
     require(len(frames.time) == frames.count > 0, "its frames and their stages are not of one number")
     require(count > 0, "its frames hold no spheres")
     require(frames.lower < frames.upper, "a frame has a lower wall that is not below the upper one")

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from gmem_jax.errors import FileFormatError
 from gmem_jax.files.lammpsdata import SAME, Read, density_of, read_lammps
 from gmem_jax.files.validation import optional, refusing, require, require_finite
+from gmem_jax.physics.grain import require_radii
 
 LARGEST = 1 << 30  # bytes of a file
 _GSD = b"\xdf\x65\xdf\x65\xdf\x65\xdf\x65"
@@ -35,6 +37,7 @@ class Spheres:
 
     Attributes:
         centres: in the order of the file within a grain, [N, K, 3].
+        radii: of the spheres, [N, K].
         lower: lower planes of the box, [3].
         upper: upper planes, [3].
         density: of the spheres, in the file's units; None where it has none.
@@ -42,6 +45,7 @@ class Spheres:
     """
 
     centres: np.ndarray
+    radii: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
     density: float | None = None
@@ -53,12 +57,13 @@ def load_spheres(path: Path, radius: float = 1.0) -> Spheres:
 
     Args:
         path: a file; GSD by how it begins or by its suffix .gsd, LAMMPS otherwise.
-        radius: of the spheres in the file's unit of length, which becomes R.
+        radius: R in the file's unit of length: of equal spheres their radius.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it cannot be read, holds what no pack has, its radii or densities are others than one, or
-            its grains differ in their number of spheres.
+        FileFormatError: if it cannot be read, holds what no pack has, its spheres are all of another radius or of
+            radii that no pack can have, its densities are others than one, or its grains differ in their number of
+            spheres.
         ValueError: if the radius is not positive, or the package gsd is not there.
     """
     if not 0.0 < radius < np.inf:
@@ -74,12 +79,19 @@ def load_spheres(path: Path, radius: float = 1.0) -> Spheres:
             require(not re.match(pattern, begins, re.DOTALL), f"it is {what}; {how}")
         centres, grain, radii, box, density, notes = _gsd(path, radius) if gsd else read_lammps(path, radius)
         require_finite({"positions": centres, "planes of the box": box})
-        odd = np.abs(radii - radius) > SAME * radius
+        radii = radii / radius if len(radii) else np.ones(len(centres))
+        radii = np.where(np.abs(radii - 1.0) <= SAME, 1.0, radii)
+        require_finite({"radii": radii})
+        how = "the radius in the file's lengths is given by --radius"
+        alike = np.ptp(radii) <= SAME * np.max(radii, initial=0.0)
         require(
-            ~odd,
-            f"its spheres must have radius {radius:g}, found {radii[odd][0] if odd.any() else 0:g}; "
-            "the radius in the file's lengths is given by --radius",
+            not alike or np.all(radii == 1.0),
+            f"its spheres must have radius {radius:g}, found {radius * np.max(radii, initial=0.0):g}; {how}",
         )
+        try:
+            require_radii(radii)
+        except ValueError as error:
+            raise FileFormatError(f"{error}; {how}") from error
         _, counts = np.unique(grain, return_counts=True)
         require(len(counts) > 0, "it holds no spheres")
         told = "; ".join([f"its grains have {counts.min()} to {counts.max()} spheres, all must have the same", *notes])
@@ -87,7 +99,7 @@ def load_spheres(path: Path, radius: float = 1.0) -> Spheres:
         order = np.argsort(grain, kind="stable")
         lower, upper = box / radius
         shaped = centres[order].reshape(len(counts), counts[0], 3) / radius
-        return Spheres(shaped, lower, upper, density, notes)
+        return Spheres(shaped, radii[order].reshape(shaped.shape[:2]), lower, upper, density, notes)
 
 
 def _gsd(path: Path, radius: float) -> Read:
@@ -108,7 +120,9 @@ def _gsd(path: Path, radius: float) -> Read:
         np.asarray(own.image)[kept] == 0, "its particles have images: a pack lies within walls, not in a periodic box"
     )
     centres, radii = np.asarray(own.position, float)[kept], 0.5 * np.asarray(own.diameter, float)[kept]
-    density = density_of(np.asarray(own.mass, float)[kept], radius)
+    require(radii > 0.0, "a diameter is not positive")
+    unequal = np.ptp(radii) > SAME * radii.max() if len(radii) else False
+    density = density_of(np.asarray(own.mass, float)[kept], radii if unequal else radius)
     notes = ["its velocities are left out"] * bool(np.any(own.velocity))
     if free.any():
         notes.append(f"{free.sum()} of its particles belong to no body: each is a grain of one sphere")

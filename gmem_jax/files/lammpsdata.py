@@ -76,7 +76,7 @@ def read_lammps(path: Path, radius: float) -> Read:
 
     Args:
         path: the file.
-        radius: that its spheres should have; tells the columns of `Atoms # hybrid` apart.
+        radius: that equal spheres should have; tells the columns of `Atoms # hybrid` apart.
 
     Raises:
         OSError: if it cannot be read.
@@ -123,14 +123,16 @@ def one_value(what: str, values: np.ndarray) -> float:
     return float(high)
 
 
-def density_of(masses: np.ndarray, radius: float) -> float | None:
+def density_of(masses: np.ndarray, radii: np.ndarray | float) -> float | None:
     """The density of spheres of these masses; None where all are 1, as programs write who know no masses.
 
     Raises:
         FileFormatError: if they differ.
     """
-    mass = one_value("mass", masses)
-    return None if mass == 1.0 else mass / (4.0 * np.pi / 3.0 * radius**3)
+    if np.all(masses == 1.0):
+        return None
+    volume = 4.0 * np.pi / 3.0 * radii**3
+    return one_value("density", masses / volume) if np.ndim(radii) else one_value("mass", masses) / float(volume)
 
 
 def _parts(lines: list[str]) -> tuple[dict[str, _Row], dict[str, _Section]]:
@@ -182,7 +184,10 @@ def _box(head: Mapping[str, _Row]) -> np.ndarray:
 
 
 def _style_of(atoms: _Section, radius: float) -> str:
-    """What the comment behind `Atoms` says; of LAMMPS' own "hybrid" the order in which diameters are those meant."""
+    """What the comment behind `Atoms` says; of LAMMPS' own "hybrid" the order in which diameters are those meant.
+
+    If they are in none, the spheres are unequal: the order in which all densities are one.
+    """
     if atoms.hint != "hybrid":
         require(
             atoms.hint in _STYLES,
@@ -190,14 +195,20 @@ def _style_of(atoms: _Section, radius: float) -> str:
             f"{', '.join(_STYLES)}",
         )
         return atoms.hint
-    fits = []
+    meant, dense = [], []
     for style in _HYBRID:
         names = _STYLES[style].split()
         rows = [dict(zip(names, row.words, strict=False)) for row in atoms.rows]
         whole = all(_WHOLE.fullmatch(row.get("mol", "")) for row in rows)
-        sizes = [row["diameter"] for row in rows if _REAL.fullmatch(row.get("diameter", ""))]
-        if whole and len(sizes) == len(rows) and np.all(np.abs(np.array(sizes, float) - 2.0 * radius) <= SAME * radius):
-            fits.append(style)
+        numbers = [[row.get(name, "") for row in rows] for name in ("diameter", "density")]
+        if not (whole and all(_REAL.fullmatch(word) for column in numbers for word in column)):
+            continue
+        sizes, densities = (np.array(column, float) for column in numbers)
+        if np.all(np.abs(sizes - 2.0 * radius) <= SAME * radius):
+            meant.append(style)
+        if np.ptp(densities) <= SAME * np.max(densities, initial=0.0):
+            dense.append(style)
+    fits = meant or dense
     require(len(fits) < 2, f"'Atoms # hybrid' does not tell its columns: write {' or '.join(_HYBRID)} in that comment")
     return fits[0] if fits else _HYBRID[0]
 

@@ -11,9 +11,9 @@ def frame_wall_forces(frames: Frames, number: int, material: Material) -> np.nda
 
     What damping adds depends on speeds, which frames do not keep: it is left out.
     """
-    centres = frames.centres(number)
-    overlaps = (1.0 - (centres - frames.lower[number]), 1.0 - (frames.upper[number] - centres))
-    lower, upper = (np.maximum(overlap, 0.0) ** 1.5 for overlap in overlaps)
+    centres, radii = frames.centres(number), frames.sphere_radii[:, None]
+    overlaps = (radii - (centres - frames.lower[number]), radii - (frames.upper[number] - centres))
+    lower, upper = (np.sqrt(radii) * np.maximum(overlap, 0.0) ** 1.5 for overlap in overlaps)
     return np.asarray(np.where(frames.periodic, 0.0, float(material.wall_stiffness) * (lower - upper)))
 
 

@@ -9,11 +9,20 @@ from typing import Any
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.files.validation import is_number, numbers, require, require_fields, require_finite, title, whole
+from gmem_jax.files.validation import (
+    is_number,
+    numbers,
+    require,
+    require_fields,
+    require_finite,
+    require_sizes,
+    title,
+    whole,
+)
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes, require_room
 from gmem_jax.physics.pairs import nearest_images
 from gmem_jax.physics.pytree import interval
-from gmem_jax.simulation.frames import sphere_places
+from gmem_jax.simulation.frames import radii_of_spheres, sphere_places
 from gmem_jax.simulation.strain import COMPRESSIONS
 
 UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
@@ -44,14 +53,17 @@ def check_arrays(found: Found, *, isotropic: bool, record: dict[str, Any], perio
         FileFormatError: saying what is wrong.
     """
     require_finite(found)
+    own, sizes = found.get("clump/radii"), found.get("clump/sizes")
+    require_sizes(own, sizes)
     _check_clump(found, isotropic)
     _check_box(found)
-    spheres = sphere_places(found["position"], found["quaternion"], found["clump/offsets"])
+    spheres = sphere_places(found["position"], found["quaternion"], found["clump/offsets"], sizes)
+    radii = radii_of_spheres(len(found["position"]), len(found["clump/offsets"]), own, sizes)
     lower, upper, axes = found["lower"], found["upper"], np.asarray(periodic)
     require((spheres > lower) & (spheres < upper) | axes, "a grain lies outside the box")
     centres = found["position"]
     require((centres >= lower) & (centres <= upper), "a grain's centre lies outside the box")
-    _check_list(found, spheres, periodic)
+    _check_list(found, spheres, radii, periodic)
     first, second = found["pairs/candidates"]
     apart = spheres[second] - spheres[first]
     if any(periodic):
@@ -59,9 +71,9 @@ def check_arrays(found: Found, *, isotropic: bool, record: dict[str, Any], perio
         apart += nearest_images(found["pairs/candidates"], reference, found["pairs/smallest"], periodic) * (
             upper - lower
         )
-    overlap = 2.0 - np.linalg.norm(apart, axis=1)
-    walls = 1.0 - np.min(np.where(axes, 1.0, np.minimum(spheres - lower, upper - spheres)))
-    deepest = max(overlap.max(initial=0.0), walls)
+    overlap = radii[first] + radii[second] - np.linalg.norm(apart, axis=1)
+    walls = np.where(axes, 0.0, radii[:, None] - np.minimum(spheres - lower, upper - spheres))
+    deepest = max(overlap.max(initial=0.0), walls.max())
     require(
         deepest < LARGEST_OVERLAP,
         f"grains or walls overlap by {deepest:.2f} R, must be below {LARGEST_OVERLAP} R: this is no pack at rest",
@@ -70,14 +82,16 @@ def check_arrays(found: Found, *, isotropic: bool, record: dict[str, Any], perio
 
 
 def _check_clump(found: Found, isotropic: bool) -> None:
-    """Bounds on the mass properties of a union of K unit spheres, whichever it is."""
+    """Bounds on the mass properties of a union of K spheres, whichever it is."""
     offsets, mass = found["clump/offsets"], float(found["clump/mass"])
     inertia, diameter = found["clump/inertia"], float(found["clump/diameter"])
     require(0 < len(offsets) <= MOST_SPHERES, f"its grain has {len(offsets)} spheres, must have 1 to {MOST_SPHERES}")
-    extent = 2.0 * (1.0 + np.linalg.norm(offsets, axis=1).max())
+    radii = radii_of_spheres(1, len(offsets), found.get("clump/radii"))
+    extent = 2.0 * float((radii + np.linalg.norm(offsets, axis=1)).max())
     require(abs(diameter - extent) < UNIT * extent, f"the grain's diameter is {diameter:g}, its spheres say {extent:g}")
+    balls = _BALL * radii**3
     require(
-        0.999 * _BALL < mass < 1.001 * _BALL * len(offsets), f"the mass {mass:g} is not that of {len(offsets)} spheres"
+        0.999 * balls.max() < mass < 1.001 * balls.sum(), f"the mass {mass:g} is not that of {len(offsets)} spheres"
     )
     second = 0.5 * float(inertia.sum())  # the integral of r^2 over the grain
     least, most = 0.6 * mass * (mass / _BALL) ** (2 / 3), mass * (0.5 * extent) ** 2
@@ -116,22 +130,27 @@ def period_bounds(lengths: np.ndarray) -> tuple[float, float]:
 
 
 def _filling(found: Found) -> float:
-    return len(found["position"]) * float(found["clump/mass"]) / float(np.prod(found["upper"] - found["lower"]))
+    count = float(np.sum(radii_of_spheres(len(found["position"]), 1, None, found.get("clump/sizes")) ** 3))
+    return count * float(found["clump/mass"]) / float(np.prod(found["upper"] - found["lower"]))
 
 
-def _check_list(found: Found, spheres: np.ndarray, periodic: PeriodicAxes) -> None:
+def _check_list(found: Found, spheres: np.ndarray, radii: np.ndarray, periodic: PeriodicAxes) -> None:
     """The list of candidates is sorted, in range, and holds every pair in reach, as at the list's own configuration."""
     listed, reference = found["pairs/candidates"].astype(np.int64), found["pairs/reference"]
     smallest, reach = found["pairs/smallest"], float(found["pairs/reach"])
     count, per_grain = len(spheres), len(found["clump/offsets"])
     lengths = found["upper"] - found["lower"]
     require(len(reference) == count, f"its list is of {len(reference)} spheres, not {count}")
-    require(2.0 < reach < 4.0, f"the reach of its list must be in (2, 4) R, got {reach:g}")
+    widest, largest = 2.0 * float(radii.max()), float(found.get("clump/sizes", np.ones(1)).max())
+    require(
+        widest < reach < widest + 2.0,
+        f"the reach of its list must be in ({widest:g}, {widest + 2.0:g}) R, got {reach:g}",
+    )
     require((smallest > 0.5 * lengths) & (smallest <= lengths * (1.0 + UNIT)), "its list is of another box")
     within = (reference > 0.0) & (reference < 1.0)
     require(within | np.asarray(periodic), "its list was made of spheres outside the box")
     try:
-        require_room(smallest, periodic, reach, float(found["clump/diameter"]))
+        require_room(smallest, periodic, reach, largest * float(found["clump/diameter"]))
     except ValueError as error:
         raise FileFormatError(str(error)) from error
     require((listed >= 0) & (listed < count), f"a candidate is none of the {count} spheres")
@@ -141,16 +160,17 @@ def _check_list(found: Found, spheres: np.ndarray, periodic: PeriodicAxes) -> No
     keys = listed[0] * count + listed[1]
     require(np.diff(keys) > 0, "its candidates are not sorted, or listed twice")
     moved = float(np.linalg.norm(spheres - found["lower"] - reference * lengths, axis=1).max())
-    require(2.0 * moved < reach - 2.0, f"its list is stale: a sphere has moved by {moved:.2f} R since it was made")
+    require(2.0 * moved < reach - widest, f"its list is stale: a sphere has moved by {moved:.2f} R since it was made")
     mapped = reference * smallest
     lines = mapped[listed[1]] - mapped[listed[0]]
     if any(periodic):
         lines += nearest_images(listed, reference[..., None], smallest, periodic) * smallest
     apart = np.linalg.norm(lines, axis=1)
-    require(apart < reach + GRAZING, "its list pairs spheres that are out of reach of each other")
+    gaps = apart - radii[listed[0]] - radii[listed[1]]
+    require(gaps < reach - widest + GRAZING, "its list pairs spheres that are out of reach of each other")
     # Nothing listed is out of reach or listed twice: then it is complete if there are no more pairs than listed ones.
     require(
-        pairs_within(mapped, reach - GRAZING, per_grain, smallest, periodic) <= len(keys),
+        pairs_within(mapped, reach - GRAZING, per_grain, smallest, periodic, radii) <= len(keys),
         "its list misses spheres that are in reach of each other",
     )
 
@@ -161,20 +181,22 @@ def pairs_within(
     per_grain: int,
     edges: np.ndarray | None = None,
     periodic: PeriodicAxes = WALLS,
+    radii: np.ndarray | None = None,
 ) -> int:
     """Number of pairs of spheres of different grains within reach, by cells of that edge; scipy takes longer to load.
 
     Args:
         centres: of the spheres, [S, 3].
-        reach: how far apart they may be.
+        reach: how far apart they may be; of unequal ones the largest.
         per_grain: spheres of a grain.
         edges: of the box, [3], if any of its axes is periodic.
         periodic: those axes.
+        radii: of the spheres, [S], if they differ: smaller ones may be as far apart from surface to surface.
 
     Raises:
         FileFormatError: if the spheres lie in a heap, which has more pairs than there is time and memory for.
     """
-    owner = np.arange(len(centres))
+    owner, short = np.arange(len(centres)), None if radii is None else radii.max() - radii
     for axis in np.flatnonzero(periodic) if edges is not None else ():
         # Images of what is near the lower face, beyond the upper one. A pair may be found twice, but is one: there is
         # room for no two of its images.
@@ -188,16 +210,21 @@ def pairs_within(
     order = np.argsort(key, kind="stable")
     key, centres, owner = key[order], centres[order], owner[order]
     here, grain = np.arange(len(key)), owner // per_grain
+    crowd = 1.0 if radii is None else float(radii.max() ** 3 / np.mean(radii**3))  # of small ones about a large one
     found: list[np.ndarray] = []
     for over, along in ((0, 0), (0, 1), (1, -1), (1, 0), (1, 1)):  # half of the columns of cells around
         column = key + (over * rows + along) * columns
         first = np.searchsorted(key, column - 1) if over or along else here + 1
         count = np.searchsorted(key, column + 1, side="right") - first
-        require(count.sum() <= (100 + 30 * per_grain) * len(key), "its grains lie in a heap: this is no pack at rest")
+        require(
+            count.sum() <= (100 + 30 * per_grain) * crowd * len(key),
+            "its grains lie in a heap: this is no pack at rest",
+        )
         one = np.repeat(here, count)
         other = np.arange(len(one)) + np.repeat(first - (np.cumsum(count) - count), count)
         far = centres[one] - centres[other]
-        near = (np.einsum("pi,pi->p", far, far) < reach**2) & (grain[one] != grain[other])
+        most = reach if short is None else reach - short[owner[one]] - short[owner[other]]
+        near = (np.einsum("pi,pi->p", far, far) < most**2) & (grain[one] != grain[other])
         pair = np.stack([owner[one[near]], owner[other[near]]])
         found.append(pair.min(axis=0) * len(key) + pair.max(axis=0))
     pairs = np.concatenate(found)

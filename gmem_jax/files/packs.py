@@ -16,7 +16,7 @@ from gmem_jax.files import pack_validation
 from gmem_jax.files.cache import kept_pack, list_packs
 from gmem_jax.files.frames import check_frames, write_frames
 from gmem_jax.files.hdf5 import reading, stored_axes, write_arrays, write_samples, writing
-from gmem_jax.files.schemas import PACK
+from gmem_jax.files.schemas import PACK, UNEQUAL
 from gmem_jax.files.validation import fit, json_of, refusing, require, title
 from gmem_jax.physics.boundary import PeriodicAxes, boundary_of
 from gmem_jax.physics.grain import Clump
@@ -37,6 +37,7 @@ def _arrays(pack: Pack) -> dict[str, Any]:
     """What `PACK` declares, by path."""
     values: dict[str, Any] = {name: getattr(pack, name) for name in _OWN}
     values |= {f"clump/{name}": getattr(pack.clump, name) for name in _CLUMP}
+    values |= {f"clump/{name}": own for name in UNEQUAL if (own := getattr(pack.clump, name)) is not None}
     values |= {f"pairs/{name}": getattr(pack.pairs, name) for name in ("smallest", "reach")}
     reference = np.asarray(pack.pairs.reference)[..., 0]
     return {**values, "pairs/candidates": listed_candidates(pack.pairs), "pairs/reference": reference}
@@ -67,7 +68,7 @@ def save_pack(
         file.attrs["record"] = pack.record
         if any(pack.periodic):
             file.attrs["boundary"] = boundary_of(pack.periodic)
-        write_arrays(file, PACK.arrays, values)
+        write_arrays(file, PACK.declared(values), values)
         file["clump"].attrs["shape"] = clump.shape
         file["clump"].attrs["isotropic"] = clump.isotropic
         if stages:
@@ -83,9 +84,9 @@ def check_pack(pack: Pack) -> None:
         FileFormatError: saying what is wrong.
     """
     arrays = {path: np.asarray(array) for path, array in _arrays(pack).items()}
-    fit(PACK.arrays, arrays)
+    fit(PACK.declared(arrays), arrays)
     require(
-        all(arrays[path].dtype != np.float32 for path in PACK.arrays),
+        all(array.dtype != np.float32 for array in arrays.values()),
         'its numbers are in single precision: call jax.config.update("jax_enable_x64", True) before it is made or read',
     )
     _check(arrays, pack.periodic, pack.clump.isotropic, pack.name, pack.clump.shape, pack.record)
@@ -117,7 +118,7 @@ def load_pack(source: str | Path) -> Pack:
     path = _path_of(source)
     with refusing(path, "pack"):
         with reading(path, PACK.name) as content:
-            found = content.arrays(PACK.arrays)
+            found = content.arrays(PACK.declared(content.datasets))
             label, record, shape = content.text("name"), content.text("record"), content.text("shape", "clump")
             isotropic, periodic = content.attributes["clump"].get("isotropic"), stored_axes(content)
         _check(found, periodic, isotropic, label, shape, record)
@@ -125,11 +126,13 @@ def load_pack(source: str | Path) -> Pack:
             path != pack_called(str(source)) or label == str(source),
             f"it is the pack {label}, not {source}: files were exchanged; make it again with gmem prepare",
         )
-        clump = Clump(
-            **{key: jnp.asarray(found[f"clump/{key}"]) for key in _CLUMP}, isotropic=bool(isotropic), shape=shape
-        )
+        own = {key: jnp.asarray(found[f"clump/{key}"]) for key in (*_CLUMP, *UNEQUAL) if f"clump/{key}" in found}
+        clump = Clump(**own, isotropic=bool(isotropic), shape=shape)
         listed, reference, smallest, reach = (found[f"pairs/{key}"] for key in _PAIRS)
-        pairs = tabulate(listed, reference[..., None], smallest, float(reach), clump.spheres, periodic=periodic)
+        radii = clump.sphere_radii(len(reference))
+        pairs = tabulate(
+            listed, reference[..., None], smallest, float(reach), clump.spheres, periodic=periodic, radii=radii
+        )
         numbers: dict[str, Any] = {key: jnp.asarray(found[key]) for key in _OWN}
         return Pack(
             clump=clump, pairs=pairs, periodic=periodic, name=label, record=record, source=str(source), **numbers

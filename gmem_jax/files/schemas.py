@@ -1,6 +1,6 @@
 """What every kind of file holds, with units: the one table to write from, read by, and print in docs/files.md."""
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any, NamedTuple
 
 from gmem_jax.files.validation import FIXED_LENGTHS, Array
@@ -38,6 +38,7 @@ class Schema(NamedTuple):
         words: what it is and what makes it.
         arrays: every array by its path, or every field of JSON.
         texts: attributes, by name.
+        unequal: arrays by their paths, of packs whose spheres are not all of radius 1.
     """
 
     name: str
@@ -45,6 +46,11 @@ class Schema(NamedTuple):
     words: str
     arrays: Mapping[str, Array]
     texts: Mapping[str, str] = {}
+    unequal: Mapping[str, Array] = {}
+
+    def declared(self, found: Container[str]) -> dict[str, Array]:
+        """Its arrays, those of `unequal` as far as they are among what was found."""
+        return {**self.arrays, **{path: array for path, array in self.unequal.items() if path in found}}
 
 
 _CONFIGURATION = {
@@ -54,6 +60,11 @@ _CONFIGURATION = {
 STAGE = {  # of a recall or a preparation, in stages/NAME; `common` is the last dimension where there is one run for all
     "time": Array("real", ("time",), "t0", "end of the bin, since the first stage in the file began"),
     **{name: Array("real", ("time", *each.dimensions), *each[:2]) for name, each in MEASURED.items()},
+}
+
+UNEQUAL = {  # of spheres that are not all of radius 1; else they are missing
+    "radii": Array("real", ("part",), "R", "radii of the spheres of a grain"),
+    "sizes": Array("real", ("grain",), "1", "sizes of the grains: factors on their lengths"),
 }
 
 FRAMES = {  # configurations along the run that made a recall or a pack, in frames
@@ -97,6 +108,7 @@ PACK = Schema(
         "clump: shape": 'like "tetra(0.6)"',
         "clump: isotropic": "whether its three moments are equal",
     },
+    {f"clump/{name}": array for name, array in UNEQUAL.items()},
 )
 
 RECALL = Schema(
@@ -319,6 +331,12 @@ _SEVERAL = (
 )
 
 
+_SIZES = (
+    "Where spheres are not all of radius 1, the pack has one or both of these arrays, and so have `frames`. Then mass, "
+    "moments, diameter and offsets are those of a grain of size 1."
+)
+
+
 def _section(schema: Schema) -> str:
     name = f"`{schema.name}`. " if schema.name else ""
     lines = [f"## {schema.title}", "", f"{name}{schema.words}", ""]
@@ -330,6 +348,9 @@ def _section(schema: Schema) -> str:
         lines += _table(STAGE)
         lines += ["", "In `frames`, where they were asked for (`--frames`), whose attribute `stages` names theirs:", ""]
         lines += _table(FRAMES)
+    if schema is PACK:
+        lines += ["", _SIZES, ""]
+        lines += _table(schema.unequal)
     if schema.texts:
         lines += ["", "Attributes: " + "; ".join(f"`{name}`, {words}" for name, words in schema.texts.items()) + "."]
     return "\n".join([*lines, ""])

@@ -6,7 +6,7 @@ import numpy as np
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.files.pack_validation import MOST_SPHERES
-from gmem_jax.files.validation import NAME, refusing, require, title
+from gmem_jax.files.validation import NAME, refusing, require, require_sizes, title
 from gmem_jax.physics.grain import Clump, clump
 
 _LARGEST = 1 << 16  # bytes: 256 lines of four long numbers
@@ -16,7 +16,7 @@ _COLUMNS = "x y z r"
 def load_clump(path: Path) -> Clump:
     """The grain whose spheres a file lists: x, y, z and r of one in every line, apart by spaces or commas.
 
-    Lines that begin with # are comments. Lengths are in R, and r is 1: contact laws are for equal spheres.
+    Lines that begin with # are comments. Lengths are in R.
 
     Args:
         path: the file; the grain is called by its name.
@@ -37,17 +37,19 @@ def load_clump(path: Path) -> Clump:
             f"it lists {len(rows)} spheres, must be 1 to {MOST_SPHERES}: {_COLUMNS} in every line",
         )
         name = path.stem[:NAME]
-        made = clump(np.asarray(rows), shape=name if title(name) else "clump")
+        found = np.asarray(rows)
+        require_sizes(found[:, 3], None)
+        made = clump(found[:, :3], shape=name if title(name) else "clump", radii=found[:, 3])
     return made
 
 
 def _sphere(number: int, line: str) -> list[float]:
-    """The centre of the sphere in a line."""
+    """Centre and radius of the sphere in a line."""
     try:
         found = [float(cell) for cell in line.replace(",", " ").split()]
     except ValueError:
         found = []
     if len(found) != 4 or not np.all(np.abs(found) < 1e3):
         raise FileFormatError(f"line {number}: must be four numbers {_COLUMNS}, got {line.strip()[:40]!r}")
-    require(found[3] == 1.0, f"line {number}: r is {found[3]:g}, must be 1: all spheres are of radius R, which is 1")
-    return found[:3]
+    require(found[3] > 0.0, f"line {number}: r is {found[3]:g}, must be positive")
+    return found

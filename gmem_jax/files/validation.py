@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
+from gmem_jax.physics.grain import require_radii
 from gmem_jax.physics.rules import require_started
 from gmem_jax.simulation.protocol import BINS
 
@@ -36,6 +37,8 @@ TEXTS = (
     "backend",
     "precision",
     "variant",
+    "sizes",
+    "shares",
 )
 WHOLE_NUMBERS = ("steps", "points", "grains", "seed", "cycles")
 YES_OR_NO = ("scale",)
@@ -151,6 +154,19 @@ def require_finite(arrays: Mapping[str, np.ndarray]) -> None:
     """
     for name, array in arrays.items():
         require(np.isfinite(array), f"{name} holds numbers that are not finite")
+
+
+def require_sizes(radii: np.ndarray | None, sizes: np.ndarray | None) -> None:
+    """Refuse radii of a grain's spheres and sizes of grains that no pack can have; None for all 1.
+
+    Raises:
+        FileFormatError: saying what they are, and what they may be.
+    """
+    one = np.ones(1)
+    try:
+        require_radii(np.outer(one if sizes is None else sizes, one if radii is None else radii))
+    except ValueError as error:
+        raise FileFormatError(str(error)) from error
 
 
 def json_of(text: Any, what: str) -> dict[str, Any]:

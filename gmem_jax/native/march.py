@@ -17,6 +17,7 @@ from jax.extend.backend import get_backend
 from gmem_jax.native import library, primitives
 from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.boundary import PeriodicAxes
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import LAWS, entry_of
 from gmem_jax.physics.pytree import Scalar
@@ -26,9 +27,27 @@ from gmem_jax.physics.step import System
 March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 """The signature of `gmem_jax.physics.step.march`."""
 
-NO_PERIODIC = "the native backend does not know periodic boxes; use backend='auto' or 'jax'"
-
 _LAW_NUMBERS = max(len(entry.numbers) for entry in LAWS)  # rows of the parameter array for a law's own
+
+
+def lacking(periodic: PeriodicAxes, equal: bool) -> str:
+    """What of a pack the library does not know, in words; "" if it knows all.
+
+    Args:
+        periodic: the periodic axes of its box.
+        equal: whether all its spheres are of radius 1.
+    """
+    return "periodic boxes" if any(periodic) else "" if equal else "spheres of unequal radii"
+
+
+def require_known(periodic: PeriodicAxes, equal: bool) -> None:
+    """Refuse a pack that the library does not know; arguments are those of `lacking`.
+
+    Raises:
+        ValueError: saying what it lacks.
+    """
+    if lacks := lacking(periodic, equal):
+        raise ValueError(f"the native backend does not know {lacks}; use backend='auto' or 'jax'")
 
 
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
@@ -46,7 +65,7 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
 
     Raises:
         ValueError: if the backend is not available, does not know the friction law, or the state is not float64; or if
-            an argument does not fit the number of replicas; or if the boxes are periodic.
+            an argument does not fit the number of replicas; or for a pack that the library does not know (`lacking`).
         NotImplementedError: if it is compiled for anything but a CPU or a CUDA GPU, or for that without NVRTC.
     """
     return _march(system, state, boxes, dt, drag, _Mode())
@@ -79,7 +98,7 @@ def require_mixed(law: FrictionLaw) -> None:
 
 def march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
     """`march` on CPUs and CUDA GPUs, its definition elsewhere."""
-    if entry_of(system.friction) is None or any(boxes.periodic):
+    if entry_of(system.friction) is None or lacking(boxes.periodic, system.clump.equal):
         return dynamics.march(system, state, boxes, dt, drag)
     built, reason = library.available()
     if not built:
@@ -109,8 +128,7 @@ class _Mode(NamedTuple):
 def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, mode: _Mode) -> tuple[State, jax.Array]:
     library.require_library()
     library.entry(system.friction)
-    if any(boxes.periodic):
-        raise ValueError(NO_PERIODIC)
+    require_known(boxes.periodic, system.clump.equal)
     if state.grains.position.dtype != jnp.float64:
         raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
     law = {field.name: getattr(system.friction, field.name) for field in fields(system.friction)}  # type: ignore[arg-type]

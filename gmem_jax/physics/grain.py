@@ -1,27 +1,33 @@
-"""Grains: rigid clumps of equal spheres, and their mass properties.
+"""Grains: rigid clumps of spheres, and their mass properties.
 
-A grain is a rigid union of unit spheres. The solid union (overlaps counted once) sets volume, mass and inertia;
-they are computed by summing exact one-dimensional sections of the union along a fine grid of lines.
+A grain is a rigid union of spheres, of radius 1 unless others are given. The solid union (overlaps counted once) sets
+volume, mass and inertia; they are computed by summing exact one-dimensional sections of the union along a fine grid
+of lines.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.numbers import is_real, require_numbers, said
-from gmem_jax.physics.pytree import label, pytree, static
+from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 
 _LINES = 700  # lines per side of the integration grid: volume and inertia to about 1e-5
+RADII = 0.1, 10.0  # R, of the smallest and the largest sphere; skins of lists and springs of law H are in R
+LARGEST_RATIO = 10.0  # of the radii in a pack: around a large sphere cells hold its cube of small ones
 
 
 @pytree
 @dataclass(frozen=True)
 class Clump:
     """One kind of grain, in its principal frame with the centre of mass at the origin (R = rho = 1).
+
+    The grains of a pack may differ in size. Then all that is said here but `sizes` is of a grain of size 1.
 
     Attributes:
         offsets: sphere centres, [K, 3], in R.
@@ -30,6 +36,8 @@ class Clump:
         diameter: outer diameter, of the sphere about its centre of mass that holds it, in R.
         isotropic: whether the three moments are equal, so that no gyroscopic term is needed.
         shape: a name for logs and files.
+        radii: of the spheres, [K], in R; None where all are 1.
+        sizes: of the grains of a pack, factors on all their lengths, [N]; None where all are 1.
     """
 
     offsets: jax.Array
@@ -38,25 +46,84 @@ class Clump:
     diameter: jax.Array
     isotropic: bool = static(True)
     shape: str = label("clump")
+    radii: jax.Array | None = None
+    sizes: jax.Array | None = None
 
     @property
     def spheres(self) -> int:
         """Number of spheres K in one grain."""
         return int(self.offsets.shape[-2])
 
+    @property
+    def equal(self) -> bool:
+        """Whether all spheres of a pack are of radius 1."""
+        return self.radii is None and self.sizes is None
 
-def _sections(offsets: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Volume, first moment [3] and second moment [3, 3] of a union of unit spheres.
+    @property
+    def masses(self) -> jax.Array:
+        """Mass of the grains, as of `scaled`, in rho R^3."""
+        return self.scaled(self.mass, 3)
+
+    @property
+    def smallest(self) -> Scalar:
+        """Size of the smallest grain."""
+        return 1.0 if self.sizes is None else jnp.min(self.sizes)
+
+    @property
+    def largest(self) -> Scalar:
+        """Size of the largest grain."""
+        return 1.0 if self.sizes is None else jnp.max(self.sizes)
+
+    @property
+    def widest(self) -> Scalar:
+        """Diameter of the largest sphere, at which the last spheres touch, in R."""
+        return 2.0 * self.largest if self.radii is None else 2.0 * self.largest * jnp.max(self.radii)
+
+    def scaled(self, value: jax.Array, power: int) -> jax.Array:
+        """What goes with a power of the size of a grain: of all grains, [N, 1, 1]; or the value where all are alike.
+
+        Args:
+            value: of a grain of size 1; scalar, [B] or [3, B].
+            power: of the size.
+        """
+        return value if self.sizes is None else value * self.sizes[:, None, None] ** power
+
+    def sphere_radii(self, spheres: int) -> jax.Array | None:
+        """Radii of the S = N K spheres of a pack, [S], in R; None where all are 1."""
+        if self.equal:
+            return None
+        own = jnp.ones(self.spheres) if self.radii is None else self.radii
+        sizes = jnp.ones(spheres // self.spheres) if self.sizes is None else self.sizes
+        return (sizes[:, None] * own).reshape(-1)
+
+    def volume(self, grains: int) -> jax.Array:
+        """Volume of all N grains of a pack, in R^3; scalar or [B]."""
+        return grains * self.mass if self.sizes is None else jnp.sum(self.sizes**3) * self.mass
+
+
+def words_of_sizes(clump: Clump) -> str:
+    """How the spheres of a pack differ in radius, like "sizes 0.74 to 1.31, SD 0.1"; "" where all are of radius 1."""
+    found = []
+    if clump.sizes is not None:
+        sizes = np.asarray(clump.sizes)
+        found.append(f"sizes {sizes.min():.3g} to {sizes.max():.3g}, SD {sizes.std():.2g}")
+    if clump.radii is not None:
+        found.append(f"spheres of radii {float(clump.radii.min()):.3g} to {float(clump.radii.max()):.3g} R")
+    return "; ".join(found)
+
+
+def _sections(offsets: np.ndarray, radii: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Volume, first moment [3] and second moment [3, 3] of a union of spheres at [K, 3] of radii [K].
 
     Along each line parallel to z the union is a set of intervals whose ends are known exactly; only the two
     transverse directions are discretised (midpoint rule).
     """
-    low, high = offsets[:, :2].min(axis=0) - 1.0, offsets[:, :2].max(axis=0) + 1.0
+    low, high = (offsets[:, :2] - radii[:, None]).min(axis=0), (offsets[:, :2] + radii[:, None]).max(axis=0)
     step = (high - low) / _LINES
     x = low[0] + step[0] * (np.arange(_LINES) + 0.5)
     y = low[1] + step[1] * (np.arange(_LINES) + 0.5)
     grid_x, grid_y = (g.ravel() for g in np.meshgrid(x, y, indexing="ij"))
-    reach2 = 1.0 - (grid_x[:, None] - offsets[:, 0]) ** 2 - (grid_y[:, None] - offsets[:, 1]) ** 2
+    reach2 = radii**2 - (grid_x[:, None] - offsets[:, 0]) ** 2 - (grid_y[:, None] - offsets[:, 1]) ** 2
     hit = reach2 > 0.0
     half = np.sqrt(np.where(hit, reach2, 0.0))
     start = np.where(hit, offsets[:, 2] - half, np.inf)
@@ -81,8 +148,13 @@ def _sections(offsets: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 @usual_rules()
-def clump(offsets: Sequence[Sequence[float]] | np.ndarray, shape: str = "clump") -> Clump:
-    """A rigid grain of unit spheres centred at `offsets`.
+def clump(
+    offsets: Sequence[Sequence[float]] | np.ndarray,
+    shape: str = "clump",
+    *,
+    radii: Sequence[float] | np.ndarray | None = None,
+) -> Clump:
+    """A rigid grain of spheres centred at `offsets`.
 
     Mass properties are those of the solid union, to about 1e-5; the offsets are moved to the centre of mass and
     turned to the principal axes.
@@ -90,16 +162,19 @@ def clump(offsets: Sequence[Sequence[float]] | np.ndarray, shape: str = "clump")
     Args:
         offsets: sphere centres, [K, 3], in R, in any frame.
         shape: a name for logs and files.
+        radii: of the spheres, [K], in R; default 1.
 
     Raises:
-        ValueError: if `offsets` is not a finite [K, 3] array with K >= 1.
+        ValueError: if `offsets` is not a finite [K, 3] array with K >= 1, or the radii are none of `require_radii`.
     """
     if not is_real(offsets):
         raise ValueError(f"clump offsets must be numbers, [K, 3], got {said(offsets)}")
     centres = np.asarray(offsets, dtype=float)
     if centres.ndim != 2 or centres.shape[0] < 1 or centres.shape[1] != 3 or not np.all(np.isfinite(centres)):
         raise ValueError(f"clump offsets must be a finite [K, 3] array, got shape {centres.shape}")
-    volume, first, second = _sections(centres)
+    own = _lengths("clump radii", np.ones(len(centres)) if radii is None else radii, len(centres))
+    require_radii(own)
+    volume, first, second = _sections(centres, own)
     centre = first / volume
     second = second - volume * np.outer(centre, centre)
     inertia = np.trace(second) * np.eye(3) - second
@@ -115,10 +190,64 @@ def clump(offsets: Sequence[Sequence[float]] | np.ndarray, shape: str = "clump")
         offsets=jnp.asarray(centres),
         mass=jnp.asarray(volume),
         inertia=jnp.asarray(moments),
-        diameter=jnp.asarray(2.0 * (1.0 + np.linalg.norm(centres, axis=1).max())),
+        diameter=jnp.asarray(2.0 * (own + np.linalg.norm(centres, axis=1)).max()),
         isotropic=isotropic,
         shape=shape,
+        radii=None if np.all(own == 1.0) else jnp.asarray(own),
     )
+
+
+def _lengths(name: str, values: Any, count: int | None = None) -> np.ndarray:
+    """Positive numbers in a row.
+
+    Raises:
+        ValueError: if they are none, or not so many.
+    """
+    found = np.asarray(values, float) if is_real(values) else np.zeros(0)
+    if found.ndim != 1 or found.size == 0 or found.size != (count or found.size) or not np.all(found > 0.0):
+        raise ValueError(f"{name} must be {count or 'N'} positive numbers, got {said(values)}")
+    return found
+
+
+def require_radii(radii: np.ndarray) -> None:
+    """Refuse spheres that cannot be listed together: lists have one skin and one size of cells.
+
+    Args:
+        radii: of all spheres of a pack, in R.
+
+    Raises:
+        ValueError: if one is outside `RADII`, or no number; or if the largest is more than `LARGEST_RATIO` times the
+            smallest.
+    """
+    (low, high), least, most = RADII, float(np.min(radii)), float(np.max(radii))
+    if not low <= least <= most <= high:
+        raise ValueError(f"radii of spheres must be in [{low:g}, {high:g}] R, got {least:g} to {most:g}")
+    if most > LARGEST_RATIO * least:
+        raise ValueError(
+            f"spheres of radii {least:g} to {most:g} R cannot be listed together: the largest may be {LARGEST_RATIO:g} "
+            "times the smallest"
+        )
+
+
+@usual_rules()
+def sized(clump: Clump, sizes: Sequence[float] | np.ndarray | jax.Array) -> Clump:
+    """The grain of a pack whose grains have sizes of their own.
+
+    Lengths go with the size, mass with its cube and moments of inertia with its fifth power.
+
+    Args:
+        clump: a grain of size 1.
+        sizes: factors on all lengths of each grain, [N]; may be traced.
+
+    Raises:
+        ValueError: if they are no positive numbers, or their spheres none of `require_radii`.
+    """
+    if traced(clump, sizes):
+        return replace(clump, sizes=jnp.asarray(sizes))
+    found = _lengths("sizes", sizes)
+    own = np.ones(1) if clump.radii is None else np.asarray(clump.radii)
+    require_radii(np.outer([found.min(), found.max()], own))
+    return replace(clump, sizes=None if np.all(found == 1.0) else jnp.asarray(found))
 
 
 @usual_rules()

@@ -38,7 +38,9 @@ class Pairs:
         reference: sphere centres in box coordinates (0 to 1) when the list was built, [S, 3, B], or [S, 3, 1] for
             replicas that had not parted yet.
         smallest: edge lengths of the box the distances were measured in, [3].
-        reach: largest centre distance listed there, 2 R + skin.
+        reach: largest centre distance listed there, the diameter of the largest sphere + skin; pairs of smaller spheres
+            are listed up to R_i + R_j + skin.
+        radii: of the spheres when the list was built, [S], in R; None where all were 1.
         image: which image of sphere j meets sphere i: by how many edges of the box it is moved along each axis, int8
             [P, 3]; None between walls.
     """
@@ -52,6 +54,7 @@ class Pairs:
     smallest: jax.Array
     reach: jax.Array
     image: jax.Array | None = None
+    radii: jax.Array | None = None
 
     @property
     def capacity(self) -> int:
@@ -62,6 +65,8 @@ class Pairs:
 def sphere_offsets(quaternion: jax.Array, clump: Clump) -> jax.Array:
     """Sphere centres relative to their grain's centre in the lab frame, [N, K, 3, B], of quaternions [N, 4, B]."""
     body = clump.offsets[None, :, None, :, None]
+    if clump.sizes is not None:
+        body = body * clump.sizes[:, None, None, None, None]
     return jnp.sum(matrix(quaternion)[:, None] * body, axis=-2)
 
 
@@ -71,17 +76,28 @@ def sphere_centres(grains: Grains, clump: Clump) -> jax.Array:
     return centres.reshape(-1, *centres.shape[2:])
 
 
-def slack(pairs: Pairs, spheres: jax.Array, box: Box) -> jax.Array:
+def touching_distance(pairs: Pairs, clump: Clump) -> jax.Array | float:
+    """R_i + R_j of every candidate, [P, 1], in R; 2 where all radii are 1."""
+    radii = clump.sphere_radii(pairs.incidence.shape[-2])
+    return 2.0 if radii is None else (radii[pairs.first] + radii[pairs.second])[:, None]
+
+
+def slack(pairs: Pairs, spheres: jax.Array, box: Box, radii: jax.Array | None = None) -> jax.Array:
     """How much closer two unlisted spheres may still come before they could touch, [B], in R.
 
     Positive while the list is certainly complete: unlisted spheres are at least ratio * reach apart after the affine
-    part of their motion, and the non-affine part brings them together by at most twice the largest deviation.
+    part of their motion, and the non-affine part brings them together by at most twice the largest deviation. Of
+    unequal spheres this is least for the largest, as the ratio is 1 at most; radii [S] may have grown since.
     """
+    touching: jax.Array | float = 2.0
+    if radii is not None or pairs.radii is not None:
+        before, now = (jnp.ones(1) if own is None else own for own in (pairs.radii, radii))
+        touching = 2.0 * (jnp.max(before) + jnp.max(now - before))
     lengths = box.lengths
     affine = box.lower + pairs.reference * lengths
     deviation = jnp.sqrt(jnp.max(jnp.sum((spheres - affine) ** 2, axis=1), axis=0))
     ratio = jnp.minimum(1.0, jnp.min(lengths / pairs.smallest[:, None], axis=0))
-    return ratio * pairs.reach - 2.0 - 2.0 * deviation
+    return ratio * pairs.reach - touching - 2.0 * deviation
 
 
 def image_shifts(pairs: Pairs, lengths: jax.Array) -> jax.Array | float:
@@ -116,6 +132,7 @@ def tabulate(
     capacity: int = 0,
     per_sphere: int = 0,
     periodic: PeriodicAxes = WALLS,
+    radii: jax.Array | None = None,
 ) -> Pairs:
     """`Pairs` from sorted sphere pairs [2, n]: padded, with the incidence table.
 
@@ -128,6 +145,7 @@ def tabulate(
         capacity: rows to allocate at least; rounded up (see `bucket`), and raised to what was found.
         per_sphere: columns of the incidence table to allocate at least; likewise, to multiples of four.
         periodic: the periodic axes of the box.
+        radii: see `Pairs`.
     """
     pairs, count = found.shape[1], reference.shape[0]
     capacity = bucket(max(8, capacity, pairs))  # a gas may have no candidates, but arrays need rows
@@ -162,6 +180,7 @@ def tabulate(
         smallest=jnp.asarray(smallest),
         reach=jnp.asarray(float(reach)),
         image=None if image is None else jnp.asarray(image),
+        radii=radii,
     )
 
 

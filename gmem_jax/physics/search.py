@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.boundary import PeriodicAxes, require_room
-from gmem_jax.physics.grain import Clump
+from gmem_jax.physics.grain import Clump, require_radii
 from gmem_jax.physics.pairs import Pairs, sphere_centres, tabulate
 from gmem_jax.physics.state import Box, Grains
 
@@ -41,7 +41,7 @@ class PairFinder:
         search: finds the same pairs in place of jax-md.
 
     Raises:
-        ValueError: if the skin is not positive.
+        ValueError: if the skin is not positive, or spheres differ too much in radius (see `require_radii`).
     """
 
     def __init__(
@@ -63,9 +63,12 @@ class PairFinder:
         self._per_sphere = int(per_sphere)
         self._search = search
         self._neighbors: Any = None
-        body = np.asarray(clump.offsets)
-        self._cutoff = 2.0 * (1.0 + float(np.linalg.norm(body - body.mean(axis=0), axis=1).max())) + skin
-        self._diameter = float(clump.diameter)
+        body, own = np.asarray(clump.offsets), np.ones(1) if clump.radii is None else np.asarray(clump.radii)
+        largest = float(clump.largest)
+        require_radii(np.outer([clump.smallest, largest], own))
+        self._widest = float(clump.widest)
+        self._cutoff = 2.0 * largest * float((own + np.linalg.norm(body - body.mean(axis=0), axis=1)).max()) + skin
+        self._diameter = largest * float(clump.diameter)
 
     @functools.cached_property
     def _list(self) -> tuple[Any, Any]:
@@ -131,17 +134,28 @@ class PairFinder:
         if known is None or bool(known.did_buffer_overflow) or bool(known.cell_size_too_small):
             self._neighbors = allocate(positions, **box)
 
-    def _keys(self, mapped: np.ndarray, smallest: np.ndarray, periodic: PeriodicAxes) -> np.ndarray:
+    def _keys(
+        self, mapped: np.ndarray, radii: np.ndarray | None, smallest: np.ndarray, periodic: PeriodicAxes
+    ) -> np.ndarray:
         """Pairs i < j of spheres of different grains within reach, of centres [S, 3], as sorted numbers i S + j."""
-        if self._search and not any(periodic):
-            return self._search(mapped, self._spheres_per_grain, 2.0 + self.skin)
         spheres = np.int64(len(mapped))
+        if self._search and not any(periodic):
+            found = self._search(mapped, self._spheres_per_grain, self._widest + self.skin)
+            if radii is None:
+                return found
+            one, other = np.divmod(found, spheres)
+            gap = np.linalg.norm(mapped[one] - mapped[other], axis=-1) - radii[one] - radii[other]
+            return np.asarray(found[gap < self.skin])
         mapped = mapped.reshape(-1, self._spheres_per_grain, 3)
         one, other = self._grain_pairs(mapped.mean(axis=1), smallest, periodic)
         apart = mapped[one][:, :, None] - mapped[other][:, None, :]
         apart -= np.where(periodic, smallest * np.rint(apart / smallest), 0.0)
         distance = np.linalg.norm(apart, axis=-1)
-        pair, sphere_i, sphere_j = np.nonzero(distance < 2.0 + self.skin)
+        reach: np.ndarray | float = self._widest + self.skin
+        if radii is not None:
+            own = radii.reshape(-1, self._spheres_per_grain)
+            reach = own[one][:, :, None] + own[other][:, None, :] + self.skin
+        pair, sphere_i, sphere_j = np.nonzero(distance < reach)
         first, second = (side[pair] * self._spheres_per_grain for side in (one, other))
         keys: np.ndarray = np.sort((first + sphere_i) * spheres + second + sphere_j)
         return keys
@@ -161,12 +175,15 @@ class PairFinder:
         lengths = np.asarray(box.lengths)
         now = lengths.min(axis=1)  # shear makes the boxes of replicas differ
         smallest = now if smallest is None else np.minimum(smallest, now)
-        require_room(smallest, box.periodic, 2.0 + self.skin, self._diameter)
+        require_room(smallest, box.periodic, self._widest + self.skin, self._diameter)
         reference = (np.asarray(sphere_centres(grains, clump)) - np.asarray(box.lower)) / lengths
         if np.all(reference == reference[..., :1]):
             reference = reference[..., :1]
         spheres = reference.shape[0]
-        keys = [self._keys(reference[..., b] * smallest, smallest, box.periodic) for b in range(reference.shape[-1])]
+        own = clump.sphere_radii(spheres)
+        radii = None if own is None else np.asarray(own)
+        mapped = (reference[..., b] * smallest for b in range(reference.shape[-1]))
+        keys = [self._keys(one, radii, smallest, box.periodic) for one in mapped]
         found = np.stack(np.divmod(functools.reduce(np.union1d, keys), spheres))
         if found.shape[1] > self._capacity > 0:
             self._capacity = int(_SPARE * found.shape[1])
@@ -174,11 +191,12 @@ class PairFinder:
             found,
             reference,
             smallest,
-            2.0 + self.skin,
+            self._widest + self.skin,
             self._spheres_per_grain,
             capacity=self._capacity,
             per_sphere=self._per_sphere,
             periodic=box.periodic,
+            radii=own,
         )
         self._capacity, self._per_sphere = pairs.capacity, int(pairs.incidence.shape[-1])
         return pairs

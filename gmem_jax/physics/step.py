@@ -10,7 +10,7 @@ from jax import lax
 
 from gmem_jax.physics.boundary import WALLS, boundary_of
 from gmem_jax.physics.contact.friction import FrictionLaw
-from gmem_jax.physics.contact.kinematics import Kinematics, kinematics
+from gmem_jax.physics.contact.kinematics import Kinematics, Unequal, kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.contact.wall import wall_forces
 from gmem_jax.physics.grain import Clump
@@ -78,18 +78,25 @@ def sphere_table(clump: Clump, grains: Grains, cell: Box | None = None) -> tuple
     return rows.reshape(-1, *rows.shape[2:]), arms
 
 
-def relative_motion(pairs: Pairs, table: jax.Array, cell: Box | None = None) -> tuple[jax.Array, jax.Array, jax.Array]:
+def relative_motion(
+    system: System, table: jax.Array, cell: Box | None = None
+) -> tuple[jax.Array, jax.Array, jax.Array, Unequal | None]:
     """Separations and relative velocities of candidates, and the sums of their spins, [P, 3, B] each.
 
-    Of the second sphere of a pair it is the listed image in the periodic `cell` that counts.
+    Of the second sphere of a pair it is the listed image in the periodic `cell` that counts. Where spheres differ in
+    radius, what is to be known of that.
     """
+    pairs, radii = system.pairs, system.clump.sphere_radii(len(table))
     one, other = table[pairs.first], table[pairs.second]
     difference = other[:, :6] - one[:, :6]
     separation, velocity, spin_sum = difference[:, :3], difference[:, 3:], other[:, 6:] + one[:, 6:]
     if cell is not None:
         separation += image_shifts(pairs, cell.lengths)
         velocity += image_shifts(pairs, cell.growth)
-    return separation, velocity, spin_sum
+    if radii is None:
+        return separation, velocity, spin_sum, None
+    first, second = (radii[side][:, None, None] for side in (pairs.first, pairs.second))
+    return separation, velocity, spin_sum, Unequal(first, second, other[:, 6:] - one[:, 6:])
 
 
 def _strain_rate(cell: Box) -> jax.Array:
@@ -113,7 +120,13 @@ def _carried(before: Box, cell: Box, position: jax.Array, displacement: jax.Arra
 
 
 def contact_loads(
-    system: System, separation: jax.Array, velocity: jax.Array, spin_sum: jax.Array, history: Any, dt: jax.Array
+    system: System,
+    separation: jax.Array,
+    velocity: jax.Array,
+    spin_sum: jax.Array,
+    unequal: Unequal | None,
+    history: Any,
+    dt: jax.Array,
 ) -> tuple[Kinematics, jax.Array, jax.Array, Any]:
     """The law of a contact: of every candidate its kinematics, the repulsive normal force [P, 1, B], the tangential
     force on the first sphere [P, 3, B], and the new history.
@@ -123,13 +136,14 @@ def contact_loads(
         separation: see `relative_motion`.
         velocity: likewise.
         spin_sum: likewise.
+        unequal: likewise.
         history: the friction law's.
         dt: time step; 0 leaves the histories as they are.
     """
-    kin = kinematics(separation, velocity, spin_sum, system.pairs.valid, dt)
+    kin = kinematics(separation, velocity, spin_sum, system.pairs.valid, dt, unequal)
     material = system.material
     normal_force = hertz(
-        kin.safe_overlap, kin.closing, kin.touching, material.normal_stiffness, material.normal_damping
+        kin.safe_overlap, kin.closing, kin.touching, material.normal_stiffness, material.normal_damping, kin.radius
     )
     tangential, new_history = system.friction(kin, normal_force, history)
     return kin, normal_force, tangential, new_history
@@ -153,17 +167,21 @@ def contact_forces(
     """
     pairs = system.pairs
 
-    def law(separation: jax.Array, velocity: jax.Array, spin_sum: jax.Array, history: Any) -> tuple[Any, ...]:
-        kin, normal_force, tangential, new_history = contact_loads(system, separation, velocity, spin_sum, history, dt)
+    def law(
+        separation: jax.Array, velocity: jax.Array, spin_sum: jax.Array, unequal: Unequal | None, history: Any
+    ) -> tuple[Any, ...]:
+        motion = separation, velocity, spin_sum, unequal
+        kin, normal_force, tangential, new_history = contact_loads(system, *motion, history, dt)
         force = tangential - normal_force * kin.normal
-        # The surface force on j is opposite and so is its arm: the tangential torque is the same on both.
+        # The surface force on j is opposite and so is its arm: the tangential torque is the same on both equal spheres.
         torque = kin.arm * cross(kin.normal, tangential)
+        other = torque if kin.other_arm is None else kin.other_arm * cross(kin.normal, tangential)
         nothing = jnp.zeros((1, 6, force.shape[-1]), force.dtype)
-        stack = [jnp.concatenate([force, torque], axis=1), jnp.concatenate([-force, torque], axis=1), nothing]
+        stack = [jnp.concatenate([force, torque], axis=1), jnp.concatenate([-force, other], axis=1), nothing]
         through = None if pairs.image is None else -jnp.sum(pairs.image[..., None] * force, axis=0)
         return jnp.concatenate(stack, axis=0), new_history, through
 
-    motion = _fusion_barrier(alive, lambda table, cell: relative_motion(pairs, table, cell), table, cell)
+    motion = _fusion_barrier(alive, lambda table, cell: relative_motion(system, table, cell), table, cell)
     stack, history, through = _fusion_barrier(alive, law, *motion, history)
     return _fusion_barrier(alive, lambda rows: jnp.sum(rows[pairs.incidence], axis=1), stack), history, through
 
@@ -183,7 +201,8 @@ def _loads(
     with jax.named_scope("contacts"):
         contact, history, through = contact_forces(system, table, history, dt, alive, cell)
     with jax.named_scope("walls"):
-        lower, upper = wall_forces(table[:, :3], table[:, 3:6], box, material.wall_stiffness, material.normal_damping)
+        solid, radii = (material.wall_stiffness, material.normal_damping), system.clump.sphere_radii(len(table))
+        lower, upper = wall_forces(table[:, :3], table[:, 3:6], box, *solid, radii)
     return arms, contact, lower, upper, history, through
 
 
@@ -220,15 +239,15 @@ def section_force(clump: Clump, grains: Grains, force: jax.Array, through: jax.A
         cell: the periodic box.
     """
     place = grains.position - cell.lower
-    return through + jnp.sum(force * place + clump.mass * grains.velocity**2, axis=0) / cell.lengths
+    return through + jnp.sum(force * place + clump.masses * grains.velocity**2, axis=0) / cell.lengths
 
 
 def _angular_acceleration(clump: Clump, grains: Grains, torque: jax.Array, ahead: Scalar = 0.0) -> jax.Array:
     """d(spin)/dt at a time `ahead` of that of the spins: torque / I, with the gyroscopic term where moments differ."""
     if clump.isotropic:
-        return torque / clump.inertia[0]
+        return torque / clump.scaled(clump.inertia[0], 5)
     rotation = matrix(grains.quaternion)
-    inertia = clump.inertia.reshape(3, -1)
+    inertia = clump.scaled(clump.inertia.reshape(3, -1), 5)
     body_spin = jnp.sum(rotation * grains.spin[:, :, None], axis=1)
     body_torque = jnp.sum(rotation * torque[:, :, None], axis=1)
 
@@ -274,7 +293,7 @@ def step(
         state, slowing = replace(state, cell=_wide(box, state.replicas)), drag + _strain_rate(box)
     force, torque, history, walls = _forces(system, midway, state.history, box, dt, alive)
     # Of drag on the velocities at the end, which are found with it.
-    acceleration = (force / system.clump.mass - slowing * velocity) / (1.0 + 0.5 * dt * slowing)
+    acceleration = (force / system.clump.masses - slowing * velocity) / (1.0 + 0.5 * dt * slowing)
     turning = _angular_acceleration(system.clump, midway, torque, 0.5 * dt)
     spin_rate = (turning - drag * spin) / (1.0 + 0.5 * dt * drag)
     grains = replace(
@@ -368,7 +387,7 @@ def accelerate(system: System, state: State, box: Box) -> State:
     slowing = 0.0 if state.cell is None else _strain_rate(box) * state.grains.velocity
     grains = replace(
         state.grains,
-        acceleration=force / system.clump.mass - slowing,
+        acceleration=force / system.clump.masses - slowing,
         spin_rate=_angular_acceleration(system.clump, state.grains, torque),
     )
     return replace(state, grains=grains)

@@ -20,7 +20,7 @@ from gmem_jax.files.packs import check_pack
 from gmem_jax.files.validation import require
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.hooke import Hooke
-from gmem_jax.physics.grain import Clump, clump, sphere, tetra
+from gmem_jax.physics.grain import Clump, clump, sized, sphere, tetra
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import interval
 from gmem_jax.physics.rules import usual_rules
@@ -37,8 +37,10 @@ _ORDERS = 6  # spheres of a grain up to which they may be listed in another orde
 DT = 0.3  # t_c, of the run that measures the ringing period
 
 
-def clump_of_centres(centres: np.ndarray) -> Clump:
-    """The grain whose spheres lie so, [K, 3]; a sphere or tetra grain where it is one."""
+def clump_of_centres(centres: np.ndarray, radii: np.ndarray) -> Clump:
+    """The grain whose spheres lie so, [K, 3], and have these radii, [K]; a sphere or tetra grain where it is one."""
+    if np.any(radii != 1.0):
+        return clump(centres, shape=f"clump-{len(centres)}", radii=radii)
     if len(centres) == 1:
         return sphere()
     edges = np.linalg.norm(centres[:, None] - centres, axis=-1)[np.triu_indices(len(centres), 1)]
@@ -49,12 +51,28 @@ def clump_of_centres(centres: np.ndarray) -> Clump:
     return clump(centres, shape=f"clump-{len(centres)}")
 
 
-def lay(centres: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sizes_of(radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes of grains [N] by the radii of their spheres [N, K], and the radii of one of size 1, [K].
+
+    Grains of equal spheres are of size 1 where these are of radius 1; others are measured by the first grain.
+    """
+    totals = radii.mean(axis=1)
+    equal = np.all(np.ptp(radii, axis=1) <= SAME * totals)
+    sizes = totals if equal else totals / totals[0]
+    sizes = np.where(np.abs(sizes - 1.0) <= SAME, 1.0, sizes)
+    return sizes, np.ones(radii.shape[1]) if equal else radii[0]
+
+
+def lay(
+    centres: np.ndarray, offsets: np.ndarray, radii: np.ndarray | None = None, own: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Where grains of spheres at `offsets` [K, 3] lie, and how they are turned, if their spheres are at `centres`.
 
     Args:
         centres: [N, K, 3]; in any order within a grain of up to 6 spheres.
         offsets: in the grain's frame.
+        radii: of the spheres at `centres`, [N, K], if they differ.
+        own: of those at `offsets`, [K].
 
     Returns:
         Grain centres [N, 3] and body-to-lab quaternions (w, x, y, z) [N, 4], of a rotation that the shape allows.
@@ -76,12 +94,15 @@ def lay(centres: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarra
         first[:, :, 2] *= np.sign(np.linalg.det(first @ second))[:, None]
         found = first @ second
         far = np.linalg.norm(seen - np.einsum("nij,kj->nki", found, body), axis=2).max(axis=1)
+        if radii is not None and own is not None:
+            far = np.maximum(far, np.abs(radii[left] - own[list(order)]).max(axis=1))
         better = far < misfit[left]
         turned[left[better]], misfit[left[better]] = found[better], far[better]
     worst = int(np.argmax(misfit))
     require(
         misfit <= MISFIT,
-        f"grain {worst + 1} has another shape than the first: a sphere is {misfit[worst]:.2g} R from its place",
+        f"grain {worst + 1} has another shape than the first: a sphere is {misfit[worst]:.2g} R from its place"
+        f"{'' if radii is None else ', or has another radius'}",
     )
     quaternion = Rotation.from_matrix(turned).as_quat()[:, [3, 0, 1, 2]]
     return middle - turned @ offsets.mean(axis=0), quaternion
@@ -101,7 +122,7 @@ def import_pack(
 
     Args:
         path: the file.
-        radius: of its spheres in its own unit of length, which becomes R.
+        radius: R in its unit of length: of equal spheres their radius.
         delta0: compression that the pack is meant for.
         name: of the pack; default the file's.
         friction: law under which the ringing period is measured; default `Hooke()`.
@@ -109,7 +130,7 @@ def import_pack(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it cannot be read, or is no pack at rest of equal grains of equal spheres in a box.
+        FileFormatError: if it cannot be read, or is no pack at rest of grains of one shape in a box.
         ValueError: for an impossible radius or delta0, or if the pressure on the walls does not ring.
         RunFailedError: if the grains cannot be simulated.
 
@@ -130,13 +151,18 @@ def _pack_of(
 ) -> Pack:
     require((read.centres > read.lower) & (read.centres < read.upper), "a grain lies outside the box")
     _require_pressed(read)
-    pairs_within(read.centres.reshape(-1, 3), 2.0 + SKIN, read.centres.shape[1])  # refuses a heap
-    grain = clump_of_centres(read.centres[0])
-    position, quaternion = lay(read.centres, np.asarray(grain.offsets))
+    reach, flat = 2.0 * float(read.radii.max()) + SKIN, read.radii.ravel()
+    pairs_within(read.centres.reshape(-1, 3), reach, read.centres.shape[1], radii=flat)  # refuses a heap
+    sizes, own = sizes_of(read.radii)
+    middle, scale = read.centres.mean(axis=1), sizes[:, None]
+    alike = middle[:, None] + (read.centres - middle[:, None]) / scale[:, None]
+    grain = clump_of_centres(alike[0], own)
+    position, quaternion = lay(alike, np.asarray(grain.offsets), read.radii / scale, own)
+    position, grain = middle + scale * (position - middle), sized(grain, sizes)
     box = still_box(jnp.asarray(read.lower)[:, None], jnp.asarray(read.upper)[:, None])
     notes = list(read.notes)
-    own = float(grain.mass) / (grain.spheres * 4.0 * np.pi / 3.0)  # spread over its spheres, which overlap, as exported
-    if read.density is not None and not np.isclose(read.density, (1.0, own), rtol=SAME).any():
+    spread = float(grain.mass) / (np.sum(own**3) * 4.0 * np.pi / 3.0)  # over its spheres, which overlap, as exported
+    if read.density is not None and not np.isclose(read.density, (1.0, spread), rtol=SAME).any():
         notes.append(f"the density {read.density:g} of its spheres is left out: that of grains is the unit rho")
     for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=3)
@@ -162,5 +188,6 @@ def _pack_of(
 
 def _require_pressed(read: Spheres) -> None:
     """Walls along x and y that nobody touches ring with nothing."""
-    lower, upper = (read.centres - read.lower < 1.0), (read.upper - read.centres < 1.0)
+    radii = read.radii[..., None]
+    lower, upper = (read.centres - read.lower < radii), (read.upper - read.centres < radii)
     require((lower | upper)[..., :2].any(), "its grains do not press on the walls: this is no pack at rest")

@@ -74,7 +74,8 @@ def press(
     The wall moves steadily during a block, at a speed set by p_z averaged over the one before. The list is left early
     enough that it is complete throughout: the next block is allowed for at the speed of the fastest sphere.
     """
-    reach = jnp.sqrt(jnp.max(jnp.sum(system.clump.offsets**2, axis=1)))
+    clump = system.clump
+    reach = clump.largest * jnp.sqrt(jnp.max(jnp.sum(clump.offsets**2, axis=1)))
     times = dt * jnp.arange(1.0, STEPS_PER_CHECK + 1.0)
 
     def block(now: Pressed) -> Pressed:
@@ -88,7 +89,8 @@ def press(
         fastest = largest_speed(state)
         spin = jnp.sqrt(jnp.max(jnp.sum(state.grains.spin**2, axis=1)))
         ahead = 2.0 * STEPS_PER_CHECK * dt * (1.2 * (fastest + reach * spin) + servo.speed)
-        room = jnp.min(slack(system.pairs, sphere_centres(state.grains, system.clump), box))
+        spheres = sphere_centres(state.grains, clump)
+        room = jnp.min(slack(system.pairs, spheres, box, clump.sphere_radii(len(spheres))))
         pressure = total[2] / STEPS_PER_CHECK
         met = jnp.max(jnp.abs(pressure / servo.target - 1.0)) < servo.error
         return Pressed(

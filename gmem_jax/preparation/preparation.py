@@ -33,6 +33,7 @@ from gmem_jax.preparation.recipe import (
     Recipe,
     bins_outside,
     cycles_of,
+    graded,
     last_rest,
     pressure_over_wanted,
     sites_of,
@@ -129,7 +130,7 @@ class _Preparation:
         state = start(system, at, grains.quaternion, self.box)
         state = accelerate(system, replace(state, grains=grains), self.box)
         expected = bins_outside(recipe, clump) * work_of_bin(1) + work_of(cycles_of(recipe), 1)
-        self.march = native.marcher(native.name(backend, system.friction, self.periodic))
+        self.march = native.marcher(native.name(backend, system.friction, self.periodic, clump.equal))
         simulation = Simulation(system, self._path(), self.dt, recipe.drag, steps=steps, backend=backend)
         self.runner = Runner(
             simulation, state, finder=finder, progress=progress, total_work=expected, observers=(self.frames,)
@@ -205,7 +206,8 @@ class _Preparation:
                 f"{float(largest_speed(pressed.state)):.1e} R/t_c after {recipe.patience:g} t_c; allow more patience"
             )
         self.box = still_box(self.box.lower, self.box.upper, self.periodic)
-        lengths, diameter = np.asarray(self.box.lengths)[:, 0], float(self.runner.simulation.system.clump.diameter)
+        clump = self.runner.simulation.system.clump
+        lengths, diameter = np.asarray(self.box.lengths)[:, 0], float(clump.diameter * clump.largest)
         if lengths.min() < diameter:
             raise RunFailedError(
                 f"settle: the pack is {' x '.join(f'{edge:.1f}' for edge in lengths)} R, flatter than a grain "
@@ -272,7 +274,7 @@ def prepare(
 
     Args:
         recipe: the numbers; default `Recipe()`.
-        grain: the grain; default `tetra(0.6)`.
+        grain: the grain; default `tetra(0.6)`. It may have sizes, one for each grain of the pack (`sized`).
         material: the elastic solid.
         friction: law under which the ringing period of the finished pack is measured; default `Hooke()`.
         name: of the pack; default from grain, size and seed.
@@ -295,8 +297,9 @@ def prepare(
     require_x64()
     require_kind("prepare", recipe or Recipe(), Recipe)
     recipe = replace(recipe or Recipe(), **changes)
-    clump, material = grain or tetra(), material or Material()
+    clump, material = graded(recipe, grain or tetra()), material or Material()
     require_walls(periodic_axes(recipe.boundary), material)
+    native.require_precision("double", backend, Frictionless(), periodic_axes(recipe.boundary), clump.equal)
     preparation = _Preparation(recipe, clump, material, backend, frames, cache, tell)
     preparation.compact()
     preparation.cycle()
@@ -304,8 +307,7 @@ def prepare(
         log.update(preparation.log)
     if film is not None and frames:
         centre = np.asarray(0.5 * (preparation.box.lower + preparation.box.upper))[:, 0]  # the origin of the pack
-        offsets = np.asarray(clump.offsets)
-        film.append(concatenate(preparation.frames.recorded, offsets, centre=centre, periodic=preparation.periodic))
+        film.append(concatenate(preparation.frames.recorded, clump, centre=centre, periodic=preparation.periodic))
     pack = _finish(preparation, material, friction or Hooke(), name)
     _warn_of_another_pressure(pack)
     return pack
@@ -348,7 +350,7 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
         "simulated_time": runner.time,
         "at_rest": asdict(last),
         **provenance(),
-        "backend": native.name(runner.simulation.backend, Frictionless(), box.periodic),
+        "backend": native.name(runner.simulation.backend, Frictionless(), box.periodic, clump.equal),
     }
     return Pack(
         clump=clump,

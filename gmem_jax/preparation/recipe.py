@@ -11,9 +11,10 @@ import numpy as np
 from gmem_jax.experiment.stages import cycle
 from gmem_jax.files.validation import is_number
 from gmem_jax.physics.boundary import boundary_of, periodic_axes, require_room
-from gmem_jax.physics.grain import Clump
-from gmem_jax.physics.numbers import is_real
+from gmem_jax.physics.grain import Clump, sized
+from gmem_jax.physics.numbers import is_real, said
 from gmem_jax.physics.pytree import interval
+from gmem_jax.preparation.grading import LARGEST_SPREAD, lognormal, mixture
 from gmem_jax.simulation.protocol import BINS, Stage
 from gmem_jax.simulation.strain import COMPRESSIONS
 
@@ -61,6 +62,9 @@ class Recipe:
         quiet: largest grain speed of the finished pack, in R / t_c.
         pressure_error: relative error of p_z at which the piston is fixed.
         patience: longest time spent on coming to rest, in t_c; four times what 100,450 grains should need (`SETTLING`).
+        size_spread: standard deviation of the sizes of grains over their mean, which is 1; see `grading.lognormal`.
+        sizes: of the grains of a mixture, as in "1,1.4" or (1.0, 1.4), instead of a spread; see `grading.mixture`.
+        shares: part of the grains that has each of these sizes, as in "0.5,0.5"; default equal parts.
         boundary: "walls", "periodic", or one for each axis, as in "periodic,periodic,walls". A periodic box is
             compressed as one between walls is, and its grains are carried along.
     """
@@ -86,12 +90,19 @@ class Recipe:
     quiet: float = _number(1.0e-6, "(0, inf)", "Largest grain speed of the finished pack", "R/t_c")
     pressure_error: float = _number(0.01, "(0, inf)", "Relative error of p_z at which the piston is fixed")
     patience: float = _number(2.0e5, "(0, inf)", "Longest time spent on coming to rest", "t_c")
+    size_spread: float = _number(
+        0.0, f"[0, {LARGEST_SPREAD:g}]", "SD of the sizes of grains over their mean, lognormal, cut at 3 SD"
+    )
+    sizes: str = field(default="", metadata={"help": "Sizes of the grains of a mixture, like 1,1.4"})
+    shares: str = field(default="", metadata={"help": "Their shares of all grains, like 0.5,0.5; default equal ones"})
     boundary: str = field(
         default="walls", metadata={"help": "walls, periodic, or one for each axis: periodic,periodic,walls"}
     )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "boundary", boundary_of(periodic_axes(self.boundary)))
+        for name in ("sizes", "shares"):
+            object.__setattr__(self, name, ",".join(f"{value:.12g}" for value in _listed(name, getattr(self, name))))
         for entry in fields(self):
             if "interval" not in entry.metadata:
                 continue
@@ -106,6 +117,46 @@ class Recipe:
             if not within.holds(value):
                 raise ValueError(f"{entry.name} must be in {within.words}{unit and ' ' + unit}, got {given}")
             object.__setattr__(self, entry.name, value)
+        if self.sizes and self.size_spread:
+            raise ValueError("sizes and size_spread exclude each other: grains are a mixture, or are spread")
+        if self.shares and not self.sizes:
+            raise ValueError("shares are those of sizes: name the sizes, too")
+        self.drawn_sizes()
+
+    def drawn_sizes(self) -> np.ndarray | None:
+        """Sizes of the grains, [N]; None where all are alike.
+
+        Raises:
+            ValueError: if the recipe asks for impossible ones.
+        """
+        if self.sizes:
+            shares = _listed("shares", self.shares)
+            return mixture(self.grains, _listed("sizes", self.sizes), shares or None, seed=self.seed)
+        return lognormal(self.grains, self.size_spread, seed=self.seed) if self.size_spread else None
+
+
+def _listed(name: str, given: Any) -> list[float]:
+    """Numbers of a text like "1,1.4", or of a sequence."""
+    words = given.split(",") if isinstance(given, str) and given.strip() else given
+    try:
+        return [float(word) for word in words or ()]
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} must be numbers with commas between them, like 1,1.4; got {said(given)}") from None
+
+
+def graded(recipe: Recipe, clump: Clump) -> Clump:
+    """The grain with the sizes that a recipe asks for, or that it has itself.
+
+    Raises:
+        ValueError: if both say so, or it has not one for each grain, or they cannot be listed together.
+    """
+    drawn = recipe.drawn_sizes()
+    if clump.sizes is not None and (drawn is not None or len(clump.sizes) != recipe.grains):
+        raise ValueError(
+            f"the grain has {len(clump.sizes)} sizes of its own: then there must be as many grains, and the recipe "
+            f"names no sizes; it has {recipe.grains} grains"
+        )
+    return clump if drawn is None else sized(clump, drawn)
 
 
 def _plain(kind: Any, given: Any) -> float | int:
@@ -150,8 +201,9 @@ def sites_of(recipe: Recipe, clump: Clump) -> tuple[tuple[int, int, int], np.nda
     Raises:
         ValueError: if the pressed pack would be flatter than its grains, or too small for a periodic one.
     """
-    mass, diameter = float(clump.mass), float(clump.diameter)
-    count, least = recipe.grains, LATTICE_SPACING * diameter
+    count, diameter = recipe.grains, float(clump.diameter * clump.largest)
+    mass = float(clump.mass) if clump.sizes is None else float(clump.volume(count)) / count
+    least = LATTICE_SPACING * diameter
     spacing = (mass / recipe.filling) ** (1.0 / 3.0)
     cube = (count * mass / DENSE) ** (1.0 / 3.0)
     if spacing >= least:
@@ -166,7 +218,7 @@ def sites_of(recipe: Recipe, clump: Clump) -> tuple[tuple[int, int, int], np.nda
             f"a grain ({diameter:.1f} R): take more grains{', or a thicker gas' if spacing >= least else ''}"
         )
     pressed = np.array([width, sites[1] * apart[1], height])
-    require_room(pressed, periodic_axes(recipe.boundary), 2.0 + FREE_SKIN, diameter)
+    require_room(pressed, periodic_axes(recipe.boundary), float(clump.widest) + FREE_SKIN, diameter)
     return sites, apart
 
 
@@ -188,7 +240,7 @@ def bins_outside(recipe: Recipe, clump: Clump) -> float:
     """Bins that a preparation will take about before and after its cycles."""
     sites, apart = sites_of(recipe, clump)
     width, height = sites[0] * float(apart[0]), sites[2] * float(apart[2])
-    dense = recipe.grains * float(clump.mass) / (DENSE * width**2)
+    dense = float(clump.volume(recipe.grains)) / (DENSE * width**2)
     fall = max(0.0, height - dense) / min(recipe.piston_speed, recipe.piston_gain)
     return last_rest(recipe).bins + BINS * (recipe.gas_time + fall + SETTLING * dense) / max(recipe.t0, SLOWEST_BINS)
 

@@ -106,6 +106,7 @@ def conditions_of(configuration: dict[str, Any]) -> Conditions:
     entry = next(entry for entry in LAWS if entry.name == configuration["friction"])
     variant = law.get("variant", "averaged")
     shape, _, overlap = configuration["grain"]["shape"].partition("(")
+    shape += "".join(f", {words}" for words in (configuration["grain"].get("sizes"),) if words)
     signals = configuration["experiment"]["signals"]
     return Conditions(
         law=entry.paper + ("" if variant == "averaged" else f", {variant}"),

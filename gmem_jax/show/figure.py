@@ -71,17 +71,19 @@ class Image:
 
 @dataclass(frozen=True)
 class Discs:
-    """Discs of radius 1, the later before the earlier; in pictures only.
+    """Discs, the later before the earlier; in pictures only.
 
     Attributes:
         places: of the centres, [n, 2].
         values: what they are coloured by, [n].
         label: of the colours.
+        radii: of the discs, [n].
     """
 
     places: np.ndarray
     values: np.ndarray
     label: str
+    radii: np.ndarray
 
 
 @dataclass(frozen=True)

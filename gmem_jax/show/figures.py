@@ -43,10 +43,12 @@ def grains_figure(pack: Pack) -> Figure:
     still = jnp.zeros((*pack.position.shape, 1))
     grains = Grains(pack.position[..., None], pack.quaternion[..., None], still, still, still, still)
     centres = np.asarray(sphere_centres(grains, pack.clump))[..., 0]
-    centres = centres[np.argsort(centres[:, 2])]
+    own, order = pack.clump.sphere_radii(len(centres)), np.argsort(centres[:, 2])
+    radii = np.ones(len(centres)) if own is None else np.asarray(own)
+    centres = centres[order]
     (left, right), (front, back) = zip(*(np.asarray(each)[:2] for each in (pack.lower, pack.upper)), strict=True)
     limits = {"x_limits": (left, right), "y_limits": (front, back), "equal": True}
-    discs = Discs(centres[:, :2], centres[:, 2], "z ($R$)")
+    discs = Discs(centres[:, :2], centres[:, 2], "z ($R$)", radii[order])
     title = f"{pack.name}: {pack.grains} {pack.clump.shape}"
     return Figure((Panel((discs,), title, "x ($R$)", "y ($R$)", **limits),), size=(6.4, 5.4))  # type: ignore[arg-type]
 

@@ -26,34 +26,37 @@ def colours(grains: int) -> np.ndarray:
     return 0.72 + 0.24 * np.cos(2.0 * np.pi * (hue[:, None] + np.array([0.0, 1.0, 2.0]) / 3.0))
 
 
-def rendered(centres: np.ndarray, colour: np.ndarray, pixels: int = 700) -> np.ndarray:
-    """An image of unit spheres.
+def rendered(centres: np.ndarray, colour: np.ndarray, pixels: int = 700, radii: np.ndarray | None = None) -> np.ndarray:
+    """An image of spheres.
 
     Args:
         centres: of the spheres, [S, 3].
         colour: of each, [S, 3], from 0 to 1.
         pixels: the longer side.
+        radii: of the spheres, [S]; default 1.
 
     Returns:
         Red, green, blue and opacity, [height, width, 4], the first row on top.
     """
     seen = centres @ camera(*VIEW).T
-    low, high = seen[:, :2].min(axis=0) - 1.05, seen[:, :2].max(axis=0) + 1.05
+    own = np.ones(len(seen)) if radii is None else radii
+    widest = float(own.max())
+    low, high = seen[:, :2].min(axis=0) - 1.05 * widest, seen[:, :2].max(axis=0) + 1.05 * widest
     scale = pixels / float(np.max(high - low))
     width, height = np.ceil(scale * (high - low)).astype(int)
     depth, image = np.full((height, width), -np.inf), np.zeros((height, width, 4))
-    radius = int(np.ceil(scale)) + 1
+    radius = int(np.ceil(scale * widest)) + 1
     step = np.arange(-radius, radius + 1)
-    for centre, tint in zip(seen, colour, strict=True):
+    for centre, tint, size in zip(seen, colour, own, strict=True):
         place = scale * (centre[:2] - low)
         columns, rows = (np.round(one).astype(int) + step for one in place)
         columns, rows = columns[(columns >= 0) & (columns < width)], rows[(rows >= 0) & (rows < height)]
-        x, y = np.meshgrid((columns + 0.5 - place[0]) / scale, (rows + 0.5 - place[1]) / scale)
+        x, y = (one / size for one in np.meshgrid((columns + 0.5 - place[0]) / scale, (rows + 0.5 - place[1]) / scale))
         outwards = np.sqrt(np.maximum(1.0 - x * x - y * y, 0.0))
         window = np.ix_(rows, columns)
-        nearer = (outwards > 0.0) & (centre[2] + outwards > depth[window])
+        nearer = (outwards > 0.0) & (centre[2] + size * outwards > depth[window])
         light = 0.35 + 0.65 * np.maximum(LIGHT[0] * x + LIGHT[1] * y + LIGHT[2] * outwards, 0.0)
-        depth[window] = np.where(nearer, centre[2] + outwards, depth[window])
+        depth[window] = np.where(nearer, centre[2] + size * outwards, depth[window])
         shaded = np.concatenate([np.minimum(light[..., None] * tint, 1.0), np.ones((*light.shape, 1))], axis=-1)
         image[window] = np.where(nearer[..., None], shaded, image[window])
     return image[::-1]
@@ -63,7 +66,8 @@ def pack_image(pack: Pack, pixels: int = 700) -> np.ndarray:
     """An image of a pack; see `rendered`."""
     centres = pack.position[:, None] + sphere_offsets(pack.quaternion[..., None], pack.clump)[..., 0]
     tints = np.repeat(colours(pack.grains), pack.clump.spheres, axis=0)
-    return rendered(np.asarray(centres).reshape(-1, 3), tints, pixels)
+    own = pack.clump.sphere_radii(len(tints))
+    return rendered(np.asarray(centres).reshape(-1, 3), tints, pixels, None if own is None else np.asarray(own))
 
 
 def packs_figure(path: Path, packs: Sequence[Pack], title: str, columns: int = 4) -> None:
@@ -78,7 +82,7 @@ def packs_figure(path: Path, packs: Sequence[Pack], title: str, columns: int = 4
         axis.axis("off")
     for axis, pack in zip(axes.flat, packs, strict=False):
         axis.imshow(pack_image(pack), interpolation="bilinear")
-        filling = pack.grains * float(pack.clump.mass) / float(np.prod(np.asarray(pack.upper - pack.lower)))
+        filling = float(pack.clump.volume(pack.grains)) / float(np.prod(np.asarray(pack.upper - pack.lower)))
         axis.set_title(f"{pack.grains:,} {pack.clump.shape}, $\\phi$ = {filling:.3f}", fontsize=9)
     figure.suptitle(title, fontsize=10)
     save_picture(path, figure)

@@ -198,7 +198,7 @@ def _image(axis: Any, image: Image, *, square: bool) -> None:
 def _discs(axis: Any, discs: Discs) -> None:
     from matplotlib.collections import EllipseCollection
 
-    width = np.full(len(discs.values), 2.0)
+    width = 2.0 * discs.radii
     place = {"units": "xy", "offsets": discs.places, "transOffset": axis.transData, "array": discs.values}
     drawn = EllipseCollection(width, width, 0.0 * width, **place)
     drawn.set(cmap="viridis", edgecolor="0.2", linewidth=0.2)

@@ -105,12 +105,13 @@ def quantities(frames: Frames, network: Links, newton: float) -> list[Colouring]
         Colouring("displacement", "R", np.linalg.norm(frames.position - frames.position[:1], axis=2)),
         Colouring("non-affine displacement", "R", np.linalg.norm(frames.position - carried, axis=2)),
     ]
+    sizes = [] if frames.sizes is None else [Colouring("size", "", np.tile(frames.sizes, (frames.count, 1)))]
     found = [
         Colouring("coordination", "", _of_grains(frames, network.start, network.grains, np.ones(len(network.force)))),
         Colouring("normal force, sum over contacts", "mN", MILLI * newton * pushed),
         Colouring("friction force, sum over contacts", "mN", MILLI * newton * rubbed),
     ]
-    return (moved if frames.count > 1 else []) + [one for one in found if one.values.any()]
+    return (moved if frames.count > 1 else []) + [one for one in found if one.values.any()] + sizes
 
 
 def packed(frames: Frames, captions: list[str], material: Material = Material()) -> str:
@@ -127,6 +128,7 @@ def packed(frames: Frames, captions: list[str], material: Material = Material())
     network = links(frames)
     coloured = quantities(frames, network, newton)
     force = Colouring("force between grains", "mN", MILLI * newton * network.force)
+    radii = np.ones(len(frames.offsets)) if frames.radii is None else frames.radii
     arrays: dict[str, np.ndarray] = {
         "position": frames.position,
         "quaternion": frames.quaternion,
@@ -135,6 +137,7 @@ def packed(frames: Frames, captions: list[str], material: Material = Material())
         "start": network.start.astype(np.uint32),
         "ends": network.grains.astype(np.uint16 if frames.position.shape[1] <= _LEVELS else np.uint32),
         "force": force.values,
+        "sizes": np.ones(frames.position.shape[1]) if frames.sizes is None else frames.sizes,
         **{f"quantity-{number}": one.values for number, one in enumerate(coloured)},
     }
     told, parts = [], []
@@ -145,7 +148,7 @@ def packed(frames: Frames, captions: list[str], material: Material = Material())
     scene = {
         "captions": captions,
         "grains": frames.position.shape[1],
-        "offsets": frames.offsets.tolist(),
+        "spheres": np.column_stack([frames.offsets, radii]).tolist(),
         "quantities": [{"name": f"quantity-{number}", **_told(one)} for number, one in enumerate(coloured)],
         "force": _told(force),
         "arrays": told,

@@ -21,6 +21,7 @@ from gmem_jax.files.measures import of_each, read_stress, relative_scale
 from gmem_jax.files.printing import printable
 from gmem_jax.files.waveforms import signals_from_dict
 from gmem_jax.physics.boundary import boundary_of
+from gmem_jax.physics.grain import words_of_sizes
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import Status, combined_status, explain
@@ -425,6 +426,8 @@ def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:
     if any(written.get(name) != getattr(Experiment, name) for name in ("shear", "store", "hold", "protocol")):
         return []
     same = {key: configuration[key] for key in ("mu", "delta0", "gamma0")}
+    if "sizes" in configuration["grain"]:
+        return []
     shape = configuration["grain"]["shape"]
     kind, overlap = ("sphere", 1.0) if shape == "sphere" else _tetra(shape)
     return published(n_grains=float(configuration["grains"]), shape=kind, overlap=overlap, **same)
@@ -470,6 +473,7 @@ def pack_table(pack: Pack) -> Table:
     recipe = pack.info.get("recipe", {})
     rows = [
         Fact("grains", f"{pack.grains} {pack.clump.shape}"),
+        *([] if pack.clump.equal else [Fact("unequal", words_of_sizes(pack.clump))]),
         Fact("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)), "R"),
         *([Fact("boundary", boundary_of(pack.periodic))] if any(pack.periodic) else []),
         Fact("meant for delta0" if "imported" in pack.info else "cycled with delta0", f"{float(pack.delta0):g}"),

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
+from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.numbers import require_numbers
 from gmem_jax.physics.pytree import pytree, short_repr, static
 from gmem_jax.physics.state import State
@@ -61,10 +62,12 @@ class Frames:
         normal_force: by which they repel each other, [M], in E R^2.
         friction_force: tangential force on sphere i, the opposite of that on j, [M, 3]. Half of the next step's
             increment is in it, as in the history that a law keeps.
-        offsets: sphere centres of a grain in its own frame, [K, 3], in R.
+        offsets: sphere centres of a grain of size 1 in its own frame, [K, 3], in R.
         stages: the stage that each frame ends or is in, [F].
         signal: whose replica it is: from 1, or 0 for no signal.
         periodic: the periodic axes of the box; grains may have left it through these faces.
+        radii: of the spheres of a grain of size 1, [K], in R; None where all are 1.
+        sizes: of the grains, factors on their lengths, [N]; None where all are 1.
     """
 
     time: np.ndarray
@@ -81,6 +84,8 @@ class Frames:
     stages: tuple[str, ...] = static(())
     signal: int = static(0)
     periodic: PeriodicAxes = static(WALLS)
+    radii: np.ndarray | None = None
+    sizes: np.ndarray | None = None
 
     __repr__ = short_repr
 
@@ -89,9 +94,14 @@ class Frames:
         """Number of configurations F."""
         return len(self.stages)
 
+    @property
+    def sphere_radii(self) -> np.ndarray:
+        """Radii of all spheres, [N K], in R."""
+        return radii_of_spheres(self.position.shape[1], len(self.offsets), self.radii, self.sizes)
+
     def centres(self, frame: int) -> np.ndarray:
         """Sphere centres of a frame, [N K, 3], in R."""
-        return sphere_places(self.position[frame], self.quaternion[frame], self.offsets)
+        return sphere_places(self.position[frame], self.quaternion[frame], self.offsets, self.sizes)
 
 
 def images_met(frames: Frames, number: int) -> np.ndarray:
@@ -102,13 +112,26 @@ def images_met(frames: Frames, number: int) -> np.ndarray:
     return np.where(frames.periodic, nearest, 0.0)
 
 
-def sphere_places(position: np.ndarray, quaternion: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+def radii_of_spheres(
+    grains: int, per_grain: int, radii: np.ndarray | None = None, sizes: np.ndarray | None = None
+) -> np.ndarray:
+    """Radii of the spheres of N grains, [N K], in R; `radii` and `sizes` are those of a `Clump`."""
+    of_one, of_grains = (
+        np.ones(count) if own is None else np.asarray(own) for count, own in ((per_grain, radii), (grains, sizes))
+    )
+    return np.outer(of_grains, of_one).ravel()
+
+
+def sphere_places(
+    position: np.ndarray, quaternion: np.ndarray, offsets: np.ndarray, sizes: np.ndarray | None = None
+) -> np.ndarray:
     """Sphere centres [N K, 3] of grains [N, 3], [N, 4]; `pairs.sphere_centres` without JAX, which compiles for each N.
 
     Args:
         position: grain centres, in R.
         quaternion: body-to-lab rotations (w, x, y, z).
         offsets: of the spheres in the grain's frame, [K, 3], in R.
+        sizes: of the grains, [N]; None where all are 1.
     """
     w, x, y, z = np.asarray(quaternion).T
     rows = (
@@ -117,6 +140,8 @@ def sphere_places(position: np.ndarray, quaternion: np.ndarray, offsets: np.ndar
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     turned = np.einsum("ijn,kj->nki", np.array(rows), offsets)
+    if sizes is not None:
+        turned = turned * np.asarray(sizes)[:, None, None]
     return np.asarray((np.asarray(position)[:, None] + turned).reshape(-1, 3))
 
 
@@ -273,7 +298,7 @@ def _contacts(system: System, state: State) -> tuple[jax.Array, jax.Array, jax.A
     """Of every candidate: whether it touches, its normal force and its friction, [P, 1, B] and [P, 3, B]."""
     table, _ = sphere_table(system.clump, state.grains, state.cell)
     still = jnp.zeros(())  # in no time a history stays as it is
-    motion = relative_motion(system.pairs, table, state.cell)
+    motion = relative_motion(system, table, state.cell)
     kin, normal, friction, _ = contact_loads(system, *motion, state.history, still)
     return kin.touching, normal, friction
 
@@ -308,7 +333,7 @@ def configuration(system: System, state: State, lower: np.ndarray, upper: np.nda
 
 def concatenate(
     recorded: Recorded,
-    offsets: np.ndarray,
+    clump: Clump,
     signal: int = 0,
     centre: np.ndarray | float = 0.0,
     periodic: PeriodicAxes = WALLS,
@@ -317,7 +342,7 @@ def concatenate(
 
     Args:
         recorded: by stage, at least one.
-        offsets: of a grain's spheres, [K, 3].
+        clump: the grain.
         signal: whose replica it is.
         centre: what becomes the origin, [3].
         periodic: the periodic axes of the box.
@@ -336,8 +361,10 @@ def concatenate(
         **moved,
         **contacts,
         start=np.cumsum([0, *(len(frame.spheres) for frame in every)]),
-        offsets=np.asarray(offsets),
+        offsets=np.asarray(clump.offsets),
         stages=tuple(name for name, frames in recorded.items() for _ in frames),
         signal=signal,
         periodic=periodic,
+        radii=None if clump.radii is None else np.asarray(clump.radii),
+        sizes=None if clump.sizes is None else np.asarray(clump.sizes),
     )

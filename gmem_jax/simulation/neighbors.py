@@ -27,4 +27,5 @@ def pair_finder(clump: Clump, extent: np.ndarray, skin: float, **sizes: Any) -> 
 @Compiled
 def skin_left(system: System, state: State, box: Box) -> jax.Array:
     """What the list still allows for, [B], in R: its skin at first; see `pairs.slack`."""
-    return slack(system.pairs, sphere_centres(state.grains, system.clump), box)
+    spheres = sphere_centres(state.grains, system.clump)
+    return slack(system.pairs, spheres, box, system.clump.sphere_radii(len(spheres)))

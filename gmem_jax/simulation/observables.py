@@ -250,7 +250,8 @@ def normal_power() -> Observable:
 def _normal_power(simulation: Simulation, state: State) -> jax.Array:
     seen, box = _contacts(simulation, state), _known(simulation.box)
     kin, velocity = seen.kin, seen.table[:, 3:6]
-    elastic = hertz(kin.safe_overlap, kin.closing, kin.touching, simulation.system.material.normal_stiffness, 0.0)
+    stiffness = simulation.system.material.normal_stiffness
+    elastic = hertz(kin.safe_overlap, kin.closing, kin.touching, stiffness, 0.0, kin.radius)
     between = jnp.sum((seen.normal_force - elastic) * kin.closing, axis=(0, 1))
     lower, upper = (
         force - spring for force, spring in zip(seen.walls(simulation), seen.walls(simulation, 0.0), strict=True)
@@ -347,7 +348,8 @@ class _Seen(NamedTuple):
         material = simulation.system.material
         damping = material.normal_damping if damping_time is None else damping_time
         places, velocities = self.table[:, :3], self.table[:, 3:6]
-        return wall_forces(places, velocities, _known(simulation.box), material.wall_stiffness, damping)
+        radii = simulation.system.clump.sphere_radii(len(places))
+        return wall_forces(places, velocities, _known(simulation.box), material.wall_stiffness, damping, radii)
 
 
 def _contacts(simulation: Simulation, state: State, *, ahead: bool = False) -> _Seen:
@@ -355,7 +357,7 @@ def _contacts(simulation: Simulation, state: State, *, ahead: bool = False) -> _
     system = simulation.system
     table, _ = sphere_table(system.clump, state.grains, state.cell)
     dt = jnp.asarray(simulation.dt) if ahead else jnp.zeros(())  # in no time a history stays as it is
-    motion = relative_motion(system.pairs, table, state.cell)
+    motion = relative_motion(system, table, state.cell)
     kin, normal_force, friction, _ = contact_loads(system, *motion, state.history, dt)
     return _Seen(table, kin, normal_force, friction)
 

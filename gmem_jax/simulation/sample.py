@@ -9,7 +9,7 @@ from jax import lax
 
 from gmem_jax.physics.contact.friction import largest_overlap
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pairs import image_shifts, slack, sphere_centres
+from gmem_jax.physics.pairs import image_shifts, slack, sphere_centres, touching_distance
 from gmem_jax.physics.pytree import Scalar, pytree, short_repr
 from gmem_jax.physics.rotation import dot, matrix
 from gmem_jax.physics.state import Box, State, Status
@@ -139,11 +139,12 @@ def check(system: System, state: State, box: Box) -> State:
     """Set the status bits for what can be seen in one configuration: stale list, escaped grain, non-finite number."""
     grains = state.grains
     spheres = sphere_centres(grains, system.clump)
+    radii = system.clump.sphere_radii(len(spheres))
     beyond = (spheres < box.lower) | (spheres > box.upper)
     outside = jnp.any(beyond & ~box.images if any(box.periodic) else beyond, axis=(0, 1))
     numbers = grains.position.sum((0, 1)) + grains.acceleration.sum((0, 1)) + grains.spin_rate.sum((0, 1))
     bits = (
-        jnp.where(slack(system.pairs, spheres, box) <= 0.0, int(Status.STALE_PAIRS), 0)
+        jnp.where(slack(system.pairs, spheres, box, radii) <= 0.0, int(Status.STALE_PAIRS), 0)
         | jnp.where(outside, int(Status.OUTSIDE_BOX), 0)
         | jnp.where(jnp.isfinite(numbers), 0, int(Status.NOT_FINITE))
     ).astype(jnp.int32)
@@ -157,7 +158,8 @@ def overlaps(system: System, state: State) -> jax.Array:
     if state.cell is not None:
         apart += image_shifts(pairs, state.cell.lengths)
     square = dot(apart, apart)[:, 0]
-    return jnp.where(pairs.valid[:, None], 2.0 - jnp.sqrt(jnp.where(pairs.valid[:, None], square, 1.0)), -1.0)
+    reach = touching_distance(pairs, system.clump)
+    return jnp.where(pairs.valid[:, None], reach - jnp.sqrt(jnp.where(pairs.valid[:, None], square, 1.0)), -1.0)
 
 
 def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scalar) -> Sample:
@@ -169,9 +171,13 @@ def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scal
     count = grains.position.shape[0]
     touching_pairs = jax.ops.segment_max(touching, pairs.grain_pair, num_segments=pairs.capacity)
     body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)
-    energy = clump.mass * jnp.sum(grains.velocity**2, axis=1) + jnp.sum(clump.inertia[:, None] * body_spin**2, axis=1)
+    inertia = clump.scaled(clump.inertia[:, None], 5)
+    energy = jnp.sum(inertia * body_spin**2, axis=1, keepdims=True)
+    energy = clump.masses * jnp.sum(grains.velocity**2, axis=1, keepdims=True) + energy
     lengths = jnp.broadcast_to(box.lengths, pressure.shape)
-    at_walls = (spheres - box.lower < 1.0) * 1 + (box.upper - spheres < 1.0)
+    own = clump.sphere_radii(len(spheres))
+    radii = 1.0 if own is None else own[:, None, None]
+    at_walls = (spheres - box.lower < radii) * 1 + (box.upper - spheres < radii)
     if any(box.periodic):
         at_walls = at_walls * ~box.images
     rate = jnp.abs(box.upper_velocity[0] - box.lower_velocity[0]) / lengths[0]
@@ -182,12 +188,12 @@ def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scal
         u=jnp.broadcast_to(u, pressure.shape[1:]),
         pressure=pressure,
         lengths=lengths,
-        kinetic_energy=0.5 * jnp.sum(energy, axis=0),
+        kinetic_energy=0.5 * jnp.sum(energy, axis=(0, 1)),
         largest_speed=jnp.sqrt(jnp.max(jnp.sum(lax.stop_gradient(grains.velocity) ** 2, axis=1), axis=0)),
         coordination=2.0 * jnp.sum(jnp.maximum(touching_pairs, 0), axis=0) / count,
         contacts=2.0 * jnp.sum(touching, axis=0) / count,
         wall_contacts=jnp.sum(at_walls, axis=(0, 1)) / count,
-        filling=count * clump.mass / jnp.prod(lengths, axis=0),
+        filling=clump.volume(count) / jnp.prod(lengths, axis=0),
         largest_overlap=jnp.max(lax.stop_gradient(overlap), axis=0),
         inertial_number=jnp.where(loaded, inertial, 0.0),
     )

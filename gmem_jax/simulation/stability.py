@@ -27,7 +27,7 @@ def longest_step(mass: float, plane_stiffness: float, numbers: Mapping[str, floa
     """The longest stable step for a grain on a wall and two grains with friction, in t_c.
 
     Args:
-        mass: of a grain.
+        mass: of the smallest grain.
         plane_stiffness: of its material.
         numbers: those in `_USUAL`.
     """
@@ -50,7 +50,8 @@ def cause(simulation: Simulation) -> str:
     if entry_of(law):
         known |= {f"friction.{name}": getattr(law, name, 0.0) for name in ("stiffness", "damping_time")}
     numbers = {**_USUAL, **{name: _most(value) for name, value in known.items()}}
-    mass, plane, dt = _most(simulation.system.clump.mass), _most(material.plane_stiffness), _most(simulation.dt)
+    clump, plane, dt = simulation.system.clump, _most(material.plane_stiffness), _most(simulation.dt)
+    mass = _most(clump.mass) * float(clump.smallest) ** 3
 
     def longest(**changed: float) -> float:
         return longest_step(mass, plane, {**numbers, **changed})

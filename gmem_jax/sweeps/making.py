@@ -11,7 +11,7 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import sources
 from gmem_jax.physics import grain
 from gmem_jax.physics.material import Material
-from gmem_jax.preparation.recipe import Recipe, grain_steps
+from gmem_jax.preparation.recipe import Recipe, graded, grain_steps
 from gmem_jax.sweeps.plan import digest
 from gmem_jax.sweeps.spec import PREPARE
 
@@ -53,7 +53,7 @@ def pack_job(values: Mapping[str, Any], *, follow: bool = True) -> dict[str, Any
     """The job of making the pack of a point; arguments and errors are those of `recipe_of`."""
     recipe, shape, material = recipe_of(values, follow=follow)
     made = {"recipe": asdict(recipe), "grain": shape, "material": asdict(material)}
-    work = grain_steps(recipe, clump_of(shape))
+    work = grain_steps(recipe, graded(recipe, clump_of(shape)))
     return {"kind": "pack", "name": digest({**made, **sources()}), "work": work, "replicas": 1, **made}
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import PERIODIC_27, ROOT
+from scenes import PERIODIC_27, ROOT, SPREAD_27
 from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
@@ -191,7 +191,7 @@ def test_every_number_of_a_recipe_is_an_option_of_prepare(
         **{"grains": 13, "seed": 5, "delta0": 0.04, "t0": 70.0, "dt": 0.2, "filling": 0.25, "gas_speed": 0.03},
         **{"gas_time": 300.0, "pressure": 3e-3, "piston_speed": 0.03, "piston_gain": 0.006, "cycles": 1, "rest": 0.3},
         **{"hold": 0.1, "drag": 0.02, "settled_speed": 2e-5, "quiet": 2e-6, "pressure_error": 0.02, "patience": 1e5},
-        "boundary": "walls",
+        **{"size_spread": 0.0, "sizes": "", "shares": "", "boundary": "walls"},
     }
     assert set(numbers) == {entry.name for entry in fields(gm.Recipe)}
     options = [word for name, value in numbers.items() for word in (f"--{name.replace('_', '-')}", value)]
@@ -210,7 +210,8 @@ def test_every_number_of_a_recipe_is_an_option_of_prepare(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("0 0 0 1\n1 0 0 0.5\n", "line 2: r is 0.5, must be 1"),
+        ("0 0 0 1\n1 0 0 0\n", "line 2: r is 0, must be positive"),
+        ("0 0 0 1\n1 0 0 0.05\n", "radii of spheres must be in [0.1, 10] R, got 0.05 to 1"),
         ("0 0 0\n", "line 1: must be four numbers x y z r, got '0 0 0'"),
         ("x y z r\n0 0 0 1\n", "line 1: must be four numbers"),
         ("0 0 nan 1\n", "line 1: must be four numbers"),
@@ -228,6 +229,39 @@ def test_a_file_of_spheres_that_is_none_is_refused_in_one_line(
     assert words in said
     assert str(path) in said
     assert len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--sizes", "1,0"], "sizes must be positive numbers"),
+        (["--sizes", "1,nan"], "sizes must be positive numbers"),
+        (["--sizes", "0.2,3"], "cannot be listed together: the largest may be 10 times the smallest"),
+        (["--size-spread", "0.6"], "size_spread must be in [0, 0.35]"),
+        (["--sizes", "1,1.4", "--shares", "0.9"], "shares must be one for each of 2 sizes and sum to 1"),
+        (["--sizes", "1,1.4", "--backend", "native"], "the native backend does not know spheres of unequal radii"),
+    ],
+)
+def test_sizes_that_no_pack_can_have_are_refused_in_one_line_and_nothing_is_written(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, options: list[str], words: str
+) -> None:
+    out = tmp_path / "out.h5"
+    assert gmem(monkeypatch, "prepare", "--shape", "sphere", "--grains", 40, *options, "-o", out) == 2
+    assert words in capsys.readouterr().err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_pack_of_several_sizes_is_foreseen_and_shown(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    (tmp_path / "bent.txt").write_text("0 0 0 1\n1 0 0 0.6\n1.4 0.5 0 0.4\n")
+    shape = ["--shape", tmp_path / "bent.txt", "--grains", 40, "--sizes", "0.8,1.2", "--shares", "0.7,0.3"]
+    assert gmem(monkeypatch, "prepare", *shape, "-o", tmp_path / "out.h5", "--dry-run") == 0
+    assert "plain JAX" in capsys.readouterr().err
+    assert gmem(monkeypatch, "show", SPREAD_27) == 0
+    assert "sizes 0.811 to 1.22, SD 0.097" in capsys.readouterr().out
+    assert gmem(monkeypatch, "export", SPREAD_27, "--to", "lammps", "-o", tmp_path / "pack.data") == 0
+    assert gmem(monkeypatch, "report", SPREAD_27, "-o", tmp_path / "pack.html") == 0
 
 
 def test_a_recall_of_few_spheres_says_that_they_hold_little() -> None:

@@ -207,7 +207,7 @@ def sized(*values: str) -> str:
         (sized("2", "nan", "2"), "line 13: density is 'nan', must be a positive number"),
         (sized("0", "1", "2"), "line 13: diameter is '0', must be a positive number"),
         (sized("2", "3", "2"), "density of 1 to 3, all must have the same"),
-        (sized("3", "1", "2"), "must have radius 1, found 1.5"),
+        (sized("40", "1", "2"), "radii of spheres must be in [0.1, 10] R, got 1 to 20; the radius in the file"),
         (data("1 1 1 0 -1 0 0", "2 2 1 0.5 0.99 0 0", hint="full"), "line 13: q is '0.5', must be 0"),
         (data("1 1 -1 0 0 2 2 1", "2 1 1 0 0 2 2 2", hint="hybrid"), "does not tell its columns"),
         (data(*ROWS, box=BOX + "0 0.1 0 xy xz yz\n"), "line 9: tilt is '0.1', must be 0"),

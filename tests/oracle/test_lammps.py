@@ -22,6 +22,8 @@ from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.contact.normal import hertz
+from gmem_jax.physics.contact.wall import wall_forces
+from gmem_jax.physics.grain import sized
 from gmem_jax.physics.rotation import cross, dot
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box
@@ -38,10 +40,14 @@ HOOKE = gm.Hooke(stiffness=0.145, damping_time=0.0)
 BOTH_LAWS = pytest.mark.parametrize("law", [HOOKE, MindlinRescaled()], ids=["H", "M1"])
 
 
-def surface_kinematics(separation, velocity, spin_sum, valid, dt):
+def surface_kinematics(separation, velocity, spin_sum, valid, dt, unequal=None):
     """LAMMPS': sliding velocity at the full radius, no turn about the normal."""
-    kin = kinematics(separation, velocity, spin_sum, valid, dt)
-    relative = velocity - cross(spin_sum, kin.normal)
+    kin = kinematics(separation, velocity, spin_sum, valid, dt, unequal)
+    rolling = spin_sum
+    if unequal is not None:
+        one, other = (spin_sum + sign * unequal.spin_difference for sign in (-1.0, 1.0))
+        rolling = 0.5 * (unequal.first * one + unequal.second * other)
+    relative = velocity - cross(rolling, kin.normal)
     return replace(kin, sliding=relative - dot(relative, kin.normal) * kin.normal, twist=jnp.zeros_like(kin.twist))
 
 
@@ -80,7 +86,7 @@ def two_spheres(folder, law, dt, variables, displacement, velocity, start=(0.0, 
     scene = lammps.Scene.free(gm.sphere(), [[0.0, 0.0, 0.0], start], [[1.0, 0.0, 0.0, 0.0]] * 2, still, still)
     lines = [
         *lammps.write_scene(scene, folder),
-        *lammps.pair_lines(law, MATERIAL, float(gm.sphere().mass)),
+        *lammps.pair_lines(law, MATERIAL, [float(gm.sphere().mass)]),
         f"timestep {dt!r}",
         "group one id 1",
         "group two id 2",
@@ -359,7 +365,7 @@ def test_forces_in_a_periodic_pack_at_rest_are_those_of_lammps(tmp_path):
     np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-10 * np.abs(ours).max())
 
 
-def strained_spheres(law, material=MATERIAL, wider=1.0):
+def strained_spheres(law, material=MATERIAL, wider=1.0, sphere=scenes.SPHERE):
     """64 overlapping spheres that move and turn in a periodic box that is strained."""
     random, edges = np.random.default_rng(2), wider * np.array([6.0, 6.3, 6.6])
     lattice = (np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / 4.0
@@ -369,16 +375,34 @@ def strained_spheres(law, material=MATERIAL, wider=1.0):
     growth = upper * jnp.asarray([-3e-3, 2e-3, -1e-3])[:, None]
     box = Box(lower, upper, -0.5 * growth, 0.5 * growth, (True, True, True))
     grains = scenes.make_grains(place, None, velocity, spin)
-    pairs = PairFinder(gm.sphere(), edges, 0.9)(grains, gm.sphere(), box)
-    return dynamics.System(gm.sphere(), law, pairs, material), grains, box
+    pairs = PairFinder(sphere, edges, 2.9 - float(sphere.widest))(grains, sphere, box)
+    return dynamics.System(sphere, law, pairs, material), grains, box
+
+
+BIDISPERSE = sized(scenes.SPHERE, np.where(np.arange(64) % 3, 0.8, 1.1))
 
 
 @pytest.mark.usefixtures("lammps_kinematics")
-def test_forces_between_moving_spheres_in_a_cell_that_is_strained_are_those_of_lammps(tmp_path):
+@pytest.mark.parametrize("sphere", [scenes.SPHERE, BIDISPERSE], ids=["equal", "bidisperse"])
+def test_forces_between_moving_spheres_in_a_cell_that_is_strained_are_those_of_lammps(sphere, tmp_path):
     """Damping and friction see the velocities of images: LAMMPS adds the growth of the cell to those ("remap v")."""
-    ours, theirs = forces_in_a_cell(*strained_spheres(MindlinRescaled()), tmp_path)
+    ours, theirs = forces_in_a_cell(*strained_spheres(MindlinRescaled(), sphere=sphere), tmp_path)
     assert np.abs(ours).max() > 1e-2
     np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=1e-10 * np.abs(ours).max())
+
+
+def test_forces_in_a_bidisperse_pack_between_walls_are_those_of_lammps(tmp_path):
+    pack = gm.load_pack(scenes.TETRA_27)
+    made = sized(pack.clump, np.where(np.arange(27) % 2, 1.04, 0.96))
+    pack = gm.pack_from(replace(pack, clump=made), position=pack.position, quaternion=pack.quaternion)
+    system, grains = dynamics.System(made, HOOKE, pack.pairs), scenes.make_grains(pack.position, pack.quaternion)
+    ours, theirs = forces_in_a_cell(system, grains, pack.box, tmp_path)
+    radii, still = made.sphere_radii(len(ours)), jnp.zeros((len(ours), 3, 1))
+    places = dynamics.sphere_table(made, grains)[0][:, :3]
+    lower, upper = wall_forces(places, still, pack.box, MATERIAL.wall_stiffness, MATERIAL.normal_damping, radii)
+    by_walls = np.asarray(lower - upper)[..., 0]
+    assert min(np.abs(ours).max(), np.abs(by_walls).max()) > 1e-3
+    np.testing.assert_allclose(ours + by_walls, theirs, rtol=0.0, atol=1e-10 * np.abs(ours).max())
 
 
 def test_spheres_in_a_cell_that_is_strained_move_as_in_lammps_to_first_order_in_dt(tmp_path):

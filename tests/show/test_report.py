@@ -81,7 +81,7 @@ def one_after_the_other(*some: Frames) -> Frames:
     parts = {
         name: np.concatenate([getattr(one, name) for one in some])
         for name in vars(some[0])
-        if name not in ("offsets", "stages", "start", "signal")
+        if name not in ("offsets", "stages", "start", "signal", "radii", "sizes")
     }
     return Frames(**parts, **alike)
 
@@ -207,7 +207,9 @@ def test_a_scene_is_read_back_as_it_was() -> None:
     network = links(frames)
     np.testing.assert_array_equal(arrays["start"], network.start)
     np.testing.assert_array_equal(arrays["ends"], network.grains.ravel())
-    assert (scene["grains"], len(scene["offsets"]), len(scene["captions"])) == (27, 4, 4)
+    assert (scene["grains"], len(scene["spheres"]), len(scene["captions"])) == (27, 4, 4)
+    assert [sphere[3] for sphere in scene["spheres"]] == [1.0] * 4
+    np.testing.assert_array_equal(arrays["sizes"], np.ones(27))
     assert [one["label"] for one in scene["quantities"]][:2] == ["displacement", "non-affine displacement"]
 
 

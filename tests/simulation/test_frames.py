@@ -147,9 +147,7 @@ def test_the_forces_of_a_frame_are_those_on_the_spheres() -> None:
     table, _ = sphere_table(PACK.clump, grains)
     on_spheres, *_ = jax.jit(contact_forces)(system, table, history, jnp.zeros(()), jnp.asarray(True))
     lower, upper = np.asarray(PACK.lower), np.asarray(PACK.upper)
-    frames = concatenate(
-        {"rest": (configuration(system, state, lower, upper, 0.0, 0.0),)}, np.asarray(PACK.clump.offsets)
-    )
+    frames = concatenate({"rest": (configuration(system, state, lower, upper, 0.0, 0.0),)}, PACK.clump)
     centres, (first, second) = frames.centres(0), frames.spheres.T
     normal = centres[second] - centres[first]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)

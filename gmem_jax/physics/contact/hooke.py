@@ -16,6 +16,8 @@ from gmem_jax.physics.pytree import Scalar, parameter, pytree, validate
 class Hooke:
     """df_e = k dsigma, f_d = damping_time k dsigma/dt, |f_e + f_d| <= mu f_n (paper, Sec. II).
 
+    The stiffness is one for all contacts, whatever the radii of the spheres.
+
     Attributes:
         mu: friction coefficient; scalar or [B].
         stiffness: k_H in E R; scalar or [B]. The paper gives "a typical inverse transverse compliance" of the

@@ -1,6 +1,7 @@
 """The geometry and motion of sphere-sphere contacts, computed once for every law."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,23 +10,39 @@ from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import cross, dot
 
 
+class Unequal(NamedTuple):
+    """What is to be known of candidates where spheres differ in radius.
+
+    Attributes:
+        first: R_i, [P, 1, 1], in R.
+        second: R_j, likewise.
+        spin_difference: spin of the grain of sphere j minus that of i, [P, 3, B], in 1 / t_c.
+    """
+
+    first: jax.Array
+    second: jax.Array
+    spin_difference: jax.Array
+
+
 @pytree
 @dataclass(frozen=True)
 class Kinematics:
     """Relative position and motion at P candidate contacts; [P, 3, B] vectors, [P, 1, B] scalars.
 
-    The contact point is at x_i + n (R - p/2); "relative" means surface j minus surface i there.
+    The contact point is at x_i + n (R_i - p/2); "relative" means surface j minus surface i there.
 
     Attributes:
         normal: unit vector n from sphere i to sphere j.
-        overlap: p = 2 R - r_ij; negative where the spheres are apart.
+        overlap: p = R_i + R_j - r_ij; negative where the spheres are apart.
         safe_overlap: the overlap where they touch and 1 elsewhere, so that roots and their derivatives stay finite.
         touching: whether p > 0.
         closing: dp/dt.
         sliding: tangential relative velocity.
         twist: half the sum of the two spins along n, the rate at which the contact itself turns about n.
-        arm: R - p/2.
+        arm: R_i - p/2.
         dt: the time step, scalar or [B].
+        other_arm: R_j - p/2; None where all radii are 1, so that it is `arm`.
+        radius: harmonic mean of the two radii, 2 R_i R_j / (R_i + R_j), [P, 1, 1]; None where all are 1.
     """
 
     normal: jax.Array
@@ -37,12 +54,27 @@ class Kinematics:
     twist: jax.Array
     arm: jax.Array
     dt: jax.Array
+    other_arm: jax.Array | None = None
+    radius: jax.Array | None = None
+
+    @property
+    def root(self) -> jax.Array:
+        """sqrt(radius p), to which the stiffness of a Mindlin contact is proportional, where they touch; [P, 1, B].
+
+        It is the radius of the contact area times sqrt(2): sqrt(p) between spheres of radius 1.
+        """
+        return jnp.sqrt(self.safe_overlap if self.radius is None else self.radius * self.safe_overlap)
 
 
 def kinematics(
-    separation: jax.Array, velocity: jax.Array, spin_sum: jax.Array, valid: jax.Array, dt: jax.Array
+    separation: jax.Array,
+    velocity: jax.Array,
+    spin_sum: jax.Array,
+    valid: jax.Array,
+    dt: jax.Array,
+    unequal: Unequal | None = None,
 ) -> Kinematics:
-    """Kinematics of candidate contacts between unit spheres.
+    """Kinematics of candidate contacts.
 
     Args:
         separation: x_j - x_i of the sphere centres, [P, 3, B].
@@ -50,14 +82,24 @@ def kinematics(
         spin_sum: sum of the two grains' spins.
         valid: [P], False for padding.
         dt: time step.
+        unequal: where spheres differ in radius; else all are of radius 1.
     """
-    # Padding pairs sphere 0 with itself; a distance of 4 R keeps them apart and every root finite.
-    square = jnp.where(valid[:, None, None], dot(separation, separation), 16.0)
+    reach = 2.0 if unequal is None else unequal.first + unequal.second
+    # Padding pairs sphere 0 with itself; twice the distance of touching keeps them apart and every root finite.
+    square = jnp.where(valid[:, None, None], dot(separation, separation), 4.0 * reach**2)
     distance = jnp.sqrt(square)
     normal = separation / distance
-    overlap = 2.0 - distance
-    arm = 1.0 - 0.5 * overlap
-    relative = velocity - cross(spin_sum, arm * normal)
+    overlap = reach - distance
+    other_arm = radius = None
+    if unequal is None:
+        arm = 1.0 - 0.5 * overlap
+        relative = velocity - cross(spin_sum, arm * normal)
+    else:
+        arm, other_arm = unequal.first - 0.5 * overlap, unequal.second - 0.5 * overlap
+        radius = 2.0 * unequal.first * unequal.second / reach
+        # arm spin_i + other_arm spin_j; the arms are half the distance, less and more by half the radii's difference.
+        relative = velocity - cross(spin_sum, 0.5 * separation)
+        relative -= cross(unequal.spin_difference, 0.5 * (unequal.second - unequal.first) * normal)
     along = dot(relative, normal)
     touching = overlap > 0.0
     return Kinematics(
@@ -70,6 +112,8 @@ def kinematics(
         twist=0.5 * dot(spin_sum, normal),
         arm=arm,
         dt=dt,
+        other_arm=other_arm,
+        radius=radius,
     )
 
 

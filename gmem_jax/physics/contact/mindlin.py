@@ -49,6 +49,10 @@ class Mindlin:
     |f_e + f_d| <= mu f_n; a sliding contact gives up the same f in all its rings. These turn with the contact alike:
     what is kept of f_j are its components in a frame that does.
 
+    Between spheres of other radii than 1, q runs to sqrt(r p), where r is their harmonic mean: in all contacts it is
+    the radius of the contact area times sqrt(2). The points of a contact are sqrt(r) dq apart, so that they reach to
+    the overlap p_max everywhere, and x is as above.
+
     The variants differ in the outermost ring, which the contact fills in part only:
 
     - "averaged": w_j = 1 and w_jp = x - jp, so that the stiffness dq sum w_j is sqrt(p) to the last digit. While the
@@ -150,8 +154,8 @@ class Mindlin:
         self, kin: Kinematics, normal_force: jax.Array, history: LayeredHistory
     ) -> tuple[jax.Array, LayeredHistory]:
         """Tangential force on sphere i and the new history; see `FrictionLaw`."""
-        root = jnp.sqrt(kin.safe_overlap)
-        x = root / self.spacing
+        x = jnp.sqrt(kin.safe_overlap) / self.spacing
+        spacing = self.spacing if kin.radius is None else self.spacing * jnp.sqrt(kin.radius)
         inside, weight, total = self.weights(x)
         inside &= kin.touching[:, None]
 
@@ -160,13 +164,13 @@ class Mindlin:
         across = cross(kin.normal, frame)
         sliding = jnp.concatenate([dot(kin.sliding, frame), dot(kin.sliding, across)], axis=1)
         growth = (self.stiffness * kin.dt) * sliding
-        dashpot = (self.stiffness * self.damping_time) * root * sliding
+        dashpot = (self.stiffness * self.damping_time) * kin.root * sliding
 
         layers = self._diluted(history, x) if self.variant == "averaged" else history.layers
         layers = jnp.where(inside, layers + growth[:, None], 0.0)
-        trial = self.spacing * jnp.sum(weight * layers, axis=1) + dashpot
+        trial = spacing * jnp.sum(weight * layers, axis=1) + dashpot
         force, _ = coulomb(trial, self.mu * normal_force)
-        correction = (force - trial) / (self.spacing * total)
+        correction = (force - trial) / (spacing * total)
         layers = jnp.where(inside, layers + correction[:, None], 0.0)
         force = jnp.where(kin.touching, force[:, :1] * frame + force[:, 1:] * across, 0.0)
         return force, LayeredHistory(

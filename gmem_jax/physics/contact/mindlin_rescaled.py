@@ -31,7 +31,8 @@ class RescaledHistory:
 class MindlinRescaled:
     """f_e *= sqrt(p / p_old) on unloading, then df_e = k p^0.5 dsigma, f_d = damping_time k p^0.5 dsigma/dt (Sec. II).
 
-    The Coulomb limit |f_e + f_d| <= mu f_n applies as in the other laws.
+    The Coulomb limit |f_e + f_d| <= mu f_n applies as in the other laws. Between spheres of other radii than 1, k is
+    times the root of their harmonic mean.
 
     Attributes:
         mu: friction coefficient; scalar or [B].
@@ -64,7 +65,7 @@ class MindlinRescaled:
         """Tangential force on sphere i and the new history; see `FrictionLaw`."""
         unloads = kin.touching & (kin.overlap < history.overlap)
         ratio = jnp.where(unloads, kin.safe_overlap, 1.0) / jnp.where(unloads, history.overlap, 1.0)
-        spring = self.stiffness * jnp.sqrt(kin.safe_overlap)
+        spring = self.stiffness * kin.root
         dashpot = self.damping_time * spring * kin.sliding
         elastic = jnp.sqrt(ratio) * transport(history.force, kin, self.spinning) + kin.dt * spring * kin.sliding
         force, _ = coulomb(elastic + dashpot, self.mu * normal_force)

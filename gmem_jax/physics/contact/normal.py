@@ -7,9 +7,14 @@ from gmem_jax.physics.pytree import Scalar
 
 
 def hertz(
-    overlap: jax.Array, closing: jax.Array, touching: jax.Array, stiffness: Scalar, damping_time: Scalar
+    overlap: jax.Array,
+    closing: jax.Array,
+    touching: jax.Array,
+    stiffness: Scalar,
+    damping_time: Scalar,
+    radius: jax.Array | None = None,
 ) -> jax.Array:
-    """f_n = max(0, k p^1.5 + gamma p^0.5 dp/dt) with gamma = damping_time k (paper, Sec. II).
+    """f_n = max(0, k p^1.5 + gamma p^0.5 dp/dt) with gamma = damping_time k (paper, Sec. II); k is times radius^0.5.
 
     Args:
         overlap: p where touching, any positive number elsewhere, in R.
@@ -17,9 +22,10 @@ def hertz(
         touching: mask; the force is zero elsewhere.
         stiffness: k, in E R^0.5.
         damping_time: gamma / k, in t_c.
+        radius: of the sphere on a plane, or the harmonic mean of those of two spheres, in R; None for 1.
 
     Returns:
         The repulsive force, in E R^2, in the shape of `overlap`.
     """
-    force = stiffness * jnp.sqrt(overlap) * (overlap + damping_time * closing)
+    force = stiffness * jnp.sqrt(overlap if radius is None else radius * overlap) * (overlap + damping_time * closing)
     return jnp.where(touching & (force > 0.0), force, 0.0)

@@ -4,7 +4,7 @@ import { OrbitControls } from "orbit";
 
 const VIRIDIS = ["#440154", "#482878", "#3e4989", "#31688e", "#26828e", "#1f9e89", "#35b779", "#6ece58", "#b5de2b", "#fde725"];
 const HEAT = ["#f3d9a4", "#f2b46d", "#e98a45", "#d75b30", "#b52d28", "#811526", "#4b0b20"];
-const SIZE = { grains: 1, both: 0.3, forces: 0 }; // of a sphere, in R
+const SIZE = { grains: 1, both: 0.3, forces: 0 }; // of a sphere, in its radii
 const THINNEST = 0.02, THICKEST = 0.45; // half the width of a force, in R
 
 // Spheres are squares that face the eye, on which each pixel finds its point of the sphere: smooth at any distance,
@@ -12,9 +12,11 @@ const THINNEST = 0.02, THICKEST = 0.45; // half the width of a force, in R
 const SPHERE = {
   vertexShader: `
     attribute vec3 centre, tint;
-    uniform float radius;
+    attribute float radius;
     varying vec3 middle, place, colour;
+    varying float wide;
     void main() {
+      wide = radius;
       middle = (modelViewMatrix * vec4(centre, 1.0)).xyz;
       colour = tint;
       float away = length(middle);
@@ -26,15 +28,15 @@ const SPHERE = {
     }`,
   fragmentShader: `
     uniform mat4 projectionMatrix;
-    uniform float radius;
     varying vec3 middle, place, colour;
+    varying float wide;
     void main() {
       vec3 ray = normalize(place);
       float along = dot(ray, middle);
-      float inside = along * along - dot(middle, middle) + radius * radius;
+      float inside = along * along - dot(middle, middle) + wide * wide;
       if (inside < 0.0) discard;
       vec3 hit = (along - sqrt(inside)) * ray;
-      vec3 normal = (hit - middle) / radius;
+      vec3 normal = (hit - middle) / wide;
       vec4 clip = projectionMatrix * vec4(hit, 1.0);
       gl_FragDepth = 0.5 * clip.z / clip.w + 0.5;
       float lit = 0.66 + 0.34 * dot(normal, normalize(vec3(-0.4, 0.7, 0.6)));
@@ -115,14 +117,14 @@ class View {
     this.root = root;
     this.scene = scene;
     this.grains = scene.grains;
-    this.spheres = scene.offsets.length;
+    this.spheres = scene.spheres.length;
     this.find = (name) => root.querySelector(`.${name}`);
     this.canvas = this.find("stage").querySelector("canvas");
     this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: true, preserveDrawingBuffer: true });
     this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // colours are given as they are shown
     this.renderer.setClearColor(0xffffff);
     this.world = new THREE.Scene();
-    this.balls = squares(this.grains * this.spheres, SPHERE, { radius: { value: 1 }, projectionMatrix: { value: null } }, { centre: 3, tint: 3 });
+    this.balls = squares(this.grains * this.spheres, SPHERE, { projectionMatrix: { value: null } }, { centre: 3, tint: 3, radius: 1 });
     const most = Math.max(0, ...scene.captions.map((_, frame) => this.links(frame).length));
     this.rods = squares(most, ROD, {}, { tail: 3, head: 3, tint: 3, width: 1 });
     this.box = new THREE.LineSegments(new THREE.EdgesGeometry(new THREE.BoxGeometry(1, 1, 1)), new THREE.LineBasicMaterial({ color: 0x888888 }));
@@ -178,7 +180,7 @@ class View {
 
   /** Everything of the chosen frame into the buffers. */
   fill() {
-    const { scene, grains } = this, { position, quaternion, lower, upper, ends, force } = scene.arrays;
+    const { scene, grains } = this, { position, quaternion, sizes, lower, upper, ends, force } = scene.arrays;
     const frame = Number(this.find("frame").value), show = this.find("show").value;
     const quantity = scene.quantities[this.find("colour").selectedIndex];
     const axis = this.find("axis-of-cut").selectedIndex, cut = Number(this.find("cut").value);
@@ -188,23 +190,23 @@ class View {
     const kept = (grain) => places[3 * grain + axis] <= limit;
     this.values = scene.arrays[quantity.name].subarray(grains * frame, grains * (frame + 1));
 
-    const { centre, tint } = this.balls.geometry.attributes, colours = palette(VIRIDIS);
+    const { centre, tint, radius } = this.balls.geometry.attributes, colours = palette(VIRIDIS);
     this.shown = [];
     for (let grain = 0; grain < grains && SIZE[show]; grain++) {
       if (!kept(grain)) continue;
       const [w, x, y, z] = quaternion.subarray(4 * (grains * frame + grain));
       const colour = colours(this.values[grain] / quantity.top);
-      for (const [a, b, c] of scene.offsets) {
-        const at = 3 * this.shown.length;
+      for (const sphere of scene.spheres) {
+        const at = 3 * this.shown.length, [a, b, c, wide] = sphere.map((length) => sizes[grain] * length);
         const p = 2 * (y * c - z * b), q = 2 * (z * a - x * c), r = 2 * (x * b - y * a); // 2 v x offset
         centre.array[at] = places[3 * grain] + a + w * p + y * r - z * q;
         centre.array[at + 1] = places[3 * grain + 1] + b + w * q + z * p - x * r;
         centre.array[at + 2] = places[3 * grain + 2] + c + w * r + x * q - y * p;
         tint.array.set(colour, at);
+        radius.array[this.shown.length] = SIZE[show] * wide;
         this.shown.push(grain);
       }
     }
-    this.balls.material.uniforms.radius.value = SIZE[show];
     this.balls.visible = SIZE[show] > 0;
     settled(this.balls, this.shown.length);
 
@@ -268,9 +270,9 @@ class View {
 
   /** Say the numbers of the grain under the pointer. */
   point(event) {
-    const tip = this.find("tip"), { centre } = this.balls.geometry.attributes, radius = this.balls.material.uniforms.radius.value;
+    const tip = this.find("tip"), { centre, radius } = this.balls.geometry.attributes;
     tip.hidden = true;
-    if (event.buttons || !radius) return;
+    if (event.buttons || !this.balls.visible) return;
     const { left, top, width, height } = this.canvas.getBoundingClientRect();
     const x = event.clientX - left, y = event.clientY - top;
     const eye = this.camera.position, to = new THREE.Vector3((2 * x) / width - 1, 1 - (2 * y) / height, 0.5).unproject(this.camera).sub(eye).normalize();
@@ -278,7 +280,7 @@ class View {
     for (let ball = 0; ball < this.shown.length; ball++) {
       const a = centre.array[3 * ball] - eye.x, b = centre.array[3 * ball + 1] - eye.y, c = centre.array[3 * ball + 2] - eye.z;
       const along = a * to.x + b * to.y + c * to.z;
-      const inside = along * along - (a * a + b * b + c * c) + radius * radius;
+      const inside = along * along - (a * a + b * b + c * c) + radius.array[ball] ** 2;
       if (inside < 0 || along - Math.sqrt(inside) > nearest) continue;
       nearest = along - Math.sqrt(inside);
       found = this.shown[ball];
