@@ -1385,8 +1385,8 @@ MUTATIONS = (
     mutation(
         "mass-of-a-larger-sphere",
         "files/lammpsdata.py",
-        "mass / (4.0 * np.pi / 3.0 * radius**3)",
-        "mass / (4.0 * np.pi / 3.0)",
+        "volume = 4.0 * np.pi / 3.0 * radii**3",
+        "volume = 4.0 * np.pi / 3.0 * radii**0",
         "test_free_particles_are_grains_of_their_own_of_the_density_they_have",
     ),
     mutation(

@@ -25,7 +25,7 @@ _LISTED = {  # the commands in their order: the module of each, and the beginnin
     "demo": ("recalls", "The main job: six waveforms stored in a pack and recalled."),
     "show": ("show", "What a file holds; with --plot, a picture of it."),
     "export": ("exchange", "Write a pack or the frames of a recall for other programs."),
-    "import": ("exchange", "Make a pack of spheres or clumps of one shape, of any sizes, at rest in a box."),
+    "import": ("exchange", "Make a pack of spheres or clumps of one shape, of any sizes."),
     "classify": ("classify", "Read recalled binary words."),
     "gradient": ("derive", "Exact derivatives of the fidelity."),
     "kernel": ("derive", "The linear memory kernel of a pack."),

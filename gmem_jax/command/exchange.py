@@ -72,7 +72,7 @@ def import_command(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make a pack of spheres or clumps of one shape, of any sizes, at rest in a box."""
+    """Make a pack of spheres or clumps of one shape, of any sizes."""
     # Here, not above: scipy takes half a second to load, and no other command needs it.
     from gmem_jax.preparation.imported import import_pack
 

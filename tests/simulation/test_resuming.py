@@ -95,7 +95,7 @@ def test_a_preparation_goes_on(changes: dict[str, Any], tmp_path: Path) -> None:
         record = {name: value for name, value in pack.info.items() if name in ("rebuilds", "simulated_time")}
         return dataclasses.replace(pack, record="{}"), log, record, film
 
-    _same(run, tmp_path / "parts", [2, 5, 40, 76])  # in the gas, twice, the cycles, the last rest
+    _same(run, tmp_path / "parts", [2, 5, 40, 60])  # in the gas, twice, the cycles, the last rest
 
 
 @pytest.mark.slow
