@@ -27,7 +27,7 @@ if TYPE_CHECKING or not gmem_start.alone:
     from gmem_jax.experiment.samples import waveform_from
     from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, signals, six_signals, waveform, words
     from gmem_jax.experiment.stages import compress, cycle, hold, read, rest, shake, train, write
-    from gmem_jax.experiment.stepping import stable_step
+    from gmem_jax.experiment.stepping import at_accuracy, stable_step
     from gmem_jax.files.cache import list_packs
     from gmem_jax.files.configuration import from_dict
     from gmem_jax.files.datasets import to_csv, to_xarray
@@ -114,6 +114,7 @@ __all__ = [
     "Stage",
     "Status",
     "TunedDrive",
+    "at_accuracy",
     "capacity",
     "classify",
     "clump",

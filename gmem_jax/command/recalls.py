@@ -10,6 +10,7 @@ import numpy as np
 import typer
 
 from gmem_jax.command.console import (
+    GIVEN,
     AsJson,
     DryRun,
     Force,
@@ -34,7 +35,7 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import frame_schedule, replica_bins, run, run_bytes
 from gmem_jax.experiment.record import key_of_run, signals_to_dict
 from gmem_jax.experiment.signals import Signals, six_signals
-from gmem_jax.experiment.stepping import require_stable, stable_step
+from gmem_jax.experiment.stepping import at_accuracy, require_stable, stable_step
 from gmem_jax.files.cache import list_packs
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.recalls import save_recall
@@ -108,6 +109,9 @@ def recall_command(
     frames_at: Annotated[
         str, typer.Option(metavar="U,U", help="Keep configurations wherever u passes these, as in 0,0.5,1.")
     ] = "",
+    accuracy: Annotated[
+        float | None, typer.Option(help="Wanted error of G, relative, 0.002 to 0.1: chooses t0 and dt.")
+    ] = None,
     restart: Restart = False,
     dry_run: DryRun = False,
     picture: Picture = True,
@@ -116,6 +120,12 @@ def recall_command(
 ) -> None:
     """Store waveforms in a pack and recall them."""
     (experiment,), drawn = chosen.check_output([pack], output, ".h5", picture=picture, force=force)
+    if accuracy is not None:
+        for name in ("t0", "dt"):
+            if name in GIVEN.get():
+                raise InputError(f"--accuracy chooses t0 and dt: leave {GIVEN.get()[name]} out")
+        experiment = at_accuracy(experiment, accuracy)
+        log(f"t0 = {float(np.max(experiment.t0)):.5g} t_c, dt = {float(np.max(experiment.timing.dt)):.3g} t_c")
     target = chosen.target(experiment.signals.count)
     at = _compressions(frames_at)
     if not frames and not at:

@@ -1,4 +1,4 @@
-"""The largest stable time step of an experiment, and its refusal of longer ones."""
+"""The largest stable time step of an experiment, its refusal of longer ones, and the rate for a wanted accuracy."""
 
 from dataclasses import replace
 from typing import Any
@@ -9,15 +9,20 @@ import numpy as np
 
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import USUAL_STEP, Experiment
+from gmem_jax.experiment.experiment import replace as with_changes
 from gmem_jax.experiment.record import fingerprint, pack_fingerprint
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.laws import entry_of
+from gmem_jax.physics.numbers import is_real, said
 from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import still_box
 from gmem_jax.simulation.stable_step import largest_stable_step
 
+RINGING_PERIODS = 9.6  # of a compression for an error of 1 in G: it falls as 1 / t0^2, measured to be at most 0.9 % at 96
+ACCURACIES = 0.002, 0.1
+LONG_STEP, LONG_DRIVE = 1.0, 1.8e3  # t_c; such steps change G by less than 1e-3 where t0 is at least so long
 ENOUGH_RINGS = 10  # rings of a history: their number hardly matters to its stiffness, and 100 take minutes
 
 _known: dict[tuple[str, ...], float] = {}
@@ -78,3 +83,29 @@ def require_stable(experiment: Experiment) -> None:
             f"dt = {dt:.3g} t_c exceeds the largest stable step of this pack, law and compression, {stable:.3g} t_c; "
             "use a smaller dt"
         )
+
+
+@usual_rules()
+def at_accuracy(experiment: Experiment, accuracy: float) -> Experiment:
+    """The experiment with a t0 and a dt for which G is as exact as wanted, compared with slow drives and short steps.
+
+    In drives that are too fast G is too large, by some (9.6 T1 / t0)^2 in parts of it, and F is off by about as much
+    (docs/scaling.md). T1 is the ringing period of the pack.
+
+    Args:
+        experiment: what is to be run, not traced; its own t0, dt and steps do not count.
+        accuracy: error of G, relative, 0.002 to 0.1.
+
+    Returns:
+        t0 is 9.6 T1 / accuracy^0.5, and dt half of the stable step, but at most 1 t_c, or 0.6 where t0 is below 1,800.
+
+    Raises:
+        ValueError: if the accuracy is outside of this.
+    """
+    require_kind("at_accuracy", experiment, Experiment)
+    least, most = ACCURACIES
+    if not (is_real(accuracy) and np.ndim(accuracy) == 0 and least <= accuracy <= most):
+        raise ValueError(f"accuracy must be a number from {least} to {most}, got {said(accuracy)}")
+    t0 = float(RINGING_PERIODS * np.max(np.asarray(experiment.pack.ringing_period)) / accuracy**0.5)
+    longest = LONG_STEP if t0 >= LONG_DRIVE else USUAL_STEP
+    return with_changes(experiment, t0=t0, dt=min(longest, 0.5 * stable_step(experiment)), steps=None)

@@ -240,6 +240,11 @@ BAD = [
     (["recall", "tetra-64-a", "-o", "{out}"], "`gmem prepare tetra-64-a` makes it"),
     (["recall", "{pack}", "--mu", "-0.5", "-o", "{out}"], "mu must be in [0, inf), got -0.5"),
     (
+        ["recall", "{pack}", "--accuracy", "0.01", "--t0", "900", "-o", "{out}"],
+        "--accuracy chooses t0 and dt: leave --t0",
+    ),
+    (["recall", "{pack}", "--accuracy", "0.5", "-o", "{out}"], "accuracy must be a number from 0.002 to 0.1, got 0.5"),
+    (
         ["recall", "{pack}", "--dt", "0.9", "--stiffness", "0.93", "-o", "{out}"],
         "t_c exceeds the largest stable step of this pack, law and",
     ),
