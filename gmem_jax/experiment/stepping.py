@@ -20,7 +20,7 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import still_box
 from gmem_jax.simulation.stable_step import largest_stable_step
 
-RINGING_PERIODS = 9.6  # of a compression for an error of 1 in G: it falls as 1 / t0^2, measured to be at most 0.9 % at 96
+RINGING_PERIODS = 9.6  # of a compression for an error of 1 in G, which falls as 1 / t0^2: at most 0.9 % at 96 of them
 ACCURACIES = 0.002, 0.1
 LONG_STEP, LONG_DRIVE = 1.0, 1.8e3  # t_c; such steps change G by less than 1e-3 where t0 is at least so long
 ENOUGH_RINGS = 10  # rings of a history: their number hardly matters to its stiffness, and 100 take minutes
