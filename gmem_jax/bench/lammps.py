@@ -25,6 +25,7 @@ from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.rotation import matrix
+from gmem_jax.simulation.frames import radii_of_spheres
 
 OUTPUT = "id x y z vx vy vz omegax omegay omegaz fx fy fz"
 
@@ -149,8 +150,7 @@ def write_scene(scene: Scene, folder: Path, *, skin: float = 0.2, every: int = 1
     count, per_grain = spheres.shape[:2]
     sizes = np.ones(count) if scene.clump.sizes is None else np.asarray(scene.clump.sizes)
     kinds = np.repeat(np.unique(sizes, return_inverse=True)[1] + 1, per_grain)
-    found = scene.clump.sphere_radii(count * per_grain)
-    diameters = 2.0 * (np.ones(len(kinds)) if found is None else np.asarray(found))
+    diameters = 2.0 * radii_of_spheres(count, per_grain, scene.clump.radii, scene.clump.sizes)
     flat = spheres.reshape(-1, 3)
     arms = spheres - scene.position[:, None]
     velocity = (scene.velocity[:, None] + np.cross(scene.spin[:, None], arms)).reshape(-1, 3)

@@ -10,7 +10,6 @@ import numpy as np
 import typer
 
 from gmem_jax.command.console import (
-    GIVEN,
     AsJson,
     DryRun,
     Force,
@@ -121,9 +120,7 @@ def recall_command(
     """Store waveforms in a pack and recall them."""
     (experiment,), drawn = chosen.check_output([pack], output, ".h5", picture=picture, force=force)
     if accuracy is not None:
-        for name in ("t0", "dt"):
-            if name in GIVEN.get():
-                raise InputError(f"--accuracy chooses t0 and dt: leave {GIVEN.get()[name]} out")
+        refuse_idle("with --accuracy, which chooses t0 and dt", "t0", "dt")
         experiment = at_accuracy(experiment, accuracy)
         log(f"t0 = {float(np.max(experiment.t0)):.5g} t_c, dt = {float(np.max(experiment.timing.dt)):.3g} t_c")
     target = chosen.target(experiment.signals.count)

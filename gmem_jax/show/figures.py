@@ -16,6 +16,7 @@ from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.state import Grains
 from gmem_jax.show.figure import Curve, Discs, Figure, Image, Panel, U, grid, ramp, shown_part, u_label
 from gmem_jax.show.recalls import MOST_OF_PAGE, SHEAR
+from gmem_jax.simulation.frames import radii_of_spheres
 from gmem_jax.simulation.protocol import BINS
 
 PASCAL = float(Material().modulus)
@@ -43,8 +44,8 @@ def grains_figure(pack: Pack) -> Figure:
     still = jnp.zeros((*pack.position.shape, 1))
     grains = Grains(pack.position[..., None], pack.quaternion[..., None], still, still, still, still)
     centres = np.asarray(sphere_centres(grains, pack.clump))[..., 0]
-    own, order = pack.clump.sphere_radii(len(centres)), np.argsort(centres[:, 2])
-    radii = np.ones(len(centres)) if own is None else np.asarray(own)
+    clump, order = pack.clump, np.argsort(centres[:, 2])
+    radii = radii_of_spheres(pack.grains, clump.spheres, clump.radii, clump.sizes)
     centres = centres[order]
     (left, right), (front, back) = zip(*(np.asarray(each)[:2] for each in (pack.lower, pack.upper)), strict=True)
     limits = {"x_limits": (left, right), "y_limits": (front, back), "equal": True}

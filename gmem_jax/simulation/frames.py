@@ -113,7 +113,7 @@ def images_met(frames: Frames, number: int) -> np.ndarray:
 
 
 def radii_of_spheres(
-    grains: int, per_grain: int, radii: np.ndarray | None = None, sizes: np.ndarray | None = None
+    grains: int, per_grain: int, radii: jax.typing.ArrayLike | None = None, sizes: jax.typing.ArrayLike | None = None
 ) -> np.ndarray:
     """Radii of the spheres of N grains, [N K], in R; `radii` and `sizes` are those of a `Clump`."""
     of_one, of_grains = (

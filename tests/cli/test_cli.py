@@ -241,7 +241,7 @@ BAD = [
     (["recall", "{pack}", "--mu", "-0.5", "-o", "{out}"], "mu must be in [0, inf), got -0.5"),
     (
         ["recall", "{pack}", "--accuracy", "0.01", "--t0", "900", "-o", "{out}"],
-        "--accuracy chooses t0 and dt: leave --t0",
+        "--t0 does nothing with --accuracy, which chooses t0 and dt",
     ),
     (["recall", "{pack}", "--accuracy", "0.5", "-o", "{out}"], "accuracy must be a number from 0.002 to 0.1, got 0.5"),
     (
