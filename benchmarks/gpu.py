@@ -1,8 +1,12 @@
-"""gpu.md of this folder: what a step takes of a GPU and, where there is one, how long it takes.
+"""gpu.md of this folder: what a step takes of a GPU and how long it takes.
 
-python benchmarks/gpu.py
+python benchmarks/gpu.py             # all of it, where there is a GPU
+python benchmarks/gpu.py --times-to FILE   # there: the times alone
+python benchmarks/gpu.py --times FILE      # anywhere: the page, of these times
 """
 
+import argparse
+import json
 from pathlib import Path
 
 import jax
@@ -11,19 +15,31 @@ from gmem_jax.bench import gpu
 from gmem_jax.files.packs import load_pack
 
 OTHERS = """
-Launches: one a step; three more of ours a bin (numbers from the arrays of the call, pressures, histories back), and
-some fifty of XLA's (`docs/gpu.md`).
+Launches: two a step, and a few more of ours a bin (numbers from the arrays of the call, pressures); some forty of XLA's
+(`docs/gpu.md`).
 
-DEM-Engine (`deme3`; 3.6 ns per clump of three spheres and step on two RTX 3080, published) is not run beside: it
-starts on a GPU only, so that nothing about it could be tried here.
+DEM-Engine (`deme3`; 3.6 ns per clump of three spheres and step on two RTX 3080, published) was not run beside.
 """
 
-if __name__ == "__main__":
+
+def main() -> None:
+    """Time, or write the page, or both."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--times", type=Path, help="times of a GPU that is not here")
+    parser.add_argument("--times-to", type=Path, help="write the times here, and no page")
+    arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    try:
+    if arguments.times:
+        times = json.loads(arguments.times.read_text())
+    else:
         gpu.device()
-        times = gpu.timed(load_pack)
-    except ValueError:
-        times = None
-    text = gpu.gpu_markdown(gpu.kernel_facts(load_pack), times)
-    Path(__file__).with_suffix(".md").write_text(f"# On a GPU\n\n{text}{OTHERS}")
+        times = gpu.timed(load_pack, lambda what, fraction: print(f"{fraction:4.0%} {what}", flush=True))
+    if arguments.times_to:
+        arguments.times_to.write_text(json.dumps(times, indent=1) + "\n")
+        return
+    page = f"# On a GPU\n\n{gpu.gpu_markdown(gpu.kernel_facts(load_pack), times)}{OTHERS}"
+    Path(__file__).with_suffix(".md").write_text(page)
+
+
+if __name__ == "__main__":
+    main()

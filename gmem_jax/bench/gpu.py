@@ -20,8 +20,17 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.simulation import sample
 
-PACKS = ("tetra-1024-a", "tetra-10240-b")
+PACKS = ("tetra-325-a", "tetra-1024-a", "tetra-10240-b")
 REPLICAS = (1, 8, 32, 128)
+BINS_TIMED = 32  # of a call, as in a run: what the host does around a call would weigh more in a shorter one
+OTHERS = (  # packs, laws, backends and replicas beside law H on all of `PACKS`
+    ("tetra-1024-a", "M1", "native", 128),
+    ("tetra-10240-b", "M1", "native", 128),
+    ("tetra-1024-a", "M2", "native", 32),
+    ("tetra-10240-b", "M2", "native", 8),
+    ("tetra-1024-a", "H", "jax", 8),
+    ("tetra-10240-b", "H", "jax", 8),
+)
 COPIED = 1 << 26  # numbers, for the bandwidth
 ARCHITECTURES = {"sm_80": "A100", "sm_90": "H100, H200", "sm_100": "B200", "sm_120": "RTX 50"}
 GPU_LAWS = {"frictionless": Frictionless(), **measure.TIMED_LAWS}
@@ -58,34 +67,36 @@ def bytes_per_grain_step(pack: Pack) -> dict[str, float]:
     """Bytes of a grain-step under law H, many replicas: what must come from memory or go there, and what is gathered.
 
     Returns:
-        "memory": own numbers and histories, each read and written once. "gathered": beside them the spheres of all
-        candidates and the grains of those that touch, which caches may hold. "held": memory of a grain and replica,
+        "memory": what either kernel reads or writes, each number once. "gathered": what it reads again, for the other
+        candidates of a sphere and contacts of a grain; caches may hold it. "held": memory of a grain and replica,
         between steps and in the arrays of a call.
     """
     simulation, state = measure.encode(pack, measure.TIMED_LAWS["H"], 1, "native")
-    touching = float(sample.measure(simulation.system, state, pack.box, jnp.ones((3, 1)), 0.0).contacts[0])
-    sides = 2.0 * float(np.asarray(pack.pairs.valid).sum()) / pack.grains
-    remembered = 3  # numbers of a contact
-    spheres, own = pack.clump.spheres, 9 + 4
-    memory = 8.0 * (2 * own + 2 * 3 * spheres + remembered * (sides + touching))
-    held = 8.0 * (9 + own + 6 * spheres + 3 + sides * remembered + 2 * own + sides * remembered / 2.0)
-    return {"memory": memory, "gathered": 8.0 * (3 * sides + 9 * touching), "held": held}
+    sides = float(sample.measure(simulation.system, state, pack.box, jnp.ones((3, 1)), 0.0).contacts[0])
+    rows, touching = float(np.asarray(pack.pairs.valid).sum()) / pack.grains, sides / 2.0
+    spheres, hot, cold, load, remembered = pack.clump.spheres, 9, 4, 6, 3
+    touch = 8.0 * (3 * spheres + hot + touching * (2 * remembered + load)) + rows
+    move = 8.0 * (2 * hot + 2 * cold + 3 * spheres + touching * load) + rows
+    again = 8.0 * (3 * (2 * rows - spheres) + hot * (sides - 1) + touching * load) + rows
+    held = 8.0 * (hot + cold + 9 * spheres + rows * (load + remembered) + 2 * 19) + rows + spheres
+    return {"memory": touch + move, "gathered": again, "held": held}
 
 
-def registers() -> dict[str, dict[str, Needs]]:
-    """What the step takes, by law and architecture; empty without NVRTC or library."""
+def registers() -> dict[str, dict[str, tuple[Needs, Needs]]]:
+    """What the kernels `touch` and `move_alone` take, by law and architecture; empty without NVRTC or library."""
     if cuda.missing() or not native.available()[0]:
         return {}
 
-    def of(law: FrictionLaw, tangent: bool) -> dict[str, Needs]:
-        return {name: native.needs(law, name, tangent=tangent)["advance"] for name in ARCHITECTURES}
+    def of(law: FrictionLaw, tangent: bool) -> dict[str, tuple[Needs, Needs]]:
+        found = {name: native.needs(law, name, tangent=tangent) for name in ARCHITECTURES}
+        return {name: (kernels["touch"], kernels["move_alone"]) for name, kernels in found.items()}
 
     plain = {name: of(law, tangent=False) for name, law in GPU_LAWS.items()}
     return {**plain, **{f"{name}, with derivatives": of(GPU_LAWS[name], tangent=True) for name in ("H", "M2")}}
 
 
 def timed(load: Callable[[str], Pack], say: measure.Say = lambda what, fraction: None) -> dict[str, Any]:
-    """Every pack and number of replicas under law H, and the bandwidth of a copy.
+    """Every pack and number of replicas under law H, `OTHERS`, and the bandwidth of a copy.
 
     Raises:
         ValueError: see `device`.
@@ -93,10 +104,13 @@ def timed(load: Callable[[str], Pack], say: measure.Say = lambda what, fraction:
     on = device()
     with jax.default_device(on):
         rows = []
-        for place, (name, count) in enumerate(itertools.product(PACKS, REPLICAS)):
-            say(f"native, {name}, {count} replicas", place / (len(PACKS) * len(REPLICAS)))
-            rows.append({"pack": name, **asdict(measure.time_rollout(load(name), "native", "H", count))})
-        return {"device": on.device_kind, "copied_bytes_per_s": copied_bytes_per_second(), "rows": rows}
+        every = [(name, "H", "native", count) for name, count in itertools.product(PACKS, REPLICAS)] + list(OTHERS)
+        for place, (name, law, backend, count) in enumerate(every):
+            say(f"{backend}, {law}, {name}, {count} replicas", place / len(every))
+            row = measure.time_rollout(load(name), backend, law, count, bins=BINS_TIMED if backend == "native" else 4)
+            rows.append({"pack": name, **asdict(row)})
+        about = {**provenance(), "device": on.device_kind}
+        return {**about, "copied_bytes_per_s": copied_bytes_per_second(), "rows": rows}
 
 
 def kernel_facts(load: Callable[[str], Pack]) -> dict[str, Any]:
@@ -111,10 +125,11 @@ def kernel_facts(load: Callable[[str], Pack]) -> dict[str, Any]:
 def gpu_markdown(facts: dict[str, Any], times: dict[str, Any] | None) -> str:
     """Tables of `kernel_facts` and, where there was a GPU, of `timed`."""
     heads = [f"{architecture} ({name})" for architecture, name in ARCHITECTURES.items()]
-    lines = ["Registers of a thread and bytes that it spills, for one step (`--fmad=false`, blocks of 128):", ""]
+    lines = ["Registers of a thread and bytes that it spills, in `touch` and in `move_alone` (`--fmad=false`):", ""]
     lines += ["| law | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|"]
     for law, found in facts["registers"].items():
-        lines.append(f"| {law} | " + " | ".join(f"{used}, {spilt}" for used, spilt in found.values()) + " |")
+        cells = ("; ".join(f"{need.registers}, {need.spilt}" for need in both) for both in found.values())
+        lines.append(f"| {law} | " + " | ".join(cells) + " |")
     lines += ["", "Bytes of a grain-step under law H, for many replicas:", ""]
     lines += ["| pack | from and to memory | gathered beside | held, a grain and replica |", "|---|---|---|---|"]
     for name, count in facts["bytes"].items():
@@ -122,11 +137,15 @@ def gpu_markdown(facts: dict[str, Any], times: dict[str, Any] | None) -> str:
     if times is None:
         return "\n".join([*lines, "", "Not timed: no GPU was at hand.", ""])
     speed = times["copied_bytes_per_s"]
-    lines += ["", f"{times['device']}; a copy moves {speed / 1e9:.0f} GB/s. Nanoseconds per grain-step, law H:", ""]
-    lines += ["| N | replicas | ns | GB/s of memory needed | compile, s |", "|---|---|---|---|---|"]
+    lines += ["", f"{times['device']}, JAX {times['versions']['jax']}; a copy moves {speed / 1e9:.0f} GB/s.", ""]
+    lines += ["| N | replicas | law, backend | ns per grain-step | us per step | GB/s of memory needed | compile, s |"]
+    lines += ["|---|---|---|---|---|---|---|"]
     for row in times["rows"]:
-        rate = facts["bytes"][row["pack"]]["memory"] / row["us"] * 1e-3
+        step = row["us"] * row["grains"] * row["replicas"]
+        known = row["engine"] == "native" and row["law"] == "H"
+        rate = f"{facts['bytes'][row['pack']]['memory'] / row['us'] * 1e-3:.0f}" if known else ""
         lines.append(
-            f"| {row['grains']} | {row['replicas']} | {1e3 * row['us']:.3f} | {rate:.0f} | {row['compile_s']:.1f} |"
+            f"| {row['grains']} | {row['replicas']} | {row['law']}, {row['engine']} | {1e3 * row['us']:.3f} | "
+            f"{step:.1f} | {rate} | {row['compile_s']:.1f} |"
         )
     return "\n".join([*lines, ""])

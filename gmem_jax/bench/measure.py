@@ -43,7 +43,7 @@ from gmem_jax.physics.state import Grains, State, Status, explain, replicate, st
 from gmem_jax.physics.step import System
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.neighbors import SKIN, pair_finder
-from gmem_jax.simulation.observers import forward
+from gmem_jax.simulation.observers import forward, told_of
 from gmem_jax.simulation.protocol import Drive, Stage
 from gmem_jax.simulation.runner import status_of
 from gmem_jax.simulation.strain import smallest_box
@@ -77,16 +77,25 @@ def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str, t0: float 
     return simulation, replicate(experiment.begin(), replicas)
 
 
-def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, seconds: float = 0.5) -> Candidate:
+def rival(
+    pack: Pack,
+    backend: str,
+    law: str,
+    replicas: int,
+    *,
+    t0: float = T0,
+    seconds: float = 0.5,
+    bins: int = BINS_PER_CALL,
+) -> Candidate:
     """A rollout of some bins on a backend, compiled; timed for about `seconds` each time.
 
     Raises:
         RuntimeError: if the simulation breaks down.
     """
     simulation, state = encode(pack, TIMED_LAWS[law], replicas, backend, t0)
-    call = (simulation, state, simulation.rows(ENCODE, 0), BINS_PER_CALL)
+    call = (simulation, state, simulation.rows(ENCODE, 0), told_of(bins, bins))
     began = time.perf_counter()
-    binary = forward.program.lower(*call, most=BINS_PER_CALL).compile()
+    binary = forward.program.lower(*call, most=bins).compile()
     compile_s = time.perf_counter() - began
     final, sample = jax.block_until_ready(binary(*call))  # warm-up
     if Status(status_of(final)).fatal:
@@ -99,14 +108,16 @@ def rival(pack: Pack, backend: str, law: str, replicas: int, *, t0: float = T0, 
         while calls < 1 or time.perf_counter() - began < seconds:
             jax.block_until_ready(binary(*call))
             calls += 1
-        return 1e6 * (time.perf_counter() - began) / (calls * BINS_PER_CALL * simulation.steps * pack.grains * replicas)
+        return 1e6 * (time.perf_counter() - began) / (calls * bins * simulation.steps * pack.grains * replicas)
 
     return Candidate(Row(backend, law, pack.grains, replicas, compile_s=compile_s, p_xy=p_xy), once)
 
 
-def time_rollout(pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 0.5) -> Row:
+def time_rollout(
+    pack: Pack, backend: str, law: str, replicas: int, *, seconds: float = 0.5, bins: int = BINS_PER_CALL
+) -> Row:
     """Time a rollout of some bins on a backend by itself."""
-    return interleave([rival(pack, backend, law, replicas, seconds=seconds)])[0]
+    return interleave([rival(pack, backend, law, replicas, seconds=seconds, bins=bins)])[0]
 
 
 def lammps_rivals(pack: Pack, law: str, *, steps: int = 1000) -> list[Candidate]:

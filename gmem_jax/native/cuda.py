@@ -1,8 +1,8 @@
 """The native backend on CUDA GPUs: which arrays a call has there, and whether it can be made at all.
 
-The kernels (src/cuda) are the physics of the CPU's library, compiled where they run by NVRTC. A thread is a grain of a
-replica and goes through its own sides of the candidates; what is needed from one step to the next are further results
-of the call, so that XLA manages all memory.
+The kernels (src/cuda) are the physics of the CPU's library, compiled where they run by NVRTC. A step is two launches: a
+thread is a candidate of a replica in the first, and a grain in the second. What is needed from one step to the next are
+further results of the call, so that XLA manages all memory.
 """
 
 import ctypes
@@ -112,43 +112,21 @@ def kernel_needs(
     return found
 
 
-class Sides(NamedTuple):
-    """The candidates as each of their two grains sees them.
-
-    Attributes:
-        start: where the sides of each grain begin, int32 [N + 1].
-        side: own sphere, other sphere - as ~s where it is the one listed first -, candidate; int32 [2 P, 3].
-        place: number of each candidate's side that is listed first; -1 for padding, int32 [P].
-    """
-
-    start: jax.Array
-    side: jax.Array
-    place: jax.Array
-
-
-def sides_of(pairs: Any, spheres: int) -> tuple[Sides, jax.Array]:
-    """The sides of a list of candidates, and whether it is sound.
+def is_sound(pairs: Any) -> jax.Array:
+    """Whether every candidate is listed once by each of its two spheres, and nothing else is.
 
     Args:
         pairs: with `first`, `second`, `valid`, [P], and `incidence`, [S, C], as of `Pairs`.
-        spheres: of a grain, K.
     """
-    capacity, (count, columns) = len(pairs.first), pairs.incidence.shape
-    rows = pairs.incidence.reshape(-1)
-    mine = jnp.repeat(jnp.arange(count, dtype=jnp.int32), columns)
-    as_first, row = rows < capacity, rows % capacity
+    capacity, rows = len(pairs.first), pairs.incidence
+    spheres = jnp.arange(len(rows), dtype=jnp.int32)[:, None]
+    row = rows % capacity
     listed, other = pairs.first[row], pairs.second[row]
-    listed, other = jnp.where(as_first, listed, other), jnp.where(as_first, other, listed)
-    # What leads outside of the arrays must not get to the kernels, which do not look.
-    real = (rows >= 0) & (rows < 2 * capacity) & pairs.valid[row] & (listed == mine) & (other >= 0) & (other < count)
-    slot = jnp.where(real, jnp.cumsum(real, dtype=jnp.int32) - 1, 2 * capacity)
-    side = jnp.stack([mine, jnp.where(as_first, other, ~other), row], axis=1)
-    ends = jnp.cumsum(jnp.sum(real.reshape(-1, spheres * columns), axis=1, dtype=jnp.int32), dtype=jnp.int32)
-    start = jnp.minimum(jnp.concatenate([jnp.zeros(1, jnp.int32), ends]), 2 * capacity)
-    sides = jnp.zeros((2 * capacity, 3), jnp.int32).at[slot].set(side, mode="drop")
-    place = jnp.full(capacity, -1, jnp.int32).at[jnp.where(real & as_first, row, capacity)].set(slot, mode="drop")
-    whole = (ends[-1] == 2 * jnp.sum(pairs.valid, dtype=jnp.int32)) & jnp.all(real | (rows == 2 * capacity))
-    return Sides(start, sides, place), whole
+    listed, other = jnp.where(rows < capacity, listed, other), jnp.where(rows < capacity, other, listed)
+    real = (rows >= 0) & (rows < 2 * capacity) & pairs.valid[row] & (listed == spheres)
+    real &= (other >= 0) & (other < len(rows))
+    count = jnp.sum(real, dtype=jnp.int32) == 2 * jnp.sum(pairs.valid, dtype=jnp.int32)
+    return count & jnp.all(real | (rows == 2 * capacity))
 
 
 def between_steps(fixed: Any, history: Sequence[Any], points: int, kinds: int, lanes: int) -> list[Any]:
@@ -161,13 +139,19 @@ def between_steps(fixed: Any, history: Sequence[Any], points: int, kinds: int, l
         kinds: one for values, two for values and derivatives.
         lanes: replicas of all entries, L.
     """
-    spheres, sides = fixed.incidence.shape[1], 2 * fixed.first.shape[1]
+    spheres, rows = fixed.incidence.shape[1], fixed.first.shape[1]
     grains = spheres // fixed.offsets.shape[1]
-    remembered = sum(leaf.shape[2] for leaf in history if leaf.ndim == 4) + (6 if points else 0)  # ... and `Layers`
-    shapes = [(2, kinds, grains, 9), (2, kinds, spheres, 3), (kinds, grains, 4), (kinds, grains, 3)]
-    shapes += [(kinds, sides, remembered), *([(kinds, sides, points, 3)] if points else [])]
-    found = [jax.ShapeDtypeStruct((1, *shape, lanes), jnp.float64) for shape in shapes]
-    return [*found, jax.ShapeDtypeStruct((1, sides, lanes), jnp.int32)] if points else found
+
+    def array(*shape: int, dtype: Any = jnp.float64) -> Any:
+        return jax.ShapeDtypeStruct((1, *shape, lanes), dtype)
+
+    found = [array(kinds, grains, 9), array(kinds, spheres, 3), array(kinds, grains, 4)]
+    found += [array(kinds, spheres, 6), array(kinds, rows, 6), array(rows + spheres, dtype=jnp.uint8)]
+    if kinds == 2:  # where there are values alone, histories are in the results
+        found += [array(kinds, rows, leaf.shape[2]) for leaf in history if leaf.ndim == 4]
+    if points:
+        found += [array(kinds, rows, 6), array(kinds, rows, points, 3), array(rows, dtype=jnp.int32)]
+    return found
 
 
 def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Sequence[Any]) -> Sequence[jax.Array]:
@@ -193,11 +177,12 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
     fixed, arrays, *slopes = jax.tree.map(flat, parts)
     lists = {name: getattr(fixed, name) for name in ("first", "second", "valid", "incidence")}
     many = max(map(len, lists.values()))
-    lists = {name: jnp.broadcast_to(leaf, (many, *leaf.shape[1:])) for name, leaf in lists.items()}
-    sides, sound = jax.vmap(lambda **lists: sides_of(fixed._replace(**lists), fixed.offsets.shape[1]))(**lists)
-    arm = jnp.sqrt(jnp.max(jnp.sum(fixed.offsets**2, axis=2), axis=1))
+    whole = {name: jnp.broadcast_to(leaf, (many, *leaf.shape[1:])) for name, leaf in lists.items()}
+    sound = jax.vmap(lambda **lists: is_sound(fixed._replace(**lists)))(**whole)
+    blank, odd = 2 * fixed.first.shape[1], -fixed.incidence.shape[2] % 4
+    lists["incidence"] = jnp.pad(fixed.incidence, ((0, 0), (0, 0), (0, odd)), constant_values=blank)  # read in fours
     numbers = jnp.where(sound[:, None, None], arrays.parameters, jnp.nan)  # there is no other way to refuse a list
-    before = [*arrays.fields, *sides, fixed.offsets, arm, numbers, arrays.walls]
+    before = [*arrays.fields, *lists.values(), fixed.offsets, numbers, arrays.walls]
     results = [jax.ShapeDtypeStruct((entries, *shape.shape[len(outer) :]), shape.dtype) for shape in shapes]
     aliases = {}
     if in_place:

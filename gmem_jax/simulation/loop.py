@@ -215,9 +215,11 @@ def rollout_stages(simulation: Simulation, state: State, stages: tuple[Stage, ..
 
 
 def rollout_chunk(
-    simulation: Simulation, state: State, first: Bin, count: jax.Array, most: int
+    simulation: Simulation, state: State, first: Bin, count: jax.Array | None, most: int
 ) -> tuple[State, Sample]:
     """`count` bins of one stage from the bin `first`, in a program for any count up to `most`; not for reverse mode.
+
+    Without a count, `most`: a GPU whose program knows the number of bins does not wait for the host after each.
 
     Returns:
         The state, and samples with a leading axis [most], zero beyond `count`.
@@ -230,5 +232,5 @@ def rollout_chunk(
 
     shape = jax.eval_shape(lambda: bin_step(simulation, state, first)[1])
     blank = jax.tree.map(lambda leaf: jnp.zeros((most, *leaf.shape), leaf.dtype), shape)
-    done: tuple[State, Sample] = lax.fori_loop(0, count, one, (state, blank))
+    done: tuple[State, Sample] = lax.fori_loop(0, most if count is None else count, one, (state, blank))
     return done

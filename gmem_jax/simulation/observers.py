@@ -24,6 +24,15 @@ CHUNK = 32  # bins per call: some seconds of work at most, a few milliseconds of
 forward = Compiled(rollout_chunk, static_argnames="most")
 """`rollout_chunk`, compiled once for all chunks and stages of one structure."""
 
+
+def told_of(count: int, most: int) -> int | None:
+    """The `count` that `rollout_chunk` is told: none for a whole chunk on a GPU, which then need not wait for the host.
+
+    CPUs have nothing to wait for, and run one program for all counts.
+    """
+    return None if count == most and jax.default_backend() != "cpu" else count
+
+
 Move = Callable[[Any, Any], Any]
 """From a history of an old list and a blank one of the new, to the history of the new: linear in both."""
 
@@ -62,7 +71,7 @@ class Chunk:
 
     def run(self, bins: int | None = None) -> tuple[State, Sample]:
         """Run it, or its first bins; samples have a leading axis of `CHUNK`, of which the bins that were run count."""
-        count = self.count if bins is None else bins
+        count = told_of(self.count if bins is None else bins, CHUNK)
         done: tuple[State, Sample] = forward(self.simulation, self.state, self.row, count, most=CHUNK)
         return done
 

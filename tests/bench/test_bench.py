@@ -14,6 +14,7 @@ from gmem_jax import native
 from gmem_jax.bench import gpu, table
 from gmem_jax.bench import measure as bench
 from gmem_jax.bench.race import Candidate, Row, interleave
+from gmem_jax.native.cuda import Needs
 
 PACK = TETRA_27
 
@@ -151,24 +152,35 @@ def test_large_histories_are_left_out(pack: gm.Pack) -> None:
 
 
 def test_the_table_of_a_gpu_has_what_was_timed_or_says_that_nothing_was() -> None:
-    needs = {"H": {name: (188, 0) for name in gpu.ARCHITECTURES}}
+    needs = {"H": {name: (Needs(64, 60), Needs(96, 0)) for name in gpu.ARCHITECTURES}}
     facts = {"registers": needs, "bytes": {"tetra-27": gpu.bytes_per_grain_step(gm.load_pack(PACK))}}
     text = gpu.gpu_markdown(facts, None)
-    assert "| H | 188, 0 | 188, 0 | 188, 0 | 188, 0 |" in text
+    assert "| H | 64, 60; 96, 0 | 64, 60; 96, 0 | 64, 60; 96, 0 | 64, 60; 96, 0 |" in text
     assert "Not timed: no GPU was at hand." in text
-    row = {"pack": "tetra-27", "grains": 27, "replicas": 8, "us": 2e-3, "compile_s": 1.0}
-    text = gpu.gpu_markdown(facts, {"device": "G", "copied_bytes_per_s": 2e12, "rows": [row]})
-    assert "G; a copy moves 2000 GB/s" in text
-    assert f"| 27 | 8 | 2.000 | {facts['bytes']['tetra-27']['memory'] / 2.0:.0f} | 1.0 |" in text
+    row = {
+        "pack": "tetra-27",
+        "engine": "native",
+        "law": "H",
+        "grains": 27,
+        "replicas": 8,
+        "us": 2e-3,
+        "compile_s": 1.0,
+    }
+    times = {"device": "G", "versions": {"jax": "0.0"}, "copied_bytes_per_s": 2e12}
+    text = gpu.gpu_markdown(facts, {**times, "rows": [row, {**row, "engine": "jax"}]})
+    assert "G, JAX 0.0; a copy moves 2000 GB/s" in text
+    assert f"| 27 | 8 | H, native | 2.000 | 0.4 | {facts['bytes']['tetra-27']['memory'] / 2.0:.0f} | 1.0 |" in text
+    assert "| 27 | 8 | H, jax | 2.000 | 0.4 |  | 1.0 |" in text
 
 
 def test_bytes_of_a_grain_step_are_those_counted_by_hand() -> None:
     pack = gm.load_pack(PACK)
     count = gpu.bytes_per_grain_step(pack)
-    sides = 2 * int(np.asarray(pack.pairs.valid).sum()) / 27
-    # Twice 9 + 10 + 12 numbers, and a history of three of each candidate, written where it touches (half at most).
-    assert 8 * (62 + 3 * sides) < count["memory"] < 8 * (62 + 4.5 * sides + 27)
-    assert count["gathered"] > 8 * 3 * sides
+    rows = int(np.asarray(pack.pairs.valid).sum()) / 27
+    # `touch` reads 12 + 9 numbers and a byte a candidate; `move` reads and writes 9 + 4, writes 12 and reads the bytes.
+    # Of a contact three numbers are read and written and six are; half of the candidates touch at most.
+    assert 8 * 59 + 2 * rows < count["memory"] < 8 * (59 + 18 * rows / 2) + 2 * rows
+    assert count["gathered"] > 8 * 3 * (2 * rows - 4)
     assert count["held"] > count["memory"] / 2
 
 

@@ -8,17 +8,18 @@ namespace cuda {
 
 namespace {
 
+// Of one thread.
 template <class V, class Law>
-void run(GpuKernel kernel, int threads, const Arguments& a, int step) {
+void run(GpuKernel kernel, const Arguments& a, int step, int thread) {
   namespace k = gmem::GMEM_ISA;
-  threads = (threads + kBlock - 1) / kBlock * kBlock;  // blocks are whole
-  for (int thread = 0; thread < threads; ++thread) {
-    switch (kernel) {
-      case GpuKernel::enter: k::enter<V, Law>(a, thread); break;
-      case GpuKernel::advance: k::advance<V, Law>(a, step, thread); break;
-      case GpuKernel::collect: k::collect<V>(a, thread); break;
-      case GpuKernel::leave: k::leave<V, Law>(a, thread); break;
-    }
+  switch (kernel) {
+    case GpuKernel::enter: return k::enter<V>(a, thread);
+    case GpuKernel::remember: return k::remember<V, Law>(a, thread);
+    case GpuKernel::touch: return k::touch<V, Law>(a, step, thread);
+    case GpuKernel::move:  // in the order of its sum it is the same
+    case GpuKernel::move_alone: return k::move_alone<V>(a, step, thread);
+    case GpuKernel::collect: return k::collect<V>(a, step, thread);
+    case GpuKernel::leave: return k::leave<V, Law>(a, thread);
   }
 }
 
@@ -35,12 +36,18 @@ auto without_stream() { return with_arguments(xla::ffi::Ffi::Bind()); }
 Launcher::Launcher(void* stream, const Which& which) : stream_(stream), kernels_(new Which(which)) {}
 Launcher::~Launcher() { delete static_cast<const Which*>(kernels_); }
 
-void Launcher::operator()(GpuKernel kernel, int threads, const Arguments& a, int step) const {
+void Launcher::operator()(GpuKernel kernel, int items, const Arguments& a, int step) const {
   const Which& which = *static_cast<const Which*>(kernels_);
+  constexpr int block = 128;
+  const int threads = (items * a.lanes + block - 1) / block * block;  // blocks are whole
   with_law(which.law, which.variant, [&](auto law) {
     using L = decltype(law);
-    if (which.task == Task::forward) return run<double, L>(kernel, threads, a, step);
-    run<gmem::GMEM_ISA::Dual<double>, L>(kernel, threads, a, step);
+    for (int thread = 0; thread < threads; ++thread)
+      if (which.task == Task::forward) {
+        run<double, L>(kernel, a, step, thread);
+      } else {
+        run<gmem::GMEM_ISA::Dual<double>, L>(kernel, a, step, thread);
+      }
   });
 }
 

@@ -1,7 +1,7 @@
 // What the kernels are given: plain structures that the host and the device share.
 //
 // A lane is one replica: of B in each of the entries of the call's leading axis, L = entries times B in all. N grains
-// of K spheres have P listed candidates. A candidate has two sides, its two grains, and each has a copy of the history.
+// of K spheres have P listed candidates; a sphere is named in up to C of them.
 
 #pragma once
 
@@ -10,7 +10,10 @@
 namespace gmem {
 namespace cuda {
 
-constexpr int kChunk = 64;  // grains whose pressures are summed by one thread
+constexpr int kChunk = 64;   // numbers that one thread sums up
+constexpr int kItems = 32;   // grains that a block of `move` has
+constexpr int kWorkers = 4;  // threads that sum up the forces on one of them
+constexpr int kLoad = 6;     // numbers of a contact: the force on its first sphere, and the point where it acts
 
 // Where the numbers of each entry begin; the step is zero where all share them.
 template <class T>
@@ -24,37 +27,55 @@ struct Entries {
 // Number `row` of replica b in entry e is value.of(e)[row * stride + b], its derivative the same of `slope`.
 struct Table {
   Entries<double> value, slope;
-  long long stride;
+  int stride;
 };
 
-// A candidate seen from one of its grains.
-// gmem_jax/native/cuda.py: sides_of
-struct Side {
-  int mine, other;  // spheres; the latter as ~s where it is the one listed first
-  int row;          // in the list
+// Division by a number that is known when the kernels are launched; of numbers from 0 to 2^31 - 1.
+struct Divisor {
+  unsigned magic, shift;
+
+  Divisor() = default;
+  explicit Divisor(int by) : magic(0), shift(0) {
+    while ((1ull << shift) < static_cast<unsigned long long>(by)) ++shift;
+    magic = static_cast<unsigned>((((1ull << shift) - by) << 32) / by + 1);
+  }
+
+  int of(int number) const {
+    const unsigned n = static_cast<unsigned>(number);
+    return static_cast<int>((static_cast<unsigned>(static_cast<unsigned long long>(n) * magic >> 32) + n) >> shift);
+  }
+};
+
+// What a thread reads at once.
+struct alignas(16) Four {
+  int of[4];
 };
 
 struct Arguments {
-  int grains, spheres, rows, points, steps;  // N, K, P, Q, T
-  int replicas, lanes;                       // B, L
-  bool isotropic;
-  Entries<const int> start;  // the sides of each grain: start[g] to start[g + 1], [N + 1]
-  Entries<const Side> side;  // [2 P]
-  Entries<const int> place;  // number of each candidate's side that is listed first; -1 for padding, [P]
-  Entries<const double> offsets, arm;
+  int grains, spheres, rows, columns, points, steps;  // N, K, P, C, Q, T
+  int replicas, lanes;                                // B, L
+  Divisor by_replicas, by_lanes, by_spheres;
+  bool isotropic, tangent;
+  Entries<const int> first, second;    // spheres of a candidate, [P]
+  Entries<const unsigned char> valid;  // [P]
+  Entries<const Four> incidence;       // candidates of a sphere, plus P where it is the second one; [N K, C]
+  Entries<const double> offsets;
   Table parameters, walls, grains_in[kFields], history_in[kMaxHistory];
   Table grains_out[kFields], history_out[kMaxHistory], pressure_out;  // values, or derivatives where they are wanted
-  // Between steps: a grain reads its neighbours' numbers of this step while they write those of the next.
-  Table hot[2];     // position, velocity, spin, [N, 9, L]
-  Table sphere[2];  // centres, [N K, 3, L]
-  Table cold;       // orientation, [N, 4, L]
-  Table pressure;   // summed over steps, [N, 3, L]
-  Table history;    // beside rings, [2 P, kHistory, L]
-  Table segments;   // of rings of the Mindlin law: force and first ring, [2 P, Q, 3, L]
-  int* stored;      // ... how many, [2 P, L]
+  // Between steps.
+  Table hot;                   // position, velocity, spin, [N, 9, L]
+  Table sphere;                // centres, [N K, 3, L]
+  Table cold;                  // orientation, [N, 4, L]
+  Table wall;                  // force of the walls, and their pressures summed over steps, [N K, 6, L]
+  Table load;                  // of candidates that touch, [P, kLoad, L]
+  unsigned char* touching;     // which candidates touch, and which spheres the walls, [P + N K, L]
+  Table history[kMaxHistory];  // as in the arrays of the call, but for Mindlin's rings, which these replace:
+  Table layers;                // `Layers`, [P, 6, L]
+  Table segments;              // force and first ring, [P, Q, 3, L]
+  int* stored;                 // ... how many, [P, L]
 };
 
-enum class GpuKernel { enter, advance, collect, leave };
+enum class GpuKernel { enter, remember, touch, move, move_alone, collect, leave };
 
 }  // namespace cuda
 }  // namespace gmem

@@ -4,6 +4,7 @@
 #include <unistd.h>
 
 #include <cstdio>
+#include <cstdlib>
 #include <filesystem>
 #include <fstream>
 #include <iterator>
@@ -60,7 +61,6 @@ std::string contents(const std::string& path) {
 
 // A file that is there is whole. One that cannot be kept is compiled again next time.
 void keep(const std::string& path, const std::string& code) {
-  if (paths().cache.empty()) return;
   std::error_code unable;
   std::filesystem::create_directories(paths().cache, unable);
   const std::string unfinished = path + "." + std::to_string(getpid());
@@ -80,10 +80,12 @@ std::string compiled(const Nvrtc& nvrtc, const std::string& architecture, const 
   std::vector<std::string> options = {
       "--gpu-architecture=" + architecture, "--std=c++17", "--device-as-default-execution-space",
       "--fmad=false",  // as on CPUs: a fused multiply-add is where the sources say so
-      "-I" + paths().sources, "-DGMEM_ISA=gpu", "-DGMEM_BLOCK=" + std::to_string(kBlock),
+      "-I" + paths().sources, "-DGMEM_ISA=gpu",
       "-DGMEM_LAW=" + law_as_type(which),
       std::string("-DGMEM_NUMBER=") + (which.task == Task::forward ? "double" : "Dual<double>")};
   if (log) options.emplace_back("--ptxas-options=-v");
+  std::istringstream more(trial_options());
+  for (std::string option; more >> option;) options.push_back(option);
   std::vector<const char*> words;
   for (const std::string& option : options) words.push_back(option.c_str());
   Program program = nullptr;
@@ -106,6 +108,11 @@ std::string compiled(const Nvrtc& nvrtc, const std::string& architecture, const 
 }
 
 }  // namespace
+
+std::string trial_options() {
+  const char* told = std::getenv("GMEM_NVRTC");
+  return told ? told : "";
+}
 
 void* open_library(const std::string& names, const std::string& help) {
   std::istringstream each(names);
@@ -130,10 +137,11 @@ std::string code_for(const std::string& architecture, const Which& which, std::s
                           std::to_string(static_cast<int>(which.variant)) +
                           (which.task == Task::forward ? "" : "-tangent");
   const std::string path = paths().cache + "/" + GMEM_SOURCE_HASH + "-" + architecture + compiler + law + ".cubin";
-  std::string code = log || paths().cache.empty() ? "" : contents(path);
+  const bool keeps = !paths().cache.empty() && trial_options().empty();
+  std::string code = keeps && !log ? contents(path) : "";
   if (code.empty()) {
     code = compiled(nvrtc, architecture, which, log);
-    keep(path, code);
+    if (keeps) keep(path, code);
   }
   return code;
 }

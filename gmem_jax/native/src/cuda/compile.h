@@ -9,14 +9,15 @@
 namespace gmem {
 namespace cuda {
 
-constexpr int kBlock = 128;  // threads of a block
-
 // Which kernels: of one law, in plain numbers or (for the tangent) in those that carry a derivative.
 struct Which {
   Law law;
   Variant variant;
   Task task;
 };
+
+// Further options for NVRTC, for trials: of the environment's GMEM_NVRTC, as "-DGMEM_BLOCK=256".
+std::string trial_options();
 
 // The code for an architecture, as "sm_90"; compiled once and then kept in a file. Where `log` is given it is compiled
 // anew, and what the assembler says of registers and spills goes there. Throws std::runtime_error in one line.

@@ -18,29 +18,31 @@ namespace {
 
 namespace ffi = xla::ffi;
 
+constexpr int kFew = 1 << 17;  // grains times lanes from which on one thread a grain keeps a GPU busy (an H200, measured)
 constexpr int kOfPack = 5;  // arguments that belong to a pack
 
-// Beside the letters of call/signature.h: starts G = N + 1, sides M = 2 P, numbers of a cold grain C, of a history H,
-// derivatives and values D, lanes L.
-// gmem_jax/native/cuda.py: run, sides_of, between_steps
+// Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain O, of a load F, of `Layers`
+// Y, derivatives and values D, lanes L.
+// gmem_jax/native/cuda.py: call_kernels, between_steps
 Wants arguments_of(Task task, Law law) {
-  const Wants pack = {{"starts", "G", ffi::S32}, {"sides", "M3", ffi::S32}, {"places", "P", ffi::S32},
-                      {"offsets", "K3"},         {"arms", ""}};
+  const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32}, {"validity", "P", ffi::PRED},
+                      {"incidence", "SC", ffi::S32},    {"offsets", "K3"}};
   const Wants arrays = fields_of_grains() + numbers_of_steps() + histories(law);
   const Wants all = fields_of_grains() + pack + numbers_of_steps() + histories(law);
   return task == Task::tangent ? all + arrays : all;
 }
 
-Wants results_of(Law law) {
-  const Wants between = {{"hot", "2DN9L"},  {"spheres", "2DS3L"},  {"cold", "DNCL"},
-                         {"sums", "DN3L"}, {"memories", "DMHL"}};
-  const Wants layered = {{"segments", "DMQ3L"}, {"stored", "ML", ffi::S32}};
-  const Wants all = fields_of_grains() + pressures() + histories(law) + between;
-  return is_layered(law) ? all + layered : all;
-}
-
-int numbers_remembered(Law law) {
-  return with_law(law, Variant::exact, [](auto law) { return static_cast<int>(decltype(law)::kHistory); });
+// Histories of the tangent are kept with their values.
+Wants results_of(Task task, Law law) {
+  Wants all = fields_of_grains() + pressures() + histories(law);
+  all = all + Wants{{"hot", "DN9L"},   {"spheres", "DS3L"}, {"cold", "DNOL"},
+                    {"walls", "DSFL"}, {"loads", "DPFL"}, {"touching", "AL", ffi::U8}};
+  const bool layered = is_layered(law);
+  if (task == Task::tangent)
+    for (const Wanted& leaf : histories(law))
+      if (leaf.axes.size() == 3) all.push_back({leaf.name, std::string("D") + leaf.axes.substr(0, 2) + "L"});
+  if (layered) all = all + Wants{{"layers", "DPYL"}, {"segments", "DPQ3L"}, {"stored", "PL", ffi::S32}};
+  return all;
 }
 
 template <class T>
@@ -49,7 +51,7 @@ Entries<T> entries(const Array& array) {
 }
 
 int threads_for(int64_t many) {
-  require(many < (int64_t{1} << 31) - kBlock, "too many replicas at once for a GPU; use fewer");
+  require(many < (int64_t{1} << 31) - 1024, "too many replicas at once for a GPU; use fewer");
   return static_cast<int>(many);
 }
 
@@ -57,7 +59,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
                 ffi::RemainingArgs args, ffi::RemainingRets rets) {
   require_law(law, variant, points);
   const Which which{static_cast<Law>(law), static_cast<Variant>(variant), task};
-  const Wants wanted = arguments_of(task, which.law), given = results_of(which.law);
+  const Wants wanted = arguments_of(task, which.law), given = results_of(task, which.law);
   require(args.size() == wanted.size() && rets.size() == given.size(),
           "the number of arguments or results is not that of the friction law");
   std::vector<ffi::AnyBuffer> results;
@@ -68,13 +70,15 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   reader.size('R') = kParameters;
   reader.size('W') = kWalls;
   reader.size('Q') = points;
-  reader.size('C') = 4;
+  reader.size('O') = 4;
+  reader.size('F') = kLoad;
+  reader.size('Y') = 6;
   reader.size('D') = task == Task::forward ? 1 : 2;
-  reader.size('H') = numbers_remembered(which.law);
   std::vector<Array> in, out;
   for (std::size_t i = 0; i < args.size(); ++i)
     in.push_back(reader.read(args.get<ffi::AnyBuffer>(i).value(), wanted[i]));
   reader.size('L') = dims[0] * reader.size('B');
+  reader.size('A') = reader.size('P') + reader.size('S');
   for (std::size_t i = 0; i < results.size(); ++i) out.push_back(reader.read(results[i], given[i]));
   const std::size_t leaves = histories(which.law).size(), fresh = kFields + 1 + leaves;
   for (std::size_t i = 0; i < fresh; ++i)
@@ -89,10 +93,13 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.replicas = static_cast<int>(reader.size('B'));
   a.lanes = static_cast<int>(reader.size('L'));
   a.isotropic = isotropic != 0;
+  a.columns = static_cast<int>(reader.size('C'));
+  a.tangent = task == Task::tangent;
   require(a.grains > 0 && a.spheres > 0, "there is no grain");
-  require(reader.size('S') == reader.size('N') * reader.size('K') && reader.size('G') == reader.size('N') + 1 &&
-              reader.size('M') == 2 * reader.size('P'),
-          "spheres, sides or their starts are not as many as grains and candidates have");
+  require(a.lanes > 0, "there is no replica");
+  require(a.columns % 4 == 0, "columns of the incidence should come in fours");
+  require(reader.size('S') == reader.size('N') * reader.size('K'), "spheres are not as many as grains have");
+  a.by_replicas = Divisor(a.replicas), a.by_lanes = Divisor(a.lanes), a.by_spheres = Divisor(a.spheres);
 
   // Tables in the order of arguments and results.
   std::size_t argument = 0, slope = kFields + kOfPack + 2 + leaves, result = 0;
@@ -103,44 +110,52 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   };
   const auto write = [&] { return Table{entries<double>(out[result++]), {nullptr, 0}, a.replicas}; };
   for (Table& field : a.grains_in) field = read();
-  a.start = entries<const int>(in[argument++]);
-  a.side = entries<const Side>(in[argument++]);
-  a.side.step /= 3;
-  a.place = entries<const int>(in[argument++]);
+  a.first = entries<const int>(in[argument++]);
+  a.second = entries<const int>(in[argument++]);
+  a.valid = entries<const unsigned char>(in[argument++]);
+  a.incidence = entries<const Four>(in[argument++]);
+  a.incidence.step /= 4;
   a.offsets = entries<const double>(in[argument++]);
-  a.arm = entries<const double>(in[argument++]);
   a.parameters = read();
   a.walls = read();
   for (std::size_t leaf = 0; leaf < leaves; ++leaf) a.history_in[leaf] = read();
   for (Table& field : a.grains_out) field = write();
   a.pressure_out = write();
   for (std::size_t leaf = 0; leaf < leaves; ++leaf) a.history_out[leaf] = write();
-  const auto between = [&](double* values, int64_t rows) {
+  const auto between = [&](int64_t rows) {
+    double* values = reinterpret_cast<double*>(out[result++].data);
     return Table{{values, a.replicas}, {values + rows * a.lanes, a.replicas}, a.lanes};
   };
-  const auto next = [&] { return reinterpret_cast<double*>(out[result++].data); };
-  const auto both = [&](Table (&tables)[2], int64_t rows) {
-    double* values = next();
-    tables[0] = between(values, rows);
-    tables[1] = between(values + reader.size('D') * rows * a.lanes, rows);
-  };
-  both(a.hot, a.grains * int64_t{9});
-  both(a.sphere, reader.size('S') * 3);
-  a.cold = between(next(), a.grains * int64_t{4});
-  a.pressure = between(next(), a.grains * int64_t{3});
-  a.history = between(next(), reader.size('M') * reader.size('H'));
-  if (is_layered(which.law)) {
-    a.segments = between(next(), reader.size('M') * points * 3);
-    a.stored = reinterpret_cast<int*>(next());
+  a.hot = between(a.grains * int64_t{9});
+  a.sphere = between(reader.size('S') * 3);
+  a.cold = between(a.grains * int64_t{4});
+  a.wall = between(reader.size('S') * 6);
+  a.load = between(a.rows * int64_t{kLoad});
+  a.touching = reinterpret_cast<unsigned char*>(out[result++].data);
+  const bool layered = is_layered(which.law);
+  for (std::size_t leaf = 0; leaf < leaves; ++leaf) {
+    const bool rings = layered && leaf == 0, vectors = leaf + 1 < leaves || leaves == 1;
+    a.history[leaf] = rings || !a.tangent ? a.history_out[leaf] : between(a.rows * int64_t{vectors ? 3 : 1});
+  }
+  if (layered) {
+    a.layers = between(a.rows * int64_t{6});
+    a.segments = between(a.rows * points * 3);
+    a.stored = reinterpret_cast<int*>(out[result++].data);
   }
 
-  const int of_grains = threads_for(reader.size('N') * a.lanes);
-  const int of_rows = threads_for(std::max<int64_t>(3, a.rows) * a.lanes);
+  const int spheres = a.grains * a.spheres;
+  threads_for((a.rows + int64_t{spheres}) * std::max<int64_t>({9, 3 * points, a.lanes}));  // rows of tables; threads
   const Launcher launch(stream, which);
-  launch(GpuKernel::enter, of_grains, a);
-  for (int step = 0; step < a.steps; ++step) launch(GpuKernel::advance, of_grains, a, step);
-  launch(GpuKernel::collect, threads_for((a.grains + kChunk - 1) / kChunk * int64_t{3} * a.lanes), a);
-  launch(GpuKernel::leave, of_rows, a);
+  launch(GpuKernel::enter, a.grains, a);
+  launch(GpuKernel::remember, a.rows, a);
+  const GpuKernel move = a.grains * int64_t{a.lanes} < kFew ? GpuKernel::move : GpuKernel::move_alone;
+  for (int step = 0; step < a.steps; ++step) {
+    launch(GpuKernel::touch, a.rows + spheres, a, step);
+    launch(move, a.grains, a, step);
+  }
+  for (int stride = 1; stride < spheres; stride *= kChunk)
+    launch(GpuKernel::collect, (spheres + kChunk * stride - 1) / (kChunk * stride) * 3, a, stride);
+  launch(GpuKernel::leave, layered || a.tangent ? std::max(a.rows, 3) : 3, a);
   return ffi::Error::Success();
 }
 

@@ -6,15 +6,43 @@ namespace {
 
 using namespace gmem;
 using namespace gmem::GMEM_ISA;
+using cuda::kItems;
+using cuda::kWorkers;
 using Number = GMEM_NUMBER;
 
 inline int thread() { return blockIdx.x * blockDim.x + threadIdx.x; }
 
 }  // namespace
 
-#define GMEM_KERNEL extern "C" __global__ void __launch_bounds__(GMEM_BLOCK, 2)
+// Blocks of 128 threads that shall fit into a multiprocessor: 8 leave 64 registers to a thread. Tried on an H200; more
+// threads hide more of the memory's latency than a few spilt numbers cost. Other values by GMEM_NVRTC="-DGMEM_TOUCH=6".
+constexpr bool kPlain = !__is_class(Number);
+#ifndef GMEM_TOUCH
+#define GMEM_TOUCH (!kPlain ? 2 : GMEM_LAW::kLayered ? 4 : 8)
+#endif
+#ifndef GMEM_MOVE
+#define GMEM_MOVE (kPlain ? 5 : 2)
+#endif
+#define GMEM_KERNEL(threads, blocks) extern "C" __global__ void __launch_bounds__(threads, blocks)
+#define GMEM_GIVEN const __grid_constant__ Arguments a, int step
 
-GMEM_KERNEL enter(const Arguments a, int) { gmem::GMEM_ISA::enter<Number, GMEM_LAW>(a, thread()); }
-GMEM_KERNEL advance(const Arguments a, int step) { gmem::GMEM_ISA::advance<Number, GMEM_LAW>(a, step, thread()); }
-GMEM_KERNEL collect(const Arguments a, int) { gmem::GMEM_ISA::collect<Number>(a, thread()); }
-GMEM_KERNEL leave(const Arguments a, int) { gmem::GMEM_ISA::leave<Number, GMEM_LAW>(a, thread()); }
+GMEM_KERNEL(128, 2) enter(GMEM_GIVEN) { gmem::GMEM_ISA::enter<Number>(a, thread()); }
+GMEM_KERNEL(128, 4) remember(GMEM_GIVEN) { gmem::GMEM_ISA::remember<Number, GMEM_LAW>(a, thread()); }
+GMEM_KERNEL(128, GMEM_TOUCH) touch(GMEM_GIVEN) { gmem::GMEM_ISA::touch<Number, GMEM_LAW>(a, step, thread()); }
+GMEM_KERNEL(128, GMEM_MOVE) move_alone(GMEM_GIVEN) { gmem::GMEM_ISA::move_alone<Number>(a, step, thread()); }
+GMEM_KERNEL(128, 4) collect(GMEM_GIVEN) { gmem::GMEM_ISA::collect<Number>(a, step, thread()); }
+GMEM_KERNEL(128, 4) leave(GMEM_GIVEN) { gmem::GMEM_ISA::leave<Number, GMEM_LAW>(a, thread()); }
+
+GMEM_KERNEL(kItems * kWorkers, 2) move(GMEM_GIVEN) {
+  __shared__ Load<Number> part[kWorkers][kItems];
+  const int slot = threadIdx.x % kItems, worker = threadIdx.x / kItems;
+  const ReplicaView<Number> on(a, blockIdx.x * kItems + slot);
+  Load<Number> sum{};
+  for (int first = 0; first < a.spheres; first += kWorkers) {
+    part[worker][slot] = loads_of(on, first + worker);
+    __syncthreads();
+    for (int w = 0; worker == 0 && w < kWorkers && first + w < a.spheres; ++w) sum = sum + part[w][slot];
+    if (first + kWorkers < a.spheres) __syncthreads();
+  }
+  if (worker == 0) gmem::GMEM_ISA::move(on, step, sum);
+}

@@ -15,9 +15,14 @@ namespace cuda {
 namespace {
 
 using Handle = void*;  // the driver's contexts, modules, functions and streams
-using Kernels = std::array<Handle, 4>;
-constexpr const char* kNames[] = {"enter", "advance", "collect", "leave"};
-constexpr int kRelaxed = 2, kMajor = 75, kMinor = 76;  // of cuda.h
+constexpr const char* kNames[] = {"enter", "remember", "touch", "move", "move_alone", "collect", "leave"};
+constexpr int kRelaxed = 2, kMajor = 75, kMinor = 76, kMostThreads = 0;  // of cuda.h
+
+struct Kernel {
+  Handle function;
+  int block;  // threads that it was compiled for
+};
+using Kernels = std::array<Kernel, 7>;
 
 struct Driver {
   int (*context_of)(Handle, Handle*);
@@ -27,6 +32,7 @@ struct Driver {
   int (*attribute)(int*, int, int);
   int (*load)(Handle*, const void*);
   int (*function)(Handle*, Handle, const char*);
+  int (*needs)(int*, int, Handle);
   int (*launch)(Handle, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, unsigned, Handle, void**, void**);
   int (*exchange_mode)(int*);
   int (*describe)(int, const char**);
@@ -40,6 +46,7 @@ struct Driver {
     find(library, "cuDeviceGetAttribute", attribute);
     find(library, "cuModuleLoadData", load);
     find(library, "cuModuleGetFunction", function);
+    find(library, "cuFuncGetAttribute", needs);
     find(library, "cuLaunchKernel", launch);
     find(library, "cuThreadExchangeStreamCaptureMode", exchange_mode);
     find(library, "cuGetErrorString", describe);
@@ -60,9 +67,9 @@ const Driver& driver() {
 // The kernels in the current context; kept until the process ends.
 const Kernels* kernels_of(Handle context, const Which& which) {
   static std::mutex mutex;
-  static std::map<std::tuple<Handle, Law, Variant, Task>, Kernels> known;
+  static std::map<std::tuple<Handle, Law, Variant, Task, std::string>, Kernels> known;
   const std::lock_guard<std::mutex> lock(mutex);
-  const auto key = std::make_tuple(context, which.law, which.variant, which.task);
+  const auto key = std::make_tuple(context, which.law, which.variant, which.task, trial_options());
   const auto found = known.find(key);
   if (found != known.end()) return &found->second;
   const Driver& d = driver();
@@ -78,7 +85,10 @@ const Kernels* kernels_of(Handle context, const Which& which) {
   Kernels kernels{};
   const int loaded = d.load(&module, code.data());
   int got = loaded;
-  for (std::size_t i = 0; i < kernels.size() && got == 0; ++i) got = d.function(&kernels[i], module, kNames[i]);
+  for (std::size_t i = 0; i < kernels.size() && got == 0; ++i) {
+    got = d.function(&kernels[i].function, module, kNames[i]);
+    if (got == 0) got = d.needs(&kernels[i].block, kMostThreads, kernels[i].function);
+  }
   d.exchange_mode(&mode);
   d.must(got, "loading the kernels");
   return &known.emplace(key, kernels).first->second;
@@ -104,13 +114,14 @@ Launcher::~Launcher() {
   driver().pop(&context);
 }
 
-void Launcher::operator()(GpuKernel kernel, int threads, const Arguments& arguments, int step) const {
-  if (threads == 0) return;
+void Launcher::operator()(GpuKernel kernel, int items, const Arguments& arguments, int step) const {
+  if (items == 0) return;
   const Driver& d = driver();
   void* parameters[] = {const_cast<Arguments*>(&arguments), &step};
-  const Handle function = (*static_cast<const Kernels*>(kernels_))[static_cast<std::size_t>(kernel)];
-  const unsigned blocks = (static_cast<unsigned>(threads) + kBlock - 1) / kBlock;
-  d.must(d.launch(function, blocks, 1, 1, kBlock, 1, 1, 0, stream_, parameters, nullptr), "launch");
+  const Kernel& found = (*static_cast<const Kernels*>(kernels_))[static_cast<std::size_t>(kernel)];
+  const unsigned block = static_cast<unsigned>(found.block), each = kernel == GpuKernel::move ? kItems : block;
+  const unsigned blocks = (static_cast<unsigned>(items) * static_cast<unsigned>(arguments.lanes) + each - 1) / each;
+  d.must(d.launch(found.function, blocks, 1, 1, block, 1, 1, 0, stream_, parameters, nullptr), "launch");
 }
 
 }  // namespace cuda

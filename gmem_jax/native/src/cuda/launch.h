@@ -15,8 +15,8 @@ class Launcher {
   ~Launcher();
   Launcher(const Launcher&) = delete;
 
-  // Does not wait.
-  void operator()(GpuKernel kernel, int threads, const Arguments& arguments, int step = 0) const;
+  // Items in every lane, one thread each; for `move` more. Does not wait.
+  void operator()(GpuKernel kernel, int items, const Arguments& arguments, int step = 0) const;
 
  private:
   void* stream_;

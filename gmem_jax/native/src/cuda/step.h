@@ -1,9 +1,10 @@
-// The time step on a GPU: a thread is one grain of one lane.
+// The time step on a GPU: two launches, `touch` and `move`.
 //
-// `advance` is one step and one launch: the contacts of the grain, the end of this step, the beginning of the next.
-// Both grains of a contact compute it, each with its own copy of the history and in the listed order, so that they get
-// the same bits, nothing races, and forces are summed in an order of their own. `enter` and `leave` copy from and to
-// the arrays of the call. For V = double, or numbers that carry a derivative, whose results are the derivatives alone.
+// In `touch` a thread is one candidate, or one sphere and the walls, of one lane: it finds the forces where they touch. In
+// `move` it is one grain of one lane: it sums up the forces on it, sphere after sphere, ends this step and begins the next. Where there are few
+// grains and lanes the sums are shared out to kWorkers threads. Nothing races, and a lane's numbers depend neither on other
+// lanes nor on how threads share the work. `enter` and `remember` copy from the arrays of the call, `leave` to them. For V =
+// double, or numbers that carry a derivative, whose results are the derivatives alone.
 
 #pragma once
 
@@ -16,33 +17,41 @@ namespace gmem {
 namespace GMEM_ISA {
 
 using cuda::Arguments;
+using cuda::Four;
 using cuda::kChunk;
-using cuda::Side;
+using cuda::kLoad;
 using cuda::Table;
+
+constexpr int kOfLayers = 6;  // numbers of `Layers`
 
 // The numbers of one lane in a table.
 template <class V>
 struct Column {
   double* value;
   double* slope;
-  long long stride;
+  int bytes;  // from one row to the next
 
-  V operator[](long long row) const {
+  // One instruction of a GPU: 32 bits times 32 bits, added to 64.
+  double& at(double* from, int row) const {
+    return *reinterpret_cast<double*>(reinterpret_cast<char*>(from) + static_cast<long long>(row) * bytes);
+  }
+
+  V operator[](int row) const {
     if constexpr (__is_class(V)) {
-      return {value[row * stride], slope[row * stride]};
+      return {at(value, row), at(slope, row)};
     } else {
-      return value[row * stride];
+      return at(value, row);
     }
   }
-  void put(long long row, V a) const {
+  void put(int row, V a) const {
     if constexpr (__is_class(V)) {
-      value[row * stride] = a.value, slope[row * stride] = a.slope;
+      at(value, row) = a.value, at(slope, row) = a.slope;
     } else {
-      value[row * stride] = a;
+      at(value, row) = a;
     }
   }
-  Vec<V> vec(long long row) const { return {(*this)[row], (*this)[row + 1], (*this)[row + 2]}; }
-  void put(long long row, Vec<V> a) const { put(row, a.x), put(row + 1, a.y), put(row + 2, a.z); }
+  Vec<V> vec(int row) const { return {(*this)[row], (*this)[row + 1], (*this)[row + 2]}; }
+  void put(int row, Vec<V> a) const { put(row, a.x), put(row + 1, a.y), put(row + 2, a.z); }
 };
 
 inline double result(double a) { return a; }
@@ -50,27 +59,31 @@ inline double result(Dual<double> a) { return a.slope; }
 inline bool is_zero(double a) { return a == 0.0; }
 inline bool is_zero(Dual<double> a) { return a.value == 0.0 && a.slope == 0.0; }
 
-// One replica - a lane of the kernels - as its threads see it.
+// What one thread has to do: its item - a candidate, a grain - and its lane, one replica.
 template <class V>
 struct ReplicaView {
   const Arguments& a;
-  int lane, entry, replica;
+  int item, lane, entry, replica;
 
-  ReplicaView(const Arguments& a, int lane) : a(a), lane(lane), entry(lane / a.replicas), replica(lane % a.replicas) {}
+  ReplicaView(const Arguments& a, int thread)
+      : a(a), item(a.by_lanes.of(thread)), lane(thread - item * a.lanes), entry(a.by_replicas.of(lane)),
+        replica(lane - entry * a.replicas) {}
 
   Column<V> in(const Table& t) const {
-    return {t.value.of(entry) + replica, __is_class(V) ? t.slope.of(entry) + replica : nullptr, t.stride};
+    return {t.value.of(entry) + replica, __is_class(V) ? t.slope.of(entry) + replica : nullptr, 8 * t.stride};
   }
-  Column<double> out(const Table& t) const { return {t.value.of(entry) + replica, nullptr, t.stride}; }
+  Column<double> out(const Table& t) const { return {t.value.of(entry) + replica, nullptr, 8 * t.stride}; }
+  // Number of this lane in an array [..., L].
+  long long of_lane(int row) const { return static_cast<long long>(row) * a.lanes + lane; }
 
   WallState<V> walls(int step) const {
     const Column<V> w = in(a.walls);
-    const long long row = static_cast<long long>(step) * kWalls;
+    const int row = step * kWalls;
     return {w.vec(row), w.vec(row + 3), w.vec(row + 6), w.vec(row + 9)};
   }
 };
 
-// The segments of one side, in one lane; see physics/segments.h.
+// The segments of one contact, in one lane; see physics/segments.h.
 template <class V>
 struct Segments {
   Column<V> at;
@@ -115,42 +128,49 @@ struct Segments {
   }
 };
 
-// The outermost ring that a side has reached.
+// The overlap that a contact had in the last step, for laws that remember it.
 template <class V, class Law>
-int outermost(const ReplicaView<V>& on, long long side, const LawParameters<V>& law) {
-  const V overlap = on.in(on.a.history)[side * Law::kHistory + kLastOverlap];
-  return static_cast<int>(largest(Reach<V, Law::variant>(overlap, law, splat<V>(on.a.points - 2.0)).outer));
+V last_overlap(const ReplicaView<V>& on, int row) {
+  const Place place = place_of<Law>(row, kLastOverlap);
+  return on.in(on.a.history[place.leaf])[static_cast<int>(place.row)];
+}
+
+// The outermost ring that a contact has reached.
+template <class V, class Law>
+int outermost(const ReplicaView<V>& on, int row, const LawParameters<V>& law) {
+  const Reach<V, Law::variant> reach(last_overlap<V, Law>(on, row), law, splat<V>(on.a.points - 2.0));
+  return static_cast<int>(largest(reach.outer));
 }
 
 template <class V>
-Segments<V> segments_of(const ReplicaView<V>& on, long long side) {
+Segments<V> segments_of(const ReplicaView<V>& on, int row) {
   const Arguments& a = on.a;
   Column<V> at = on.in(a.segments);
-  at.value += side * a.points * 3 * at.stride;
-  if (__is_class(V)) at.slope += side * a.points * 3 * at.stride;
-  return {at, a.stored + side * a.lanes + on.lane, a.points};
+  const long long before = static_cast<long long>(row) * a.points * 3 * a.segments.stride;
+  at.value += before;
+  if (__is_class(V)) at.slope += before;
+  return {at, a.stored + on.of_lane(row), a.points};
 }
 
-// Begins a step whose numbers go to side `next` of the double tables.
+// Begins a step.
 template <class V>
-GMEM_INLINE void begin(const ReplicaView<V>& on, int grain, const GrainParameters<V>& constants, const Grain<V>& from,
-                       int next) {
+GMEM_INLINE void begin(const ReplicaView<V>& on, const GrainParameters<V>& constants, const Grain<V>& from) {
   const Arguments& a = on.a;
   const HalfStep<V> m = begin_step(constants, from);
-  const Column<V> hot = on.in(a.hot[next]), cold = on.in(a.cold), sphere = on.in(a.sphere[next]);
-  const long long h = grain * 9ll, c = grain * 4ll;
+  const Column<V> hot = on.in(a.hot), cold = on.in(a.cold), sphere = on.in(a.sphere);
+  const int h = on.item * 9, c = on.item * 4;
   hot.put(h, m.position), hot.put(h + 3, m.velocity), hot.put(h + 6, m.spin);
   cold.put(c, m.orientation.w), cold.put(c + 1, m.orientation.v);
   const Matrix<V> rotation = matrix(m.orientation);
   for (int k = 0; k < a.spheres; ++k) {
     const double* body = a.offsets.of(on.entry) + 3 * k;
     const Vec<V> lever = rotation * Vec<V>{splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])};
-    sphere.put(3 * (static_cast<long long>(grain) * a.spheres + k), m.position + lever);
+    sphere.put(3 * (on.item * a.spheres + k), m.position + lever);
   }
 }
 
 template <class V>
-inline void deliver(const ReplicaView<V>& on, int grain, const Grain<V>& g) {
+inline void deliver(const ReplicaView<V>& on, const Grain<V>& g) {
   const V number[kFields][4] = {{g.position.x, g.position.y, g.position.z},
                                 {g.orientation.w, g.orientation.v.x, g.orientation.v.y, g.orientation.v.z},
                                 {g.velocity.x, g.velocity.y, g.velocity.z},
@@ -160,7 +180,7 @@ inline void deliver(const ReplicaView<V>& on, int grain, const Grain<V>& g) {
   for (int f = 0; f < kFields; ++f) {
     const int size = f == 1 ? 4 : 3;
     const Column<double> out = on.out(on.a.grains_out[f]);
-    for (int q = 0; q < size; ++q) out.put(static_cast<long long>(grain) * size + q, result(number[f][q]));
+    for (int q = 0; q < size; ++q) out.put(on.item * size + q, result(number[f][q]));
   }
 }
 
@@ -170,179 +190,260 @@ GrainParameters<V> read_parameters(const ReplicaView<V>& on, V* parameter) {
   return GrainParameters<V>(parameter);
 }
 
-// From the arrays of the call. Thread of grain and lane.
+// The history of a candidate, from the arrays of the call. Thread of candidate and lane.
 template <class V, class Law>
-void enter(const Arguments& a, int thread) {
-  if (thread >= a.grains * a.lanes) return;
-  const ReplicaView<V> on(a, thread % a.lanes);
-  const int grain = thread / a.lanes;
-  V parameter[kParameters];
-  const GrainParameters<V> constants = read_parameters(on, parameter);
-  const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
-  const auto field = [&](int f) { return on.in(a.grains_in[f]).vec(grain * 3ll); };
-  const Column<V> q = on.in(a.grains_in[1]);
-  const Grain<V> from{field(0), {q[grain * 4ll], q.vec(grain * 4ll + 1)}, field(2), field(3), field(4), field(5)};
-  for (int side = a.start.of(on.entry)[grain]; side < a.start.of(on.entry)[grain + 1]; ++side) {
-    const int row = a.side.of(on.entry)[side].row;
-    const Column<V> history = on.in(a.history);
-    for (int n = 0; n < Law::kGiven; ++n) {
-      const Place place = place_of<Law>(row, n);
-      history.put(side * static_cast<long long>(Law::kHistory) + n, on.in(a.history_in[place.leaf])[place.row]);
-    }
-    if constexpr (Law::kLayered) {
-      const Column<V> rings = on.in(a.history_in[0]);
-      const long long first = 2ll * row * a.points;
-      V layers[Law::kHistory - kLayers];
-      store_layers(layers, segments_of(on, side).load(outermost<V, Law>(on, side, law), kLacking<Law::variant>, [&](int j) {
-        return Flat<V>{rings[first + 2 * j], rings[first + 2 * j + 1]};
-      }));
-      for (int n = kLayers; n < Law::kHistory; ++n)
-        history.put(side * static_cast<long long>(Law::kHistory) + n, layers[n - kLayers]);
-    }
+void remember(const Arguments& a, int thread) {
+  const ReplicaView<V> on(a, thread);
+  const int row = on.item;
+  if (row >= a.rows) return;
+  const bool listed = a.valid.of(on.entry)[row];
+  bool remembers = false;
+  for (int n = 0; n < Law::kGiven; ++n) {
+    const Place place = place_of<Law>(row, n);
+    const int at = static_cast<int>(place.row);
+    const Column<V> from = on.in(a.history_in[place.leaf]), to = on.in(a.history[place.leaf]);
+    const V number = listed ? from[at] : V{};
+    if (from.value != to.value || !listed) to.put(at, number);
+    remembers = remembers || !is_zero(number);
   }
-  on.in(a.pressure).put(grain * 3ll, Vec<V>{});
-  if (a.steps == 0) return deliver(on, grain, from);
-  begin(on, grain, constants, from, 0);
+  a.touching[on.of_lane(row)] = remembers;
+  if constexpr (Law::kLayered) {
+    V parameter[kParameters];
+    read_parameters(on, parameter);
+    const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
+    const Column<V> rings = on.in(a.history_in[0]);
+    const int first = 2 * row * a.points, outer = listed ? outermost<V, Law>(on, row, law) : -1;
+    V layers[kOfLayers];
+    store_layers(layers, segments_of(on, row).load(outer, kLacking<Law::variant>, [&](int j) {
+      return Flat<V>{rings[first + 2 * j], rings[first + 2 * j + 1]};
+    }));
+    for (int n = 0; n < kOfLayers; ++n) on.in(a.layers).put(kOfLayers * row + n, layers[n]);
+  }
 }
 
-// What a side does to its grain.
+// Grains, from the arrays of the call. Thread of grain and lane.
+template <class V>
+void enter(const Arguments& a, int thread) {
+  const ReplicaView<V> on(a, thread);
+  const int grain = on.item;
+  if (grain >= a.grains) return;
+  V parameter[kParameters];
+  const GrainParameters<V> constants = read_parameters(on, parameter);
+  const auto field = [&](int f) { return on.in(a.grains_in[f]).vec(grain * 3); };
+  const Column<V> q = on.in(a.grains_in[1]);
+  const Grain<V> from{field(0), {q[grain * 4], q.vec(grain * 4 + 1)}, field(2), field(3), field(4), field(5)};
+  for (int k = 0; k < a.spheres; ++k) {
+    on.in(a.wall).put(6 * (grain * a.spheres + k) + 3, Vec<V>{});
+    a.touching[on.of_lane(a.rows + grain * a.spheres + k)] = 0;
+  }
+  if (a.steps == 0) return deliver(on, from);
+  begin(on, constants, from);
+}
+
+// What is remembered of a contact while it is computed.
+template <class V, class Law>
+struct Memory {
+  const ReplicaView<V>& on;
+  int row;
+  V number[Law::kHistory + 1];
+
+  template <class Each>
+  void each(const Each& each) {
+    for (int n = 0; n < Law::kGiven; ++n) {
+      const Place place = place_of<Law>(row, n);
+      each(on.in(on.a.history[place.leaf]), static_cast<int>(place.row), number[n]);
+    }
+    for (int n = Law::kGiven; n < Law::kHistory; ++n)
+      each(on.in(on.a.layers), kOfLayers * row + n - Law::kGiven, number[n]);
+  }
+  void read() {
+    each([](const Column<V>& from, int at, V& number) { number = from[at]; });
+  }
+  void write() {
+    each([](const Column<V>& to, int at, V& number) { to.put(at, number); });
+  }
+  // Spheres that are apart have nothing to remember.
+  void forget() {
+    each([](const Column<V>& to, int at, V&) { to.put(at, V{}); });
+    if constexpr (Law::kLayered) segments_of(on, row).keep(V{});
+  }
+};
+
+// The forces of the walls on a sphere.
+template <class V>
+void touch_walls(const ReplicaView<V>& on, int step, int number) {
+  const Arguments& a = on.a;
+  if (number >= a.grains * a.spheres) return;
+  const WallState<V> box = on.walls(step);
+  const Vec<V> centre = on.in(a.sphere).vec(3 * number);
+  unsigned char& touching = a.touching[on.of_lane(a.rows + number)];
+  const bool touches = bits_less(V{}, deepest(splat<V>(1.0), centre, box));
+  if (touches != static_cast<bool>(touching)) touching = touches;
+  if (!touches) return;
+  V parameter[kParameters];
+  const GrainParameters<V> constants = read_parameters(on, parameter);
+  const Column<V> hot = on.in(a.hot), wall = on.in(a.wall);
+  const int h = 9 * a.by_spheres.of(number);
+  const Vec<V> lever = centre - hot.vec(h);
+  WallForces<V> found{};
+  touch_walls(constants, centre, lever, add_cross(hot.vec(h + 3), hot.vec(h + 6), lever), box, found);
+  wall.put(6 * number, found.force);
+  wall.put(6 * number + 3, wall.vec(6 * number + 3) + pressure(box, found.lower + found.upper));
+}
+
+// The forces between the spheres of a candidate, or of the walls on a sphere. Thread of candidate or sphere, and lane.
+template <class V, class Law>
+void touch(const Arguments& a, int step, int thread) {
+  const ReplicaView<V> on(a, thread);
+  const int row = on.item;
+  if (row >= a.rows) return touch_walls(on, step, row - a.rows);
+  if (!a.valid.of(on.entry)[row]) return;
+  const int one = a.first.of(on.entry)[row], other = a.second.of(on.entry)[row];
+  const unsigned all = static_cast<unsigned>(a.grains * a.spheres);
+  if (static_cast<unsigned>(one) >= all || static_cast<unsigned>(other) >= all) return;
+  unsigned char& touching = a.touching[on.of_lane(row)];
+  const bool touched = touching;
+  const Column<V> sphere = on.in(a.sphere);
+  const Vec<V> here = sphere.vec(3 * one), there = sphere.vec(3 * other), gap = there - here;
+  const V square = dot(gap, gap);
+  Memory<V, Law> memory{on, row, {}};
+  if (!bits_less(square, splat<V>(4.0))) {
+    if (touched) memory.forget(), touching = 0;
+    return;
+  }
+  V parameter[kParameters];
+  read_parameters(on, parameter);
+  const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
+  const Column<V> hot = on.in(a.hot), load = on.in(a.load);
+  const int i = 9 * a.by_spheres.of(one), j = 9 * a.by_spheres.of(other);
+  const Vec<V> point = splat<V>(0.5) * (here + there);
+  const ContactInput<V> input{gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3),
+                              hot.vec(i + 6), hot.vec(j + 6)};
+  memory.read();
+  Contact<V> contact;
+  relative_motion(input, square, contact);
+  contact.history = memory.number;
+  close(&contact, 1, parameter);
+  if constexpr (Law::kLayered) {
+    friction(Law{}, &contact, 1, law, [&](int) { return segments_of(on, row); });
+  } else {
+    friction(Law{}, &contact, 1, law);
+  }
+  memory.write();
+  load.put(kLoad * row, fnma(contact.normal_force, contact.normal, contact.force));
+  load.put(kLoad * row + 3, point);
+  if (!touched) touching = 1;
+}
+
+// What acts on a grain.
 template <class V>
 struct Load {
   Vec<V> force, torque;
 };
 
-// The contact of one side, which touches.
-template <class V, class Law>
-GMEM_INLINE void touch(const ReplicaView<V>& on, int now, long long number, const Side& side, const HalfStep<V>& own,
-                       Vec<V> here, Vec<V> there, const V* parameter, const LawParameters<V>& law, Load<V>& load) {
+template <class V>
+inline Load<V> operator+(const Load<V>& one, const Load<V>& other) {
+  return {one.force + other.force, one.torque + other.torque};
+}
+
+// A force that acts `lever` away from the grain's centre.
+template <class V>
+inline Load<V> at_lever(Vec<V> force, Vec<V> lever) { return {force, cross(lever, force)}; }
+
+// The sum over the contacts of a sphere of a grain, walls included.
+template <class V>
+GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int sphere) {
   const Arguments& a = on.a;
-  const bool first = side.other >= 0;
-  const int other = (first ? side.other : ~side.other) / a.spheres;
-  const Column<V> theirs = on.in(a.hot[now]), stored = on.in(a.history);
-  const long long h = other * 9ll;
-  const Vec<V> position = theirs.vec(h), velocity = theirs.vec(h + 3), spin = theirs.vec(h + 6);
-  const Vec<V> gap = there - here, point = splat<V>(0.5) * (here + there);
-  // As listed: from the first sphere to the second.
-  const auto pick = [first](Vec<V> one, Vec<V> two) {
-    return Vec<V>{select(first, one.x, two.x), select(first, one.y, two.y), select(first, one.z, two.z)};
-  };
-  const ContactInput<V> input{pick(gap, -gap),
-                              pick(point - own.position, point - position),
-                              pick(point - position, point - own.position),
-                              pick(velocity - own.velocity, own.velocity - velocity),
-                              pick(own.spin, spin),
-                              pick(spin, own.spin)};
-  V history[Law::kHistory + 1];
-  for (int n = 0; n < Law::kHistory; ++n) history[n] = stored[number * Law::kHistory + n];
-  Contact<V> contact;
-  relative_motion(input, dot(gap, gap), contact);
-  contact.history = history;
-  close(&contact, 1, parameter);
-  if constexpr (Law::kLayered) {
-    friction(Law{}, &contact, 1, law, [&](int) { return segments_of(on, number); });
-  } else {
-    friction(Law{}, &contact, 1, law);
+  Load<V> sum{};
+  if (on.item >= a.grains || sphere >= a.spheres) return sum;
+  const int fours = a.columns / 4, rows = a.rows, number = on.item * a.spheres + sphere;
+  const Four* listed = a.incidence.of(on.entry) + static_cast<long long>(number) * fours;
+  const Column<V> load = on.in(a.load);
+  const Vec<V> position = on.in(a.hot).vec(9 * on.item);
+  if (a.touching[on.of_lane(rows + number)])
+    sum = at_lever(on.in(a.wall).vec(6 * number), on.in(a.sphere).vec(3 * number) - position);
+  Four next = listed[0];
+  for (int n = 1; n <= fours; ++n) {
+    const Four now = next;
+    if (n < fours) next = listed[n];
+    int row[4];
+    bool second[4], touching[4];
+    for (int q = 0; q < 4; ++q) {
+      second[q] = now.of[q] >= rows;
+      row[q] = second[q] ? now.of[q] - rows : now.of[q];
+      touching[q] = static_cast<unsigned>(row[q]) < static_cast<unsigned>(rows) && a.touching[on.of_lane(row[q])];
+    }
+    for (int q = 0; q < 4; ++q) {
+      if (!touching[q]) continue;
+      const int at = kLoad * row[q];
+      const Vec<V> force = load.vec(at), lever = load.vec(at + 3) - position;
+      sum = sum + at_lever(second[q] ? -force : force, lever);
+    }
+    if (static_cast<unsigned>(now.of[3]) >= 2u * rows) break;  // those that follow are blank, too
   }
-  for (int n = 0; n < Law::kHistory; ++n) stored.put(number * Law::kHistory + n, history[n]);
-  const ContactLoads<V> p = push(contact);
-  load.force = load.force + pick(p.force, -p.force);
-  load.torque = load.torque + pick(p.torque_one, p.torque_other);
+  return sum;
 }
 
-// A side whose spheres are apart has nothing to remember.
-template <class V, class Law>
-inline void forget(const ReplicaView<V>& on, long long number) {
-  const Column<V> stored = on.in(on.a.history);
-  if (Law::kHistory > kLastOverlap && is_zero(stored[number * Law::kHistory + kLastOverlap])) return;
-  for (int n = 0; n < Law::kHistory; ++n)
-    if (!is_zero(stored[number * Law::kHistory + n])) stored.put(number * Law::kHistory + n, V{});
-  if constexpr (Law::kLayered) segments_of(on, number).keep(V{});
-}
-
-// One step. Thread of grain and lane.
-template <class V, class Law>
-void advance(const Arguments& a, int step, int thread) {
-  if (thread >= a.grains * a.lanes) return;
-  const ReplicaView<V> on(a, thread % a.lanes);
-  const int grain = thread / a.lanes, now = step & 1;
+// The end of a step, and the beginning of the next, of a grain in a lane.
+template <class V>
+GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
+  const Arguments& a = on.a;
+  if (on.item >= a.grains) return;
+  const Column<V> hot = on.in(a.hot), cold = on.in(a.cold);
+  const int h = on.item * 9, c = on.item * 4;
+  const HalfStep<V> own{hot.vec(h), {cold[c], cold.vec(c + 1)}, hot.vec(h + 3), hot.vec(h + 6)};
   V parameter[kParameters];
   const GrainParameters<V> constants = read_parameters(on, parameter);
-  const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
-  const Column<V> hot = on.in(a.hot[now]), cold = on.in(a.cold), sphere = on.in(a.sphere[now]);
-  const long long h = grain * 9ll, c = grain * 4ll;
-  HalfStep<V> own{hot.vec(h), {}, hot.vec(h + 3), hot.vec(h + 6)};
-  Load<V> load{};
-  const int end = a.start.of(on.entry)[grain + 1];
-  for (int number = a.start.of(on.entry)[grain]; number < end; ++number) {
-    const Side side = a.side.of(on.entry)[number];
-    const Vec<V> here = sphere.vec(side.mine * 3ll);
-    const Vec<V> there = sphere.vec((side.other >= 0 ? side.other : ~side.other) * 3ll);
-    const Vec<V> gap = there - here;
-    if (bits_less(dot(gap, gap), splat<V>(4.0))) {
-      touch<V, Law>(on, now, number, side, own, here, there, parameter, law, load);
-    } else {
-      forget<V, Law>(on, number);
-    }
-  }
-  own.orientation = {cold[c], cold.vec(c + 1)};
-  const WallState<V> box = on.walls(step);
-  WallForces<V> walls{};
-  const double arm = *a.arm.of(on.entry);
-  if (spheres_of(constants, own, a.offsets.of(on.entry), a.spheres, arm, box, walls, [](int, Vec<V>) {})) {
-    const Column<V> sum = on.in(a.pressure);
-    sum.put(grain * 3ll, sum.vec(grain * 3ll) + pressure(box, walls.lower + walls.upper));
-  }
-  const Grain<V> after = end_step(constants, a.isotropic, own, load.force + walls.force, load.torque + walls.torque);
-  if (step + 1 == a.steps) return deliver(on, grain, after);
-  begin(on, grain, constants, after, 1 - now);
+  const Grain<V> after = end_step(constants, a.isotropic, own, load.force, load.torque);
+  if (step + 1 == a.steps) return deliver(on, after);
+  begin(on, constants, after);
 }
 
-// Sums of pressures over a chunk of grains, in the place of its first. Thread of chunk, axis and lane.
+// One thread for all spheres of a grain.
 template <class V>
-void collect(const Arguments& a, int thread) {
-  const int axis = thread / a.lanes % 3, first = thread / (3 * a.lanes) * kChunk;
-  if (first >= a.grains) return;
-  const Column<V> sum = ReplicaView<V>(a, thread % a.lanes).in(a.pressure);
-  const int end = first + kChunk < a.grains ? first + kChunk : a.grains;
-  V total{};
-  for (int grain = first; grain < end; ++grain) total = total + sum[grain * 3ll + axis];
-  sum.put(first * 3ll + axis, total);
+void move_alone(const Arguments& a, int step, int thread) {
+  const ReplicaView<V> on(a, thread);
+  Load<V> sum{};
+  for (int k = 0; k < a.spheres; ++k) sum = sum + loads_of(on, k);
+  move(on, step, sum);
 }
 
-// Histories and pressures to the arrays of the call. Thread of row and lane; the first also of axis and lane.
+// Sums of pressures over a chunk of spheres that are `stride` apart, in the place of its first. Thread of chunk and axis,
+// and lane.
+template <class V>
+void collect(const Arguments& a, int stride, int thread) {
+  const ReplicaView<V> on(a, thread);
+  const int axis = on.item % 3, first = on.item / 3 * kChunk * stride;
+  if (first >= a.grains * a.spheres) return;
+  const Column<V> wall = on.in(a.wall);
+  const int all = a.grains * a.spheres, end = first + kChunk * stride < all ? first + kChunk * stride : all;
+  V total{};
+  for (int sphere = first; sphere < end; sphere += stride) total = total + wall[6 * sphere + 3 + axis];
+  wall.put(6 * first + 3 + axis, total);
+}
+
+// Pressures, and of histories what is not yet in the arrays of the call, to these. Thread of axis or candidate, and lane.
 template <class V, class Law>
 void leave(const Arguments& a, int thread) {
-  const ReplicaView<V> on(a, thread % a.lanes);
-  const int row = thread / a.lanes;
-  if (row < 3) {
-    V total{};
-    for (int grain = 0; grain < a.grains; grain += kChunk) total = total + on.in(a.pressure)[grain * 3ll + row];
-    on.out(a.pressure_out).put(row, result(total));
-  }
+  const ReplicaView<V> on(a, thread);
+  const int row = on.item;
+  if (row < 3) on.out(a.pressure_out).put(row, result(on.in(a.wall)[3 + row]));
   if (row >= a.rows) return;
-  const long long side = a.place.of(on.entry)[row];
-  for (int n = 0; n < Law::kGiven; ++n) {
+  for (int n = 0; a.tangent && n < Law::kGiven; ++n) {
     const Place place = place_of<Law>(row, n);
-    const V number = side < 0 ? V{} : on.in(a.history)[side * Law::kHistory + n];
-    on.out(a.history_out[place.leaf]).put(place.row, result(number));
+    const int at = static_cast<int>(place.row);
+    on.out(a.history_out[place.leaf]).put(at, result(on.in(a.history[place.leaf])[at]));
   }
   if constexpr (Law::kLayered) {
     const Column<double> out = on.out(a.history_out[0]);
-    const auto put = [&](int j, Flat<V> f) {
-      const long long to = 2 * (static_cast<long long>(row) * a.points + j);
-      out.put(to, result(f.along)), out.put(to + 1, result(f.across));
-    };
-    if (side < 0) {
-      for (int j = 0; j < a.points; ++j) put(j, Flat<V>{});
-    } else {
-      V parameter[kParameters];
-      read_parameters(on, parameter);
-      const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
-      const Column<V> history = on.in(a.history);
-      V layers[Law::kHistory - kLayers];
-      for (int n = kLayers; n < Law::kHistory; ++n) layers[n - kLayers] = history[side * Law::kHistory + n];
-      segments_of(on, side).unload(load_layers(layers), outermost<V, Law>(on, side, law), put);
-    }
+    V parameter[kParameters], layers[kOfLayers];
+    read_parameters(on, parameter);
+    const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
+    for (int n = 0; n < kOfLayers; ++n) layers[n] = on.in(a.layers)[kOfLayers * row + n];
+    const int first = 2 * row * a.points;
+    segments_of(on, row).unload(load_layers(layers), outermost<V, Law>(on, row, law), [&](int j, Flat<V> f) {
+      out.put(first + 2 * j, result(f.along)), out.put(first + 2 * j + 1, result(f.across));
+    });
   }
 }
 
