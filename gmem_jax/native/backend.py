@@ -57,7 +57,7 @@ def resolve(
         ValueError: if the backend is unknown or not available, or the precision is not to be had with it.
     """
     lacks = "" if supports(law) else f"the friction law {type(law).__name__}"
-    return _resolve(backend, precision, lacking(periodic, equal) or lacks, *library.available())
+    return _resolve(backend, precision, lacking(equal) or lacks, *library.available())
 
 
 @functools.cache
@@ -108,14 +108,14 @@ def require_precision(
     if precision not in PRECISIONS:
         raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
     if backend == "native":
-        require_known(periodic, equal)
+        require_known(equal)
     if precision == "double":
         return
     if name(backend, law, periodic, equal) != "native":
         built, said = library.available()
         why = "" if backend == "jax" or built else f", which is not available: {said}"
         raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")
-    require_mixed(law)
+    require_mixed(law, periodic)
 
 
 def marcher(backend: str = "auto", precision: str = "double") -> March:

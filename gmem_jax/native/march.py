@@ -17,7 +17,7 @@ from jax.extend.backend import get_backend
 from gmem_jax.native import library, primitives
 from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics import step as dynamics
-from gmem_jax.physics.boundary import PeriodicAxes
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import LAWS, entry_of
 from gmem_jax.physics.pytree import Scalar
@@ -30,23 +30,22 @@ March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 _LAW_NUMBERS = max(len(entry.numbers) for entry in LAWS)  # rows of the parameter array for a law's own
 
 
-def lacking(periodic: PeriodicAxes, equal: bool) -> str:
+def lacking(equal: bool) -> str:
     """What of a pack the library does not know, in words; "" if it knows all.
 
     Args:
-        periodic: the periodic axes of its box.
         equal: whether all its spheres are of radius 1.
     """
-    return "periodic boxes" if any(periodic) else "" if equal else "spheres of unequal radii"
+    return "" if equal else "spheres of unequal radii"
 
 
-def require_known(periodic: PeriodicAxes, equal: bool) -> None:
-    """Refuse a pack that the library does not know; arguments are those of `lacking`.
+def require_known(equal: bool) -> None:
+    """Refuse a pack that the library does not know; the argument is that of `lacking`.
 
     Raises:
         ValueError: saying what it lacks.
     """
-    if lacks := lacking(periodic, equal):
+    if lacks := lacking(equal):
         raise ValueError(f"the native backend does not know {lacks}; use backend='auto' or 'jax'")
 
 
@@ -80,16 +79,19 @@ def march_mixed(system: System, state: State, boxes: Box, dt: Scalar, drag: Scal
     Raises:
         ValueError: as of `march` and `require_mixed`.
     """
-    require_mixed(system.friction)
+    require_mixed(system.friction, boxes.periodic)
     return _march(system, state, boxes, dt, drag, _Mode(mixed=state.replicas > 1))
 
 
-def require_mixed(law: FrictionLaw) -> None:
+def require_mixed(law: FrictionLaw, periodic: PeriodicAxes) -> None:
     """Refuse what cannot be done with contacts in single precision.
 
     Raises:
-        ValueError: if the law is kept in double precision or unknown, or JAX's default device is no CPU.
+        ValueError: if the law is kept in double precision or unknown, JAX's default device is no CPU, or the box has
+            periodic axes.
     """
+    if any(periodic):
+        raise ValueError("precision='mixed' is not for periodic boxes; use 'double'")
     if get_backend().platform != "cpu":
         raise ValueError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
     if library.entry(law).layered:
@@ -98,7 +100,7 @@ def require_mixed(law: FrictionLaw) -> None:
 
 def march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
     """`march` on CPUs and CUDA GPUs, its definition elsewhere."""
-    if entry_of(system.friction) is None or lacking(boxes.periodic, system.clump.equal):
+    if entry_of(system.friction) is None or lacking(system.clump.equal):
         return dynamics.march(system, state, boxes, dt, drag)
     built, reason = library.available()
     if not built:
@@ -128,32 +130,34 @@ class _Mode(NamedTuple):
 def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, mode: _Mode) -> tuple[State, jax.Array]:
     library.require_library()
     library.entry(system.friction)
-    require_known(boxes.periodic, system.clump.equal)
+    require_known(system.clump.equal)
     if state.grains.position.dtype != jnp.float64:
         raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
     law = {field.name: getattr(system.friction, field.name) for field in fields(system.friction)}  # type: ignore[arg-type]
     dynamics.require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass, **law)
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
     system, state, boxes, dt, drag = dynamics.mark_varying((system, state, boxes, jnp.asarray(dt), jnp.asarray(drag)))
-    grains, history, total = _bin(mode, system, state.grains, state.history, boxes, (dt, drag))
-    return replace(state, grains=grains, history=history), total
+    grains, history, total = _bin(mode, system, state.grains, state.history, boxes, (dt, drag), state.cell)
+    cell = jax.tree.map(lambda leaf: leaf[-1], boxes) if state.cell is not None and len(boxes.lower) else state.cell
+    return replace(state, grains=grains, history=history, cell=cell), total
 
 
 _Result = tuple[Grains, Any, jax.Array]
+_Numbers = tuple[jax.Array, jax.Array]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _bin(
-    mode: _Mode, system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]
+    mode: _Mode, system: System, grains: Grains, history: Any, boxes: Box, numbers: _Numbers, cell: Box | None
 ) -> _Result:
-    """The steps whose walls are `boxes` ([steps, 3, B]); `numbers` are (dt, drag).
+    """The steps whose walls are `boxes` ([steps, 3, B]) from the periodic `cell` on; `numbers` are (dt, drag).
 
     Returns:
         The grains, the history, and the sum over the steps of the wall pressures, [3, B].
     """
-    arrays = arrays_of(system, grains, history, boxes, numbers)
-    definition = PlainDefinition.of(system, history, mode.anywhere)
-    call = call_of(system)._replace(mixed=int(mode.mixed))
+    arrays = arrays_of(system, grains, history, boxes, numbers, cell)
+    definition = PlainDefinition.of(system, history, mode.anywhere, boxes.periodic)
+    call = call_of(system, boxes.periodic)._replace(mixed=int(mode.mixed))
     return _result(grains, history, primitives.advance(call, definition, fixed_of(system), arrays))
 
 
@@ -174,14 +178,14 @@ def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -
         rebuilt: tuple[Any, ...] = jax.tree.unflatten(structure, whole)
         return rebuilt
 
-    system, _, history, *_ = primals
+    system, _, history, boxes, *_ = primals
     if not all(map(_is_zero, jax.tree.leaves((tangents[0].pairs, tangents[0].clump.offsets)))):
         # The library has no derivatives by these.
         _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
         return _bin(mode, *primals), slope
     arrays, along = jax.jvp(lambda *varied: arrays_of(*filled(varied)), varied, directions)
-    definition = PlainDefinition.of(system, history, mode.anywhere)
-    change = primitives.tangent(call_of(system), definition, fixed_of(system), arrays, along)
+    definition = PlainDefinition.of(system, history, mode.anywhere, boxes.periodic)
+    change = primitives.tangent(call_of(system, boxes.periodic), definition, fixed_of(system), arrays, along)
     return _bin(mode, *primals), _result(primals[1], history, change)
 
 
@@ -189,9 +193,11 @@ def _is_zero(slope: Any) -> bool:
     return isinstance(slope, jax.custom_derivatives.SymbolicZero)
 
 
-def _plain(system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]) -> _Result:
+def _plain(
+    system: System, grains: Grains, history: Any, boxes: Box, numbers: _Numbers, cell: Box | None
+) -> _Result:
     """The definition of `_bin`."""
-    state = State(grains, history, jnp.zeros(grains.position.shape[-1], jnp.int32))
+    state = State(grains, history, jnp.zeros(grains.position.shape[-1], jnp.int32), cell=cell)
     state, total = dynamics.march(system, state, boxes, *numbers)
     return state.grains, state.history, total
 
@@ -212,37 +218,46 @@ class PlainDefinition:
         system: structure of the `System`.
         history: structure of the history.
         anywhere: see `gmem_jax.native.primitives.Definition`.
+        periodic: the periodic axes of the box.
     """
 
     system: Any
     history: Any
     anywhere: bool = True
+    periodic: PeriodicAxes = WALLS
 
     @classmethod
-    def of(cls, system: System, history: Any, anywhere: bool = True) -> "PlainDefinition":
+    def of(
+        cls, system: System, history: Any, anywhere: bool = True, periodic: PeriodicAxes = WALLS
+    ) -> "PlainDefinition":
         """That of a system with such a history."""
-        return cls(jax.tree.structure(system), jax.tree.structure(history), anywhere)
+        return cls(jax.tree.structure(system), jax.tree.structure(history), anywhere, periodic)
 
     def __call__(self, fixed: Fixed, arrays: Arrays) -> StepOutput:
         """The steps."""
         empty: System = jax.tree.unflatten(self.system, [None] * self.system.num_leaves)
         dt, drag, mass, *inertia = arrays.parameters[:6]
+        own, edges = arrays.parameters[9:-6], jnp.split(arrays.parameters[-6:], 2)
         clump = replace(empty.clump, offsets=fixed.offsets, mass=mass, inertia=jnp.stack(inertia))
         law: Any = empty.friction
-        law = library.entry(law).with_numbers(law, arrays.parameters[9:])
+        law = library.entry(law).with_numbers(law, own)
         material: Any = _Solid(*arrays.parameters[6:9])
         lists = ("first", "second", "valid", "incidence")
         pairs = replace(empty.pairs, **{field: getattr(fixed, field) for field in lists})
         lower, upper, *speeds = jnp.split(arrays.walls, 4, axis=1)
-        boxes = Box(lower, upper, speeds[0], speeds[1])
+        boxes, cell = Box(lower, upper, speeds[0], speeds[1], self.periodic), None
+        if any(self.periodic):
+            pairs = replace(pairs, image=fixed.images)
+            still = jnp.zeros_like(edges[0])
+            cell = Box(edges[0], edges[1], still, still, self.periodic)
         history = jax.tree.unflatten(self.history, arrays.history)
         system = replace(empty, clump=clump, friction=law, pairs=pairs, material=material)
-        grains, history, total = _plain(system, Grains(*arrays.fields), history, boxes, (dt, drag))
+        grains, history, total = _plain(system, Grains(*arrays.fields), history, boxes, (dt, drag), cell)
         return StepOutput(jax.tree.leaves(grains), total, jax.tree.leaves(history))
 
 
-def call_of(system: System) -> Call:
-    """What the library is told beside arrays."""
+def call_of(system: System, periodic: PeriodicAxes = WALLS) -> Call:
+    """What the library is told beside arrays, of a system in a box with these periodic axes."""
     law = system.friction
     row = library.entry(law)
     return Call(
@@ -251,6 +266,7 @@ def call_of(system: System) -> Call:
         points=row.points(law),
         isotropic=int(system.clump.isotropic),
         leaves=len(row.history),
+        periodic=sum(int(is_periodic) << axis for axis, is_periodic in enumerate(periodic)),
     )
 
 
@@ -258,13 +274,16 @@ def fixed_of(system: System) -> Fixed:
     """Arguments without derivatives."""
     pairs = system.pairs
     candidates = (pairs.first, pairs.second, pairs.valid, pairs.incidence, pairs.reference[..., 0], pairs.smallest)
-    return Fixed(*candidates, system.clump.offsets)
+    images = jnp.zeros((pairs.capacity, 0), jnp.int8) if pairs.image is None else pairs.image
+    return Fixed(*candidates, system.clump.offsets, images)
 
 
-def arrays_of(system: System, grains: Grains, history: Any, boxes: Box, numbers: tuple[jax.Array, jax.Array]) -> Arrays:
+def arrays_of(
+    system: System, grains: Grains, history: Any, boxes: Box, numbers: _Numbers, cell: Box | None = None
+) -> Arrays:
     """Arguments with derivatives."""
     walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
-    parameters = _parameters(system, numbers, grains.position.shape[-1])
+    parameters = _parameters(system, numbers, cell, grains.position.shape[-1])
     return Arrays(jax.tree.leaves(grains), parameters, walls, jax.tree.leaves(history))
 
 
@@ -273,11 +292,12 @@ def _result(grains: Grains, history: Any, results: StepOutput) -> _Result:
     return moved, jax.tree.unflatten(jax.tree.structure(history), results.history), results.pressure
 
 
-def _parameters(system: System, numbers: tuple[jax.Array, jax.Array], replicas: int) -> jax.Array:
+def _parameters(system: System, numbers: _Numbers, cell: Box | None, replicas: int) -> jax.Array:
     """What parameters.h calls the rows of the parameter array, [rows, B]."""
     law, clump, material = system.friction, system.clump, system.material
     own = [getattr(law, number) for number in library.entry(law).numbers]
     own += [1.0] * (_LAW_NUMBERS - len(own))
     solid = (material.normal_stiffness, material.normal_damping, material.wall_stiffness)
-    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own)
+    edges = (0.0,) * 6 if cell is None else (*cell.lower, *cell.upper)
+    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own, *edges)
     return jnp.stack([jnp.broadcast_to(jnp.asarray(row, jnp.float64), (replicas,)) for row in rows])

@@ -40,6 +40,7 @@ class Call(NamedTuple):
         isotropic: whether all moments of inertia are equal.
         leaves: arrays of the history.
         mixed: whether contacts are computed in single precision.
+        periodic: bits of the periodic axes.
     """
 
     law: int
@@ -48,6 +49,7 @@ class Call(NamedTuple):
     isotropic: int
     leaves: int
     mixed: int = 0
+    periodic: int = 0
 
 
 class Fixed(NamedTuple):
@@ -61,6 +63,7 @@ class Fixed(NamedTuple):
         reference: of the first replica, [S, 3].
         smallest: [3].
         offsets: sphere centres of a grain, [K, 3], in R.
+        images: of `Pairs.image`, [P, 3]; [P, 0] without periodic axes.
     """
 
     first: jax.Array
@@ -70,6 +73,7 @@ class Fixed(NamedTuple):
     reference: jax.Array
     smallest: jax.Array
     offsets: jax.Array
+    images: jax.Array
 
 
 class Arrays(NamedTuple):
@@ -183,7 +187,7 @@ def _library(
     target: str, outputs: Callable[[Any], list[Any]], call: Call, in_place: bool, parts: Any
 ) -> Sequence[jax.Array]:
     fixed, arrays, *slopes = parts
-    pack = (fixed.first, fixed.second, fixed.valid, fixed.reference, fixed.smallest, fixed.offsets)
+    pack = (fixed.first, fixed.second, fixed.valid, fixed.reference, fixed.smallest, fixed.offsets, fixed.images)
     before = [*arrays.fields, *pack, arrays.parameters, arrays.walls]
     shapes, aliases = outputs(parts), {}
     if in_place:  # histories, much the largest arrays, are updated where they are
@@ -289,9 +293,16 @@ def _primitive(
 
     in_plain_jax = mlir.lower_fun(elsewhere, multiple_results=True)
 
+    def on_cpu(context: mlir.LoweringRuleContext, *values: Any, **static: Any) -> Any:
+        if target == "gmem_adjoint" and static["call"].periodic:  # which the library has not
+            return in_plain_jax(context, *values, **static)
+        return library(context, *values, **static)
+
     def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
         if static["call"].mixed:
             raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
+        if static["call"].periodic and definition.anywhere:
+            return in_plain_jax(context, *values, definition=definition, **static)
         if target in cuda.CUDA_TARGETS and not cuda.missing():
             return library(context, *values, on_gpu=True, **static)
         if target in cuda.CUDA_TARGETS and not definition.anywhere:
@@ -314,7 +325,7 @@ def _primitive(
     primitive.def_impl(alone)
     primitive.def_abstract_eval(abstract)
     batching.primitive_batchers[primitive] = batch
-    mlir.register_lowering(primitive, library, platform="cpu")
+    mlir.register_lowering(primitive, on_cpu, platform="cpu")
     mlir.register_lowering(primitive, on_cuda, platform="cuda")
     mlir.register_lowering(primitive, on_others)
     # `custom_partitioning` wants to know the devices, and JAX has no public name for saying so.

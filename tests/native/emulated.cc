@@ -25,8 +25,8 @@ void run(GpuKernel kernel, const Arguments& a, int step, int thread) {
 
 template <Task task>
 xla::ffi::Error emulate(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                        int64_t mixed, xla::ffi::RemainingArgs args, xla::ffi::RemainingRets rets) {
-  return handle<task>(nullptr, law, variant, points, isotropic, leaves, mixed, args, rets);
+                        int64_t mixed, int64_t periodic, xla::ffi::RemainingArgs args, xla::ffi::RemainingRets rets) {
+  return handle<task>(nullptr, law, variant, points, isotropic, leaves, mixed, periodic, args, rets);
 }
 
 auto without_stream() { return with_arguments(xla::ffi::Ffi::Bind()); }

@@ -15,7 +15,7 @@
 
 namespace gmem {
 
-// Axes are grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
+// Axes are edges of a periodic box by which an image is moved I (none, or three), grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
 // Mindlin's points Q, replicas B.
 using Wants = std::vector<Wanted>;
 
@@ -51,6 +51,10 @@ inline void require_law(int64_t law, int64_t variant, int64_t points) {
   require(!is_layered(static_cast<Law>(law)) || points >= 2, "the Mindlin law needs two points or more");
 }
 
+inline void require_axes(int64_t periodic) {
+  require(0 <= periodic && periodic < 8, "the periodic axes should be bits, one each");
+}
+
 // A binding with what a call is given: numbers by name, in the order of a handler's arguments, then arrays.
 template <class Binding>
 auto with_arguments(Binding&& binding) {
@@ -61,6 +65,7 @@ auto with_arguments(Binding&& binding) {
       .template Attr<int64_t>("isotropic")
       .template Attr<int64_t>("leaves")
       .template Attr<int64_t>("mixed")
+      .template Attr<int64_t>("periodic")
       .RemainingArgs()
       .RemainingRets();
 }

@@ -316,7 +316,8 @@ struct Adjoint : AdjointLayout<Law> {
     recorded.reverse({});
     V sum[kParameters] = {};
     parameter.add_bars(sum);
-    for (int r = 0; r < kParameters; ++r) write([](const Lane& lane) { return lane.parameters_out; }, r, sum[r]);
+    for (int r = 0; r < kRows; ++r)  // without periodic axes there is nothing before the steps
+      write([](const Lane& lane) { return lane.parameters_out; }, r, r < kParameters ? sum[r] : V{});
   }
 
   // --- backwards

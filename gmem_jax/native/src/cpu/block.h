@@ -44,6 +44,13 @@ inline V* field_at(int f, int u, V* hot, V* cold) {
 
 inline int chunks(const Problem& p) { return (p.grains + kChunk - 1) / kChunk; }
 
+// A periodic box, and the forces through its faces.
+template <class V>
+struct Faces {
+  Cell<V> cell;
+  Vec<V> through;
+};
+
 // The memory of an `Engine`.
 template <class Mode>
 struct EngineLayout {
@@ -54,6 +61,8 @@ struct EngineLayout {
   V* cold;        // [units, kCold]
   double* walls;  // partial sums, [chunks, 2, 3] in the mode's own layout
   V* fastest;     // squares of the largest half-step velocity and spin, [chunks, 2]
+  double* sections;  // of periodic boxes, as `walls`: see `section`
+  V* through;        // ... and the forces through their faces, [domains, 3]
   typename Mode::Layout of_mode;
 
   void place(const Problem& p, const Block& block, Arena& arena) {
@@ -62,6 +71,8 @@ struct EngineLayout {
     cold = arena.take<V>(units * kCold);
     walls = arena.take<double>(chunks * 6 * kNumber);
     fastest = arena.take<V>(chunks * 2);
+    sections = arena.take<double>(p.periodic ? chunks * 6 * kNumber : 0);
+    through = arena.take<V>(p.periodic ? static_cast<std::size_t>(block.pack->plan->domains) * 3 : 0);
     of_mode.place(p, *block.pack->plan, arena);
   }
 };
@@ -70,7 +81,7 @@ template <class Mode>
 struct Engine : EngineLayout<Mode> {
   using Layout = EngineLayout<Mode>;
   using V = typename Mode::Number;
-  using Layout::hot, Layout::cold, Layout::walls, Layout::fastest, Layout::kNumber;
+  using Layout::hot, Layout::cold, Layout::walls, Layout::fastest, Layout::sections, Layout::through, Layout::kNumber;
 
   const Problem& problem;
   const Block& block;
@@ -82,6 +93,7 @@ struct Engine : EngineLayout<Mode> {
   GrainParameters<V> constants;
   double arm;           // of the outermost sphere of a grain
   double travel = 0.0;  // how much closer any two spheres can have come since the call began
+  int current = 0;      // step under way
 
   Engine(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : problem(problem), block(block), plan(*block.pack->plan), team(team), rank(rank), mode(problem, block) {
@@ -104,6 +116,16 @@ struct Engine : EngineLayout<Mode> {
     return {load_vec(w), load_vec(w + 3), load_vec(w + 6), load_vec(w + 9)};
   }
 
+  // Of a periodic box at the end of a step, or before the first.
+  Cell<V> cell_at(int step) const {
+    if (step >= 0) return Cell<V>::of(problem.periodic, walls_at(step));
+    V edge[6];
+    for (int row = 0; row < 6; ++row) edge[row] = mode.per_lane(&Lane::parameters, kCell + row);
+    WallState<V> box{};
+    box.lower = load_vec(edge), box.upper = load_vec(edge + 3);
+    return Cell<V>::of(problem.periodic, box);
+  }
+
   // Unit u between two steps.
   Grain<V> still(int u) const {
     const V* h = hot + static_cast<std::size_t>(u) * kHot;
@@ -112,11 +134,10 @@ struct Engine : EngineLayout<Mode> {
             load_vec(h + kSpin),     load_vec(c + kAcceleration),                    load_vec(c + kSpinRate)};
   }
 
-  // First half of a step of unit u, and wall forces.
-  void begin(int u, const Grain<V>& grain, const WallState<V>& box, double* wall_sums, V* speeds) {
+  // First half of a step of unit u, midway, and wall forces.
+  void begin(int u, const HalfStep<V>& m, const WallState<V>& box, double* wall_sums, V* speeds) {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
-    const HalfStep<V> m = begin_step(constants, grain);
     speeds[0] = max(speeds[0], dot(m.velocity, m.velocity));
     speeds[1] = max(speeds[1], dot(m.spin, m.spin));
     c[kQuaternion] = m.orientation.w;
@@ -137,11 +158,14 @@ struct Engine : EngineLayout<Mode> {
     return {g.position, g.orientation, g.velocity, g.spin};
   }
 
-  // Second half: accelerations and velocities.
-  Grain<V> finish(int u) const {
+  // Second half: accelerations and velocities. In a periodic box of `cell` sums up its sections.
+  Grain<V> finish(int u, const Cell<V>* cell, double* sums) const {
     Vec<V> force, torque;
     mode.total_force(u, force, torque);
-    return end_step(constants, problem.isotropic, half_step_of(u), force, torque);
+    const HalfStep<V> half = half_step_of(u);
+    if (!cell) return end_step(constants, problem.isotropic, half, force, torque);
+    mode.add_walls(u, sums, section(*cell, parameter[kMass], half, force), Vec<V>{});
+    return end_step(constants, problem.isotropic, half, force, torque, *cell);
   }
 
   void keep(int u, const Grain<V>& g) {
@@ -155,28 +179,35 @@ struct Engine : EngineLayout<Mode> {
 
   // One pass over the grains: `ends` the step in progress and/or `begins` step number `step`.
   void grains(bool ends, bool begins, int step) {
-    const WallState<V> box = walls_at(begins ? step : 0);
+    const int periodic = problem.periodic;
+    const WallState<V> box = begins ? without(periodic, walls_at(step)) : WallState<V>{};
+    const Cell<V> ended = periodic ? cell_at(current) : Cell<V>{}, before = periodic ? cell_at(step - 1) : Cell<V>{};
+    const Cell<V> cell = periodic && begins ? cell_at(step) : Cell<V>{};
     team.share(Team::kGrains, rank, chunks(problem));
     for (int chunk; team.take(Team::kGrains, rank, &chunk);) {
       double* sums = walls + static_cast<std::size_t>(chunk) * 6 * kNumber;
       V* speeds = fastest + 2 * static_cast<std::size_t>(chunk);
+      double* of_sections = periodic ? sections + static_cast<std::size_t>(chunk) * 6 * kNumber : nullptr;
+      if (ends && periodic) std::memset(of_sections, 0, 6 * sizeof(V));
       if (begins) {
         std::memset(sums, 0, 6 * sizeof(V));
         speeds[0] = speeds[1] = V{};
       }
       const int first = Mode::unit_of(chunk * kChunk), last = Mode::unit_of((chunk + 1) * kChunk);
       for (int u = first; u < last && u < Mode::units(problem); ++u) {
-        const Grain<V> grain = ends ? finish(u) : still(u);
-        if (begins) begin(u, grain, box, sums, speeds);
-        else keep(u, grain);
+        const Grain<V> grain = ends ? finish(u, periodic ? &ended : nullptr, of_sections) : still(u);
+        if (!begins) keep(u, grain);
+        else begin(u, periodic ? begin_step(constants, grain, before, cell) : begin_step(constants, grain), box, sums, speeds);
       }
     }
     team.barrier();
-    if (begins) add_travel();
+    if (begins) current = step;
+    if (begins) add_travel(cell);
   }
 
-  // A sphere moves by at most dt (|v| + |spin| arm) in a step; two may approach each other by twice that.
-  void add_travel() {
+  // A sphere moves by at most dt (|v| + |spin| arm) in a step; two may approach each other by twice that. Strain of a periodic
+  // box brings grains closer by its rate times their distance, of which spheres are at most kFar.
+  void add_travel(const Cell<V>& cell) {
     V speed{}, spin{};
     for (int chunk = 0; chunk < chunks(problem); ++chunk) {
       speed = max(speed, fastest[2 * chunk]);
@@ -184,6 +215,9 @@ struct Engine : EngineLayout<Mode> {
     }
     const V step = parameter[kDt] * fma(splat<V>(arm), root(spin), root(speed));
     travel += 2.0 * (1.0 + 1e-9) * largest(step);
+    if (!problem.periodic) return;
+    const V strain = parameter[kDt] * (max(cell.rate.x, -cell.rate.x) + max(cell.rate.y, -cell.rate.y) + max(cell.rate.z, -cell.rate.z));
+    travel += (1.0 + 1e-9) * (kFar + 2.0 * arm) * largest(strain);
   }
 
   void contacts() {
@@ -192,9 +226,21 @@ struct Engine : EngineLayout<Mode> {
     for (int row = 0; row < kParameters; ++row) parameter[row] = convert<C>(this->parameter[row]);
     const LawParameters<C> law(parameter + kLaw, parameter[kDt]);
     team.share(Team::kContacts, rank, plan.domains);
-    for (int domain; team.take(Team::kContacts, rank, &domain);)
-      mode.contacts(plan.domain_candidate[domain], plan.domain_candidate[domain + 1], parameter, law, travel);
+    const Cell<V> cell = problem.periodic ? cell_at(current) : Cell<V>{};
+    for (int domain; team.take(Team::kContacts, rank, &domain);) {
+      Faces<V> faces{cell, {}};
+      mode.contacts(plan.domain_candidate[domain], plan.domain_candidate[domain + 1], parameter, law, travel, faces);
+      if (problem.periodic) store_vec(through + 3 * static_cast<std::size_t>(domain), faces.through);
+    }
     team.barrier();
+  }
+
+  // p of the periodic axes in the step that has just ended.
+  Vec<V> section_pressure_at(int step) const {
+    Vec<V> through{};
+    for (int domain = 0; domain < plan.domains; ++domain)
+      through = through + load_vec(this->through + 3 * static_cast<std::size_t>(domain));
+    return section_pressure(problem.periodic, walls_at(step), cell_at(step), mode.sum_walls(sections, chunks(problem)), through);
   }
 
   // p of each axis in `step`.
@@ -242,11 +288,13 @@ struct Engine : EngineLayout<Mode> {
       if (rank == 0) total = total + pressure_at(step);
       contacts();
       const bool more = step + 1 < steps;
-      if (!any_ends(step + 1)) {
-        grains(true, more, step + 1);
-        continue;
+      const bool delivers = any_ends(step + 1);
+      grains(true, more && !delivers, step + 1);
+      if (problem.periodic) {
+        if (rank == 0) total = total + section_pressure_at(step);
+        team.barrier();  // before others write what that was made of
       }
-      grains(true, false, 0);
+      if (!delivers) continue;
       deliver(step + 1, total);
       if (more) grains(false, true, step + 1);
     }

@@ -11,9 +11,12 @@
 namespace gmem {
 namespace GMEM_ISA {
 
+constexpr double kFar = 4.0;  // distance of spheres from which on nearer ones are spoken of: see `Engine::add_travel`
+
 // The travel up to which two spheres that are now apart, by the square of their distance, cannot touch.
 inline double next_check(double travel, double square) {
-  return travel + (1.0 - 1e-9) * (__builtin_sqrt(square) - 2.0);
+  const double apart = __builtin_sqrt(square);
+  return travel + (1.0 - 1e-9) * ((apart < kFar ? apart : kFar) - 2.0);
 }
 
 // What is kept of each candidate beside forces and histories.

@@ -212,7 +212,7 @@ struct Packed : PackedLayout<Law> {
     Candidate pair[W];
   };
 
-  void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel) {
+  void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel, Faces<V>& faces) {
     constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether * W, kAhead = 8;
     int near[kLook + 1], touching[kBatch];
     int count = 0;
@@ -229,19 +229,27 @@ struct Packed : PackedLayout<Law> {
           if (marks.touched[later])
             __builtin_prefetch(other), __builtin_prefetch(&other->spin), __builtin_prefetch(&other->torque);
         }
-        if (!marks.touched[c] && !touches(c, travel)) continue;
+        if (!marks.touched[c] && !touches(c, travel, faces.cell)) continue;
         touching[count++] = c;
         if (count < kBatch) continue;
-        compute(touching, count, parameter, law);
+        compute(touching, count, parameter, law, faces);
         count = 0;
       }
     }
-    compute(touching, count, parameter, law);
+    compute(touching, count, parameter, law, faces);
+  }
+
+  // By what the second sphere of a candidate is moved in a periodic box.
+  Row shift(const Cell<V>& cell, std::size_t c) const {
+    if (c >= static_cast<std::size_t>(plan.candidates)) return Row{};
+    const Image& image = plan.image[c];
+    return Row{image.x * cell.lengths.x[0], image.y * cell.lengths.y[0], image.z * cell.lengths.z[0]};
   }
 
   // Whether a candidate that did not touch at the last step does now, by the same arithmetic as in vectors.
-  bool touches(std::size_t c, double travel) {
-    const Row d = sphere[plan.candidate[c].other] - sphere[plan.candidate[c].one];
+  bool touches(std::size_t c, double travel, const Cell<V>& cell) {
+    const Row other = sphere[plan.candidate[c].other];
+    const Row d = (plan.image ? other + shift(cell, c) : other) - sphere[plan.candidate[c].one];
     const double square = fma(d[2], d[2], fma(d[1], d[1], d[0] * d[0]));
     if (square < 4.0) return marks.touched[c] = true;
     if (marks.next_check[c] < 0.0) blank(c);
@@ -260,7 +268,7 @@ struct Packed : PackedLayout<Law> {
     if (n >= 0) remote[2 * static_cast<std::size_t>(n)] = remote[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
 
-  void compute(const int* touching, int count, const V* parameter, const LawParameters<V>& law) {
+  void compute(const int* touching, int count, const V* parameter, const LawParameters<V>& law, Faces<V>& faces) {
     constexpr int kGroups = kTogether;
     Group group[kGroups];
     Contact<V> contact[kGroups];
@@ -270,7 +278,7 @@ struct Packed : PackedLayout<Law> {
       group[n] = group_of(touching + n * W, count - n * W);
       contact[n].history = memory[n];
       read_history(group[n], memory[n]);
-      const ContactInput<V> m = contact_input(group[n]);
+      const ContactInput<V> m = plan.image ? contact_input(group[n], faces.cell) : contact_input(group[n]);
       relative_motion(m, dot(m.separation, m.separation), contact[n]);
     }
     close(contact, groups, parameter);
@@ -282,7 +290,14 @@ struct Packed : PackedLayout<Law> {
     }
     for (int n = 0; n < groups; ++n) {
       write_history(group[n], memory[n]);
-      add(group[n], push(contact[n]));
+      const ContactLoads<V> found = push(contact[n]);
+      add(group[n], found);
+      for (int l = 0; plan.image && l < group[n].count; ++l) {
+        const Image& image = plan.image[group[n].c[l]];
+        if (!image.any()) continue;
+        faces.through = faces.through - Vec<V>{splat<V>(image.x * found.force.x[l]), splat<V>(image.y * found.force.y[l]),
+                                               splat<V>(image.z * found.force.z[l])};
+      }
     }
   }
 
@@ -314,6 +329,26 @@ struct Packed : PackedLayout<Law> {
             columns(point - one(&GrainRows::position)),
             columns(point - other(&GrainRows::position)),
             columns(other(&GrainRows::velocity) - one(&GrainRows::velocity)),
+            columns(one(&GrainRows::spin)),
+            columns(other(&GrainRows::spin))};
+  }
+
+  // ... in a periodic box, of their images.
+  GMEM_INLINE ContactInput<V> contact_input(const Group& g, const Cell<V>& cell) const {
+    Row moved[W];
+    for (int l = 0; l < W; ++l) moved[l] = shift(cell, static_cast<std::size_t>(g.c[l]));
+    const auto one = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); }); };
+    const auto other = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_other].*row); }); };
+    const Rows shift = load_rows([&](int l) { return moved + l; });
+    const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l].one; });
+    const Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l].other; }) + shift;
+    const Rows point = splat<V>(0.5) * (centre_one + centre_other);
+    const Rows here = one(&GrainRows::position), there = other(&GrainRows::position) + shift;
+    const Vec<V> velocity = columns(other(&GrainRows::velocity) - one(&GrainRows::velocity));
+    return {columns(centre_other - centre_one),
+            columns(point - here),
+            columns(point - there),
+            velocity + cell.flow(columns(there - here)),
             columns(one(&GrainRows::spin)),
             columns(other(&GrainRows::spin))};
   }

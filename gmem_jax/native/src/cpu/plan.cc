@@ -144,12 +144,19 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
     store->remote_sphere[c.remote] = away(c) == c.grain_one ? c.one : c.other;
   }
 
+  for (const Candidate& c : candidates) {
+    if (!list.image) break;
+    const int8_t* of = list.image + 3 * static_cast<std::size_t>(c.row);
+    store->image.push_back({of[0], of[1], of[2]});
+  }
+
   store->plan = {count,
                  static_cast<int>(store->domain_candidate.size()) - 1,
                  store->remote_start.back(),
                  static_cast<int>(store->padding_row.size()),
                  store->grain.data(),
                  candidates.data(),
+                 list.image ? store->image.data() : nullptr,
                  store->domain_candidate.data(),
                  store->remote_start.data(),
                  store->remote_sphere.data(),
@@ -160,9 +167,10 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
 // A copy of what a plan was made from.
 struct Key {
   int grains, spheres_per_grain, rows;
+  bool images;
   std::vector<char> bytes;
 
-  explicit Key(const List& list) : grains(list.grains), spheres_per_grain(list.spheres_per_grain), rows(list.rows) {
+  explicit Key(const List& list) : grains(list.grains), spheres_per_grain(list.spheres_per_grain), rows(list.rows), images(list.image) {
     visit(list, [this](const void* data, std::size_t size) {
       const char* begin = static_cast<const char*>(data);
       bytes.insert(bytes.end(), begin, begin + size);
@@ -172,6 +180,7 @@ struct Key {
 
   bool matches(const List& list) const {
     if (grains != list.grains || spheres_per_grain != list.spheres_per_grain || rows != list.rows) return false;
+    if (images != (list.image != nullptr)) return false;
     std::size_t at = 0;
     return visit(list, [&](const void* data, std::size_t size) {
       const bool same = std::memcmp(bytes.data() + at, data, size) == 0;
@@ -185,7 +194,7 @@ struct Key {
     const std::size_t rows = list.rows, spheres = static_cast<std::size_t>(list.grains) * list.spheres_per_grain;
     return function(list.first, rows * sizeof(int32_t)) && function(list.second, rows * sizeof(int32_t)) &&
            function(list.valid, rows * sizeof(bool)) && function(list.reference, 3 * spheres * sizeof(double)) &&
-           function(list.smallest, 3 * sizeof(double));
+           function(list.smallest, 3 * sizeof(double)) && function(list.image, list.image ? 3 * rows : 0);
   }
 };
 

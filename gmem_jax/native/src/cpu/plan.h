@@ -23,6 +23,7 @@ struct List {
   const bool* valid;
   const double* reference;  // sphere centres in box coordinates, [S, 3]
   const double* smallest;   // edge lengths of the box, [3]
+  const int8_t* image;      // see `Image`, [rows, 3]; null without periodic axes
 };
 
 // A plan and the memory it points to.
@@ -30,6 +31,7 @@ struct PlanStore {
   Plan plan;
   std::vector<int32_t> grain, domain_candidate, remote_start, remote_sphere, padding_row;
   std::vector<Candidate> candidate;
+  std::vector<Image> image;
 };
 
 // The plan of a list; that of a list seen lately is remembered. Throws std::invalid_argument if a candidate is not a

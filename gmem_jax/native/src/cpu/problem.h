@@ -41,6 +41,7 @@ struct Problem {
   int spheres_per_grain;  // K
   std::ptrdiff_t stride;  // doubles between two rows of an array: replicas B of the innermost axis
   bool mixed = false;     // contacts in single precision; forward only
+  int periodic = 0;       // bit of each axis along which the box is; not for the adjoint
 
   int spheres() const { return grains * spheres_per_grain; }
 };
@@ -56,6 +57,13 @@ struct Candidate {
   bool away_is_one() const { return grain_one > grain_other; }
 };
 
+// By how many edges of a periodic box the second sphere of a candidate is moved along each axis.
+struct Image {
+  int8_t x, y, z;
+
+  bool any() const { return x || y || z; }
+};
+
 // The candidate list, sorted for memory and threads; see plan.h. Grains and spheres are numbered anew.
 struct Plan {
   int candidates;
@@ -64,6 +72,7 @@ struct Plan {
   int padding;                      // rows of the list without a candidate
   const int32_t* grain;             // number in the call of each grain, [N]
   const Candidate* candidate;       // by domain
+  const Image* image;               // of each, or null without periodic axes
   const int32_t* domain_candidate;  // first candidate of each domain, [domains + 1]
   const int32_t* remote_start;      // the remotes of each grain: remote_start[g] to remote_start[g + 1], [N + 1]
   const int32_t* remote_sphere;     // that each remote acts on, [remotes]

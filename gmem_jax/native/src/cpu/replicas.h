@@ -266,7 +266,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     if constexpr (Law::kLayered) trace.segments[c] = -1;
   }
 
-  void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel) {
+  void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel, Faces<V>& faces) {
     constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether, kAhead = 6;
     const V contact_square = splat<V>(4.0);
     int near[kLook + 1], touching[kBatch];
@@ -289,7 +289,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
             for (std::size_t at = 0; at < Law::kHistory * sizeof(C); at += 64) __builtin_prefetch(remembered + at);
         }
         const Vec<V> one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
-        const Vec<V> other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
+        Vec<V> other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
+        if (plan.image) other = other + shift(faces.cell, c);
         const V square = dot(other - one, other - one);
         if (!bits_less(square, contact_square)) {
           if (marks.touched[c]) forget(c, pair);
@@ -298,27 +299,45 @@ struct Replicas : ReplicasLayout<Law, V, C> {
         }
         marks.touched[c] = true;
         if (trace.touching) remember(c, remembered++);
-        relative_motion(contact_input(pair, one, other), convert<C>(square), contact[count]);
+        if constexpr (!kMixed) {
+          if (plan.image) relative_motion(contact_input(pair, one, other, faces.cell, c), square, contact[count]);
+          else relative_motion(contact_input(pair, one, other), square, contact[count]);
+        } else {
+          relative_motion(contact_input(pair, one, other), convert<C>(square), contact[count]);
+        }
         if constexpr (kMixed) contact[count].before = convert<C>(contact_square - square);
         contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
         touching[count++] = c;
         if (count < kBatch) continue;
-        compute(touching, count, contact, parameter, law);
+        compute(touching, count, contact, parameter, law, faces);
         count = 0;
       }
     }
-    compute(touching, count, contact, parameter, law);
+    compute(touching, count, contact, parameter, law, faces);
     if (trace.touching && first < end) trace.end[first] = remembered;
   }
 
-  void compute(const int* touching, int count, Contact<C>* contact, const C* parameter, const LawParameters<C>& law) {
+  Vec<V> shift(const Cell<V>& cell, std::size_t c) const {
+    const Image& image = plan.image[c];
+    return cell.shift(image.x, image.y, image.z);
+  }
+
+  void compute(const int* touching, int count, Contact<C>* contact, const C* parameter, const LawParameters<C>& law,
+               Faces<V>& faces) {
     close(contact, count, parameter);
     if constexpr (Law::kLayered) {
       friction(Law{}, contact, count, law, [&](int n) { return segments_of(touching[n]); });
     } else {
       friction(Law{}, contact, count, law);
     }
-    for (int n = 0; n < count; ++n) add(plan.candidate[touching[n]], push(contact[n]));
+    for (int n = 0; n < count; ++n) {
+      const ContactLoads<C> found = push(contact[n]);
+      add(plan.candidate[touching[n]], found);
+      if (!plan.image || !plan.image[touching[n]].any()) continue;
+      const Image& image = plan.image[touching[n]];
+      const Vec<V> force = convert<V>(found.force);
+      faces.through = faces.through - Vec<V>{splat<V>(image.x) * force.x, splat<V>(image.y) * force.y, splat<V>(image.z) * force.z};
+    }
   }
 
   void forget(std::size_t c, const Candidate& pair) {
@@ -350,6 +369,18 @@ struct Replicas : ReplicasLayout<Law, V, C> {
               load_vec(one + kSpin),
               load_vec(other + kSpin)};
     }
+  }
+
+  // ... in a periodic box, of the image at `centre_other`.
+  GMEM_INLINE ContactInput<V> contact_input(const Candidate& pair, Vec<V> centre_one, Vec<V> centre_other,
+                                            const Cell<V>& cell, std::size_t c) const {
+    const V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
+    const V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
+    const Vec<V> point = splat<V>(0.5) * (centre_one + centre_other);
+    const Vec<V> here = load_vec(one + kPosition), there = load_vec(other + kPosition) + shift(cell, c);
+    const Vec<V> velocity = load_vec(other + kVelocity) - load_vec(one + kVelocity);
+    return {centre_other - centre_one,       point - here,          point - there,
+            velocity + cell.flow(there - here), load_vec(one + kSpin), load_vec(other + kSpin)};
   }
 
   GMEM_INLINE void add(const Candidate& pair, const ContactLoads<C>& push) {

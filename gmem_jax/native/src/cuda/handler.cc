@@ -67,7 +67,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   const auto dims = results[0].dimensions();
   require(dims.size() == 4, "positions need four axes");
   Reader reader({dims[0]});
-  reader.size('R') = kParameters;
+  reader.size('R') = kRows;
   reader.size('W') = kWalls;
   reader.size('Q') = points;
   reader.size('O') = 4;
@@ -161,9 +161,10 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 
 template <Task task>
 ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t,
-                  int64_t mixed, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+                  int64_t mixed, int64_t periodic, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   return in_words([&] {
     require(mixed == 0, "there is no mixed precision on GPUs");
+    require(periodic == 0, "there are no periodic boxes on GPUs");
     return call(task, law, variant, points, isotropic, stream, args, rets);
   });
 }

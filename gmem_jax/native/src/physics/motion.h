@@ -13,6 +13,42 @@ struct WallState {
   Vec<V> lower, upper, lower_velocity, upper_velocity;
 };
 
+// A box of which some axes are periodic: bit `axis` of `periodic`. Along the others there is nothing of it: rate and lower
+// are 0, lengths 1.
+// gmem_jax/physics/step.py: _carried, _strain_rate
+template <class V>
+struct Cell {
+  Vec<V> lower, lengths, rate;
+
+  static constexpr Cell of(int periodic, const WallState<V>& w) {
+    const auto axis = [&](int bit, V lower, V upper, V slow, V fast, V& from, V& length, V& rate) {
+      const bool is = periodic >> bit & 1;
+      from = is ? lower : V{}, length = is ? upper - lower : splat<V>(1.0), rate = is ? (fast - slow) / length : V{};
+    };
+    Cell c{};
+    axis(0, w.lower.x, w.upper.x, w.lower_velocity.x, w.upper_velocity.x, c.lower.x, c.lengths.x, c.rate.x);
+    axis(1, w.lower.y, w.upper.y, w.lower_velocity.y, w.upper_velocity.y, c.lower.y, c.lengths.y, c.rate.y);
+    axis(2, w.lower.z, w.upper.z, w.lower_velocity.z, w.upper_velocity.z, c.lower.z, c.lengths.z, c.rate.z);
+    return c;
+  }
+
+  // From one image of a place to another.
+  constexpr Vec<V> shift(double x, double y, double z) const {
+    return {splat<V>(x) * lengths.x, splat<V>(y) * lengths.y, splat<V>(z) * lengths.z};
+  }
+  constexpr Vec<V> flow(Vec<V> apart) const { return {rate.x * apart.x, rate.y * apart.y, rate.z * apart.z}; }
+};
+
+// The walls without those of periodic axes, which nothing touches.
+template <class V>
+constexpr WallState<V> without(int periodic, WallState<V> w) {
+  const V far = splat<V>(1e300);
+  if (periodic & 1) w.lower.x = -far, w.upper.x = far;
+  if (periodic & 2) w.lower.y = -far, w.upper.y = far;
+  if (periodic & 4) w.lower.z = -far, w.upper.z = far;
+  return w;
+}
+
 // A grain at the beginning of a step.
 template <class V>
 struct Grain {
@@ -55,6 +91,21 @@ constexpr GMEM_INLINE HalfStep<V> begin_step(const GrainParameters<V>& p, const 
   return {fma(p.dt, velocity, g.position), turn(g.orientation, p.dt * spin), velocity, spin};
 }
 
+// ... where a periodic box goes from `before` to `cell`: grains keep their places in it, and move beside that.
+template <class V>
+constexpr GMEM_INLINE HalfStep<V> begin_step(const GrainParameters<V>& p, const Grain<V>& g, const Cell<V>& before,
+                                             const Cell<V>& cell) {
+  HalfStep<V> m = begin_step(p, g);
+  const auto carried = [&](V at, V from, V old, V to, V now, V velocity) {
+    const V stretch = now / old, half = splat<V>(0.5) * (splat<V>(1.0) + stretch);
+    return to + stretch * (at - from) + half * (p.dt * velocity);
+  };
+  m.position = {carried(g.position.x, before.lower.x, before.lengths.x, cell.lower.x, cell.lengths.x, m.velocity.x),
+                carried(g.position.y, before.lower.y, before.lengths.y, cell.lower.y, cell.lengths.y, m.velocity.y),
+                carried(g.position.z, before.lower.z, before.lengths.z, cell.lower.z, cell.lengths.z, m.velocity.z)};
+  return m;
+}
+
 // gmem_jax/physics/step.py: _angular_acceleration
 template <class V>
 constexpr Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropic, Quaternion<V> orientation,
@@ -80,6 +131,21 @@ constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotro
       p.slowed * fnma(p.drag, m.spin, angular_acceleration(p, isotropic, m.orientation, m.spin, torque));
   return {m.position,   m.orientation, fma(p.half_dt, acceleration, m.velocity), fma(p.half_dt, spin_rate, m.spin),
           acceleration, spin_rate};
+}
+
+// ... where velocities are those beside the strain of a periodic box.
+template <class V>
+constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const HalfStep<V>& m, Vec<V> force,
+                                        Vec<V> torque, const Cell<V>& cell) {
+  Grain<V> g = end_step(p, isotropic, m, force, torque);
+  const auto acceleration = [&](V velocity, V force, V rate) {
+    const V slowing = p.drag + rate;
+    return fnma(slowing, velocity, p.inverse_mass * force) / fma(p.half_dt, slowing, splat<V>(1.0));
+  };
+  g.acceleration = {acceleration(m.velocity.x, force.x, cell.rate.x), acceleration(m.velocity.y, force.y, cell.rate.y),
+                    acceleration(m.velocity.z, force.z, cell.rate.z)};
+  g.velocity = fma(p.half_dt, g.acceleration, m.velocity);
+  return g;
 }
 
 template <class V>
@@ -147,6 +213,17 @@ GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, c
   return near;
 }
 
+// What a grain adds to L times the force across a section of a periodic box.
+// gmem_jax/physics/step.py: section_force
+template <class V>
+constexpr Vec<V> section(const Cell<V>& cell, V mass, const HalfStep<V>& m, Vec<V> force) {
+  const auto axis = [&](V at, V lower, V velocity, V force) {
+    return fma(force, at - lower, mass * (velocity * velocity));
+  };
+  return {axis(m.position.x, cell.lower.x, m.velocity.x, force.x), axis(m.position.y, cell.lower.y, m.velocity.y, force.y),
+          axis(m.position.z, cell.lower.z, m.velocity.z, force.z)};
+}
+
 // p of each axis from the sum of the forces on its two walls: (F_lower + F_upper) / (2 A).
 // gmem_jax/physics/step.py: wall_pressure
 template <class V>
@@ -155,6 +232,16 @@ constexpr Vec<V> pressure(const WallState<V>& box, Vec<V> force) {
   const V two = splat<V>(2.0);
   return {force.x / (two * (lengths.y * lengths.z)), force.y / (two * (lengths.x * lengths.z)),
           force.z / (two * (lengths.x * lengths.y))};
+}
+
+// Pressures along the periodic axes: of what the grains of a box add, and of the forces through its faces.
+template <class V>
+constexpr Vec<V> section_pressure(int periodic, const WallState<V>& box, const Cell<V>& cell, Vec<V> sections, Vec<V> through) {
+  const V two = splat<V>(2.0);
+  const Vec<V> p = pressure(box, {two * (through.x + sections.x / cell.lengths.x),
+                                  two * (through.y + sections.y / cell.lengths.y),
+                                  two * (through.z + sections.z / cell.lengths.z)});
+  return {periodic & 1 ? p.x : V{}, periodic & 2 ? p.y : V{}, periodic & 4 ? p.z : V{}};
 }
 
 }  // namespace GMEM_ISA
