@@ -33,7 +33,6 @@ from gmem_jax.files.packs import STANDARD_NAME, save_pack
 from gmem_jax.files.sizes import pack_bytes
 from gmem_jax.files.spheres import load_clump
 from gmem_jax.physics import grain
-from gmem_jax.physics.boundary import periodic_axes
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.grain import Clump
 from gmem_jax.preparation.preparation import preparation_frames, prepare
@@ -125,7 +124,7 @@ def prepare_command(
     preparation_frames(recipe, frames)  # refuses what cannot be before anything is begun
     check_output(output, ".h5", force=force)
     made = graded(recipe, clump)
-    backend = native.name(backend, Frictionless(), periodic_axes(recipe.boundary), made.equal)
+    backend = native.name(backend, Frictionless(), made.equal)
     cost = announce(f"{recipe.grains} grains", grain_steps(recipe, made), PREPARATION_BYTES * recipe.grains, backend)
     key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
     if dry_run:

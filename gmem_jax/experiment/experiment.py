@@ -317,8 +317,8 @@ class Experiment:
 
     @property
     def runs_on(self) -> native.Backend:
-        """What `backend` means for this law and box on JAX's default device."""
-        return native.name(self.backend, self.friction, self.pack.periodic, self.pack.clump.equal)
+        """What `backend` means for this law and pack on JAX's default device."""
+        return native.name(self.backend, self.friction, self.pack.clump.equal)
 
     @property
     def timing(self) -> Timing:

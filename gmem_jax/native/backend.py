@@ -41,16 +41,13 @@ def supports(law: FrictionLaw) -> bool:
     return entry_of(law) is not None
 
 
-def resolve(
-    backend: str, precision: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS, equal: bool = True
-) -> ResolvedBackend:
+def resolve(backend: str, precision: str, law: FrictionLaw, equal: bool = True) -> ResolvedBackend:
     """What does the steps for a friction law; the same object for the same arguments.
 
     Args:
         backend: as of `marcher`.
         precision: likewise.
         law: its class matters, and not its parameters.
-        periodic: the periodic axes of the box.
         equal: whether all spheres are of radius 1.
 
     Raises:
@@ -80,7 +77,7 @@ def _why_not(lacks: str, built: bool, said: str) -> str:
     return "" if client.platform == "cpu" else f"the native backend does not run on {client.platform}"
 
 
-def name(backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS, equal: bool = True) -> Backend:
+def name(backend: str, law: FrictionLaw, equal: bool = True) -> Backend:
     """What "auto" means on JAX's default device, "jax" or "native"; arguments are those of `resolve`.
 
     Others are themselves.
@@ -89,7 +86,7 @@ def name(backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS, equal: 
         ValueError: if there is no such backend.
     """
     _require_known(backend)
-    return resolve(backend, "double", law, periodic, equal).name if backend == "auto" else cast(Backend, backend)
+    return resolve(backend, "double", law, equal).name if backend == "auto" else cast(Backend, backend)
 
 
 def _require_known(backend: str) -> None:
@@ -111,7 +108,7 @@ def require_precision(
         require_known(equal)
     if precision == "double":
         return
-    if name(backend, law, periodic, equal) != "native":
+    if name(backend, law, equal) != "native":
         built, said = library.available()
         why = "" if backend == "jax" or built else f", which is not available: {said}"
         raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")

@@ -193,9 +193,7 @@ def _is_zero(slope: Any) -> bool:
     return isinstance(slope, jax.custom_derivatives.SymbolicZero)
 
 
-def _plain(
-    system: System, grains: Grains, history: Any, boxes: Box, numbers: _Numbers, cell: Box | None
-) -> _Result:
+def _plain(system: System, grains: Grains, history: Any, boxes: Box, numbers: _Numbers, cell: Box | None) -> _Result:
     """The definition of `_bin`."""
     state = State(grains, history, jnp.zeros(grains.position.shape[-1], jnp.int32), cell=cell)
     state, total = dynamics.march(system, state, boxes, *numbers)

@@ -301,8 +301,6 @@ def _primitive(
     def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
         if static["call"].mixed:
             raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
-        if static["call"].periodic and definition.anywhere:
-            return in_plain_jax(context, *values, definition=definition, **static)
         if target in cuda.CUDA_TARGETS and not cuda.missing():
             return library(context, *values, on_gpu=True, **static)
         if target in cuda.CUDA_TARGETS and not definition.anywhere:

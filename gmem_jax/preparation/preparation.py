@@ -130,7 +130,7 @@ class _Preparation:
         state = start(system, at, grains.quaternion, self.box)
         state = accelerate(system, replace(state, grains=grains), self.box)
         expected = bins_outside(recipe, clump) * work_of_bin(1) + work_of(cycles_of(recipe), 1)
-        self.march = native.marcher(native.name(backend, system.friction, self.periodic, clump.equal))
+        self.march = native.marcher(native.name(backend, system.friction, clump.equal))
         simulation = Simulation(system, self._path(), self.dt, recipe.drag, steps=steps, backend=backend)
         self.runner = Runner(
             simulation, state, finder=finder, progress=progress, total_work=expected, observers=(self.frames,)
@@ -350,7 +350,7 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
         "simulated_time": runner.time,
         "at_rest": asdict(last),
         **provenance(),
-        "backend": native.name(runner.simulation.backend, Frictionless(), box.periodic, clump.equal),
+        "backend": native.name(runner.simulation.backend, Frictionless(), clump.equal),
     }
     return Pack(
         clump=clump,

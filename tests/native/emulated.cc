@@ -9,15 +9,15 @@ namespace cuda {
 namespace {
 
 // Of one thread.
-template <class V, class Law>
+template <class V, class Law, bool periodic>
 void run(GpuKernel kernel, const Arguments& a, int step, int thread) {
   namespace k = gmem::GMEM_ISA;
   switch (kernel) {
-    case GpuKernel::enter: return k::enter<V>(a, thread);
+    case GpuKernel::enter: return k::enter<V, periodic>(a, thread);
     case GpuKernel::remember: return k::remember<V, Law>(a, thread);
-    case GpuKernel::touch: return k::touch<V, Law>(a, step, thread);
+    case GpuKernel::touch: return k::touch<V, Law, periodic>(a, step, thread);
     case GpuKernel::move:  // in the order of its sum it is the same
-    case GpuKernel::move_alone: return k::move_alone<V>(a, step, thread);
+    case GpuKernel::move_alone: return k::move_alone<V, periodic>(a, step, thread);
     case GpuKernel::collect: return k::collect<V>(a, step, thread);
     case GpuKernel::leave: return k::leave<V, Law>(a, thread);
   }
@@ -44,9 +44,10 @@ void Launcher::operator()(GpuKernel kernel, int items, const Arguments& a, int s
     using L = decltype(law);
     for (int thread = 0; thread < threads; ++thread)
       if (which.task == Task::forward) {
-        run<double, L>(kernel, a, step, thread);
+        which.periodic ? run<double, L, true>(kernel, a, step, thread) : run<double, L, false>(kernel, a, step, thread);
       } else {
-        run<gmem::GMEM_ISA::Dual<double>, L>(kernel, a, step, thread);
+        using D = gmem::GMEM_ISA::Dual<double>;
+        which.periodic ? run<D, L, true>(kernel, a, step, thread) : run<D, L, false>(kernel, a, step, thread);
       }
   });
 }

@@ -17,13 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import export
-from scenes import scene
+from scenes import PERIODIC_XY_27, scene
 
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.native import build, cuda, library, primitives
 from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of
 from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
+from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.grain import sphere
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import System, start
@@ -65,15 +66,24 @@ def emulated(tmp_path_factory: pytest.TempPathFactory) -> None:
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(functions, target)), platform="cpu")
 
 
-def walls(begun: int, lower: Any, upper: Any, speed: float) -> Box:
+def walls(begun: int, lower: Any, upper: Any, speed: float, periodic: PeriodicAxes) -> Box:
     """The next 10 walls of a sheared squeeze, each replica at its own rate."""
     inwards = speed * jnp.asarray([1.0, 0.5, 0.0])[:, None] * jnp.linspace(0.5, 1.0, REPLICAS)
     time = 0.3 * (begun + 1.0 + jnp.arange(10))[:, None, None]
     every = jnp.ones((10, 3, REPLICAS))
-    return Box(lower[:, None] + time * inwards, upper[:, None] - time * inwards, every * inwards, -every * inwards)
+    lower, upper = lower[:, None] + time * inwards, upper[:, None] - time * inwards
+    return Box(lower, upper, every * inwards, -every * inwards, periodic)
 
 
-def thrown(system: System, state: Any, lower: Any, upper: Any, speed: float = 2e-3, ago: int = 40) -> Scene:
+def thrown(
+    system: System,
+    state: Any,
+    lower: Any,
+    upper: Any,
+    speed: float = 2e-3,
+    ago: int = 40,
+    periodic: PeriodicAxes = WALLS,
+) -> Scene:
     """Grains that fly, spin and touch, some steps after they were thrown; replicas differ in all their numbers."""
     draws = np.random.default_rng(0).normal(size=(2, *state.grains.position.shape[:2], REPLICAS))
     state = replicate(state, REPLICAS)
@@ -83,13 +93,15 @@ def thrown(system: System, state: Any, lower: Any, upper: Any, speed: float = 2e
         system = replace(system, friction=replace(system.friction, mu=0.3 * spread))
     system = replace(system, clump=replace(system.clump, mass=system.clump.mass * spread))
     numbers = 0.3 * spread, 0.01 * (1.0 - spread)
-    call, fixed = call_of(system), fixed_of(system)
-    arrays = arrays_of(system, grains, state.history, walls(0, lower, upper, speed), numbers)
-    for begun in range(10, ago + 1, 10):
-        moved = emulate(call, fixed, arrays)
-        arrays = arrays_of(system, grains, state.history, walls(begun, lower, upper, speed), numbers)
-        arrays = arrays._replace(fields=moved.fields, history=moved.history)
-    return call, fixed, arrays, PlainDefinition.of(system, state.history)
+    call, fixed, cell = call_of(system, periodic), fixed_of(system), state.cell
+    fields, history = jax.tree.leaves(grains), jax.tree.leaves(state.history)
+    for begun in range(0, ago + 1, 10):
+        boxes = walls(begun, lower, upper, speed, periodic)
+        arrays = arrays_of(system, grains, state.history, boxes, numbers, cell)._replace(fields=fields, history=history)
+        if begun < ago:
+            fields, _, history = emulate(call, fixed, arrays)
+            cell = jax.tree.map(lambda leaf: leaf[-1], boxes) if any(periodic) else None
+    return call, fixed, arrays, PlainDefinition.of(system, state.history, periodic=periodic)
 
 
 @functools.cache
@@ -145,8 +157,16 @@ def assert_close(found: Any, expected: Any, tolerance: float) -> None:
         np.testing.assert_allclose(one, other, rtol=0.0, atol=tolerance * scale, err_msg=jax.tree_util.keystr(path))
 
 
+def images(law: str) -> Scene:
+    """Grains between walls along z alone, whose contacts go through the faces of the box."""
+    pack = gm.load_pack(PERIODIC_XY_27)
+    system = System(pack.clump, LAWS[law], pack.pairs)
+    state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
+    return thrown(system, state, pack.lower, pack.upper, periodic=pack.box.periodic)
+
+
 SCENES = {**{law: functools.partial(packed, law) for law in LAWS}, "gyroscopic": lambda: packed("H", False)}
-SCENES["spheres"] = spheres
+SCENES |= {"spheres": spheres, "periodic": lambda: images("H"), "periodic-M1": lambda: images("M1")}
 SLOW_SCENES = ("frictionless", "M1", "M2-averaged")  # between others that say as much
 
 

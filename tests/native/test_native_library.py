@@ -114,6 +114,7 @@ def test_want_of_memory_is_an_error_and_leaves_the_library_working() -> None:
         "first": given["first"][:1],
         "second": given["second"][:1],
         "valid": given["valid"][:1],
+        "images": given["images"][:1],
         "fields": [leaf[..., :1] for leaf in given["fields"]],
         "parameters": given["parameters"][:, :1],
         "walls": jnp.zeros((steps, 12, 1)),

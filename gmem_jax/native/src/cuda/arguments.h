@@ -55,10 +55,12 @@ struct Arguments {
   int grains, spheres, rows, columns, points, steps;  // N, K, P, C, Q, T
   int replicas, lanes;                                // B, L
   Divisor by_replicas, by_lanes, by_spheres;
+  int periodic;                                       // bit of each axis along which the box is
   bool isotropic, tangent;
   Entries<const int> first, second;    // spheres of a candidate, [P]
   Entries<const unsigned char> valid;  // [P]
   Entries<const Four> incidence;       // candidates of a sphere, plus P where it is the second one; [N K, C]
+  Entries<const signed char> image;    // by how many edges of a periodic box the second sphere is moved, [P, 3]
   Entries<const double> offsets;
   Table parameters, walls, grains_in[kFields], history_in[kMaxHistory];
   Table grains_out[kFields], history_out[kMaxHistory], pressure_out;  // values, or derivatives where they are wanted

@@ -82,6 +82,7 @@ std::string compiled(const Nvrtc& nvrtc, const std::string& architecture, const 
       "--fmad=false",  // as on CPUs: a fused multiply-add is where the sources say so
       "-I" + paths().sources, "-DGMEM_ISA=gpu",
       "-DGMEM_LAW=" + law_as_type(which),
+      "-DGMEM_PERIODIC=" + std::to_string(which.periodic),
       std::string("-DGMEM_NUMBER=") + (which.task == Task::forward ? "double" : "Dual<double>")};
   if (log) options.emplace_back("--ptxas-options=-v");
   std::istringstream more(trial_options());
@@ -135,7 +136,7 @@ std::string code_for(const std::string& architecture, const Which& which, std::s
   const std::string compiler = "-nvrtc" + std::to_string(major) + "." + std::to_string(minor);
   const std::string law = "-law" + std::to_string(static_cast<int>(which.law)) +
                           std::to_string(static_cast<int>(which.variant)) +
-                          (which.task == Task::forward ? "" : "-tangent");
+                          (which.periodic ? "-periodic" : "") + (which.task == Task::forward ? "" : "-tangent");
   const std::string path = paths().cache + "/" + GMEM_SOURCE_HASH + "-" + architecture + compiler + law + ".cubin";
   const bool keeps = !paths().cache.empty() && trial_options().empty();
   std::string code = keeps && !log ? contents(path) : "";
@@ -160,7 +161,7 @@ extern "C" int gmem_cuda_compile(const char* architecture, int law, int variant,
   int failed = 0;
   try {
     const auto task = tangent ? gmem::Task::tangent : gmem::Task::forward;
-    gmem::cuda::code_for(architecture, {static_cast<gmem::Law>(law), static_cast<gmem::Variant>(variant), task}, &log);
+    gmem::cuda::code_for(architecture, {static_cast<gmem::Law>(law), static_cast<gmem::Variant>(variant), task, false}, &log);
   } catch (const std::exception& error) {
     log = error.what();
     failed = 1;

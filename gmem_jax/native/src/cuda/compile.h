@@ -14,6 +14,7 @@ struct Which {
   Law law;
   Variant variant;
   Task task;
+  bool periodic;  // whether the box may be so
 };
 
 // Further options for NVRTC, for trials: of the environment's GMEM_NVRTC, as "-DGMEM_BLOCK=256".

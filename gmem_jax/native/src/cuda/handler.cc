@@ -19,14 +19,15 @@ namespace {
 namespace ffi = xla::ffi;
 
 constexpr int kFew = 1 << 17;  // grains times lanes from which on one thread a grain keeps a GPU busy (an H200, measured)
-constexpr int kOfPack = 5;  // arguments that belong to a pack
+constexpr int kOfPack = 6;  // arguments that belong to a pack
 
 // Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain O, of a load F, of `Layers`
 // Y, derivatives and values D, lanes L.
 // gmem_jax/native/cuda.py: call_kernels, between_steps
 Wants arguments_of(Task task, Law law) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32}, {"validity", "P", ffi::PRED},
-                      {"incidence", "SC", ffi::S32},    {"offsets", "K3"}};
+                      {"incidence", "SC", ffi::S32},    {"images", "PI", ffi::S8},
+                      {"offsets", "K3"}};
   const Wants arrays = fields_of_grains() + numbers_of_steps() + histories(law);
   const Wants all = fields_of_grains() + pack + numbers_of_steps() + histories(law);
   return task == Task::tangent ? all + arrays : all;
@@ -55,10 +56,11 @@ int threads_for(int64_t many) {
   return static_cast<int>(many);
 }
 
-ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, void* stream,
+ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t periodic, void* stream,
                 ffi::RemainingArgs args, ffi::RemainingRets rets) {
   require_law(law, variant, points);
-  const Which which{static_cast<Law>(law), static_cast<Variant>(variant), task};
+  require_axes(periodic);
+  const Which which{static_cast<Law>(law), static_cast<Variant>(variant), task, periodic != 0};
   const Wants wanted = arguments_of(task, which.law), given = results_of(task, which.law);
   require(args.size() == wanted.size() && rets.size() == given.size(),
           "the number of arguments or results is not that of the friction law");
@@ -68,6 +70,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   require(dims.size() == 4, "positions need four axes");
   Reader reader({dims[0]});
   reader.size('R') = kRows;
+  reader.size('I') = periodic ? 3 : 0;
   reader.size('W') = kWalls;
   reader.size('Q') = points;
   reader.size('O') = 4;
@@ -93,6 +96,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.replicas = static_cast<int>(reader.size('B'));
   a.lanes = static_cast<int>(reader.size('L'));
   a.isotropic = isotropic != 0;
+  a.periodic = static_cast<int>(periodic);
   a.columns = static_cast<int>(reader.size('C'));
   a.tangent = task == Task::tangent;
   require(a.grains > 0 && a.spheres > 0, "there is no grain");
@@ -115,6 +119,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.valid = entries<const unsigned char>(in[argument++]);
   a.incidence = entries<const Four>(in[argument++]);
   a.incidence.step /= 4;
+  a.image = entries<const signed char>(in[argument++]);
   a.offsets = entries<const double>(in[argument++]);
   a.parameters = read();
   a.walls = read();
@@ -164,8 +169,7 @@ ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, in
                   int64_t mixed, int64_t periodic, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   return in_words([&] {
     require(mixed == 0, "there is no mixed precision on GPUs");
-    require(periodic == 0, "there are no periodic boxes on GPUs");
-    return call(task, law, variant, points, isotropic, stream, args, rets);
+    return call(task, law, variant, points, isotropic, periodic, stream, args, rets);
   });
 }
 

@@ -76,6 +76,15 @@ struct ReplicaView {
   // Number of this lane in an array [..., L].
   long long of_lane(int row) const { return static_cast<long long>(row) * a.lanes + lane; }
 
+  // Of a periodic box at the end of a step, or before the first.
+  Cell<V> cell(int step) const {
+    if (step >= 0) return Cell<V>::of(a.periodic, walls(step));
+    const Column<V> edges = in(a.parameters);
+    WallState<V> box{};
+    box.lower = edges.vec(kCell), box.upper = edges.vec(kCell + 3);
+    return Cell<V>::of(a.periodic, box);
+  }
+
   WallState<V> walls(int step) const {
     const Column<V> w = in(a.walls);
     const int row = step * kWalls;
@@ -153,10 +162,15 @@ Segments<V> segments_of(const ReplicaView<V>& on, int row) {
 }
 
 // Begins a step.
-template <class V>
-GMEM_INLINE void begin(const ReplicaView<V>& on, const GrainParameters<V>& constants, const Grain<V>& from) {
+template <class V, bool periodic>
+GMEM_INLINE void begin(const ReplicaView<V>& on, int step, const GrainParameters<V>& constants, const Grain<V>& from) {
   const Arguments& a = on.a;
-  const HalfStep<V> m = begin_step(constants, from);
+  HalfStep<V> m{};
+  if constexpr (periodic) {
+    m = begin_step(constants, from, on.cell(step - 1), on.cell(step));
+  } else {
+    m = begin_step(constants, from);
+  }
   const Column<V> hot = on.in(a.hot), cold = on.in(a.cold), sphere = on.in(a.sphere);
   const int h = on.item * 9, c = on.item * 4;
   hot.put(h, m.position), hot.put(h + 3, m.velocity), hot.put(h + 6, m.spin);
@@ -222,7 +236,7 @@ void remember(const Arguments& a, int thread) {
 }
 
 // Grains, from the arrays of the call. Thread of grain and lane.
-template <class V>
+template <class V, bool periodic>
 void enter(const Arguments& a, int thread) {
   const ReplicaView<V> on(a, thread);
   const int grain = on.item;
@@ -237,7 +251,7 @@ void enter(const Arguments& a, int thread) {
     a.touching[on.of_lane(a.rows + grain * a.spheres + k)] = 0;
   }
   if (a.steps == 0) return deliver(on, from);
-  begin(on, constants, from);
+  begin<V, periodic>(on, 0, constants, from);
 }
 
 // What is remembered of a contact while it is computed.
@@ -270,11 +284,11 @@ struct Memory {
 };
 
 // The forces of the walls on a sphere.
-template <class V>
+template <class V, bool periodic>
 void touch_walls(const ReplicaView<V>& on, int step, int number) {
   const Arguments& a = on.a;
   if (number >= a.grains * a.spheres) return;
-  const WallState<V> box = on.walls(step);
+  const WallState<V> edges = on.walls(step), box = periodic ? without(a.periodic, edges) : edges;
   const Vec<V> centre = on.in(a.sphere).vec(3 * number);
   unsigned char& touching = a.touching[on.of_lane(a.rows + number)];
   const bool touches = bits_less(V{}, deepest(splat<V>(1.0), centre, box));
@@ -288,15 +302,15 @@ void touch_walls(const ReplicaView<V>& on, int step, int number) {
   WallForces<V> found{};
   touch_walls(constants, centre, lever, add_cross(hot.vec(h + 3), hot.vec(h + 6), lever), box, found);
   wall.put(6 * number, found.force);
-  wall.put(6 * number + 3, wall.vec(6 * number + 3) + pressure(box, found.lower + found.upper));
+  wall.put(6 * number + 3, wall.vec(6 * number + 3) + pressure(edges, found.lower + found.upper));
 }
 
 // The forces between the spheres of a candidate, or of the walls on a sphere. Thread of candidate or sphere, and lane.
-template <class V, class Law>
+template <class V, class Law, bool periodic>
 void touch(const Arguments& a, int step, int thread) {
   const ReplicaView<V> on(a, thread);
   const int row = on.item;
-  if (row >= a.rows) return touch_walls(on, step, row - a.rows);
+  if (row >= a.rows) return touch_walls<V, periodic>(on, step, row - a.rows);
   if (!a.valid.of(on.entry)[row]) return;
   const int one = a.first.of(on.entry)[row], other = a.second.of(on.entry)[row];
   const unsigned all = static_cast<unsigned>(a.grains * a.spheres);
@@ -304,7 +318,14 @@ void touch(const Arguments& a, int step, int thread) {
   unsigned char& touching = a.touching[on.of_lane(row)];
   const bool touched = touching;
   const Column<V> sphere = on.in(a.sphere);
-  const Vec<V> here = sphere.vec(3 * one), there = sphere.vec(3 * other), gap = there - here;
+  Cell<V> cell{};
+  Vec<V> shift{};
+  if constexpr (periodic) {
+    const signed char* image = a.image.of(on.entry) + 3ll * row;
+    cell = on.cell(step), shift = cell.shift(image[0], image[1], image[2]);
+  }
+  const Vec<V> here = sphere.vec(3 * one), listed = sphere.vec(3 * other);
+  const Vec<V> there = periodic ? listed + shift : listed, gap = there - here;
   const V square = dot(gap, gap);
   Memory<V, Law> memory{on, row, {}};
   if (!bits_less(square, splat<V>(4.0))) {
@@ -317,8 +338,12 @@ void touch(const Arguments& a, int step, int thread) {
   const Column<V> hot = on.in(a.hot), load = on.in(a.load);
   const int i = 9 * a.by_spheres.of(one), j = 9 * a.by_spheres.of(other);
   const Vec<V> point = splat<V>(0.5) * (here + there);
-  const ContactInput<V> input{gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3),
-                              hot.vec(i + 6), hot.vec(j + 6)};
+  ContactInput<V> input{gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3),
+                        hot.vec(i + 6), hot.vec(j + 6)};
+  if constexpr (periodic) {
+    input.lever_other = input.lever_other - shift;
+    input.velocity = input.velocity + cell.flow(input.lever_one - input.lever_other);
+  }
   memory.read();
   Contact<V> contact;
   relative_motion(input, square, contact);
@@ -339,20 +364,21 @@ void touch(const Arguments& a, int step, int thread) {
 template <class V>
 struct Load {
   Vec<V> force, torque;
+  Vec<V> through;  // the faces of a periodic box, of contacts in which it is the first
 };
 
 template <class V>
 inline Load<V> operator+(const Load<V>& one, const Load<V>& other) {
-  return {one.force + other.force, one.torque + other.torque};
+  return {one.force + other.force, one.torque + other.torque, one.through + other.through};
 }
 
 // A force that acts `lever` away from the grain's centre.
 template <class V>
-inline Load<V> at_lever(Vec<V> force, Vec<V> lever) { return {force, cross(lever, force)}; }
+inline Load<V> at_lever(Vec<V> force, Vec<V> lever) { return {force, cross(lever, force), {}}; }
 
 // The sum over the contacts of a sphere of a grain, walls included.
-template <class V>
-GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int sphere) {
+template <class V, bool periodic>
+GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int step, int sphere) {
   const Arguments& a = on.a;
   Load<V> sum{};
   if (on.item >= a.grains || sphere >= a.spheres) return sum;
@@ -376,7 +402,14 @@ GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int sphere) {
     for (int q = 0; q < 4; ++q) {
       if (!touching[q]) continue;
       const int at = kLoad * row[q];
-      const Vec<V> force = load.vec(at), lever = load.vec(at + 3) - position;
+      const Vec<V> force = load.vec(at);
+      Vec<V> lever = load.vec(at + 3) - position;
+      if constexpr (periodic) {
+        const signed char* image = a.image.of(on.entry) + 3ll * row[q];
+        const Vec<V> moved{splat<V>(image[0]), splat<V>(image[1]), splat<V>(image[2])};
+        if (second[q]) lever = lever - on.cell(step).shift(image[0], image[1], image[2]);
+        else sum.through = sum.through - Vec<V>{moved.x * force.x, moved.y * force.y, moved.z * force.z};
+      }
       sum = sum + at_lever(second[q] ? -force : force, lever);
     }
     if (static_cast<unsigned>(now.of[3]) >= 2u * rows) break;  // those that follow are blank, too
@@ -385,7 +418,7 @@ GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int sphere) {
 }
 
 // The end of a step, and the beginning of the next, of a grain in a lane.
-template <class V>
+template <class V, bool periodic>
 GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
   const Arguments& a = on.a;
   if (on.item >= a.grains) return;
@@ -394,18 +427,29 @@ GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
   const HalfStep<V> own{hot.vec(h), {cold[c], cold.vec(c + 1)}, hot.vec(h + 3), hot.vec(h + 6)};
   V parameter[kParameters];
   const GrainParameters<V> constants = read_parameters(on, parameter);
-  const Grain<V> after = end_step(constants, a.isotropic, own, load.force, load.torque);
+  Grain<V> after{};
+  if constexpr (periodic) {
+    const WallState<V> box = on.walls(step);
+    const Cell<V> cell = Cell<V>::of(a.periodic, box);
+    const Vec<V> own_part = section(cell, parameter[kMass], own, load.force);
+    const Column<V> wall = on.in(a.wall);
+    const int at = 6 * on.item * a.spheres + 3;
+    wall.put(at, wall.vec(at) + section_pressure(a.periodic, box, cell, own_part, load.through));
+    after = end_step(constants, a.isotropic, own, load.force, load.torque, cell);
+  } else {
+    after = end_step(constants, a.isotropic, own, load.force, load.torque);
+  }
   if (step + 1 == a.steps) return deliver(on, after);
-  begin(on, constants, after);
+  begin<V, periodic>(on, step + 1, constants, after);
 }
 
 // One thread for all spheres of a grain.
-template <class V>
+template <class V, bool periodic>
 void move_alone(const Arguments& a, int step, int thread) {
   const ReplicaView<V> on(a, thread);
   Load<V> sum{};
-  for (int k = 0; k < a.spheres; ++k) sum = sum + loads_of(on, k);
-  move(on, step, sum);
+  for (int k = 0; k < a.spheres; ++k) sum = sum + loads_of<V, periodic>(on, step, k);
+  move<V, periodic>(on, step, sum);
 }
 
 // Sums of pressures over a chunk of spheres that are `stride` apart, in the place of its first. Thread of chunk and axis,
