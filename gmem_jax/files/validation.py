@@ -27,6 +27,7 @@ PATH = 4096  # of a path
 # Names in TOML and JSON and what stands there; under all others a number, or lists of them.
 TEXTS = (
     "pack",
+    "boundary",
     "signals",
     "friction",
     "law",

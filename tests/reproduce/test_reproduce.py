@@ -13,6 +13,7 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
+from gmem_jax.files.validation import require_kinds
 from gmem_jax.reproduce import claims, draw, figures
 from gmem_jax.reproduce import run as reproducing
 from gmem_jax.reproduce.compare import (
@@ -149,8 +150,10 @@ def test_the_exponent_of_a_power_law() -> None:
 
 @pytest.mark.parametrize("scale", SCALES)
 @pytest.mark.parametrize("name", FIGURES)
-def test_every_figure_has_points_and_no_point_twice(name: str, scale: str) -> None:
+def test_every_figure_has_points_that_a_sweep_takes_and_none_twice(name: str, scale: str) -> None:
     points = figure_spec(FIGURES[name], SCALES[scale]).extra
+    for values in points:
+        require_kinds(values)
     rows = [tuple(sorted(values.items())) for values in points]
     assert rows
     assert len(set(rows)) == len(rows)
