@@ -416,8 +416,8 @@ MUTATIONS = (
     mutation(
         "packed-spins-swapped",
         "packed.h",
-        "columns(one(&GrainRows::spin)),\n            columns(other(&GrainRows::spin))};",
-        "columns(other(&GrainRows::spin)),\n            columns(one(&GrainRows::spin))};",
+        "columns(one(&GrainRows::spin)),\n                          columns(other(&GrainRows::spin))};",
+        "columns(other(&GrainRows::spin)),\n                          columns(one(&GrainRows::spin))};",
         f"{DOMAINS}[1-H]",
     ),
     mutation(
@@ -619,6 +619,41 @@ MUTATIONS = (
         "(material.wall_stiffness, material.normal_damping, material.normal_stiffness)",
         f"{DOMAINS}[1-H]",
     ),
+    mutation(
+        "native-image-without-the-flow",
+        "physics/contact.h",
+        "m.velocity = m.velocity + cell.flow(m.lever_one - m.lever_other);",
+        "",
+        "test_values_are_those_of_the_definition[H-5]",
+    ),
+    mutation(
+        "native-image-unseen",
+        "cpu/packed.h",
+        "(plan.image ? other + shift(cell, c) : other)",
+        "other",
+        "test_values_are_those_of_the_definition[H-1]",
+    ),
+    mutation(
+        "native-carried-by-the-whole",
+        "physics/motion.h",
+        "half * (p.dt * velocity)",
+        "stretch * (p.dt * velocity)",
+        "test_values_are_those_of_the_definition[H-1]",
+    ),
+    mutation(
+        "native-section-at-rest",
+        "physics/motion.h",
+        "fma(force, at - lower, mass * (velocity * velocity))",
+        "force * (at - lower)",
+        "test_values_are_those_of_the_definition[H-1]",
+    ),
+    mutation(
+        "native-faces-of-one-domain",
+        "cpu/block.h",
+        "domain < plan.domains; ++domain)\n      through",
+        "domain < 0; ++domain)\n      through",
+        "test_values_are_those_of_the_definition[H-5]",
+    ),
     # ---------------------------------------------------------------- the GPU's half of it
     mutation(
         "gpu-lever-of-the-other",
@@ -661,6 +696,13 @@ MUTATIONS = (
         "if (touches != static_cast<bool>(touching)) touching = touches;",
         "if (touches) touching = 1;",
         KERNELS + "[spheres]",
+    ),
+    mutation(
+        "gpu-image-of-the-lever",
+        "cuda/step.h",
+        "if (second[q]) lever = lever - on.cell(step)",
+        "if (false) lever = lever - on.cell(step)",
+        KERNELS + "[periodic]",
     ),
     mutation(
         "gpu-pressure-of-the-first-chunk",

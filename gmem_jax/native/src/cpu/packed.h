@@ -278,7 +278,7 @@ struct Packed : PackedLayout<Law> {
       group[n] = group_of(touching + n * W, count - n * W);
       contact[n].history = memory[n];
       read_history(group[n], memory[n]);
-      const ContactInput<V> m = plan.image ? contact_input(group[n], faces.cell) : contact_input(group[n]);
+      const ContactInput<V> m = contact_input(group[n], plan.image ? &faces.cell : nullptr);
       relative_motion(m, dot(m.separation, m.separation), contact[n]);
     }
     close(contact, groups, parameter);
@@ -319,38 +319,27 @@ struct Packed : PackedLayout<Law> {
     return g;
   }
 
-  GMEM_INLINE ContactInput<V> contact_input(const Group& g) const {
+  // With images of the second spheres, of a periodic box.
+  GMEM_INLINE ContactInput<V> contact_input(const Group& g, const Cell<V>* cell) const {
     const auto one = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); }); };
     const auto other = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_other].*row); }); };
     const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l].one; });
-    const Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l].other; });
+    Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l].other; }), moved{};
+    if (cell) {
+      Row each[W];
+      for (int l = 0; l < W; ++l) each[l] = shift(*cell, static_cast<std::size_t>(g.c[l]));
+      moved = load_rows([&](int l) { return each + l; });
+      centre_other = centre_other + moved;
+    }
     const Rows point = splat<V>(0.5) * (centre_one + centre_other);
-    return {columns(centre_other - centre_one),
-            columns(point - one(&GrainRows::position)),
-            columns(point - other(&GrainRows::position)),
-            columns(other(&GrainRows::velocity) - one(&GrainRows::velocity)),
-            columns(one(&GrainRows::spin)),
-            columns(other(&GrainRows::spin))};
-  }
-
-  // ... in a periodic box, of their images.
-  GMEM_INLINE ContactInput<V> contact_input(const Group& g, const Cell<V>& cell) const {
-    Row moved[W];
-    for (int l = 0; l < W; ++l) moved[l] = shift(cell, static_cast<std::size_t>(g.c[l]));
-    const auto one = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); }); };
-    const auto other = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_other].*row); }); };
-    const Rows shift = load_rows([&](int l) { return moved + l; });
-    const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l].one; });
-    const Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l].other; }) + shift;
-    const Rows point = splat<V>(0.5) * (centre_one + centre_other);
-    const Rows here = one(&GrainRows::position), there = other(&GrainRows::position) + shift;
-    const Vec<V> velocity = columns(other(&GrainRows::velocity) - one(&GrainRows::velocity));
-    return {columns(centre_other - centre_one),
-            columns(point - here),
-            columns(point - there),
-            velocity + cell.flow(columns(there - here)),
-            columns(one(&GrainRows::spin)),
-            columns(other(&GrainRows::spin))};
+    ContactInput<V> input{columns(centre_other - centre_one),
+                          columns(point - one(&GrainRows::position)),
+                          columns(point - other(&GrainRows::position)),
+                          columns(other(&GrainRows::velocity) - one(&GrainRows::velocity)),
+                          columns(one(&GrainRows::spin)),
+                          columns(other(&GrainRows::spin))};
+    if (cell) to_image(input, columns(moved), *cell);
+    return input;
   }
 
   void read_history(const Group& g, V* memory) const {

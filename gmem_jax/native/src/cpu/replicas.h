@@ -299,12 +299,10 @@ struct Replicas : ReplicasLayout<Law, V, C> {
         }
         marks.touched[c] = true;
         if (trace.touching) remember(c, remembered++);
-        if constexpr (!kMixed) {
-          if (plan.image) relative_motion(contact_input(pair, one, other, faces.cell, c), square, contact[count]);
-          else relative_motion(contact_input(pair, one, other), square, contact[count]);
-        } else {
-          relative_motion(contact_input(pair, one, other), convert<C>(square), contact[count]);
-        }
+        ContactInput<C> input = contact_input(pair, one, other);
+        if constexpr (!kMixed)
+          if (plan.image) to_image(input, shift(faces.cell, c), faces.cell);
+        relative_motion(input, convert<C>(square), contact[count]);
         if constexpr (kMixed) contact[count].before = convert<C>(contact_square - square);
         contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
         touching[count++] = c;
@@ -369,18 +367,6 @@ struct Replicas : ReplicasLayout<Law, V, C> {
               load_vec(one + kSpin),
               load_vec(other + kSpin)};
     }
-  }
-
-  // ... in a periodic box, of the image at `centre_other`.
-  GMEM_INLINE ContactInput<V> contact_input(const Candidate& pair, Vec<V> centre_one, Vec<V> centre_other,
-                                            const Cell<V>& cell, std::size_t c) const {
-    const V* one = hot + static_cast<std::size_t>(pair.grain_one) * kHot;
-    const V* other = hot + static_cast<std::size_t>(pair.grain_other) * kHot;
-    const Vec<V> point = splat<V>(0.5) * (centre_one + centre_other);
-    const Vec<V> here = load_vec(one + kPosition), there = load_vec(other + kPosition) + shift(cell, c);
-    const Vec<V> velocity = load_vec(other + kVelocity) - load_vec(one + kVelocity);
-    return {centre_other - centre_one,       point - here,          point - there,
-            velocity + cell.flow(there - here), load_vec(one + kSpin), load_vec(other + kSpin)};
   }
 
   GMEM_INLINE void add(const Candidate& pair, const ContactLoads<C>& push) {

@@ -340,10 +340,7 @@ void touch(const Arguments& a, int step, int thread) {
   const Vec<V> point = splat<V>(0.5) * (here + there);
   ContactInput<V> input{gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3),
                         hot.vec(i + 6), hot.vec(j + 6)};
-  if constexpr (periodic) {
-    input.lever_other = input.lever_other - shift;
-    input.velocity = input.velocity + cell.flow(input.lever_one - input.lever_other);
-  }
+  if constexpr (periodic) to_image(input, shift, cell);
   memory.read();
   Contact<V> contact;
   relative_motion(input, square, contact);

@@ -16,6 +16,15 @@ struct ContactInput {
   Vec<V> spin_one, spin_other;
 };
 
+// From the second grain to its image in a periodic box (`Cell` of motion.h), which `shift` leads to. Levers already end
+// at the contact with that.
+// gmem_jax/physics/step.py: relative_motion
+template <class V, class Cell>
+constexpr GMEM_INLINE void to_image(ContactInput<V>& m, Vec<V> shift, const Cell& cell) {
+  m.lever_other = m.lever_other - shift;
+  m.velocity = m.velocity + cell.flow(m.lever_one - m.lever_other);
+}
+
 // Levers and relative motion, unprojected. The first part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
 template <class V>
