@@ -65,10 +65,17 @@ def _cache() -> str:
     return str(home / "gmem_jax" / "kernels")
 
 
+def initializing(symbol: str) -> str:
+    """The symbol of what loads the kernels of a call, before it is made."""
+    return f"{symbol}_load"
+
+
 def register(library: ctypes.CDLL, sources: Path) -> None:
     """Tell XLA of the library's calls on GPUs, and the library where its sources are."""
     for target, symbol in CUDA_TARGETS.items():
-        jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, symbol)), platform="CUDA")
+        stages = {"initialize": initializing(symbol), "execute": symbol}
+        handlers = {stage: jax.ffi.pycapsule(getattr(library, name)) for stage, name in stages.items()}
+        jax.ffi.register_ffi_target(target, handlers, platform="CUDA")
     nvrtc = ":".join([_packaged(), *_NAMES]).lstrip(":")
     library.gmem_cuda_paths(*(ctypes.c_char_p(path.encode()) for path in (nvrtc, str(sources), _cache())))
 

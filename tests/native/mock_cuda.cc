@@ -55,6 +55,7 @@ std::map<int, Stream> streams;
 std::map<std::string, int> counts, failures;
 std::string complaints, folder;
 int device = 0, replays = 0;
+bool initializes = true;
 thread_local std::vector<Context*> stack;
 thread_local int capture_mode = 0;
 thread_local bool captures = false;
@@ -149,9 +150,13 @@ XLA_FFI_Error* stream_for_call(XLA_FFI_Stream_Get_Args* args) {
 
 using Handler = XLA_FFI_Error* (*)(XLA_FFI_CallFrame*);
 
-// As XLA calls a handler on a GPU: another context is current.
-XLA_FFI_Error* call(XLA_FFI_CallFrame* frame, Handler handler) {
-  if (frame->extension_start) return handler(frame);  // what the handler is
+struct Handlers {
+  Handler initialize, execute;
+};
+
+// As XLA runs a call on a GPU, while another context is current.
+XLA_FFI_Error* call(XLA_FFI_CallFrame* frame, const Handlers& handlers) {
+  if (frame->extension_start) return handlers.execute(frame);  // what the handler is
   const std::lock_guard<std::recursive_mutex> lock(mutex);
   std::vector<char> room(frame->api->struct_size);
   std::memcpy(room.data(), frame->api, room.size());
@@ -163,8 +168,12 @@ XLA_FFI_Error* call(XLA_FFI_CallFrame* frame, Handler handler) {
   stack = {&other};
   Stream& stream = stream_of(device);
   stream.graph.clear();
+  XLA_FFI_Error* error = nullptr;
+  own.stage = XLA_FFI_ExecutionStage_INITIALIZE;
+  if (initializes) error = handlers.initialize(&own);
+  own.stage = XLA_FFI_ExecutionStage_EXECUTE;
   stream.capturing = captures = replays > 0;
-  XLA_FFI_Error* error = handler(&own);
+  if (!error) error = handlers.execute(&own);
   stream.capturing = captures = false;
   if (stack != std::vector<Context*>{&other}) complain("the stack of contexts is another one after the call");
   if (capture_mode != 0) complain("the mode of capture is another one after the call");
@@ -173,7 +182,7 @@ XLA_FFI_Error* call(XLA_FFI_CallFrame* frame, Handler handler) {
   return error;
 }
 
-Handler handlers[2];
+Handlers advance, tangent;
 
 }  // namespace
 
@@ -255,12 +264,14 @@ int cuGetErrorString(int code, const char** text) {
 }
 
 // For the test. The library's handlers, and the folder of compiled kernels.
-void mock_handlers(void* advance, void* tangent, const char* kept) {
-  handlers[0] = reinterpret_cast<Handler>(advance), handlers[1] = reinterpret_cast<Handler>(tangent), folder = kept;
+void mock_handlers(Handler load_advance, Handler run_advance, Handler load_tangent, Handler run_tangent,
+                   const char* kept) {
+  advance = {load_advance, run_advance}, tangent = {load_tangent, run_tangent}, folder = kept;
 }
-// Calls run on this device from now on, captured and then replayed so often, or (0) at once. Counts begin anew.
-void mock_begin(int on, int so_often) {
-  device = on, replays = so_often;
+// Calls run on this device from now on, captured and then replayed so often, or (0) at once; and before that they are
+// initialized, or not. Counts begin anew.
+void mock_begin(int on, int so_often, int before) {
+  device = on, replays = so_often, initializes = before;
   counts.clear(), failures.clear(), complaints.clear();
 }
 // The n-th call of a function of the driver, counted from one, shall fail.
@@ -268,7 +279,7 @@ void mock_fail(const char* function, int n) { failures[function] = n; }
 int mock_count(const char* function) { return counts[function]; }
 const char* mock_complaints() { return complaints.c_str(); }
 
-XLA_FFI_Error* gmem_mock_advance(XLA_FFI_CallFrame* frame) { return call(frame, handlers[0]); }
-XLA_FFI_Error* gmem_mock_tangent(XLA_FFI_CallFrame* frame) { return call(frame, handlers[1]); }
+XLA_FFI_Error* gmem_mock_advance(XLA_FFI_CallFrame* frame) { return call(frame, advance); }
+XLA_FFI_Error* gmem_mock_tangent(XLA_FFI_CallFrame* frame) { return call(frame, tangent); }
 
 }  // extern "C"

@@ -50,17 +50,21 @@ class Driver:
         self._library = ctypes.CDLL(path)  # before the library asks for the driver
         self._library.mock_complaints.restype = ctypes.c_char_p
         handlers = ctypes.CDLL(str(library.path()))
-        symbols = [getattr(handlers, symbol) for symbol in cuda.CUDA_TARGETS.values()]
+        names = (name for symbol in cuda.CUDA_TARGETS.values() for name in (cuda.initializing(symbol), symbol))
+        symbols = [ctypes.cast(getattr(handlers, name), ctypes.c_void_p) for name in names]
         kept = str(Path(os.environ["GMEM_COMPILE_CACHE"]) / "kernels").encode()
-        self._library.mock_handlers(*(ctypes.cast(symbol, ctypes.c_void_p) for symbol in symbols), kept)
+        self._library.mock_handlers(*symbols, kept)
         for kind in ("advance", "tangent"):
             for made in ("mock", "emulated"):
                 function = getattr(self._library, f"gmem_{made}_{kind}")
                 jax.ffi.register_ffi_target(f"gmem_{made}_{kind}", jax.ffi.pycapsule(function), platform="cpu")
 
-    def begin(self, device: int = 0, replays: int = 0) -> None:
-        """Run on this device from now on, captured and replayed so often, or (0) at once; and count anew."""
-        self._library.mock_begin(device, replays)
+    def begin(self, device: int = 0, replays: int = 0, initialized: bool = True) -> None:
+        """Run on this device from now on, captured and replayed so often, or (0) at once; and count anew.
+
+        Before a call runs it is initialized, as XLA does it, or not.
+        """
+        self._library.mock_begin(device, replays, initialized)
 
     def fail(self, function: str, call: int = 1) -> None:
         """Let that call of a function fail, counted from one."""
@@ -168,35 +172,45 @@ def captured(driver: Driver) -> None:
 
 
 def two_devices(driver: Driver) -> None:
-    """Each has modules of its own, and they are loaded once, be it while launches are captured."""
+    """Each has modules of its own, and they are loaded once, before anything is captured."""
     expected = values("emulated", "H")
     for device, replays in ((1, 0), (2, 1)):
         driver.begin(device, replays)
         for _ in range(2):
             assert_same(values("mock", "H"), expected)
         assert driver.count("cuModuleLoadData") == 1
+        assert driver.count("loads while capturing") == 0
     driver.begin(1)
     assert_same(values("mock", "H"), expected)
     assert driver.count("cuModuleLoadData") == 0
 
 
-FUNCTIONS = {  # of the driver, and the call of it that fails
-    "cuStreamGetCtx": 1,
-    "cuCtxPushCurrent_v2": 1,
-    "cuCtxGetDevice": 1,
-    "cuDeviceGetAttribute": 2,
-    "cuThreadExchangeStreamCaptureMode": 1,
-    "cuModuleLoadData": 1,
-    "cuModuleGetFunction": 3,
-    "cuFuncGetAttribute": 2,
-    "cuLaunchKernel": 4,
-}
+def not_initialized(driver: Driver) -> None:
+    """Modules are then loaded while launches are captured."""
+    driver.begin(3, replays=1, initialized=False)
+    assert_same(values("mock", "H"), values("emulated", "H"))
+    assert driver.count("loads while capturing") == 1
+
+
+FAILURES = [  # functions of the driver, and the call of them that fails
+    ("cuStreamGetCtx", 1),
+    ("cuStreamGetCtx", 2),
+    ("cuCtxPushCurrent_v2", 1),
+    ("cuCtxPushCurrent_v2", 2),
+    ("cuCtxGetDevice", 1),
+    ("cuDeviceGetAttribute", 2),
+    ("cuThreadExchangeStreamCaptureMode", 1),
+    ("cuModuleLoadData", 1),
+    ("cuModuleGetFunction", 3),
+    ("cuFuncGetAttribute", 2),
+    ("cuLaunchKernel", 4),
+]
 
 
 def failures(driver: Driver) -> None:
     """Each is one line, disturbs nothing, and the next call works."""
     expected = values("emulated", "H")
-    for device, (function, call) in enumerate(FUNCTIONS.items(), start=10):
+    for device, (function, call) in enumerate(FAILURES, start=10):
         driver.begin(device)
         driver.fail(function, call)
         said = refused()
@@ -215,6 +229,7 @@ CASES: dict[str, Callable[[Driver], None]] = {
     "many replicas": many_replicas,
     "launches that are captured and replayed": captured,
     "two devices": two_devices,
+    "calls that were not initialized": not_initialized,
     "functions of the driver that fail": failures,
 }
 SLOW = {f"the numbers of {law}" for law in LAWS if law != "H"}  # NVRTC takes its time

@@ -56,11 +56,15 @@ int threads_for(int64_t many) {
   return static_cast<int>(many);
 }
 
-ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t periodic, void* stream,
-                ffi::RemainingArgs args, ffi::RemainingRets rets) {
+Which which_of(Task task, int64_t law, int64_t variant, int64_t points, int64_t periodic) {
   require_law(law, variant, points);
   require_axes(periodic);
-  const Which which{static_cast<Law>(law), static_cast<Variant>(variant), task, periodic != 0};
+  return {static_cast<Law>(law), static_cast<Variant>(variant), task, periodic != 0};
+}
+
+ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t periodic, void* stream,
+                ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  const Which which = which_of(task, law, variant, points, periodic);
   const Wants wanted = arguments_of(task, which.law), given = results_of(task, which.law);
   require(args.size() == wanted.size() && rets.size() == given.size(),
           "the number of arguments or results is not that of the friction law");
@@ -173,13 +177,31 @@ ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, in
   });
 }
 
-auto binding() { return with_arguments(ffi::Ffi::Bind().Ctx<ffi::PlatformStream<void*>>()); }
+// Before a program runs: a stream may be on its way into a graph when a call is made, and loading is no part of that.
+template <Task task>
+ffi::Error load(void* stream, int64_t law, int64_t variant, int64_t points, int64_t, int64_t, int64_t, int64_t periodic,
+                ffi::RemainingArgs, ffi::RemainingRets) {
+  return in_words([&] {
+    const Launcher loads(stream, which_of(task, law, variant, points, periodic));
+    return ffi::Error::Success();
+  });
+}
+
+template <ffi::ExecutionStage stage = ffi::ExecutionStage::kExecute>
+auto binding() {
+  return with_arguments(ffi::Ffi::Bind<stage>().template Ctx<ffi::PlatformStream<void*>>());
+}
+constexpr auto kInitialize = ffi::ExecutionStage::kInitialize;
 
 }  // namespace
 }  // namespace cuda
 }  // namespace gmem
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_cuda_advance, gmem::cuda::handle<gmem::Task::forward>, gmem::cuda::binding(),
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_cuda_advance, gmem::cuda::handle<gmem::Task::forward>, gmem::cuda::binding<>(),
                               {xla::ffi::Traits::kCmdBufferCompatible});
-XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_cuda_tangent, gmem::cuda::handle<gmem::Task::tangent>, gmem::cuda::binding(),
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_cuda_tangent, gmem::cuda::handle<gmem::Task::tangent>, gmem::cuda::binding<>(),
                               {xla::ffi::Traits::kCmdBufferCompatible});
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_cuda_advance_load, gmem::cuda::load<gmem::Task::forward>,
+                              gmem::cuda::binding<gmem::cuda::kInitialize>());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_cuda_tangent_load, gmem::cuda::load<gmem::Task::tangent>,
+                              gmem::cuda::binding<gmem::cuda::kInitialize>());
