@@ -45,7 +45,8 @@ def device() -> Any:
     try:
         found = jax.devices("cuda")[0]
     except RuntimeError as error:
-        raise ValueError("JAX sees no CUDA GPU here (with one: pip install 'gmem-jax[cuda13]')") from error
+        hint = "pip install 'gmem-jax[cuda13]', or [cuda12] for drivers of CUDA 12"
+        raise ValueError(f"JAX sees no CUDA GPU here (with one: {hint})") from error
     if reason := (native.available()[1] if not native.available()[0] else cuda.missing()):
         raise ValueError(f"the native backend cannot use the GPU: {reason}")
     return found

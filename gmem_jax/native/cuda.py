@@ -23,26 +23,37 @@ CUDA_TARGETS = {"gmem_advance": "gmem_cuda_advance", "gmem_tangent": "gmem_cuda_
 """Symbols of the library by the names of calls; reverse mode is in plain JAX."""
 
 _NAMES = ("libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so")
+_registered: list[ctypes.CDLL] = []  # the library, once it is loaded
 
 
-def _packaged() -> str:
-    """NVRTC as a Python package brings it; "" if none does."""
+def _nvrtc() -> str:
+    """Where NVRTC may be, joined by ":": as Python packages bring it, the newest first, and where the system has it."""
     spec = find_spec("nvidia")
     roots = [] if spec is None else list(spec.submodule_search_locations or ())
     found = [path for root in roots for path in Path(root).glob("*/lib/libnvrtc.so.*") if path.suffix[1:].isdigit()]
-    return str(max(found, default=""))
+    newest_first = sorted(found, key=lambda path: int(path.suffix[1:]), reverse=True)
+    return ":".join([*map(str, newest_first), *_NAMES])
+
+
+def _architectures() -> set[str]:
+    """The GPUs of this process, as "sm_90"; none where it has none."""
+    try:
+        devices = jax.local_devices(backend="cuda")
+    except RuntimeError:
+        return set()
+    return {"sm_" + device.compute_capability.replace(".", "") for device in devices}
 
 
 @functools.cache
 def missing() -> str:
-    """Why GPUs run plain JAX; "" if they need not."""
-    for name in [path] if (path := _packaged()) else _NAMES:
-        try:
-            ctypes.CDLL(name)
-        except OSError:
-            continue
-        return ""
-    return "NVRTC was not found; pip install 'gmem-jax[cuda13]'"
+    """Why GPUs run plain JAX; "" if they need not, as far as that is known before a program runs."""
+    if not _registered:
+        return "the native library is not there"
+    said = ctypes.create_string_buffer(1 << 10)
+    for architecture in sorted(_architectures()) or [""]:
+        if _registered[-1].gmem_cuda_missing(architecture.encode(), said, len(said)):
+            return said.value.decode()
+    return ""
 
 
 @functools.cache
@@ -76,8 +87,8 @@ def register(library: ctypes.CDLL, sources: Path) -> None:
         stages = {"initialize": initializing(symbol), "execute": symbol}
         handlers = {stage: jax.ffi.pycapsule(getattr(library, name)) for stage, name in stages.items()}
         jax.ffi.register_ffi_target(target, handlers, platform="CUDA")
-    nvrtc = ":".join([_packaged(), *_NAMES]).lstrip(":")
-    library.gmem_cuda_paths(*(ctypes.c_char_p(path.encode()) for path in (nvrtc, str(sources), _cache())))
+    library.gmem_cuda_paths(*(ctypes.c_char_p(path.encode()) for path in (_nvrtc(), str(sources), _cache())))
+    _registered.append(library)
 
 
 class Needs(NamedTuple):

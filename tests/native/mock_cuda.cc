@@ -10,6 +10,7 @@
 #include <iterator>
 #include <map>
 #include <mutex>
+#include <regex>
 
 #include "emulated.cc"
 
@@ -19,8 +20,8 @@ using gmem::cuda::Arguments;
 using gmem::cuda::GpuKernel;
 using gmem::cuda::Which;
 
-enum { kOk = 0, kInvalidValue = 1, kOutOfMemory = 2, kInvalidImage = 200, kInvalidContext = 201, kInvalidHandle = 400,
-       kNotFound = 500, kCaptureUnsupported = 900 };
+enum { kOk = 0, kInvalidValue = 1, kOutOfMemory = 2, kInvalidImage = 200, kInvalidContext = 201,
+       kNoBinary = 209, kNotFound = 500, kCaptureUnsupported = 900 };
 enum { kRelaxed = 2, kMostThreads = 0, kMajor = 75, kMinor = 76 };
 constexpr const char* kKernels[] = {"enter", "remember", "touch", "move", "move_alone", "collect", "leave"};
 
@@ -54,7 +55,7 @@ std::map<int, Context> contexts;
 std::map<int, Stream> streams;
 std::map<std::string, int> counts, failures;
 std::string complaints, folder;
-int device = 0, replays = 0;
+int device = 0, replays = 0, architecture = 90;
 bool initializes = true;
 thread_local std::vector<Context*> stack;
 thread_local int capture_mode = 0;
@@ -103,8 +104,19 @@ Module kernels_of(const char* image) {
   return found;
 }
 
-// The kept file that has the same bytes says of which law they are.
-bool is_kept(const char* image, Which& which) {
+// The same of PTX, where arguments lie one after another.
+Module kernels_of_text(const std::string& text) {
+  Module found;
+  const std::regex entry(R"(\.entry (\w+)\([^)]*\.b8 \w+\[(\d+)\][^)]*\.u32 \w+\s*\)\s*\.maxntid (\d+))");
+  for (std::sregex_iterator at(text.begin(), text.end(), entry), end; at != end; ++at) {
+    const unsigned size = static_cast<unsigned>(std::stoi((*at)[2]));
+    found[(*at)[1]] = {nullptr, {}, {}, {{0, size}, {size, sizeof(int)}}, std::stoi((*at)[3])};
+  }
+  return found;
+}
+
+// The kept file that has the same bytes says of which law they are. Cubins are for one architecture.
+int identify(const char* image, Which& which) {
   for (const auto& entry : std::filesystem::directory_iterator(folder)) {
     std::ifstream file(entry.path(), std::ios::binary);
     const std::string bytes{std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>()};
@@ -114,9 +126,10 @@ bool is_kept(const char* image, Which& which) {
     const bool tangent = name.find("-tangent") != std::string::npos;
     which = {static_cast<gmem::Law>(name[law + 4] - '0'), static_cast<gmem::Variant>(name[law + 5] - '0'),
              tangent ? gmem::Task::tangent : gmem::Task::forward, name.find("-periodic") != std::string::npos};
-    return true;
+    const bool own = name.find("-sm_" + std::to_string(architecture) + "-") != std::string::npos;
+    return own || entry.path().extension() == ".ptx" ? kOk : kNoBinary;
   }
-  return false;
+  return kInvalidImage;
 }
 
 void execute(const Launch& launch) {
@@ -188,6 +201,7 @@ Handlers advance, tangent;
 
 extern "C" {
 
+int cuDriverGetVersion(int* version) { return *version = 99000, kOk; }
 int cuStreamGetCtx(Stream* stream, Context** context) {
   if (const int failed = called(__func__)) return failed;
   return *context = stream->context, kOk;
@@ -208,7 +222,7 @@ int cuCtxGetDevice(int* number) {
 }
 int cuDeviceGetAttribute(int* value, int attribute, int) {
   if (const int failed = called(__func__)) return failed;
-  return *value = attribute == kMajor ? 9 : 0, attribute == kMajor || attribute == kMinor ? kOk : kInvalidValue;
+  return *value = attribute == kMajor ? architecture / 10 : architecture % 10, attribute == kMajor || attribute == kMinor ? kOk : kInvalidValue;
 }
 int cuThreadExchangeStreamCaptureMode(int* mode) {
   if (const int failed = called(__func__)) return failed;
@@ -220,8 +234,8 @@ int cuModuleLoadData(Module** module, const void* code) {
   if (captures && capture_mode != kRelaxed) return kCaptureUnsupported;
   const char* image = static_cast<const char*>(code);
   Which which{};
-  if (std::memcmp(image, ELFMAG, SELFMAG) != 0 || !is_kept(image, which)) return kInvalidImage;
-  *module = new Module(kernels_of(image));
+  if (const int unable = identify(image, which)) return unable;
+  *module = new Module(std::memcmp(image, ELFMAG, SELFMAG) == 0 ? kernels_of(image) : kernels_of_text(image));
   for (std::size_t n = 0; n < std::size(kKernels); ++n) {
     Function& kernel = (**module)[kKernels[n]];
     kernel.context = stack.back(), kernel.which = which, kernel.kernel = static_cast<GpuKernel>(n);
@@ -271,11 +285,13 @@ void mock_handlers(Handler load_advance, Handler run_advance, Handler load_tange
 // Calls run on this device from now on, captured and then replayed so often, or (0) at once; and before that they are
 // initialized, or not. Counts begin anew.
 void mock_begin(int on, int so_often, int before) {
-  device = on, replays = so_often, initializes = before;
+  device = on, replays = so_often, initializes = before, architecture = 90;
   counts.clear(), failures.clear(), complaints.clear();
 }
 // The n-th call of a function of the driver, counted from one, shall fail.
 void mock_fail(const char* function, int n) { failures[function] = n; }
+// GPUs are of another architecture, as 120 for sm_120.
+void mock_architecture(int number) { architecture = number; }
 int mock_count(const char* function) { return counts[function]; }
 const char* mock_complaints() { return complaints.c_str(); }
 

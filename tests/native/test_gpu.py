@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -266,39 +267,116 @@ def test_numbers_with_derivatives_fit_too(law: str) -> None:
 
 ALONE = """
 import ctypes, sys
-library = ctypes.CDLL(sys.argv[1])
-library.gmem_cuda_paths(sys.argv[2].encode(), sys.argv[3].encode(), sys.argv[4].encode())
+path, asked, nvrtc, sources, cache, architecture, *driver = sys.argv[1:]
+kept = [ctypes.CDLL(one) for one in driver]
+library = ctypes.CDLL(path)
+library.gmem_cuda_paths(nvrtc.encode(), sources.encode(), cache.encode())
 said = ctypes.create_string_buffer(1 << 16)
-failed = library.gmem_cuda_compile(sys.argv[5].encode(), 1, 0, 0, said, len(said))
+law = (1, 0, 0) if asked == "compile" else ()
+failed = getattr(library, "gmem_cuda_" + asked)(architecture.encode(), *law, said, len(said))
 print(failed, said.value.decode())
 """
 
 
-def compile_alone(nvrtc: str, cache: Path, architecture: str) -> str:
-    paths = [str(library.path()), nvrtc, str(build.SOURCES), str(cache), architecture]
+def alone(asked: str, nvrtc: str, cache: Path, architecture: str, *driver: Path) -> str:
+    """What the library says in a process of its own, beside a driver or none."""
+    paths = [str(library.path()), asked, nvrtc, str(build.SOURCES), str(cache), architecture, *map(str, driver)]
     return subprocess.run([sys.executable, "-c", ALONE, *paths], capture_output=True, text=True, check=True).stdout
 
 
 @needs_nvrtc
 def test_compiled_kernels_are_kept_as_whole_files(tmp_path: Path) -> None:
     folder = tmp_path / "not" / "there"
-    assert compile_alone(cuda._packaged() or "libnvrtc.so", folder, "sm_90").startswith("0 ")
+    assert alone("compile", cuda._nvrtc(), folder, "sm_90").startswith("0 ")
     (kept,) = folder.iterdir()
     assert re.fullmatch(rf"{build.source_hash()}-sm_90-nvrtc\d+\.\d+-law10\.cubin", kept.name)
     assert kept.read_bytes().startswith(b"\x7fELF")
 
 
 @needs_nvrtc
-def test_an_unknown_architecture_is_one_line(tmp_path: Path) -> None:
-    said = compile_alone(cuda._packaged() or "libnvrtc.so", tmp_path, "sm_1")
-    assert said.startswith("1 NVRTC does not compile the kernels for sm_1: ")
-    assert said.count("\n") == 1
+@pytest.mark.parametrize(
+    ("architecture", "said"), [("sm_1", "knows no GPU as old as sm_1; "), ("sm_999", "does not know sm_999\n")]
+)
+def test_an_unknown_architecture_is_one_line(architecture: str, said: str, tmp_path: Path) -> None:
+    found = alone("compile", cuda._nvrtc(), tmp_path, architecture)
+    assert re.match(rf"1 NVRTC \d+\.\d+ {said}", found)
+    assert found.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
 def test_without_nvrtc_what_would_help_is_one_line(tmp_path: Path) -> None:
-    said = compile_alone("no-such-library.so:nor-this.so", tmp_path, "sm_90")
-    assert said == "1 no-such-library.so could not be loaded; pip install 'gmem-jax[cuda13]'\n"
+    said = alone("compile", "no-such-library.so:nor-this.so", tmp_path, "sm_90")
+    assert said == f"1 no-such-library.so could not be loaded; {HELP}\n"
+
+
+HELP = "pip install 'gmem-jax[cuda13]' (or [cuda12] for drivers of CUDA 12)"
+NVRTC_CALLS = ("CreateProgram", "CompileProgram", "GetProgramLogSize", "GetProgramLog", "DestroyProgram")
+NVRTC_CALLS += ("GetCUBINSize", "GetCUBIN", "GetPTXSize", "GetPTX")
+
+
+def stub(path: Path, *functions: str) -> Path:
+    """A library of a few functions in C, which other libraries find by its name once it is loaded."""
+    path.with_suffix(".cc").write_text("\n".join(f'extern "C" int {function}' for function in functions))
+    flags = ["-shared", "-fPIC", f"-Wl,-soname,{path.name}"]
+    subprocess.run([*build.compiler(), *flags, str(path.with_suffix(".cc")), "-o", str(path)], check=True)
+    return path
+
+
+def nvrtc_stub(folder: Path, version: int, *architectures: int) -> Path:
+    """NVRTC of CUDA `version`.3 that knows these architectures and compiles nothing."""
+    known = "".join(f"a[{n}] = {number}; " for n, number in enumerate(architectures))
+    return stub(
+        folder / f"nvrtc-{version}.so",
+        f"nvrtcVersion(int* a, int* b) {{ *a = {version}; *b = 3; return 0; }}",
+        f"nvrtcGetNumSupportedArchs(int* n) {{ *n = {len(architectures)}; return 0; }}",
+        f"nvrtcGetSupportedArchs(int* a) {{ {known}return 0; }}",
+        *(f"nvrtc{name}() {{ return 1; }}" for name in NVRTC_CALLS),
+    )
+
+
+@pytest.fixture(scope="module")
+def stubs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("stubs")
+    found = {"13": nvrtc_stub(folder, 13, 75, 90), "12": nvrtc_stub(folder, 12, 50, 80)}
+    for version in (12080, 13000, 13030):
+        (folder / str(version)).mkdir()
+        driver = folder / str(version) / "libcuda.so.1"
+        found[str(version)] = stub(driver, f"cuDriverGetVersion(int* v) {{ *v = {version}; return 0; }}")
+    return found
+
+
+TOO_NEW = f"1 NVRTC 13.3 is too new for the GPU's driver, which is of CUDA 12.8; {HELP}"
+PTX_TOO_NEW = "does not know sm_120, and the GPU's driver, of CUDA 13.0, is too old for its PTX"
+
+
+@pytest.mark.parametrize(
+    ("names", "driver", "architecture", "said"),
+    [
+        ("13 12", "13000", "sm_90", "0 "),
+        ("13 12", "13000", "sm_70", f"1 NVRTC 13.3 knows no GPU as old as sm_70; {HELP}"),
+        ("13 12", "12080", "sm_70", "0 "),  # by the older one
+        ("13", "12080", "sm_90", TOO_NEW),
+        ("13", "12080", "", TOO_NEW),
+        ("13", "", "", "0 "),
+        ("13", "13030", "sm_120", "0 "),  # by the driver's own compiler
+        ("13", "13000", "sm_120", f"1 NVRTC 13.3 {PTX_TOO_NEW}; {HELP}"),
+    ],
+)
+def test_nvrtc_is_chosen_by_what_the_driver_loads(
+    names: str, driver: str, architecture: str, said: str, stubs: dict[str, Path], tmp_path: Path
+) -> None:
+    nvrtc = ":".join(str(stubs[name]) for name in names.split())
+    assert alone("missing", nvrtc, tmp_path, architecture, *([stubs[driver]] if driver else [])) == f"{said}\n"
+
+
+@needs_nvrtc
+def test_a_gpu_that_is_too_old_is_known_before_a_program_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    for capability, said in (("9.0", ""), ("5.0", "knows no GPU as old as sm_50")):
+        gpus = [SimpleNamespace(compute_capability="9.0"), SimpleNamespace(compute_capability=capability)]
+        monkeypatch.setattr(jax, "local_devices", lambda backend, gpus=gpus: gpus)
+        found = cuda.missing.__wrapped__()
+        assert said in found
+        assert bool(said) == bool(found)
 
 
 def test_a_bin_of_an_experiment_on_a_gpu_is_one_call_and_waits_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,6 +66,10 @@ class Driver:
         """
         self._library.mock_begin(device, replays, initialized)
 
+    def be(self, architecture: int) -> None:
+        """Let GPUs be of another architecture, as 120 for sm_120."""
+        self._library.mock_architecture(architecture)
+
     def fail(self, function: str, call: int = 1) -> None:
         """Let that call of a function fail, counted from one."""
         self._library.mock_fail(function.encode(), call)
@@ -192,6 +196,17 @@ def not_initialized(driver: Driver) -> None:
     assert driver.count("loads while capturing") == 1
 
 
+def an_architecture_of_the_future(driver: Driver) -> None:
+    """What NVRTC does not know is compiled by the driver, from PTX."""
+    driver.begin(4)
+    driver.be(990)
+    assert_same(values("mock", "H"), values("emulated", "H"))
+    assert driver.count("cuModuleLoadData") == 1
+    (kept,) = Path(os.environ["GMEM_COMPILE_CACHE"]).glob("kernels/*.ptx")
+    assert re.search(r"-compute_\d+-nvrtc[\d.]+-law10\.ptx$", kept.name)
+    assert not re.search(r"(mul|add|sub)\.f64", kept.read_text())  # which could be contracted
+
+
 FAILURES = [  # functions of the driver, and the call of them that fails
     ("cuStreamGetCtx", 1),
     ("cuStreamGetCtx", 2),
@@ -229,6 +244,7 @@ CASES: dict[str, Callable[[Driver], None]] = {
     "many replicas": many_replicas,
     "launches that are captured and replayed": captured,
     "two devices": two_devices,
+    "a GPU that NVRTC does not know": an_architecture_of_the_future,
     "calls that were not initialized": not_initialized,
     "functions of the driver that fail": failures,
 }

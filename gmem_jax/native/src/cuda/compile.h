@@ -20,13 +20,12 @@ struct Which {
 // Further options for NVRTC, for trials: of the environment's GMEM_NVRTC, as "-DGMEM_BLOCK=256".
 std::string trial_options();
 
-// The code for an architecture, as "sm_90"; compiled once and then kept in a file. Where `log` is given it is compiled
-// anew, and what the assembler says of registers and spills goes there. Throws std::runtime_error in one line.
+// The code for an architecture, as "sm_90": a cubin, or text in PTX for the driver to compile where NVRTC does not know the
+// architecture. Compiled once and then kept in a file. Where `log` is given a cubin is compiled anew, and what the assembler
+// says of registers and spills goes there. Throws std::runtime_error in one line.
 std::string code_for(const std::string& architecture, const Which& which, std::string* log = nullptr);
 
-// Opens the first library that there is among paths and names joined by ":", or throws with what would help.
-void* open_library(const std::string& names, const std::string& help);
-// A function of it, by name.
+// A function of a library, by name.
 void* symbol_of(void* library, const char* name);
 template <class Function>
 void find(void* library, const char* name, Function*& function) {

@@ -2,6 +2,8 @@
 
 #include "cuda/launch.h"
 
+#include <dlfcn.h>
+
 #include <array>
 #include <map>
 #include <mutex>
@@ -38,7 +40,8 @@ struct Driver {
   int (*describe)(int, const char**);
 
   Driver() {
-    void* library = open_library("libcuda.so.1", "is there a driver for the GPU?");
+    void* library = dlopen("libcuda.so.1", RTLD_NOW);
+    if (!library) throw std::runtime_error("libcuda.so.1 could not be loaded; is there a driver for the GPU?");
     find(library, "cuStreamGetCtx", context_of);
     find(library, "cuCtxPushCurrent_v2", push);
     find(library, "cuCtxPopCurrent_v2", pop);
@@ -78,7 +81,7 @@ const Kernels* kernels_of(Handle context, const Which& which) {
   d.must(d.attribute(&major, kMajor, device), "which architecture");
   d.must(d.attribute(&minor, kMinor, device), "which architecture");
   const std::string code = code_for("sm_" + std::to_string(major) + std::to_string(minor), which);
-  // The stream may be on its way into a graph: loading is no part of that.
+  // Where the call was not initialized, the stream may be on its way into a graph: loading is no part of that.
   int mode = kRelaxed;
   d.must(d.exchange_mode(&mode), "mode of capture");
   Handle module = nullptr;
