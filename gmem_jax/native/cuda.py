@@ -41,7 +41,8 @@ def _architectures() -> set[str]:
         devices = jax.local_devices(backend="cuda")
     except RuntimeError:
         return set()
-    return {"sm_" + device.compute_capability.replace(".", "") for device in devices}
+    capabilities = {getattr(device, "compute_capability", "") for device in devices}
+    return {"sm_" + one.replace(".", "") for one in capabilities if one}
 
 
 @functools.cache

@@ -10,7 +10,6 @@
 #include <iterator>
 #include <map>
 #include <mutex>
-#include <regex>
 
 #include "emulated.cc"
 
@@ -67,7 +66,7 @@ void complain(const std::string& what) { complaints += what + "\n"; }
 int called(const std::string& function) {
   const std::lock_guard<std::recursive_mutex> lock(mutex);
   const auto fails = failures.find(function);
-  return ++counts[function], fails != failures.end() && fails->second == counts[function] ? kOutOfMemory : kOk;
+  return ++counts[function], fails != failures.end() && fails->second <= counts[function] ? kOutOfMemory : kOk;
 }
 
 template <class T>
@@ -107,29 +106,37 @@ Module kernels_of(const char* image) {
 // The same of PTX, where arguments lie one after another.
 Module kernels_of_text(const std::string& text) {
   Module found;
-  const std::regex entry(R"(\.entry (\w+)\([^)]*\.b8 \w+\[(\d+)\][^)]*\.u32 \w+\s*\)\s*\.maxntid (\d+))");
-  for (std::sregex_iterator at(text.begin(), text.end(), entry), end; at != end; ++at) {
-    const unsigned size = static_cast<unsigned>(std::stoi((*at)[2]));
-    found[(*at)[1]] = {nullptr, {}, {}, {{0, size}, {size, sizeof(int)}}, std::stoi((*at)[3])};
+  const std::string begin = ".entry ", threads = ".maxntid ";
+  for (std::size_t at = 0; (at = text.find(begin, at)) != std::string::npos; ++at) {
+    const std::size_t name = at + begin.size();
+    const auto size = static_cast<unsigned>(std::stoi(text.substr(text.find('[', at) + 1)));
+    const int most = std::stoi(text.substr(text.find(threads, at) + threads.size()));
+    found[text.substr(name, text.find('(', at) - name)] = {nullptr, {}, {}, {{0, size}, {size, sizeof(int)}}, most};
   }
   return found;
 }
 
-// The kept file that has the same bytes says of which law they are. Cubins are for one architecture.
-int identify(const char* image, Which& which) {
+// The kept file that has the same bytes (and a checksum after them) says of which law they are.
+bool identify(const char* image, Which& which) {
   for (const auto& entry : std::filesystem::directory_iterator(folder)) {
     std::ifstream file(entry.path(), std::ios::binary);
     const std::string bytes{std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>()};
     const std::string name = entry.path().filename();
     const std::size_t law = name.find("-law");
-    if (law == std::string::npos || bytes.empty() || std::memcmp(bytes.data(), image, bytes.size()) != 0) continue;
+    if (law == std::string::npos || bytes.size() < 1000) continue;
+    if (std::memcmp(bytes.data(), image, bytes.size() - 16) != 0) continue;
     const bool tangent = name.find("-tangent") != std::string::npos;
     which = {static_cast<gmem::Law>(name[law + 4] - '0'), static_cast<gmem::Variant>(name[law + 5] - '0'),
              tangent ? gmem::Task::tangent : gmem::Task::forward, name.find("-periodic") != std::string::npos};
-    const bool own = name.find("-sm_" + std::to_string(architecture) + "-") != std::string::npos;
-    return own || entry.path().extension() == ".ptx" ? kOk : kNoBinary;
+    return true;
   }
-  return kInvalidImage;
+  return false;
+}
+
+// Of a cubin, as 90.
+int architecture_of(const char* image) {
+  const auto header = number_at<Elf64_Ehdr>(image);
+  return header.e_ident[EI_OSABI] == 0x33 ? header.e_flags & 0xff : header.e_flags >> 8 & 0xff;
 }
 
 void execute(const Launch& launch) {
@@ -234,8 +241,10 @@ int cuModuleLoadData(Module** module, const void* code) {
   if (captures && capture_mode != kRelaxed) return kCaptureUnsupported;
   const char* image = static_cast<const char*>(code);
   Which which{};
-  if (const int unable = identify(image, which)) return unable;
-  *module = new Module(std::memcmp(image, ELFMAG, SELFMAG) == 0 ? kernels_of(image) : kernels_of_text(image));
+  if (!identify(image, which)) return kInvalidImage;
+  const bool is_cubin = std::memcmp(image, ELFMAG, SELFMAG) == 0;
+  if (is_cubin && architecture_of(image) != architecture) return kNoBinary;
+  *module = new Module(is_cubin ? kernels_of(image) : kernels_of_text(image));
   for (std::size_t n = 0; n < std::size(kKernels); ++n) {
     Function& kernel = (**module)[kKernels[n]];
     kernel.context = stack.back(), kernel.which = which, kernel.kernel = static_cast<GpuKernel>(n);
@@ -288,7 +297,7 @@ void mock_begin(int on, int so_often, int before) {
   device = on, replays = so_often, initializes = before, architecture = 90;
   counts.clear(), failures.clear(), complaints.clear();
 }
-// The n-th call of a function of the driver, counted from one, shall fail.
+// From the n-th call on, counted from one, a function of the driver shall fail.
 void mock_fail(const char* function, int n) { failures[function] = n; }
 // GPUs are of another architecture, as 120 for sm_120.
 void mock_architecture(int number) { architecture = number; }

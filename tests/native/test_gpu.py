@@ -291,6 +291,7 @@ def test_compiled_kernels_are_kept_as_whole_files(tmp_path: Path) -> None:
     (kept,) = folder.iterdir()
     assert re.fullmatch(rf"{build.source_hash()}-sm_90-nvrtc\d+\.\d+-law10\.cubin", kept.name)
     assert kept.read_bytes().startswith(b"\x7fELF")
+    assert kept.stat().st_mode & 0o777 == 0o644
 
 
 @needs_nvrtc

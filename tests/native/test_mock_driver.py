@@ -71,7 +71,7 @@ class Driver:
         self._library.mock_architecture(architecture)
 
     def fail(self, function: str, call: int = 1) -> None:
-        """Let that call of a function fail, counted from one."""
+        """Let a function fail from that call on, counted from one."""
         self._library.mock_fail(function.encode(), call)
 
     def count(self, function: str) -> int:
@@ -207,7 +207,27 @@ def an_architecture_of_the_future(driver: Driver) -> None:
     assert not re.search(r"(mul|add|sub)\.f64", kept.read_text())  # which could be contracted
 
 
-FAILURES = [  # functions of the driver, and the call of them that fails
+def files_that_are_not_what_they_seem(driver: Driver) -> None:
+    """They are compiled anew, once."""
+    expected = values("emulated", "H")
+    driver.begin(5)
+    driver.be(80)
+    assert_same(values("mock", "H"), expected)
+    folder = Path(os.environ["GMEM_COMPILE_CACHE"]) / "kernels"
+    (other,) = folder.glob("*-sm_80-*-law10.cubin")
+    kept = Path(str(other).replace("-sm_80-", "-sm_90-"))
+    whole = kept.read_bytes()
+    wrong = {"nothing": (b"", 1), "cut short": (whole[:-100], 1), "of another GPU": (other.read_bytes(), 2)}
+    for device, (bytes_of, loads) in enumerate(wrong.values(), start=6):
+        kept.write_bytes(bytes_of)
+        driver.begin(device)
+        assert_same(values("mock", "H"), expected)
+        assert driver.count("cuModuleLoadData") == loads
+        assert kept.read_bytes() == whole
+    assert not list(folder.glob("*.cubin.*"))
+
+
+FAILURES = [  # functions of the driver, and the call of them from which on they fail
     ("cuStreamGetCtx", 1),
     ("cuStreamGetCtx", 2),
     ("cuCtxPushCurrent_v2", 1),
@@ -232,6 +252,7 @@ def failures(driver: Driver) -> None:
         assert re.search(r"gmem_jax native: the GPU's driver: [a-z ]+: out of memory", said), (function, said)
         assert "\n" not in said, (function, said)
         assert driver.complaints() == "", (function, driver.complaints())
+        driver.begin(device)
         assert_same(values("mock", "H"), expected)
     driver.begin(99)
     driver.fail("cuStreamGetCtx")
@@ -245,6 +266,7 @@ CASES: dict[str, Callable[[Driver], None]] = {
     "launches that are captured and replayed": captured,
     "two devices": two_devices,
     "a GPU that NVRTC does not know": an_architecture_of_the_future,
+    "files that are not what they seem": files_that_are_not_what_they_seem,
     "calls that were not initialized": not_initialized,
     "functions of the driver that fail": failures,
 }

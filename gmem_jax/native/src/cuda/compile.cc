@@ -1,9 +1,11 @@
 #include "cuda/compile.h"
 
 #include <dlfcn.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include <algorithm>
+#include <cstdint>
 #include <cstdio>
 #include <cstdlib>
 #include <filesystem>
@@ -125,15 +127,35 @@ std::string contents(const std::string& path) {
   return {std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>()};
 }
 
-// A file that is there is whole. One that cannot be kept is compiled again next time.
+// The end of a file, by which one that was cut short or changed is known: FNV-1a in 16 digits.
+std::string checksum(const std::string& code) {
+  std::uint64_t sum = 14695981039346656037u;
+  for (const char byte : code) sum = (sum ^ static_cast<unsigned char>(byte)) * 1099511628211u;
+  char digits[17];
+  std::snprintf(digits, sizeof digits, "%016llx", static_cast<unsigned long long>(sum));
+  return digits;
+}
+
+// The code in a file; "" where there is none, or it is not whole.
+std::string kept(const std::string& path) {
+  const std::string file = contents(path);
+  const std::string code = file.substr(0, file.size() < 16 ? 0 : file.size() - 16);
+  return code + checksum(code) == file ? code : "";
+}
+
+// Processes may do so at once. What cannot be kept is compiled again next time.
 void keep(const std::string& path, const std::string& code) {
   std::error_code unable;
   std::filesystem::create_directories(paths().cache, unable);
-  const std::string unfinished = path + "." + std::to_string(getpid());
-  std::ofstream file(unfinished, std::ios::binary);
-  file.write(code.data(), static_cast<std::streamsize>(code.size()));
-  file.close();
-  if (!file || std::rename(unfinished.c_str(), path.c_str()) != 0) std::remove(unfinished.c_str());
+  std::string unfinished = path + ".XXXXXX";
+  const int file = mkstemp(&unfinished[0]);
+  if (file < 0) return;
+  const std::string all = code + checksum(code);
+  const bool whole = write(file, all.data(), all.size()) == static_cast<ssize_t>(all.size());
+  const bool readable = fchmod(file, S_IRUSR | S_IWUSR | S_IRGRP | S_IROTH) == 0;  // by all who share the folder
+  const bool closed = close(file) == 0;
+  if (!whole || !readable || !closed || std::rename(unfinished.c_str(), path.c_str()) != 0)
+    std::remove(unfinished.c_str());
 }
 
 std::string law_as_type(const Which& which) {
@@ -145,7 +167,7 @@ std::string compiled(const std::string& target, const Which& which, std::string*
   if (source.empty()) throw std::runtime_error("the sources of the GPU's kernels are not in " + paths().sources);
   std::vector<std::string> options = {
       "--gpu-architecture=" + target, "--std=c++17", "--device-as-default-execution-space",
-      "--fmad=false",  // as on CPUs: a fused multiply-add is where the sources say so
+      "--generate-line-info", "--fmad=false",  // as on CPUs: a fused multiply-add is where the sources say so
       "-I" + paths().sources, "-DGMEM_ISA=gpu",
       "-DGMEM_LAW=" + law_as_type(which),
       "-DGMEM_PERIODIC=" + std::to_string(which.periodic),
@@ -202,7 +224,7 @@ void* symbol_of(void* library, const char* name) {
   throw std::runtime_error(std::string("the CUDA libraries here are too old: they have no ") + name);
 }
 
-std::string code_for(const std::string& architecture, const Which& which, std::string* log) {
+std::string code_for(const std::string& architecture, const Which& which, bool anew, std::string* log) {
   static std::mutex one_at_a_time;
   const std::lock_guard<std::mutex> lock(one_at_a_time);
   const std::string target = target_for(architecture), version = dotted(nvrtc().version);
@@ -213,7 +235,7 @@ std::string code_for(const std::string& architecture, const Which& which, std::s
   const std::string path = paths().cache + "/" + GMEM_SOURCE_HASH + "-" + target + "-nvrtc" + version + law +
                            (is_ptx(target) ? ".ptx" : ".cubin");
   const bool keeps = !paths().cache.empty() && trial_options().empty();
-  std::string code = keeps && !log ? contents(path) : "";
+  std::string code = keeps && !anew && !log ? kept(path) : "";
   if (code.empty()) {
     code = compiled(target, which, log);
     if (keeps) keep(path, code);
@@ -247,7 +269,7 @@ extern "C" int gmem_cuda_compile(const char* architecture, int law, int variant,
     std::string log;
     const auto task = tangent ? gmem::Task::tangent : gmem::Task::forward;
     const gmem::cuda::Which which{static_cast<gmem::Law>(law), static_cast<gmem::Variant>(variant), task, false};
-    gmem::cuda::code_for(architecture, which, &log);
+    gmem::cuda::code_for(architecture, which, true, &log);
     return log;
   });
 }

@@ -21,9 +21,10 @@ struct Which {
 std::string trial_options();
 
 // The code for an architecture, as "sm_90": a cubin, or text in PTX for the driver to compile where NVRTC does not know the
-// architecture. Compiled once and then kept in a file. Where `log` is given a cubin is compiled anew, and what the assembler
-// says of registers and spills goes there. Throws std::runtime_error in one line.
-std::string code_for(const std::string& architecture, const Which& which, std::string* log = nullptr);
+// architecture. Compiled once and then kept in a file; or `anew`, as always where `log` is given, to which what the assembler
+// says of a cubin's registers and spills goes. Throws std::runtime_error in one line.
+std::string code_for(const std::string& architecture, const Which& which, bool anew = false,
+                     std::string* log = nullptr);
 
 // A function of a library, by name.
 void* symbol_of(void* library, const char* name);

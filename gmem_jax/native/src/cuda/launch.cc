@@ -80,20 +80,24 @@ const Kernels* kernels_of(Handle context, const Which& which) {
   d.must(d.device_of(&device), "which device");
   d.must(d.attribute(&major, kMajor, device), "which architecture");
   d.must(d.attribute(&minor, kMinor, device), "which architecture");
-  const std::string code = code_for("sm_" + std::to_string(major) + std::to_string(minor), which);
-  // Where the call was not initialized, the stream may be on its way into a graph: loading is no part of that.
-  int mode = kRelaxed;
-  d.must(d.exchange_mode(&mode), "mode of capture");
-  Handle module = nullptr;
+  const std::string architecture = "sm_" + std::to_string(major) + std::to_string(minor);
   Kernels kernels{};
-  const int loaded = d.load(&module, code.data());
-  int got = loaded;
-  for (std::size_t i = 0; i < kernels.size() && got == 0; ++i) {
-    got = d.function(&kernels[i].function, module, kNames[i]);
-    if (got == 0) got = d.needs(&kernels[i].block, kMostThreads, kernels[i].function);
-  }
-  d.exchange_mode(&mode);
-  d.must(got, "loading the kernels");
+  const auto load = [&](bool anew) {
+    const std::string code = code_for(architecture, which, anew);
+    // Where the call was not initialized, the stream may be on its way into a graph: loading is no part of that.
+    int mode = kRelaxed;
+    d.must(d.exchange_mode(&mode), "mode of capture");
+    Handle module = nullptr;
+    int failed = d.load(&module, code.data());
+    for (std::size_t i = 0; i < kernels.size() && failed == 0; ++i) {
+      failed = d.function(&kernels[i].function, module, kNames[i]);
+      if (failed == 0) failed = d.needs(&kernels[i].block, kMostThreads, kernels[i].function);
+    }
+    d.exchange_mode(&mode);
+    return failed;
+  };
+  // The file may be of another GPU, though its name says otherwise.
+  if (load(false) != 0) d.must(load(true), "loading the kernels");
   return &known.emplace(key, kernels).first->second;
 }
 
