@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import TETRA_27
+from scenes import PERIODIC_XY_27, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -40,6 +40,8 @@ LAWS: dict[str, Any] = {
     "M1": gm.MindlinRescaled(mu=0.3),
     **{f"M2-{variant}": gm.Mindlin(mu=0.3, points=8, variant=variant) for variant in ("exact", "averaged", "paper")},
 }
+PERIODIC = "H in a box that is periodic along two axes"
+LAWS[PERIODIC] = LAWS["H"]
 Parts = tuple[Call, Fixed, Arrays, Arrays]
 
 
@@ -84,30 +86,31 @@ class Driver:
 
 
 @functools.cache
-def at_rest() -> tuple[Any, Any]:
+def at_rest(path: Path) -> tuple[Any, Any]:
     """A pack of 27 grains, and its state, whose accelerations are those of any law without a history."""
-    pack = gm.load_pack(TETRA_27)
+    pack = gm.load_pack(path)
     system = System(pack.clump, LAWS["H"], pack.pairs)
     begin = jax.jit(start, compiler_options=QUICKLY)
     return pack, begin(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
 
 
 @functools.cache
-def parts_of(law: str) -> Parts:
+def parts_of(name: str) -> Parts:
     """Grains that fly and spin into each other, each replica at its own speed; and a direction."""
-    pack, state = at_rest()
-    system = System(pack.clump, LAWS[law], pack.pairs)
+    pack, state = at_rest(PERIODIC_XY_27 if name == PERIODIC else TETRA_27)
+    system = System(pack.clump, LAWS[name], pack.pairs)
     draws = np.random.default_rng(0)
     scale = 5e-3 * np.linspace(0.5, 1.0, REPLICAS)
     velocity, spin = (scale * draws.normal(size=(pack.grains, 3, 1)) for _ in range(2))
     still = np.zeros((STEPS, 3, REPLICAS))
     walls = (np.broadcast_to(np.asarray(edge)[:, None], still.shape) for edge in (pack.lower, pack.upper))
+    box = Box(*walls, still, still, pack.box.periodic)
     grains = replace(replicate(state, REPLICAS).grains, velocity=velocity, spin=spin)
     history = system.friction.init(pack.pairs.capacity, REPLICAS, np.dtype(float))
     numbers = jnp.asarray(0.3), jnp.asarray(0.01)
-    arrays = jax.tree.map(jnp.asarray, arrays_of(system, grains, history, Box(*walls, still, still), numbers))
+    arrays = jax.tree.map(jnp.asarray, arrays_of(system, grains, history, box, numbers, state.cell))
     along = jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), arrays)
-    return call_of(system), fixed_of(system), arrays, along
+    return call_of(system, pack.box.periodic), fixed_of(system), arrays, along
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICKLY)
