@@ -11,7 +11,6 @@
 //   chunk   16 grains: what a thread takes at once, and of which wall forces are summed before they are added up.
 //   domain  the contacts that a thread takes at once: those whose lower-numbered grain is in one part of the pack.
 //   remote  a force on a grain of another domain, which waits until that grain is moved.
-//   side    on GPUs, a candidate as one of its two grains sees it (cuda/arguments.h).
 //
 // Most candidates are apart for many steps. `Engine::travel` is how much closer any two spheres can have come since the
 // call began: twice what the fastest grain can have moved and turned, summed over the steps. When a candidate is found
