@@ -81,7 +81,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   const auto small = [](int row, int l) { return 1e-3 * noise(row, l, 1); };
   const auto positive = [](int row, int l) { return 1e-3 * (1.5 + noise(row, l, 2)); };
   const auto parameter = [](int row, int) {
-    const double numbers[kParameters] = {0.05, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.9, 0.06};
+    const double numbers[kRows] = {0.05, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.9, 0.06};
     return numbers[row];
   };
   const auto wall = [&](int row, int) { return row % 12 < 3 ? 0.0 : row % 12 < 6 ? 2.9 * (c.edge ? c.edge : 2) : 1e-3; };
@@ -113,12 +113,12 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     slope.history_in[leaf] = array(rows, false, small);
     lane.history_out[leaf] = slope.history_out[leaf] = array(rows, true, small);
   }
-  lane.parameters = array(kParameters, false, parameter);
+  lane.parameters = array(kRows, false, parameter);
   lane.walls = array(kSteps * kWalls, false, wall);
-  slope.parameters = array(kParameters, false, small);
+  slope.parameters = array(kRows, false, small);
   slope.walls = array(kSteps * kWalls, false, small);
   lane.pressure = slope.pressure = array(3, !back, small);
-  if (back) slope.parameters_out = array(kParameters, true, small), slope.walls_out = array(kSteps * kWalls, true, small);
+  if (back) slope.parameters_out = array(kRows, true, small), slope.walls_out = array(kSteps * kWalls, true, small);
 
   const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b};
   const auto store = plan_for({n, kSpheres, candidates, scene.first.data(), scene.second.data(),
