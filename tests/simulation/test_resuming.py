@@ -81,7 +81,8 @@ def test_a_run_goes_on_with_the_lists_it_had(law: Any, tmp_path: Path) -> None:
     "changes",
     [
         pytest.param({"grains": 12}, id="walls"),
-        pytest.param({"grains": 56, "boundary": "periodic"}, id="periodic", marks=pytest.mark.slow),
+        # Some seeds of so few spheres lose their pressure in the cycles, which is warned of; on either backend.
+        pytest.param({"grains": 56, "boundary": "periodic", "seed": 6}, id="periodic", marks=pytest.mark.slow),
         pytest.param({"grains": 40, "boundary": "walls,periodic,walls"}, id="periodic along y", marks=pytest.mark.slow),
     ],
 )
