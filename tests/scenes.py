@@ -3,6 +3,7 @@
 import functools
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +37,15 @@ FREE = still_box(jnp.full((3, 1), -15.0), jnp.full((3, 1), 15.0))  # walls out o
 
 cached_tetra = functools.lru_cache(tetra)
 accelerate = jax.jit(dynamics.accelerate)
+
+
+def assert_close(found: Any, expected: Any, tolerance: float) -> None:
+    """Every array of a tree to `tolerance` of its own largest number."""
+    for one, (path, other) in zip(
+        jax.tree.leaves(found), jax.tree_util.tree_flatten_with_path(expected)[0], strict=True
+    ):
+        scale = float(np.abs(np.asarray(other)).max()) if other.size else 0.0
+        np.testing.assert_allclose(one, other, rtol=0.0, atol=tolerance * scale, err_msg=jax.tree_util.keystr(path))
 
 
 def column(values) -> jax.Array:

@@ -26,7 +26,8 @@ def bench_command(
     scaling: Annotated[bool, typer.Option("--scaling/--no-scaling", help="Cost against N, memory, gradient.")] = True,
     baseline: Annotated[Path | None, typer.Option(help="A bench.json to compare with.")] = None,
     device: Annotated[
-        Literal["cpu", "gpu"], typer.Option(help="gpu: the native backend there, at N = 1,024 and 10,240; no files.")
+        Literal["cpu", "gpu"],
+        typer.Option(help="gpu: the native backend there, N = 325 to 10,240; no files."),
     ] = "cpu",
     as_json: AsJson = False,
 ) -> None:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import export
-from scenes import PERIODIC_XY_27, scene
+from scenes import PERIODIC_XY_27, assert_close, scene
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -147,15 +147,6 @@ def emulate_tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> 
     shapes = primitives._of_results((fixed, arrays))
     found = cuda.call_kernels("gmem_emulated_tangent", call, False, (fixed, arrays, along), shapes)
     return primitives._results(arrays, found[: len(shapes)])
-
-
-def assert_close(found: Any, expected: Any, tolerance: float) -> None:
-    """Every array to `tolerance` of its own largest number."""
-    for one, (path, other) in zip(
-        jax.tree.leaves(found), jax.tree_util.tree_flatten_with_path(expected)[0], strict=True
-    ):
-        scale = float(jnp.abs(other).max()) if other.size else 0.0
-        np.testing.assert_allclose(one, other, rtol=0.0, atol=tolerance * scale, err_msg=jax.tree_util.keystr(path))
 
 
 def images(law: str) -> Scene:

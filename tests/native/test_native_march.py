@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import scene
+from scenes import assert_close, scene
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -70,16 +70,6 @@ def as_defined(law: str) -> tuple[State, jax.Array]:
     """40 steps in plain JAX."""
     system, state = thrown(law)
     return jax.jit(dynamics.march)(system, state, walls(0, STEPS), DT, 0.0)
-
-
-def assert_close(found: Any, expected: Any, tolerance: float) -> None:
-    """Every array to `tolerance` of its own largest number."""
-    for one, (path, other) in zip(
-        jax.tree.leaves(found), jax.tree_util.tree_flatten_with_path(expected)[0], strict=True
-    ):
-        scale = float(jnp.abs(other).max()) if other.size else 0.0
-        where = jax.tree_util.keystr(path)
-        np.testing.assert_allclose(one, other, rtol=0.0, atol=tolerance * scale, err_msg=where)
 
 
 def test_the_pack_is_shared_out_to_several_domains_and_its_grains_spin_and_touch() -> None:

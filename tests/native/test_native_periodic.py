@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import PERIODIC_27, PERIODIC_XY_27
+from scenes import PERIODIC_27, PERIODIC_XY_27, assert_close
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -53,12 +53,6 @@ def moved(march: Callable[..., Any], system: System, state: State, boxes: Box) -
     state, pressure = march(system, state, first, 0.3, 0.01)
     state, more = march(system, state, last, 0.3, 0.01)
     return state.grains, state.history, pressure + more, state.cell
-
-
-def assert_close(found: Any, expected: Any, tolerance: float) -> None:
-    """Every array to `tolerance` of its own largest number."""
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(one, other, rtol=0.0, atol=tolerance * float(np.abs(np.asarray(other)).max()))
 
 
 @pytest.mark.parametrize("replicas", [1, 5])

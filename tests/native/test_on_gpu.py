@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import assert_close
 from test_gpu import LAWS, PACK
 
 import gmem_jax as gm
@@ -63,13 +64,6 @@ def on_both(function: Any, make: Any) -> tuple[Any, Any]:
         arguments = make()
         expected = function(*arguments)
     return function(*jax.device_put(arguments, GPU)), expected
-
-
-def assert_close(found: Any, expected: Any, tolerance: float) -> None:
-    """Every array to `tolerance` of its own largest number."""
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        if other.size:
-            np.testing.assert_allclose(one, other, rtol=0.0, atol=tolerance * float(np.abs(np.asarray(other)).max()))
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -13,6 +13,7 @@ namespace cuda {
 constexpr int kChunk = 64;   // numbers that one thread sums up
 constexpr int kItems = 32;   // grains that a block of `move` has
 constexpr int kWorkers = 4;  // threads that sum up the forces on one of them
+constexpr int kOfLayers = 6; // numbers of Mindlin's `Layers`
 constexpr int kLoad = 6;     // numbers of a contact: the force on its first sphere, and the point where it acts
 
 // Where the numbers of each entry begin; the step is zero where all share them.

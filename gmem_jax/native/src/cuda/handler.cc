@@ -21,8 +21,8 @@ namespace ffi = xla::ffi;
 constexpr int kFew = 1 << 17;  // grains times lanes from which on one thread a grain keeps a GPU busy (an H200, measured)
 constexpr int kOfPack = 6;  // arguments that belong to a pack
 
-// Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain O, of a load F, of `Layers`
-// Y, derivatives and values D, lanes L.
+// Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain O,
+// of a load F, of `Layers` Y, derivatives and values D, lanes L.
 // gmem_jax/native/cuda.py: call_kernels, between_steps
 Wants arguments_of(Task task, Law law) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32}, {"validity", "P", ffi::PRED},
@@ -79,7 +79,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   reader.size('Q') = points;
   reader.size('O') = 4;
   reader.size('F') = kLoad;
-  reader.size('Y') = 6;
+  reader.size('Y') = kOfLayers;
   reader.size('D') = task == Task::forward ? 1 : 2;
   std::vector<Array> in, out;
   for (std::size_t i = 0; i < args.size(); ++i)
@@ -143,11 +143,12 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.touching = reinterpret_cast<unsigned char*>(out[result++].data);
   const bool layered = is_layered(which.law);
   for (std::size_t leaf = 0; leaf < leaves; ++leaf) {
-    const bool rings = layered && leaf == 0, vectors = leaf + 1 < leaves || leaves == 1;
-    a.history[leaf] = rings || !a.tangent ? a.history_out[leaf] : between(a.rows * int64_t{vectors ? 3 : 1});
+    const std::string axes = histories(which.law)[leaf].axes;  // "P3B", "P1B"; of the rings "PQ2B"
+    const bool kept = a.tangent && axes.size() == 3;
+    a.history[leaf] = kept ? between(a.rows * int64_t{axes[1] - '0'}) : a.history_out[leaf];
   }
   if (layered) {
-    a.layers = between(a.rows * int64_t{6});
+    a.layers = between(a.rows * int64_t{kOfLayers});
     a.segments = between(a.rows * points * 3);
     a.stored = reinterpret_cast<int*>(out[result++].data);
   }

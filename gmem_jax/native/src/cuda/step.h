@@ -20,9 +20,8 @@ using cuda::Arguments;
 using cuda::Four;
 using cuda::kChunk;
 using cuda::kLoad;
+using cuda::kOfLayers;
 using cuda::Table;
-
-constexpr int kOfLayers = 6;  // numbers of `Layers`
 
 // The numbers of one lane in a table.
 template <class V>
