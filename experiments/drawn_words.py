@@ -145,11 +145,12 @@ def draw(rows: list[Row], path: Path) -> None:
     for axis, words in ((left, "F"), (right, "words read right")):
         axis.set(xlabel="length of words L (bits)", ylabel=words, ylim=(0.0, 1.05))
         axis.legend(fontsize=8, frameon=False, loc="lower left")
-    counts = ", ".join(f"{row['words']} of {row['bits']} bits" for row in rows)
+    alike = {int(row["words"]): [str(one["bits"]) for one in rows if one["words"] == row["words"]] for row in rows}
+    counts = "; ".join(f"{words} of {', '.join(bits)} bits" for words, bits in alike.items())
     size = int(str(rows[0]["pack"]).split("-")[1])
     figure.suptitle(
-        f"Drawn words ({counts}) of one pack, N = {size:,}, $t_0$ = {float(rows[0]['t0']):,.0f} $t_c$, mean ± SE over "
-        "words; published: all words, N = 10,240",
+        f"Drawn words ({counts}) of one pack, N = {size:,}, $t_0$ = {float(rows[0]['t0']):,.0f} $t_c$,\n"
+        "mean ± SE over words; published: all words, N = 10,240",
         fontsize=10,
     )
     save_picture(path, figure)

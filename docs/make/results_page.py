@@ -1,4 +1,4 @@
-"""The tables of docs/results/figures.md, as `gmem reproduce` wrote them, and of docs/remember_more.md, of words.
+"""The tables of docs/results/figures.md and points.md, and of docs/remember_more.md, of words.
 
 PYTHONPATH=experiments python docs/make/results_page.py [--redraw]
 
@@ -15,6 +15,7 @@ from pathlib import Path
 import design_words
 import drawn_words
 import jax
+import points
 from packs import over_packs
 
 from gmem_jax.reproduce import choices as weighed
@@ -29,6 +30,9 @@ HERE = Path(__file__).parents[1] / "results"
 JOINED = {  # figures that no one command makes
     "fig12b-paper": "Fig. 6 of this scale, figs. 8 and 12b of smaller ones, "
     "`--scale workstation,sizes=31680,few=1` and `experiments/large_pack.py`, put together by `experiments/joined.py`",
+    **dict.fromkeys(
+        points.WHICH, "Sweeps of single packs ([table](points.csv), [how](runs.md#points-of-10240-grains))"
+    ),
 }
 TITLES = {"fig03": "packs at rest, by size and by shape", "choices": "what the paper leaves open, each tried otherwise"}
 RATES = {"fig12b-paper": "1,800 to 18,000"}  # of figures whose points are of several
@@ -192,6 +196,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--redraw", action="store_true", help="draw pictures anew")
     arguments = parser.parse_args()
+    points.figures()
     for path in HERE.glob("*/fig*.csv"):
         write_csv(path, comparison_rows(read_csv(path)))
     if arguments.redraw:
@@ -206,6 +211,7 @@ def main() -> None:
     for (_, name, _, scale), path in sorted(shown):
         lines += [*heading(name, scale), *([*verdicts(path), ""] if name == "claims" else figure(path))]
     put(lines, HERE / "figures.md")
+    put([*points.every_point(), "", *points.words(), "", ""], HERE / "points.md")
     put([*designed_words(HERE / "designed_words.csv"), "", ""], HERE.parent / "remember_more.md")
 
 

@@ -1,0 +1,171 @@
+"""Figures of 10,240 grains from packs that ran one by one, and every published point beside ours.
+
+python docs/make/points.py
+
+`docs/results/points.csv` has a row for each pack and condition, as `gmem sweep export` gave them: sweeps over delta0,
+gamma0, mu and the seed of `prepare`, with t0 = 5,400 and dt = 1.2. Means over packs become the tables and pictures of
+figs. 8, 11 and 12a, by the names of their scale; and docs/results/points.md is written anew.
+"""
+
+import csv
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from gmem_jax.reproduce import draw
+from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, compared, comparison_rows, read_csv, write_csv
+from gmem_jax.reproduce.figures import FIGURES
+from gmem_jax.show.tables import published
+
+HERE = Path(__file__).parents[1] / "results"
+OWN = HERE / "points.csv"
+USUAL = {"mu": 1.0, "delta0": 0.05, "gamma0": 1e-3, "overlap": 0.6, "law": "H"}
+Measured = tuple[Conditions, str]
+
+
+def _only(row: Compared, *free: str) -> bool:
+    at = asdict(row.conditions)
+    return all(at[name] == value for name, value in USUAL.items() if name not in free)
+
+
+SHOWN = (0.01, 0.02, 0.05, 0.08)  # delta0 of the curves of fig. 11: with all eight, points would lie under one another
+LARGE = 5e-3  # gamma0 from which on G is no longer that of small shear
+WHICH: dict[str, Callable[[Compared], bool]] = {
+    "fig08-paper-t0=5400-packs=3": lambda row: _only(row, "mu"),
+    "fig11-paper-t0=5400-few=1": lambda row: (
+        _only(row, "delta0", "gamma0") and row.conditions.delta0 in SHOWN and row.conditions.gamma0 < LARGE
+    ),
+    "fig12a-paper-t0=5400-few=1": lambda row: _only(row, "delta0"),
+}
+"""Figures that are made of the packs' own rows, and which rows are theirs."""
+
+WITHIN = 2.0  # combined errors that count as agreement
+REASONS: tuple[tuple[Callable[[Mapping[str, Any]], bool], str], ...] = (
+    (lambda at: at["delta0"] <= 0.02, "[thin compression](differences.md#thin-compression)"),
+    (lambda at: at["mu"] < 0.7, "[small friction](differences.md#g-at-small-friction)"),
+    (lambda at: at["gamma0"] > LARGE, "[large shear](differences.md#large-shear)"),
+    (lambda at: at["n_grains"] > 20_000, "[large packs](differences.md#g-of-31680-and-100450-grains)"),
+    (lambda at: at["shape"] == "sphere", "[spheres](differences.md#spheres)"),
+)
+
+
+def of_packs(path: Path = OWN) -> list[Compared]:
+    """Means over the packs of a table, where G and F are those over the ringing period."""
+    with path.open(newline="", encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    groups: dict[Conditions, list[dict[str, str]]] = {}
+    for line in lines:
+        overlap, mu, delta0, gamma0 = (float(line[name]) for name in ("overlap", "mu", "delta0", "gamma0"))
+        at = Conditions(line["law"], line["shape"], overlap, int(line["grains"]), mu, delta0, gamma0, 0, "sub0")
+        groups.setdefault(at, []).append(line)
+    found = []
+    for at, members in groups.items():
+        status = 0
+        for member in members:
+            status |= int(member["status"])
+        for measure in "FG":
+            found.append(compared(at, measure, [float(member[f"{measure}_over_T1"]) for member in members], status))
+    return found
+
+
+def figures() -> None:
+    """Write the tables and pictures of `WHICH`; what they have of other conditions (mu = 0) stays."""
+    rows = of_packs()
+    for name, belongs in WHICH.items():
+        table, figure = HERE / "paper" / f"{name}.csv", FIGURES[name.partition("-")[0]]
+        kept = {(row.conditions, row.measure): row for row in (read_csv(table) if table.is_file() else [])}
+        kept |= {(row.conditions, row.measure): row for row in rows if belongs(row)}
+        ordered = sorted(kept.values(), key=lambda row: [getattr(row.conditions, name) for name in figure.across])
+        write_csv(table, comparison_rows(ordered))
+        title = f"{figure.title}\n{draw.said_of(ordered, '5,400')}"
+        draw.draw_comparison(table.with_suffix(".png"), ordered, figure.across, title)
+        table.with_suffix(".svg").unlink(missing_ok=True)
+
+
+def ours() -> dict[Measured, Compared]:
+    """Of every condition that ran anywhere the estimate of most packs, of as many grains as published."""
+    best: dict[Measured, Compared] = {}
+    tables = [row for path in sorted(HERE.glob("*/fig*.csv")) for row in read_csv(path)]
+    for row in [*tables, *of_packs()]:
+        known = best.get((row.conditions, row.measure))
+        if row.theirs and row.grains == row.conditions.grains and (not known or row.ours.packs > known.ours.packs):
+            best[row.conditions, row.measure] = row
+    return best
+
+
+def _said(one: Estimate) -> str:
+    error = "" if math.isnan(one.error) else f" ± {one.error:.3f}"
+    return f"{one.mean:.3f}{error} ({one.packs})"
+
+
+def _beside(row: Compared | None) -> tuple[str, str, str]:
+    if row is None or row.theirs is None:
+        return "", "", ""
+    apart = row.errors_apart
+    return _said(row.ours), _said(row.theirs), "" if math.isnan(apart) else f"{apart:+.1f}"
+
+
+def every_point() -> list[str]:
+    """Every published point of six signals and of laws beside ours, as Markdown, and how many agree."""
+    best = ours()
+    names = ("law", "O", "mu", "N", "delta0", "gamma0")
+    head = [*names, "G", "published", "apart", "F", "published", "apart", "beyond 2: see"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    apart: list[float] = []
+    missing = 0
+    for at in _published():
+        grain, box = (at["shape"], at["overlap"], int(at["n_grains"])), (at["mu"], at["delta0"], at["gamma0"])
+        conditions = Conditions(at["law"], *grain, *box, 0, "sub0")
+        rows = [best.get((conditions, measure)) for measure in "GF"]
+        missing += rows[1] is None
+        own = [row.errors_apart for row in rows if row is not None and not math.isnan(row.errors_apart)]
+        apart += own
+        reasons = [words for holds, words in REASONS if holds(at)][:1] if any(abs(x) > WITHIN for x in own) else []
+        shown = [at["law"], f"{at['overlap']:g}", f"{at['mu']:g}", f"{conditions.grains:,}"]
+        shown += [f"{at['delta0']:g}", f"{at['gamma0']:g}", *_beside(rows[0]), *_beside(rows[1]), *(reasons or [""])]
+        lines.append(f"| {' | '.join(shown)} |")
+    within = sum(abs(one) <= WITHIN for one in apart)
+    total = len(lines) - 2
+    told = f"{total - missing} of {total} published points have one of ours of the same N. "
+    return [f"{told}Of {len(apart)} measures {within} lie within two combined errors.", "", *lines]
+
+
+def _published() -> Iterable[dict[str, Any]]:
+    for row in published("six_signals.csv"):
+        yield {"law": "H", **row}
+    for row in published("models.csv"):
+        if row["law"] != "H":
+            law = "M2, paper" if row["law"] == "M2" else row["law"]
+            yield {**USUAL, "shape": "tetra", **row, "law": law}
+
+
+def words() -> list[str]:
+    """Published words beside ours, as Markdown: F by three backgrounds, and what the net reads."""
+    with (HERE / "drawn_words.csv").open(newline="", encoding="utf-8") as file:
+        drawn = {int(row["bits"]): row for row in csv.DictReader(file)}
+    known = [row for (at, measure), row in ours().items() if at.bits and measure == "F"]
+    whole = {(row.conditions.bits, row.conditions.background): f"{row.ours.mean:.3f}" for row in known}
+    kinds = ("sub0", "sub2", "sub2-bl")
+    head = ["L", "words", *(f"F, {kind.upper()}; published" for kind in kinds), "net; published"]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for theirs in published("binary_words.csv"):
+        bits = int(theirs["word_bits"])
+        row = drawn.get(bits)
+        shown = [str(bits), f"{row['words']} drawn" if row else "all"]
+        for kind in kinds:
+            if row:
+                told = f"{float(row[f'F {kind}']):.3f} ± {float(row[f'F {kind} error']):.3f}"
+            else:
+                told = whole.get((bits, kind), "")
+            shown.append(f"{told}; {theirs['fidelity_' + kind.replace('-', '_')]:g}")
+        net = float(row["net"]) if row else 1.0
+        shown.append(f"{net:.3f}; {theirs['classifier_accuracy']:g}")
+        lines.append(f"| {' | '.join(shown)} |")
+    return lines
+
+
+if __name__ == "__main__":
+    figures()
+    print("\n".join([*every_point(), "", *words()]))
