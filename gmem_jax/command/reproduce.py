@@ -17,6 +17,7 @@ from gmem_jax.physics.state import combined_status
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import Effect
 from gmem_jax.reproduce.cost import spec_of_all
+from gmem_jax.reproduce.dataset import COLLECTED
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import GALLERY, RUNS, SCHEMATICS, Outcome, Reproduction, Weighed, outcome_summary
 from gmem_jax.simulation.progress import Progress
@@ -24,7 +25,7 @@ from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
 from gmem_jax.sweeps.store import Store
 
-REPRODUCIBLE = sorted((*FIGURES, *SCHEMATICS, GALLERY, "claims", "choices"))
+REPRODUCIBLE = sorted((*FIGURES, *SCHEMATICS, GALLERY, "claims", "choices", "dataset"))
 
 
 def reproduce_command(
@@ -47,7 +48,8 @@ def reproduce_command(
     """Run a figure of the paper again, beside the published points.
 
     Says what it will cost, resumes, and computes no point twice, whichever figures need it. Writes NAME-SCALE.png,
-    .svg and .csv, each of our points beside the published one.
+    .svg and .csv, each of our points beside the published one. dataset is not of all: the recalls of the figures as
+    one archive, dataset-SCALE.zip.
     """
     if what not in (*REPRODUCIBLE, "all"):
         raise InputError(f"reproduce {what}: no such figure; there are {', '.join(REPRODUCIBLE)} and all")
@@ -87,6 +89,11 @@ def reproduce_command(
             with reporting(goes_on=True) as progress:
                 weighed = reproduction(progress).sensitivity()
             _say_written(weighed)
+        if what == "dataset":
+            with reporting(goes_on=True) as progress:
+                drawn, broken = reproduction(progress).dataset()
+            for path in drawn:
+                log(f"wrote {path}")
         for name in wanted(FIGURES):
             log(f"{name}: {FIGURES[name].title}")
             with reporting(goes_on=True) as progress:
@@ -98,7 +105,8 @@ def reproduce_command(
         "figures": [outcome_summary(outcome) for outcome in outcomes],
         "claims": [verdict._asdict() for verdict in verdicts],
         "choices": choices.effect_rows(weighed.effects),
-        "pictures": [str(path) for path in drawn],
+        "pictures": [str(path) for path in drawn if path.suffix != ".zip"],
+        "dataset": [str(path) for path in drawn if path.suffix == ".zip"],
         "status": status,
     }
     lines = [f"{'yes' if verdict.holds else 'NO ':4}{verdict.claim}\n    {verdict.numbers}" for verdict in verdicts]
@@ -112,6 +120,7 @@ def reproduce_command(
 def _say_cost(what: str, scale: str, output: Path, workers: int, as_json: bool) -> None:
     """What is not there of the points that are needed, and how long nets are trained at most."""
     size, names = scale_of(scale), [name for name in (*FIGURES, GALLERY, "claims", "choices") if what in (name, "all")]
+    names = list(COLLECTED) if what == "dataset" else names
     facts, lines = {}, ["seconds: no experiment is run"]
     if names:
         cost = cost_of(spec_of_all(names, scale), output / RUNS, workers=workers, only_packs=names == [GALLERY])

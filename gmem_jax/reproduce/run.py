@@ -32,6 +32,8 @@ from gmem_jax.reproduce.compare import (
     points_of,
     write_csv,
 )
+from gmem_jax.reproduce.cost import spec_of_all
+from gmem_jax.reproduce.dataset import COLLECTED, write_dataset
 from gmem_jax.reproduce.figures import (
     FIGURES,
     SHOWN_WORD,
@@ -189,6 +191,19 @@ class Reproduction:
         write_csv(target.with_suffix(".csv"), choices.effect_rows(found))
         choices.draw(target, found, choices.choices_title(size, found[0].gain.packs))
         return Weighed(found, _written(target), _failed(store))
+
+    def dataset(self) -> tuple[list[Path], list[str]]:
+        """Run what is missing of the figures `COLLECTED`, and write their recalls as one archive, dataset-SCALE.zip.
+
+        Returns:
+            The files written, and why points failed.
+        """
+        require_x64()
+        store = self._run(spec_of_all(COLLECTED, self.scale)).store
+        points, target = points_of(store), self._target("dataset", ".zip")
+        if points:
+            write_dataset(target, store, points, self.scale, scale_of(self.scale).t0)
+        return [target] if points else [], _failed(store)
 
     def claims(self) -> list[Verdict]:
         """Run what the claims of the paper need, on one pack, and judge them; writes claims-SCALE.json.

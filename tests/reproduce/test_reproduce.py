@@ -1,8 +1,10 @@
 """Figures of the paper: their points, how they stand beside the published ones, and that none is computed twice."""
 
 import csv
+import hashlib
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ from gmem_jax.reproduce.compare import (
     read_csv,
     write_csv,
 )
+from gmem_jax.reproduce.dataset import COLLECTED
 from gmem_jax.reproduce.draw import power
 from gmem_jax.reproduce.figures import FIGURES, SCALES, PaperFigure, figure_spec, packs, scale_of
 from gmem_jax.reproduce.run import Reproduction
@@ -200,6 +203,21 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     Reproduction(tmp_path, "tiny", Here(), say=said.append).figure("fig06")
     assert said[1:] == ["nothing to do: 1 of 1 point there"]
     assert (tmp_path / "fig06-tiny.svg").is_file()
+    for name in set(COLLECTED) - {"fig06", "fig08"}:
+        monkeypatch.setitem(FIGURES, name, PaperFigure("none", lambda scale: []))
+    (archive,), failed = Reproduction(tmp_path, "tiny", Here(), say=said.append).dataset()
+    assert (archive.name, failed, said[2:]) == ("dataset-tiny.zip", [], ["nothing to do: 2 of 2 points there"])
+    shutil.unpack_archive(archive, tmp_path / "data")
+    with (tmp_path / "data" / "points.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["mu"] for row in rows] == ["1.0", "0.5"]  # fig. 6 comes first
+    for row in rows:
+        path = tmp_path / "data" / row["file"]
+        assert hashlib.sha256(path.read_bytes()).hexdigest() == row["sha256"]
+        np.testing.assert_allclose(float(gm.load_recall(path).windowed_gain), float(row["G"]), rtol=1e-12)
+    told = (tmp_path / "data" / "README.md").read_text()
+    assert "These are 2 such experiments" in told
+    assert rows[0]["file"] in told
 
 
 def test_each_condition_that_is_varied_has_its_line_of_panels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
