@@ -60,8 +60,9 @@ class Executor(ABC):
         names = [f"worker-{number}" for number in range(min(self.workers, max(1, len(jobs))))]
         total = sum(job["work"] for job in jobs) or 1.0
         deaths, furthest, open_ = 0, -1.0, jobs
+        store.record(RUNNER, known_by(os.getpid()))
+        own = store.held(RUNNER)
         try:
-            store.record(RUNNER, known_by(os.getpid()))
             while True:
                 open_ = [job for job in open_ if not store.finished(job)]
                 now = total - sum(job["work"] for job in open_)
@@ -84,6 +85,7 @@ class Executor(ABC):
                 time.sleep(POLL)
         finally:
             self.stop()
+            own.close()
             for name in (RUNNER, *names):
                 store.erase(name)
 
