@@ -250,6 +250,16 @@ def test_a_result_that_stdout_does_not_take(tmp_path: Path, where: str, code: in
         assert not words or "files that were to be written are complete" in done.stderr
 
 
+@pytest.mark.parametrize("why", ["the disk is full", "its reader is gone"])
+def test_no_command_ends_because_its_log_is_not_taken(why: str) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    log = os.open("/dev/full", os.O_WRONLY) if "full" in why else write
+    code = "from gmem_jax.command.console import log; log('10 %'); log('20 %'); print('done')"
+    done = subprocess.run(python("-c", code), stdout=subprocess.PIPE, stderr=log, check=False)
+    assert (done.returncode, done.stdout) == (0, b"done\n")
+
+
 def _sweep(folder: Path) -> subprocess.Popen[str]:
     (folder / "mu.toml").write_text(LONG)
     command = [sys.executable, "-P", "-c", ENTRY, "sweep", "mu.toml"]
