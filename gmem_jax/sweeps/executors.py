@@ -252,6 +252,16 @@ def _warning(options: dict[str, Any]) -> int:
         return 90
 
 
+def require_options(kind: str, options: dict[str, Any]) -> None:
+    """Refuse options that an executor would not look at; what submitit takes is seen when it is made.
+
+    Raises:
+        ValueError: naming one.
+    """
+    if kind == "processes" and options:
+        raise ValueError(f"processes have no option {min(options)!r}; the executors slurm and local take submitit's")
+
+
 def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executor:
     """An executor by name.
 
@@ -259,9 +269,8 @@ def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executo
         ValueError: if there is none of that name, it cannot be had here, or GMEM_THREADS is no number of threads.
     """
     native.require_threads()
+    require_options(kind, options)
     if kind == "processes":
-        if options:
-            raise ValueError(f"processes have no option {min(options)!r}")
         return Processes(workers)
     if kind in ("slurm", "local"):
         return Submitted(kind, workers, options)
