@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # The native library, if its sources have changed since it was compiled; without a compiler plain JAX goes on.
 REBUILD = -@$(BIN)/python gmem_jax/native/build.py --if-stale
 
-.PHONY: demo quick test test-slow check docs mutations reliability cluster wheel install clean
+.PHONY: demo quick test test-slow check docs mutations reliability cluster arm wheel install clean
 
 demo: install
 	$(REBUILD)
@@ -41,6 +41,10 @@ reliability: install-dev
 cluster: install-dev
 	$(REBUILD)
 	tests/cluster/one_node.sh $(abspath $(BIN))/python tests/cluster/sweep_on_slurm.py $(CASES)
+
+# The bits of the library on aarch64, by emulation, beside this machine's. Needs g++-aarch64-linux-gnu and qemu-user-static.
+arm: install-dev
+	$(BIN)/python tests/arm/compare.py
 
 check: install-dev
 	$(BIN)/ruff check .

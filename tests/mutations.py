@@ -1516,6 +1516,13 @@ MUTATIONS = (
         "test_a_worker_ends_when_its_parent_does",
     ),
     mutation(
+        "stops-who-works-elsewhere",
+        "sweeps/processes.py",
+        "known and any(Path(one.path).is_relative_to(here) for one in found.open_files())",
+        "known",
+        "test_stop_in_a_copy_of_a_sweep_ends_nobody_at_the_original",
+    ),
+    mutation(
         "damage-unnoticed",
         "files/seal.py",
         "if found != _block(file):",

@@ -26,7 +26,21 @@ if TYPE_CHECKING:  # what JAX is imported for, is imported where it is used: `gm
     from gmem_jax.show.figure import Figure
     from gmem_jax.simulation.progress import Progress
 
-stderr = Console(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
+
+class _Log(Console):
+    """Lines that nobody may hear: no run ends because its log's reader is gone, or the disk of the log is full."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print, if there is a place for it."""
+        with contextlib.suppress(OSError):
+            super().print(*objects, **options)
+
+    def on_broken_pipe(self) -> None:
+        """Be quiet from now on."""
+        self.quiet = True
+
+
+stderr = _Log(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
 out = Console(highlight=False, markup=False)
 
 STEP_COST = {

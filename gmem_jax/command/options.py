@@ -29,7 +29,8 @@ _OTHERS: _Options = {
     "signals": (
         "six",
         str,
-        "six; words:L, all words of L bits; or a .npy or .csv file (a column per signal, one may be time). "
+        "six; words:L, all words of L bits; or a file: .csv, a column per signal (one may be time), "
+        ".npy, a row per signal. "
         "For several channels or writes NAME=six,NAME=words:L.",
         (),
     ),

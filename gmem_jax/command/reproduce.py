@@ -23,6 +23,7 @@ from gmem_jax.reproduce.run import GALLERY, RUNS, SCHEMATICS, Outcome, Reproduct
 from gmem_jax.simulation.progress import Progress
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
+from gmem_jax.sweeps.executors import require_options
 from gmem_jax.sweeps.store import Store
 
 REPRODUCIBLE = sorted((*FIGURES, *SCHEMATICS, GALLERY, "claims", "choices", "dataset"))
@@ -57,10 +58,11 @@ def reproduce_command(
         scale_of(scale)
     except ValueError as error:
         raise InputError(f"--scale {scale}: {error}") from None
+    options = _options(option or [])
     if dry_run:
+        require_options(executor, options)
         _say_cost(what, scale, output, workers or 1, as_json)
         return
-    options = _options(option or [])
     executor_named(executor, workers, options)  # what cannot be had is refused before anything is written
     if not output.parent.is_dir():
         raise InputError(f"--output {output}: folder {output.parent} does not exist")
@@ -151,6 +153,8 @@ def _options(texts: Sequence[str]) -> dict[str, Any]:
         name, _, value = text.partition("=")
         if not (name and value):
             raise InputError(f"--option {text}: should read like timeout_min=240")
+        if name in options:
+            raise InputError(f"--option {name}: is given twice")
         options[name] = value
         for kind in (float, int):
             with contextlib.suppress(ValueError):

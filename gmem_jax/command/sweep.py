@@ -26,6 +26,7 @@ from gmem_jax.physics.numbers import plural
 from gmem_jax.show.sweeps import means_table, points_table, sweep_facts
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
+from gmem_jax.sweeps.executors import require_options
 from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.processes import stop, waiting
 from gmem_jax.sweeps.spec import Spec, read_spec
@@ -89,12 +90,14 @@ def sweep_command(
     if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
         raise InputError(f"{path}: workers must be a whole number from 1, got {count!r}")
     target = output or path.with_suffix("")
+    kind = executor or str(spec.run.get("executor", "processes"))
     if dry_run:
+        require_options(kind, options)
         with _of_file(path):
             cost = cost_of(spec, target, workers=count or 1)
         print_result(as_json, {"folder": str(target), **cost._asdict(), "status": 0}, *cost.lines)
         return
-    chosen = executor_named(executor or str(spec.run.get("executor", "processes")), count, options)
+    chosen = executor_named(kind, count, options)
     if not target.parent.is_dir():
         raise InputError(f"--output {target}: folder {target.parent} does not exist")
     try:

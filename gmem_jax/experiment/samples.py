@@ -153,7 +153,7 @@ def require_gentle(nodes: np.ndarray) -> None:
     at = np.linspace(0.0, 1.0, BINS * _FINE * max(1, -(-count // (BINS * _FINE))) + 1)  # every node of many, too
     values = np.asarray(waveform(nodes[:, 1:-1]).shear(jnp.asarray(at))).T
     apart = (len(at) - 1) // BINS
-    change = np.abs(values[:, apart:] - values[:, :-apart])
+    change = np.ptp(np.lib.stride_tricks.sliding_window_view(values, apart + 1, axis=1), axis=-1)
     for number, row in enumerate(values):
         largest = float(np.max(np.abs(row)))
         place = int(np.argmax(change[number]))

@@ -286,8 +286,8 @@ def locked(output: Path) -> Iterator[None]:
     try:
         handle = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
     except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise FileFormatError(f"{lock}: is a link where a lock should be; move it away") from None
+        if error.errno in (errno.ELOOP, errno.EISDIR):
+            raise FileFormatError(f"{lock}: is a link or a folder where a lock should be; move it away") from None
         raise
     try:
         known = os.fstat(handle)

@@ -67,7 +67,8 @@ def load_waveforms(
         found = SampleTable(_npy(path)) if path.suffix.lower() == ".npy" else read_columns(path)
     values = found.values
     if values.ndim != 2 or values.shape[0] < 1 or values.shape[1] < 2:
-        raise FileFormatError(f"{path}: a waveform needs at least 2 samples; found an array of shape {values.shape}")
+        what = "a row of .npy, a column of other files"
+        raise FileFormatError(f"{path}: a waveform needs at least 2 samples; found {values.shape}, where {what} is one")
     if not np.all(np.isfinite(values)):
         where = np.argwhere(~np.isfinite(values))[0]
         raise FileFormatError(f"{path}: sample {where[1] + 1} of signal {where[0] + 1} is not a finite number")

@@ -60,8 +60,9 @@ class Executor(ABC):
         names = [f"worker-{number}" for number in range(min(self.workers, max(1, len(jobs))))]
         total = sum(job["work"] for job in jobs) or 1.0
         deaths, furthest, open_ = 0, -1.0, jobs
+        store.record(RUNNER, known_by(os.getpid()))
+        own = store.held(RUNNER)
         try:
-            store.record(RUNNER, known_by(os.getpid()))
             while True:
                 open_ = [job for job in open_ if not store.finished(job)]
                 now = total - sum(job["work"] for job in open_)
@@ -84,6 +85,7 @@ class Executor(ABC):
                 time.sleep(POLL)
         finally:
             self.stop()
+            own.close()
             for name in (RUNNER, *names):
                 store.erase(name)
 
@@ -250,6 +252,16 @@ def _warning(options: dict[str, Any]) -> int:
         return 90
 
 
+def require_options(kind: str, options: dict[str, Any]) -> None:
+    """Refuse options that an executor would not look at; what submitit takes is seen when it is made.
+
+    Raises:
+        ValueError: naming one.
+    """
+    if kind == "processes" and options:
+        raise ValueError(f"processes have no option {min(options)!r}; the executors slurm and local take submitit's")
+
+
 def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executor:
     """An executor by name.
 
@@ -257,9 +269,8 @@ def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executo
         ValueError: if there is none of that name, it cannot be had here, or GMEM_THREADS is no number of threads.
     """
     native.require_threads()
+    require_options(kind, options)
     if kind == "processes":
-        if options:
-            raise ValueError(f"processes have no option {min(options)!r}")
         return Processes(workers)
     if kind in ("slurm", "local"):
         return Submitted(kind, workers, options)

@@ -69,11 +69,14 @@ def known_by(number: int) -> dict[str, Any]:
     return {"host": platform.node(), "pid": number, "born": psutil.Process(number).create_time()}
 
 
-def _process(who: dict[str, Any]) -> psutil.Process | None:
-    """The process of a record, if it runs on this machine."""
+def _process(who: dict[str, Any], folder: Path) -> psutil.Process | None:
+    """The process of a record, if it runs on this machine, and has a file of that very folder open: a folder that was
+    copied, or made by somebody else, may hold records of processes that work elsewhere."""
     try:
         found = psutil.Process(int(who["pid"]))
-        return found if (who["host"], who["born"]) == (platform.node(), found.create_time()) else None
+        known = (who["host"], who["born"]) == (platform.node(), found.create_time())
+        here = folder.resolve()
+        return found if known and any(Path(one.path).is_relative_to(here) for one in found.open_files()) else None
     except (KeyError, TypeError, ValueError, OverflowError, psutil.Error):
         return None
 
@@ -108,7 +111,7 @@ def stop(store: Store) -> tuple[list[str], list[str]]:
             if number in queued and queued[number].name == who.get("name") == job_name(store, worker):
                 slurm.cancel(number)
                 ended.append(f"{worker}, job {number}")
-        elif found := _process(who):
+        elif found := _process(who, store.folder):
             end(found)
             ended.append(f"{worker}, process {found.pid}")
         elif who.get("host", platform.node()) != platform.node():

@@ -16,7 +16,7 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.recall import Recall
@@ -272,6 +272,10 @@ class Store:
     def record(self, worker: str, who: dict[str, Any]) -> None:
         """Write down which process or job a worker is, so that it can be ended."""
         self._write(self._own.at(f"workers/{worker}.run"), who)
+
+    def held(self, worker: str) -> BinaryIO:
+        """The record of this very process, open as long as it works: `processes.stop` ends no other."""
+        return self._own.at(f"workers/{worker}.run").open("rb")
 
     def records(self) -> dict[str, dict[str, Any]]:
         """What `record` wrote, by worker."""

@@ -3,6 +3,7 @@
 import importlib
 import os
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -39,10 +40,10 @@ workers = 2
 
 
 @pytest.fixture
-def sleeper() -> Iterator[subprocess.Popen[bytes]]:
-    """A process that sleeps, and does not listen to TERM."""
-    command = ["sh", "-c", "trap '' TERM; echo ready; exec sleep 60"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+def sleeper(tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that sleeps, does not listen to TERM, and has the log of a worker open."""
+    command, log = ["sh", "-c", "trap '' TERM; echo ready; exec sleep 60"], Store(tmp_path / "mu").log_of("worker-1")
+    with log.open("ab") as file, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=file) as process:
         assert process.stdout
         process.stdout.readline()
         yield process
@@ -83,6 +84,15 @@ def test_stop_ends_what_works_on_a_sweep_and_nobody_else(
     store.record("worker-1", who)
     assert stop(store) == ([f"worker-1, process {sleeper.pid}"], [])
     assert not psutil.pid_exists(sleeper.pid)
+
+
+def test_stop_in_a_copy_of_a_sweep_ends_nobody_at_the_original(
+    sleeper: subprocess.Popen[bytes], tmp_path: Path
+) -> None:
+    Store(tmp_path / "mu").record("worker-1", known_by(sleeper.pid))
+    shutil.copytree(tmp_path / "mu", tmp_path / "copy")
+    assert stop(Store(tmp_path / "copy")) == ([], [])
+    assert sleeper.poll() is None
 
 
 def test_children_of_a_worker_end_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,6 +248,16 @@ def test_a_result_that_stdout_does_not_take(tmp_path: Path, where: str, code: in
         assert words in done.stderr
         assert done.stderr.count("\n") == bool(words)
         assert not words or "files that were to be written are complete" in done.stderr
+
+
+@pytest.mark.parametrize("why", ["the disk is full", "its reader is gone"])
+def test_no_command_ends_because_its_log_is_not_taken(why: str) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    log = os.open("/dev/full", os.O_WRONLY) if "full" in why else write
+    code = "from gmem_jax.command.console import log; log('10 %'); log('20 %'); print('done')"
+    done = subprocess.run(python("-c", code), stdout=subprocess.PIPE, stderr=log, check=False)
+    assert (done.returncode, done.stdout) == (0, b"done\n")
 
 
 def _sweep(folder: Path) -> subprocess.Popen[str]:

@@ -181,6 +181,8 @@ REFUSED = {
     "changes nothing of a scale": ["reproduce", "fig06", "--scale", "paper,size=3"],
     "should read like timeout_min=240": ["reproduce", "fig06", "--option", "timeout_min"],
     "no option 'mem_gb'": ["reproduce", "fig06", "--option", "mem_gb=1.5"],
+    "no option 'timeout_min'": ["reproduce", "fig06", "--dry-run", "--option", "timeout_min=240"],
+    "is given twice": ["reproduce", "fig06", "--executor", "slurm", "--option", "a=1", "--option", "a=2"],
 }
 
 

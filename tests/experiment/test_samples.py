@@ -66,6 +66,11 @@ REFUSED = {
         0.3 * NOISE * (abs(FINE - 0.5) < 0.4),
         {},
     ),
+    "changes by 200% of its largest value within 1/256": (  # and is the same again a bin later
+        np.linspace(0.0, 1.0, 4097),
+        np.cos(np.pi * np.arange(4097)),
+        {"taper": 0.1},
+    ),
     "signal 2 changes by": (U, [WAVE, np.where(np.abs(U - 0.5) < 0.2, 1.0, 0.0)], {}),
     "times must rise; sample 2": (U[::-1], WAVE, {}),
     "a time or a sample is not a finite number": (U, np.where(U == 0.5, np.nan, WAVE), {}),

@@ -278,7 +278,11 @@ def test_a_file_or_link_in_the_place_of_a_lock_survives(tmp_path: Path) -> None:
     assert lock.read_text() == "mine"
     lock.unlink()
     lock.symlink_to(tmp_path / "far")
-    with pytest.raises(gm.FileFormatError, match="is a link"), locked(tmp_path / "o.h5"):
+    with pytest.raises(gm.FileFormatError, match="is a link or a folder"), locked(tmp_path / "o.h5"):
+        pass
+    lock.unlink()
+    lock.mkdir()
+    with pytest.raises(gm.FileFormatError, match="is a link or a folder"), locked(tmp_path / "o.h5"):
         pass
     assert not (tmp_path / "far").exists()
 

@@ -228,6 +228,12 @@ def test_an_output_belongs_to_one_run_at_a_time(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_column_in_npy_is_refused_with_what_a_row_is(tmp_path: Path) -> None:
+    np.save(tmp_path / "column.npy", np.ones((255, 1)))
+    with pytest.raises(gm.FileFormatError, match=r"found \(255, 1\), where a row of .npy"):
+        gm.load_waveforms(tmp_path / "column.npy")
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

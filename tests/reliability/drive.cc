@@ -1,8 +1,10 @@
 // Drives the kernels without Python or XLA, to be compiled with sanitizers: every law and task, thread counts, sizes of
 // batches and lists, calls at once; the numbers must not depend on threads, batches or company. An argument plants a
 // defect: what the library is told about its arrays is then a lie, which the sanitizers must notice in its own code.
+// The argument "numbers" prints a hash of what each case gives, to be compared with another machine's (tests/arm).
 
 #include <cmath>
+#include <cstdio>
 #include <cstring>
 #include <deque>
 #include <string>
@@ -25,8 +27,11 @@ using Numbers = std::vector<double>;
 constexpr int kSpheres = 2, kSteps = 2;
 constexpr int kSizes[kFields] = {3, 4, 3, 3, 3, 3};
 
-// Something between -1 and 1 that depends on three integers alone.
-double noise(int a, int b, int c) { return std::sin(12.9898 * a + 78.233 * b + 37.719 * c + 1.0); }
+// Something between -1 and 1 that depends on three integers alone: rounded, since sines differ in their last bit
+// between machines.
+double noise(int a, int b, int c) {
+  return std::round(1e6 * std::sin(12.9898 * a + 78.233 * b + 37.719 * c + 1.0)) / 1e6;
+}
 
 struct Case {
   Law law;
@@ -35,6 +40,7 @@ struct Case {
   int edge;      // grains along the edge of a block of them, or 0: two grains
   double reach;  // of the candidates
   int replicas;
+  bool mixed = false;
 };
 
 // Grains of two spheres that touch their neighbours and the walls.
@@ -120,7 +126,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   lane.pressure = slope.pressure = array(3, !back, small);
   if (back) slope.parameters_out = array(kRows, true, small), slope.walls_out = array(kSteps * kWalls, true, small);
 
-  const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b};
+  const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed};
   const auto store = plan_for({n, kSpheres, candidates, scene.first.data(), scene.second.data(),
                                reinterpret_cast<const bool*>(scene.valid.data()), scene.reference.data(),
                                scene.smallest.data()});
@@ -159,8 +165,17 @@ bool same(const Numbers& a, const Numbers& b) {
   return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(double)) == 0);
 }
 
+// FNV-1a of the bytes.
+unsigned long long hash(const Numbers& numbers) {
+  unsigned long long found = 14695981039346656037ull;
+  const auto* bytes = reinterpret_cast<const unsigned char*>(numbers.data());
+  for (std::size_t i = 0; i < numbers.size() * sizeof(double); ++i) found = (found ^ bytes[i]) * 1099511628211ull;
+  return found;
+}
+
 int main(int count, char** arguments) {
-  if (count > 1) {
+  const bool printed = count > 1 && std::string(arguments[1]) == "numbers";
+  if (count > 1 && !printed) {
     for (int repeat = 0; repeat < 50; ++repeat) run({Law::hooke, Variant::exact, Task::forward, 4, 4.5, 16}, 2, arguments[1]);
     return 0;
   }
@@ -174,6 +189,17 @@ int main(int count, char** arguments) {
         const auto with = [&](int replicas) { return Case{law.law, law.variant, task, pack.edge, pack.reach, replicas}; };
         const Numbers alone = run(with(1), 1);
         for (const double number : alone) CHECK(std::isfinite(number));
+        if (printed) {
+          const int name[] = {static_cast<int>(law.law), static_cast<int>(law.variant), static_cast<int>(task)};
+          const auto print = [&](const char* precision, const Numbers& numbers) {
+            std::printf("law %d.%d task %d pack %d.%g %s %016llx\n", name[0], name[1], name[2], pack.edge, pack.reach,
+                        precision, hash(numbers));
+          };
+          print("double", alone);
+          Case mixed = with(1);
+          mixed.mixed = true;
+          if (task == Task::forward) print("mixed", run(mixed, 2));
+        }
         for (const int replicas : {2, 7, 9, 17})
           if (pack.edge < 4) CHECK(same(run(with(replicas), 2), alone));
         for (const int threads : {2, 5})
