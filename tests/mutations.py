@@ -702,7 +702,7 @@ MUTATIONS = (
         "cuda/step.h",
         "if (second[q]) lever = lever - on.cell(step)",
         "if (false) lever = lever - on.cell(step)",
-        KERNELS + "[periodic]",
+        KERNELS + "[periodic-H]",
     ),
     mutation(
         "gpu-pressure-of-the-first-chunk",

@@ -239,7 +239,6 @@ def test_a_file_of_spheres_that_is_none_is_refused_in_one_line(
         (["--sizes", "0.2,3"], "cannot be listed together: the largest may be 10 times the smallest"),
         (["--size-spread", "0.6"], "size_spread must be in [0, 0.35]"),
         (["--sizes", "1,1.4", "--shares", "0.9"], "shares must be one for each of 2 sizes and sum to 1"),
-        (["--sizes", "1,1.4", "--backend", "native"], "the native backend does not know spheres of unequal radii"),
     ],
 )
 def test_sizes_that_no_pack_can_have_are_refused_in_one_line_and_nothing_is_written(
