@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import PERIODIC_27, SPREAD_27, TETRA_27, assert_close, make_grains
+from scenes import PERIODIC_27, SPREAD_27, TETRA_27, assert_close, make_grains, scene
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -27,7 +27,7 @@ LAWS: dict[str, Any] = {
     "M1": gm.MindlinRescaled(mu=0.3),
     **{f"M2-{variant}": gm.Mindlin(mu=0.3, points=8, variant=variant) for variant in ("exact", "averaged", "paper")},
 }
-STEPS, REPLICAS = 40, 5
+STEPS, REPLICAS = 20, 5  # of a bin
 QUICKLY = {"xla_backend_optimization_level": 0}
 Scene = tuple[System, State, Box]
 
@@ -61,95 +61,128 @@ SCENES: dict[str, Callable[[], tuple[Clump, np.ndarray, np.ndarray, Box]]] = {
 
 @functools.cache
 def thrown(law: str, of: str = "clumps", replicas: int = REPLICAS) -> Scene:
-    """Grains that fly, spin, touch and slide in a box that shrinks, more along one axis than another."""
+    """Grains that fly, spin, touch and slide in a box that shrinks, more along one axis than another, in two bins."""
     grain, position, quaternion, box = SCENES[of]()
     grains = make_grains(position, quaternion)
-    pairs = PairFinder(grain, np.asarray(box.lengths)[:, 0], 0.5)(grains, grain, box)
-    system = System(grain, LAWS[law], pairs)
-    state = replicate(start(system, grains.position, grains.quaternion, box), replicas)
+    finder = PairFinder(grain, np.asarray(box.lengths)[:, 0], 0.5, search=native.search())
+    system = System(grain, LAWS[law], finder(grains, grain, box))
+    begin = jax.jit(start, compiler_options=QUICKLY)
+    state = replicate(begin(system, grains.position, grains.quaternion, box), replicas)
     draws = 5e-3 * np.random.default_rng(0).normal(size=(2, len(position), 3, replicas))
     moving = replace(state.grains, velocity=jnp.asarray(draws[0]), spin=jnp.asarray(draws[1]))
     inwards = jnp.asarray([2e-3, 1e-3, -5e-4])[:, None] * jnp.linspace(1.0, 0.5, replicas)
-    time, every = 0.3 * (1.0 + jnp.arange(STEPS))[:, None, None], jnp.ones((STEPS, 3, replicas))
-    lower, upper = box.lower + time * inwards, box.upper - 2.0 * time * inwards
-    return (
-        system,
-        replace(state, grains=moving),
-        Box(lower, upper, every * inwards, -2.0 * every * inwards, box.periodic),
-    )
+    time = 0.3 * (1.0 + jnp.arange(2 * STEPS)).reshape(2, STEPS, 1, 1)
+    lower, upper, every = box.lower + time * inwards, box.upper - 2.0 * time * inwards, jnp.ones_like(time)
+    boxes = Box(lower, upper, every * inwards, -2.0 * every * inwards, box.periodic)
+    return system, replace(state, grains=moving), boxes
 
 
-def moved(march: Callable[..., Any], system: System, state: State, boxes: Box) -> Any:
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
+def bin_by(march: native.March, system: System, state: State, boxes: Box) -> tuple[State, jax.Array]:
+    return march(system, state, boxes, 0.3, 0.01)
+
+
+def nth(boxes: Box, bin: int) -> Box:
+    return jax.tree.map(lambda leaf: leaf[bin], boxes)
+
+
+def moved(march: native.March, system: System, state: State, boxes: Box) -> Any:
     """All that a march gives, in two bins."""
-    first, last = (jax.tree.map(lambda leaf, part=part: leaf[part], boxes) for part in (slice(25), slice(25, None)))
-    state, pressure = march(system, state, first, 0.3, 0.01)
-    state, more = march(system, state, last, 0.3, 0.01)
+    state, pressure = bin_by(march, system, state, nth(boxes, 0))
+    state, more = bin_by(march, system, state, nth(boxes, 1))
     return state.grains, state.history, pressure + more, state.cell
 
 
-def both(law: str, of: str) -> tuple[Any, Any]:
-    """What the library and the definition give of a scene."""
-    scene = thrown(law, of)
-    marches = functools.partial(moved, native.march), functools.partial(moved, dynamics.march)
-    found, expected = (jax.jit(march, compiler_options=QUICKLY)(*scene) for march in marches)
-    return found, expected
+def slow(*names: str) -> list[Any]:
+    """The laws, these among the slow tests."""
+    return [pytest.param(law, marks=[pytest.mark.slow] * (law in names)) for law in LAWS]
 
 
-@pytest.mark.parametrize(
-    ("law", "of"),
-    [*((law, "clumps") for law in LAWS), ("H", "spheres"), ("M1", "periodic"), ("M2-averaged", "periodic")],
-)
-def test_values_are_those_of_the_definition_and_a_replica_has_the_same_bits_alone(law: str, of: str) -> None:
-    found, expected = both(law, of)
-    assert_close(found, expected, 1e-12)
-    # One replica is computed contact by contact, five side by side.
-    one = functools.partial(jax.tree.map, lambda leaf: leaf[..., 2:3])
-    system, state, boxes = thrown(law, of)
-    alone = jax.jit(functools.partial(moved, native.march))(system, one(state), one(boxes))
-    for lone, among in zip(jax.tree.leaves(alone), jax.tree.leaves(found), strict=True):
-        np.testing.assert_array_equal(lone[..., 0], among[..., 2])
+@pytest.mark.parametrize("law", slow("M2-exact"))
+def test_values_of_unequal_spheres_are_those_of_the_definition(law: str) -> None:
+    given = thrown(law)
+    assert_close(moved(native.march, *given), moved(dynamics.march, *given), 1e-12)
+
+
+@pytest.mark.parametrize(("law", "of"), [("H", "spheres"), ("M1", "periodic")])
+def test_values_of_bidisperse_spheres_and_in_periodic_boxes_are_those_of_the_definition(law: str, of: str) -> None:
+    given = thrown(law, of)
+    found = moved(native.march, *given)
+    assert_close(found, moved(dynamics.march, *given), 1e-12)
+    touching = np.any(np.asarray(jax.tree.leaves(found[1])[0]) != 0.0, axis=(1, 2))
+    first, second = (np.asarray(given[0].pairs.radii)[side] for side in (given[0].pairs.first, given[0].pairs.second))
+    assert np.any(touching & (first > second))
+    assert np.any(touching & (first < second))
+    assert of == "spheres" or np.any(np.asarray(given[0].pairs.image)[touching] != 0)
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_tangents_are_those_of_the_definition(law: str) -> None:
-    system, state, boxes = thrown(law, "clumps", 2)
+def test_a_replica_of_unequal_spheres_has_the_same_bits_alone(law: str) -> None:
+    # One replica is computed contact by contact, five side by side.
+    system, state, boxes = thrown(law)
+    one = functools.partial(jax.tree.map, lambda leaf: leaf[..., 2:3])
+    everyone, alone = moved(native.march, system, state, boxes), moved(native.march, system, one(state), one(boxes))
+    for lone, among in zip(jax.tree.leaves(alone), jax.tree.leaves(everyone), strict=True):
+        np.testing.assert_array_equal(lone[..., 0], among[..., 2])
+
+
+@pytest.mark.parametrize("law", slow("frictionless", "M2-exact", "M2-paper"))
+def test_tangents_of_unequal_spheres_are_those_of_the_definition(law: str) -> None:
+    system, state, boxes = thrown(law)
+    state, _ = bin_by(native.march, system, state, nth(boxes, 0))  # histories have begun
     draws = np.random.default_rng(1)
-    along = jax.tree.map(
-        lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), (state.grains, boxes, system.clump.mass)
-    )
+    point = state.grains, nth(boxes, 1), system.clump.mass, system.clump.inertia
+    along = jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), point)
 
-    def of(march: Callable[..., Any], grains: Any, boxes: Box, mass: jax.Array) -> Any:
-        heavy = replace(system, clump=replace(system.clump, mass=mass))
-        grains, _, pressure, _ = moved(march, heavy, replace(state, grains=grains), boxes)
-        return grains.position, grains.velocity, pressure
+    def of(march: native.March, grains: Any, boxes: Box, mass: jax.Array, inertia: jax.Array) -> Any:
+        heavy = replace(system, clump=replace(system.clump, mass=mass, inertia=inertia))
+        return march(heavy, replace(state, grains=grains), boxes, 0.3, 0.01)
 
-    point, slopes = (state.grains, boxes, system.clump.mass), []
-    for march in (native.march, dynamics.march):
-        steps = functools.partial(of, march)
-        slope = jax.jit(lambda along, steps=steps: jax.jvp(steps, point, along)[1], compiler_options=QUICKLY)
-        slopes.append(slope(along))
-    assert_close(*slopes, 1e-9)
+    def slope(march: native.March) -> Any:
+        change = jax.jit(lambda along: jax.jvp(functools.partial(of, march), point, along)[1], compiler_options=QUICKLY)
+        end, pressure = change(along)
+        return end.grains, end.history, pressure
+
+    assert_close(slope(native.march), slope(dynamics.march), 1e-9)
 
 
-def test_adjoints_and_derivatives_by_sizes_are_those_of_the_definition() -> None:
+def test_adjoints_of_unequal_spheres_and_derivatives_by_sizes_are_those_of_the_definition() -> None:
     system, state, boxes = thrown("H", "clumps", 2)
-    few = jax.tree.map(lambda leaf: leaf[:5], boxes)
+    few = jax.tree.map(lambda leaf: leaf[:5], nth(boxes, 0))
 
-    def of(march: Callable[..., Any], sizes: jax.Array, position: jax.Array) -> jax.Array:
+    def of(march: native.March, position: jax.Array, sizes: jax.Array) -> jax.Array:
         grown = replace(system, clump=replace(system.clump, sizes=sizes))
         moving = replace(state, grains=replace(state.grains, position=position))
         end, pressure = march(grown, moving, few, 0.3, 0.0)
         return jnp.sum(pressure) + jnp.sum(end.grains.velocity)
 
-    point = system.clump.sizes, state.grains.position
-    found, expected = (
-        jax.jit(jax.grad(functools.partial(of, march), argnums=argnums), compiler_options=QUICKLY)(*point)
-        for march in (native.march, dynamics.march)
-        for argnums in ((0, 1),)
+    def slopes(march: native.March, *by: int) -> Any:
+        pull = jax.grad(functools.partial(of, march), argnums=by)
+        return jax.jit(pull, compiler_options=QUICKLY)(state.grains.position, system.clump.sizes)
+
+    expected = slopes(dynamics.march, 0, 1)
+    assert_close(slopes(native.march, 0), expected[:1], 1e-9)
+    assert_close(slopes(native.march, 1), expected[1:], 1e-9)
+
+
+@pytest.mark.parametrize("replicas", [1, REPLICAS])
+def test_large_spheres_that_come_from_afar_meet_when_they_should(replicas: int) -> None:
+    large = sized(sphere(), [1.6, 2.2])
+    system, state, box = scene(
+        large, [[0, 0, 0], [6.0, 0.3, 0.2]], None, [[0.05, 0, 0], [-0.05, 0, 0]], replicas=replicas
     )
-    assert_close(found, expected, 1e-9)
-    by_position = jax.jit(jax.grad(functools.partial(of, native.march), argnums=1), compiler_options=QUICKLY)(*point)
-    assert_close(by_position, expected[1], 1e-9)  # by an adjoint call, which is the definition's
+    boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (400, 3, replicas)), box)
+    fast, plain = (bin_by(march, system, state, boxes)[0] for march in (native.march, dynamics.march))
+    assert np.abs(plain.grains.spin).max() > 1e-3  # they met
+    assert_close(fast.grains, plain.grains, 1e-11)  # as there: test_native_march.py
+
+
+def test_a_list_is_remembered_with_the_sizes_of_its_grains() -> None:
+    system, state, boxes = thrown("H")
+    other = replace(system, clump=replace(system.clump, sizes=0.999 * system.clump.sizes))
+    first, second, again = (moved(native.march, grains, state, boxes) for grains in (system, other, system))
+    np.testing.assert_array_equal(first[0].position, again[0].position)
+    assert float(jnp.max(jnp.abs(first[0].position - second[0].position))) > 1e-6
 
 
 def test_packs_of_unequal_spheres_run_natively_and_in_double_precision() -> None:
@@ -157,6 +190,5 @@ def test_packs_of_unequal_spheres_run_natively_and_in_double_precision() -> None
     assert gm.Experiment(pack, gm.six_signals(), t0=20.0).runs_on == "native"
     with pytest.raises(ValueError, match="precision='mixed' is not for spheres of unequal radii; use 'double'"):
         gm.Experiment(pack, gm.six_signals(), t0=20.0, precision="mixed")
-    system, state, boxes = thrown("H")
-    auto = jax.jit(functools.partial(moved, native.marcher("auto")))
-    assert "custom_call @gmem_advance" in auto.lower(system, state, boxes).as_text()
+    lowered = bin_by.lower(native.marcher("auto"), *thrown("H")[:2], nth(thrown("H")[2], 0))
+    assert "custom_call @gmem_advance" in lowered.as_text()

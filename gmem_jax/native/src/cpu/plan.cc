@@ -212,9 +212,9 @@ struct Key {
     const std::size_t rows = list.rows, spheres = static_cast<std::size_t>(list.grains) * list.spheres_per_grain;
     return function(list.first, rows * sizeof(int32_t)) && function(list.second, rows * sizeof(int32_t)) &&
            function(list.valid, rows * sizeof(bool)) && function(list.reference, 3 * spheres * sizeof(double)) &&
-           function(list.smallest, 3 * sizeof(double)) && function(list.image, list.image ? 3 * rows : 0) &&
-           function(list.radii, list.radii ? list.spheres_per_grain * sizeof(double) : 0) &&
-           function(list.sizes, list.radii ? list.grains * sizeof(double) : 0);
+           function(list.smallest, 3 * sizeof(double)) && (!list.image || function(list.image, 3 * rows)) &&
+           (!list.radii || (function(list.radii, list.spheres_per_grain * sizeof(double)) &&
+                            function(list.sizes, list.grains * sizeof(double))));
   }
 };
 
