@@ -714,7 +714,7 @@ MUTATIONS = (
     mutation(
         "native-unequal-reach",
         "cpu/replicas.h",
-        "radii ? splat<V>(radii->square) : contact_square",
+        "differ ? splat<V>(radii->square) : contact_square",
         "contact_square",
         f"{UNEQUAL}[H]",
     ),

@@ -139,7 +139,7 @@ struct Engine : EngineLayout<Mode> {
   }
 
   // First half of a step of unit u, midway, and wall forces.
-  void begin(int u, const HalfStep<V>& m, const WallState<V>& box, double* wall_sums, V* speeds) {
+  GMEM_INLINE void begin(int u, const HalfStep<V>& m, const WallState<V>& box, double* wall_sums, V* speeds) {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
     speeds[0] = max(speeds[0], dot(m.velocity, m.velocity));
@@ -150,13 +150,21 @@ struct Engine : EngineLayout<Mode> {
     store_vec(h + kVelocity, m.velocity);
     store_vec(h + kSpin, m.spin);
     WallForces<V> on{};
-    const auto put = [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); };
-    const Pack& pack = *block.pack;
-    const int spheres = problem.spheres_per_grain;
-    const bool near = plan.size ? spheres_of(constants, m, pack.offsets, pack.radii, spheres, mode.size_of(u), outer, box, on, put)
-                                : spheres_of(constants, m, pack.offsets, spheres, arm, box, on, put);
+    bool near = true;
+    if (plan.size) on = unequal_spheres(u, m, box);
+    else near = spheres_of(constants, m, block.pack->offsets, problem.spheres_per_grain, arm, box, on,
+                           [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     mode.put_grain(u, m.position, m.velocity, m.spin, on.force, on.torque);
     if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
+  }
+
+  // Apart from `begin`, and given copies: so what `begin` does of equal spheres stays in registers.
+  __attribute__((noinline)) WallForces<V> unequal_spheres(int u, HalfStep<V> m, WallState<V> box) {
+    const Pack& pack = *block.pack;
+    WallForces<V> on{};
+    spheres_of(constants, m, pack.offsets, pack.radii, problem.spheres_per_grain, mode.size_of(u), outer, box, on,
+               [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+    return on;
   }
 
   // What `begin` left of unit u: the same places.

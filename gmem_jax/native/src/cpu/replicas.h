@@ -269,11 +269,19 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   }
 
   void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel, Faces<V>& faces) {
+    if constexpr (!kMixed)
+      if (plan.radii) return contacts_of<true>(first, end, parameter, law, travel, faces);
+    contacts_of<false>(first, end, parameter, law, travel, faces);
+  }
+
+  // ... of spheres that `differ` in radius or do not.
+  template <bool differ>
+  void contacts_of(int first, int end, const C* parameter, const LawParameters<C>& law, double travel, Faces<V>& faces) {
     constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether, kAhead = 6;
     const V contact_square = splat<V>(4.0);
     int near[kLook + 1], touching[kBatch];
     Contact<C> contact[kBatch];
-    Unequal<C> unequal[kBatch];
+    Unequal<C> unequal[differ ? kBatch : 1];
     int count = 0, remembered = first;
     for (int look = first; look < end; look += kLook) {
       const int found = marks.find_near(look, end, travel, near);
@@ -295,11 +303,11 @@ struct Replicas : ReplicasLayout<Law, V, C> {
         Vec<V> other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
         if (plan.image) other = other + shift(faces.cell, c);
         const V square = dot(other - one, other - one);
-        const Radii* const radii = plan.radii ? plan.radii + c : nullptr;
-        if (!bits_less(square, radii ? splat<V>(radii->square) : contact_square)) {
+        const Radii* const radii = differ ? plan.radii + c : nullptr;
+        if (!bits_less(square, differ ? splat<V>(radii->square) : contact_square)) {
           if (marks.touched[c]) forget(c, pair);
-          marks.next_check[c] = radii ? next_check(travel, smallest(square), radii->reach, plan.far)
-                                      : next_check(travel, smallest(square));
+          marks.next_check[c] = differ ? next_check(travel, smallest(square), radii->reach, plan.far)
+                                       : next_check(travel, smallest(square));
           continue;
         }
         marks.touched[c] = true;
@@ -307,18 +315,18 @@ struct Replicas : ReplicasLayout<Law, V, C> {
         ContactInput<C> input = contact_input(pair, one, other);
         if constexpr (!kMixed)
           if (plan.image) to_image(input, shift(faces.cell, c), faces.cell);
-        if (radii)
+        if constexpr (differ)
           unequal[count] = {splat<C>(radii->reach), splat<C>(radii->lean), splat<C>(radii->root), input.spin_other - input.spin_one};
         relative_motion(input, convert<C>(square), contact[count]);
         if constexpr (kMixed) contact[count].before = convert<C>(contact_square - square);
         contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
         touching[count++] = c;
         if (count < kBatch) continue;
-        compute(touching, count, contact, unequal, parameter, law, faces);
+        compute(touching, count, contact, differ ? unequal : nullptr, parameter, law, faces);
         count = 0;
       }
     }
-    compute(touching, count, contact, unequal, parameter, law, faces);
+    compute(touching, count, contact, differ ? unequal : nullptr, parameter, law, faces);
     if (trace.touching && first < end) trace.end[first] = remembered;
   }
 
@@ -332,9 +340,9 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     if constexpr (kMixed) {
       close(contact, count, parameter);
     } else {
-      plan.radii ? close<true>(contact, count, parameter, unequal) : close(contact, count, parameter);
+      unequal ? close<true>(contact, count, parameter, unequal) : close(contact, count, parameter);
     }
-    rub<Law>(contact, count, law, plan.radii ? unequal : nullptr, [&](auto n) { return segments_of(touching[n]); });
+    rub<Law>(contact, count, law, unequal, [&](auto n) { return segments_of(touching[n]); });
     for (int n = 0; n < count; ++n) {
       const ContactLoads<C> found = push(contact[n]);
       add(plan.candidate[touching[n]], found);
