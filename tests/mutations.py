@@ -685,8 +685,8 @@ MUTATIONS = (
     ),
     mutation(
         "native-size-inertia",
-        "physics/motion.h",
-        "fifth = cube * square;",
+        "cpu/plan.cc",
+        "fifth = cube * size * size;",
         "fifth = cube;",
         f"{UNEQUAL}[H]",
     ),
@@ -707,7 +707,7 @@ MUTATIONS = (
     mutation(
         "native-size-section",
         "cpu/block.h",
-        "size * size * size * parameter[kMass]",
+        "power(&Size::cube) * parameter[kMass]",
         "parameter[kMass]",
         "test_values_of_bidisperse_spheres_and_in_periodic_boxes_are_those_of_the_definition[M1-periodic]",
     ),
@@ -764,8 +764,8 @@ MUTATIONS = (
     mutation(
         "gpu-size-mass",
         "cuda/step.h",
-        "own = constants.of_size(size), mass",
-        "mass",
+        "splat<V>(1.0 / cube)",
+        "splat<V>(1.0)",
         KERNELS + "[spread-H]",
     ),
     mutation(

@@ -162,7 +162,7 @@ struct Engine : EngineLayout<Mode> {
   __attribute__((noinline)) WallForces<V> unequal_spheres(int u, HalfStep<V> m, WallState<V> box) {
     const Pack& pack = *block.pack;
     WallForces<V> on{};
-    spheres_of(constants, m, pack.offsets, pack.radii, problem.spheres_per_grain, mode.size_of(u), outer, box, on,
+    spheres_of(constants, m, pack.offsets, pack.radii, problem.spheres_per_grain, mode.size_of(u, &Size::one), outer, box, on,
                [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     return on;
   }
@@ -176,8 +176,9 @@ struct Engine : EngineLayout<Mode> {
   // Second half: accelerations and velocities. In a periodic box of `cell` sums up its sections.
   Grain<V> finish(int u, const Cell<V>* cell, double* sums) const {
     if (!plan.size) return finish(u, constants, parameter[kMass], cell, sums);
-    const V size = mode.size_of(u);
-    return finish(u, constants.of_size(size), size * size * size * parameter[kMass], cell, sums);
+    const auto power = [&](double Size::*power) { return mode.size_of(u, power); };
+    const GrainParameters<V> own = constants.of_size(power(&Size::inverse_cube), power(&Size::fifth), power(&Size::inverse_fifth));
+    return finish(u, own, power(&Size::cube) * parameter[kMass], cell, sums);
   }
 
   Grain<V> finish(int u, const GrainParameters<V>& own, V mass, const Cell<V>* cell, double* sums) const {

@@ -69,9 +69,9 @@ struct Packed : PackedLayout<Law> {
 
   V per_lane(const double* Lane::*array, std::ptrdiff_t row) const { return splat<V>((lane.*array)[row * problem.stride]); }
 
-  V size_of(int u) const {
+  V size_of(int u, double Size::*power) const {
     V size;
-    for (int l = 0; l < W; ++l) size[l] = plan.size[grain_in(u, l)];
+    for (int l = 0; l < W; ++l) size[l] = plan.size[grain_in(u, l)].*power;
     return size;
   }
 

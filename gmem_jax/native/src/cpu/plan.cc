@@ -152,14 +152,17 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
 
   double largest = 1.0, widest = 1.0;
   if (list.radii) {
-    for (const int32_t grain : store->grain) store->size.push_back(list.sizes[grain]);
+    for (const int32_t grain : store->grain) {
+      const double size = list.sizes[grain], cube = size * size * size, fifth = cube * size * size;
+      store->size.push_back({size, cube, 1.0 / cube, fifth, 1.0 / fifth});
+    }
     for (const Candidate& c : candidates) {
-      const double one = store->size[c.grain_one] * list.radii[c.one % spheres];
-      const double other = store->size[c.grain_other] * list.radii[c.other % spheres], reach = one + other;
+      const double one = store->size[c.grain_one].one * list.radii[c.one % spheres];
+      const double other = store->size[c.grain_other].one * list.radii[c.other % spheres], reach = one + other;
       store->radii.push_back({reach, 0.5 * (one - other), std::sqrt(2.0 * one * other / reach), reach * reach});
     }
     store->radii.push_back({2.0, 0.0, 1.0, 4.0});
-    largest = *std::max_element(store->size.begin(), store->size.end());
+    largest = *std::max_element(list.sizes, list.sizes + list.grains);
     widest = largest * *std::max_element(list.radii, list.radii + spheres);
   }
 

@@ -35,7 +35,7 @@ struct PlanStore {
   std::vector<Candidate> candidate;
   std::vector<Image> image;
   std::vector<Radii> radii;
-  std::vector<double> size;
+  std::vector<Size> size;
 };
 
 // The plan of a list; that of a list seen lately is remembered. Throws std::invalid_argument if a candidate is not a

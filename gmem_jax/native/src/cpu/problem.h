@@ -71,6 +71,11 @@ struct alignas(32) Radii {
   double square;  // of reach
 };
 
+// Powers of the size of a grain.
+struct Size {
+  double one, cube, inverse_cube, fifth, inverse_fifth;
+};
+
 // The candidate list, sorted for memory and threads; see plan.h. Grains and spheres are numbered anew.
 struct Plan {
   int candidates;
@@ -81,7 +86,7 @@ struct Plan {
   const Candidate* candidate;       // by domain
   const Image* image;               // of each, or null without periodic axes
   const Radii* radii;               // of each and of a dummy, or null where all radii are 1
-  const double* size;               // of each grain, or null where all radii are 1, [N]
+  const Size* size;                 // of each grain, or null where all radii are 1, [N]
   double largest;                   // of the sizes
   double far;                       // distance from which on spheres are spoken of as nearer: see `Engine::add_travel`
   const int32_t* domain_candidate;  // first candidate of each domain, [domains + 1]

@@ -136,7 +136,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     });
   }
 
-  V size_of(int u) const { return splat<V>(plan.size[u]); }
+  V size_of(int u, double Size::*power) const { return splat<V>(plan.size[u].*power); }
 
   // --- copying in and out
 

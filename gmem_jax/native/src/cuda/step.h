@@ -444,8 +444,8 @@ GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
   GrainParameters<V> own = constants;
   V mass = parameter[kMass];
   if constexpr (unequal) {
-    const V size = splat<V>(size_of(on, on.item));
-    own = constants.of_size(size), mass = size * size * size * mass;
+    const double size = size_of(on, on.item), cube = size * size * size, fifth = cube * size * size;
+    own = constants.of_size(splat<V>(1.0 / cube), splat<V>(fifth), splat<V>(1.0 / fifth)), mass = splat<V>(cube) * mass;
   }
   Grain<V> after{};
   if constexpr (periodic) {

@@ -82,15 +82,14 @@ struct GrainParameters {
     }
   }
 
-  // Of a grain of another size.
+  // Of a grain of another size, of which these are powers.
   // gmem_jax/physics/grain.py: Clump.scaled
-  constexpr GrainParameters of_size(V size) const {
+  constexpr GrainParameters of_size(V inverse_cube, V fifth, V inverse_fifth) const {
     GrainParameters p = *this;
-    const V square = size * size, cube = size * square, fifth = cube * square;
-    p.inverse_mass = p.inverse_mass / cube;
+    p.inverse_mass = inverse_cube * p.inverse_mass;
     for (int axis = 0; axis < 3; ++axis) {
       p.inertia[axis] = fifth * p.inertia[axis];
-      p.inverse_inertia[axis] = p.inverse_inertia[axis] / fifth;
+      p.inverse_inertia[axis] = inverse_fifth * p.inverse_inertia[axis];
     }
     return p;
   }
