@@ -59,6 +59,7 @@ def mutation(name: str, file: str, text: str, wrong: str, *tests: str) -> Mutati
 
 DOMAINS = "test_spinning_sliding_grains_of_several_domains_move_as_defined"
 ACROSS = "test_both_modes_of_derivatives_cross_the_domains_as_defined"
+UNEQUAL = "test_values_of_unequal_spheres_are_those_of_the_definition"
 KERNELS = "test_the_kernels_give_the_values_and_tangents_of_the_definition"
 AFAR = "test_grains_that_come_from_afar_meet_when_they_should"
 GAS = "test_the_gas_has_the_speeds_and_spins_of_the_recipe_each_at_random"
@@ -654,7 +655,119 @@ MUTATIONS = (
         "domain < 0; ++domain)\n      through",
         "test_values_are_those_of_the_definition[H-5]",
     ),
+    mutation(
+        "native-unequal-contact-halfway",
+        "physics/contact.h",
+        "c.lever_other = c.lever_other + moved;",
+        "",
+        f"{UNEQUAL}[H]",
+    ),
+    mutation(
+        "native-unequal-rolling",
+        "physics/contact.h",
+        "c.sliding = add_cross(c.sliding, unequal.spin_difference, moved);",
+        "",
+        f"{UNEQUAL}[H]",
+    ),
+    mutation(
+        "native-unequal-rings",
+        "physics/contact.h",
+        ", c[n].force = unequal[n].root * c[n].force;",
+        ";",
+        f"{UNEQUAL}[M2-averaged]",
+    ),
+    mutation(
+        "native-unequal-m1-of-radius-one",
+        "physics/contact.h",
+        ", c[n].root_overlap = unequal[n].root * c[n].root_overlap;",
+        ";",
+        f"{UNEQUAL}[M1]",
+    ),
+    mutation(
+        "native-size-inertia",
+        "cpu/plan.cc",
+        "fifth = cube * size * size;",
+        "fifth = cube;",
+        f"{UNEQUAL}[H]",
+    ),
+    mutation(
+        "native-size-walls",
+        "physics/motion.h",
+        "if (near) own.wall_stiffness = root(radius) * p.wall_stiffness;",
+        "",
+        f"{UNEQUAL}[frictionless]",
+    ),
+    mutation(
+        "native-size-walls-unseen",
+        "physics/motion.h",
+        "deepest(splat<V>(outer) * size, m.position, box)",
+        "deepest(splat<V>(outer), m.position, box)",
+        "test_values_of_bidisperse_spheres_and_in_periodic_boxes_are_those_of_the_definition[H-spheres]",
+    ),
+    mutation(
+        "native-size-section",
+        "cpu/block.h",
+        "power(&Size::cube) * parameter[kMass]",
+        "parameter[kMass]",
+        "test_values_of_bidisperse_spheres_and_in_periodic_boxes_are_those_of_the_definition[M1-periodic]",
+    ),
+    mutation(
+        "native-unequal-reach",
+        "cpu/replicas.h",
+        "differ ? splat<V>(radii->square) : contact_square",
+        "contact_square",
+        f"{UNEQUAL}[H]",
+    ),
+    mutation(
+        "native-unequal-reach-of-one",
+        "cpu/packed.h",
+        "square < radii.square",
+        "square < 4.0",
+        "test_a_replica_of_unequal_spheres_has_the_same_bits_alone[H]",
+    ),
+    mutation(
+        "native-unequal-looked-at-late",
+        "cpu/replicas.h",
+        "next_check(travel, smallest(square), radii->reach, plan.far)",
+        "next_check(travel, smallest(square))",
+        "test_large_spheres_that_come_from_afar_meet_when_they_should[5]",
+    ),
+    mutation(
+        "native-sizes-of-another-pack",
+        "cpu/plan.cc",
+        "function(list.sizes, list.grains * sizeof(double))",
+        "true",
+        "test_a_list_is_remembered_with_the_sizes_of_its_grains",
+    ),
+    mutation(
+        "native-slopes-by-sizes-forgotten",
+        "native/march.py",
+        "(tangents[0].pairs, shape.offsets, shape.radii, shape.sizes)",
+        "(tangents[0].pairs, shape.offsets, shape.radii)",
+        "test_adjoints_of_unequal_spheres_and_derivatives_by_sizes_are_those_of_the_definition",
+    ),
     # ---------------------------------------------------------------- the GPU's half of it
+    mutation(
+        "gpu-unequal-point-halfway",
+        "cuda/step.h",
+        "point = point + differing.lean * contact.normal;",
+        "",
+        KERNELS + "[spread-H]",
+    ),
+    mutation(
+        "gpu-unequal-arms",
+        "cuda/step.h",
+        "lever = splat<V>(size_of(on, on.item)) * lever;",
+        "",
+        KERNELS + "[spread-H]",
+    ),
+    mutation(
+        "gpu-size-mass",
+        "cuda/step.h",
+        "splat<V>(1.0 / cube)",
+        "splat<V>(1.0)",
+        KERNELS + "[spread-H]",
+    ),
     mutation(
         "gpu-lever-of-the-other",
         "cuda/step.h",
@@ -702,7 +815,7 @@ MUTATIONS = (
         "cuda/step.h",
         "if (second[q]) lever = lever - on.cell(step)",
         "if (false) lever = lever - on.cell(step)",
-        KERNELS + "[periodic]",
+        KERNELS + "[periodic-H]",
     ),
     mutation(
         "gpu-pressure-of-the-first-chunk",

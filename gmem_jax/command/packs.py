@@ -124,7 +124,7 @@ def prepare_command(
     preparation_frames(recipe, frames)  # refuses what cannot be before anything is begun
     check_output(output, ".h5", force=force)
     made = graded(recipe, clump)
-    backend = native.name(backend, Frictionless(), made.equal)
+    backend = native.name(backend, Frictionless())
     cost = announce(f"{recipe.grains} grains", grain_steps(recipe, made), PREPARATION_BYTES * recipe.grains, backend)
     key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
     if dry_run:

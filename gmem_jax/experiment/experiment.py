@@ -318,7 +318,7 @@ class Experiment:
     @property
     def runs_on(self) -> native.Backend:
         """What `backend` means for this law and pack on JAX's default device."""
-        return native.name(self.backend, self.friction, self.pack.clump.equal)
+        return native.name(self.backend, self.friction)
 
     @property
     def timing(self) -> Timing:

@@ -7,7 +7,7 @@ from typing import Literal, cast, get_args
 from jax.extend.backend import get_backend
 
 from gmem_jax.native import cuda, library
-from gmem_jax.native.march import March, lacking, march, march_anywhere, march_mixed, require_known, require_mixed
+from gmem_jax.native.march import March, march, march_anywhere, march_mixed, require_mixed
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -41,20 +41,19 @@ def supports(law: FrictionLaw) -> bool:
     return entry_of(law) is not None
 
 
-def resolve(backend: str, precision: str, law: FrictionLaw, equal: bool = True) -> ResolvedBackend:
+def resolve(backend: str, precision: str, law: FrictionLaw) -> ResolvedBackend:
     """What does the steps for a friction law; the same object for the same arguments.
 
     Args:
         backend: as of `marcher`.
         precision: likewise.
         law: its class matters, and not its parameters.
-        equal: whether all spheres are of radius 1.
 
     Raises:
         ValueError: if the backend is unknown or not available, or the precision is not to be had with it.
     """
     lacks = "" if supports(law) else f"the friction law {type(law).__name__}"
-    return _resolve(backend, precision, lacking(equal) or lacks, *library.available())
+    return _resolve(backend, precision, lacks, *library.available())
 
 
 @functools.cache
@@ -77,7 +76,7 @@ def _why_not(lacks: str, built: bool, said: str) -> str:
     return "" if client.platform == "cpu" else f"the native backend does not run on {client.platform}"
 
 
-def name(backend: str, law: FrictionLaw, equal: bool = True) -> Backend:
+def name(backend: str, law: FrictionLaw) -> Backend:
     """What "auto" means on JAX's default device, "jax" or "native"; arguments are those of `resolve`.
 
     Others are themselves.
@@ -86,7 +85,7 @@ def name(backend: str, law: FrictionLaw, equal: bool = True) -> Backend:
         ValueError: if there is no such backend.
     """
     _require_known(backend)
-    return resolve(backend, "double", law, equal).name if backend == "auto" else cast(Backend, backend)
+    return resolve(backend, "double", law).name if backend == "auto" else cast(Backend, backend)
 
 
 def _require_known(backend: str) -> None:
@@ -97,22 +96,27 @@ def _require_known(backend: str) -> None:
 def require_precision(
     precision: str, backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS, equal: bool = True
 ) -> None:
-    """Refuse a precision that is unknown, or not to be had; and the native backend for a pack it does not know.
+    """Refuse a precision that is unknown, or not to be had.
+
+    Args:
+        precision: as of `marcher`.
+        backend: likewise.
+        law: the friction law.
+        periodic: the periodic axes of the box.
+        equal: whether all spheres are of radius 1.
 
     Raises:
         ValueError: saying why.
     """
     if precision not in PRECISIONS:
         raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
-    if backend == "native":
-        require_known(equal)
     if precision == "double":
         return
-    if name(backend, law, equal) != "native":
+    if name(backend, law) != "native":
         built, said = library.available()
         why = "" if backend == "jax" or built else f", which is not available: {said}"
         raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")
-    require_mixed(law, periodic)
+    require_mixed(law, periodic, equal)
 
 
 def marcher(backend: str = "auto", precision: str = "double") -> March:

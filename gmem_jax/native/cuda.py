@@ -201,7 +201,8 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
     blank, odd = 2 * fixed.first.shape[1], -fixed.incidence.shape[2] % 4
     lists["incidence"] = jnp.pad(fixed.incidence, ((0, 0), (0, 0), (0, odd)), constant_values=blank)  # read in fours
     numbers = jnp.where(sound[:, None, None], arrays.parameters, jnp.nan)  # there is no other way to refuse a list
-    before = [*arrays.fields, *lists.values(), fixed.images, fixed.offsets, numbers, arrays.walls]
+    before = [*arrays.fields, *lists.values(), fixed.images, fixed.offsets, fixed.radii, fixed.sizes]
+    before += [numbers, arrays.walls]
     results = [jax.ShapeDtypeStruct((entries, *shape.shape[len(outer) :]), shape.dtype) for shape in shapes]
     aliases = {}
     if in_place:

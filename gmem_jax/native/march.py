@@ -30,25 +30,6 @@ March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 _LAW_NUMBERS = max(len(entry.numbers) for entry in LAWS)  # rows of the parameter array for a law's own
 
 
-def lacking(equal: bool) -> str:
-    """What of a pack the library does not know, in words; "" if it knows all.
-
-    Args:
-        equal: whether all its spheres are of radius 1.
-    """
-    return "" if equal else "spheres of unequal radii"
-
-
-def require_known(equal: bool) -> None:
-    """Refuse a pack that the library does not know; the argument is that of `lacking`.
-
-    Raises:
-        ValueError: saying what it lacks.
-    """
-    if lacks := lacking(equal):
-        raise ValueError(f"the native backend does not know {lacks}; use backend='auto' or 'jax'")
-
-
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
     """`gmem_jax.physics.step.march` on the native backend.
 
@@ -64,7 +45,7 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
 
     Raises:
         ValueError: if the backend is not available, does not know the friction law, or the state is not float64; or if
-            an argument does not fit the number of replicas; or for a pack that the library does not know (`lacking`).
+            an argument does not fit the number of replicas.
         NotImplementedError: if it is compiled for anything but a CPU or a CUDA GPU, or for that without NVRTC.
     """
     return _march(system, state, boxes, dt, drag, _Mode())
@@ -79,19 +60,21 @@ def march_mixed(system: System, state: State, boxes: Box, dt: Scalar, drag: Scal
     Raises:
         ValueError: as of `march` and `require_mixed`.
     """
-    require_mixed(system.friction, boxes.periodic)
+    require_mixed(system.friction, boxes.periodic, system.clump.equal)
     return _march(system, state, boxes, dt, drag, _Mode(mixed=state.replicas > 1))
 
 
-def require_mixed(law: FrictionLaw, periodic: PeriodicAxes) -> None:
+def require_mixed(law: FrictionLaw, periodic: PeriodicAxes, equal: bool) -> None:
     """Refuse what cannot be done with contacts in single precision.
 
     Raises:
-        ValueError: if the law is kept in double precision or unknown, JAX's default device is no CPU, or the box has
-            periodic axes.
+        ValueError: if the law is kept in double precision or unknown, JAX's default device is no CPU, the box has
+            periodic axes, or spheres differ in radius.
     """
     if any(periodic):
         raise ValueError("precision='mixed' is not for periodic boxes; use 'double'")
+    if not equal:
+        raise ValueError("precision='mixed' is not for spheres of unequal radii; use 'double'")
     if get_backend().platform != "cpu":
         raise ValueError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
     if library.entry(law).layered:
@@ -100,7 +83,7 @@ def require_mixed(law: FrictionLaw, periodic: PeriodicAxes) -> None:
 
 def march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
     """`march` on CPUs and CUDA GPUs, its definition elsewhere."""
-    if entry_of(system.friction) is None or lacking(system.clump.equal):
+    if entry_of(system.friction) is None:
         return dynamics.march(system, state, boxes, dt, drag)
     built, reason = library.available()
     if not built:
@@ -130,7 +113,6 @@ class _Mode(NamedTuple):
 def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, mode: _Mode) -> tuple[State, jax.Array]:
     library.require_library()
     library.entry(system.friction)
-    require_known(system.clump.equal)
     if state.grains.position.dtype != jnp.float64:
         raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
     law = {field.name: getattr(system.friction, field.name) for field in fields(system.friction)}  # type: ignore[arg-type]
@@ -179,7 +161,8 @@ def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -
         return rebuilt
 
     system, _, history, boxes, *_ = primals
-    if not all(map(_is_zero, jax.tree.leaves((tangents[0].pairs, tangents[0].clump.offsets)))):
+    shape = tangents[0].clump
+    if not all(map(_is_zero, jax.tree.leaves((tangents[0].pairs, shape.offsets, shape.radii, shape.sizes)))):
         # The library has no derivatives by these.
         _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
         return _bin(mode, *primals), slope
@@ -237,6 +220,8 @@ class PlainDefinition:
         dt, drag, mass, *inertia = arrays.parameters[:6]
         own, edges = arrays.parameters[9:-6], jnp.split(arrays.parameters[-6:], 2)
         clump = replace(empty.clump, offsets=fixed.offsets, mass=mass, inertia=jnp.stack(inertia))
+        if fixed.sizes.shape[-1]:
+            clump = replace(clump, radii=fixed.radii[:, 0], sizes=fixed.sizes[:, 0])
         law: Any = empty.friction
         law = library.entry(law).with_numbers(law, own)
         material: Any = _Solid(*arrays.parameters[6:9])
@@ -265,15 +250,19 @@ def call_of(system: System, periodic: PeriodicAxes = WALLS) -> Call:
         isotropic=int(system.clump.isotropic),
         leaves=len(row.history),
         periodic=sum(int(is_periodic) << axis for axis, is_periodic in enumerate(periodic)),
+        unequal=int(not system.clump.equal),
     )
 
 
 def fixed_of(system: System) -> Fixed:
     """Arguments without derivatives."""
-    pairs = system.pairs
+    pairs, clump = system.pairs, system.clump
     candidates = (pairs.first, pairs.second, pairs.valid, pairs.incidence, pairs.reference[..., 0], pairs.smallest)
     images = jnp.zeros((pairs.capacity, 0), jnp.int8) if pairs.image is None else pairs.image
-    return Fixed(*candidates, system.clump.offsets, images)
+    counts, columns = (clump.spheres, len(pairs.reference) // clump.spheres), int(not clump.equal)
+    lengths = zip((clump.radii, clump.sizes), counts, strict=True)
+    radii, sizes = (jnp.ones((count, columns)) if own is None else own[:, None] for own, count in lengths)
+    return Fixed(*candidates, clump.offsets, images, radii, sizes)
 
 
 def arrays_of(

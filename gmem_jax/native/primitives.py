@@ -41,6 +41,7 @@ class Call(NamedTuple):
         leaves: arrays of the history.
         mixed: whether contacts are computed in single precision.
         periodic: bits of the periodic axes.
+        unequal: whether spheres differ in radius.
     """
 
     law: int
@@ -50,6 +51,7 @@ class Call(NamedTuple):
     leaves: int
     mixed: int = 0
     periodic: int = 0
+    unequal: int = 0
 
 
 class Fixed(NamedTuple):
@@ -64,6 +66,8 @@ class Fixed(NamedTuple):
         smallest: [3].
         offsets: sphere centres of a grain, [K, 3], in R.
         images: of `Pairs.image`, [P, 3]; [P, 0] without periodic axes.
+        radii: of the spheres of a grain of size 1, [K, 1], in R; [K, 0] where all spheres of the pack are of radius 1.
+        sizes: of the grains, [N, 1]; or [N, 0] likewise.
     """
 
     first: jax.Array
@@ -74,6 +78,8 @@ class Fixed(NamedTuple):
     smallest: jax.Array
     offsets: jax.Array
     images: jax.Array
+    radii: jax.Array
+    sizes: jax.Array
 
 
 class Arrays(NamedTuple):
@@ -187,8 +193,9 @@ def _library(
     target: str, outputs: Callable[[Any], list[Any]], call: Call, in_place: bool, parts: Any
 ) -> Sequence[jax.Array]:
     fixed, arrays, *slopes = parts
-    pack = (fixed.first, fixed.second, fixed.valid, fixed.reference, fixed.smallest, fixed.offsets, fixed.images)
-    before = [*arrays.fields, *pack, arrays.parameters, arrays.walls]
+    pack = fixed._asdict()
+    del pack["incidence"]
+    before = [*arrays.fields, *pack.values(), arrays.parameters, arrays.walls]
     shapes, aliases = outputs(parts), {}
     if in_place:  # histories, much the largest arrays, are updated where they are
         for number, leaf in enumerate(arrays.history):
@@ -294,7 +301,8 @@ def _primitive(
     in_plain_jax = mlir.lower_fun(elsewhere, multiple_results=True)
 
     def on_cpu(context: mlir.LoweringRuleContext, *values: Any, **static: Any) -> Any:
-        if target == "gmem_adjoint" and static["call"].periodic:  # which the library has not
+        call = static["call"]
+        if target == "gmem_adjoint" and (call.periodic or call.unequal):  # which the library has not
             return in_plain_jax(context, *values, **static)
         return library(context, *values, **static)
 

@@ -130,7 +130,7 @@ class _Preparation:
         state = start(system, at, grains.quaternion, self.box)
         state = accelerate(system, replace(state, grains=grains), self.box)
         expected = bins_outside(recipe, clump) * work_of_bin(1) + work_of(cycles_of(recipe), 1)
-        self.march = native.marcher(native.name(backend, system.friction, clump.equal))
+        self.march = native.marcher(native.name(backend, system.friction))
         simulation = Simulation(system, self._path(), self.dt, recipe.drag, steps=steps, backend=backend)
         self.runner = Runner(
             simulation, state, finder=finder, progress=progress, total_work=expected, observers=(self.frames,)
@@ -299,7 +299,6 @@ def prepare(
     recipe = replace(recipe or Recipe(), **changes)
     clump, material = graded(recipe, grain or tetra()), material or Material()
     require_walls(periodic_axes(recipe.boundary), material)
-    native.require_precision("double", backend, Frictionless(), periodic_axes(recipe.boundary), clump.equal)
     preparation = _Preparation(recipe, clump, material, backend, frames, cache, tell)
     preparation.compact()
     preparation.cycle()
@@ -350,7 +349,7 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
         "simulated_time": runner.time,
         "at_rest": asdict(last),
         **provenance(),
-        "backend": native.name(runner.simulation.backend, Frictionless(), clump.equal),
+        "backend": native.name(runner.simulation.backend, Frictionless()),
     }
     return Pack(
         clump=clump,

@@ -81,7 +81,7 @@ class Simulation:
     @property
     def resolved(self) -> native.ResolvedBackend:
         """What does the steps; the same object for all simulations that ask for the same."""
-        return native.resolve(self.backend, self.precision, self.system.friction, self.system.clump.equal)
+        return native.resolve(self.backend, self.precision, self.system.friction)
 
     def marked(self, state: State, stage: Stage) -> "Simulation":
         """The same, whose observers compare with a state at the beginning of a stage."""

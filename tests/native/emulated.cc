@@ -9,24 +9,39 @@ namespace cuda {
 namespace {
 
 // Of one thread.
-template <class V, class Law, bool periodic>
+template <class V, class Law, bool periodic, bool unequal>
 void run(GpuKernel kernel, const Arguments& a, int step, int thread) {
   namespace k = gmem::GMEM_ISA;
   switch (kernel) {
-    case GpuKernel::enter: return k::enter<V, periodic>(a, thread);
+    case GpuKernel::enter: return k::enter<V, periodic, unequal>(a, thread);
     case GpuKernel::remember: return k::remember<V, Law>(a, thread);
-    case GpuKernel::touch: return k::touch<V, Law, periodic>(a, step, thread);
+    case GpuKernel::touch: return k::touch<V, Law, periodic, unequal>(a, step, thread);
     case GpuKernel::move:  // in the order of its sum it is the same
-    case GpuKernel::move_alone: return k::move_alone<V, periodic>(a, step, thread);
+    case GpuKernel::move_alone: return k::move_alone<V, periodic, unequal>(a, step, thread);
     case GpuKernel::collect: return k::collect<V>(a, step, thread);
     case GpuKernel::leave: return k::leave<V, Law>(a, thread);
   }
 }
 
+// ... of some kernels.
+using Run = void (*)(GpuKernel, const Arguments&, int step, int thread);
+Run run_of(const Which& which) {
+  return with_law(which.law, which.variant, [&](auto law) {
+    using L = decltype(law);
+    const auto of_numbers = [&](auto number) -> Run {
+      using V = decltype(number);
+      if (which.periodic) return which.unequal ? run<V, L, true, true> : run<V, L, true, false>;
+      return which.unequal ? run<V, L, false, true> : run<V, L, false, false>;
+    };
+    return which.task == Task::forward ? of_numbers(double{}) : of_numbers(gmem::GMEM_ISA::Dual<double>{});
+  });
+}
+
 template <Task task>
 xla::ffi::Error emulate(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                        int64_t mixed, int64_t periodic, xla::ffi::RemainingArgs args, xla::ffi::RemainingRets rets) {
-  return handle<task>(nullptr, law, variant, points, isotropic, leaves, mixed, periodic, args, rets);
+                        int64_t mixed, int64_t periodic, int64_t unequal, xla::ffi::RemainingArgs args,
+                        xla::ffi::RemainingRets rets) {
+  return handle<task>(nullptr, law, variant, points, isotropic, leaves, mixed, periodic, unequal, args, rets);
 }
 
 auto without_stream() { return with_arguments(xla::ffi::Ffi::Bind()); }
@@ -40,16 +55,8 @@ void Launcher::operator()(GpuKernel kernel, int items, const Arguments& a, int s
   const Which& which = *static_cast<const Which*>(kernels_);
   constexpr int block = 128;
   const int threads = (items * a.lanes + block - 1) / block * block;  // blocks are whole
-  with_law(which.law, which.variant, [&](auto law) {
-    using L = decltype(law);
-    for (int thread = 0; thread < threads; ++thread)
-      if (which.task == Task::forward) {
-        which.periodic ? run<double, L, true>(kernel, a, step, thread) : run<double, L, false>(kernel, a, step, thread);
-      } else {
-        using D = gmem::GMEM_ISA::Dual<double>;
-        which.periodic ? run<D, L, true>(kernel, a, step, thread) : run<D, L, false>(kernel, a, step, thread);
-      }
-  });
+  const Run run = run_of(which);
+  for (int thread = 0; thread < threads; ++thread) run(kernel, a, step, thread);
 }
 
 }  // namespace cuda

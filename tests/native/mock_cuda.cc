@@ -127,7 +127,8 @@ bool identify(const char* image, Which& which) {
     if (std::memcmp(bytes.data(), image, bytes.size() - 16) != 0) continue;
     const bool tangent = name.find("-tangent") != std::string::npos;
     which = {static_cast<gmem::Law>(name[law + 4] - '0'), static_cast<gmem::Variant>(name[law + 5] - '0'),
-             tangent ? gmem::Task::tangent : gmem::Task::forward, name.find("-periodic") != std::string::npos};
+             tangent ? gmem::Task::tangent : gmem::Task::forward, name.find("-periodic") != std::string::npos,
+             name.find("-unequal") != std::string::npos};
     return true;
   }
   return false;
@@ -148,14 +149,8 @@ void execute(const Launch& launch) {
   const int step = number_at<int>(launch.bytes.data() + f.parameters[1].offset);
   const bool shared_out = f.kernel == GpuKernel::move;  // where some threads do the work of one
   const unsigned threads = launch.blocks * (shared_out ? gmem::cuda::kItems : launch.threads);
-  gmem::with_law(f.which.law, f.which.variant, [&](auto law) {
-    using L = decltype(law);
-    using D = gmem::GMEM_ISA::Dual<double>;
-    const bool plain = f.which.task == gmem::Task::forward, periodic = f.which.periodic;
-    const auto run = plain ? periodic ? gmem::cuda::run<double, L, true> : gmem::cuda::run<double, L, false>
-                           : periodic ? gmem::cuda::run<D, L, true> : gmem::cuda::run<D, L, false>;
-    for (unsigned thread = 0; thread < threads; ++thread) run(f.kernel, a, step, static_cast<int>(thread));
-  });
+  const auto run = gmem::cuda::run_of(f.which);
+  for (unsigned thread = 0; thread < threads; ++thread) run(f.kernel, a, step, static_cast<int>(thread));
 }
 
 Stream& stream_of(int number) {

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import export
-from scenes import PERIODIC_XY_27, assert_close, scene
+from scenes import PERIODIC_XY_27, SPREAD_27, assert_close, scene
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -149,16 +149,20 @@ def emulate_tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> 
     return primitives._results(arrays, found[: len(shapes)])
 
 
-def images(law: str) -> Scene:
-    """Grains between walls along z alone, whose contacts go through the faces of the box."""
-    pack = gm.load_pack(PERIODIC_XY_27)
-    system = System(pack.clump, LAWS[law], pack.pairs)
+def few(law: str, file: Path) -> Scene:
+    """27 grains of a file; where they differ in size, their spheres do so, too."""
+    pack = gm.load_pack(file)
+    clump = pack.clump if pack.clump.equal else replace(pack.clump, radii=jnp.asarray([1.0, 0.98, 0.96, 1.0]))
+    system = System(clump, LAWS[law], pack.pairs)
     state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
     return thrown(system, state, pack.lower, pack.upper, periodic=pack.box.periodic)
 
 
 SCENES = {**{law: functools.partial(packed, law) for law in LAWS}, "gyroscopic": lambda: packed("H", False)}
-SCENES |= {"spheres": spheres, "periodic": lambda: images("H"), "periodic-M1": lambda: images("M1")}
+SCENES |= {"spheres": spheres}
+# Grains between walls along z alone, whose contacts go through the faces of the box; and grains of many sizes.
+SCENES |= {f"periodic-{law}": functools.partial(few, law, PERIODIC_XY_27) for law in ("H", "M1")}
+SCENES |= {f"spread-{law}": functools.partial(few, law, SPREAD_27) for law in ("H", "M1", "M2-averaged")}
 SLOW_SCENES = ("frictionless", "M1", "M2-averaged")  # between others that say as much
 
 

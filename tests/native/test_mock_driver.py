@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import PERIODIC_XY_27, TETRA_27
+from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -41,7 +41,9 @@ LAWS: dict[str, Any] = {
     **{f"M2-{variant}": gm.Mindlin(mu=0.3, points=8, variant=variant) for variant in ("exact", "averaged", "paper")},
 }
 PERIODIC = "H in a box that is periodic along two axes"
-LAWS[PERIODIC] = LAWS["H"]
+SPREAD = "H between grains of many sizes"
+FILES = {PERIODIC: PERIODIC_XY_27, SPREAD: SPREAD_27}
+LAWS |= dict.fromkeys(FILES, LAWS["H"])
 Parts = tuple[Call, Fixed, Arrays, Arrays]
 
 
@@ -97,7 +99,7 @@ def at_rest(path: Path) -> tuple[Any, Any]:
 @functools.cache
 def parts_of(name: str) -> Parts:
     """Grains that fly and spin into each other, each replica at its own speed; and a direction."""
-    pack, state = at_rest(PERIODIC_XY_27 if name == PERIODIC else TETRA_27)
+    pack, state = at_rest(FILES.get(name, TETRA_27))
     system = System(pack.clump, LAWS[name], pack.pairs)
     draws = np.random.default_rng(0)
     scale = 5e-3 * np.linspace(0.5, 1.0, REPLICAS)

@@ -317,18 +317,6 @@ def test_samples_of_unequal_grains_count_mass_and_walls_by_size() -> None:
     assert float(sample.wall_contacts[0]) == 0.5  # the small one at 14.2 is 0.1 R from its wall
 
 
-def test_packs_of_unequal_grains_run_in_plain_jax_and_the_native_backend_refuses_them_in_a_line() -> None:
-    pack = bidisperse()
-    assert gm.Experiment(pack, gm.six_signals(), t0=20.0).runs_on == "jax"
-    why = "the native backend does not know spheres of unequal radii; use backend='auto' or 'jax'"
-    with pytest.raises(ValueError, match=why):
-        gm.Experiment(pack, gm.six_signals(), t0=20.0, backend="native")
-    system = dynamics.System(pack.clump, Hooke(), pack.pairs)
-    state = dynamics.start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
-    with pytest.raises(ValueError, match=why):
-        native.march(system, state, jax.tree.map(lambda leaf: leaf[None], pack.box), 0.3, 0.0)
-
-
 @pytest.mark.parametrize(
     ("radii", "said"),
     [

@@ -55,7 +55,7 @@ const Kernel& best_kernel(Task task, std::size_t replicas) {
   return of_task(baseline::kernel, baseline_derivatives::kernel);
 }
 
-enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kOffsets, kImages, kParameterRows, kWallRows, kHistoryIn };
+enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kOffsets, kImages, kRadii, kSizes, kParameterRows, kWallRows, kHistoryIn };
 constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
 
 struct Signature {
@@ -69,7 +69,8 @@ Signature signature(Task task, Law law) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
                       {"validities", "P", ffi::PRED},   {"reference centres", "S3"},
                       {"smallest lengths", "3"},        {"offsets", "K3"},
-                      {"images", "PI", ffi::S8}};
+                      {"images", "PI", ffi::S8},        {"radii", "KU"},
+                      {"sizes", "NU"}};
   const Wants fields = fields_of_grains(), numbers = numbers_of_steps(), history = histories(law);
   const Wants arguments = fields + pack + numbers + history, arrays = fields + numbers + history;
   const Wants moved = fields + pressures() + history;
@@ -81,7 +82,7 @@ Signature signature(Task task, Law law) {
 }
 
 ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                int64_t mixed, int64_t periodic, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+                int64_t mixed, int64_t periodic, int64_t unequal, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   require_law(law, variant, points);
   require_axes(periodic);
   Problem problem{};
@@ -91,8 +92,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   problem.isotropic = isotropic != 0;
   problem.mixed = mixed != 0;
   problem.periodic = static_cast<int>(periodic);
-  require(!periodic || (task != Task::adjoint && !problem.mixed),
-          "in a periodic box there are neither the adjoint nor mixed precision");
+  require(!(periodic || unequal) || (task != Task::adjoint && !problem.mixed),
+          "in a periodic box, and of unequal spheres, there are neither the adjoint nor mixed precision");
   require(!problem.mixed || (task == Task::forward && !is_layered(problem.law)),
           "there is no mixed precision for derivatives and the Mindlin law");
   const Signature wanted = signature(task, problem.law);
@@ -108,6 +109,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   Reader reader(batch);
   reader.size('R') = kRows;
   reader.size('I') = periodic ? 3 : 0;
+  reader.size('U') = unequal ? 1 : 0;
   reader.size('W') = kWalls;
   reader.size('Q') = points;
   std::vector<Array> in, out;
@@ -130,7 +132,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
     problem.history_aliased &= in[kHistoryIn + leaf].data == out[kHistoryOut + leaf].data;
 
   // Collect the replicas by candidate list.
-  constexpr int kOfPack = 7;  // arguments that belong to a pack
+  constexpr int kOfPack = 9;  // arguments that belong to a pack
   std::map<std::array<int64_t, kOfPack>, std::size_t> known;
   std::vector<std::shared_ptr<const PlanStore>> plans;
   std::vector<std::unique_ptr<Pack>> packs;
@@ -148,8 +150,9 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       const bool* valid = reinterpret_cast<const bool*>(in[kValid].data) + key[kValid - kFirst];
       const int8_t* image = periodic ? reinterpret_cast<const int8_t*>(in[kImages].data) + key[kImages - kFirst] : nullptr;
       plans.push_back(plan_for({problem.grains, problem.spheres_per_grain, static_cast<int>(reader.size('P')),
-                                integers(kFirst), integers(kSecond), valid, doubles(kReference), doubles(kSmallest), image}));
-      packs.emplace_back(new Pack{&plans.back()->plan, doubles(kOffsets)});
+                                integers(kFirst), integers(kSecond), valid, doubles(kReference), doubles(kSmallest), image,
+                                unequal ? doubles(kRadii) : nullptr, unequal ? doubles(kSizes) : nullptr}));
+      packs.emplace_back(new Pack{&plans.back()->plan, doubles(kOffsets), unequal ? doubles(kRadii) : nullptr});
       lanes.emplace_back();
       slopes.emplace_back();
     }
@@ -209,8 +212,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 
 template <Task task>
 ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves, int64_t mixed,
-                  int64_t periodic, ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  return in_words([&] { return call(task, law, variant, points, isotropic, leaves, mixed, periodic, args, rets); });
+                  int64_t periodic, int64_t unequal, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  return in_words([&] { return call(task, law, variant, points, isotropic, leaves, mixed, periodic, unequal, args, rets); });
 }
 
 auto binding() { return with_arguments(ffi::Ffi::Bind()); }

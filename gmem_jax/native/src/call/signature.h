@@ -15,7 +15,8 @@
 
 namespace gmem {
 
-// Axes are edges of a periodic box by which an image is moved I (none, or three), grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
+// Axes are edges of a periodic box by which an image is moved I (none, or three), sizes where spheres differ in radius U
+// (none, or one), grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
 // Mindlin's points Q, replicas B.
 using Wants = std::vector<Wanted>;
 
@@ -66,6 +67,7 @@ auto with_arguments(Binding&& binding) {
       .template Attr<int64_t>("leaves")
       .template Attr<int64_t>("mixed")
       .template Attr<int64_t>("periodic")
+      .template Attr<int64_t>("unequal")
       .RemainingArgs()
       .RemainingRets();
 }

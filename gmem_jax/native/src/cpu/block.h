@@ -91,7 +91,8 @@ struct Engine : EngineLayout<Mode> {
   Mode mode;
   V parameter[kParameters];
   GrainParameters<V> constants;
-  double arm;           // of the outermost sphere of a grain
+  double arm;           // of the outermost sphere of a grain, of the largest where they differ in size
+  double outer;         // radius about the centre of a grain of size 1 that holds it
   double travel = 0.0;  // how much closer any two spheres can have come since the call began
   int current = 0;      // step under way
 
@@ -102,12 +103,15 @@ struct Engine : EngineLayout<Mode> {
     mode.use(this->of_mode, hot);
     for (int row = 0; row < kParameters; ++row) parameter[row] = mode.per_lane(&Lane::parameters, row);
     constants = GrainParameters<V>(parameter);
-    arm = 0.0;
+    arm = outer = 0.0;
     for (int k = 0; k < problem.spheres_per_grain; ++k) {
       const double* body = block.pack->offsets + 3 * k;
       const double length = __builtin_sqrt(body[0] * body[0] + body[1] * body[1] + body[2] * body[2]);
+      const double reach = length + (block.pack->radii ? block.pack->radii[k] : 1.0);
       arm = length > arm ? length : arm;
+      outer = reach > outer ? reach : outer;
     }
+    arm *= plan.largest;
   }
 
   WallState<V> walls_at(int step) const {
@@ -135,7 +139,7 @@ struct Engine : EngineLayout<Mode> {
   }
 
   // First half of a step of unit u, midway, and wall forces.
-  void begin(int u, const HalfStep<V>& m, const WallState<V>& box, double* wall_sums, V* speeds) {
+  GMEM_INLINE void begin(int u, const HalfStep<V>& m, const WallState<V>& box, double* wall_sums, V* speeds) {
     V* h = hot + static_cast<std::size_t>(u) * kHot;
     V* c = cold + static_cast<std::size_t>(u) * kCold;
     speeds[0] = max(speeds[0], dot(m.velocity, m.velocity));
@@ -146,10 +150,21 @@ struct Engine : EngineLayout<Mode> {
     store_vec(h + kVelocity, m.velocity);
     store_vec(h + kSpin, m.spin);
     WallForces<V> on{};
-    const bool near = spheres_of(constants, m, block.pack->offsets, problem.spheres_per_grain, arm, box, on,
-                                 [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+    bool near = true;
+    if (plan.size) on = unequal_spheres(u, m, box);
+    else near = spheres_of(constants, m, block.pack->offsets, problem.spheres_per_grain, arm, box, on,
+                           [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     mode.put_grain(u, m.position, m.velocity, m.spin, on.force, on.torque);
     if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
+  }
+
+  // Apart from `begin`, and given copies: so what `begin` does of equal spheres stays in registers.
+  __attribute__((noinline)) WallForces<V> unequal_spheres(int u, HalfStep<V> m, WallState<V> box) {
+    const Pack& pack = *block.pack;
+    WallForces<V> on{};
+    spheres_of(constants, m, pack.offsets, pack.radii, problem.spheres_per_grain, mode.size_of(u, &Size::one), outer, box, on,
+               [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+    return on;
   }
 
   // What `begin` left of unit u: the same places.
@@ -160,12 +175,19 @@ struct Engine : EngineLayout<Mode> {
 
   // Second half: accelerations and velocities. In a periodic box of `cell` sums up its sections.
   Grain<V> finish(int u, const Cell<V>* cell, double* sums) const {
+    if (!plan.size) return finish(u, constants, parameter[kMass], cell, sums);
+    const auto power = [&](double Size::*power) { return mode.size_of(u, power); };
+    const GrainParameters<V> own = constants.of_size(power(&Size::inverse_cube), power(&Size::fifth), power(&Size::inverse_fifth));
+    return finish(u, own, power(&Size::cube) * parameter[kMass], cell, sums);
+  }
+
+  Grain<V> finish(int u, const GrainParameters<V>& own, V mass, const Cell<V>* cell, double* sums) const {
     Vec<V> force, torque;
     mode.total_force(u, force, torque);
     const HalfStep<V> half = half_step_of(u);
-    if (!cell) return end_step(constants, problem.isotropic, half, force, torque);
-    mode.add_walls(u, sums, section(*cell, parameter[kMass], half, force), Vec<V>{});
-    return end_step(constants, problem.isotropic, half, force, torque, *cell);
+    if (!cell) return end_step(own, problem.isotropic, half, force, torque);
+    mode.add_walls(u, sums, section(*cell, mass, half, force), Vec<V>{});
+    return end_step(own, problem.isotropic, half, force, torque, *cell);
   }
 
   void keep(int u, const Grain<V>& g) {
@@ -206,7 +228,8 @@ struct Engine : EngineLayout<Mode> {
   }
 
   // A sphere moves by at most dt (|v| + |spin| arm) in a step; two may approach each other by twice that. Strain of a periodic
-  // box brings grains closer by its rate times their distance, of which spheres are at most kFar.
+  // box brings grains closer by its rate times their distance, of which that of spheres is at most
+  // `Plan::far`.
   void add_travel(const Cell<V>& cell) {
     V speed{}, spin{};
     for (int chunk = 0; chunk < chunks(problem); ++chunk) {
@@ -217,7 +240,7 @@ struct Engine : EngineLayout<Mode> {
     travel += 2.0 * (1.0 + 1e-9) * largest(step);
     if (!problem.periodic) return;
     const V strain = parameter[kDt] * (max(cell.rate.x, -cell.rate.x) + max(cell.rate.y, -cell.rate.y) + max(cell.rate.z, -cell.rate.z));
-    travel += (1.0 + 1e-9) * (kFar + 2.0 * arm) * largest(strain);
+    travel += (1.0 + 1e-9) * (plan.far + 2.0 * arm) * largest(strain);
   }
 
   void contacts() {

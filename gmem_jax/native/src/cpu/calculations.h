@@ -119,12 +119,9 @@ struct OneContact {
     contact.history = history;
     relative_motion(meeting, dot(meeting.separation, meeting.separation), contact);
     close(&contact, 1, parameter);
-    if constexpr (Law::kLayered) {
-      const SameRings rings{input(program, 3, 0, Bar::none)};
-      friction(Law{}, &contact, 1, law, [&](int) { return rings; });
-    } else {
-      friction(Law{}, &contact, 1, law);
-    }
+    SameRings rings{};
+    if constexpr (Law::kLayered) rings.end = input(program, 3, 0, Bar::none);
+    rub<Law>(&contact, 1, law, static_cast<const Unequal<Symbol>*>(nullptr), [&](int) { return rings; });
     const ContactLoads<Symbol> found = push(contact);
     result(program, found.force), result(program, found.torque_one), result(program, found.torque_other);
     for (int q = 0; q < Law::kHistory; ++q) result(program, history[q]);

@@ -11,12 +11,11 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-constexpr double kFar = 4.0;  // distance of spheres from which on nearer ones are spoken of: see `Engine::add_travel`
-
-// The travel up to which two spheres that are now apart, by the square of their distance, cannot touch.
-inline double next_check(double travel, double square) {
+// The travel up to which two spheres that are now apart, by the square of their distance, cannot touch. They do at a
+// distance of `reach`; from `far` on (`Plan::far`) nearer ones are spoken of.
+inline double next_check(double travel, double square, double reach = 2.0, double far = 4.0) {
   const double apart = __builtin_sqrt(square);
-  return travel + (1.0 - 1e-9) * ((apart < kFar ? apart : kFar) - 2.0);
+  return travel + (1.0 - 1e-9) * ((apart < far ? apart : far) - reach);
 }
 
 // What is kept of each candidate beside forces and histories.

@@ -69,6 +69,12 @@ struct Packed : PackedLayout<Law> {
 
   V per_lane(const double* Lane::*array, std::ptrdiff_t row) const { return splat<V>((lane.*array)[row * problem.stride]); }
 
+  V size_of(int u, double Size::*power) const {
+    V size;
+    for (int l = 0; l < W; ++l) size[l] = plan.size[grain_in(u, l)].*power;
+    return size;
+  }
+
   // --- copying in and out
 
   // Grain of lane l in unit u; the last vector is filled up with copies of the last grain, which nothing touches.
@@ -251,9 +257,10 @@ struct Packed : PackedLayout<Law> {
     const Row other = sphere[plan.candidate[c].other];
     const Row d = (plan.image ? other + shift(cell, c) : other) - sphere[plan.candidate[c].one];
     const double square = fma(d[2], d[2], fma(d[1], d[1], d[0] * d[0]));
-    if (square < 4.0) return marks.touched[c] = true;
+    const Radii radii = plan.radii ? plan.radii[c] : Radii{2.0, 0.0, 1.0, 4.0};
+    if (square < radii.square) return marks.touched[c] = true;
     if (marks.next_check[c] < 0.0) blank(c);
-    marks.next_check[c] = next_check(travel, square);
+    marks.next_check[c] = next_check(travel, square, radii.reach, plan.far);
     return false;
   }
 
@@ -272,6 +279,7 @@ struct Packed : PackedLayout<Law> {
     constexpr int kGroups = kTogether;
     Group group[kGroups];
     Contact<V> contact[kGroups];
+    Unequal<V> unequal[kGroups];
     V memory[kGroups][kHistoryRows ? 4 * kHistoryRows : 1];
     const int groups = (count + W - 1) / W;
     for (int n = 0; n < groups; ++n) {
@@ -279,15 +287,12 @@ struct Packed : PackedLayout<Law> {
       contact[n].history = memory[n];
       read_history(group[n], memory[n]);
       const ContactInput<V> m = contact_input(group[n], plan.image ? &faces.cell : nullptr);
+      if (plan.radii) unequal[n] = unequal_of(group[n], m);
       relative_motion(m, dot(m.separation, m.separation), contact[n]);
     }
-    close(contact, groups, parameter);
+    plan.radii ? close<true>(contact, groups, parameter, unequal) : close(contact, groups, parameter);
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
-    if constexpr (Law::kLayered) {
-      friction(Law{}, contact, groups, law, [&](int n) { return segments_of(group[n]); });
-    } else {
-      friction(Law{}, contact, groups, law);
-    }
+    rub<Law>(contact, groups, law, plan.radii ? unequal : nullptr, [&](int n) { return segments_of(group[n]); });
     for (int n = 0; n < groups; ++n) {
       write_history(group[n], memory[n]);
       const ContactLoads<V> found = push(contact[n]);
@@ -340,6 +345,12 @@ struct Packed : PackedLayout<Law> {
                           columns(other(&GrainRows::spin))};
     if (cell) to_image(input, columns(moved), *cell);
     return input;
+  }
+
+  Unequal<V> unequal_of(const Group& g, const ContactInput<V>& m) const {
+    const Rows rows = load_rows([&](int l) { return reinterpret_cast<const Row*>(plan.radii + g.c[l]); });
+    const Vec<V> radii = columns(rows);
+    return {radii.x, radii.y, radii.z, m.spin_other - m.spin_one};
   }
 
   void read_history(const Group& g, V* memory) const {

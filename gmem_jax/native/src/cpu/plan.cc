@@ -150,6 +150,22 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
     store->image.push_back({of[0], of[1], of[2]});
   }
 
+  double largest = 1.0, widest = 1.0;
+  if (list.radii) {
+    for (const int32_t grain : store->grain) {
+      const double size = list.sizes[grain], cube = size * size * size, fifth = cube * size * size;
+      store->size.push_back({size, cube, 1.0 / cube, fifth, 1.0 / fifth});
+    }
+    for (const Candidate& c : candidates) {
+      const double one = store->size[c.grain_one].one * list.radii[c.one % spheres];
+      const double other = store->size[c.grain_other].one * list.radii[c.other % spheres], reach = one + other;
+      store->radii.push_back({reach, 0.5 * (one - other), std::sqrt(2.0 * one * other / reach), reach * reach});
+    }
+    store->radii.push_back({2.0, 0.0, 1.0, 4.0});
+    largest = *std::max_element(list.sizes, list.sizes + list.grains);
+    widest = largest * *std::max_element(list.radii, list.radii + spheres);
+  }
+
   store->plan = {count,
                  static_cast<int>(store->domain_candidate.size()) - 1,
                  store->remote_start.back(),
@@ -157,6 +173,10 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
                  store->grain.data(),
                  candidates.data(),
                  list.image ? store->image.data() : nullptr,
+                 list.radii ? store->radii.data() : nullptr,
+                 list.radii ? store->size.data() : nullptr,
+                 largest,
+                 4.0 * widest,
                  store->domain_candidate.data(),
                  store->remote_start.data(),
                  store->remote_sphere.data(),
@@ -167,10 +187,11 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
 // A copy of what a plan was made from.
 struct Key {
   int grains, spheres_per_grain, rows;
-  bool images;
+  bool images, radii;
   std::vector<char> bytes;
 
-  explicit Key(const List& list) : grains(list.grains), spheres_per_grain(list.spheres_per_grain), rows(list.rows), images(list.image) {
+  explicit Key(const List& list)
+      : grains(list.grains), spheres_per_grain(list.spheres_per_grain), rows(list.rows), images(list.image), radii(list.radii) {
     visit(list, [this](const void* data, std::size_t size) {
       const char* begin = static_cast<const char*>(data);
       bytes.insert(bytes.end(), begin, begin + size);
@@ -180,7 +201,7 @@ struct Key {
 
   bool matches(const List& list) const {
     if (grains != list.grains || spheres_per_grain != list.spheres_per_grain || rows != list.rows) return false;
-    if (images != (list.image != nullptr)) return false;
+    if (images != (list.image != nullptr) || radii != (list.radii != nullptr)) return false;
     std::size_t at = 0;
     return visit(list, [&](const void* data, std::size_t size) {
       const bool same = std::memcmp(bytes.data() + at, data, size) == 0;
@@ -194,7 +215,9 @@ struct Key {
     const std::size_t rows = list.rows, spheres = static_cast<std::size_t>(list.grains) * list.spheres_per_grain;
     return function(list.first, rows * sizeof(int32_t)) && function(list.second, rows * sizeof(int32_t)) &&
            function(list.valid, rows * sizeof(bool)) && function(list.reference, 3 * spheres * sizeof(double)) &&
-           function(list.smallest, 3 * sizeof(double)) && function(list.image, list.image ? 3 * rows : 0);
+           function(list.smallest, 3 * sizeof(double)) && (!list.image || function(list.image, 3 * rows)) &&
+           (!list.radii || (function(list.radii, list.spheres_per_grain * sizeof(double)) &&
+                            function(list.sizes, list.grains * sizeof(double))));
   }
 };
 

@@ -24,6 +24,8 @@ struct List {
   const double* reference;  // sphere centres in box coordinates, [S, 3]
   const double* smallest;   // edge lengths of the box, [3]
   const int8_t* image;      // see `Image`, [rows, 3]; null without periodic axes
+  const double* radii;      // of the spheres of a grain of size 1, [spheres_per_grain]; null where all radii are 1
+  const double* sizes;      // of the grains; null where all radii are 1
 };
 
 // A plan and the memory it points to.
@@ -32,6 +34,8 @@ struct PlanStore {
   std::vector<int32_t> grain, domain_candidate, remote_start, remote_sphere, padding_row;
   std::vector<Candidate> candidate;
   std::vector<Image> image;
+  std::vector<Radii> radii;
+  std::vector<Size> size;
 };
 
 // The plan of a list; that of a list seen lately is remembered. Throws std::invalid_argument if a candidate is not a

@@ -63,6 +63,19 @@ struct Image {
   bool any() const { return x || y || z; }
 };
 
+// Of a candidate between spheres i and j, where spheres differ in radius R.
+struct alignas(32) Radii {
+  double reach;   // R_i + R_j
+  double lean;    // (R_i - R_j) / 2: by how much the contact is beyond the place halfway between the spheres, towards j
+  double root;    // of the harmonic mean, 2 R_i R_j / reach
+  double square;  // of reach
+};
+
+// Powers of the size of a grain.
+struct Size {
+  double one, cube, inverse_cube, fifth, inverse_fifth;
+};
+
 // The candidate list, sorted for memory and threads; see plan.h. Grains and spheres are numbered anew.
 struct Plan {
   int candidates;
@@ -72,6 +85,10 @@ struct Plan {
   const int32_t* grain;             // number in the call of each grain, [N]
   const Candidate* candidate;       // by domain
   const Image* image;               // of each, or null without periodic axes
+  const Radii* radii;               // of each and of a dummy, or null where all radii are 1
+  const Size* size;                 // of each grain, or null where all radii are 1, [N]
+  double largest;                   // of the sizes
+  double far;                       // distance from which on spheres are spoken of as nearer: see `Engine::add_travel`
   const int32_t* domain_candidate;  // first candidate of each domain, [domains + 1]
   const int32_t* remote_start;      // the remotes of each grain: remote_start[g] to remote_start[g + 1], [N + 1]
   const int32_t* remote_sphere;     // that each remote acts on, [remotes]
@@ -81,6 +98,7 @@ struct Plan {
 struct Pack {
   const Plan* plan;
   const double* offsets;  // sphere centres in a grain, [K, 3]
+  const double* radii;    // of these spheres, or null where all radii of the pack are 1, [K]
 };
 
 // One replica: pointers to its first element; rows are `stride` apart.

@@ -136,6 +136,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     });
   }
 
+  V size_of(int u, double Size::*power) const { return splat<V>(plan.size[u].*power); }
+
   // --- copying in and out
 
   const Lane* results() const { return problem.task == Task::forward ? block.lanes : block.slopes; }
@@ -267,10 +269,19 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   }
 
   void contacts(int first, int end, const C* parameter, const LawParameters<C>& law, double travel, Faces<V>& faces) {
+    if constexpr (!kMixed)
+      if (plan.radii) return contacts_of<true>(first, end, parameter, law, travel, faces);
+    contacts_of<false>(first, end, parameter, law, travel, faces);
+  }
+
+  // ... of spheres that `differ` in radius or do not.
+  template <bool differ>
+  void contacts_of(int first, int end, const C* parameter, const LawParameters<C>& law, double travel, Faces<V>& faces) {
     constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether, kAhead = 6;
     const V contact_square = splat<V>(4.0);
     int near[kLook + 1], touching[kBatch];
     Contact<C> contact[kBatch];
+    Unequal<C> unequal[differ ? kBatch : 1];
     int count = 0, remembered = first;
     for (int look = first; look < end; look += kLook) {
       const int found = marks.find_near(look, end, travel, near);
@@ -292,9 +303,11 @@ struct Replicas : ReplicasLayout<Law, V, C> {
         Vec<V> other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
         if (plan.image) other = other + shift(faces.cell, c);
         const V square = dot(other - one, other - one);
-        if (!bits_less(square, contact_square)) {
+        const Radii* const radii = differ ? plan.radii + c : nullptr;
+        if (!bits_less(square, differ ? splat<V>(radii->square) : contact_square)) {
           if (marks.touched[c]) forget(c, pair);
-          marks.next_check[c] = next_check(travel, smallest(square));
+          marks.next_check[c] = differ ? next_check(travel, smallest(square), radii->reach, plan.far)
+                                       : next_check(travel, smallest(square));
           continue;
         }
         marks.touched[c] = true;
@@ -302,16 +315,18 @@ struct Replicas : ReplicasLayout<Law, V, C> {
         ContactInput<C> input = contact_input(pair, one, other);
         if constexpr (!kMixed)
           if (plan.image) to_image(input, shift(faces.cell, c), faces.cell);
+        if constexpr (differ)
+          unequal[count] = {splat<C>(radii->reach), splat<C>(radii->lean), splat<C>(radii->root), input.spin_other - input.spin_one};
         relative_motion(input, convert<C>(square), contact[count]);
         if constexpr (kMixed) contact[count].before = convert<C>(contact_square - square);
         contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
         touching[count++] = c;
         if (count < kBatch) continue;
-        compute(touching, count, contact, parameter, law, faces);
+        compute(touching, count, contact, differ ? unequal : nullptr, parameter, law, faces);
         count = 0;
       }
     }
-    compute(touching, count, contact, parameter, law, faces);
+    compute(touching, count, contact, differ ? unequal : nullptr, parameter, law, faces);
     if (trace.touching && first < end) trace.end[first] = remembered;
   }
 
@@ -320,14 +335,14 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     return cell.shift(image.x, image.y, image.z);
   }
 
-  void compute(const int* touching, int count, Contact<C>* contact, const C* parameter, const LawParameters<C>& law,
-               Faces<V>& faces) {
-    close(contact, count, parameter);
-    if constexpr (Law::kLayered) {
-      friction(Law{}, contact, count, law, [&](int n) { return segments_of(touching[n]); });
+  void compute(const int* touching, int count, Contact<C>* contact, const Unequal<C>* unequal, const C* parameter,
+               const LawParameters<C>& law, Faces<V>& faces) {
+    if constexpr (kMixed) {
+      close(contact, count, parameter);
     } else {
-      friction(Law{}, contact, count, law);
+      unequal ? close<true>(contact, count, parameter, unequal) : close(contact, count, parameter);
     }
+    rub<Law>(contact, count, law, unequal, [&](auto n) { return segments_of(touching[n]); });
     for (int n = 0; n < count; ++n) {
       const ContactLoads<C> found = push(contact[n]);
       add(plan.candidate[touching[n]], found);

@@ -15,6 +15,7 @@ struct Which {
   Variant variant;
   Task task;
   bool periodic;  // whether the box may be so
+  bool unequal;   // whether spheres may differ in radius
 };
 
 // Further options for NVRTC, for trials: of the environment's GMEM_NVRTC, as "-DGMEM_BLOCK=256".

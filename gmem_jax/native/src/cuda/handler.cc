@@ -19,7 +19,7 @@ namespace {
 namespace ffi = xla::ffi;
 
 constexpr int kFew = 1 << 17;  // grains times lanes from which on one thread a grain keeps a GPU busy (an H200, measured)
-constexpr int kOfPack = 6;  // arguments that belong to a pack
+constexpr int kOfPack = 8;  // arguments that belong to a pack
 
 // Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain O,
 // of a load F, of `Layers` Y, derivatives and values D, lanes L.
@@ -27,7 +27,7 @@ constexpr int kOfPack = 6;  // arguments that belong to a pack
 Wants arguments_of(Task task, Law law) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32}, {"validity", "P", ffi::PRED},
                       {"incidence", "SC", ffi::S32},    {"images", "PI", ffi::S8},
-                      {"offsets", "K3"}};
+                      {"offsets", "K3"},                {"radii", "KU"},              {"sizes", "NU"}};
   const Wants arrays = fields_of_grains() + numbers_of_steps() + histories(law);
   const Wants all = fields_of_grains() + pack + numbers_of_steps() + histories(law);
   return task == Task::tangent ? all + arrays : all;
@@ -56,15 +56,15 @@ int threads_for(int64_t many) {
   return static_cast<int>(many);
 }
 
-Which which_of(Task task, int64_t law, int64_t variant, int64_t points, int64_t periodic) {
+Which which_of(Task task, int64_t law, int64_t variant, int64_t points, int64_t periodic, int64_t unequal) {
   require_law(law, variant, points);
   require_axes(periodic);
-  return {static_cast<Law>(law), static_cast<Variant>(variant), task, periodic != 0};
+  return {static_cast<Law>(law), static_cast<Variant>(variant), task, periodic != 0, unequal != 0};
 }
 
-ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t periodic, void* stream,
-                ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  const Which which = which_of(task, law, variant, points, periodic);
+ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t periodic,
+                int64_t unequal, void* stream, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  const Which which = which_of(task, law, variant, points, periodic, unequal);
   const Wants wanted = arguments_of(task, which.law), given = results_of(task, which.law);
   require(args.size() == wanted.size() && rets.size() == given.size(),
           "the number of arguments or results is not that of the friction law");
@@ -75,6 +75,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   Reader reader({dims[0]});
   reader.size('R') = kRows;
   reader.size('I') = periodic ? 3 : 0;
+  reader.size('U') = unequal ? 1 : 0;
   reader.size('W') = kWalls;
   reader.size('Q') = points;
   reader.size('O') = 4;
@@ -125,6 +126,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.incidence.step /= 4;
   a.image = entries<const signed char>(in[argument++]);
   a.offsets = entries<const double>(in[argument++]);
+  a.radii = entries<const double>(in[argument++]);
+  a.sizes = entries<const double>(in[argument++]);
   a.parameters = read();
   a.walls = read();
   for (std::size_t leaf = 0; leaf < leaves; ++leaf) a.history_in[leaf] = read();
@@ -171,19 +174,19 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 
 template <Task task>
 ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t,
-                  int64_t mixed, int64_t periodic, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+                  int64_t mixed, int64_t periodic, int64_t unequal, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   return in_words([&] {
     require(mixed == 0, "there is no mixed precision on GPUs");
-    return call(task, law, variant, points, isotropic, periodic, stream, args, rets);
+    return call(task, law, variant, points, isotropic, periodic, unequal, stream, args, rets);
   });
 }
 
 // Before a program runs: a stream may be on its way into a graph when a call is made, and loading is no part of that.
 template <Task task>
 ffi::Error load(void* stream, int64_t law, int64_t variant, int64_t points, int64_t, int64_t, int64_t, int64_t periodic,
-                ffi::RemainingArgs, ffi::RemainingRets) {
+                int64_t unequal, ffi::RemainingArgs, ffi::RemainingRets) {
   return in_words([&] {
-    const Launcher loads(stream, which_of(task, law, variant, points, periodic));
+    const Launcher loads(stream, which_of(task, law, variant, points, periodic, unequal));
     return ffi::Error::Success();
   });
 }

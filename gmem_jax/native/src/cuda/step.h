@@ -160,8 +160,17 @@ Segments<V> segments_of(const ReplicaView<V>& on, int row) {
   return {at, a.stored + on.of_lane(row), a.points};
 }
 
+// Of the spheres of a pack in which they differ: the radius of one, and the size of a grain.
+template <class V>
+double size_of(const ReplicaView<V>& on, int grain) { return on.a.sizes.of(on.entry)[grain]; }
+template <class V>
+double radius_of(const ReplicaView<V>& on, int sphere) {
+  const int grain = on.a.by_spheres.of(sphere);
+  return size_of(on, grain) * on.a.radii.of(on.entry)[sphere - grain * on.a.spheres];
+}
+
 // Begins a step.
-template <class V, bool periodic>
+template <class V, bool periodic, bool unequal>
 GMEM_INLINE void begin(const ReplicaView<V>& on, int step, const GrainParameters<V>& constants, const Grain<V>& from) {
   const Arguments& a = on.a;
   HalfStep<V> m{};
@@ -177,7 +186,8 @@ GMEM_INLINE void begin(const ReplicaView<V>& on, int step, const GrainParameters
   const Matrix<V> rotation = matrix(m.orientation);
   for (int k = 0; k < a.spheres; ++k) {
     const double* body = a.offsets.of(on.entry) + 3 * k;
-    const Vec<V> lever = rotation * Vec<V>{splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])};
+    Vec<V> lever = rotation * Vec<V>{splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])};
+    if constexpr (unequal) lever = splat<V>(size_of(on, on.item)) * lever;
     sphere.put(3 * (on.item * a.spheres + k), m.position + lever);
   }
 }
@@ -235,7 +245,7 @@ void remember(const Arguments& a, int thread) {
 }
 
 // Grains, from the arrays of the call. Thread of grain and lane.
-template <class V, bool periodic>
+template <class V, bool periodic, bool unequal>
 void enter(const Arguments& a, int thread) {
   const ReplicaView<V> on(a, thread);
   const int grain = on.item;
@@ -250,7 +260,7 @@ void enter(const Arguments& a, int thread) {
     a.touching[on.of_lane(a.rows + grain * a.spheres + k)] = 0;
   }
   if (a.steps == 0) return deliver(on, from);
-  begin<V, periodic>(on, 0, constants, from);
+  begin<V, periodic, unequal>(on, 0, constants, from);
 }
 
 // What is remembered of a contact while it is computed.
@@ -283,33 +293,36 @@ struct Memory {
 };
 
 // The forces of the walls on a sphere.
-template <class V, bool periodic>
+template <class V, bool periodic, bool unequal>
 void touch_walls(const ReplicaView<V>& on, int step, int number) {
   const Arguments& a = on.a;
   if (number >= a.grains * a.spheres) return;
   const WallState<V> edges = on.walls(step), box = periodic ? without(a.periodic, edges) : edges;
   const Vec<V> centre = on.in(a.sphere).vec(3 * number);
   unsigned char& touching = a.touching[on.of_lane(a.rows + number)];
-  const bool touches = bits_less(V{}, deepest(splat<V>(1.0), centre, box));
+  V radius = splat<V>(1.0);
+  if constexpr (unequal) radius = splat<V>(radius_of(on, number));
+  const bool touches = bits_less(V{}, deepest(radius, centre, box));
   if (touches != static_cast<bool>(touching)) touching = touches;
   if (!touches) return;
   V parameter[kParameters];
-  const GrainParameters<V> constants = read_parameters(on, parameter);
+  GrainParameters<V> constants = read_parameters(on, parameter);
+  if constexpr (unequal) constants.wall_stiffness = root(radius) * constants.wall_stiffness;
   const Column<V> hot = on.in(a.hot), wall = on.in(a.wall);
   const int h = 9 * a.by_spheres.of(number);
   const Vec<V> lever = centre - hot.vec(h);
   WallForces<V> found{};
-  touch_walls(constants, centre, lever, add_cross(hot.vec(h + 3), hot.vec(h + 6), lever), box, found);
+  touch_walls(constants, centre, lever, add_cross(hot.vec(h + 3), hot.vec(h + 6), lever), box, found, radius);
   wall.put(6 * number, found.force);
   wall.put(6 * number + 3, wall.vec(6 * number + 3) + pressure(edges, found.lower + found.upper));
 }
 
 // The forces between the spheres of a candidate, or of the walls on a sphere. Thread of candidate or sphere, and lane.
-template <class V, class Law, bool periodic>
+template <class V, class Law, bool periodic, bool unequal>
 void touch(const Arguments& a, int step, int thread) {
   const ReplicaView<V> on(a, thread);
   const int row = on.item;
-  if (row >= a.rows) return touch_walls<V, periodic>(on, step, row - a.rows);
+  if (row >= a.rows) return touch_walls<V, periodic, unequal>(on, step, row - a.rows);
   if (!a.valid.of(on.entry)[row]) return;
   const int one = a.first.of(on.entry)[row], other = a.second.of(on.entry)[row];
   const unsigned all = static_cast<unsigned>(a.grains * a.spheres);
@@ -327,7 +340,14 @@ void touch(const Arguments& a, int step, int thread) {
   const Vec<V> there = periodic ? listed + shift : listed, gap = there - here;
   const V square = dot(gap, gap);
   Memory<V, Law> memory{on, row, {}};
-  if (!bits_less(square, splat<V>(4.0))) {
+  Unequal<V> differing{};
+  double reach = 2.0;
+  if constexpr (unequal) {
+    const double radius = radius_of(on, one), of_other = radius_of(on, other);
+    reach = radius + of_other;
+    differing = {splat<V>(reach), splat<V>(0.5 * (radius - of_other)), splat<V>(root(2.0 * radius * of_other / reach)), {}};
+  }
+  if (!bits_less(square, splat<V>(reach * reach))) {
     if (touched) memory.forget(), touching = 0;
     return;
   }
@@ -336,7 +356,7 @@ void touch(const Arguments& a, int step, int thread) {
   const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
   const Column<V> hot = on.in(a.hot), load = on.in(a.load);
   const int i = 9 * a.by_spheres.of(one), j = 9 * a.by_spheres.of(other);
-  const Vec<V> point = splat<V>(0.5) * (here + there);
+  Vec<V> point = splat<V>(0.5) * (here + there);
   ContactInput<V> input{gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3),
                         hot.vec(i + 6), hot.vec(j + 6)};
   if constexpr (periodic) to_image(input, shift, cell);
@@ -344,12 +364,10 @@ void touch(const Arguments& a, int step, int thread) {
   Contact<V> contact;
   relative_motion(input, square, contact);
   contact.history = memory.number;
-  close(&contact, 1, parameter);
-  if constexpr (Law::kLayered) {
-    friction(Law{}, &contact, 1, law, [&](int) { return segments_of(on, row); });
-  } else {
-    friction(Law{}, &contact, 1, law);
-  }
+  differing.spin_difference = input.spin_other - input.spin_one;
+  close<unequal>(&contact, 1, parameter, &differing);
+  rub<Law>(&contact, 1, law, unequal ? &differing : nullptr, [&](int) { return segments_of(on, row); });
+  if constexpr (unequal) point = point + differing.lean * contact.normal;
   memory.write();
   load.put(kLoad * row, fnma(contact.normal_force, contact.normal, contact.force));
   load.put(kLoad * row + 3, point);
@@ -414,38 +432,44 @@ GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int step, int sphere) {
 }
 
 // The end of a step, and the beginning of the next, of a grain in a lane.
-template <class V, bool periodic>
+template <class V, bool periodic, bool unequal>
 GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
   const Arguments& a = on.a;
   if (on.item >= a.grains) return;
   const Column<V> hot = on.in(a.hot), cold = on.in(a.cold);
   const int h = on.item * 9, c = on.item * 4;
-  const HalfStep<V> own{hot.vec(h), {cold[c], cold.vec(c + 1)}, hot.vec(h + 3), hot.vec(h + 6)};
+  const HalfStep<V> half{hot.vec(h), {cold[c], cold.vec(c + 1)}, hot.vec(h + 3), hot.vec(h + 6)};
   V parameter[kParameters];
   const GrainParameters<V> constants = read_parameters(on, parameter);
+  GrainParameters<V> own = constants;
+  V mass = parameter[kMass];
+  if constexpr (unequal) {
+    const double size = size_of(on, on.item), cube = size * size * size, fifth = cube * size * size;
+    own = constants.of_size(splat<V>(1.0 / cube), splat<V>(fifth), splat<V>(1.0 / fifth)), mass = splat<V>(cube) * mass;
+  }
   Grain<V> after{};
   if constexpr (periodic) {
     const WallState<V> box = on.walls(step);
     const Cell<V> cell = Cell<V>::of(a.periodic, box);
-    const Vec<V> own_part = section(cell, parameter[kMass], own, load.force);
+    const Vec<V> own_part = section(cell, mass, half, load.force);
     const Column<V> wall = on.in(a.wall);
     const int at = 6 * on.item * a.spheres + 3;
     wall.put(at, wall.vec(at) + section_pressure(a.periodic, box, cell, own_part, load.through));
-    after = end_step(constants, a.isotropic, own, load.force, load.torque, cell);
+    after = end_step(own, a.isotropic, half, load.force, load.torque, cell);
   } else {
-    after = end_step(constants, a.isotropic, own, load.force, load.torque);
+    after = end_step(own, a.isotropic, half, load.force, load.torque);
   }
   if (step + 1 == a.steps) return deliver(on, after);
-  begin<V, periodic>(on, step + 1, constants, after);
+  begin<V, periodic, unequal>(on, step + 1, constants, after);
 }
 
 // One thread for all spheres of a grain.
-template <class V, bool periodic>
+template <class V, bool periodic, bool unequal>
 void move_alone(const Arguments& a, int step, int thread) {
   const ReplicaView<V> on(a, thread);
   Load<V> sum{};
   for (int k = 0; k < a.spheres; ++k) sum = sum + loads_of<V, periodic>(on, step, k);
-  move<V, periodic>(on, step, sum);
+  move<V, periodic, unequal>(on, step, sum);
 }
 
 // Sums of pressures over a chunk of spheres that are `stride` apart, in the place of its first. Thread of chunk and axis,

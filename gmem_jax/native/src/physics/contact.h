@@ -16,6 +16,14 @@ struct ContactInput {
   Vec<V> spin_one, spin_other;
 };
 
+// What is to be known of a contact where spheres differ in radius.
+// gmem_jax/physics/contact/kinematics.py: Unequal
+template <class V>
+struct Unequal {
+  V reach, lean, root;     // as of `Radii` in cpu/problem.h
+  Vec<V> spin_difference;  // of the grains, j - i
+};
+
 // From the second grain to its image in a periodic box (`Cell` of motion.h), which `shift` leads to. Levers already end
 // at the contact with that.
 // gmem_jax/physics/step.py: relative_motion
@@ -41,20 +49,35 @@ constexpr GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, C
 template <class V>
 constexpr GMEM_INLINE V overlap_of(const Contact<V>& c) { return fnma(c.square, c.inverse, splat<V>(2.0)); }
 
+// The contact is no longer halfway between the spheres.
+template <class V>
+constexpr GMEM_INLINE void lean(Contact<V>& c, const Unequal<V>& unequal) {
+  const Vec<V> moved = unequal.lean * c.normal;
+  c.lever_one = c.lever_one + moved;
+  c.lever_other = c.lever_other + moved;
+  c.sliding = add_cross(c.sliding, unequal.spin_difference, moved);
+}
+
 // From what `relative_motion` left to normals, sliding velocities and normal forces. The second part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
-template <class V>
-constexpr void close(Contact<V>* c, int count, const V* parameter) {
+// Where spheres differ in radius, roots of overlaps and forces are still those of a harmonic mean of 1: see `rub`.
+template <bool differ = false, class V>
+constexpr void close(Contact<V>* c, int count, const V* parameter, const Unequal<V>* unequal = nullptr) {
   const V quarter_dt = splat<V>(0.25) * parameter[kDt] * parameter[kSpinning];
   invert_roots(c, count);
   for (int n = 0; n < count; ++n) {
     const Vec<V> normal = c[n].inverse * c[n].normal;
-    const V along = dot(c[n].sliding, normal);
     c[n].normal = normal;
+    if constexpr (differ) lean(c[n], unequal[n]);
+    const V along = dot(c[n].sliding, normal);
     c[n].sliding = fnma(along, normal, c[n].sliding);
     c[n].normal_force = -along;  // for now, the closing velocity
     c[n].turned = quarter_dt * dot(c[n].spin_sum, normal);  // with the mean spin of the two grains
-    c[n].overlap = overlap_of(c[n]);
+    if constexpr (differ) {
+      c[n].overlap = fnma(c[n].square, c[n].inverse, unequal[n].reach);
+    } else {
+      c[n].overlap = overlap_of(c[n]);
+    }
     c[n].square = c[n].safe_overlap();
   }
   invert_roots(c, count);
@@ -62,6 +85,22 @@ constexpr void close(Contact<V>* c, int count, const V* parameter) {
     c[n].root_overlap = c[n].square * c[n].inverse;
     c[n].normal_force = hertz(c[n].touching(), c[n].square, c[n].root_overlap, c[n].normal_force,
                               parameter[kNormalStiffness], parameter[kNormalDamping]);
+  }
+}
+
+// The tangential forces of a batch, of which `close` found the rest. Between spheres whose radii have a harmonic mean r all
+// forces are root(r) times those of spheres of radius 1, but for tangential springs that do not depend on the overlap.
+template <class Law, class V, class SegmentsOf>
+constexpr GMEM_INLINE void rub(Contact<V>* c, int count, const LawParameters<V>& law, const Unequal<V>* unequal,
+                               const SegmentsOf& segments_of) {
+  if constexpr (Law::kLayered) {
+    friction(Law{}, c, count, law, segments_of);
+    for (int n = 0; unequal && n < count; ++n)
+      c[n].normal_force = unequal[n].root * c[n].normal_force, c[n].force = unequal[n].root * c[n].force;
+  } else {
+    for (int n = 0; unequal && n < count; ++n)
+      c[n].normal_force = unequal[n].root * c[n].normal_force, c[n].root_overlap = unequal[n].root * c[n].root_overlap;
+    friction(Law{}, c, count, law);
   }
 }
 

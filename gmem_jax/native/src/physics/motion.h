@@ -81,6 +81,18 @@ struct GrainParameters {
       inverse_inertia[axis] = splat<V>(1.0) / inertia[axis];
     }
   }
+
+  // Of a grain of another size, of which these are powers.
+  // gmem_jax/physics/grain.py: Clump.scaled
+  constexpr GrainParameters of_size(V inverse_cube, V fifth, V inverse_fifth) const {
+    GrainParameters p = *this;
+    p.inverse_mass = inverse_cube * p.inverse_mass;
+    for (int axis = 0; axis < 3; ++axis) {
+      p.inertia[axis] = fifth * p.inertia[axis];
+      p.inverse_inertia[axis] = inverse_fifth * p.inverse_inertia[axis];
+    }
+    return p;
+  }
 };
 
 // First half of a step.
@@ -174,14 +186,14 @@ constexpr Vec<V> wall_force(const GrainParameters<V>& parameters, Vec<V> overlap
   return {axis(overlap.x, closing.x), axis(overlap.y, closing.y), axis(overlap.z, closing.z)};
 }
 
-// Adds to `on` the forces of the walls on one sphere of a grain.
+// Adds to `on` the forces of the walls on one sphere of a grain, of a radius for which the walls have their stiffness.
 // gmem_jax/physics/step.py: _forces
 template <class V>
 constexpr void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
-                        const WallState<V>& box, WallForces<V>& on) {
-  const Vec<V> one{splat<V>(1.0), splat<V>(1.0), splat<V>(1.0)};
-  if (!bits_less(V{}, deepest(one.x, centre, box))) return;
-  const Vec<V> lower = one - (centre - box.lower), upper = one - (box.upper - centre);
+                        const WallState<V>& box, WallForces<V>& on, V radius = splat<V>(1.0)) {
+  const Vec<V> all{radius, radius, radius};
+  if (!bits_less(V{}, deepest(radius, centre, box))) return;
+  const Vec<V> lower = all - (centre - box.lower), upper = all - (box.upper - centre);
   const Vec<V> low = wall_force(p, lower, box.lower_velocity - velocity);
   const Vec<V> up = wall_force(p, upper, velocity - box.upper_velocity);
   on.lower = on.lower + low;
@@ -193,9 +205,10 @@ constexpr void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> le
 // The centre of a sphere of a grain, and what the walls do to it if they are near.
 template <class V>
 constexpr GMEM_INLINE Vec<V> sphere_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Matrix<V>& rotation,
-                                       Vec<V> body, bool near, const WallState<V>& box, WallForces<V>& on) {
+                                       Vec<V> body, bool near, const WallState<V>& box, WallForces<V>& on,
+                                       V radius = splat<V>(1.0)) {
   const Vec<V> lever = rotation * body, centre = m.position + lever;
-  if (near) touch_walls(p, centre, lever, add_cross(m.velocity, m.spin, lever), box, on);
+  if (near) touch_walls(p, centre, lever, add_cross(m.velocity, m.spin, lever), box, on, radius);
   return centre;
 }
 
@@ -209,6 +222,22 @@ GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, c
   for (int k = 0; k < spheres; ++k) {
     const double* body = offsets + 3 * k;
     put(k, sphere_of(p, m, rotation, {splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])}, near, box, on));
+  }
+  return near;
+}
+
+// ... of a grain of some size, whose spheres have `radii` where it is 1 and are then within `outer` of its centre.
+template <class V, class Put>
+GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const double* offsets, const double* radii,
+                            int spheres, V size, double outer, const WallState<V>& box, WallForces<V>& on, const Put& put) {
+  const Matrix<V> rotation = matrix(m.orientation);
+  const bool near = bits_less(V{}, deepest(splat<V>(outer) * size, m.position, box)) != 0;
+  GrainParameters<V> own = p;
+  for (int k = 0; k < spheres; ++k) {
+    const double* body = offsets + 3 * k;
+    const V radius = splat<V>(radii[k]) * size;
+    if (near) own.wall_stiffness = root(radius) * p.wall_stiffness;
+    put(k, sphere_of(own, m, rotation, size * Vec<V>{splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])}, near, box, on, radius));
   }
   return near;
 }
