@@ -235,7 +235,9 @@ def test_examples_run(
     page: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, recalled: tuple[gm.Experiment, gm.Recall]
 ) -> None:
     """All blocks of a page, one after the other, on a pack of 27 grains and a short experiment."""
-    pytest.importorskip("xarray")
+    imported = set(re.findall(r"^import (\w+)", page.read_text(), re.MULTILINE))
+    for needed in ("xarray", *sorted(imported & {"blackjax", "equinox", "optimistix"})):
+        pytest.importorskip(needed)
     monkeypatch.chdir(tmp_path)
     gm.save_recall(Path("recall.h5"), recalled[1])  # a page on files reads what `gmem recall` wrote
     small, experiment, train = gm.load_pack(SMALL), gm.Experiment, gm.classify.train

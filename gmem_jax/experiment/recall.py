@@ -250,7 +250,8 @@ def recall(experiment: Experiment) -> Recall:
     require_kind("recall", experiment, Experiment)
     require_double(pack=experiment.pack, signals=experiment.signals)
     found: Recall = _recall(experiment)
-    return found if traced(experiment) else found.described(describe(experiment, 0.0))
+    # Within somebody's `jax.jit` the numbers are traced also where the experiment is not.
+    return found if traced(experiment, found) else found.described(describe(experiment, 0.0))
 
 
 def fidelity(experiment: Experiment) -> jax.Array:

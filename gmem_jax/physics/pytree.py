@@ -188,8 +188,11 @@ def traced(*trees: Any) -> bool:
 
 
 def _number(value: Any) -> Any:
-    """One kind of number for every way to write it, so that 1, 1.0 and np.float32(1) share a program."""
-    if not traced(value) and np.ndim(value) == 0:
+    """One kind of number for every way to write it, so that 1, 1.0 and np.float32(1) share a program.
+
+    An array of JAX stays one: libraries tell by it what is to be differentiated by.
+    """
+    if not isinstance(value, jax.Array) and np.ndim(value) == 0:
         return float(value)
     return jnp.asarray(value, float)
 

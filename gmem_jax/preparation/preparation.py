@@ -224,6 +224,8 @@ class _Preparation:
             np.asarray(self.box.lower)[:, 0], np.asarray(self.box.upper)[:, 0], recipe.delta0
         )
         runner.renew(self.box)
+        # How long a pack takes to come to rest was a guess; from here on it is known what is left.
+        runner.total_work = runner.work + work_of((*cycles_of(recipe), last_rest(recipe)), 1)
         self.log |= runner.run_cached("cycles", self.cache, *cycles_of(recipe))
         runner.simulation = replace(runner.simulation, steps=outside.steps, dt=outside.dt)
         rest = last_rest(recipe)

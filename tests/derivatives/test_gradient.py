@@ -1,6 +1,8 @@
 """Derivatives through whole, shortened experiments on 27 grains, and at the corners of the contact laws."""
 
 import dataclasses
+import re
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -351,3 +353,11 @@ def test_derivatives_do_not_mind_lists_that_are_made_anew(experiment: gm.Experim
     one, other = (gradient.push(e, direction) for e in (short, tight))
     scale = np.abs(one.p_sig_slope).max()
     np.testing.assert_allclose(other.p_sig_slope, one.p_sig_slope, atol=1e-6 * scale)
+
+
+def test_the_table_of_derivatives_has_every_name(whole: gm.Experiment) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "derivatives.md").read_text()
+    rows = dict(re.findall(r"^\| `([\w.]+)` \|.*\| (.*?) \|.*\|.*\|$", page, re.MULTILINE))
+    assert set(all_names(whole)) <= set(rows)
+    assert {"friction.p_max", "creep", "creep_fades", "pack.clump.sizes", "signals.nodes"} <= set(rows)
+    assert all(found.startswith("0: ") or float(found) < 2e-2 for found in rows.values())

@@ -11,6 +11,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -102,6 +103,9 @@ def test_numbers_may_be_written_in_any_way_that_is_one() -> None:
     assert gm.Hooke(mu=[1, 2]) == gm.Hooke(mu=np.array([1.0, 2.0]))
     assert gm.Bumps([[1, -1]], [[0.3, 0.7]], 0.2).count == 1
     assert gm.Mindlin(points=np.int64(9)) == gm.Mindlin(points=9)
+    # Libraries that differentiate by arrays find one where one was given, and nowhere else.
+    assert isinstance(gm.Hooke(mu=jnp.asarray(1.0)).mu, jax.Array)
+    assert type(gm.Hooke(mu=np.array(1.0)).mu) is float
 
 
 def test_every_number_that_is_asked_for_is_a_number_and_no_text_of_one() -> None:

@@ -64,6 +64,8 @@ def test_traced_and_host_runs_are_the_same_computation(pack: gm.Pack, recall: gm
     traced = jax.jit(lambda gamma0: gm.recall(gm.replace(experiment, gamma0=gamma0)))(1e-3)
     # The two are compiled differently; round-off of 1e-16 grows over some 1,200 steps of frictional contacts.
     np.testing.assert_allclose(traced.p_sig, recall.p_sig, atol=1e-6 * np.abs(np.asarray(recall.p_sig)).max())
+    # Nor need any of the experiment be an argument of what is traced.
+    assert jax.eval_shape(lambda: gm.recall(experiment).p_sig).shape == recall.p_sig.shape
 
 
 def test_vmap_over_parameters_equals_one_run_at_a_time(pack: gm.Pack) -> None:
