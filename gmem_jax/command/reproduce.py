@@ -69,6 +69,7 @@ def reproduce_command(
     probe(output)
     output.mkdir(exist_ok=True)
     outcomes, verdicts, weighed, drawn = [], [], Weighed([], [], []), []
+    archives: list[Path] = []
     broken: list[str] = []
 
     def wanted(names: Iterable[str]) -> list[str]:
@@ -93,8 +94,8 @@ def reproduce_command(
             _say_written(weighed)
         if what == "dataset":
             with reporting(goes_on=True) as progress:
-                drawn, broken = reproduction(progress).dataset()
-            for path in drawn:
+                archives, broken = reproduction(progress).dataset()
+            for path in archives:
                 log(f"wrote {path}")
         for name in wanted(FIGURES):
             log(f"{name}: {FIGURES[name].title}")
@@ -107,8 +108,8 @@ def reproduce_command(
         "figures": [outcome_summary(outcome) for outcome in outcomes],
         "claims": [verdict._asdict() for verdict in verdicts],
         "choices": choices.effect_rows(weighed.effects),
-        "pictures": [str(path) for path in drawn if path.suffix != ".zip"],
-        "dataset": [str(path) for path in drawn if path.suffix == ".zip"],
+        "pictures": [str(path) for path in drawn],
+        "dataset": [str(path) for path in archives],
         "status": status,
     }
     lines = [f"{'yes' if verdict.holds else 'NO ':4}{verdict.claim}\n    {verdict.numbers}" for verdict in verdicts]

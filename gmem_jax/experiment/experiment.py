@@ -317,7 +317,7 @@ class Experiment:
 
     @property
     def runs_on(self) -> native.Backend:
-        """What `backend` means for this law and pack on JAX's default device."""
+        """What `backend` means for this law on JAX's default device."""
         return native.name(self.backend, self.friction)
 
     @property

@@ -70,8 +70,10 @@ def known_by(number: int) -> dict[str, Any]:
 
 
 def _process(who: dict[str, Any], folder: Path) -> psutil.Process | None:
-    """The process of a record, if it runs on this machine, and has a file of that very folder open: a folder that was
-    copied, or made by somebody else, may hold records of processes that work elsewhere."""
+    """The process of a record, if it runs on this machine and has a file of that very folder open.
+
+    A folder that was copied, or made by somebody else, may hold records of processes that work elsewhere.
+    """
     try:
         found = psutil.Process(int(who["pid"]))
         known = (who["host"], who["born"]) == (platform.node(), found.create_time())
