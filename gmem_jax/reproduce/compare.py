@@ -123,14 +123,13 @@ def conditions_of(configuration: dict[str, Any]) -> Conditions:
 
 
 def points_of(store: Store) -> list[ComputedPoint]:
-    """Every finished point of the sweep that a store was last asked for."""
+    """Every finished point of the sweep that a store was last asked for; once, in however many words it was."""
     found = []
     done = store.done()
-    for row in store.card()["points"]:
-        if row["key"] in done:
-            recall = store.load(row["key"])
-            configuration = recall.configuration
-            found.append(ComputedPoint(conditions_of(configuration), summary(recall), row["key"]))
+    for key in dict.fromkeys(row["key"] for row in store.card()["points"]):
+        if key in done:
+            recall = store.load(key)
+            found.append(ComputedPoint(conditions_of(recall.configuration), summary(recall), key))
     return found
 
 

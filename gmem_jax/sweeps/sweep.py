@@ -303,13 +303,14 @@ class SweepRunner:
         begun = self.store.begun({one.key for one in points} - set(self.store.failed()))
         under_way = {key for job in begun for key in job["points"]}
         jobs = begun + [job.asdict() for job in plan(points, known | under_way, memory, workers=executor.workers)]
-        kept = len({one.key for one in points} & known)
+        keys = {one.key for one in points}  # some may be written in several ways
+        kept, told = len(keys & known), plural(len(keys), "point")
         if jobs:
             count = sum(len(job["points"]) for job in jobs)
-            self._announce(f"{count} of {plural(len(points), 'point')} in {plural(len(jobs), 'run')}", jobs, executor)
+            self._announce(f"{count} of {told} in {plural(len(jobs), 'run')}", jobs, executor)
             self._finish(executor, jobs, progress, "points")
         else:
-            self.say(f"nothing to do: {kept} of {plural(len(points), 'point')} there")
+            self.say(f"nothing to do: {kept} of {told} there")
 
     def points_to_come(self) -> list[dict[str, Any]]:
         """What will be run on packs that do not exist yet: work, replicas and bytes of each point by itself."""

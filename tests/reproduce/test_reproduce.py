@@ -205,6 +205,8 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     assert (tmp_path / "fig06-tiny.svg").is_file()
     for name in set(COLLECTED) - {"fig06", "fig08"}:
         monkeypatch.setitem(FIGURES, name, PaperFigure("none", lambda scale: []))
+    # mu = 1 is what holds where nothing is said: the same point, which is in the archive once.
+    monkeypatch.setitem(FIGURES, "fig09", PaperFigure("as it is", lambda scale: [{"pack": PACK}]))
     (archive,), failed = Reproduction(tmp_path, "tiny", Here(), say=said.append).dataset()
     assert (archive.name, failed, said[2:]) == ("dataset-tiny.zip", [], ["nothing to do: 2 of 2 points there"])
     shutil.unpack_archive(archive, tmp_path / "data")
