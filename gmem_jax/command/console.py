@@ -27,17 +27,24 @@ if TYPE_CHECKING:  # what JAX is imported for, is imported where it is used: `gm
     from gmem_jax.simulation.progress import Progress
 
 
+def _give_up(stream: int) -> None:
+    """Send a stream nowhere from now on: what is still in its buffer would fail once more when Python ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+
+
 class _Log(Console):
     """Lines that nobody may hear: no run ends because its log's reader is gone, or the disk of the log is full."""
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print, if there is a place for it."""
-        with contextlib.suppress(OSError):
+        try:
             super().print(*objects, **options)
+        except OSError:
+            self.on_broken_pipe()
 
     def on_broken_pipe(self) -> None:
         """Be quiet from now on."""
-        self.quiet = True
+        _give_up(2)
 
 
 stderr = _Log(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
@@ -113,7 +120,7 @@ def heard() -> Iterator[None]:
         yield
         sys.stdout.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what is still in the buffer would fail once more at the end
+        _give_up(1)
         raise UnheardError(os.strerror(error.errno) if error.errno else str(error)) from error
 
 

@@ -256,7 +256,8 @@ def test_no_command_ends_because_its_log_is_not_taken(why: str) -> None:
     os.close(read)
     log = os.open("/dev/full", os.O_WRONLY) if "full" in why else write
     code = "from gmem_jax.command.console import log; log('10 %'); log('20 %'); print('done')"
-    done = subprocess.run(python("-c", code), stdout=subprocess.PIPE, stderr=log, check=False)
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run(python("-c", code), stdout=subprocess.PIPE, stderr=log, env=buffered, check=False)
     assert (done.returncode, done.stdout) == (0, b"done\n")
 
 
