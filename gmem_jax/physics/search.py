@@ -22,6 +22,7 @@ Search = Callable[[np.ndarray, int, float], np.ndarray]
 """From sphere centres [S, 3], spheres per grain and a reach to the sorted numbers i S + j of all pairs i < j of spheres
 of different grains that are closer."""
 
+_centres = jax.jit(sphere_centres)
 _SPARE = 1.15  # capacity allocated over what is needed now: a list that is built again should fit the same program
 
 
@@ -176,7 +177,7 @@ class PairFinder:
         now = lengths.min(axis=1)  # shear makes the boxes of replicas differ
         smallest = now if smallest is None else np.minimum(smallest, now)
         require_room(smallest, box.periodic, self._widest + self.skin, self._diameter)
-        reference = (np.asarray(sphere_centres(grains, clump)) - np.asarray(box.lower)) / lengths
+        reference = (np.asarray(_centres(grains, clump)) - np.asarray(box.lower)) / lengths
         if np.all(reference == reference[..., :1]):
             reference = reference[..., :1]
         spheres = reference.shape[0]

@@ -106,7 +106,7 @@ class Simulation:
 
     def box_before(self, row: Bin, servo: HeldWalls | None = None) -> Box:
         """The walls at the beginning of a bin; their velocities are per bin here."""
-        box = self.path.box_at(row, jnp.asarray(float(row.number)), float(row.bins))
+        box = self.path.box_at(row, jnp.asarray(row.number, float), jnp.asarray(row.bins, float))
         return box if servo is None else stretched(box, servo.stretch)
 
 

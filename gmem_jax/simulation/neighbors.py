@@ -11,7 +11,6 @@ from gmem_jax.physics.pairs import slack, sphere_centres
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, State
 from gmem_jax.physics.step import System
-from gmem_jax.simulation.compiled import Compiled
 
 SKIN = 0.3
 """Skin of the neighbour list of an experiment, in R. Measured non-affine displacements over a full compression stay
@@ -24,7 +23,6 @@ def pair_finder(clump: Clump, extent: np.ndarray, skin: float, **sizes: Any) -> 
     return PairFinder(clump, extent, skin, search=native.search(), **sizes)
 
 
-@Compiled
 def skin_left(system: System, state: State, box: Box) -> jax.Array:
     """What the list still allows for, [B], in R: its skin at first; see `pairs.slack`."""
     spheres = sphere_centres(state.grains, system.clump)

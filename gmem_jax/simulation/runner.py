@@ -18,11 +18,12 @@ from gmem_jax.physics.pairs import carry_history
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, State, Status, combined_status, explain
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint, ResultCache
+from gmem_jax.simulation.compiled import Compiled
 from gmem_jax.simulation.loop import Mark, Simulation
 from gmem_jax.simulation.neighbors import LARGEST_SKIN, SKIN, pair_finder, skin_left
 from gmem_jax.simulation.observers import CHUNK, CheckpointWriter, Chunk, Observer, SampleRecorder
 from gmem_jax.simulation.progress import Progress, silent, work_of_bin
-from gmem_jax.simulation.protocol import Stage
+from gmem_jax.simulation.protocol import Bin, Stage
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.sharding import Placement, to_host
 from gmem_jax.simulation.stability import cause
@@ -46,6 +47,13 @@ def raise_if_fatal(status: int, where: str, simulation: Simulation | None = None
 
 def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+
+
+@Compiled
+def _box_and_skin(simulation: Simulation, state: State, row: Bin) -> tuple[Box, jax.Array]:
+    """The walls before a bin, and what the list allows for between them."""
+    box = simulation.box_before(row, state.servo)
+    return box, skin_left(simulation.system, state, box)
 
 
 @dataclass
@@ -229,8 +237,8 @@ class Runner:
     def _foresee(self, stage: Stage, done: int) -> None:
         """Renew a list that would not last for another chunk, if grains went on using it up as they have."""
         count = min(self.chunk, stage.bins - done)
-        box = self.simulation.box_before(self.simulation.rows(stage, done), self.state.servo)
-        left = float(np.min(np.asarray(skin_left(self.simulation.system, self.state, box))))
+        box, skins = _box_and_skin(self.simulation, self.state, self.simulation.rows(stage, done))
+        left = float(np.min(np.asarray(skins)))
         if (self.skin - left) * (1.0 + count / self._lasted) > self.skin:
             self._renewed_at = (stage.name, self.time)
             self.renew(box)
