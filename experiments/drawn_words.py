@@ -124,8 +124,22 @@ def write(path: Path, rows: list[Row]) -> None:
         writer.writerows(rows)
 
 
+def over_packs(rows: list[Row]) -> list[Row]:
+    """One row for each length: means over packs, and words of all; the same words were drawn for each."""
+    groups: dict[str | int | float, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row["bits"], []).append(row)
+    found: list[Row] = []
+    for members in groups.values():
+        means = {name: float(np.mean([float(row[name]) for row in members])) for name in members[0] if name != "pack"}
+        whole = {name: int(means[name]) for name in ("bits", "words")}
+        found.append({"pack": " ".join(str(row["pack"]) for row in members), **means, **whole})
+    return found
+
+
 def draw(rows: list[Row], path: Path) -> None:
-    """F by three backgrounds, and accuracies, against L, beside the published."""
+    """F by three backgrounds, and accuracies, against L, beside the published; means where several packs ran."""
+    rows = over_packs(rows)
     lengths = np.array([int(row["bits"]) for row in rows])
     theirs = published("binary_words.csv")
     figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 4.2))
@@ -145,11 +159,16 @@ def draw(rows: list[Row], path: Path) -> None:
     for axis, words in ((left, "F"), (right, "words read right")):
         axis.set(xlabel="length of words L (bits)", ylabel=words, ylim=(0.0, 1.05))
         axis.legend(fontsize=8, frameon=False, loc="lower left")
-    alike = {int(row["words"]): [str(one["bits"]) for one in rows if one["words"] == row["words"]] for row in rows}
-    counts = "; ".join(f"{words} of {', '.join(bits)} bits" for words, bits in alike.items())
+    alike: dict[tuple[int, int], list[str]] = {}
+    for row in rows:
+        alike.setdefault((int(row["words"]), len(str(row["pack"]).split())), []).append(str(row["bits"]))
+    counts = "; ".join(
+        f"{words} of {', '.join(bits)} bits on {'one pack' if packs == 1 else f'{packs} packs'}"
+        for (words, packs), bits in alike.items()
+    )
     size = int(str(rows[0]["pack"]).split("-")[1])
     figure.suptitle(
-        f"Drawn words ({counts}) of one pack, N = {size:,}, $t_0$ = {float(rows[0]['t0']):,.0f} $t_c$,\n"
+        f"Drawn words ({counts}), N = {size:,}, $t_0$ = {float(rows[0]['t0']):,.0f} $t_c$,\n"
         "mean ± SE over words; published: all words, N = 10,240",
         fontsize=10,
     )

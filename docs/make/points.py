@@ -1,10 +1,11 @@
 """Figures of 10,240 grains from packs that ran one by one, and every published point beside ours.
 
-python docs/make/points.py
+PYTHONPATH=experiments python docs/make/points.py
 
 `docs/results/points.csv` has a row for each pack and condition, as `gmem sweep export` gave them: sweeps over delta0,
-gamma0, mu and the seed of `prepare`, with t0 = 5,400 and dt = 1.2. Means over packs become the tables and pictures of
-figs. 8, 11 and 12a, by the names of their scale; and docs/results/points.md is written anew.
+gamma0, mu and the seed of `prepare`, with t0 = 5,400 and dt = 1.2. Of a pack that ran at several rates the slowest
+counts. Means over packs become the tables and pictures of
+figs. 8, 9, 11 and 12a, by the names of their scale; and docs/results/points.md is written anew.
 """
 
 import csv
@@ -14,6 +15,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from drawn_words import over_packs, read_rows
+
 from gmem_jax.reproduce import draw
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, compared, comparison_rows, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES
@@ -22,22 +25,26 @@ from gmem_jax.show.tables import published
 HERE = Path(__file__).parents[1] / "results"
 OWN = HERE / "points.csv"
 USUAL = {"mu": 1.0, "delta0": 0.05, "gamma0": 1e-3, "overlap": 0.6, "law": "H"}
+GRAINS = 10_240  # of figures
 Measured = tuple[Conditions, str]
 
 
 def _only(row: Compared, *free: str) -> bool:
     at = asdict(row.conditions)
-    return all(at[name] == value for name, value in USUAL.items() if name not in free)
+    usual = all(at[name] == value for name, value in USUAL.items() if name not in free)
+    return usual and row.grains == row.conditions.grains == GRAINS
 
 
 SHOWN = (0.01, 0.02, 0.05, 0.08)  # delta0 of the curves of fig. 11: with all eight, points would lie under one another
 LARGE = 5e-3  # gamma0 from which on G is no longer that of small shear
 WHICH: dict[str, Callable[[Compared], bool]] = {
-    "fig08-paper-t0=5400-packs=3": lambda row: _only(row, "mu"),
-    "fig11-paper-t0=5400-few=1": lambda row: (
-        _only(row, "delta0", "gamma0") and row.conditions.delta0 in SHOWN and row.conditions.gamma0 < LARGE
+    "fig08-paper-t0=5400-packs=4": lambda row: _only(row, "mu"),
+    "fig09-paper-t0=5400-packs=4-few=2": lambda row: _only(row, "law"),
+    "fig11-paper-t0=5400-few=2": lambda row: (
+        _only(row, "overlap")
+        or (_only(row, "delta0", "gamma0") and row.conditions.delta0 in SHOWN and row.conditions.gamma0 < LARGE)
     ),
-    "fig12a-paper-t0=5400-few=1": lambda row: _only(row, "delta0"),
+    "fig12a-paper-t0=5400-few=2": lambda row: _only(row, "delta0"),
 }
 """Figures that are made of the packs' own rows, and which rows are theirs."""
 
@@ -55,14 +62,14 @@ def of_packs(path: Path = OWN) -> list[Compared]:
     """Means over the packs of a table, where G and F are those over the ringing period."""
     with path.open(newline="", encoding="utf-8") as file:
         lines = list(csv.DictReader(file))
-    groups: dict[Conditions, list[dict[str, str]]] = {}
-    for line in lines:
+    groups: dict[Conditions, dict[str, dict[str, str]]] = {}
+    for line in sorted(lines, key=lambda line: float(line["t0"])):
         overlap, mu, delta0, gamma0 = (float(line[name]) for name in ("overlap", "mu", "delta0", "gamma0"))
         at = Conditions(line["law"], line["shape"], overlap, int(line["grains"]), mu, delta0, gamma0, 0, "sub0")
-        groups.setdefault(at, []).append(line)
+        groups.setdefault(at, {})[line["pack"]] = line
     found = []
-    for at, members in groups.items():
-        status = 0
+    for at, packs in groups.items():
+        status, members = 0, packs.values()
         for member in members:
             status |= int(member["status"])
         for measure in "FG":
@@ -71,7 +78,7 @@ def of_packs(path: Path = OWN) -> list[Compared]:
 
 
 def figures() -> None:
-    """Write the tables and pictures of `WHICH`; what they have of other conditions (mu = 0) stays."""
+    """Write the tables and pictures of `WHICH`; what they have of other conditions (as mu = 0) stays."""
     rows = of_packs()
     for name, belongs in WHICH.items():
         table, figure = HERE / "paper" / f"{name}.csv", FIGURES[name.partition("-")[0]]
@@ -88,7 +95,7 @@ def ours() -> dict[Measured, Compared]:
     """Of every condition that ran anywhere the estimate of most packs, of as many grains as published."""
     best: dict[Measured, Compared] = {}
     tables = [row for path in sorted(HERE.glob("*/fig*.csv")) for row in read_csv(path)]
-    for row in [*tables, *of_packs()]:
+    for row in [*of_packs(), *tables]:
         known = best.get((row.conditions, row.measure))
         if row.theirs and row.grains == row.conditions.grains and (not known or row.ours.packs > known.ours.packs):
             best[row.conditions, row.measure] = row
@@ -141,10 +148,14 @@ def _published() -> Iterable[dict[str, Any]]:
             yield {**USUAL, "shape": "tetra", **row, "law": law}
 
 
+def _words_of(row: Mapping[str, Any]) -> str:
+    packs = len(row["pack"].split())
+    return f"{row['words']} drawn" + (f", {packs} packs" if packs > 1 else "")
+
+
 def words() -> list[str]:
     """Published words beside ours, as Markdown: F by three backgrounds, and what the net reads."""
-    with (HERE / "drawn_words.csv").open(newline="", encoding="utf-8") as file:
-        drawn = {int(row["bits"]): row for row in csv.DictReader(file)}
+    drawn = {int(row["bits"]): row for row in over_packs(read_rows(HERE / "drawn_words.csv"))}
     known = [row for (at, measure), row in ours().items() if at.bits and measure == "F"]
     whole = {(row.conditions.bits, row.conditions.background): f"{row.ours.mean:.3f}" for row in known}
     kinds = ("sub0", "sub2", "sub2-bl")
@@ -153,7 +164,7 @@ def words() -> list[str]:
     for theirs in published("binary_words.csv"):
         bits = int(theirs["word_bits"])
         row = drawn.get(bits)
-        shown = [str(bits), f"{row['words']} drawn" if row else "all"]
+        shown = [str(bits), _words_of(row) if row else "all"]
         for kind in kinds:
             if row:
                 told = f"{float(row[f'F {kind}']):.3f} ± {float(row[f'F {kind} error']):.3f}"

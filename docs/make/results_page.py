@@ -3,13 +3,13 @@
 PYTHONPATH=experiments python docs/make/results_page.py [--redraw]
 
 What is published beside each point is looked up anew. With --redraw pictures are drawn anew too, those that show no
-more than their table holds and those that need no run; those of recalls (figs. 3, 4, 6 and 13) stay as they are.
+more than their table holds and those that need no run; those of recalls (figs. 3, 4, 6 and 13) and of choices stay as
+they are.
 """
 
 import argparse
 import csv
 import json
-import math
 from pathlib import Path
 
 import design_words
@@ -20,8 +20,7 @@ from packs import over_packs
 
 from gmem_jax.reproduce import choices as weighed
 from gmem_jax.reproduce import draw
-from gmem_jax.reproduce.choices import CHOICES, Effect
-from gmem_jax.reproduce.compare import Estimate, comparison_rows, read_csv, write_csv
+from gmem_jax.reproduce.compare import comparison_rows, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import SCHEMATICS
 from gmem_jax.show.tables import published
@@ -147,30 +146,12 @@ def figure(picture: Path) -> list[str]:
     return [*lines, *(choices if picture.stem.startswith("choices") else table)(numbers), ""]
 
 
-def effects(path: Path) -> list[Effect]:
-    """The rows of `choices.effect_rows`, from a file."""
-    found, known = [], {choice.name: choice for choice in CHOICES}
-    with path.open() as file:
-        for row in csv.DictReader(file):
-            choice = known[row["choice"]]
-            value = next(one for one in choice.values if str(one) == row["value"])
-            gain, fidelity, of_gain, of_fidelity = (
-                Estimate(float(row[name]), float(row[f"{name}_sd"] or math.nan), int(row["packs"]))
-                for name in ("G", "F", "dG_over_G", "dF")
-            )
-            found.append(Effect(choice, value, gain, fidelity, of_gain, of_fidelity, int(row["status"])))
-    return found
-
-
 def anew(path: Path) -> None:
     """Write a figure's table with what is published now, and draw it."""
     name, _, scale = path.stem.partition("-")
-    size = scale_of(scale.replace("-", ","), weighed.SIZES if name == "choices" else SCALES)
+    size = scale_of(scale.replace("-", ","), SCALES)
     picture = path.with_suffix(".png")
-    if name == "choices":
-        found = effects(path)
-        weighed.draw(picture, found, weighed.choices_title(size, found[0].gain.packs))
-    elif across := FIGURES[name].across:
+    if across := FIGURES[name].across:
         rows = read_csv(path)
         rate = RATES.get(path.stem, f"{size.t0:,.0f}")
         draw.draw_comparison(picture, rows, across, f"{FIGURES[name].title}\n{draw.said_of(rows, rate)}")
@@ -185,7 +166,7 @@ def redraw() -> None:
         for suffix in (".svg", ".csv"):
             target.with_suffix(suffix).unlink(missing_ok=True)
     for path in sorted(HERE.glob("*/*-*.csv")):
-        if path.parent.name != "designs":
+        if path.stem.startswith("fig"):
             anew(path)
     drawn_words.draw(drawn_words.read_rows(HERE / "drawn_words.csv"), HERE / "drawn_words.png")
     design_words.draw(HERE / "designed_words.csv", HERE / "designed_words.png")
