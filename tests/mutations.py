@@ -83,6 +83,27 @@ MUTATIONS = (
         "test_work_of_the_walls_is_what_was_stored_damped_and_slid_away",
     ),
     mutation(
+        "step-gravity-upwards",
+        "physics/step.py",
+        ".add(-jnp.asarray(self.gravity",
+        ".add(jnp.asarray(self.gravity",
+        "test_a_free_grain_falls_as_galilei_says",
+    ),
+    mutation(
+        "native-gravity-left-out",
+        "physics/motion.h",
+        "pull.z = pull.z - p.gravity;",
+        "",
+        "test_a_march_is_a_step_for_each_box_in_gravity_too",
+    ),
+    mutation(
+        "native-gravity-left-out-of-periodic-boxes",
+        "physics/motion.h",
+        "acceleration(m.velocity.z, force.z, cell.rate.z, p.gravity)",
+        "acceleration(m.velocity.z, force.z, cell.rate.z, V{})",
+        "test_values_between_walls_along_one_axis",
+    ),
+    mutation(
         "step-spin-drag",
         "physics/step.py",
         "(turning - drag * spin)",

@@ -47,6 +47,7 @@ def experiments() -> Iterator[tuple[str, gm.Experiment]]:
     yield "law M1", gm.Experiment(pack, bumps, gm.MindlinRescaled(mu=0.8), **short)
     yield "law M2", gm.Experiment(pack, bumps, gm.Mindlin(mu=0.8), **short)
     yield "creep", gm.Experiment(pack, bumps, creep=1e-3, creep_fades=5.0, **short)
+    yield "gravity", gm.Experiment(pack, bumps, gravity=1e-4, **short)
     sizes = 1.0 + 0.05 * np.random.default_rng(0).normal(size=pack.grains)
     yield "grains of sizes", gm.Experiment(dataclasses.replace(pack, clump=gm.sized(pack.clump, sizes)), bumps, **short)
     yield "a spline", gm.Experiment(pack, gm.waveform(jnp.sin(jnp.linspace(0.2, 3.0, 8))), **short)

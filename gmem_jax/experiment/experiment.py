@@ -61,7 +61,7 @@ class Experiment:
     """Everything a recall depends on. S signals make S + 1 replicas; replica 0 is the zero signal.
 
     A pytree: its floats can be differentiated and vmapped. The friction law's parameters, gamma0, shear_share, delta0,
-    t0 and hold_drag are one number or one for each replica, [S + 1].
+    t0, hold_drag and gravity are one number or one for each replica, [S + 1].
 
     Attributes:
         pack: the pack at rest.
@@ -76,6 +76,7 @@ class Experiment:
         hold_drag: viscous drag while the walls stand still, 1 / t_c; default 0.05 for t0 below the paper's, else 0.
         creep: rate at which elastic tangential forces relax, 1 / t_c; default never. A twentieth of a bin's at most.
         creep_fades: time in a stage after which that rate falls as 1 / t, in t_c; default it stays.
+        gravity: its acceleration along -z, in R / t_c^2, that is E / (rho R); default none. It acts from the start on.
         dt: largest time step, in t_c.
         steps: steps in a bin of t0 / 256; default the fewest that `dt` allows. Needed where t0 is a tracer.
         steps_per_bin: what follows from that.
@@ -115,6 +116,9 @@ class Experiment:
     creep_fades: Scalar | None = parameter(
         None, "(0, inf)", "Time in a stage after which creep falls as 1/t; default it stays", "t_c", varies=True
     )
+    gravity: Scalar | None = parameter(
+        None, "[0, 0.01]", "Acceleration of gravity along -z; default none", "R/t_c^2", varies=True
+    )
     dt: float = static(USUAL_STEP, "Largest time step", "t_c")
     steps: int | None = static(None, "Steps in a bin of t0 / 256, in the place of dt", no_option=True)
     rest: float = static(0.2, "Rests at u = 0", "t0")
@@ -146,6 +150,8 @@ class Experiment:
         of_pack = self.pack.periodic, self.pack.clump.equal
         native.require_precision(self.precision, self.backend, self.friction, *of_pack)
         require_walls(self.pack.periodic, self.material)
+        if self.gravity is not None and self.pack.periodic[2]:
+            raise ValueError("gravity acts along z, and a box that is periodic there has no floor: leave gravity out")
         if not 0.0 < self.dt <= LARGEST_STEP:
             raise ValueError(f"dt must be in (0, {LARGEST_STEP}], got {self.dt:g}")
         if self.steps is not None:
@@ -343,7 +349,7 @@ class Experiment:
             columns, drive = columns._replace(lanes=()), (0.0, (), 1.0, (), ())
         dt, steps = self.timing
         return Simulation(
-            System(self.pack.clump, self.friction, self.pack.pairs, self.material),
+            System(self.pack.clump, self.friction, self.pack.pairs, self.material, self.gravity),
             StrainPath(lower, upper, self.compression, *drive, self.pack.periodic),
             dt,
             self.drag,

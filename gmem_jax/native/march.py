@@ -218,7 +218,7 @@ class PlainDefinition:
         """The steps."""
         empty: System = jax.tree.unflatten(self.system, [None] * self.system.num_leaves)
         dt, drag, mass, *inertia = arrays.parameters[:6]
-        own, edges = arrays.parameters[9:-6], jnp.split(arrays.parameters[-6:], 2)
+        own, gravity, edges = arrays.parameters[9:-7], arrays.parameters[-7], jnp.split(arrays.parameters[-6:], 2)
         clump = replace(empty.clump, offsets=fixed.offsets, mass=mass, inertia=jnp.stack(inertia))
         if fixed.sizes.shape[-1]:
             clump = replace(clump, radii=fixed.radii[:, 0], sizes=fixed.sizes[:, 0])
@@ -234,7 +234,7 @@ class PlainDefinition:
             still = jnp.zeros_like(edges[0])
             cell = Box(edges[0], edges[1], still, still, self.periodic)
         history = jax.tree.unflatten(self.history, arrays.history)
-        system = replace(empty, clump=clump, friction=law, pairs=pairs, material=material)
+        system = replace(empty, clump=clump, friction=law, pairs=pairs, material=material, gravity=gravity)
         grains, history, total = _plain(system, Grains(*arrays.fields), history, boxes, (dt, drag), cell)
         return StepOutput(jax.tree.leaves(grains), total, jax.tree.leaves(history))
 
@@ -286,5 +286,6 @@ def _parameters(system: System, numbers: _Numbers, cell: Box | None, replicas: i
     own += [1.0] * (_LAW_NUMBERS - len(own))
     solid = (material.normal_stiffness, material.normal_damping, material.wall_stiffness)
     edges = (0.0,) * 6 if cell is None else (*cell.lower, *cell.upper)
-    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own, *edges)
+    gravity = 0.0 if system.gravity is None else system.gravity
+    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own, gravity, *edges)
     return jnp.stack([jnp.broadcast_to(jnp.asarray(row, jnp.float64), (replicas,)) for row in rows])

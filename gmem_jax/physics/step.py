@@ -31,12 +31,20 @@ class System:
         friction: the friction law.
         pairs: candidate contacts.
         material: the elastic solid.
+        gravity: acceleration of every grain along -z, in R / t_c^2; scalar or [B], None for none.
     """
 
     clump: Clump
     friction: FrictionLaw
     pairs: Pairs
     material: Material = Material()
+    gravity: Scalar | None = None
+
+    def weighed(self, acceleration: jax.Array) -> jax.Array:
+        """Accelerations [N, 3, B] with that of gravity."""
+        if self.gravity is None:
+            return acceleration
+        return acceleration.at[:, 2].add(-jnp.asarray(self.gravity, acceleration.dtype))
 
 
 def _fusion_barrier(alive: jax.Array, function: Callable[..., Any], *args: Any) -> Any:
@@ -293,7 +301,7 @@ def step(
         state, slowing = replace(state, cell=_wide(box, state.replicas)), drag + _strain_rate(box)
     force, torque, history, walls = _forces(system, midway, state.history, box, dt, alive)
     # Of drag on the velocities at the end, which are found with it.
-    acceleration = (force / system.clump.masses - slowing * velocity) / (1.0 + 0.5 * dt * slowing)
+    acceleration = system.weighed(force / system.clump.masses - slowing * velocity) / (1.0 + 0.5 * dt * slowing)
     turning = _angular_acceleration(system.clump, midway, torque, 0.5 * dt)
     spin_rate = (turning - drag * spin) / (1.0 + 0.5 * dt * drag)
     grains = replace(
@@ -387,7 +395,7 @@ def accelerate(system: System, state: State, box: Box) -> State:
     slowing = 0.0 if state.cell is None else _strain_rate(box) * state.grains.velocity
     grains = replace(
         state.grains,
-        acceleration=force / system.clump.masses - slowing,
+        acceleration=system.weighed(force / system.clump.masses - slowing),
         spin_rate=_angular_acceleration(system.clump, state.grains, torque),
     )
     return replace(state, grains=grains)

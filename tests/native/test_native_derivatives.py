@@ -59,7 +59,7 @@ def end(march: native.March, system: System, state: State, theta: dict[str, Any]
     clump = replace(system.clump, mass=theta["mass"], inertia=theta["inertia"])
     state = replace(state, grains=theta["grains"], history=theta["history"])
     after, sample = advance_by(march)(
-        replace(system, friction=law, clump=clump),
+        replace(system, friction=law, clump=clump, gravity=theta["gravity"]),
         state,
         motion(theta["gamma0"], theta["heights"]),
         theta["dt"],
@@ -79,6 +79,7 @@ def arguments(system: System, state: State) -> dict[str, Any]:
         "law": {name: jnp.asarray(getattr(system.friction, name)) for name in names},
         "mass": system.clump.mass,
         "inertia": system.clump.inertia,
+        "gravity": jnp.asarray(1e-3),
         "gamma0": jnp.asarray(3e-2),
         "heights": HEIGHTS,
         "dt": jnp.asarray(0.3),

@@ -32,9 +32,10 @@ constexpr int kLawNumbers = 5;
 template <class V, class Each>
 constexpr void for_numbers(GrainParameters<V>& p, const Each& each) {
   each(p.dt), each(p.half_dt), each(p.drag), each(p.slowed), each(p.inverse_mass), each(p.wall_stiffness), each(p.normal_damping);
+  each(p.gravity);
   for (int axis = 0; axis < 3; ++axis) each(p.inertia[axis]), each(p.inverse_inertia[axis]);
 }
-constexpr int kGrainNumbers = 13;
+constexpr int kGrainNumbers = 14;
 
 template <class V, class Each>
 constexpr void for_numbers(Vec<V>& a, const Each& each) {

@@ -68,14 +68,14 @@ struct HalfStep {
 // A grain's constants, of the parameter array.
 template <class V>
 struct GrainParameters {
-  V dt, half_dt, drag, slowed, inertia[3], inverse_mass, inverse_inertia[3], wall_stiffness, normal_damping;
+  V dt, half_dt, drag, slowed, inertia[3], inverse_mass, inverse_inertia[3], wall_stiffness, normal_damping, gravity;
 
   GrainParameters() = default;
 
   constexpr explicit GrainParameters(const V* parameter)
       : dt(parameter[kDt]), half_dt(splat<V>(0.5) * dt), drag(parameter[kDrag]),
         slowed(splat<V>(1.0) / fma(half_dt, drag, splat<V>(1.0))), inverse_mass(splat<V>(1.0) / parameter[kMass]), wall_stiffness(parameter[kWallStiffness]),
-        normal_damping(parameter[kNormalDamping]) {
+        normal_damping(parameter[kNormalDamping]), gravity(parameter[kGravity]) {
     for (int axis = 0; axis < 3; ++axis) {
       inertia[axis] = parameter[kInertia + axis];
       inverse_inertia[axis] = splat<V>(1.0) / inertia[axis];
@@ -138,7 +138,9 @@ constexpr Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropi
 template <class V>
 constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const HalfStep<V>& m, Vec<V> force,
                                         Vec<V> torque) {
-  const Vec<V> acceleration = p.slowed * fnma(p.drag, m.velocity, p.inverse_mass * force);
+  Vec<V> pull = fnma(p.drag, m.velocity, p.inverse_mass * force);
+  pull.z = pull.z - p.gravity;
+  const Vec<V> acceleration = p.slowed * pull;
   const Vec<V> spin_rate =
       p.slowed * fnma(p.drag, m.spin, angular_acceleration(p, isotropic, m.orientation, m.spin, torque));
   return {m.position,   m.orientation, fma(p.half_dt, acceleration, m.velocity), fma(p.half_dt, spin_rate, m.spin),
@@ -150,12 +152,12 @@ template <class V>
 constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const HalfStep<V>& m, Vec<V> force,
                                         Vec<V> torque, const Cell<V>& cell) {
   Grain<V> g = end_step(p, isotropic, m, force, torque);
-  const auto acceleration = [&](V velocity, V force, V rate) {
+  const auto acceleration = [&](V velocity, V force, V rate, V gravity) {
     const V slowing = p.drag + rate;
-    return fnma(slowing, velocity, p.inverse_mass * force) / fma(p.half_dt, slowing, splat<V>(1.0));
+    return (fnma(slowing, velocity, p.inverse_mass * force) - gravity) / fma(p.half_dt, slowing, splat<V>(1.0));
   };
-  g.acceleration = {acceleration(m.velocity.x, force.x, cell.rate.x), acceleration(m.velocity.y, force.y, cell.rate.y),
-                    acceleration(m.velocity.z, force.z, cell.rate.z)};
+  g.acceleration = {acceleration(m.velocity.x, force.x, cell.rate.x, V{}), acceleration(m.velocity.y, force.y, cell.rate.y, V{}),
+                    acceleration(m.velocity.z, force.z, cell.rate.z, p.gravity)};
   g.velocity = fma(p.half_dt, g.acceleration, m.velocity);
   return g;
 }

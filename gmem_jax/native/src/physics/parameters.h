@@ -17,11 +17,11 @@ enum class Task { forward, tangent, adjoint };
 enum class Law { frictionless = 0, hooke = 1, mindlin_rescaled = 2, mindlin = 3 };
 enum class Variant { exact = 0, averaged = 1, paper = 2 };
 
-// Rows of the parameter array; a law's own follow.
+// Rows of the parameter array; a law's own follow, and gravity.
 // gmem_jax/native/march.py: _parameters
 enum Parameter { kDt, kDrag, kMass, kInertia, kNormalStiffness = kInertia + 3, kNormalDamping, kWallStiffness, kLaw };
 constexpr int kLawParameters = 5;  // mu, stiffness, damping time, spinning, spacing of Mindlin's points
-constexpr int kParameters = kLaw + kLawParameters;
+constexpr int kGravity = kLaw + kLawParameters, kParameters = kGravity + 1;
 // ... and, after these, the lower and upper edges of the box before the first step, which a periodic one is carried from.
 constexpr int kCell = kParameters, kRows = kCell + 6;
 constexpr int kSpinning = kLaw + 3;
