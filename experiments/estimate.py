@@ -1,0 +1,180 @@
+"""mu and k_H from one noisy recall: their posterior by NUTS, and by quadrature on a grid beside it.
+
+python experiments/estimate.py [-o estimate] [--pack tests/data/tetra-27.h5] [--t0 600] [--samples 100] [--warm 50]
+
+Needs blackjax. The recall of six waveforms is read as the means of p_sig over each sixteenth of u, with Gaussian noise
+of four times their root mean square. For a given pack the recall is a function of mu and k_H, and their logarithms have
+a normal prior. NUTS starts from four places, with gradients backwards through all steps: for two numbers they cost what
+two tangents do. The grid says whether the chains found the posterior.
+"""
+
+import argparse
+import csv
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import blackjax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import gmem_jax as gm
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
+
+NAMES = {"friction.mu": "friction coefficient $\\mu$", "friction.stiffness": "stiffness $k_H$ (E R)"}
+TICKS = ((0.2, 0.5, 1.0, 2.0), (0.03, 0.1, 0.3))
+TRUE = np.array([0.5, 0.13])
+MIDDLE = np.array([0.7, 0.1])  # of the prior
+WIDTH = 0.5  # of the prior, the standard deviation of each logarithm
+STARTS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])  # in widths from the middle
+REACH = 2.5  # of the grid, in widths from the middle
+READINGS = 16  # of each waveform
+NOISE = 4.0  # of a reading, over the root mean square of all
+
+LogDensity = Callable[[jax.Array], jax.Array]
+
+
+def numbers(place: Any) -> Any:
+    """mu and k_H at a place, which is in widths of the prior from its middle, [..., 2]."""
+    return MIDDLE * jnp.exp(WIDTH * place)
+
+
+def main() -> None:
+    """Measure, sample, integrate, draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("-o", "--output", type=Path, default=Path("estimate"), help="without a suffix")
+    parser.add_argument("--pack", default="tests/data/tetra-27.h5")
+    parser.add_argument("--t0", type=float, default=600.0)
+    parser.add_argument("--samples", type=int, default=100, help="of each of the four chains")
+    parser.add_argument("--warm", type=int, default=50, help="samples that tune a chain before")
+    parser.add_argument("--points", type=int, default=31, help="of the grid on each axis, odd")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    experiment = gm.Experiment(
+        gm.load_pack(arguments.pack), gm.six_signals(), t0=arguments.t0, dt=1.2, rest=0.1, hold=0.1, store=0.1
+    )
+
+    def readings(values: jax.Array) -> jax.Array:
+        p_sig = gm.recall(gm.replace(experiment, dict(zip(NAMES, values, strict=True)))).p_sig
+        return jnp.mean(p_sig.reshape(len(p_sig), READINGS, -1), axis=2)
+
+    clean = jax.jit(readings)(jnp.asarray(TRUE))
+    noise = NOISE * float(jnp.sqrt(jnp.mean(clean**2)))
+    measuring, sampling = jax.random.split(jax.random.key(arguments.seed))
+    measured = clean + noise * jax.random.normal(measuring, clean.shape)
+
+    def log_density(place: jax.Array) -> jax.Array:
+        misfit = (readings(numbers(place)) - measured) / noise
+        return -0.5 * (jnp.sum(misfit**2) + jnp.sum(place**2))
+
+    places = sample(log_density, sampling, arguments.warm, arguments.samples)
+    axis = np.linspace(-REACH, REACH, arguments.points)
+    weights = integrate(log_density, axis)
+    found = np.asarray(numbers(places))
+    tell("NUTS", found, np.ones(found.shape[:2]))
+    for name, every in (("grid", 1), ("every second point", 2)):
+        mesh = np.stack(np.meshgrid(axis[::every], axis[::every], indexing="ij"), -1)
+        tell(name, np.asarray(numbers(mesh)), weights[::every, ::every])
+    with arguments.output.with_suffix(".csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["chain", "mu", "k_H"])
+        writer.writerows([n, *(f"{value:.5f}" for value in row)] for n, chain in enumerate(found) for row in chain)
+    draw(arguments.output.with_suffix(".png"), places, axis, weights, np.asarray(measured), np.asarray(clean), noise)
+
+
+def sample(log_density: LogDensity, key: jax.Array, warm: int, count: int) -> np.ndarray:
+    """Chains [4, count, 2], each tuned by itself, all run together."""
+
+    @jax.jit
+    @jax.vmap
+    def chain(key: jax.Array, start: jax.Array) -> Any:
+        tuning, sampling = jax.random.split(key)
+        tuned = blackjax.window_adaptation(
+            blackjax.nuts, log_density, is_mass_matrix_diagonal=False, initial_step_size=0.3, max_num_doublings=2
+        )
+        (state, parameters), _ = tuned.run(tuning, start, num_steps=warm)
+        kernel = blackjax.nuts(log_density, **parameters)
+
+        def step(state: Any, key: jax.Array) -> Any:
+            state, info = kernel.step(key, state)
+            return state, (state.position, info)
+
+        return jax.lax.scan(step, state, jax.random.split(sampling, count))[1]
+
+    began = time.process_time()
+    places, info = chain(jax.random.split(key, len(STARTS)), jnp.asarray(STARTS))
+    print(
+        f"{places[..., 0].size} samples, {float(info.num_integration_steps.mean()):.1f} gradients each, acceptance "
+        f"{float(info.acceptance_rate.mean()):.2f}, {int(info.is_divergent.sum())} divergent, "
+        f"{time.process_time() - began:.0f} s of CPU with compilation and warm-up",
+        flush=True,
+    )
+    scale = blackjax.diagnostics.potential_scale_reduction(places)
+    effective = blackjax.diagnostics.effective_sample_size(places)
+    print(f"R-hat {scale[0]:.3f}, {scale[1]:.3f}; effective samples {effective[0]:.0f}, {effective[1]:.0f}")
+    return np.asarray(places)
+
+
+def integrate(log_density: LogDensity, axis: np.ndarray) -> np.ndarray:
+    """The posterior on a square grid, [mu, k_H], its sum 1."""
+    began, row = time.process_time(), jax.jit(jax.vmap(log_density))
+    logs = np.asarray([row(jnp.stack([jnp.full(len(axis), mu), jnp.asarray(axis)], axis=1)) for mu in axis])
+    print(f"{logs.size} points, {np.isnan(logs).sum()} of them failed, {time.process_time() - began:.0f} s of CPU")
+    weights = np.exp(np.nan_to_num(logs - np.nanmax(logs), nan=-np.inf))
+    return np.asarray(weights / weights.sum())
+
+
+def tell(name: str, found: np.ndarray, weights: np.ndarray) -> None:
+    """Means and standard deviations of mu and k_H, [..., 2]."""
+    mean = np.average(found, axis=(0, 1), weights=np.stack([weights] * 2, -1))
+    deviation = np.sqrt(np.average((found - mean) ** 2, axis=(0, 1), weights=np.stack([weights] * 2, -1)))
+    print(f"{name}: mu {mean[0]:.3f} +- {deviation[0]:.3f}, k_H {mean[1]:.4f} +- {deviation[1]:.4f}")
+
+
+def draw(
+    path: Path,
+    places: np.ndarray,
+    axis: np.ndarray,
+    weights: np.ndarray,
+    measured: np.ndarray,
+    clean: np.ndarray,
+    noise: float,
+) -> None:
+    """What was read of one waveform, the posterior by both ways, and what each number has of it."""
+    figure, ((top, joint), margins) = pyplot().subplots(2, 2, figsize=(10, 8))
+    u, grid = (np.arange(READINGS) + 0.5) / READINGS, np.asarray(numbers(np.stack([axis, axis], 1)))
+    top.errorbar(u, measured[4] * 1e6, noise * 1e6, fmt="o", ms=4, color="0.4", capsize=2, label="read, ± noise")
+    top.plot(u, clean[4] * 1e6, color="#1f5fa8", label="without noise")
+    top.set(xlabel="compression variable u", ylabel="$p_{sig}$ ($10^{-6}$ E)", title="one of six recalled waveforms")
+    falling = np.sort(weights.ravel())[::-1]
+    levels = [falling[np.searchsorted(np.cumsum(falling), part)] for part in (0.95, 0.5)]
+    joint.contourf(*grid.T, weights.T, [*levels, 1.0], colors=["#dbe6f2", "#a9c4e2"])
+    for chain in np.asarray(numbers(places)):
+        joint.plot(*chain.T, ".", ms=3)
+    joint.plot(*TRUE, "k+", ms=14, mew=2, label="true")
+    joint.plot(*MIDDLE, "kx", ms=7, label="middle of the prior")
+    x_label, y_label = NAMES.values()
+    joint.set(xscale="log", yscale="log", xlabel=x_label, ylabel=y_label, title="NUTS over 50 % and 95 % by the grid")
+    for number, (panel, label) in enumerate(zip(margins, NAMES.values(), strict=True)):
+        heights, edges = np.histogram(places[..., number], 24, density=True)
+        panel.stairs(heights / WIDTH, MIDDLE[number] * np.exp(WIDTH * edges), fill=True, color="#e8b89c", label="NUTS")
+        density = weights.sum(1 - number) / (axis[1] - axis[0])
+        panel.plot(grid[:, number], density / WIDTH, color="#1f5fa8", label="grid")
+        panel.plot(
+            grid[:, number], np.exp(-0.5 * axis**2) / np.sqrt(2.0 * np.pi) / WIDTH, ":", color="0.4", label="prior"
+        )
+        panel.axvline(TRUE[number], color="k", lw=1, label="true")
+        panel.set(xscale="log", xlabel=label, ylabel="density of the logarithm", ylim=(0.0, None))
+    for side, ticks in zip((joint.xaxis, joint.yaxis, *(panel.xaxis for panel in margins)), TICKS * 2, strict=True):
+        side.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+        side.set_minor_formatter("")
+    for panel in (top, joint, *margins):
+        panel.legend(fontsize=8, frameon=False)
+    save_picture(path, figure)
+
+
+if __name__ == "__main__":
+    main()
