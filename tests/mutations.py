@@ -763,8 +763,8 @@ MUTATIONS = (
     mutation(
         "native-slopes-by-sizes-forgotten",
         "native/march.py",
-        "(tangents[0].pairs, shape.offsets, shape.radii, shape.sizes)",
-        "(tangents[0].pairs, shape.offsets, shape.radii)",
+        "(shape.radii, shape.sizes)",
+        "(shape.radii,)",
         "test_adjoints_of_unequal_spheres_and_derivatives_by_sizes_are_those_of_the_definition",
     ),
     # ---------------------------------------------------------------- the GPU's half of it
@@ -1282,11 +1282,25 @@ MUTATIONS = (
         "test_each_doubt_is_that_of_its_replica_alone",
     ),
     mutation(
-        "offsets-without-derivatives",
-        "derivatives/gradient.py",
-        '(place == ".system.clump.offsets" and not offsets)',
-        'place == ".system.clump.offsets"',
-        "test_offsets_are_differentiated_by_when_they_are_named_and_not_otherwise",
+        "tangent-of-offsets-lost",
+        "cpu/block.h",
+        "if (deforms) return function(offsets);",
+        "",
+        "test_both_modes_agree_with_plain_jax[H-True]",
+    ),
+    mutation(
+        "adjoint-of-offsets-of-the-first-chunk",
+        "cpu/adjoint.h",
+        "chunk < chunks(); ++chunk) of_offset",
+        "chunk < 1; ++chunk) of_offset",
+        "test_both_modes_agree_with_plain_jax[H-True]",
+    ),
+    mutation(
+        "gpu-tangent-of-offsets-lost",
+        "cuda/step.h",
+        "a.along_offsets.of(entry)[row * a.replicas + replica]",
+        "0.0",
+        KERNELS + "[H]",
     ),
     mutation(
         "length-of-quaternions-counts",

@@ -25,8 +25,7 @@ BEGIN, END = "<!-- made by docs/make/derivatives_page.py -->", "<!-- end -->"
 STEP = 1e-7  # of a difference, over the size of a number: contacts of 27 grains hardly change within it
 DIRECTIONS = 5  # the median over these is not that of a step in which a contact began to slide
 LARGEST_ERROR = 2e-2  # as in tests/derivatives/test_gradient.py
-BY_SHAPE = "pack.clump.offsets"
-PLAIN = {BY_SHAPE: "plain JAX", "pack.clump.sizes": "forward native, reverse plain JAX"}
+PLAIN = {"pack.clump.sizes": "forward native, reverse plain JAX"}
 ZERO = {  # inputs whose slope is 0, and why
     "material.radius": "a unit",
     "material.modulus": "a unit",
@@ -107,11 +106,8 @@ def rows() -> list[str]:
     lines, cost = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"], costs()
     known: set[str] = set()
     for what, experiment in experiments():
-        names = [name for name in names_of(experiment) if name not in known and (name != BY_SHAPE or not known)]
-        quick = [name for name in names if name != BY_SHAPE]
-        slopes = dict(gm.value_and_grad(experiment, quick, loss=score, progress=False).slope)
-        if len(quick) < len(names):
-            slopes |= gm.value_and_grad(experiment, [BY_SHAPE], loss=score, progress=False).slope
+        names = [name for name in names_of(experiment) if name not in known]
+        slopes = gm.value_and_grad(experiment, names, loss=score, progress=False).slope
         for name in names:
             known.add(name)
             if not np.any(np.asarray(slopes[name])):

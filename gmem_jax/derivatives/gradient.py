@@ -5,7 +5,7 @@
 and the replay of one chunk. What is differentiated by is named: "gamma0", "friction.mu", "signals.amplitudes", ...
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
@@ -43,36 +43,24 @@ def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
     return experiment.compare(p_sig).fidelity
 
 
-_OFFSETS = "pack.clump.offsets"
-
-
-def _needs_offsets(names: Iterable[str]) -> bool:
-    """Whether any of the named parameters is or holds the offsets of the spheres in a grain."""
-    return any(f"{_OFFSETS}.".startswith(f"{name}.") for name in names)
-
-
-def _is_moving(path: Any, leaf: Any, offsets: bool) -> bool:
-    """Whether a number of a simulation is differentiated by: not the list or the mark, offsets only if asked for.
-
-    The native library has no derivatives by offsets: with them all steps are differentiated in plain JAX.
-    """
-    place = jax.tree_util.keystr(path)
-    fixed = place.startswith((".system.pairs", ".mark")) or (place == ".system.clump.offsets" and not offsets)
+def _is_moving(path: Any, leaf: Any) -> bool:
+    """Whether a number of a simulation is differentiated by: not the list or the mark."""
+    fixed = jax.tree_util.keystr(path).startswith((".system.pairs", ".mark"))
     return not fixed and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
 
 
-def _numbers(simulation: Simulation, offsets: bool) -> list[jax.Array]:
+def _numbers(simulation: Simulation) -> list[jax.Array]:
     """The numbers of a simulation that are differentiated by."""
     leaves = jax.tree_util.tree_leaves_with_path(simulation)
-    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf, offsets)]
+    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf)]
 
 
-def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array], offsets: bool) -> Simulation:
+def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array]) -> Simulation:
     """The simulation with other numbers in the place of `_numbers`."""
     left = iter(numbers)
     leaves, structure = jax.tree_util.tree_flatten_with_path(simulation)
     filled: Simulation = jax.tree.unflatten(
-        structure, [next(left) if _is_moving(path, leaf, offsets) else leaf for path, leaf in leaves]
+        structure, [next(left) if _is_moving(path, leaf) else leaf for path, leaf in leaves]
     )
     return filled
 
@@ -85,32 +73,32 @@ def _state(moving: Moving, status: jax.Array) -> State:
     return State(moving[0], moving[1], status, moving[2], moving[3])
 
 
-def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int, offsets: bool) -> Any:
+def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int) -> Any:
     """A chunk and its tangent."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        changed = _with_numbers(simulation, numbers, offsets)
+        changed = _with_numbers(simulation, numbers)
         after, sample = rollout_chunk(changed, _state(moving, state.status), first, count, most)
         return (_moving(after), sample.pressure), (after.status, sample)
 
-    at = (_numbers(simulation, offsets), _moving(state))
+    at = (_numbers(simulation), _moving(state))
     (moving, _), slope, (status, sample) = jax.jvp(chunk, at, slopes, has_aux=True)
     return _state(moving, status), sample, slope
 
 
-def _pull(simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving, jax.Array], offsets: bool) -> Any:
+def _pull(simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving, jax.Array]) -> Any:
     """Derivatives by numbers and state before a chunk, from those by state and pressures after it."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        changed = _with_numbers(simulation, numbers, offsets)
+        changed = _with_numbers(simulation, numbers)
         after, sample = rollout(changed, _state(moving, state.status), rows)
         return _moving(after), sample.pressure
 
-    return jax.vjp(chunk, _numbers(simulation, offsets), _moving(state))[1](slopes)
+    return jax.vjp(chunk, _numbers(simulation), _moving(state))[1](slopes)
 
 
-_pushed = Compiled(_push, static_argnames=("most", "offsets"))
-_pulled = Compiled(_pull, static_argnames="offsets")
+_pushed = Compiled(_push, static_argnames="most")
+_pulled = Compiled(_pull)
 
 
 @dataclass
@@ -120,13 +108,11 @@ class _Pushing(Observer):
     Attributes:
         numbers: tangent of the simulation's numbers.
         moving: tangent of the state now; None as long as nothing has one.
-        offsets: whether sphere offsets are among the numbers.
         slopes: derivatives of the pressures of every stage, by chunks.
     """
 
     numbers: Any
     moving: Moving | None
-    offsets: bool
     slopes: dict[str, list[np.ndarray]] = field(default_factory=dict)
     _next: tuple[Moving, jax.Array] | None = None
 
@@ -135,9 +121,7 @@ class _Pushing(Observer):
         if self.moving is None:
             return None
         slopes = (self.numbers, self.moving)
-        after, sample, self._next = _pushed(
-            chunk.simulation, chunk.state, chunk.row, chunk.count, slopes, most=CHUNK, offsets=self.offsets
-        )
+        after, sample, self._next = _pushed(chunk.simulation, chunk.state, chunk.row, chunk.count, slopes, most=CHUNK)
         return after, sample
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
@@ -166,7 +150,6 @@ class _Piece(NamedTuple):
 class _Remembering(Observer):
     """Remembers the way, to go back on it."""
 
-    offsets: bool  # whether sphere offsets are among the numbers
     tape: list[_Piece] = field(default_factory=list)
     numbers: Any = None  # derivatives by the simulation's numbers so far
     reads: Mapping[str, np.ndarray] = field(default_factory=dict)  # derivatives by the pressures that are read
@@ -181,7 +164,7 @@ class _Remembering(Observer):
             shape = (count, 3, before.replicas)
             own = np.zeros(shape) if known is None else known[first : first + count]
             back_from = (slope, jnp.asarray(own))
-            by_numbers, by_state = _pulled(simulation, before, rows, back_from, offsets=self.offsets)
+            by_numbers, by_state = _pulled(simulation, before, rows, back_from)
             self.numbers = by_numbers if self.numbers is None else jax.tree.map(jnp.add, self.numbers, by_numbers)
             moving: Moving = by_state
             return moving
@@ -237,7 +220,7 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
     slope: Moving | None = None
     if any(map(acts_on_prefix, theta)):
         slope = jax.jvp(lambda theta: _moving(along(theta).begin()), (theta,), (tangent,))[1]
-    pushing = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope, _needs_offsets(theta))
+    pushing = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope)
     on.observers = (pushing,)
     samples = on.run_stages(*common)
     if pushing.moving is None:
@@ -286,7 +269,7 @@ def _along(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
 
 def _number_slope(experiment: Experiment, theta: Any, tangent: Any, *, sheared: bool) -> Any:
     def numbers(theta: Any) -> list[jax.Array]:
-        return _numbers(with_values(experiment, theta).simulation(sheared=sheared), _needs_offsets(theta))
+        return _numbers(with_values(experiment, theta).simulation(sheared=sheared))
 
     return jax.jvp(numbers, (theta,), (tangent,))[1]
 
@@ -332,8 +315,7 @@ def value_and_grad(
     Args:
         experiment: where.
         by: what to differentiate by: dotted names of floats or of parts that hold them, like "signals.amplitudes",
-            "friction.mu", "t0" or "pack.position". None within another. "pack.clump" and its offsets take as long as
-            `jax.grad` of plain JAX does: the native library has no derivatives by the shape of a grain.
+            "friction.mu", "t0", "pack.clump" or "pack.position". None within another.
         loss: what is differentiated; default the fidelity.
         checkpoint: where to go on and to keep how far it is on the way back; the way forward, a sixth, is done again.
         progress: told about every chunk of both ways; default a bar in a terminal or a notebook, False for none.
@@ -348,8 +330,7 @@ def value_and_grad(
     common, own = experiment.phases
     on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))
     on.total_work = _work(experiment, on)
-    offsets = _needs_offsets(by)
-    prefix, rest = _Remembering(offsets), _Remembering(offsets)
+    prefix, rest = _Remembering(), _Remembering()
     on.observers = (prefix,) if any(map(acts_on_prefix, by)) else ()
     _, pull_begin = jax.vjp(lambda theta: _moving(along(theta).begin()), theta)
     on.run_stages(*common)
@@ -377,7 +358,7 @@ def value_and_grad(
 
     def pull_numbers(sheared: bool, found: Any) -> Any:
         def numbers(theta: Any) -> list[jax.Array]:
-            return _numbers(along(theta).simulation(sheared=sheared), offsets)
+            return _numbers(along(theta).simulation(sheared=sheared))
 
         return jax.vjp(numbers, theta)[1](found)[0]
 

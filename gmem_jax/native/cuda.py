@@ -148,18 +148,18 @@ def is_sound(pairs: Any) -> jax.Array:
     return count & jnp.all(real | (rows == 2 * capacity))
 
 
-def between_steps(fixed: Any, history: Sequence[Any], points: int, kinds: int, lanes: int) -> list[Any]:
+def between_steps(fixed: Any, history: Sequence[Any], grains: int, points: int, kinds: int, lanes: int) -> list[Any]:
     """Shapes of what the kernels need from one step to the next; see src/cuda/arguments.h.
 
     Args:
         fixed: of the call.
         history: of the call, leaves [1, P, ..., B].
+        grains: N.
         points: Q of the Mindlin law, or 0.
         kinds: one for values, two for values and derivatives.
         lanes: replicas of all entries, L.
     """
     spheres, rows = fixed.incidence.shape[1], fixed.first.shape[1]
-    grains = spheres // fixed.offsets.shape[1]
 
     def array(*shape: int, dtype: Any = jnp.float64) -> Any:
         return jax.ShapeDtypeStruct((1, *shape, lanes), dtype)
@@ -201,7 +201,8 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
     blank, odd = 2 * fixed.first.shape[1], -fixed.incidence.shape[2] % 4
     lists["incidence"] = jnp.pad(fixed.incidence, ((0, 0), (0, 0), (0, odd)), constant_values=blank)  # read in fours
     numbers = jnp.where(sound[:, None, None], arrays.parameters, jnp.nan)  # there is no other way to refuse a list
-    before = [*arrays.fields, *lists.values(), fixed.images, fixed.offsets, fixed.radii, fixed.sizes]
+    before = [*arrays.fields, *lists.values(), fixed.images]
+    before += [arrays.offsets[..., 0], fixed.radii, fixed.sizes]
     before += [numbers, arrays.walls]
     results = [jax.ShapeDtypeStruct((entries, *shape.shape[len(outer) :]), shape.dtype) for shape in shapes]
     aliases = {}
@@ -210,8 +211,9 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
             argument, result = len(before) + number, len(arrays.fields) + 1 + number
             if leaf.shape == results[result].shape:
                 aliases[argument] = result
-    lanes = entries * arrays.fields[0].shape[-1]
-    between = between_steps(fixed, arrays.history, call.points, 2 if slopes else 1, lanes)
+    _, grains, _, replicas = arrays.fields[0].shape
+    lanes = entries * replicas
+    between = between_steps(fixed, arrays.history, grains, call.points, 2 if slopes else 1, lanes)
     ffi = jax.ffi.ffi_call(target, [*results, *between], input_output_aliases=aliases)
     found = ffi(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict())
     moved = [leaf.reshape(shape.shape) for leaf, shape in zip(found, shapes, strict=False)]

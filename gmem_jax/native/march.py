@@ -162,8 +162,8 @@ def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -
 
     system, _, history, boxes, *_ = primals
     shape = tangents[0].clump
-    if not all(map(_is_zero, jax.tree.leaves((tangents[0].pairs, shape.offsets, shape.radii, shape.sizes)))):
-        # The library has no derivatives by these.
+    if not all(map(_is_zero, jax.tree.leaves((shape.radii, shape.sizes)))):
+        # The library has no derivatives by these. By lists there is none: they say where contacts can be.
         _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
         return _bin(mode, *primals), slope
     arrays, along = jax.jvp(lambda *varied: arrays_of(*filled(varied)), varied, directions)
@@ -219,7 +219,7 @@ class PlainDefinition:
         empty: System = jax.tree.unflatten(self.system, [None] * self.system.num_leaves)
         dt, drag, mass, *inertia = arrays.parameters[:6]
         own, gravity, edges = arrays.parameters[9:-7], arrays.parameters[-7], jnp.split(arrays.parameters[-6:], 2)
-        clump = replace(empty.clump, offsets=fixed.offsets, mass=mass, inertia=jnp.stack(inertia))
+        clump = replace(empty.clump, offsets=arrays.offsets, mass=mass, inertia=jnp.stack(inertia))
         if fixed.sizes.shape[-1]:
             clump = replace(clump, radii=fixed.radii[:, 0], sizes=fixed.sizes[:, 0])
         law: Any = empty.friction
@@ -262,7 +262,7 @@ def fixed_of(system: System) -> Fixed:
     counts, columns = (clump.spheres, len(pairs.reference) // clump.spheres), int(not clump.equal)
     lengths = zip((clump.radii, clump.sizes), counts, strict=True)
     radii, sizes = (jnp.ones((count, columns)) if own is None else own[:, None] for own, count in lengths)
-    return Fixed(*candidates, clump.offsets, images, radii, sizes)
+    return Fixed(*candidates, images, radii, sizes)
 
 
 def arrays_of(
@@ -270,8 +270,10 @@ def arrays_of(
 ) -> Arrays:
     """Arguments with derivatives."""
     walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
-    parameters = _parameters(system, numbers, cell, grains.position.shape[-1])
-    return Arrays(jax.tree.leaves(grains), parameters, walls, jax.tree.leaves(history))
+    replicas = grains.position.shape[-1]
+    parameters, offsets = _parameters(system, numbers, cell, replicas), system.clump.offsets
+    centres = jnp.broadcast_to(offsets[..., None], (*offsets.shape, replicas))
+    return Arrays(jax.tree.leaves(grains), parameters, walls, centres, jax.tree.leaves(history))
 
 
 def _result(grains: Grains, history: Any, results: StepOutput) -> _Result:

@@ -64,7 +64,6 @@ class Fixed(NamedTuple):
         incidence: [S, C].
         reference: of the first replica, [S, 3].
         smallest: [3].
-        offsets: sphere centres of a grain, [K, 3], in R.
         images: of `Pairs.image`, [P, 3]; [P, 0] without periodic axes.
         radii: of the spheres of a grain of size 1, [K, 1], in R; [K, 0] where all spheres of the pack are of radius 1.
         sizes: of the grains, [N, 1]; or [N, 0] likewise.
@@ -76,7 +75,6 @@ class Fixed(NamedTuple):
     incidence: jax.Array
     reference: jax.Array
     smallest: jax.Array
-    offsets: jax.Array
     images: jax.Array
     radii: jax.Array
     sizes: jax.Array
@@ -89,12 +87,14 @@ class Arrays(NamedTuple):
         fields: leaves of `Grains`, [N, 3 or 4, B].
         parameters: rows of src/physics/parameters.h's parameter array, [rows, B].
         walls: lower, upper and their velocities of every step, [steps, 12, B].
+        offsets: sphere centres of a grain, [K, 3, B], in R; alike in all replicas, as their derivatives need not be.
         history: leaves of the history, [P, ..., B].
     """
 
     fields: list[jax.Array]
     parameters: jax.Array
     walls: jax.Array
+    offsets: jax.Array
     history: list[jax.Array]
 
 
@@ -193,7 +193,7 @@ def _library(
     target: str, outputs: Callable[[Any], list[Any]], call: Call, in_place: bool, parts: Any
 ) -> Sequence[jax.Array]:
     fixed, arrays, *slopes = parts
-    pack = fixed._asdict()
+    pack = {**fixed._asdict(), "offsets": arrays.offsets[..., 0]}
     del pack["incidence"]
     before = [*arrays.fields, *pack.values(), arrays.parameters, arrays.walls]
     shapes, aliases = outputs(parts), {}

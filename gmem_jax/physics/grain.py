@@ -52,7 +52,7 @@ class Clump:
     @property
     def spheres(self) -> int:
         """Number of spheres K in one grain."""
-        return int(self.offsets.shape[-2])
+        return len(self.offsets)
 
     @property
     def equal(self) -> bool:

@@ -64,7 +64,7 @@ class Pairs:
 
 def sphere_offsets(quaternion: jax.Array, clump: Clump) -> jax.Array:
     """Sphere centres relative to their grain's centre in the lab frame, [N, K, 3, B], of quaternions [N, 4, B]."""
-    body = clump.offsets[None, :, None, :, None]
+    body = clump.offsets.reshape(*clump.offsets.shape[:2], -1)[None, :, None]
     if clump.sizes is not None:
         body = body * clump.sizes[:, None, None, None, None]
     return jnp.sum(matrix(quaternion)[:, None] * body, axis=-2)

@@ -12,9 +12,11 @@ import pytest
 from scenes import TETRA_27, with_skin
 
 import gmem_jax as gm
+from gmem_jax import native
 from gmem_jax.derivatives import gradient, jacobian
 from gmem_jax.experiment.experiment import acts_on_prefix, value_at
 from gmem_jax.experiment.recall import run
+from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.reading import classify
@@ -119,9 +121,6 @@ def whole(experiment: gm.Experiment) -> gm.Experiment:
     return gm.replace(given, {"friction.spinning": 0.9})
 
 
-BY_SHAPE = "pack.clump.offsets"
-
-
 def require_differences(experiment: gm.Experiment, slopes: dict[str, Any]) -> None:
     """Each derivative, along some direction, is that of central differences."""
     for number, (name, slope) in enumerate(slopes.items()):
@@ -136,9 +135,9 @@ def require_differences(experiment: gm.Experiment, slopes: dict[str, Any]) -> No
         np.testing.assert_allclose(np.vdot(slope, toss), difference, rtol=2e-2, atol=1e-6, err_msg=name)
 
 
-def test_every_name_but_the_shape_of_the_grain_has_the_derivative_of_differences(whole: gm.Experiment) -> None:
-    names = [name for name in all_names(whole) if name != BY_SHAPE]
-    assert {"pack.lower", "pack.quaternion", "pack.clump.inertia", "material.poisson", "t0", "hold_drag"} < set(names)
+def test_every_name_has_the_derivative_of_differences(whole: gm.Experiment) -> None:
+    names = all_names(whole)
+    assert {"pack.lower", "pack.quaternion", "pack.clump.offsets", "material.poisson", "t0", "hold_drag"} < set(names)
     found = gm.value_and_grad(whole, names, loss=smooth)
     require_differences(whole, found.slope)
     moved = {name for name, slope in found.slope.items() if np.any(np.asarray(slope))}
@@ -147,39 +146,26 @@ def test_every_name_but_the_shape_of_the_grain_has_the_derivative_of_differences
     assert set(names) - moved == still | units  # delta0 was given
 
 
+def score(experiment: gm.Experiment) -> jax.Array:
+    return smooth(experiment, gm.recall(experiment).p_sig)
+
+
 @pytest.mark.slow
-def test_every_name_has_the_derivative_of_grad_and_the_shape_of_the_grain_that_of_differences(
-    whole: gm.Experiment,
-) -> None:
+@pytest.mark.parametrize("backend", ["auto", "jax"])
+def test_every_name_has_the_derivative_of_grad_by_the_whole_experiment(whole: gm.Experiment, backend: Any) -> None:
     names = all_names(whole)
     found = gm.value_and_grad(whole, names, loss=smooth).slope
-    require_differences(whole, {BY_SHAPE: found[BY_SHAPE]})
-
-    def score(theta: dict[str, Any]) -> jax.Array:
-        changed = gm.replace(whole, theta)
-        return smooth(changed, gm.recall(changed).p_sig)
-
-    expected = jax.grad(score)({name: jnp.asarray(value_at(whole, name)) for name in names})
+    expected = jax.jit(jax.grad(score, allow_int=True))(gm.replace(whole, backend=backend))
     for name in names:
-        scale = np.abs(expected[name]).max()
-        np.testing.assert_allclose(found[name], expected[name], rtol=1e-6, atol=1e-8 * scale, err_msg=name)
-    assert np.all(np.abs(found[BY_SHAPE]).max(axis=1) > 0.0)
+        slope = np.asarray(value_at(expected, name))
+        np.testing.assert_allclose(found[name], slope, rtol=1e-6, atol=1e-8 * np.abs(slope).max(), err_msg=name)
 
 
-@pytest.mark.slow
-def test_the_forward_mode_has_the_shape_of_the_grain_too(whole: gm.Experiment) -> None:
-    offsets, toss = whole.pack.clump.offsets, jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
-    along = gradient.push(whole, {BY_SHAPE: toss}).p_sig_slope
-    up, down = (run(gm.replace(whole, {BY_SHAPE: offsets + by * toss})).p_sig for by in (1e-7, -1e-7))
-    np.testing.assert_allclose(along, (up - down) / 2e-7, atol=2e-2 * np.abs(along).max())
-
-
-def test_offsets_are_differentiated_by_when_they_are_named_and_not_otherwise(experiment: gm.Experiment) -> None:
-    simulation = experiment.simulation(sheared=True)
-    for names, asked in ((["pack.clump"], True), ([BY_SHAPE], True), (["pack.clump.mass", "gamma0"], False)):
-        assert gradient._needs_offsets(names) == asked
-        shapes = [number.shape for number in gradient._numbers(simulation, gradient._needs_offsets(names))]
-        assert ((4, 3) in shapes) == asked
+@pytest.mark.skipif(not native.available()[0], reason=native.available()[1])
+def test_a_gradient_by_the_whole_experiment_is_native(whole: gm.Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(dynamics, "march")  # the definition of the steps
+    slope = jax.eval_shape(jax.grad(score, allow_int=True), whole)
+    assert slope.pack.clump.offsets.shape == (4, 3)
 
 
 def test_names_that_cannot_be_differentiated_by_are_refused(experiment: gm.Experiment) -> None:

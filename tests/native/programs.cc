@@ -166,21 +166,24 @@ void sphere() {
   for (int n = 0; n < kWalls; ++n) walls[n] = splat<Real>(n < 3 ? -1.5 : n < 6 ? 1.5 : 0.0) + splat<Real>(0.1) * m.random.lanes();
   const Real body[] = {splat<Real>(0.3), splat<Real>(-0.4), splat<Real>(0.2)};
   const Real* in[] = {m.own, m.numbers, body, walls};
-  Real* bar[] = {m.own_bar, m.bar_of_numbers, nullptr, wall_bar};
+  Real body_bar[3] = {};
+  Real* bar[] = {m.own_bar, m.bar_of_numbers, body_bar, wall_bar};
   pull_back<OneSphere<near>>(in, m.result_bar, bar);
   const auto half = leaves<HalfStep<Taped>>(m.own);
   const auto rotation = leaves<Matrix<Taped>>(m.own + kTurnedRotation);
   const auto parameters = leaves<GrainParameters<Taped>>(m.numbers);
+  const int first_body = m.recorded.mark().slots;
+  const auto offset = leaves<Vec<Taped>>(body);
   const int first_wall = m.recorded.mark().slots;
   const auto box = leaves<WallState<Taped>>(walls);
   WallForces<Taped> on{};
-  const Vec<Taped> offset{constant(body[0]), constant(body[1]), constant(body[2])};
   const Vec<Taped> centre = sphere_of(parameters, half, rotation, offset, near, box, on);
   const Real* seeds = m.result_bar;
   for (const Vec<Taped>& part : {centre, on.force, on.torque, on.lower, on.upper}) seed(part, seeds);
   m.recorded.reverse({});
   CHECK(same(m.first, m.own_bar, kTurned));
   CHECK(same(m.first + kTurned, m.bar_of_numbers, kGrainNumbers) == near);
+  CHECK(same(first_body, body_bar, 3));
   CHECK(same(first_wall, wall_bar, kWalls) == near);
 }
 

@@ -56,7 +56,7 @@ def motion(gamma0: Any = 3e-2, heights: jax.Array = HEIGHTS) -> Motion:
 def end(march: native.March, system: System, state: State, theta: dict[str, Any]) -> Any:
     """Everything that 20 more steps give, as a function of everything they depend on."""
     law = replace(system.friction, **theta["law"])
-    clump = replace(system.clump, mass=theta["mass"], inertia=theta["inertia"])
+    clump = replace(system.clump, **theta["clump"])
     state = replace(state, grains=theta["grains"], history=theta["history"])
     after, sample = advance_by(march)(
         replace(system, friction=law, clump=clump, gravity=theta["gravity"]),
@@ -77,8 +77,7 @@ def arguments(system: System, state: State) -> dict[str, Any]:
         "grains": state.grains,
         "history": state.history,
         "law": {name: jnp.asarray(getattr(system.friction, name)) for name in names},
-        "mass": system.clump.mass,
-        "inertia": system.clump.inertia,
+        "clump": {name: getattr(system.clump, name) for name in ("offsets", "mass", "inertia")},
         "gravity": jnp.asarray(1e-3),
         "gamma0": jnp.asarray(3e-2),
         "heights": HEIGHTS,

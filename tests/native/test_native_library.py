@@ -119,6 +119,7 @@ def test_want_of_memory_is_an_error_and_leaves_the_library_working() -> None:
         "fields": [leaf[..., :1] for leaf in given["fields"]],
         "parameters": given["parameters"][:, :1],
         "walls": jnp.zeros((steps, 12, 1)),
+        "offsets": given["offsets"][..., :1],
         "history": [jnp.zeros((1, points, 2, 1)), jnp.zeros((1, 3, 1)), jnp.zeros((1, 1, 1))],
     }
     call, fixed, arrays = parts({**called(points=points)(given), **alone})

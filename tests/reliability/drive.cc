@@ -123,8 +123,10 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   lane.walls = array(kSteps * kWalls, false, wall);
   slope.parameters = array(kRows, false, small);
   slope.walls = array(kSteps * kWalls, false, small);
+  lane.offsets = slope.offsets = array(kSpheres * 3, false, small);
   lane.pressure = slope.pressure = array(3, !back, small);
   if (back) slope.parameters_out = array(kRows, true, small), slope.walls_out = array(kSteps * kWalls, true, small);
+  if (back) slope.offsets_out = array(kSpheres * 3, true, small);
 
   const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed};
   const auto store = plan_for({n, kSpheres, candidates, scene.first.data(), scene.second.data(),
@@ -136,8 +138,8 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     for (int f = 0; f < kFields; ++f) of.grains_in[f] += l, of.grains_out[f] += l;
     for (int leaf = 0; leaf < kMaxHistory; ++leaf)
       if (of.history_in[leaf]) of.history_in[leaf] += l, of.history_out[leaf] += l;
-    of.parameters += l, of.walls += l, of.pressure += l;
-    if (of.parameters_out) of.parameters_out += l, of.walls_out += l;
+    of.parameters += l, of.walls += l, of.offsets += l, of.pressure += l;
+    if (of.parameters_out) of.parameters_out += l, of.walls_out += l, of.offsets_out += l;
     return of;
   };
   std::vector<Lane> lanes, slopes;

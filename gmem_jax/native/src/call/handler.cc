@@ -55,7 +55,7 @@ const Kernel& best_kernel(Task task, std::size_t replicas) {
   return of_task(baseline::kernel, baseline_derivatives::kernel);
 }
 
-enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kOffsets, kImages, kRadii, kSizes, kParameterRows, kWallRows, kHistoryIn };
+enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kImages, kRadii, kSizes, kOffsets, kParameterRows, kWallRows, kHistoryIn };
 constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
 
 struct Signature {
@@ -68,11 +68,11 @@ struct Signature {
 Signature signature(Task task, Law law) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
                       {"validities", "P", ffi::PRED},   {"reference centres", "S3"},
-                      {"smallest lengths", "3"},        {"offsets", "K3"},
-                      {"images", "PI", ffi::S8},        {"radii", "KU"},
-                      {"sizes", "NU"}};
+                      {"smallest lengths", "3"},        {"images", "PI", ffi::S8},
+                      {"radii", "KU"},                  {"sizes", "NU"},
+                      {"offsets", "K3"}};
   const Wants fields = fields_of_grains(), numbers = numbers_of_steps(), history = histories(law);
-  const Wants arguments = fields + pack + numbers + history, arrays = fields + numbers + history;
+  const Wants arguments = fields + pack + numbers + history, arrays = arrays_of_steps(law);
   const Wants moved = fields + pressures() + history;
   switch (task) {
     case Task::tangent: return {arguments + arrays, moved};
@@ -172,10 +172,11 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       Lane slope = lane;
       if (task != Task::forward)
         for (int f = 0; f < kFields; ++f) slope.grains_in[f] = next_argument();
-      if (task == Task::tangent) slope.parameters = next_argument(), slope.walls = next_argument();
+      if (task == Task::tangent)
+        slope.parameters = next_argument(), slope.walls = next_argument(), slope.offsets = next_argument();
       if (task == Task::adjoint) {
         slope.pressure = next_argument();
-        slope.parameters_out = next_result(), slope.walls_out = next_result();
+        slope.parameters_out = next_result(), slope.walls_out = next_result(), slope.offsets_out = next_result();
       } else {
         lane.pressure = slope.pressure = next_result();
       }

@@ -43,6 +43,10 @@ inline Wants fields_of_grains() {
           {"spins", "N3B"},     {"accelerations", "N3B"}, {"spin rates", "N3B"}};
 }
 inline Wants numbers_of_steps() { return {{"parameters", "RB"}, {"walls", "TWB"}}; }
+// What steps are differentiated by.
+inline Wants arrays_of_steps(Law law) {
+  return fields_of_grains() + numbers_of_steps() + Wants{{"offsets", "K3B"}} + histories(law);
+}
 inline Wants pressures() { return {{"pressures", "3B"}}; }
 
 inline void require_law(int64_t law, int64_t variant, int64_t points) {

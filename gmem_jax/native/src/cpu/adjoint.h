@@ -73,11 +73,14 @@ struct AdjointLayout {
   V* history_bar;   // [candidates, kHistory and the forces of Mindlin's segments, 2 Q]
   bool* has_bar;    // [candidates]: whether their bars, and those of their remotes, may be other than zero
   V* domain_bar;    // [domains, kParameters + kLawNumbers]
-  V* chunk_bar;     // [chunks, kGrainNumbers]
+  V* chunk_bar;     // [chunks, kGrainNumbers and the offsets, 3 K]
   V* wall_bar;      // [chunks, kWalls], of one step
 
   // Numbers in the history of a contact.
   static int remembered(const Problem& p) { return Law::kHistory + (Law::kLayered ? 2 * p.points : 0); }
+
+  // Rows of `chunk_bar`.
+  static int chunk_rows(const Problem& p) { return kGrainNumbers + 3 * p.spheres_per_grain; }
 
   // With `fills` the traces of the steps are written down too: one thread does it, the others see it after a barrier.
   void place(const Problem& p, const Block& block, Arena& arena, bool fills = false) {
@@ -104,7 +107,7 @@ struct AdjointLayout {
     history_bar = arena.take<V>(candidates * remembered(p));
     has_bar = arena.take<bool>(candidates);
     domain_bar = arena.take<V>(static_cast<std::size_t>(plan.domains) * (kParameters + kLawNumbers));
-    chunk_bar = arena.take<V>(chunks * kGrainNumbers);
+    chunk_bar = arena.take<V>(chunks * chunk_rows(p));
     wall_bar = arena.take<V>(chunks * kWalls);
   }
 };
@@ -115,7 +118,7 @@ struct Adjoint : AdjointLayout<Law> {
   using Layout::state, Layout::total, Layout::trace, Layout::state_bar, Layout::mid_bar, Layout::sphere_bar;
   using Layout::remote_bar, Layout::history_bar, Layout::has_bar, Layout::domain_bar;
   using Layout::chunk_bar, Layout::wall_bar;
-  using Layout::remembered;
+  using Layout::remembered, Layout::chunk_rows;
   using V = Real;
   using Forward = Engine<Replicas<Law, Real>>;
 
@@ -144,7 +147,7 @@ struct Adjoint : AdjointLayout<Law> {
 
   int chunks() const { return gmem::GMEM_ISA::chunks(problem); }
   V* of_domain(int domain) const { return domain_bar + static_cast<std::size_t>(domain) * (kParameters + kLawNumbers); }
-  V* of_chunk(int chunk) const { return chunk_bar + static_cast<std::size_t>(chunk) * kGrainNumbers; }
+  V* of_chunk(int chunk) const { return chunk_bar + static_cast<std::size_t>(chunk) * chunk_rows(problem); }
   V* of_grain(V* array, int u, int rows) const { return array + static_cast<std::size_t>(u) * rows; }
 
   // Calls `each(u)` for this rank's grains.
@@ -238,7 +241,7 @@ struct Adjoint : AdjointLayout<Law> {
       for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c) to_layers(c);
     if (rank == 0) {
       std::memset(domain_bar, 0, sizeof(V) * plan.domains * (kParameters + kLawNumbers));
-      std::memset(chunk_bar, 0, sizeof(V) * chunks() * kGrainNumbers);
+      std::memset(chunk_bar, 0, sizeof(V) * chunks() * chunk_rows(problem));
     }
     team.barrier();
   }
@@ -318,6 +321,11 @@ struct Adjoint : AdjointLayout<Law> {
     parameter.add_bars(sum);
     for (int r = 0; r < kRows; ++r)  // without periodic axes there is nothing before the steps
       write([](const Lane& lane) { return lane.parameters_out; }, r, r < kParameters ? sum[r] : V{});
+    for (int row = 0; row < 3 * problem.spheres_per_grain; ++row) {
+      V of_offset{};
+      for (int chunk = 0; chunk < chunks(); ++chunk) of_offset += of_chunk(chunk)[kGrainNumbers + row];
+      write([](const Lane& lane) { return lane.offsets_out; }, row, of_offset);
+    }
   }
 
   // --- backwards
@@ -546,10 +554,10 @@ struct Adjoint : AdjointLayout<Law> {
       store_numbers(turned + kTurnedRotation, matrix(half.orientation));
       std::copy_n(mid, kMidForce, turned_bar);
       for (int k = 0; k < spheres; ++k) {
-        const double* offset = block.pack->offsets + 3 * k;
-        const V body[] = {splat<V>(offset[0]), splat<V>(offset[1]), splat<V>(offset[2])};
+        V body[3];
+        store_vec(body, body_at<V>(block.pack->offsets + 3 * k));
         const V* in[] = {turned, grain_numbers, body, walls};
-        V* bar[] = {turned_bar, of_chunk(chunk), nullptr, of_walls};
+        V* bar[] = {turned_bar, of_chunk(chunk), of_chunk(chunk) + kGrainNumbers + 3 * k, of_walls};
         const Vec<V> centre = load_vec(forward.mode.sphere + 3 * (static_cast<std::size_t>(u) * spheres + k));
         if (bits_less(V{}, deepest(splat<V>(1.0), centre, box))) {
           V result_bar[OneSphere<true>::kResults];

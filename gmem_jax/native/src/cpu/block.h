@@ -59,6 +59,7 @@ struct EngineLayout {
 
   V* hot;         // [units, kHot]
   V* cold;        // [units, kCold]
+  V* offsets;     // of the pack, where they carry derivatives, [K, 3]
   double* walls;  // partial sums, [chunks, 2, 3] in the mode's own layout
   V* fastest;     // squares of the largest half-step velocity and spin, [chunks, 2]
   double* sections;  // of periodic boxes, as `walls`: see `section`
@@ -69,6 +70,7 @@ struct EngineLayout {
     const std::size_t units = Mode::units(p), chunks = gmem::GMEM_ISA::chunks(p);
     hot = arena.take<V>(units * kHot);
     cold = arena.take<V>(units * kCold);
+    offsets = arena.take<V>(Mode::kDual ? static_cast<std::size_t>(p.spheres_per_grain) * 3 : 0);
     walls = arena.take<double>(chunks * 6 * kNumber);
     fastest = arena.take<V>(chunks * 2);
     sections = arena.take<double>(p.periodic ? chunks * 6 * kNumber : 0);
@@ -81,7 +83,7 @@ template <class Mode>
 struct Engine : EngineLayout<Mode> {
   using Layout = EngineLayout<Mode>;
   using V = typename Mode::Number;
-  using Layout::hot, Layout::cold, Layout::walls, Layout::fastest, Layout::sections, Layout::through, Layout::kNumber;
+  using Layout::hot, Layout::cold, Layout::offsets, Layout::walls, Layout::fastest, Layout::sections, Layout::through, Layout::kNumber;
 
   const Problem& problem;
   const Block& block;
@@ -95,6 +97,7 @@ struct Engine : EngineLayout<Mode> {
   double outer;         // radius about the centre of a grain of size 1 that holds it
   double travel = 0.0;  // how much closer any two spheres can have come since the call began
   int current = 0;      // step under way
+  bool deforms = false;  // whether the shape of a grain has a derivative
 
   Engine(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : problem(problem), block(block), plan(*block.pack->plan), team(team), rank(rank), mode(problem, block) {
@@ -112,6 +115,17 @@ struct Engine : EngineLayout<Mode> {
       outer = reach > outer ? reach : outer;
     }
     arm *= plan.largest;
+    if constexpr (Mode::kDual)
+      for (int row = 0; row < 3 * problem.spheres_per_grain; ++row)
+        for (int l = 0; l < W; ++l) deforms |= mode.offset(row).slope[l] != 0.0;
+  }
+
+  // Calls `function` with the sphere centres of a grain.
+  template <class Function>
+  GMEM_INLINE auto with_offsets(const Function& function) const {
+    if constexpr (Mode::kDual)
+      if (deforms) return function(offsets);
+    return function(block.pack->offsets);
   }
 
   WallState<V> walls_at(int step) const {
@@ -152,18 +166,21 @@ struct Engine : EngineLayout<Mode> {
     WallForces<V> on{};
     bool near = true;
     if (plan.size) on = unequal_spheres(u, m, box);
-    else near = spheres_of(constants, m, block.pack->offsets, problem.spheres_per_grain, arm, box, on,
-                           [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+    else near = with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
+      return spheres_of(constants, m, offsets, problem.spheres_per_grain, arm, box, on,
+                        [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+    });
     mode.put_grain(u, m.position, m.velocity, m.spin, on.force, on.torque);
     if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
   }
 
   // Apart from `begin`, and given copies: so what `begin` does of equal spheres stays in registers.
   __attribute__((noinline)) WallForces<V> unequal_spheres(int u, HalfStep<V> m, WallState<V> box) {
-    const Pack& pack = *block.pack;
     WallForces<V> on{};
-    spheres_of(constants, m, pack.offsets, pack.radii, problem.spheres_per_grain, mode.size_of(u, &Size::one), outer, box, on,
-               [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+    with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
+      return spheres_of(constants, m, offsets, block.pack->radii, problem.spheres_per_grain, mode.size_of(u, &Size::one), outer,
+                        box, on, [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+    });
     return on;
   }
 
@@ -278,6 +295,8 @@ struct Engine : EngineLayout<Mode> {
     for (int u = share_begin(units); u < share_begin(units, 1); ++u) mode.load_unit(u, hot, cold);
     const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
     for (int c = share_begin(plan.candidates); c < share_begin(plan.candidates, 1); ++c) load_history(mode, c, law);
+    if constexpr (Mode::kDual)
+      for (int row = 0; rank == 0 && row < 3 * problem.spheres_per_grain; ++row) offsets[row] = mode.offset(row);
     if (rank == 0) mode.load_dummies();
     team.barrier();
   }

@@ -168,7 +168,7 @@ struct OneSphere {
     const auto half = inputs<HalfStep<Symbol>>(program, 0, Bar::add);
     const auto rotation = inputs<Matrix<Symbol>>(program, 0, Bar::add, kTurnedRotation);
     const auto parameters = inputs<GrainParameters<Symbol>>(program, 1, Bar::add);
-    const auto body = inputs<Vec<Symbol>>(program, 2, Bar::none);
+    const auto body = inputs<Vec<Symbol>>(program, 2, Bar::add);
     const auto box = inputs<WallState<Symbol>>(program, 3, Bar::add);
     WallForces<Symbol> on{};
     result(program, sphere_of(parameters, half, rotation, body, near, box, on));

@@ -50,6 +50,7 @@ struct Packed : PackedLayout<Law> {
   using V = Real;
   using OfContacts = Real;
   static constexpr bool apart = false;  // see `Replicas::apart`
+  static constexpr bool kDual = false;
   using Layout::kHistoryRows;
   using OfLaw = Law;
 

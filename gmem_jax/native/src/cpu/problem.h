@@ -111,9 +111,11 @@ struct Lane {
   const double* walls;
   double* pressure;
   int steps;
+  const double* offsets;  // only among the slopes of the tangent, [K, 3]
   // Only among the slopes of the adjoint, where "in" is by the results and "out" by the arguments:
   double* parameters_out;
   double* walls_out;
+  double* offsets_out;
 };
 
 struct Block {

@@ -84,7 +84,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   using Number = V;
   using OfContacts = C;
   using OfLaw = Law;
-  static constexpr bool kMixed = !std::is_same<V, C>::value;
+  static constexpr bool kMixed = !std::is_same<V, C>::value, kDual = std::is_same<V, Dual<Real>>::value;
 
   const Problem& problem;
   const Block& block;
@@ -134,6 +134,11 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     return of_lanes<V>(block, [&](const Lane* lanes, int first) {
       return gather(lanes, [array](const Lane& lane) { return lane.*array; }, row, first);
     });
+  }
+
+  // Number `row` of the pack's offsets, with its derivative.
+  Dual<Real> offset(int row) const {
+    return {splat<Real>(block.pack->offsets[row]), gather(block.slopes, [](const Lane& lane) { return lane.offsets; }, row)};
   }
 
   V size_of(int u, double Size::*power) const { return splat<V>(plan.size[u].*power); }

@@ -62,7 +62,8 @@ struct Arguments {
   Entries<const unsigned char> valid;  // [P]
   Entries<const Four> incidence;       // candidates of a sphere, plus P where it is the second one; [N K, C]
   Entries<const signed char> image;    // by how many edges of a periodic box the second sphere is moved, [P, 3]
-  Entries<const double> offsets;
+  Entries<const double> offsets;       // sphere centres of a grain, [K, 3]
+  Entries<const double> along_offsets;  // ... and their derivatives, where there are any, [K, 3, B]
   Entries<const double> radii, sizes;  // where spheres differ in radius: of those of a grain of size 1, and of grains; [K], [N]
   Table parameters, walls, grains_in[kFields], history_in[kMaxHistory];
   Table grains_out[kFields], history_out[kMaxHistory], pressure_out;  // values, or derivatives where they are wanted

@@ -28,9 +28,8 @@ Wants arguments_of(Task task, Law law) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32}, {"validity", "P", ffi::PRED},
                       {"incidence", "SC", ffi::S32},    {"images", "PI", ffi::S8},
                       {"offsets", "K3"},                {"radii", "KU"},              {"sizes", "NU"}};
-  const Wants arrays = fields_of_grains() + numbers_of_steps() + histories(law);
   const Wants all = fields_of_grains() + pack + numbers_of_steps() + histories(law);
-  return task == Task::tangent ? all + arrays : all;
+  return task == Task::tangent ? all + arrays_of_steps(law) : all;
 }
 
 // Histories of the tangent are kept with their values.
@@ -130,6 +129,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.sizes = entries<const double>(in[argument++]);
   a.parameters = read();
   a.walls = read();
+  if (task == Task::tangent) a.along_offsets = entries<const double>(in[slope++]);
   for (std::size_t leaf = 0; leaf < leaves; ++leaf) a.history_in[leaf] = read();
   for (Table& field : a.grains_out) field = write();
   a.pressure_out = write();

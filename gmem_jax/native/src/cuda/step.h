@@ -75,6 +75,16 @@ struct ReplicaView {
   // Number of this lane in an array [..., L].
   long long of_lane(int row) const { return static_cast<long long>(row) * a.lanes + lane; }
 
+  // Number `row` of the sphere centres of a grain, [K, 3].
+  V offset(int row) const {
+    const double value = a.offsets.of(entry)[row];
+    if constexpr (__is_class(V)) {
+      return {value, a.along_offsets.of(entry)[row * a.replicas + replica]};
+    } else {
+      return value;
+    }
+  }
+
   // Of a periodic box at the end of a step, or before the first.
   Cell<V> cell(int step) const {
     if (step >= 0) return Cell<V>::of(a.periodic, walls(step));
@@ -185,8 +195,7 @@ GMEM_INLINE void begin(const ReplicaView<V>& on, int step, const GrainParameters
   cold.put(c, m.orientation.w), cold.put(c + 1, m.orientation.v);
   const Matrix<V> rotation = matrix(m.orientation);
   for (int k = 0; k < a.spheres; ++k) {
-    const double* body = a.offsets.of(on.entry) + 3 * k;
-    Vec<V> lever = rotation * Vec<V>{splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])};
+    Vec<V> lever = rotation * Vec<V>{on.offset(3 * k), on.offset(3 * k + 1), on.offset(3 * k + 2)};
     if constexpr (unequal) lever = splat<V>(size_of(on, on.item)) * lever;
     sphere.put(3 * (on.item * a.spheres + k), m.position + lever);
   }

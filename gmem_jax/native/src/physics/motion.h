@@ -214,32 +214,40 @@ constexpr GMEM_INLINE Vec<V> sphere_of(const GrainParameters<V>& p, const HalfSt
   return centre;
 }
 
+// The centre of a sphere in a grain: three doubles, or numbers that carry derivatives.
+template <class V, class Number>
+constexpr GMEM_INLINE Vec<V> body_at(const Number* at) {
+  if constexpr (__is_class(Number)) {
+    return load_vec(at);
+  } else {
+    return {splat<V>(at[0]), splat<V>(at[1]), splat<V>(at[2])};
+  }
+}
+
 // Finds the spheres of a grain, handed to `put(k, centre)`, and what the walls do to them; whether they are near them.
 // gmem_jax/physics/step.py: sphere_table
-template <class V, class Put>
-GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const double* offsets, int spheres,
+template <class V, class Number, class Put>
+GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Number* offsets, int spheres,
                             double arm, const WallState<V>& box, WallForces<V>& on, const Put& put) {
   const Matrix<V> rotation = matrix(m.orientation);
   const bool near = bits_less(V{}, deepest(splat<V>(1.0 + arm), m.position, box)) != 0;
   for (int k = 0; k < spheres; ++k) {
-    const double* body = offsets + 3 * k;
-    put(k, sphere_of(p, m, rotation, {splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])}, near, box, on));
+    put(k, sphere_of(p, m, rotation, body_at<V>(offsets + 3 * k), near, box, on));
   }
   return near;
 }
 
 // ... of a grain of some size, whose spheres have `radii` where it is 1 and are then within `outer` of its centre.
-template <class V, class Put>
-GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const double* offsets, const double* radii,
+template <class V, class Number, class Put>
+GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Number* offsets, const double* radii,
                             int spheres, V size, double outer, const WallState<V>& box, WallForces<V>& on, const Put& put) {
   const Matrix<V> rotation = matrix(m.orientation);
   const bool near = bits_less(V{}, deepest(splat<V>(outer) * size, m.position, box)) != 0;
   GrainParameters<V> own = p;
   for (int k = 0; k < spheres; ++k) {
-    const double* body = offsets + 3 * k;
     const V radius = splat<V>(radii[k]) * size;
     if (near) own.wall_stiffness = root(radius) * p.wall_stiffness;
-    put(k, sphere_of(own, m, rotation, size * Vec<V>{splat<V>(body[0]), splat<V>(body[1]), splat<V>(body[2])}, near, box, on, radius));
+    put(k, sphere_of(own, m, rotation, size * body_at<V>(offsets + 3 * k), near, box, on, radius));
   }
   return near;
 }
