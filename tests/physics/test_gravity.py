@@ -73,15 +73,11 @@ def test_gravity_is_a_number_of_an_experiment():
     signal = gm.Bumps(jnp.asarray([[1.0]]), jnp.asarray([[0.5]]), 0.3)
     short = {"t0": 60.0, "rest": 0.1, "hold": 0.02, "store": 0.02}
     heavy = gm.Experiment(pack, signal, gravity=1e-4, **short)
-    light = gm.Experiment(pack, signal, **short)
-    assert not np.allclose(gm.recall(heavy).p_sig, gm.recall(light).p_sig, rtol=1e-3)
-    np.testing.assert_allclose(
-        gm.recall(heavy).p_sig, gm.recall(replace(heavy, backend="jax")).p_sig, atol=1e-9 * float(light.scale)
-    )
-    slopes = gm.value_and_grad(heavy, ["gravity"], progress=False)
-    by = 1e-9
-    up, down = (float(gm.fidelity(gm.replace(heavy, gravity=1e-4 + x))) for x in (by, -by))
-    np.testing.assert_allclose(float(slopes.slope["gravity"]), (up - down) / (2.0 * by), rtol=1e-3)
+    weightless = gm.recall(gm.replace(heavy, gravity=0.0)).p_sig
+    recalled = gm.recall(heavy).p_sig
+    assert not np.allclose(recalled, weightless, rtol=1e-3)
+    definition = gm.recall(replace(heavy, backend="jax")).p_sig
+    np.testing.assert_allclose(recalled, definition, atol=1e-9 * float(heavy.scale))
 
 
 def test_impossible_gravity_is_refused():
