@@ -1285,7 +1285,7 @@ MUTATIONS = (
         "tangent-of-offsets-lost",
         "cpu/block.h",
         "if (deforms) return function(offsets);",
-        "",
+        "if (deforms) return function(block.pack->offsets);",
         "test_both_modes_agree_with_plain_jax[H-True]",
     ),
     mutation(
