@@ -83,6 +83,13 @@ MUTATIONS = (
         "test_work_of_the_walls_is_what_was_stored_damped_and_slid_away",
     ),
     mutation(
+        "search-shares-over-one-another",
+        "cpu/search.cc",
+        "keys + std::min(found, room)",
+        "keys",
+        "test_threads_that_share_out_the_spheres_find_all_pairs_once_and_in_order",
+    ),
+    mutation(
         "step-gravity-upwards",
         "physics/step.py",
         ".add(-jnp.asarray(self.gravity",
@@ -94,14 +101,14 @@ MUTATIONS = (
         "physics/motion.h",
         "pull.z = pull.z - p.gravity;",
         "",
-        "test_a_march_is_a_step_for_each_box_in_gravity_too",
+        "test_a_march_is_a_step_for_each_box[0.001]",
     ),
     mutation(
         "native-gravity-left-out-of-periodic-boxes",
         "physics/motion.h",
         "acceleration(m.velocity.z, force.z, cell.rate.z, p.gravity)",
         "acceleration(m.velocity.z, force.z, cell.rate.z, V{})",
-        "test_values_between_walls_along_one_axis",
+        "test_values_between_walls_along_one_axis[0.001]",
     ),
     mutation(
         "step-spin-drag",

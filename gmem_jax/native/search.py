@@ -20,6 +20,7 @@ def search() -> Search | None:
     call.argtypes = [pointer, integer, integer, ctypes.c_double, pointer, integer]
 
     def keys_of(centres: np.ndarray, spheres_per_grain: int, reach: float) -> np.ndarray:
+        library.require_threads()
         if not np.isfinite(centres).all():
             raise ValueError("sphere centres must be finite to look for neighbours")
         # In a dense pack a sphere has six candidates with a skin of 0.5 R, sixteen with 1 R.
@@ -28,7 +29,7 @@ def search() -> Search | None:
             keys = np.empty(room, dtype=np.int64)
             found = call(centres.ctypes.data, len(centres), spheres_per_grain, reach, keys.ctypes.data, room)
             if found < 0:
-                raise MemoryError("no memory to look for neighbours")
+                raise MemoryError("no memory, or no thread, to look for neighbours")
             if found <= room:
                 return keys[:found].copy()
             room = found

@@ -118,7 +118,7 @@ def all_names(experiment: gm.Experiment) -> list[str]:
 def whole(experiment: gm.Experiment) -> gm.Experiment:
     """Every number of it given."""
     given = gm.replace(experiment, t0=60.0, rest=0.02, hold=0.02, store=0.02, delta0=0.05, hold_drag=0.04)
-    return gm.replace(given, {"friction.spinning": 0.9})
+    return gm.replace(given, {"friction.spinning": 0.9, "gravity": 1e-4})
 
 
 def require_differences(experiment: gm.Experiment, slopes: dict[str, Any]) -> None:
@@ -137,9 +137,11 @@ def require_differences(experiment: gm.Experiment, slopes: dict[str, Any]) -> No
 
 def test_every_name_has_the_derivative_of_differences(whole: gm.Experiment) -> None:
     names = all_names(whole)
-    assert {"pack.lower", "pack.quaternion", "pack.clump.offsets", "material.poisson", "t0", "hold_drag"} < set(names)
+    assert {"pack.lower", "pack.quaternion", "pack.clump.inertia", "material.poisson", "t0", "hold_drag"} < set(names)
+    assert {"pack.clump.offsets", "gravity"} < set(names)
     found = gm.value_and_grad(whole, names, loss=smooth)
     require_differences(whole, found.slope)
+    assert np.all(np.abs(np.asarray(found.slope["pack.clump.offsets"])).max(axis=1) > 0.0)
     moved = {name for name, slope in found.slope.items() if np.any(np.asarray(slope))}
     still = {"pack.delta0", "pack.ringing_period", "pack.clump.diameter", *(n for n in names if "pairs" in n)}
     units = {f"material.{name}" for name in ("radius", "modulus", "density")}
@@ -159,6 +161,15 @@ def test_every_name_has_the_derivative_of_grad_by_the_whole_experiment(whole: gm
     for name in names:
         slope = np.asarray(value_at(expected, name))
         np.testing.assert_allclose(found[name], slope, rtol=1e-6, atol=1e-8 * np.abs(slope).max(), err_msg=name)
+
+
+@pytest.mark.slow
+def test_the_forward_mode_has_the_shape_of_the_grain_too(whole: gm.Experiment) -> None:
+    name = "pack.clump.offsets"
+    offsets, toss = whole.pack.clump.offsets, jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
+    along = gradient.push(whole, {name: toss}).p_sig_slope
+    up, down = (run(gm.replace(whole, {name: offsets + by * toss})).p_sig for by in (1e-7, -1e-7))
+    np.testing.assert_allclose(along, (up - down) / 2e-7, atol=2e-2 * np.abs(along).max())
 
 
 @pytest.mark.skipif(not native.available()[0], reason=native.available()[1])

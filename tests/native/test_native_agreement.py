@@ -53,8 +53,9 @@ def test_native_and_plain_jax_agree_to_the_growth_of_round_off(law: object, repl
     np.testing.assert_array_equal(fast.status, plain.status)
 
 
-def test_a_march_is_a_step_for_each_box_in_gravity_too() -> None:
-    system = System(PACK.clump, gm.Hooke(), PACK.pairs, gravity=1e-3)
+@pytest.mark.parametrize("gravity", [None, 1e-3])
+def test_a_march_is_a_step_for_each_box(gravity: float | None) -> None:
+    system = System(PACK.clump, gm.Hooke(), PACK.pairs, gravity=gravity)
     state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
     motion = Motion(PACK.lower[:, None], PACK.upper[:, None], 0.05, 0.0, 1.0, 300.0)
     boxes = jax.vmap(motion.box_at)(0.3 * jnp.arange(1.0, 101.0))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scenes import SPHERE, blank_state, cached_tetra, cluster27, make_grains, orientations, squeeze
+from scipy.spatial import cKDTree
 
 from gmem_jax import native
 from gmem_jax.physics import step as dynamics
@@ -92,6 +93,24 @@ def test_the_library_lists_no_pairs_of_what_is_far_apart_or_not_finite():
     far[1, 1] = np.nan
     with pytest.raises(ValueError, match="finite"):
         search(far, 1, 2.6)
+
+
+@pytest.mark.skipif(native.search() is None, reason=native.available()[1])
+@pytest.mark.parametrize("edge", [44.0, 22.0])  # some five neighbours of a sphere; forty, more than are expected
+def test_threads_that_share_out_the_spheres_find_all_pairs_once_and_in_order(edge, monkeypatch):
+    centres = np.random.default_rng(0).uniform(0.0, edge, (9000, 3))
+    near = cKDTree(centres).query_pairs(2.5, output_type="ndarray")
+    near = near[near[:, 0] // 3 != near[:, 1] // 3]
+    for threads in ("1", "2", "3"):
+        monkeypatch.setenv("GMEM_THREADS", threads)
+        np.testing.assert_array_equal(native.search()(centres, 3, 2.5), np.sort(near[:, 0] * 9000 + near[:, 1]))
+
+
+@pytest.mark.skipif(native.search() is None, reason=native.available()[1])
+def test_a_search_refuses_a_bad_number_of_threads_in_a_sentence(monkeypatch):
+    monkeypatch.setenv("GMEM_THREADS", "two")
+    with pytest.raises(ValueError, match=r'GMEM_THREADS should be a number of threads .* it is "two"'):
+        native.search()(np.zeros((2, 3)), 1, 2.5)
 
 
 @pytest.mark.parametrize("skin", [0.1, 0.3, 0.4, 1.0])

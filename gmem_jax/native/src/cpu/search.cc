@@ -103,7 +103,7 @@ constexpr int64_t kSpheresOfAThread = 2048;  // fewer are found sooner than a th
 }  // namespace gmem
 
 // Pairs i < j of spheres of different grains whose centres [S, 3], finite, are closer than `reach`, in order, as numbers
-// i S + j. Writes the first `room` of them to `keys`; returns how many there are, or -1 without memory.
+// i S + j. Writes the first `room` of them to `keys`; returns how many there are, or -1 without memory or threads.
 extern "C" int64_t gmem_search(const double* centres, int64_t spheres, int64_t spheres_per_grain, double reach,
                                int64_t* keys, int64_t room) {
   try {
