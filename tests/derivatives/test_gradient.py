@@ -123,9 +123,12 @@ def whole(experiment: gm.Experiment) -> gm.Experiment:
 
 def require_differences(experiment: gm.Experiment, slopes: dict[str, Any]) -> None:
     """Each derivative, along some direction, is that of central differences."""
+    experiment = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf)), experiment)  # one program for all
     for number, (name, slope) in enumerate(slopes.items()):
         value = np.asarray(value_at(experiment, name))
-        toss = np.random.default_rng(number).normal(size=value.shape) * (np.abs(value).mean() + 1e-3)
+        random = np.random.default_rng(number)  # no component near 0, where round-off would be all there is to see
+        toss = random.choice([-1.0, 1.0], value.shape) * random.uniform(0.5, 1.5, value.shape)
+        toss *= np.abs(value).mean() + 1e-3
         up, down = (run(gm.replace(experiment, {name: jnp.asarray(value + by * toss)})) for by in (1e-7, -1e-7))
         difference = float(smooth(experiment, up.p_sig) - smooth(experiment, down.p_sig)) / 2e-7
         if name.split(".")[-1] in ("gamma0", "delta0", "width", "amplitudes", "centres"):  # the measure has them too
