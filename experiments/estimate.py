@@ -1,9 +1,9 @@
 """mu and k_H from one noisy recall: their posterior by NUTS, and by quadrature on a grid beside it.
 
-python experiments/estimate.py [-o estimate] [--pack tests/data/tetra-27.h5] [--t0 600] [--samples 100] [--warm 50]
+python experiments/estimate.py [-o estimate] [--pack tetra-325-a] [--t0 250] [--signals 2] [--samples 100] [--warm 50]
 
-Needs blackjax. The recall of six waveforms is read as the means of p_sig over each sixteenth of u, with Gaussian noise
-of four times their root mean square. For a given pack the recall is a function of mu and k_H, and their logarithms have
+Needs blackjax. The recall of some waveforms is read as the means of p_sig over each sixteenth of u, with Gaussian noise
+of `--noise` times their root mean square. For a given pack the recall is a function of mu and k_H, and their logarithms have
 a normal prior. NUTS starts from four places, with gradients backwards through all steps: for two numbers they cost what
 two tangents do. The grid says whether the chains found the posterior.
 """
@@ -31,7 +31,6 @@ WIDTH = 0.5  # of the prior, the standard deviation of each logarithm
 STARTS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])  # in widths from the middle
 REACH = 2.5  # of the grid, in widths from the middle
 READINGS = 16  # of each waveform
-NOISE = 4.0  # of a reading, over the root mean square of all
 
 LogDensity = Callable[[jax.Array], jax.Array]
 
@@ -45,16 +44,20 @@ def main() -> None:
     """Measure, sample, integrate, draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("estimate"), help="without a suffix")
-    parser.add_argument("--pack", default="tests/data/tetra-27.h5")
-    parser.add_argument("--t0", type=float, default=600.0)
+    parser.add_argument("--pack", default="tetra-325-a")
+    parser.add_argument("--t0", type=float, default=250.0)
+    parser.add_argument("--signals", type=int, default=2, help="of the six waveforms, the first so many")
+    parser.add_argument("--noise", type=float, default=2.0, help="of a reading, over the root mean square of all")
     parser.add_argument("--samples", type=int, default=100, help="of each of the four chains")
     parser.add_argument("--warm", type=int, default=50, help="samples that tune a chain before")
     parser.add_argument("--points", type=int, default=31, help="of the grid on each axis, odd")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    six, count = gm.six_signals(), arguments.signals
+    signals = gm.Bumps(six.amplitudes[:count], six.centres[:count], six.width)
     experiment = gm.Experiment(
-        gm.load_pack(arguments.pack), gm.six_signals(), t0=arguments.t0, dt=1.2, rest=0.1, hold=0.1, store=0.1
+        gm.load_pack(arguments.pack), signals, t0=arguments.t0, dt=1.0, rest=0.1, hold=0.1, store=0.1
     )
 
     def readings(values: jax.Array) -> jax.Array:
@@ -62,7 +65,7 @@ def main() -> None:
         return jnp.mean(p_sig.reshape(len(p_sig), READINGS, -1), axis=2)
 
     clean = jax.jit(readings)(jnp.asarray(TRUE))
-    noise = NOISE * float(jnp.sqrt(jnp.mean(clean**2)))
+    noise = arguments.noise * float(jnp.sqrt(jnp.mean(clean**2)))
     measuring, sampling = jax.random.split(jax.random.key(arguments.seed))
     measured = clean + noise * jax.random.normal(measuring, clean.shape)
 
@@ -70,14 +73,14 @@ def main() -> None:
         misfit = (readings(numbers(place)) - measured) / noise
         return -0.5 * (jnp.sum(misfit**2) + jnp.sum(place**2))
 
-    places = sample(log_density, sampling, arguments.warm, arguments.samples)
     axis = np.linspace(-REACH, REACH, arguments.points)
     weights = integrate(log_density, axis)
-    found = np.asarray(numbers(places))
-    tell("NUTS", found, np.ones(found.shape[:2]))
     for name, every in (("grid", 1), ("every second point", 2)):
         mesh = np.stack(np.meshgrid(axis[::every], axis[::every], indexing="ij"), -1)
         tell(name, np.asarray(numbers(mesh)), weights[::every, ::every])
+    places = sample(log_density, sampling, arguments.warm, arguments.samples)
+    found = np.asarray(numbers(places))
+    tell("NUTS", found, np.ones(found.shape[:2]))
     with arguments.output.with_suffix(".csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["chain", "mu", "k_H"])
@@ -123,6 +126,7 @@ def integrate(log_density: LogDensity, axis: np.ndarray) -> np.ndarray:
     began, row = time.process_time(), jax.jit(jax.vmap(log_density))
     logs = np.asarray([row(jnp.stack([jnp.full(len(axis), mu), jnp.asarray(axis)], axis=1)) for mu in axis])
     print(f"{logs.size} points, {np.isnan(logs).sum()} of them failed, {time.process_time() - began:.0f} s of CPU")
+    np.save("/tmp/logs.npy", logs)
     weights = np.exp(np.nan_to_num(logs - np.nanmax(logs), nan=-np.inf))
     return np.asarray(weights / weights.sum())
 

@@ -75,7 +75,8 @@ def _require_one_fidelity(experiment: Experiment) -> None:
     if len(reads) * len(channels) > 1 or len(experiment.sets) > 1:
         raise InputError(
             f"this takes one set of waveforms with one F, and the protocol has reads {', '.join(reads)}, channels "
-            f"{', '.join(channels)} and sets {', '.join(experiment.sets)}; gm.value_and_grad differentiates any loss"
+            f"{', '.join(channels)} and sets {', '.join(experiment.sets)}; in the library gm.value_and_grad "
+            "differentiates any loss, and gm.kernel_matrix and gm.design_waveforms know channels"
         )
 
 
@@ -303,7 +304,8 @@ def design_command(
             design = design_by_kernel if by == "kernel" else waveforms.design_waveforms
             found = design(experiment, cache=parts, progress=progress, **options)
         way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
-        save_waveforms(output, found.signals, experiment.waveforms, design=way)
+        (designed,) = found.sets.values()
+        save_waveforms(output, designed, experiment.waveforms, design=way)
     draw_beside(drawn, lambda: design_figure(found, float(experiment.scale), cell(pack)))
     draw_beside(history if picture else None, lambda: history_figure({cell(pack): found.history}))
     result = {

@@ -17,7 +17,7 @@ from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import Prefix, run
 from gmem_jax.experiment.signals import Bumps, Signals, bin_average, signals
-from gmem_jax.physics.numbers import require_numbers, require_whole
+from gmem_jax.physics.numbers import plural, require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
@@ -250,20 +250,34 @@ def kernel_matrix(
         RunFailedError: if the simulation broke down.
     """
     require_kind("kernel_matrix", experiment, Experiment)
-    channels, sets = experiment.readings.channels, experiment.sets
-    written = experiment.protocol.written(experiment.readings.reads[0])
-    if len(experiment.readings.reads) > 1 or len({drive.waveform for drive in written.values()}) < len(channels):
-        raise ValueError("a kernel matrix is of one read, and needs a set of waveforms for each channel")
+    channels, written = experiment.readings.channels, written_sets(experiment)
     loud = _basis(experiment, n, width)
     silent = bumps(jnp.zeros_like(loud.amplitudes), width)
     tell, columns = callback(progress), []
     for number, channel in enumerate(channels):
-        alone = {name: loud if name == written[channel].waveform else silent for name in sets}
+        alone = {name: loud if name == written[number] else silent for name in experiment.sets}
         one = replace(experiment, signals=signals(**alone))
         share = within(tell, number / len(channels), (number + 1) / len(channels))
         recall = run(one, cache=cache.scoped(f"basis-{channel}"), progress=share)
         columns.append([_kernel_of(one, loud, np.asarray(recall.at(channel=name).p_sig)) for name in channels])
     return KernelMatrix(channels, tuple(zip(*columns, strict=True)))
+
+
+def written_sets(experiment: Experiment) -> tuple[str, ...]:
+    """Names of the sets of waveforms that are written on the channels, [C].
+
+    Raises:
+        ValueError: if there are several reads, or not a set of waveforms for each channel.
+    """
+    reads, channels = experiment.readings.reads, experiment.readings.channels
+    written = experiment.protocol.written(reads[0])
+    names = {str(drive.waveform): None for drive in written.values() if not drive.fixed}
+    if len(reads) > 1 or len(names) < len(channels):
+        raise ValueError(
+            f"this needs one read, and for each channel a set of waveforms; there are {plural(len(reads), 'read')}, "
+            f"and on {' and '.join(channels)} is written {' and '.join(names) or 'nothing'}"
+        )
+    return tuple(str(written[channel].waveform) for channel in channels)
 
 
 def _kernel_of(experiment: Experiment, both: Bumps, p_sig: np.ndarray) -> MemoryKernel:

@@ -1,28 +1,31 @@
-"""Inverse design: waveforms whose nonlinear recall follows wanted curves.
+"""Inverse design: waveforms whose nonlinear recall follows wanted curves, on one channel or on several at once.
 
 Waveforms are corrected by the exact Jacobian of the recall around the present ones: one tangent per amplitude, as
 replicas of one run (`gradient.push`). A damped Gauss-Newton step is simulated before it is accepted,
 whole and in parts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 
 from gmem_jax.derivatives.gradient import push
-from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest
+from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest, written_sets
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import prefix_of, run
-from gmem_jax.experiment.signals import Signals, Spline, waveform
+from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, sets_of, signals, waveform
 from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within
+from gmem_jax.simulation.protocol import BINS
 
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)
@@ -38,27 +41,35 @@ TANGENT = 2.5  # cost of a tangent in runs; see benchmarks
 class Design:
     """Waveforms found, and the way there.
 
+    Of C channels each has its own targets, recalls and F: arrays have a leading axis [C], in the order of
+    `Recall.p_sig`, and gains are a matrix [C, C].
+
     Attributes:
-        signals: the waveforms, as samples, |I| <= 1.
+        signals: the waveforms, as samples, |I| <= 1; of several channels as sets.
         target: J that their recall should follow, averaged over bins, [S, 256].
         p_sig: their recall in a fresh run, [S, 256], in E.
         fidelity: F of that recall with respect to the target.
         gain: G of that recall with respect to the target.
         untouched: recall of the untouched waveforms, [S, 256], in E.
         before: F of that.
-        history: F after every iteration, the untouched waveforms first.
+        history: F after every iteration, the untouched waveforms first; of several channels their mean.
     """
 
-    signals: Spline
+    signals: Spline | SignalSets
     target: np.ndarray
     p_sig: np.ndarray
-    fidelity: float
-    gain: float
+    fidelity: float | np.ndarray
+    gain: float | np.ndarray
     untouched: np.ndarray
-    before: float
+    before: float | np.ndarray
     history: tuple[float, ...]
 
     __repr__ = short_repr
+
+    @property
+    def sets(self) -> dict[str, Spline]:
+        """The waveforms by set, one for each channel."""
+        return cast(dict[str, Spline], sets_of(self.signals))
 
 
 def largest(amplitudes: np.ndarray, width: float) -> np.ndarray:
@@ -94,20 +105,28 @@ def sampled(signals: Signals) -> Spline:
 
 
 def verified(
-    experiment: Experiment, signals: Spline, p_sig: np.ndarray, untouched: np.ndarray, history: Sequence[float]
+    experiment: Experiment,
+    signals: Spline | SignalSets,
+    p_sig: np.ndarray,
+    untouched: np.ndarray,
+    history: Sequence[float],
 ) -> Design:
     """What came of a design, by the recalls of the designed and of the untouched waveforms, both [S, 256] in E."""
-    match = experiment.compare(jnp.asarray(p_sig))
+    match, before = (experiment.compare(jnp.asarray(recall)) for recall in (p_sig, untouched))
     return Design(
         signals=signals,
         target=np.asarray(experiment.integral()),
         p_sig=p_sig,
-        fidelity=float(match.fidelity),
-        gain=float(match.gain),
+        fidelity=_told(match.fidelity),
+        gain=_told(match.gain),
         untouched=untouched,
-        before=float(experiment.compare(jnp.asarray(untouched)).fidelity),
+        before=_told(before.fidelity),
         history=tuple(history),
     )
+
+
+def _told(found: jax.Array) -> float | np.ndarray:
+    return np.asarray(found) if jnp.ndim(found) else float(found)
 
 
 class Work:
@@ -159,9 +178,11 @@ def design_waveforms(
 ) -> Design:
     """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
 
+    Of several channels each has one gain, and what a channel gives back of the others is part of what is corrected.
+
     Args:
-        experiment: the pack, the drive, and the signals whose J are the targets.
-        iterations: corrections; each takes a Jacobian of n tangents a signal and up to three simulations.
+        experiment: the pack, the drive, and the signals whose J are the targets; with one read.
+        iterations: corrections; each takes a Jacobian of n tangents a signal and channel, and up to three simulations.
         n: bumps of a designed waveform.
         width: of the bumps.
         gain: wanted common gain; default half of the untouched waveforms' own, so that the bound leaves room.
@@ -171,6 +192,8 @@ def design_waveforms(
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
+        ValueError: if gamma0 or delta0 differs between replicas, there are several reads, or a channel has no set of
+            waveforms of its own.
         RunFailedError: if a simulation broke down.
     """
     require_kind("design_waveforms", experiment, Experiment)
@@ -178,46 +201,67 @@ def design_waveforms(
     refuse_several_scales(experiment)
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
     require_numbers(width=width, gain=gain, **{f"damping {number}": one for number, one in enumerate(damping, 1)})
-    work, share = Work(cost(experiment, iterations, n), tell), _prefix(experiment)
+    names = written_sets(experiment)
+    work, share = Work(cost(experiment, iterations, n * len(names)), tell), _prefix(experiment)
     prefix = prefix_of(experiment, cache=cache, progress=work.next(share))
     target = np.asarray(experiment.integral())
     untouched = run(experiment, prefix=prefix, cache=cache.scoped("untouched"), progress=work.next(1.0)).p_sig
     original = experiment.compare(jnp.asarray(untouched))
-    before, own_gain = float(original.fidelity), float(original.gain)
-    gain = 0.5 * own_gain if gain is None else gain
-    wanted = gain * float(experiment.scale) * target
-    basis = bumps(np.eye(n), width)
-    amplitudes = bounded(nearest(basis, experiment.waveforms) * gain / own_gain, width)
-    count = len(target)
+    own_gain = np.diag(original.gain) if len(names) > 1 else np.atleast_1d(original.gain)  # of each channel, [C]
+    gains = 0.5 * own_gain if gain is None else np.full(len(names), gain)
+    basis, count = bumps(np.eye(n), width), experiment.signals.count
 
-    def make(rows: jax.Array | np.ndarray) -> Experiment:
-        return replace(experiment, signals=bumps(rows, width))
+    def side_by_side(by_channel: npt.ArrayLike) -> np.ndarray:
+        """[C, S, 256], or [S, 256] of one channel, as [S, C 256]."""
+        shaped = np.asarray(by_channel).reshape(len(names), -1, BINS)
+        return np.concatenate(list(shaped), axis=1)
+
+    def made(rows: np.ndarray, of: Callable[[Bumps], Signals] = lambda one: one) -> Signals | SignalSets:
+        """Waveforms of amplitudes [S, C n]."""
+        own = np.split(rows, len(names), axis=1)
+        return signals(**{name: of(bumps(part, width)) for name, part in zip(names, own, strict=True)})
+
+    def within_bounds(rows: np.ndarray) -> np.ndarray:
+        return np.concatenate([bounded(part, width) for part in np.split(rows, len(names), axis=1)], axis=1)
 
     def recall(name: str, rows: np.ndarray) -> np.ndarray:
         on = work.next(len(rows) / count, name)
-        return np.asarray(run(make(rows), prefix=prefix, cache=cache.scoped(name), progress=on).p_sig)
+        changed = replace(experiment, signals=made(rows))
+        return side_by_side(run(changed, prefix=prefix, cache=cache.scoped(name), progress=on).p_sig)
 
     def jacobians(name: str, at: np.ndarray) -> np.ndarray:
-        """dp_sig / da of every signal, [S, n, 256]."""
-        rows, directions = np.repeat(at, n, axis=0), np.tile(np.eye(n), (count, 1))
-        direction = {"signals.amplitudes": jnp.asarray(directions)}
-        on = work.next(TANGENT * n, f"F = {history[-1]:.4f}")
-        slope = cache(name, lambda _: push(make(rows), direction, progress=on).p_sig_slope)
-        return np.asarray(slope).reshape(count, n, -1)
+        """dp_sig / da of every signal, [S, C n, C 256]."""
+        each = at.shape[1]
+        rows, directions = np.repeat(at, each, axis=0), np.tile(np.eye(each), (count, 1))
+        fields = ["signals"] if names == ("xy",) else [f"signals.{name}" for name in names]
+        own = zip(fields, np.split(directions, len(names), axis=1), strict=True)
+        direction = {f"{field}.amplitudes": jnp.asarray(part) for field, part in own}
+        on = work.next(TANGENT * each, f"F = {history[-1]:.4f}")
+        changed = replace(experiment, signals=made(rows))
+        slope = cache(name, lambda _: push(changed, direction, progress=on).p_sig_slope)
+        return side_by_side(slope).reshape(count, each, -1)
 
+    def fidelity(p_sig: np.ndarray) -> float:
+        by_channel = np.stack(np.split(p_sig, len(names), axis=1)).reshape(target.shape)
+        return float(np.mean(experiment.compare(jnp.asarray(by_channel)).fidelity))
+
+    sets = experiment.sets
+    wanted = side_by_side(gains.reshape(-1, 1, 1) * float(experiment.scale) * target.reshape(len(names), -1, BINS))
+    first = [nearest(basis, sets[name]) * one / own for name, one, own in zip(names, gains, own_gain, strict=True)]
+    amplitudes = within_bounds(np.concatenate(first, axis=1))
     p_sig = recall("projected", amplitudes)
-    history = [before]
+    history = [fidelity(side_by_side(untouched))]
     for iteration in range(iterations):
         local = jacobians(f"jacobian-{iteration}", amplitudes)
         damped = damping[min(iteration, len(damping) - 1)]
         steps = correction(local, wanted - p_sig, damped * np.linalg.norm(local, 2, axis=(1, 2))[:, None])
-        tried = [bounded(amplitudes + fraction * steps, width) for fraction in FRACTIONS]
+        tried = [within_bounds(amplitudes + fraction * steps) for fraction in FRACTIONS]
         candidates = np.stack([amplitudes, *tried])
         recalls = np.stack([p_sig, *recall(f"tried-{iteration}", np.concatenate(tried)).reshape(len(tried), count, -1)])
         chosen = np.linalg.norm(recalls - wanted, axis=2).argmin(axis=0), np.arange(count)
         amplitudes, p_sig = candidates[chosen], recalls[chosen]
-        history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
-    signals = sampled(bumps(amplitudes, width))
+        history.append(fidelity(p_sig))
+    designed = cast(Spline | SignalSets, made(amplitudes, sampled))
     last = work.next(1.0 + share, "verified")
-    fresh = run(replace(experiment, signals=signals), cache=cache.scoped("verified"), progress=last).p_sig
-    return verified(experiment, signals, np.asarray(fresh), np.asarray(untouched), history)
+    fresh = run(replace(experiment, signals=designed), cache=cache.scoped("verified"), progress=last).p_sig
+    return verified(experiment, designed, np.asarray(fresh), np.asarray(untouched), history)

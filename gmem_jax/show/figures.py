@@ -153,28 +153,39 @@ def design_figure(design: Design, unit: float, title: str) -> Figure:
     """Designed waveforms, and their recall beside the targets and what the untouched waveforms gave.
 
     Args:
-        design: the design, of S signals.
+        design: the design, of S signals; of several channels some of each are shown.
         unit: delta0 gamma0.
         title: over the picture.
     """
-    shown, bins = min(len(design.target), 6), design.target.shape[1]
-    u, nodes = (np.arange(bins) + 0.5) / bins, np.linspace(0.0, 1.0, design.signals.nodes.shape[1])
-    curves = (
-        (design.untouched, "recall, untouched", "0.7", "-"),
-        (design.p_sig, "recall, designed", "C0", "-"),
-        (design.gain * unit * design.target, "target", "C3", "--"),
+    channels, bins = len(design.sets), design.target.shape[-1]
+    gain = np.diag(np.atleast_2d(design.gain))[:, None, None]
+    target, p_sig, untouched = (
+        np.reshape(rows, (channels, -1, bins)) for rows in (design.target, design.p_sig, design.untouched)
     )
+    waves = np.stack([np.asarray(one.nodes) for one in design.sets.values()])
+    each = min(target.shape[1], 6 // channels)
+    shown = [(channel, number) for channel in range(channels) for number in range(each)]
+    u, nodes = (np.arange(bins) + 0.5) / bins, np.linspace(0.0, 1.0, waves.shape[-1])
+    curves = (
+        (untouched, "recall, untouched", "0.7", "-"),
+        (p_sig, "recall, designed", "C0", "-"),
+        (gain * unit * target, "target", "C3", "--"),
+    )
+    on = [f"{name} " if channels > 1 else "" for name in design.sets]
     above = [
-        Panel((Curve(nodes, np.asarray(row), colour="C2"),), f"signal {number + 1}", "", "designed I(u)")
-        for number, row in enumerate(design.signals.nodes[:shown])
+        Panel((Curve(nodes, waves[at], colour="C2"),), f"{on[at[0]]}signal {at[1] + 1}", "", "designed I(u)")
+        for at in shown
     ]
     below = [
         Panel(
-            tuple(Curve(u, PASCAL * np.asarray(row[number]), name, tone, style) for row, name, tone, style in curves),
+            tuple(Curve(u, PASCAL * row[at], name, tone, style) for row, name, tone, style in curves),
             x="u",
             y="stress (Pa)",
         )
-        for number in range(shown)
+        for at in shown
     ]
-    over = (f"{title}: F {design.before:.3f} -> {design.fidelity:.3f}",)
-    return Figure((*above, *below), shown, (max(2.6 * shown, 4.0), 4.8), over, "below", shared=("x", "row"))
+    before, after = (", ".join(f"{one:.3f}" for one in np.atleast_1d(f)) for f in (design.before, design.fidelity))
+    size = max(2.6 * len(shown), 4.0), 4.8
+    return Figure(
+        (*above, *below), len(shown), size, (f"{title}: F {before} -> {after}",), "below", shared=("x", "row")
+    )

@@ -126,6 +126,57 @@ def test_design_inverts_a_linear_memory(monkeypatch: pytest.MonkeyPatch, experim
     assert found.fidelity > 0.999  # the sampled waveform is a cubic through 127 nodes
 
 
+def two_channels(experiment: gm.Experiment) -> gm.Experiment:
+    six = gm.six_signals()
+    return gm.replace(experiment, signals=gm.signals(xy=six, z=gm.Bumps(six.amplitudes[::-1], six.centres, six.width)))
+
+
+def test_design_of_two_channels_takes_away_what_each_gives_back_of_the_other(
+    monkeypatch: pytest.MonkeyPatch, experiment: gm.Experiment
+) -> None:
+    odd, across = ideal(0.3).odd, ideal(0.2).odd[::-1]  # linear memories; across one another they are no integrals
+    coupling = np.array([[1.0, 0.3], [-0.4, 0.7]])  # of channel c by what was written on d
+    both = two_channels(experiment)
+
+    def mixed(rows: Any) -> jnp.ndarray:
+        own, other = ([amplitudes @ kernel for amplitudes in rows] for kernel in (odd, across))
+        return jnp.asarray([sum(coupling[c, d] * (own if c == d else other)[d] for d in range(2)) for c in range(2)])
+
+    def linear(run: gm.Experiment, *_: object, **__: object) -> SimpleNamespace:
+        p_sig = mixed([ideal(0.3).coefficients(one) for one in run.sets.values()])
+        return SimpleNamespace(p_sig=p_sig, **run.compare(p_sig)._asdict())
+
+    def push(run: gm.Experiment, direction: dict, **_: object) -> SimpleNamespace:
+        return SimpleNamespace(p_sig_slope=mixed([direction[f"signals.{name}.amplitudes"] for name in ("xy", "z")]))
+
+    monkeypatch.setattr(waveforms, "run", linear)
+    monkeypatch.setattr(waveforms, "prefix_of", lambda *_, **__: None)
+    monkeypatch.setattr(waveforms, "push", push)
+    found = gm.design_waveforms(both, iterations=3, gain=0.05, damping=(1e-6,))
+    assert found.target.shape == found.p_sig.shape == (2, 6, BINS)
+    assert np.all(found.before < 0.85)
+    assert np.all(found.fidelity > 0.995)  # the sampled waveforms are cubics through 127 nodes
+    np.testing.assert_allclose(found.gain, [[0.05, 0.0], [0.0, 0.05]], atol=5e-4)
+    np.testing.assert_allclose(found.history[0], np.mean(found.before), rtol=1e-12)
+    assert max(np.abs(np.asarray(one.nodes)).max() for one in found.signals.sets) <= 1.0 + 1e-6
+
+
+@pytest.mark.slow
+def test_two_channels_are_designed_together(experiment: gm.Experiment) -> None:
+    found = gm.design_waveforms(two_channels(experiment), iterations=1, n=4, width=0.4)
+    assert found.fidelity.shape == (2,)
+    assert found.history[1] > found.history[0]
+    np.testing.assert_allclose(np.mean(found.fidelity), found.history[-1], atol=1e-3)  # of samples
+
+
+def test_designs_of_what_is_read_twice_are_refused(experiment: gm.Experiment) -> None:
+    again = gm.Experiment(experiment.pack, experiment.signals, t0=75.0, protocol=gm.protocols.partial_readout())
+    with pytest.raises(
+        ValueError, match="this needs one read, and for each channel a set of waveforms; there are 2 reads"
+    ):
+        gm.design_waveforms(again)
+
+
 def memory_of_another_kernel(
     monkeypatch: pytest.MonkeyPatch, louder: float, otherwise: float, known_gain: float = 0.3
 ) -> gm.MemoryKernel:
