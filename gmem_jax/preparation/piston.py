@@ -15,6 +15,7 @@ from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.state import Box, State
 from gmem_jax.physics.step import System
 from gmem_jax.simulation.sample import check
+from gmem_jax.simulation.strain import servo_rate
 
 STEPS_PER_CHECK = 8  # steps between two looks at the neighbour list: grains may fly freely here
 
@@ -79,7 +80,7 @@ def press(
     times = dt * jnp.arange(1.0, STEPS_PER_CHECK + 1.0)
 
     def block(now: Pressed) -> Pressed:
-        velocity = jnp.clip(servo.gain * (now.pressure / servo.target - 1.0), -servo.speed, servo.speed)
+        velocity = servo_rate(now.pressure, servo.target, servo.gain, servo.speed)
         climb = jnp.zeros_like(now.box.upper).at[2].set(velocity)
         still, (lower, upper) = jnp.zeros_like(climb), (now.box.lower, now.box.upper)
         boxes = jax.vmap(lambda time: Box(lower, upper + time * climb, still, climb, now.box.periodic))(times)

@@ -121,14 +121,21 @@ def stretched(box: Box, stretch: jax.Array, rate: Scalar = 0.0) -> Box:
     return Box(centre - half, centre + half, -speed, speed, box.periodic)
 
 
+def servo_rate(pressure: jax.Array, target: Scalar | jax.Array, gain: Scalar, fastest: Scalar) -> jax.Array:
+    """How fast a servo lets a wall go: in proportion to its relative error of pressure, at most `fastest` either way.
+
+    That of the piston of a preparation, in each block of steps, and that of walls held at a pressure, in each bin.
+    """
+    return jnp.clip(gain * (pressure / target - 1.0), -fastest, fastest)
+
+
 def servo_strain(servo: HeldWalls, target: jax.Array) -> jax.Array:
     """Strain of each axis in the next bin, [3, B], by which its pressure is brought to `target` [3, 1].
 
     Where the target is 0 the strain is. Pressures that are too large let the wall go.
     """
     held = target > 0.0
-    error = servo.pressure / jnp.where(held, target, 1.0) - 1.0
-    return jnp.where(held, jnp.clip(SERVO_GAIN * error, -SERVO_STRAIN, SERVO_STRAIN), 0.0)
+    return jnp.where(held, servo_rate(servo.pressure, jnp.where(held, target, 1.0), SERVO_GAIN, SERVO_STRAIN), 0.0)
 
 
 def smallest_box(lower: np.ndarray, upper: np.ndarray, delta0: float) -> np.ndarray:
