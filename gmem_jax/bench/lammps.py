@@ -274,8 +274,12 @@ def scene_script(
     *,
     skin: float = 0.2,
     every: int = 1,
+    gravity: Scalar | None = None,
 ) -> list[str]:
-    """Everything up to `run`: files written to `folder`, contacts, walls and integrator; see `write_scene`."""
+    """Everything up to `run`: files written to `folder`, contacts, walls and integrator; see `write_scene`.
+
+    `gravity` is its acceleration along -z, in R / t_c^2; None for none.
+    """
     script = write_scene(scene, folder, skin=skin, every=every)
     script += pair_lines(friction, material, masses_of_types(scene.clump))
     # The integrator comes after the walls: it sums the initial forces when it is set up, in the order of the fixes.
@@ -284,8 +288,13 @@ def scene_script(
     if any(scene.periodic) and np.any(growth):
         strains = (f"{'xyz'[axis]} erate {_number(growth[axis])}" for axis in np.flatnonzero(scene.periodic))
         script.append(f"fix cell all deform 1 {' '.join(strains)} remap v")
+    if gravity is not None:
+        # Bodies of overlapping spheres are heavier by that than they are: the integrator adds their own weight.
+        whose = "all" if scene.clump.spheres == 1 else "nobody"
+        script += ["group nobody empty", f"fix weight {whose} gravity {_number(gravity)} vector 0 0 -1"]
     if scene.clump.spheres > 1:
-        script += ["fix move all rigid/small molecule infile scene.bodies"]
+        weighed = "" if gravity is None else " gravity weight"
+        script += [f"fix move all rigid/small molecule infile scene.bodies{weighed}"]
     else:
         script += ["fix move all nve/sphere"]
     return [*script, f"timestep {_number(dt)}"]

@@ -218,7 +218,7 @@ class Comparison:
         planes = (getattr(self.planes, field) for field in ("lower", "upper", "lower_velocity", "upper_velocity"))
         scene = lammps.Scene(self.system.clump, *grains, *planes)
         folder.mkdir()
-        script = lammps.scene_script(scene, self.system.friction, MATERIAL, dt, folder)
+        script = lammps.scene_script(scene, self.system.friction, MATERIAL, dt, folder, gravity=self.system.gravity)
         per_grain = self.system.clump.spheres
         run = lammps.run_lammps(script, folder, steps=steps, every=steps // frames, per_grain=per_grain)
         return run.position[1:], run.velocity[1:], run.spin[1:], np.abs(run.walls[1:])
@@ -288,15 +288,31 @@ def test_a_moving_wall_sends_a_sphere_off(tmp_path):
     assert max(found) < 1e-12  # measured 1e-15
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("lammps_kinematics")
+def test_a_column_of_spheres_falls_on_the_floor_as_in_lammps(tmp_path):
+    gravity, height = 1e-4, 2.02  # they lean, so that they slide on one another; the floor is 0.05 R below
+    position = [[0.3 * (n % 2), 0.2 * (n % 3), height * n] for n in range(4)]
+    system, state, _ = scenes.scene(gm.sphere(), position, friction=replace(HOOKE, mu=0.2))
+    system = replace(system, gravity=gravity)
+    floor = replace(OPEN, lower=np.array([-np.inf, -np.inf, -1.05]))
+    column = Comparison(system, dynamics.accelerate(system, state, floor.at(0.0)), floor)
+    ours = column.ours(0.1, 2000, 50)
+    assert (ours[3] > 0.0).mean() > 0.1  # the floor carries
+    assert np.abs(ours[2][-1]).max() > 1e-4  # and they roll
+    found = gaps(column, 0.1, 2000, 50, tmp_path, {1: gravity * 200.0, 2: gravity * 200.0, 3: ours[3].max()})
+    assert max(found) < 1e-10
+
+
 # ---------------------------------------------------------------- a dense pack
 
 
-def strained_pack(law, strain=1e-3, duration=300.0):
+def strained_pack(law, strain=1e-3, duration=300.0, gravity=None):
     """The 325 tetra grains of a shipped pack, at rest, under a small biaxial compression."""
     pack = gm.load_pack("tetra-325-a")
     lower, upper = np.asarray(pack.lower), np.asarray(pack.upper)
     inward = 0.5 * strain / duration * (upper - lower) * np.array([1.0, 1.0, 0.0])
-    system = dynamics.System(pack.clump, law, pack.pairs)
+    system = dynamics.System(pack.clump, law, pack.pairs, gravity=gravity)
     start = Compiled(dynamics.start)
     state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
     return Comparison(system, state, Planes(lower, upper, inward, -inward))
@@ -309,10 +325,12 @@ def strained_gaps(pack, folder):
     return apart(ours, theirs, 0) / moved, apart(ours, theirs, 3) / ours[3].max()
 
 
-@BOTH_LAWS
+@pytest.mark.parametrize(
+    ("law", "gravity"), [(HOOKE, None), (MindlinRescaled(), None), (HOOKE, 1e-5)], ids=["H", "M1", "H with gravity"]
+)
 @pytest.mark.usefixtures("lammps_kinematics")
-def test_a_dense_pack_under_strain_agrees_to_round_off(law, tmp_path):
-    position, force = strained_gaps(strained_pack(law), tmp_path)
+def test_a_dense_pack_under_strain_agrees_to_round_off(law, gravity, tmp_path):
+    position, force = strained_gaps(strained_pack(law, gravity=gravity), tmp_path)
     assert position < 1e-8  # measured 1.4e-10
     assert force < 1e-9  # 5e-12
 
