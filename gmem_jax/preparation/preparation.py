@@ -126,7 +126,7 @@ class _Preparation:
         at = jnp.asarray(position)[..., None]
         still = jnp.zeros_like(at)
         grains = Grains(at, quaternion[..., None], velocity[..., None], spin[..., None], still, still)
-        system = System(clump, Frictionless(), finder(grains, clump, self.box), material)
+        system = System(clump, Frictionless(), finder(grains, clump, self.box), material, recipe.gravity or None)
         state = start(system, at, grains.quaternion, self.box)
         state = accelerate(system, replace(state, grains=grains), self.box)
         expected = bins_outside(recipe, clump) * work_of_bin(1) + work_of(cycles_of(recipe), 1)

@@ -65,6 +65,7 @@ class Recipe:
         size_spread: standard deviation of the sizes of grains over their mean, which is 1; see `grading.lognormal`.
         sizes: of the grains of a mixture, as in "1,1.4" or (1.0, 1.4), instead of a spread; see `grading.mixture`.
         shares: part of the grains that has each of these sizes, as in "0.5,0.5"; default equal parts.
+        gravity: its acceleration along -z, from the gas on, in R / t_c^2; that of an experiment is its own.
         boundary: "walls", "periodic", or one for each axis, as in "periodic,periodic,walls". A periodic box is
             compressed as one between walls is, and its grains are carried along.
     """
@@ -90,6 +91,7 @@ class Recipe:
     quiet: float = _number(1.0e-6, "(0, inf)", "Largest grain speed of the finished pack", "R/t_c")
     pressure_error: float = _number(0.01, "(0, inf)", "Relative error of p_z at which the piston is fixed")
     patience: float = _number(2.0e5, "(0, inf)", "Longest time spent on coming to rest", "t_c")
+    gravity: float = _number(0.0, "[0, 0.01]", "Acceleration of gravity along -z", "R/t_c^2")
     size_spread: float = _number(
         0.0, f"[0, {LARGEST_SPREAD:g}]", "SD of the sizes of grains over their mean, lognormal, cut at 3 SD"
     )
@@ -117,6 +119,8 @@ class Recipe:
             if not within.holds(value):
                 raise ValueError(f"{entry.name} must be in {within.words}{unit and ' ' + unit}, got {given}")
             object.__setattr__(self, entry.name, value)
+        if self.gravity and periodic_axes(self.boundary)[2]:
+            raise ValueError("gravity acts along z, and a box that is periodic there has no floor: leave gravity out")
         if self.sizes and self.size_spread:
             raise ValueError("sizes and size_spread exclude each other: grains are a mixture, or are spread")
         if self.shares and not self.sizes:

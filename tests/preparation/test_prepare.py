@@ -11,7 +11,7 @@ from scenes import ELASTIC, SPHERE, column, scene
 
 import gmem_jax as gm
 from gmem_jax.physics.state import still_box
-from gmem_jax.physics.step import march
+from gmem_jax.physics.step import System, march, start
 from gmem_jax.preparation.piston import Pressed, Servo, press
 from gmem_jax.preparation.preparation import _gas
 from gmem_jax.preparation.recipe import grain_steps, lattice, pressure_over_wanted, sites_of
@@ -195,6 +195,22 @@ def test_a_pack_ends_at_rest_under_its_pressure(prepared: tuple[gm.Pack, dict]) 
     assert first.largest_speed[0, 0] < TINY.settled_speed + TINY.piston_gain * TINY.pressure_error
 
 
+@pytest.mark.slow
+def test_a_pack_that_was_prepared_under_gravity_is_at_rest_under_it() -> None:
+    g = 1e-4
+    pack = gm.prepare(TINY, gm.sphere(), gravity=g)
+
+    def fastest(gravity: float | None) -> float:
+        system = System(pack.clump, gm.Hooke(), pack.pairs, gm.Material(), gravity)
+        state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
+        return float(jnp.abs(state.grains.acceleration).max())
+
+    # What is left of forces at rest is what moves grains by 1e-6 R / t_c (`Recipe.quiet`) within some 10 t_c.
+    assert fastest(g) < 1e-2 * g
+    assert fastest(None) > 0.9 * g
+    assert pack.info["recipe"]["gravity"] == g
+
+
 def test_a_pack_is_centred_with_all_spheres_inside(prepared: tuple[gm.Pack, dict]) -> None:
     pack, _ = prepared
     np.testing.assert_allclose(pack.lower, -pack.upper, atol=1e-12)
@@ -235,6 +251,7 @@ def test_the_same_seed_gives_the_same_pack_bit_for_bit_and_another_another(prepa
         ({"grains": 64.5}, "grains must be a whole number in [12, inf), got 64.5"),
         ({"cycles": True}, "cycles must be a whole number in [0, 1000], got True"),
         ({"pressure": "2 kPa"}, "pressure must be a number in (0, inf), got '2 kPa'"),
+        ({"gravity": 1e-5, "boundary": "periodic"}, "gravity acts along z, and a box that is periodic there has no"),
         ({"pressure": float("inf")}, "pressure must be in (0, inf) E, got inf"),
     ],
 )
