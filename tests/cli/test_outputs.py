@@ -190,7 +190,15 @@ def test_every_number_of_a_recipe_is_an_option_of_prepare(
 ) -> None:
     numbers = {
         **{"grains": 13, "seed": 5, "delta0": 0.04, "t0": 70.0, "dt": 0.2, "filling": 0.25, "gas_speed": 0.03},
-        **{"gas_time": 300.0, "pressure": 3e-3, "piston_speed": 0.03, "piston_gain": 0.006, "cycles": 1, "rest": 0.3},
+        **{
+            "gas_time": 300.0,
+            "pressure": 3e-3,
+            "piston_speed": 0.03,
+            "piston_gain": 0.006,
+            "cycles": 1,
+            "rest": 0.3,
+            "gravity": 1e-6,
+        },
         **{"hold": 0.1, "drag": 0.02, "settled_speed": 2e-5, "quiet": 2e-6, "pressure_error": 0.02, "patience": 1e5},
         **{"size_spread": 0.0, "sizes": "", "shares": "", "boundary": "walls"},
     }
