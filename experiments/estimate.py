@@ -3,9 +3,9 @@
 python experiments/estimate.py [-o estimate] [--pack tetra-325-a] [--t0 250] [--signals 2] [--samples 100] [--warm 50]
 
 Needs blackjax. The recall of some waveforms is read as the means of p_sig over each sixteenth of u, with Gaussian noise
-of `--noise` times their root mean square. For a given pack the recall is a function of mu and k_H, and their logarithms have
-a normal prior. NUTS starts from four places, with gradients backwards through all steps: for two numbers they cost what
-two tangents do. The grid says whether the chains found the posterior.
+of `--noise` times their root mean square. For a given pack the recall is a function of mu and k_H, and the logarithm of
+each has a normal prior. NUTS starts from four places, with gradients backwards through all steps: for two numbers they
+cost what two tangents do. The grid says whether the chains found the posterior.
 """
 
 import argparse
@@ -126,7 +126,6 @@ def integrate(log_density: LogDensity, axis: np.ndarray) -> np.ndarray:
     began, row = time.process_time(), jax.jit(jax.vmap(log_density))
     logs = np.asarray([row(jnp.stack([jnp.full(len(axis), mu), jnp.asarray(axis)], axis=1)) for mu in axis])
     print(f"{logs.size} points, {np.isnan(logs).sum()} of them failed, {time.process_time() - began:.0f} s of CPU")
-    np.save("/tmp/logs.npy", logs)
     weights = np.exp(np.nan_to_num(logs - np.nanmax(logs), nan=-np.inf))
     return np.asarray(weights / weights.sum())
 

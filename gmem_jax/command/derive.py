@@ -304,8 +304,7 @@ def design_command(
             design = design_by_kernel if by == "kernel" else waveforms.design_waveforms
             found = design(experiment, cache=parts, progress=progress, **options)
         way = {"pack": pack, **{name: getattr(found, name) for name in ("before", "fidelity", "gain", "history")}}
-        (designed,) = found.sets.values()
-        save_waveforms(output, designed, experiment.waveforms, design=way)
+        save_waveforms(output, found.signals, experiment.waveforms, design=way)
     draw_beside(drawn, lambda: design_figure(found, float(experiment.scale), cell(pack)))
     draw_beside(history if picture else None, lambda: history_figure({cell(pack): found.history}))
     result = {

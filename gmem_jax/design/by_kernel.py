@@ -211,4 +211,4 @@ def design_by_kernel(
         history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
     signals = made(best)
     fresh = recall("verified", replace(experiment, signals=signals))
-    return verified(experiment, signals, fresh, untouched, history)
+    return verified(experiment, {name: signals for name in experiment.sets}, fresh, untouched, history)

@@ -5,9 +5,8 @@ replicas of one run (`gradient.push`). A damped Gauss-Newton step is simulated b
 whole and in parts.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,7 @@ from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest, written_se
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment, replace
 from gmem_jax.experiment.recall import prefix_of, run
-from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, sets_of, signals, waveform
+from gmem_jax.experiment.signals import Bumps, Signals, Spline, signals, waveform
 from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
@@ -45,7 +44,7 @@ class Design:
     `Recall.p_sig`, and gains are a matrix [C, C].
 
     Attributes:
-        signals: the waveforms, as samples, |I| <= 1; of several channels as sets.
+        sets: the waveforms, as samples, |I| <= 1, by the name of their set; see `signals`.
         target: J that their recall should follow, averaged over bins, [S, 256].
         p_sig: their recall in a fresh run, [S, 256], in E.
         fidelity: F of that recall with respect to the target.
@@ -55,7 +54,7 @@ class Design:
         history: F after every iteration, the untouched waveforms first; of several channels their mean.
     """
 
-    signals: Spline | SignalSets
+    sets: dict[str, Spline]
     target: np.ndarray
     p_sig: np.ndarray
     fidelity: float | np.ndarray
@@ -67,9 +66,15 @@ class Design:
     __repr__ = short_repr
 
     @property
-    def sets(self) -> dict[str, Spline]:
-        """The waveforms by set, one for each channel."""
-        return cast(dict[str, Spline], sets_of(self.signals))
+    def signals(self) -> Spline:
+        """The waveforms of a design on one channel.
+
+        Raises:
+            ValueError: if there are several sets, which `gm.signals(**design.sets)` puts together.
+        """
+        if len(self.sets) > 1:
+            raise ValueError(f"the design has sets {', '.join(self.sets)}: take gm.signals(**design.sets)")
+        return next(iter(self.sets.values()))
 
 
 def largest(amplitudes: np.ndarray, width: float) -> np.ndarray:
@@ -105,16 +110,12 @@ def sampled(signals: Signals) -> Spline:
 
 
 def verified(
-    experiment: Experiment,
-    signals: Spline | SignalSets,
-    p_sig: np.ndarray,
-    untouched: np.ndarray,
-    history: Sequence[float],
+    experiment: Experiment, sets: dict[str, Spline], p_sig: np.ndarray, untouched: np.ndarray, history: Sequence[float]
 ) -> Design:
     """What came of a design, by the recalls of the designed and of the untouched waveforms, both [S, 256] in E."""
     match, before = (experiment.compare(jnp.asarray(recall)) for recall in (p_sig, untouched))
     return Design(
-        signals=signals,
+        sets=sets,
         target=np.asarray(experiment.integral()),
         p_sig=p_sig,
         fidelity=_told(match.fidelity),
@@ -216,17 +217,17 @@ def design_waveforms(
         shaped = np.asarray(by_channel).reshape(len(names), -1, BINS)
         return np.concatenate(list(shaped), axis=1)
 
-    def made(rows: np.ndarray, of: Callable[[Bumps], Signals] = lambda one: one) -> Signals | SignalSets:
+    def made(rows: np.ndarray) -> dict[str, Bumps]:
         """Waveforms of amplitudes [S, C n]."""
-        own = np.split(rows, len(names), axis=1)
-        return signals(**{name: of(bumps(part, width)) for name, part in zip(names, own, strict=True)})
+        own = zip(names, np.split(rows, len(names), axis=1), strict=True)
+        return {name: bumps(part, width) for name, part in own}
 
     def within_bounds(rows: np.ndarray) -> np.ndarray:
         return np.concatenate([bounded(part, width) for part in np.split(rows, len(names), axis=1)], axis=1)
 
     def recall(name: str, rows: np.ndarray) -> np.ndarray:
         on = work.next(len(rows) / count, name)
-        changed = replace(experiment, signals=made(rows))
+        changed = replace(experiment, signals=signals(**made(rows)))
         return side_by_side(run(changed, prefix=prefix, cache=cache.scoped(name), progress=on).p_sig)
 
     def jacobians(name: str, at: np.ndarray) -> np.ndarray:
@@ -237,7 +238,7 @@ def design_waveforms(
         own = zip(fields, np.split(directions, len(names), axis=1), strict=True)
         direction = {f"{field}.amplitudes": jnp.asarray(part) for field, part in own}
         on = work.next(TANGENT * each, f"F = {history[-1]:.4f}")
-        changed = replace(experiment, signals=made(rows))
+        changed = replace(experiment, signals=signals(**made(rows)))
         slope = cache(name, lambda _: push(changed, direction, progress=on).p_sig_slope)
         return side_by_side(slope).reshape(count, each, -1)
 
@@ -261,7 +262,7 @@ def design_waveforms(
         chosen = np.linalg.norm(recalls - wanted, axis=2).argmin(axis=0), np.arange(count)
         amplitudes, p_sig = candidates[chosen], recalls[chosen]
         history.append(fidelity(p_sig))
-    designed = cast(Spline | SignalSets, made(amplitudes, sampled))
+    designed = {name: sampled(one) for name, one in made(amplitudes).items()}
     last = work.next(1.0 + share, "verified")
-    fresh = run(replace(experiment, signals=designed), cache=cache.scoped("verified"), progress=last).p_sig
+    fresh = run(replace(experiment, signals=signals(**designed)), cache=cache.scoped("verified"), progress=last).p_sig
     return verified(experiment, designed, np.asarray(fresh), np.asarray(untouched), history)

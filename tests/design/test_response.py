@@ -158,7 +158,7 @@ def test_design_of_two_channels_takes_away_what_each_gives_back_of_the_other(
     assert np.all(found.fidelity > 0.995)  # the sampled waveforms are cubics through 127 nodes
     np.testing.assert_allclose(found.gain, [[0.05, 0.0], [0.0, 0.05]], atol=5e-4)
     np.testing.assert_allclose(found.history[0], np.mean(found.before), rtol=1e-12)
-    assert max(np.abs(np.asarray(one.nodes)).max() for one in found.signals.sets) <= 1.0 + 1e-6
+    assert max(np.abs(np.asarray(one.nodes)).max() for one in found.sets.values()) <= 1.0 + 1e-6
 
 
 @pytest.mark.slow
@@ -166,6 +166,8 @@ def test_two_channels_are_designed_together(experiment: gm.Experiment) -> None:
     found = gm.design_waveforms(two_channels(experiment), iterations=1, n=4, width=0.4)
     assert found.fidelity.shape == (2,)
     assert found.history[1] > found.history[0]
+    with pytest.raises(ValueError, match=r"gm.signals\(\*\*design.sets\)"):
+        _ = found.signals
     np.testing.assert_allclose(np.mean(found.fidelity), found.history[-1], atol=1e-3)  # of samples
 
 
