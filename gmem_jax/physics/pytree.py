@@ -132,6 +132,21 @@ def comparable(cls: type[_T]) -> type[_T]:
     return cls
 
 
+def typed(tree: _T) -> _T:
+    """The same tree, its floats and arrays that came of floats as numbers of a type of their own.
+
+    Programs are compiled for one kind of number: the same for a number that was given as a float, and as an array.
+    """
+
+    def one(leaf: Any) -> Any:
+        if type(leaf) is float:
+            return np.float64(leaf)
+        return jax.lax.convert_element_type(leaf, leaf.dtype) if getattr(leaf, "weak_type", False) else leaf
+
+    found: _T = jax.tree.map(one, tree)
+    return found
+
+
 def pytree(cls: type[_T]) -> type[_T]:
     """Register a frozen dataclass with JAX. Rebuilding one runs no checks: its leaves may be tracers, or anything."""
     REGISTERED[comparable(cls).__name__] = cls

@@ -16,7 +16,7 @@ from gmem_jax.physics.contact.wall import wall_forces
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import Pairs, image_shifts, sphere_offsets
-from gmem_jax.physics.pytree import Scalar, pytree
+from gmem_jax.physics.pytree import Scalar, pytree, typed
 from gmem_jax.physics.rotation import cross, matrix, turn
 from gmem_jax.physics.state import Box, Grains, State
 
@@ -391,7 +391,7 @@ def start(system: System, position: jax.Array, quaternion: jax.Array, box: Box) 
 def accelerate(system: System, state: State, box: Box) -> State:
     """Recompute the accelerations of `state`, its histories untouched (after velocities or the law were changed)."""
     zero, alive = jnp.zeros(()), system.pairs.reach > 0.0
-    force, torque, _, _ = _forces(system, state.grains, state.history, box, zero, alive)
+    force, torque, _, _ = _forces(typed(system), state.grains, state.history, box, zero, alive)
     slowing = 0.0 if state.cell is None else _strain_rate(box) * state.grains.velocity
     grains = replace(
         state.grains,

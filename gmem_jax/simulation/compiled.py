@@ -7,6 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from gmem_jax.physics.pytree import typed
+
 
 @functools.cache
 def _settings(quick: bool) -> dict[str, Any] | None:
@@ -40,7 +42,8 @@ class Compiled:
         return jax.jit(self._function, compiler_options=_settings(self._quick), **self._options)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Call it."""
+        """Call it: a number given as a float, and one given as an array, are of one program."""
+        args, kwargs = typed((args, kwargs))
         return self.program(*args, **kwargs)
 
 
