@@ -1,6 +1,6 @@
 """mu and k_H from one noisy recall: their posterior by NUTS, and by quadrature on a grid beside it.
 
-python experiments/estimate.py [-o estimate] [--pack tetra-325-a] [--t0 250] [--signals 2] [--samples 100] [--warm 50]
+python experiments/estimate.py [-o estimate] [--pack tests/data/tetra-27.h5] [--signals 3] [--noise 2] [--samples 100]
 
 Needs blackjax. The recall of some waveforms is read as the means of p_sig over each sixteenth of u, with Gaussian noise
 of `--noise` times their root mean square. For a given pack the recall is a function of mu and k_H, and the logarithm of
@@ -44,12 +44,13 @@ def main() -> None:
     """Measure, sample, integrate, draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("estimate"), help="without a suffix")
-    parser.add_argument("--pack", default="tetra-325-a")
-    parser.add_argument("--t0", type=float, default=250.0)
-    parser.add_argument("--signals", type=int, default=2, help="of the six waveforms, the first so many")
+    parser.add_argument("--pack", default="tests/data/tetra-27.h5")
+    parser.add_argument("--t0", type=float, default=600.0)
+    parser.add_argument("--signals", type=int, default=3, help="of the six waveforms, the first so many")
     parser.add_argument("--noise", type=float, default=2.0, help="of a reading, over the root mean square of all")
     parser.add_argument("--samples", type=int, default=100, help="of each of the four chains")
     parser.add_argument("--warm", type=int, default=50, help="samples that tune a chain before")
+    parser.add_argument("--doublings", type=int, default=4, help="of a trajectory of NUTS, at most")
     parser.add_argument("--points", type=int, default=31, help="of the grid on each axis, odd")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -57,7 +58,7 @@ def main() -> None:
     six, count = gm.six_signals(), arguments.signals
     signals = gm.Bumps(six.amplitudes[:count], six.centres[:count], six.width)
     experiment = gm.Experiment(
-        gm.load_pack(arguments.pack), signals, t0=arguments.t0, dt=1.0, rest=0.1, hold=0.1, store=0.1
+        gm.load_pack(arguments.pack), signals, t0=arguments.t0, dt=1.2, rest=0.1, hold=0.1, store=0.1
     )
 
     def readings(values: jax.Array) -> jax.Array:
@@ -78,7 +79,7 @@ def main() -> None:
     for name, every in (("grid", 1), ("every second point", 2)):
         mesh = np.stack(np.meshgrid(axis[::every], axis[::every], indexing="ij"), -1)
         tell(name, np.asarray(numbers(mesh)), weights[::every, ::every])
-    places = sample(log_density, sampling, arguments.warm, arguments.samples)
+    places = sample(log_density, sampling, arguments.warm, arguments.samples, arguments.doublings)
     found = np.asarray(numbers(places))
     tell("NUTS", found, np.ones(found.shape[:2]))
     with arguments.output.with_suffix(".csv").open("w", newline="") as file:
@@ -88,7 +89,7 @@ def main() -> None:
     draw(arguments.output.with_suffix(".png"), places, axis, weights, np.asarray(measured), np.asarray(clean), noise)
 
 
-def sample(log_density: LogDensity, key: jax.Array, warm: int, count: int) -> np.ndarray:
+def sample(log_density: LogDensity, key: jax.Array, warm: int, count: int, doublings: int) -> np.ndarray:
     """Chains [4, count, 2], each tuned by itself, all run together."""
 
     @jax.jit
@@ -96,7 +97,11 @@ def sample(log_density: LogDensity, key: jax.Array, warm: int, count: int) -> np
     def chain(key: jax.Array, start: jax.Array) -> Any:
         tuning, sampling = jax.random.split(key)
         tuned = blackjax.window_adaptation(
-            blackjax.nuts, log_density, is_mass_matrix_diagonal=False, initial_step_size=0.3, max_num_doublings=2
+            blackjax.nuts,
+            log_density,
+            is_mass_matrix_diagonal=False,
+            initial_step_size=0.3,
+            max_num_doublings=doublings,
         )
         (state, parameters), _ = tuned.run(tuning, start, num_steps=warm)
         kernel = blackjax.nuts(log_density, **parameters)
@@ -149,9 +154,9 @@ def draw(
     """What was read of one waveform, the posterior by both ways, and what each number has of it."""
     figure, ((top, joint), margins) = pyplot().subplots(2, 2, figsize=(10, 8))
     u, grid = (np.arange(READINGS) + 0.5) / READINGS, np.asarray(numbers(np.stack([axis, axis], 1)))
-    top.errorbar(u, measured[4] * 1e6, noise * 1e6, fmt="o", ms=4, color="0.4", capsize=2, label="read, ± noise")
-    top.plot(u, clean[4] * 1e6, color="#1f5fa8", label="without noise")
-    top.set(xlabel="compression variable u", ylabel="$p_{sig}$ ($10^{-6}$ E)", title="one of six recalled waveforms")
+    top.errorbar(u, measured[0] * 1e6, noise * 1e6, fmt="o", ms=4, color="0.4", capsize=2, label="read, ± noise")
+    top.plot(u, clean[0] * 1e6, color="#1f5fa8", label="without noise")
+    top.set(xlabel="compression variable u", ylabel="$p_{sig}$ ($10^{-6}$ E)", title="one of the recalled waveforms")
     falling = np.sort(weights.ravel())[::-1]
     levels = [falling[np.searchsorted(np.cumsum(falling), part)] for part in (0.95, 0.5)]
     joint.contourf(*grid.T, weights.T, [*levels, 1.0], colors=["#dbe6f2", "#a9c4e2"])
