@@ -94,7 +94,12 @@ def _require_known(backend: str) -> None:
 
 
 def require_precision(
-    precision: str, backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS, equal: bool = True
+    precision: str,
+    backend: str,
+    law: FrictionLaw,
+    periodic: PeriodicAxes = WALLS,
+    equal: bool = True,
+    smooth: bool = True,
 ) -> None:
     """Refuse a precision that is unknown, or not to be had.
 
@@ -104,6 +109,7 @@ def require_precision(
         law: the friction law.
         periodic: the periodic axes of the box.
         equal: whether all spheres are of radius 1.
+        smooth: whether walls are without friction.
 
     Raises:
         ValueError: saying why.
@@ -116,7 +122,7 @@ def require_precision(
         built, said = library.available()
         why = "" if backend == "jax" or built else f", which is not available: {said}"
         raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")
-    require_mixed(law, periodic, equal)
+    require_mixed(law, periodic, equal, smooth)
 
 
 def marcher(backend: str = "auto", precision: str = "double") -> March:

@@ -38,10 +38,11 @@ class Call(NamedTuple):
         variant: number of the Mindlin law's variant.
         points: Q of the Mindlin law.
         isotropic: whether all moments of inertia are equal.
-        leaves: arrays of the history.
+        leaves: arrays of the candidates' history.
         mixed: whether contacts are computed in single precision.
         periodic: bits of the periodic axes.
         unequal: whether spheres differ in radius.
+        rubs: whether walls have friction.
     """
 
     law: int
@@ -52,6 +53,7 @@ class Call(NamedTuple):
     mixed: int = 0
     periodic: int = 0
     unequal: int = 0
+    rubs: int = 0
 
 
 class Fixed(NamedTuple):
@@ -88,7 +90,7 @@ class Arrays(NamedTuple):
         parameters: rows of src/physics/parameters.h's parameter array, [rows, B].
         walls: lower, upper and their velocities of every step, [steps, 12, B].
         offsets: sphere centres of a grain, [K, 3, B], in R; alike in all replicas, as their derivatives need not be.
-        history: leaves of the history, [P, ..., B].
+        history: leaves of the candidates' history, [P, ..., B]; then of that of walls with friction, [6 S, ..., B].
     """
 
     fields: list[jax.Array]
@@ -302,13 +304,17 @@ def _primitive(
 
     def on_cpu(context: mlir.LoweringRuleContext, *values: Any, **static: Any) -> Any:
         call = static["call"]
-        if target == "gmem_adjoint" and (call.periodic or call.unequal):  # which the library has not
+        if call.rubs or (target == "gmem_adjoint" and (call.periodic or call.unequal)):  # which the library has not
             return in_plain_jax(context, *values, **static)
         return library(context, *values, **static)
 
     def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
         if static["call"].mixed:
             raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
+        if static["call"].rubs:
+            if target in cuda.CUDA_TARGETS and not definition.anywhere:
+                raise NotImplementedError("walls with friction are not in the kernels of GPUs; use backend='auto'")
+            return in_plain_jax(context, *values, definition=definition, **static)
         if target in cuda.CUDA_TARGETS and not cuda.missing():
             return library(context, *values, on_gpu=True, **static)
         if target in cuda.CUDA_TARGETS and not definition.anywhere:

@@ -82,7 +82,7 @@ Signature signature(Task task, Law law) {
 }
 
 ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                int64_t mixed, int64_t periodic, int64_t unequal, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+                int64_t mixed, int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   require_law(law, variant, points);
   require_axes(periodic);
   Problem problem{};
@@ -213,8 +213,9 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 
 template <Task task>
 ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves, int64_t mixed,
-                  int64_t periodic, int64_t unequal, ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  return in_words([&] { return call(task, law, variant, points, isotropic, leaves, mixed, periodic, unequal, args, rets); });
+                  int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  return in_words(
+      [&] { return call(task, law, variant, points, isotropic, leaves, mixed, periodic, unequal, rubs, args, rets); });
 }
 
 auto binding() { return with_arguments(ffi::Ffi::Bind()); }

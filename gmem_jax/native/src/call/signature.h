@@ -72,6 +72,7 @@ auto with_arguments(Binding&& binding) {
       .template Attr<int64_t>("mixed")
       .template Attr<int64_t>("periodic")
       .template Attr<int64_t>("unequal")
+      .template Attr<int64_t>("rubs")
       .RemainingArgs()
       .RemainingRets();
 }
