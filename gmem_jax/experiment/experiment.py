@@ -180,7 +180,11 @@ class Experiment:
             )
 
     def _check_wall_mu(self) -> None:
-        if self.wall_mu is not None and not isinstance(self.friction, CoulombLaw):
+        if self.wall_mu is None:
+            return
+        if self.backend == "native" and not native.rubs(self.friction, self.pack.periodic):
+            raise ValueError(native.NO_RUBBING)
+        if not isinstance(self.friction, CoulombLaw):
             raise ValueError(
                 f"wall_mu takes the place of mu at walls, and {type(self.friction).__name__} has no mu: leave wall_mu "
                 "out, or use another friction law"
@@ -336,8 +340,8 @@ class Experiment:
 
     @property
     def runs_on(self) -> native.Backend:
-        """What `backend` means for this law on JAX's default device."""
-        return native.name(self.backend, self.friction)
+        """What `backend` means for this law and these walls on JAX's default device."""
+        return native.name(self.backend, self.friction, self.pack.periodic, self.wall_mu is None)
 
     @property
     def timing(self) -> Timing:

@@ -28,6 +28,9 @@ from gmem_jax.native import cuda
 from gmem_jax.physics.step import mark_varying
 
 TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint")
+NO_RUBBING = (
+    "the native backend has no walls with friction in periodic boxes, of law M2 and on GPUs; use backend='auto'"
+)
 
 
 class Call(NamedTuple):
@@ -303,8 +306,11 @@ def _primitive(
     in_plain_jax = mlir.lower_fun(elsewhere, multiple_results=True)
 
     def on_cpu(context: mlir.LoweringRuleContext, *values: Any, **static: Any) -> Any:
-        call = static["call"]
-        if call.rubs or (target == "gmem_adjoint" and (call.periodic or call.unequal)):  # which the library has not
+        call, adjoint = static["call"], target == "gmem_adjoint"
+        lacking = call.rubs and (call.periodic or call.points)  # which the library has not
+        if lacking and not adjoint and not static["definition"].anywhere:
+            raise NotImplementedError(NO_RUBBING)
+        if lacking or (adjoint and (call.periodic or call.unequal or call.rubs)):
             return in_plain_jax(context, *values, **static)
         return library(context, *values, **static)
 
@@ -313,7 +319,7 @@ def _primitive(
             raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
         if static["call"].rubs:
             if target in cuda.CUDA_TARGETS and not definition.anywhere:
-                raise NotImplementedError("walls with friction are not in the kernels of GPUs; use backend='auto'")
+                raise NotImplementedError(NO_RUBBING)
             return in_plain_jax(context, *values, definition=definition, **static)
         if target in cuda.CUDA_TARGETS and not cuda.missing():
             return library(context, *values, on_gpu=True, **static)

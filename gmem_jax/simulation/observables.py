@@ -99,7 +99,7 @@ def _stress(simulation: Simulation, state: State) -> jax.Array:
     total += _diagonal(across)
     if (rubbed := seen.rubbed(simulation, state)) is not None:
         kin, friction = rubbed
-        to_plane = (kin.arm - 0.5 * kin.overlap) * kin.normal
+        to_plane = (kin.arm - jnp.where(kin.touching, kin.overlap, 0.0)) * kin.normal
         total += _tensor(-friction, jnp.repeat(arms, PLANES, axis=0) + to_plane)
     return total / jnp.prod(box.lengths, axis=0)
 

@@ -75,7 +75,7 @@ def test_a_sphere_on_the_floor_sticks_by_its_spring_and_slides_at_the_limit(
     force, torque, pushed = dragged(law, 0.5, moved, radius, rigidity)
     np.testing.assert_allclose(pushed, rigidity * gm.Material().plane_stiffness * np.sqrt(radius) * 0.02**1.5)
     np.testing.assert_allclose(force, [-law.stiffness * stiffer * moved, 0.0, 0.0], rtol=1e-12, atol=1e-18)
-    np.testing.assert_allclose(torque, np.cross([0.0, 0.0, -(radius - 0.01)], force), rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(torque, np.cross([0.0, 0.0, -radius], force), rtol=1e-12, atol=1e-18)
     force, *_, pushed = dragged(law, 0.5, 1.0, radius, rigidity)
     np.testing.assert_allclose(force, [-0.5 * pushed, 0.0, 0.0], rtol=1e-12, atol=1e-18)
 
@@ -93,12 +93,10 @@ def test_a_sphere_that_slides_on_the_floor_rolls_with_five_sevenths_of_its_speed
     state = dynamics.accelerate(system, replace(state, grains=grains), FLOOR)
     after, _ = MARCH(system, state, standing(FLOOR, 4000), 0.5, 0.0)
     moving, turning = float(after.grains.velocity[0, 0, 0]), float(after.grains.spin[0, 1, 0])
-    # About the point of contact, an arm of R - p / 2 away, friction leaves the angular momentum as it is. What is left
-    # of the spring's oscillation, which the dashpot damps, is 1e-5.
-    arm = 1.0 - 0.5 * depth
-    np.testing.assert_allclose(moving + 0.4 / arm * turning, speed, rtol=1e-9)
-    np.testing.assert_allclose(moving, speed / (1.0 + 0.4 / arm**2), rtol=1e-4)
-    np.testing.assert_allclose(moving, 5.0 / 7.0 * speed, rtol=depth)  # of a rigid sphere; the arm differs by p / 2
+    # About the point of contact, an arm of R away, friction leaves the angular momentum as it is. What is left of the
+    # spring's oscillation, which the dashpot damps, is 1e-5; overlaps do not matter.
+    np.testing.assert_allclose(moving + 0.4 * turning, speed, rtol=1e-9)
+    np.testing.assert_allclose(moving, 5.0 / 7.0 * speed, rtol=1e-4)
 
 
 def squeezed(wall_mu: Any, law: Any = gm.Hooke(), replicas: int = 1, steps: int = 40) -> tuple[System, State, Box]:  # noqa: B008
@@ -217,7 +215,7 @@ def test_the_stable_step_knows_the_springs_of_walls() -> None:
         )
         for wall_mu in (None, 10.0)
     ]
-    frequency = np.sqrt(5.0 * (1.0 / float(SPHERE.mass) + 0.995**2 / float(SPHERE.inertia[0])))
+    frequency = np.sqrt(5.0 * (1.0 / float(SPHERE.mass) + 1.0 / float(SPHERE.inertia[0])))
     assert found[0] == 2.0
     np.testing.assert_allclose(found[1], 2.0 / frequency, rtol=0.03)  # it is looked for to 2 %
 

@@ -56,7 +56,8 @@ def wall_kinematics(
 ) -> Kinematics:
     """Kinematics of all spheres with all planes of the box, [6 S, ..., B]: row 6 s + w is sphere s at plane w.
 
-    "Sphere j" of a `Kinematics` is the plane: it moves along its normal alone, and does not turn. The radius is that of
+    "Sphere j" of a `Kinematics` is the plane: it moves along its normal alone, and does not turn. The arm is R, as in
+    LAMMPS' walls (between spheres it is R - p / 2 here). The radius is that of
     two equal spheres whose contact is as stiff as this one of the same overlap, 8 wall_rigidity^2 R: the effective
     radius is R in the place of R / 2, and one body is compliant in the place of two (docs/physics.md).
 
@@ -88,7 +89,7 @@ def wall_kinematics(
     if any(box.periodic):
         touching &= np.tile(~np.asarray(box.periodic), 2 * count)[:, None, None]
     wide = 1.0 if radii is None else jnp.repeat(radii, PLANES)[:, None, None]
-    arm = wide - 0.5 * overlap
+    arm = jnp.broadcast_to(wide, overlap.shape)
     along = dot(velocity, normal)
     return Kinematics(
         normal=normal,

@@ -7,6 +7,7 @@ namespace gmem {
 constexpr int kFields = 6;  // position, quaternion, velocity, spin, acceleration, spin rate
 constexpr int kWalls = 12;  // lower, upper, lower velocity, upper velocity
 constexpr int kMaxHistory = 3;
+constexpr int kPlanes = 6;  // that a sphere may touch: the lower walls of x, y and z, then the upper ones
 
 // What is wanted: all steps; their derivative along a direction; or, back from derivatives by all results, those by all
 // arguments.
