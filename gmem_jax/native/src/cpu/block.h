@@ -228,7 +228,7 @@ struct Engine : EngineLayout<Mode> {
 
   // What walls with friction are to spheres of unit u, from the arrays of the call ...
   void load_walls(int u) {
-    bool any = false;
+    bool any = Mode::kDual;  // a derivative may be where the value is 0
     for (int row = 0; row < problem.wall_rows(); ++row)
       for (int q = 0; q < Mode::OfLaw::kGiven; ++q) {
         const V number = mode.wall_history_in(u, row, q);
