@@ -59,8 +59,10 @@ def moved(march: Callable[..., Any], system: System, state: State, boxes: Box) -
     return state.grains, state.history, state.wall_history, pressure + more, middle.wall_history
 
 
-@pytest.mark.parametrize("replicas", [1, 5])
-@pytest.mark.parametrize("law", ["H", "M1"])
+@pytest.mark.parametrize(
+    ("law", "replicas"),
+    [("M1", 5), *(pytest.param(*more, marks=pytest.mark.slow) for more in (("H", 5), ("H", 1), ("M1", 1)))],
+)
 def test_values_are_those_of_the_definition(law: str, replicas: int) -> None:
     scene = thrown(law, replicas)
     found = moved(native.march, *scene)
@@ -71,8 +73,8 @@ def test_values_are_those_of_the_definition(law: str, replicas: int) -> None:
 
 
 def test_walls_of_this_scene_are_stuck_to_and_slid_on() -> None:
-    system, _, boxes = scene = thrown("H", 5)
-    grains, _, history, *_ = moved(dynamics.march, *scene)
+    system, _, boxes = scene = thrown("M1", 5)
+    grains, _, history, *_ = moved(native.march, *scene)
     table, _ = dynamics.sphere_table(system.clump, grains)
     box, solid = part(boxes, -1), (system.material.wall_stiffness, system.material.normal_damping)  # type: ignore[arg-type]
     forces = wall_forces(table[:, :3], table[:, 3:6], box, *solid)
@@ -93,6 +95,7 @@ def test_a_replica_has_the_same_bits_alone(law: str) -> None:
             np.testing.assert_array_equal(one[..., 0], other[..., replica])
 
 
+@pytest.mark.slow
 def test_values_of_grains_of_sizes_are_those_of_the_definition() -> None:
     scene = thrown("M1", 5, SPREAD_27)
     assert_close(moved(native.march, *scene), moved(dynamics.march, *scene), 1e-12)
@@ -142,35 +145,49 @@ def rubbed(law: str) -> Scene:
     return system, advanced, part(boxes, slice(25, None))
 
 
-@pytest.mark.parametrize("law", ["H", pytest.param("M1", marks=pytest.mark.slow)])
-def test_derivatives_are_those_of_the_definition(law: str) -> None:
-    found = []
-    for march in (native.march, dynamics.march):
-        end, theta = slopes(march, rubbed(law), 15)
+def derivatives(march: Callable[..., Any], law: str, backwards: bool) -> Any:
+    """Of 15 steps along some direction, and, if they are wanted, back from some weights."""
+    end, theta = slopes(march, rubbed(law), 15)
 
-        def both(theta: Any, along: Any, end: Callable[..., Any] = end) -> Any:
-            out, change = jax.jvp(end, (theta,), (along,))
-            return change, jax.vjp(end, theta)[1](random_like(out))[0]
+    def both(theta: Any, along: Any) -> Any:
+        out, change = jax.jvp(end, (theta,), (along,))
+        return change, jax.vjp(end, theta)[1](random_like(out))[0] if backwards else ()
 
-        found.append(jax.jit(both, compiler_options=QUICKLY)(theta, random_like(theta)))
+    return jax.jit(both, compiler_options=QUICKLY)(theta, random_like(theta))
+
+
+@pytest.mark.parametrize(
+    ("law", "backwards"), [("H", False), *(pytest.param(law, True, marks=pytest.mark.slow) for law in ("H", "M1"))]
+)
+def test_derivatives_are_those_of_the_definition(law: str, backwards: bool) -> None:
+    found, expected = (derivatives(march, law, backwards) for march in (native.march, dynamics.march))
     # Round-off of the one is some 1e-14, magnified where normal parts nearly cancel; the other is one program.
-    assert_close(found[0][0], found[1][0], 1e-9)
-    assert_close(found[0][1], found[1][1], 1e-12)
-    assert float(np.abs(found[1][1]["wall_mu"]).min()) > 0.0
+    assert_close(found[0], expected[0], 1e-9)
+    assert_close(found[1], expected[1], 1e-12)
+    assert not backwards or float(np.abs(expected[1]["wall_mu"]).min()) > 0.0
 
 
-@pytest.mark.parametrize(("law", "file"), [("M2", TETRA_27), ("H", PERIODIC_XY_27)])
-def test_what_the_library_has_not_runs_in_plain_jax_or_is_refused(law: str, file: Any) -> None:
+LACKING = pytest.mark.parametrize(("law", "file"), [("M2", TETRA_27), ("H", PERIODIC_XY_27)])
+
+
+@LACKING
+def test_what_the_library_has_not_is_refused(law: str, file: Any) -> None:
+    pack, friction = gm.load_pack(file), LAWS[law]
+    assert native.name("auto", friction, pack.periodic, smooth=False) == "jax"
+    with pytest.raises(ValueError, match="walls with friction"):
+        gm.Experiment(pack, gm.six_signals(), friction, wall_mu=0.1, backend="native")
     system, state, boxes = thrown(law, 1, file)
-    few = part(boxes, slice(3))
-    assert native.name("auto", system.friction, boxes.periodic, smooth=False) == "jax"
     with pytest.raises(NotImplementedError, match="walls with friction"):
-        jax.jit(native.march)(system, state, few, 0.3, 0.0)
+        jax.jit(native.march)(system, state, part(boxes, slice(3)), 0.3, 0.0)
+
+
+@pytest.mark.slow
+@LACKING
+def test_auto_takes_plain_jax_for_what_the_library_has_not(law: str, file: Any) -> None:
+    system, state, boxes = thrown(law, 1, file)
     auto, plain = (
-        jax.jit(march, compiler_options=QUICKLY)(system, state, few, 0.3, 0.0)
+        jax.jit(march, compiler_options=QUICKLY)(system, state, part(boxes, slice(3)), 0.3, 0.0)
         for march in (native.marcher("auto"), dynamics.march)
     )
     assert_close(auto[0].wall_history, plain[0].wall_history, 1e-13)
     assert np.any(np.asarray(jax.tree.leaves(auto[0].wall_history)[0]))
-    with pytest.raises(ValueError, match="walls with friction"):
-        gm.Experiment(gm.load_pack(file), gm.six_signals(), system.friction, wall_mu=0.1, backend="native")
