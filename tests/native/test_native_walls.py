@@ -63,7 +63,7 @@ def moved(march: Callable[..., Any], system: System, state: State, boxes: Box) -
     ("law", "replicas"),
     [("M1", 5), *(pytest.param(*more, marks=pytest.mark.slow) for more in (("H", 5), ("H", 1), ("M1", 1)))],
 )
-def test_values_are_those_of_the_definition(law: str, replicas: int) -> None:
+def test_values_at_walls_with_friction_are_those_of_the_definition(law: str, replicas: int) -> None:
     scene = thrown(law, replicas)
     found = moved(native.march, *scene)
     assert_close(found, moved(dynamics.march, *scene), 1e-12)  # one replica contact by contact, five side by side
@@ -85,7 +85,7 @@ def test_walls_of_this_scene_are_stuck_to_and_slid_on() -> None:
 
 
 @pytest.mark.parametrize("law", ["H", "M1"])
-def test_a_replica_has_the_same_bits_alone(law: str) -> None:
+def test_a_replica_between_walls_with_friction_has_the_same_bits_alone(law: str) -> None:
     system, state, boxes = thrown(law, 5)
     together = moved(native.march, system, state, boxes)
     for replica in (0, 3):
@@ -159,7 +159,7 @@ def derivatives(march: Callable[..., Any], law: str, backwards: bool) -> Any:
 @pytest.mark.parametrize(
     ("law", "backwards"), [("H", False), *(pytest.param(law, True, marks=pytest.mark.slow) for law in ("H", "M1"))]
 )
-def test_derivatives_are_those_of_the_definition(law: str, backwards: bool) -> None:
+def test_derivatives_at_walls_with_friction_are_those_of_the_definition(law: str, backwards: bool) -> None:
     found, expected = (derivatives(march, law, backwards) for march in (native.march, dynamics.march))
     # Round-off of the one is some 1e-14, magnified where normal parts nearly cancel; the other is one program.
     assert_close(found[0], expected[0], 1e-9)

@@ -216,6 +216,8 @@ struct WallLaw {
   LawParameters<V> law;
   V quarter_dt, normal_stiffness;
 
+  WallLaw() = default;
+
   constexpr WallLaw(const V* parameter, V mu)
       : law(parameter + kLaw, parameter[kDt]), quarter_dt(splat<V>(0.25) * parameter[kDt] * parameter[kSpinning]),
         normal_stiffness(parameter[kNormalStiffness]) {
@@ -224,13 +226,13 @@ struct WallLaw {
 };
 
 // Adds to `on` the friction of the walls on one sphere of a grain, of a radius for which the walls have their stiffness.
-// `history` has what the law remembers of it at each plane, [kPlanes, Law::kHistory]; is anything but 0 there, it `remembers`.
-// Returns whether it does afterwards.
+// `history` has what the law remembers of it at each plane, [kPlanes, Law::kHistory]; is that anything but 0, the plane's bit
+// of `remembered` is set. Returns these bits afterwards.
 // gmem_jax/physics/contact/wall.py: wall_kinematics, wall_friction
 template <class Law, class V>
-GMEM_INLINE bool rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
-                         Vec<V> spin, const WallState<V>& box, V radius, V* history, bool remembers, WallFriction<V>& on) {
-  if (!remembers && !bits_less(V{}, deepest(radius, centre, box))) return false;
+GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
+                         Vec<V> spin, const WallState<V>& box, V radius, V* history, unsigned remembered, WallFriction<V>& on) {
+  if (!remembered && !bits_less(V{}, deepest(radius, centre, box))) return 0;
   const Vec<V> all{radius, radius, radius};
   const Vec<V> lower = all - (centre - box.lower), upper = all - (box.upper - centre);
   const Vec<V> low = box.lower_velocity - velocity, up = velocity - box.upper_velocity;
@@ -239,17 +241,19 @@ GMEM_INLINE bool rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls,
   const V zero{}, stiffer = p.wall_stiffness / walls.normal_stiffness;
   Contact<V> c[kPlanes];
   int count = 0;
+  unsigned touched = 0;
   for (int w = 0; w < kPlanes; ++w) {
-    V* const remembered = history + w * Law::kHistory;
+    V* const own = history + w * Law::kHistory;
     if (!bits_less(V{}, overlap[w])) {
-      for (int q = 0; remembers && q < Law::kHistory; ++q) remembered[q] = V{};
+      for (int q = 0; remembered >> w & 1 && q < Law::kHistory; ++q) own[q] = V{};
       continue;
     }
+    touched |= 1u << w;
     const V side = splat<V>(w < 3 ? -1.0 : 1.0);
     Contact<V>& now = c[count++];
     now.normal = {w % 3 == 0 ? side : zero, w % 3 == 1 ? side : zero, w % 3 == 2 ? side : zero};
     now.overlap = overlap[w];
-    now.history = remembered;
+    now.history = own;
     const Vec<V> arm = radius * now.normal;
     now.lever_one = lever + arm;
     now.sliding = dot(velocity, now.normal) * now.normal - velocity - cross(spin, arm);
@@ -263,7 +267,7 @@ GMEM_INLINE bool rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls,
     on.force = on.force + c[n].force;
     on.torque = add_cross(on.torque, c[n].lever_one, c[n].force);
   }
-  return count > 0;
+  return touched;
 }
 
 // The centre of a sphere of a grain, and what the walls do to it if they are near.
