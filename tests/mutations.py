@@ -1354,15 +1354,15 @@ MUTATIONS = (
     mutation(
         "overlap-range-too-wide",
         "simulation/sample.py",
-        "sample.largest_overlap > largest_overlap(",
-        "sample.largest_overlap > 1.01 * largest_overlap(",
+        "deepest > largest_overlap(",
+        "deepest > 1.01 * largest_overlap(",
         "test_an_overlap_beyond_the_law_is_flagged_in_its_replica_and_no_other",
     ),
     mutation(
         "overlap-range-too-narrow",
         "simulation/sample.py",
-        "sample.largest_overlap > largest_overlap(",
-        "sample.largest_overlap > 0.99 * largest_overlap(",
+        "deepest > largest_overlap(",
+        "deepest > 0.99 * largest_overlap(",
         "test_an_overlap_beyond_the_law_is_flagged_in_its_replica_and_no_other",
     ),
     mutation(

@@ -370,5 +370,7 @@ def test_the_table_of_derivatives_has_every_name(whole: gm.Experiment) -> None:
     page = (Path(__file__).parents[2] / "docs" / "derivatives.md").read_text()
     rows = dict(re.findall(r"^\| `([\w.]+)` \|.*\| (.*?) \|.*\|.*\|$", page, re.MULTILINE))
     assert set(all_names(whole)) <= set(rows)
-    assert {"friction.p_max", "creep", "creep_fades", "gravity", "pack.clump.sizes", "signals.nodes"} <= set(rows)
+    assert {"friction.p_max", "creep", "creep_fades", "gravity", "wall_mu", "pack.clump.sizes", "signals.nodes"} <= set(
+        rows
+    )
     assert all(found.startswith("0: ") or float(found) < 2e-2 for found in rows.values())
