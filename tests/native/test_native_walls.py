@@ -146,8 +146,8 @@ def rubbed(law: str) -> Scene:
 
 
 def derivatives(march: Callable[..., Any], law: str, backwards: bool) -> Any:
-    """Of 15 steps along some direction, and, if they are wanted, back from some weights."""
-    end, theta = slopes(march, rubbed(law), 15)
+    """Of 10 steps along some direction, and, if they are wanted, back from some weights."""
+    end, theta = slopes(march, rubbed(law), 10)
 
     def both(theta: Any, along: Any) -> Any:
         out, change = jax.jvp(end, (theta,), (along,))
@@ -161,7 +161,8 @@ def derivatives(march: Callable[..., Any], law: str, backwards: bool) -> Any:
 )
 def test_derivatives_at_walls_with_friction_are_those_of_the_definition(law: str, backwards: bool) -> None:
     found, expected = (derivatives(march, law, backwards) for march in (native.march, dynamics.march))
-    # Round-off of the one is some 1e-14, magnified where normal parts nearly cancel; the other is one program.
+    # Round-off of the one is some 1e-14, magnified in each step where contacts between grains have just begun (as much
+    # between smooth walls); the other is one program.
     assert_close(found[0], expected[0], 1e-9)
     assert_close(found[1], expected[1], 1e-12)
     assert not backwards or float(np.abs(expected[1]["wall_mu"]).min()) > 0.0
