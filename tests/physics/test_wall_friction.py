@@ -230,6 +230,21 @@ def test_friction_of_walls_is_a_number_of_an_experiment() -> None:
     assert Status(int(np.bitwise_or.reduce(np.asarray(warned.status)))) & Status.LARGE_FRICTION
 
 
+def test_observers_see_the_friction_of_walls() -> None:
+    system = System(SPHERE, LAWS["H"], all_pairs(SPHERE, 1), wall_mu=0.5)
+    grains = make_grains([[0.0, 0.0, -2.02]], velocity=[[2e-3, 0.0, 0.0]])
+    remembered = dynamics.wall_histories(system, 1, 1).at[2, 0].set(-1e-4)  # of the floor, less than the limit
+    state = State(
+        grains, system.friction.init(system.pairs.capacity, 1, float), jnp.zeros(1, int), None, None, remembered
+    )
+    simulation = loop.Simulation(system, None, 0.3, box=FLOOR)  # type: ignore[arg-type]
+    power, stress = (one()(simulation, state) for one in (gm.observables.friction_power, gm.observables.stress))
+    np.testing.assert_allclose(power, 1e-4 * 2e-3, rtol=1e-12)
+    # The floor is pushed by 1e-4 along x, 0.98 below the centre; what lies there is pushed away along z.
+    np.testing.assert_allclose(stress[0, 2] * 180.0 * 180.0 * 93.0, -1e-4 * 0.98, rtol=1e-12)
+    assert float(stress[2, 2, 0]) > 0.0
+
+
 def test_a_stage_without_friction_has_none_at_walls() -> None:
     system = System(SPHERE, gm.Hooke(), all_pairs(SPHERE, 1), wall_mu=0.5)
     assert loop._rubbing(system, REST._replace(friction=0.5)).wall_mu == 0.25
