@@ -25,7 +25,7 @@ BEGIN, END = "<!-- made by docs/make/derivatives_page.py -->", "<!-- end -->"
 STEP = 1e-7  # of a difference, over the size of a number: contacts of 27 grains hardly change within it
 DIRECTIONS = 5  # the median over these is not that of a step in which a contact began to slide
 LARGEST_ERROR = 2e-2  # as in tests/derivatives/test_gradient.py
-PLAIN = {"pack.clump.sizes": "forward native, reverse plain JAX"}
+PLAIN = dict.fromkeys(("pack.clump.sizes", "wall_mu"), "forward native, reverse plain JAX")
 ZERO = {  # inputs whose slope is 0, and why
     "material.radius": "a unit",
     "material.modulus": "a unit",
@@ -47,6 +47,7 @@ def experiments() -> Iterator[tuple[str, gm.Experiment]]:
     yield "law M2", gm.Experiment(pack, bumps, gm.Mindlin(mu=0.8), **short)
     yield "creep", gm.Experiment(pack, bumps, creep=1e-3, creep_fades=5.0, **short)
     yield "gravity", gm.Experiment(pack, bumps, gravity=1e-4, **short)
+    yield "friction of walls", gm.Experiment(pack, bumps, wall_mu=0.5, **short)
     sizes = 1.0 + 0.05 * np.random.default_rng(0).normal(size=pack.grains)
     yield "grains of sizes", gm.Experiment(dataclasses.replace(pack, clump=gm.sized(pack.clump, sizes)), bumps, **short)
     yield "a spline", gm.Experiment(pack, gm.waveform(jnp.sin(jnp.linspace(0.2, 3.0, 8))), **short)

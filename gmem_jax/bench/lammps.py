@@ -11,7 +11,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -203,6 +203,22 @@ def masses_of_types(clump: Clump) -> list[float]:
     return [float(clump.mass) * size**3 for size in sizes]
 
 
+def _tangential(
+    friction: Frictionless | Hooke | MindlinRescaled | None, normal_damping: Scalar, root_radius: float = 1.0
+) -> str:
+    """LAMMPS' words for a law whose normal contacts have this damping, and the root of this effective radius."""
+    if isinstance(friction, Hooke):
+        if friction.damping_time != 0.0:
+            raise ValueError("LAMMPS has no law with Hooke's dashpot; use damping_time=0")
+        return f"linear_history {_number(friction.stiffness)} 0.0 {_number(friction.mu)}"
+    if isinstance(friction, MindlinRescaled):
+        ratio = friction.damping_time * friction.stiffness / normal_damping
+        return (
+            f"mindlin_rescale/force {_number(friction.stiffness / root_radius)} {_number(ratio)} {_number(friction.mu)}"
+        )
+    return "linear_nohistory 0.0 0.0"
+
+
 def pair_lines(
     friction: Frictionless | Hooke | MindlinRescaled, material: Material, masses: Sequence[float]
 ) -> list[str]:
@@ -211,16 +227,7 @@ def pair_lines(
     Hooke's constant dashpot has no counterpart (LAMMPS' varies with the contact radius): its damping_time must be 0.
     """
     root_radius = np.sqrt(0.5)
-    if isinstance(friction, Hooke):
-        if friction.damping_time != 0.0:
-            raise ValueError("LAMMPS has no law with Hooke's dashpot; use damping_time=0")
-        tangential = f"linear_history {_number(friction.stiffness)} 0.0 {_number(friction.mu)}"
-    elif isinstance(friction, MindlinRescaled):
-        ratio = friction.damping_time * friction.stiffness / (material.normal_damping * material.normal_stiffness)
-        stiffness = friction.stiffness / root_radius
-        tangential = f"mindlin_rescale/force {_number(stiffness)} {_number(ratio)} {_number(friction.mu)}"
-    else:
-        tangential = "linear_nohistory 0.0 0.0"
+    tangential = _tangential(friction, material.normal_damping * material.normal_stiffness, root_radius)
     lines = ["pair_style granular"]
     for one, other in itertools.combinations_with_replacement(range(len(masses)), 2):
         effective_mass = masses[one] * masses[other] / (masses[one] + masses[other])
@@ -232,14 +239,23 @@ def pair_lines(
     return lines
 
 
-def wall_lines(scene: Scene, material: Material, dt: float) -> list[str]:
+def wall_lines(
+    scene: Scene,
+    material: Material,
+    dt: float,
+    friction: Hooke | MindlinRescaled | None = None,
+) -> list[str]:
     """The finite planes of the scene; computes `c_wall0` (-x), `c_wall1` (+x), ... are the forces on grains.
 
-    The damping is that of grains of size 1.
+    The damping is that of grains of size 1. `friction` is the law with the coefficient of the walls, if they have one.
+    LAMMPS' effective radius at a wall is R in the place of R / 2; what else makes Mindlin's springs stiffer is given.
     """
+    if isinstance(friction, MindlinRescaled):
+        friction = replace(friction, stiffness=friction.stiffness * material.wall_stiffness / material.normal_stiffness)
+    tangential = _tangential(friction, material.normal_damping * material.wall_stiffness)
     damping = material.normal_damping * material.wall_stiffness / float(scene.clump.mass)
     law = (
-        f"hertz {_number(material.wall_stiffness)} {_number(damping)} tangential linear_nohistory 0.0 0.0 "
+        f"hertz {_number(material.wall_stiffness)} {_number(damping)} tangential {tangential} "
         "damping viscoelastic limit_damping"
     )
     lines: list[str] = []
@@ -275,15 +291,19 @@ def scene_script(
     skin: float = 0.2,
     every: int = 1,
     gravity: Scalar | None = None,
+    wall_mu: float | None = None,
 ) -> list[str]:
     """Everything up to `run`: files written to `folder`, contacts, walls and integrator; see `write_scene`.
 
-    `gravity` is its acceleration along -z, in R / t_c^2; None for none.
+    `gravity` is its acceleration along -z, in R / t_c^2, and `wall_mu` the friction coefficient of walls; None for none.
     """
     script = write_scene(scene, folder, skin=skin, every=every)
     script += pair_lines(friction, material, masses_of_types(scene.clump))
     # The integrator comes after the walls: it sums the initial forces when it is set up, in the order of the fixes.
-    script += wall_lines(scene, material, dt)
+    of_walls = None
+    if wall_mu is not None and not isinstance(friction, Frictionless):
+        of_walls = replace(friction, mu=wall_mu)
+    script += wall_lines(scene, material, dt, of_walls)
     growth = (scene.upper_velocity - scene.lower_velocity) / (scene.upper - scene.lower)
     if any(scene.periodic) and np.any(growth):
         strains = (f"{'xyz'[axis]} erate {_number(growth[axis])}" for axis in np.flatnonzero(scene.periodic))

@@ -35,7 +35,7 @@ Loss = Callable[[Experiment, jax.Array], jax.Array]
 STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
 FORWARDS = 0.17  # of a gradient's time is the way forward
 
-Moving = tuple[Any, ...]  # grains, history, held walls and periodic cell: what of a state can be differentiated
+Moving = tuple[Any, ...]  # grains, histories, held walls and periodic cell: what of a state can be differentiated
 
 
 def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
@@ -66,11 +66,11 @@ def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array]) -> Simul
 
 
 def _moving(state: State) -> Moving:
-    return state.grains, state.history, state.servo, state.cell
+    return state.grains, state.history, state.servo, state.cell, state.wall_history
 
 
 def _state(moving: Moving, status: jax.Array) -> State:
-    return State(moving[0], moving[1], status, moving[2], moving[3])
+    return State(moving[0], moving[1], status, *moving[2:])
 
 
 def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int) -> Any:

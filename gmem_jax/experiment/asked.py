@@ -12,7 +12,7 @@ from gmem_jax.physics.boundary import PeriodicAxes
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import sphere_offsets
-from gmem_jax.physics.pytree import traced
+from gmem_jax.physics.pytree import Scalar, traced
 from gmem_jax.physics.rotation import unit
 from gmem_jax.simulation.protocol import Protocol
 
@@ -59,8 +59,8 @@ def _spheres(position: jax.Array, quaternion: jax.Array, clump: Clump) -> jax.Ar
     return (position[:, None, :, None] + sphere_offsets(unit(quaternion[..., None]), clump))[..., 0]
 
 
-def require_walls(periodic: PeriodicAxes, material: Material) -> None:
-    """Refuse a rigidity of walls, other than the default, where there are none.
+def require_walls(periodic: PeriodicAxes, material: Material, wall_mu: Scalar | None = None) -> None:
+    """Refuse a rigidity of walls, other than the default, and friction of them where there are none.
 
     Raises:
         ValueError: saying so.
@@ -68,6 +68,8 @@ def require_walls(periodic: PeriodicAxes, material: Material) -> None:
     rigidity = material.wall_rigidity
     if all(periodic) and not traced(rigidity) and np.any(np.asarray(rigidity) != Material.wall_rigidity):
         raise ValueError("wall_rigidity: a box that is periodic along all axes has no walls")
+    if all(periodic) and wall_mu is not None:
+        raise ValueError("wall_mu: a box that is periodic along all axes has no walls")
 
 
 def require_memory(protocol: Protocol, background: str) -> None:

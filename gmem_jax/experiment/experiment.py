@@ -61,7 +61,7 @@ class Experiment:
     """Everything a recall depends on. S signals make S + 1 replicas; replica 0 is the zero signal.
 
     A pytree: its floats can be differentiated and vmapped. The friction law's parameters, gamma0, shear_share, delta0,
-    t0, hold_drag and gravity are one number or one for each replica, [S + 1].
+    t0, hold_drag, gravity and wall_mu are one number or one for each replica, [S + 1].
 
     Attributes:
         pack: the pack at rest.
@@ -77,6 +77,8 @@ class Experiment:
         creep: rate at which elastic tangential forces relax, 1 / t_c; default never. A twentieth of a bin's at most.
         creep_fades: time in a stage after which that rate falls as 1 / t, in t_c; default it stays.
         gravity: its acceleration along -z, in R / t_c^2, that is E / (rho R); default none. It acts from the start on.
+        wall_mu: friction coefficient of the walls, whose contacts take the friction law with it; default smooth walls.
+            Like mu it acts from the start on, and a stage without friction has none.
         dt: largest time step, in t_c.
         steps: steps in a bin of t0 / 256; default the fewest that `dt` allows. Needed where t0 is a tracer.
         steps_per_bin: what follows from that.
@@ -119,6 +121,9 @@ class Experiment:
     gravity: Scalar | None = parameter(
         None, "[0, 0.01]", "Acceleration of gravity along -z; default none", "R/t_c^2", varies=True
     )
+    wall_mu: Scalar | None = parameter(
+        None, "[0, inf)", "Friction coefficient of the walls; default smooth walls", varies=True
+    )
     dt: float = static(USUAL_STEP, "Largest time step", "t_c")
     steps: int | None = static(None, "Steps in a bin of t0 / 256, in the place of dt", no_option=True)
     rest: float = static(0.2, "Rests at u = 0", "t0")
@@ -147,9 +152,9 @@ class Experiment:
         self._set_protocol()
         if self.backend not in native.BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(native.BACKENDS)}; got {self.backend!r}")
-        of_pack = self.pack.periodic, self.pack.clump.equal
+        of_pack = self.pack.periodic, self.pack.clump.equal, self.wall_mu is None
         native.require_precision(self.precision, self.backend, self.friction, *of_pack)
-        require_walls(self.pack.periodic, self.material)
+        require_walls(self.pack.periodic, self.material, self.wall_mu)
         if self.gravity is not None and self.pack.periodic[2]:
             raise ValueError("gravity acts along z, and a box that is periodic there has no floor: leave gravity out")
         if not 0.0 < self.dt <= LARGEST_STEP:
@@ -163,6 +168,7 @@ class Experiment:
         if not native.supports(self.friction) and not traced(self.friction):
             require_law(self.friction, self.replicas)
         self._check_waveforms()
+        self._check_wall_mu()
         self._check_creep()
         step = self.timing.dt
         if not traced(step) and not np.all(np.asarray(step) >= LEAST_STEP):
@@ -171,6 +177,17 @@ class Experiment:
             raise ValueError(
                 f"steps = {self.steps_per_bin} makes a time step of {np.max(step):g} t_c, which must be at most "
                 f"{LARGEST_STEP}; give more steps, or none to have them chosen"
+            )
+
+    def _check_wall_mu(self) -> None:
+        if self.wall_mu is None:
+            return
+        if self.backend == "native" and not native.rubs(self.friction, self.pack.periodic):
+            raise ValueError(native.NO_RUBBING)
+        if not isinstance(self.friction, CoulombLaw):
+            raise ValueError(
+                f"wall_mu takes the place of mu at walls, and {type(self.friction).__name__} has no mu: leave wall_mu "
+                "out, or use another friction law"
             )
 
     def _check_creep(self) -> None:
@@ -323,8 +340,8 @@ class Experiment:
 
     @property
     def runs_on(self) -> native.Backend:
-        """What `backend` means for this law on JAX's default device."""
-        return native.name(self.backend, self.friction)
+        """What `backend` means for this law and these walls on JAX's default device."""
+        return native.name(self.backend, self.friction, self.pack.periodic, self.wall_mu is None)
 
     @property
     def timing(self) -> Timing:
@@ -349,7 +366,7 @@ class Experiment:
             columns, drive = columns._replace(lanes=()), (0.0, (), 1.0, (), ())
         dt, steps = self.timing
         return Simulation(
-            System(self.pack.clump, self.friction, self.pack.pairs, self.material, self.gravity),
+            System(self.pack.clump, self.friction, self.pack.pairs, self.material, self.gravity, self.wall_mu),
             StrainPath(lower, upper, self.compression, *drive, self.pack.periodic),
             dt,
             self.drag,

@@ -68,7 +68,10 @@ def match(one: Experiment, other: Experiment) -> bool:
     scalars = all(jnp.ndim(value) == 0 for each in (one, other) for value in replica_parameters(each).values())
     slips = [float(np.min(getattr(each.friction, "mu", 1.0))) == 0.0 for each in (one, other)]
     same = slips[0] == slips[1] and all(getattr(one, name) == getattr(other, name) for name in alike)
-    kinds = [[getattr(each, name) is None for name in ("creep", "creep_fades", "gravity")] for each in (one, other)]
+    kinds = [
+        [getattr(each, name) is None for name in ("creep", "creep_fades", "gravity", "wall_mu")]
+        for each in (one, other)
+    ]
     same = same and kinds[0] == kinds[1]
     alone = not any(isinstance(each.signals, SignalSets) or each.observe for each in (one, other))
     return alone and scalars and same and one.pack is other.pack and laws[0] == laws[1]

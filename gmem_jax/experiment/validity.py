@@ -61,6 +61,7 @@ def validity(
     shear = jnp.asarray(experiment.gamma0) * waveform / experiment.compression
     law: Any = experiment.friction
     friction = jnp.asarray(law.mu if isinstance(law, CoulombLaw) else 0.0)
+    of_walls = jnp.asarray(0.0 if experiment.wall_mu is None else experiment.wall_mu)
     rubs = friction > 0.0 if isinstance(law, CoulombLaw) else not isinstance(law, Frictionless)
     least = -_most([-(sample.pressure[:, 0] + sample.pressure[:, 1]) for sample in stages.values()])
     stiffness = jnp.asarray(law.stiffness if isinstance(law, Hooke | MindlinRescaled | Mindlin) else 0.0)
@@ -70,7 +71,7 @@ def validity(
         Status.RINGING: jnp.any(windowed - raw > RINGING),
         Status.SHEAR_BEYOND_COMPRESSION: shear > LARGEST_SHEAR,
         Status.LARGE_WAVEFORM: waveform > LARGEST_WAVEFORM,
-        Status.LARGE_FRICTION: friction > LARGEST_FRICTION,
+        Status.LARGE_FRICTION: (friction > LARGEST_FRICTION) | (of_walls > LARGEST_FRICTION),
         Status.LARGE_STIFFNESS: stiffness > LARGEST_STIFFNESS * experiment.material.normal_stiffness,
         Status.RESTLESS: (rubs & (_restlessness(experiment, stages) > FASTEST_GRAIN))
         | (rubs & (_dashpots(experiment, stages, deepest) * experiment.timing.dt > OVERSHOOT))

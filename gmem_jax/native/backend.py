@@ -76,16 +76,28 @@ def _why_not(lacks: str, built: bool, said: str) -> str:
     return "" if client.platform == "cpu" else f"the native backend does not run on {client.platform}"
 
 
-def name(backend: str, law: FrictionLaw) -> Backend:
-    """What "auto" means on JAX's default device, "jax" or "native"; arguments are those of `resolve`.
+def name(backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS, smooth: bool = True) -> Backend:
+    """What "auto" means on JAX's default device, "jax" or "native"; others are themselves.
 
-    Others are themselves.
+    Args:
+        backend: as of `resolve`.
+        law: likewise.
+        periodic: the periodic axes of the box.
+        smooth: whether walls are without friction.
 
     Raises:
         ValueError: if there is no such backend.
     """
     _require_known(backend)
-    return resolve(backend, "double", law).name if backend == "auto" else cast(Backend, backend)
+    if backend != "auto":
+        return cast(Backend, backend)
+    return resolve(backend, "double", law).name if smooth or rubs(law, periodic) else "jax"
+
+
+def rubs(law: FrictionLaw, periodic: PeriodicAxes) -> bool:
+    """Whether the native backend has walls with friction, for a law and in a box, on JAX's default device."""
+    entry = entry_of(law)
+    return entry is not None and not entry.layered and not any(periodic) and get_backend().platform == "cpu"
 
 
 def _require_known(backend: str) -> None:
@@ -94,7 +106,12 @@ def _require_known(backend: str) -> None:
 
 
 def require_precision(
-    precision: str, backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS, equal: bool = True
+    precision: str,
+    backend: str,
+    law: FrictionLaw,
+    periodic: PeriodicAxes = WALLS,
+    equal: bool = True,
+    smooth: bool = True,
 ) -> None:
     """Refuse a precision that is unknown, or not to be had.
 
@@ -104,6 +121,7 @@ def require_precision(
         law: the friction law.
         periodic: the periodic axes of the box.
         equal: whether all spheres are of radius 1.
+        smooth: whether walls are without friction.
 
     Raises:
         ValueError: saying why.
@@ -116,7 +134,7 @@ def require_precision(
         built, said = library.available()
         why = "" if backend == "jax" or built else f", which is not available: {said}"
         raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")
-    require_mixed(law, periodic, equal)
+    require_mixed(law, periodic, equal, smooth)
 
 
 def marcher(backend: str = "auto", precision: str = "double") -> March:

@@ -60,21 +60,23 @@ def march_mixed(system: System, state: State, boxes: Box, dt: Scalar, drag: Scal
     Raises:
         ValueError: as of `march` and `require_mixed`.
     """
-    require_mixed(system.friction, boxes.periodic, system.clump.equal)
+    require_mixed(system.friction, boxes.periodic, system.clump.equal, system.wall_mu is None)
     return _march(system, state, boxes, dt, drag, _Mode(mixed=state.replicas > 1))
 
 
-def require_mixed(law: FrictionLaw, periodic: PeriodicAxes, equal: bool) -> None:
+def require_mixed(law: FrictionLaw, periodic: PeriodicAxes, equal: bool, smooth: bool = True) -> None:
     """Refuse what cannot be done with contacts in single precision.
 
     Raises:
         ValueError: if the law is kept in double precision or unknown, JAX's default device is no CPU, the box has
-            periodic axes, or spheres differ in radius.
+            periodic axes, spheres differ in radius, or walls are not `smooth`.
     """
     if any(periodic):
         raise ValueError("precision='mixed' is not for periodic boxes; use 'double'")
     if not equal:
         raise ValueError("precision='mixed' is not for spheres of unequal radii; use 'double'")
+    if not smooth:
+        raise ValueError("precision='mixed' is not for walls with friction; use 'double'")
     if get_backend().platform != "cpu":
         raise ValueError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
     if library.entry(law).layered:
@@ -116,31 +118,36 @@ def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, m
     if state.grains.position.dtype != jnp.float64:
         raise ValueError(f"the native backend needs float64, got {state.grains.position.dtype}")
     law = {field.name: getattr(system.friction, field.name) for field in fields(system.friction)}  # type: ignore[arg-type]
+    if system.wall_mu is not None:
+        law["wall_mu"] = system.wall_mu
     dynamics.require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass, **law)
+    dynamics.require_wall_history(system, state)
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
     system, state, boxes, dt, drag = dynamics.mark_varying((system, state, boxes, jnp.asarray(dt), jnp.asarray(drag)))
-    grains, history, total = _bin(mode, system, state.grains, state.history, boxes, (dt, drag), state.cell)
+    histories = state.history, state.wall_history
+    grains, (history, walls), total = _bin(mode, system, state.grains, histories, boxes, (dt, drag), state.cell)
     cell = jax.tree.map(lambda leaf: leaf[-1], boxes) if state.cell is not None and len(boxes.lower) else state.cell
-    return replace(state, grains=grains, history=history, cell=cell), total
+    return replace(state, grains=grains, history=history, cell=cell, wall_history=walls), total
 
 
-_Result = tuple[Grains, Any, jax.Array]
+_Histories = tuple[Any, Any]  # of the candidates, and of walls with friction
+_Result = tuple[Grains, _Histories, jax.Array]
 _Numbers = tuple[jax.Array, jax.Array]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _bin(
-    mode: _Mode, system: System, grains: Grains, history: Any, boxes: Box, numbers: _Numbers, cell: Box | None
+    mode: _Mode, system: System, grains: Grains, histories: _Histories, boxes: Box, numbers: _Numbers, cell: Box | None
 ) -> _Result:
     """The steps whose walls are `boxes` ([steps, 3, B]) from the periodic `cell` on; `numbers` are (dt, drag).
 
     Returns:
-        The grains, the history, and the sum over the steps of the wall pressures, [3, B].
+        The grains, the histories, and the sum over the steps of the wall pressures, [3, B].
     """
-    arrays = arrays_of(system, grains, history, boxes, numbers, cell)
-    definition = PlainDefinition.of(system, history, mode.anywhere, boxes.periodic)
+    arrays = _arrays(system, grains, histories, boxes, numbers, cell)
+    definition = PlainDefinition.of(system, histories[0], mode.anywhere, boxes.periodic, histories[1])
     call = call_of(system, boxes.periodic)._replace(mixed=int(mode.mixed))
-    return _result(grains, history, primitives.advance(call, definition, fixed_of(system), arrays))
+    return _result(grains, histories, primitives.advance(call, definition, fixed_of(system), arrays))
 
 
 @functools.partial(_bin.defjvp, symbolic_zeros=True)
@@ -160,27 +167,30 @@ def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -
         rebuilt: tuple[Any, ...] = jax.tree.unflatten(structure, whole)
         return rebuilt
 
-    system, _, history, boxes, *_ = primals
+    system, _, histories, boxes, *_ = primals
     shape = tangents[0].clump
     if not all(map(_is_zero, jax.tree.leaves((shape.radii, shape.sizes)))):
         # The library has no derivatives by these. By lists there is none: they say where contacts can be.
         _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
         return _bin(mode, *primals), slope
-    arrays, along = jax.jvp(lambda *varied: arrays_of(*filled(varied)), varied, directions)
-    definition = PlainDefinition.of(system, history, mode.anywhere, boxes.periodic)
+    arrays, along = jax.jvp(lambda *varied: _arrays(*filled(varied)), varied, directions)
+    definition = PlainDefinition.of(system, histories[0], mode.anywhere, boxes.periodic, histories[1])
     change = primitives.tangent(call_of(system, boxes.periodic), definition, fixed_of(system), arrays, along)
-    return _bin(mode, *primals), _result(primals[1], history, change)
+    return _bin(mode, *primals), _result(primals[1], histories, change)
 
 
 def _is_zero(slope: Any) -> bool:
     return isinstance(slope, jax.custom_derivatives.SymbolicZero)
 
 
-def _plain(system: System, grains: Grains, history: Any, boxes: Box, numbers: _Numbers, cell: Box | None) -> _Result:
+def _plain(
+    system: System, grains: Grains, histories: _Histories, boxes: Box, numbers: _Numbers, cell: Box | None
+) -> _Result:
     """The definition of `_bin`."""
-    state = State(grains, history, jnp.zeros(grains.position.shape[-1], jnp.int32), cell=cell)
+    history, walls = histories
+    state = State(grains, history, jnp.zeros(grains.position.shape[-1], jnp.int32), cell=cell, wall_history=walls)
     state, total = dynamics.march(system, state, boxes, *numbers)
-    return state.grains, state.history, total
+    return state.grains, (state.history, state.wall_history), total
 
 
 class _Solid(NamedTuple):
@@ -197,7 +207,7 @@ class PlainDefinition:
 
     Attributes:
         system: structure of the `System`.
-        history: structure of the history.
+        history: structure of the histories, of the candidates and of walls with friction.
         anywhere: see `gmem_jax.native.primitives.Definition`.
         periodic: the periodic axes of the box.
     """
@@ -209,16 +219,22 @@ class PlainDefinition:
 
     @classmethod
     def of(
-        cls, system: System, history: Any, anywhere: bool = True, periodic: PeriodicAxes = WALLS
+        cls,
+        system: System,
+        history: Any,
+        anywhere: bool = True,
+        periodic: PeriodicAxes = WALLS,
+        wall_history: Any = None,
     ) -> "PlainDefinition":
-        """That of a system with such a history."""
-        return cls(jax.tree.structure(system), jax.tree.structure(history), anywhere, periodic)
+        """That of a system with such histories."""
+        return cls(jax.tree.structure(system), jax.tree.structure((history, wall_history)), anywhere, periodic)
 
     def __call__(self, fixed: Fixed, arrays: Arrays) -> StepOutput:
         """The steps."""
         empty: System = jax.tree.unflatten(self.system, [None] * self.system.num_leaves)
         dt, drag, mass, *inertia = arrays.parameters[:6]
-        own, gravity, edges = arrays.parameters[9:-7], arrays.parameters[-7], jnp.split(arrays.parameters[-6:], 2)
+        own, (gravity, *_, wall_mu) = arrays.parameters[9:-8], arrays.parameters[-8:]
+        edges = jnp.split(arrays.parameters[-7:-1], 2)
         clump = replace(empty.clump, offsets=arrays.offsets, mass=mass, inertia=jnp.stack(inertia))
         if fixed.sizes.shape[-1]:
             clump = replace(clump, radii=fixed.radii[:, 0], sizes=fixed.sizes[:, 0])
@@ -233,10 +249,12 @@ class PlainDefinition:
             pairs = replace(pairs, image=fixed.images)
             still = jnp.zeros_like(edges[0])
             cell = Box(edges[0], edges[1], still, still, self.periodic)
-        history = jax.tree.unflatten(self.history, arrays.history)
+        histories = jax.tree.unflatten(self.history, arrays.history)
         system = replace(empty, clump=clump, friction=law, pairs=pairs, material=material, gravity=gravity)
-        grains, history, total = _plain(system, Grains(*arrays.fields), history, boxes, (dt, drag), cell)
-        return StepOutput(jax.tree.leaves(grains), total, jax.tree.leaves(history))
+        if histories[1] is not None:
+            system = replace(system, wall_mu=wall_mu)
+        grains, histories, total = _plain(system, Grains(*arrays.fields), histories, boxes, (dt, drag), cell)
+        return StepOutput(jax.tree.leaves(grains), total, jax.tree.leaves(histories))
 
 
 def call_of(system: System, periodic: PeriodicAxes = WALLS) -> Call:
@@ -251,6 +269,7 @@ def call_of(system: System, periodic: PeriodicAxes = WALLS) -> Call:
         leaves=len(row.history),
         periodic=sum(int(is_periodic) << axis for axis, is_periodic in enumerate(periodic)),
         unequal=int(not system.clump.equal),
+        rubs=int(system.wall_mu is not None),
     )
 
 
@@ -266,19 +285,32 @@ def fixed_of(system: System) -> Fixed:
 
 
 def arrays_of(
-    system: System, grains: Grains, history: Any, boxes: Box, numbers: _Numbers, cell: Box | None = None
+    system: System,
+    grains: Grains,
+    history: Any,
+    boxes: Box,
+    numbers: _Numbers,
+    cell: Box | None = None,
+    wall_history: Any = None,
 ) -> Arrays:
     """Arguments with derivatives."""
     walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
     replicas = grains.position.shape[-1]
     parameters, offsets = _parameters(system, numbers, cell, replicas), system.clump.offsets
     centres = jnp.broadcast_to(offsets[..., None], (*offsets.shape, replicas))
-    return Arrays(jax.tree.leaves(grains), parameters, walls, centres, jax.tree.leaves(history))
+    return Arrays(jax.tree.leaves(grains), parameters, walls, centres, jax.tree.leaves((history, wall_history)))
 
 
-def _result(grains: Grains, history: Any, results: StepOutput) -> _Result:
+def _arrays(
+    system: System, grains: Grains, histories: _Histories, boxes: Box, numbers: _Numbers, cell: Box | None
+) -> Arrays:
+    """`arrays_of` with the arguments of `_bin`."""
+    return arrays_of(system, grains, histories[0], boxes, numbers, cell, histories[1])
+
+
+def _result(grains: Grains, histories: _Histories, results: StepOutput) -> _Result:
     moved = jax.tree.unflatten(jax.tree.structure(grains), results.fields)
-    return moved, jax.tree.unflatten(jax.tree.structure(history), results.history), results.pressure
+    return moved, jax.tree.unflatten(jax.tree.structure(histories), results.history), results.pressure
 
 
 def _parameters(system: System, numbers: _Numbers, cell: Box | None, replicas: int) -> jax.Array:
@@ -289,5 +321,6 @@ def _parameters(system: System, numbers: _Numbers, cell: Box | None, replicas: i
     solid = (material.normal_stiffness, material.normal_damping, material.wall_stiffness)
     edges = (0.0,) * 6 if cell is None else (*cell.lower, *cell.upper)
     gravity = 0.0 if system.gravity is None else system.gravity
-    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own, gravity, *edges)
+    wall_mu = 0.0 if system.wall_mu is None else system.wall_mu
+    rows = (*numbers, clump.mass, *clump.inertia, *solid, *own, gravity, *edges, wall_mu)
     return jnp.stack([jnp.broadcast_to(jnp.asarray(row, jnp.float64), (replicas,)) for row in rows])

@@ -28,6 +28,9 @@ from gmem_jax.native import cuda
 from gmem_jax.physics.step import mark_varying
 
 TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint")
+NO_RUBBING = (
+    "the native backend has no walls with friction in periodic boxes, of law M2 and on GPUs; use backend='auto'"
+)
 
 
 class Call(NamedTuple):
@@ -38,10 +41,11 @@ class Call(NamedTuple):
         variant: number of the Mindlin law's variant.
         points: Q of the Mindlin law.
         isotropic: whether all moments of inertia are equal.
-        leaves: arrays of the history.
+        leaves: arrays of the candidates' history.
         mixed: whether contacts are computed in single precision.
         periodic: bits of the periodic axes.
         unequal: whether spheres differ in radius.
+        rubs: whether walls have friction.
     """
 
     law: int
@@ -52,6 +56,7 @@ class Call(NamedTuple):
     mixed: int = 0
     periodic: int = 0
     unequal: int = 0
+    rubs: int = 0
 
 
 class Fixed(NamedTuple):
@@ -88,7 +93,7 @@ class Arrays(NamedTuple):
         parameters: rows of src/physics/parameters.h's parameter array, [rows, B].
         walls: lower, upper and their velocities of every step, [steps, 12, B].
         offsets: sphere centres of a grain, [K, 3, B], in R; alike in all replicas, as their derivatives need not be.
-        history: leaves of the history, [P, ..., B].
+        history: leaves of the candidates' history, [P, ..., B]; then of that of walls with friction, [6 S, ..., B].
     """
 
     fields: list[jax.Array]
@@ -301,14 +306,21 @@ def _primitive(
     in_plain_jax = mlir.lower_fun(elsewhere, multiple_results=True)
 
     def on_cpu(context: mlir.LoweringRuleContext, *values: Any, **static: Any) -> Any:
-        call = static["call"]
-        if target == "gmem_adjoint" and (call.periodic or call.unequal):  # which the library has not
+        call, adjoint = static["call"], target == "gmem_adjoint"
+        lacking = call.rubs and (call.periodic or call.points)  # which the library has not
+        if lacking and not adjoint and not static["definition"].anywhere:
+            raise NotImplementedError(NO_RUBBING)
+        if lacking or (adjoint and (call.periodic or call.unequal or call.rubs)):
             return in_plain_jax(context, *values, **static)
         return library(context, *values, **static)
 
     def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
         if static["call"].mixed:
             raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
+        if static["call"].rubs:
+            if target in cuda.CUDA_TARGETS and not definition.anywhere:
+                raise NotImplementedError(NO_RUBBING)
+            return in_plain_jax(context, *values, definition=definition, **static)
         if target in cuda.CUDA_TARGETS and not cuda.missing():
             return library(context, *values, on_gpu=True, **static)
         if target in cuda.CUDA_TARGETS and not definition.anywhere:

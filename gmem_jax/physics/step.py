@@ -12,13 +12,15 @@ from gmem_jax.physics.boundary import WALLS, boundary_of
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.kinematics import Kinematics, Unequal, kinematics
 from gmem_jax.physics.contact.normal import hertz
-from gmem_jax.physics.contact.wall import wall_forces
+from gmem_jax.physics.contact.wall import PLANES, wall_forces, wall_friction, wall_kinematics
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import Pairs, image_shifts, sphere_offsets
 from gmem_jax.physics.pytree import Scalar, pytree, typed
 from gmem_jax.physics.rotation import cross, matrix, turn
 from gmem_jax.physics.state import Box, Grains, State
+
+_Histories = tuple[Any, Any]  # of the candidates, and of the walls
 
 
 @pytree
@@ -32,6 +34,7 @@ class System:
         pairs: candidate contacts.
         material: the elastic solid.
         gravity: acceleration of every grain along -z, in R / t_c^2; scalar or [B], None for none.
+        wall_mu: friction coefficient of the walls; scalar or [B], None for smooth walls.
     """
 
     clump: Clump
@@ -39,6 +42,7 @@ class System:
     pairs: Pairs
     material: Material = Material()
     gravity: Scalar | None = None
+    wall_mu: Scalar | None = None
 
     def weighed(self, acceleration: jax.Array) -> jax.Array:
         """Accelerations [N, 3, B] with that of gravity."""
@@ -196,10 +200,10 @@ def contact_forces(
 
 @jax.jit
 def _loads(
-    system: System, grains: Grains, history: Any, box: Box, dt: jax.Array, alive: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, Any, jax.Array | None]:
-    """Of every sphere: its arm [N, K, 3, B], contact forces and torques [S, 6, B], wall forces; the new history; and
-    forces through the faces of a periodic cell.
+    system: System, grains: Grains, histories: _Histories, box: Box, dt: jax.Array, alive: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array | None, _Histories, jax.Array | None]:
+    """Of every sphere: its arm [N, K, 3, B], contact forces and torques [S, 6, B], wall forces, friction of walls as of
+    contacts (None if they are smooth); the new histories; and forces through the faces of a periodic cell.
     """
     material, cell = system.material, box if any(box.periodic) else None
     with jax.named_scope("spheres"):
@@ -207,29 +211,63 @@ def _loads(
             alive, lambda grains, cell: sphere_table(system.clump, grains, cell), grains, cell
         )
     with jax.named_scope("contacts"):
-        contact, history, through = contact_forces(system, table, history, dt, alive, cell)
+        contact, history, through = contact_forces(system, table, histories[0], dt, alive, cell)
     with jax.named_scope("walls"):
         solid, radii = (material.wall_stiffness, material.normal_damping), system.clump.sphere_radii(len(table))
         lower, upper = wall_forces(table[:, :3], table[:, 3:6], box, *solid, radii)
-    return arms, contact, lower, upper, history, through
+        rubbing, walls = None, histories[1]
+        if system.wall_mu is not None:
+            _, force, torque, walls = _fusion_barrier(alive, wall_loads, system, grains, box, lower, upper, walls, dt)
+            rows = jnp.concatenate([force, torque], axis=1)
+            rubbing = jnp.sum(rows.reshape(-1, PLANES, *rows.shape[1:]), axis=1)
+    return arms, contact, lower, upper, rubbing, (history, walls), through
+
+
+def wall_loads(
+    system: System, grains: Grains, box: Box, lower: jax.Array, upper: jax.Array, history: Any, dt: jax.Array
+) -> tuple[Kinematics, jax.Array, jax.Array, Any]:
+    """The friction of walls that have it: the kinematics of all spheres at all planes, in the order of
+    `wall_kinematics`; tangential forces on the spheres and their torques about their centres, [6 S, 3, B] each; and the
+    new history.
+
+    The walls of a box that is periodic along other axes are strained with it: under each grain as its centre is.
+
+    Args:
+        system: the system, with a `wall_mu`.
+        grains: the grains.
+        box: the planes.
+        lower: normal forces of the lower planes on spheres, [S, 3, B], of `wall_forces`.
+        upper: of the upper ones.
+        history: `State.wall_history`.
+        dt: time step; 0 leaves the history as it is.
+    """
+    table, _ = sphere_table(system.clump, grains)
+    kin = wall_kinematics(table, box, system.material, dt, system.clump.sphere_radii(len(table)))
+    force, history = wall_friction(system.friction, system.wall_mu, kin, lower, upper, history)  # type: ignore[arg-type]
+    return kin, force, kin.arm * cross(kin.normal, force), history
 
 
 def _forces(
-    system: System, grains: Grains, history: Any, box: Box, dt: jax.Array, alive: jax.Array
-) -> tuple[jax.Array, jax.Array, Any, jax.Array]:
-    """Total force and torque on every grain [N, 3, B], the new history, and the wall forces [2, 3, B].
+    system: System, grains: Grains, histories: _Histories, box: Box, dt: jax.Array, alive: jax.Array
+) -> tuple[jax.Array, jax.Array, _Histories, jax.Array]:
+    """Total force and torque on every grain [N, 3, B], the new histories, and the wall forces [2, 3, B].
 
-    In the place of a periodic axis' two walls stand its sections; see `section_force`.
+    Wall forces are normal ones. In the place of a periodic axis' two walls stand its sections; see `section_force`.
     """
-    arms, contact, lower, upper, history, through = _loads(system, grains, history, box, dt, alive)
+    arms, contact, lower, upper, rubbing, histories, through = _loads(system, grains, histories, box, dt, alive)
     per_sphere = (*arms.shape[:2], -1, contact.shape[-1])
     force = (contact[:, :3] + lower - upper).reshape(per_sphere)
     torque = contact[:, 3:].reshape(per_sphere) + cross(arms, force)
     walls = jnp.stack([jnp.sum(lower, axis=0), jnp.sum(upper, axis=0)])
     on_grains = jnp.sum(force, axis=1)
+    by_contacts = on_grains
+    if rubbing is not None:
+        friction = rubbing[:, :3].reshape(per_sphere)
+        on_grains = on_grains + jnp.sum(friction, axis=1)
+        torque = torque + rubbing[:, 3:].reshape(per_sphere) + cross(arms, friction)
     if through is not None:
-        walls = jnp.where(box.images, section_force(system.clump, grains, on_grains, through, box), walls)
-    return on_grains, jnp.sum(torque, axis=1), history, walls
+        walls = jnp.where(box.images, section_force(system.clump, grains, by_contacts, through, box), walls)
+    return on_grains, jnp.sum(torque, axis=1), histories, walls
 
 
 def section_force(clump: Clump, grains: Grains, force: jax.Array, through: jax.Array, cell: Box) -> jax.Array:
@@ -242,7 +280,7 @@ def section_force(clump: Clump, grains: Grains, force: jax.Array, through: jax.A
     Args:
         clump: the grain.
         grains: the grains.
-        force: of the contacts on them, [N, 3, B].
+        force: of the contacts on them, without the friction of walls, [N, 3, B].
         through: of those contacts that go through the face of the axis, [3, B].
         cell: the periodic box.
     """
@@ -299,7 +337,8 @@ def step(
     if state.cell is not None:
         midway = replace(midway, position=_carried(state.cell, box, old.position, dt * velocity))
         state, slowing = replace(state, cell=_wide(box, state.replicas)), drag + _strain_rate(box)
-    force, torque, history, walls = _forces(system, midway, state.history, box, dt, alive)
+    histories = state.history, state.wall_history
+    force, torque, (history, wall_history), walls = _forces(system, midway, histories, box, dt, alive)
     # Of drag on the velocities at the end, which are found with it.
     acceleration = system.weighed(force / system.clump.masses - slowing * velocity) / (1.0 + 0.5 * dt * slowing)
     turning = _angular_acceleration(system.clump, midway, torque, 0.5 * dt)
@@ -311,7 +350,7 @@ def step(
         acceleration=acceleration,
         spin_rate=spin_rate,
     )
-    return replace(state, grains=grains, history=history), walls
+    return replace(state, grains=grains, history=history, wall_history=wall_history), walls
 
 
 def wall_pressure(walls: jax.Array, box: Box) -> jax.Array:
@@ -340,6 +379,16 @@ def require_shapes(state: State, boxes: Box, **numbers: Any) -> None:
         raise ValueError(f"the boxes are {boundary_of(boxes.periodic)}, and the state is one of {boundary_of(known)}")
 
 
+def require_wall_history(system: System, state: State) -> None:
+    """Raise if a state does not remember the walls of a system that has friction there, or remembers those of none.
+
+    Raises:
+        ValueError: saying what to do.
+    """
+    if (system.wall_mu is None) != (state.wall_history is None):
+        raise ValueError("wall_mu and State.wall_history belong together: make the state by `start`, of this system")
+
+
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
     """One step for each of the boxes: what a backend does with a bin.
 
@@ -356,7 +405,9 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
     Raises:
         ValueError: if an argument does not fit the number of replicas.
     """
-    require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass)
+    own = {} if system.wall_mu is None else {"wall_mu": system.wall_mu}
+    require_shapes(state, boxes, dt=dt, drag=drag, mass=system.clump.mass, **own)
+    require_wall_history(system, state)
     numbers: tuple[jax.Array, jax.Array] = (jnp.asarray(dt), jnp.asarray(drag))
     system, state, boxes, numbers = mark_varying((system, state, boxes, numbers))
 
@@ -385,13 +436,22 @@ def start(system: System, position: jax.Array, quaternion: jax.Array, box: Box) 
     replicas = position.shape[-1]
     history = system.friction.init(system.pairs.capacity, replicas, position.dtype)
     cell = _wide(box, replicas) if any(box.periodic) else None
-    return accelerate(system, State(grains, history, jnp.zeros(replicas, jnp.int32), cell=cell), box)
+    walls = wall_histories(system, replicas, len(position), position.dtype)
+    return accelerate(system, State(grains, history, jnp.zeros(replicas, jnp.int32), None, cell, walls), box)
+
+
+def wall_histories(system: System, replicas: int, grains: int, dtype: Any = float) -> Any:
+    """Blank histories of all spheres of some grains at all planes; None where walls are smooth."""
+    if system.wall_mu is None:
+        return None
+    return system.friction.init(PLANES * grains * system.clump.spheres, replicas, dtype)
 
 
 def accelerate(system: System, state: State, box: Box) -> State:
     """Recompute the accelerations of `state`, its histories untouched (after velocities or the law were changed)."""
     zero, alive = jnp.zeros(()), system.pairs.reach > 0.0
-    force, torque, _, _ = _forces(typed(system), state.grains, state.history, box, zero, alive)
+    histories = state.history, state.wall_history
+    force, torque, _, _ = _forces(typed(system), state.grains, histories, box, zero, alive)
     slowing = 0.0 if state.cell is None else _strain_rate(box) * state.grains.velocity
     grains = replace(
         state.grains,

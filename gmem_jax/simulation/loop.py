@@ -177,8 +177,13 @@ def _crept(simulation: Simulation, state: State, row: Bin) -> State:
     length = simulation.steps * jnp.asarray(simulation.dt)
     begun = jnp.asarray(row.number * length)
     factor = relaxation(simulation.creep, simulation.creep_fades, begun, begun + length)
-    relaxed = law.relaxed(state.history, _padded(factor, state.replicas))
-    return replace(state, history=jax.tree.map(lambda new, old: new.astype(old.dtype), relaxed, state.history))
+    factor = _padded(factor, state.replicas)
+
+    def relaxed(history: Any) -> Any:
+        return jax.tree.map(lambda new, old: new.astype(old.dtype), law.relaxed(history, factor), history)
+
+    walls = None if state.wall_history is None else relaxed(state.wall_history)
+    return replace(state, history=relaxed(state.history), wall_history=walls)
 
 
 def _rubbing(system: System, row: Bin) -> System:
@@ -186,7 +191,8 @@ def _rubbing(system: System, row: Bin) -> System:
     law = system.friction
     if row.friction is None or not isinstance(law, CoulombLaw):
         return system
-    return replace(system, friction=replace(law, mu=law.mu * row.friction))  # type: ignore[type-var]
+    wall_mu: Any = None if system.wall_mu is None else system.wall_mu * row.friction
+    return replace(system, friction=replace(law, mu=law.mu * row.friction), wall_mu=wall_mu)  # type: ignore[type-var]
 
 
 def rollout(simulation: Simulation, state: State, rows: Bin) -> tuple[State, Sample]:

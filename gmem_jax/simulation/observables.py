@@ -22,12 +22,12 @@ from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.kinematics import Kinematics
 from gmem_jax.physics.contact.normal import hertz
-from gmem_jax.physics.contact.wall import wall_forces
+from gmem_jax.physics.contact.wall import PLANES, wall_forces
 from gmem_jax.physics.pairs import image_shifts
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.rotation import cross, dot
 from gmem_jax.physics.state import State
-from gmem_jax.physics.step import contact_loads, relative_motion, sphere_table
+from gmem_jax.physics.step import contact_loads, relative_motion, sphere_table, wall_loads
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.sample import overlaps
 
@@ -96,11 +96,16 @@ def _stress(simulation: Simulation, state: State) -> jax.Array:
     total = _tensor(push, branch) + _tensor(upper - lower, arms)
     place = seen.table[:, :3]
     across = jnp.sum(upper * (box.upper - place) + lower * (place - box.lower), axis=0)
-    return (total + _diagonal(across)) / jnp.prod(box.lengths, axis=0)
+    total += _diagonal(across)
+    if (rubbed := seen.rubbed(simulation, state)) is not None:
+        kin, friction = rubbed
+        to_plane = (kin.arm - jnp.where(kin.touching, kin.overlap, 0.0)) * kin.normal
+        total += _tensor(-friction, jnp.repeat(arms, PLANES, axis=0) + to_plane)
+    return total / jnp.prod(box.lengths, axis=0)
 
 
 def wall_stress() -> Observable:
-    """The stress on the walls, [3, 3, B], in E: p_x, p_y, p_z of the bin on the diagonal, for walls do not rub.
+    """The stress on the walls, [3, 3, B], in E: p_x, p_y, p_z of the bin on the diagonal, without the walls' friction.
 
     Along periodic axes, where there are no walls, it is the mean over all sections; see `section_force`.
     """
@@ -128,7 +133,8 @@ def _fabric(simulation: Simulation, state: State) -> jax.Array:
 def sliding() -> Observable:
     """The part of the contacts whose tangential force is at its limit mu f_n, [B].
 
-    Only contacts with a limit above 0 count; without any it is 0. Needs a law with mu, or `Frictionless`.
+    Only contacts with a limit above 0 count, and not those with walls; without any it is 0. Needs a law with mu, or
+    `Frictionless`.
     """
     return Observable("sliding", "1", "share of contacts at the Coulomb limit", _sliding)
 
@@ -223,7 +229,8 @@ def _rotation(simulation: Simulation, state: State) -> jax.Array:
 
 
 def friction_power() -> Observable:
-    """Power that goes into tangential forces at the end of the bin, [B], in E R^3 / t_c: the sum of f_t v_t.
+    """Power that goes into tangential forces at the end of the bin, those of walls too, [B], in E R^3 / t_c: the sum of
+    f_t v_t.
 
     v_t is the sliding velocity. What the springs of contacts that stick take up is in it, and what they give back; over
     a closed cycle that is nothing, and the work of friction and tangential dashpots remains. This is one moment of each
@@ -234,7 +241,11 @@ def friction_power() -> Observable:
 
 def _rub_power(simulation: Simulation, state: State) -> jax.Array:
     seen = _contacts(simulation, state)
-    return jnp.sum(seen.friction * seen.kin.sliding, axis=(0, 1))
+    power = jnp.sum(seen.friction * seen.kin.sliding, axis=(0, 1))
+    if (rubbed := seen.rubbed(simulation, state)) is None:
+        return power
+    kin, friction = rubbed
+    return power + jnp.sum(friction * kin.sliding, axis=(0, 1))
 
 
 def normal_power() -> Observable:
@@ -350,6 +361,15 @@ class _Seen(NamedTuple):
         places, velocities = self.table[:, :3], self.table[:, 3:6]
         radii = simulation.system.clump.sphere_radii(len(places))
         return wall_forces(places, velocities, _known(simulation.box), material.wall_stiffness, damping, radii)
+
+    def rubbed(self, simulation: Simulation, state: State) -> tuple[Kinematics, jax.Array] | None:
+        """Kinematics of spheres at walls with friction, and its forces on them, [6 S, ...]; None at smooth walls."""
+        if simulation.system.wall_mu is None:
+            return None
+        forces, box = self.walls(simulation), _known(simulation.box)
+        histories = state.wall_history, jnp.zeros(())
+        kin, friction, _, _ = wall_loads(simulation.system, state.grains, box, *forces, *histories)
+        return kin, friction
 
 
 def _contacts(simulation: Simulation, state: State, *, ahead: bool = False) -> _Seen:

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 from jax import lax
 
 from gmem_jax.physics.contact.friction import largest_overlap
+from gmem_jax.physics.contact.wall import wall_kinematics
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import image_shifts, slack, sphere_centres, touching_distance
 from gmem_jax.physics.pytree import Scalar, pytree, short_repr
 from gmem_jax.physics.rotation import dot, matrix
 from gmem_jax.physics.state import Box, State, Status
-from gmem_jax.physics.step import System
+from gmem_jax.physics.step import System, sphere_table
 
 
 class Measured(NamedTuple):
@@ -199,10 +200,21 @@ def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scal
     )
 
 
+def _deepest_at_walls(system: System, state: State, box: Box) -> jax.Array:
+    """The largest overlap of a sphere with a wall, [B], in R."""
+    table, _ = sphere_table(system.clump, lax.stop_gradient(state.grains))
+    radii = system.clump.sphere_radii(len(table))
+    kin = wall_kinematics(table, box, system.material, jnp.zeros(()), radii)
+    return jnp.max(jnp.where(kin.touching, kin.overlap, 0.0), axis=(0, 1))
+
+
 def end_bin(system: System, state: State, box: Box, pressure: jax.Array, u: Scalar) -> tuple[State, Sample]:
     """Check the state at the end of a bin and take its sample; `pressure` is the bin's average, [3, B]."""
     state = check(system, state, box)
     sample = measure(system, state, box, pressure, u)
-    beyond = sample.largest_overlap > largest_overlap(system.friction)
+    deepest = sample.largest_overlap
+    if system.wall_mu is not None:
+        deepest = jnp.maximum(deepest, _deepest_at_walls(system, state, box))
+    beyond = deepest > largest_overlap(system.friction)
     bits = jnp.where(beyond, int(Status.OVERLAP_RANGE), 0).astype(jnp.int32)
     return replace(state, status=state.status | bits), sample

@@ -65,11 +65,13 @@ class Placement:
         system = simulation.system
         reference = system.pairs.reference
         own = self._put_last(reference) if reference.shape[-1] > 1 else self._put(reference)
-        friction = jax.tree.map(self._put_number, system.friction)
+        friction, wall_mu = jax.tree.map(self._put_number, (system.friction, system.wall_mu))
         everywhere: Simulation = jax.tree.map(self._put, simulation)
         pairs = replace(everywhere.system.pairs, reference=own)
         mark = jax.tree.map(self._put_last, simulation.mark)
-        return replace(everywhere, system=replace(everywhere.system, pairs=pairs, friction=friction), mark=mark)
+        return replace(
+            everywhere, system=replace(everywhere.system, pairs=pairs, friction=friction, wall_mu=wall_mu), mark=mark
+        )
 
     def _put_number(self, leaf: Any) -> Any:
         """A number for all replicas, or one for each, [B]."""

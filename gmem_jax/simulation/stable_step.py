@@ -74,14 +74,14 @@ def _measured(simulation: Simulation, position: jax.Array, quaternion: jax.Array
     """ln |z| of the mode that grows most in steps of `dt`, [B]."""
     rest = start(simulation.system, position, quaternion, box)
     still = jnp.zeros_like(position)
-    at = (replace(rest.grains, acceleration=still, spin_rate=still), rest.history)
+    at = (replace(rest.grains, acceleration=still, spin_rate=still), rest.history, rest.wall_history)
     walls = jax.tree.map(lambda leaf: leaf[None], box)
 
     def one_step(changing: Any) -> Any:
-        grains, history = changing
-        now = replace(rest, grains=grains, history=history)
+        grains, history, of_walls = changing
+        now = replace(rest, grains=grains, history=history, wall_history=of_walls)
         state, _ = simulation.resolved.march(simulation.system, now, walls, dt, 0.0)
-        return state.grains, state.history
+        return state.grains, state.history, state.wall_history
 
     def step(change: Any) -> Any:
         return jax.jvp(one_step, (at,), (change,))[1]
@@ -97,7 +97,7 @@ def _measured(simulation: Simulation, position: jax.Array, quaternion: jax.Array
 
     kicks = jax.random.normal(chance.key(0), (2, *position.shape[:2], 1), position.dtype) + still
     blank = jax.tree.map(jnp.zeros_like, at)
-    first = lax.fori_loop(0, ROUNDS, one_round, (replace(blank[0], velocity=kicks[0], spin=kicks[1]), blank[1]))
+    first = lax.fori_loop(0, ROUNDS, one_round, (replace(blank[0], velocity=kicks[0], spin=kicks[1]), *blank[1:]))
     second = step(first)
     third = step(second)
     # A pair of modes z: third = (sum of both) second - (their product) first.

@@ -151,6 +151,17 @@ def test_every_name_has_the_derivative_of_differences(whole: gm.Experiment) -> N
     assert set(names) - moved == still | units  # delta0 was given
 
 
+@pytest.mark.slow
+def test_the_friction_of_walls_has_the_derivative_of_differences_and_of_forward_mode(whole: gm.Experiment) -> None:
+    rough = gm.replace(whole, wall_mu=0.5)  # forwards in C++ where it is built, backwards in plain JAX
+    found = gm.value_and_grad(rough, ["wall_mu", "friction.mu"], loss=smooth)
+    require_differences(rough, found.slope)
+    assert all(abs(float(slope)) > 0.0 for slope in found.slope.values())
+    along = gradient.push(rough, {"wall_mu": jnp.asarray(1.0)})
+    slope = jax.jvp(lambda p_sig: smooth(rough, p_sig), (along.p_sig,), (along.p_sig_slope,))[1]
+    np.testing.assert_allclose(slope, found.slope["wall_mu"], rtol=1e-8)  # round-off of 700 steps
+
+
 def score(experiment: gm.Experiment) -> jax.Array:
     return smooth(experiment, gm.recall(experiment).p_sig)
 
@@ -359,5 +370,7 @@ def test_the_table_of_derivatives_has_every_name(whole: gm.Experiment) -> None:
     page = (Path(__file__).parents[2] / "docs" / "derivatives.md").read_text()
     rows = dict(re.findall(r"^\| `([\w.]+)` \|.*\| (.*?) \|.*\|.*\|$", page, re.MULTILINE))
     assert set(all_names(whole)) <= set(rows)
-    assert {"friction.p_max", "creep", "creep_fades", "gravity", "pack.clump.sizes", "signals.nodes"} <= set(rows)
+    assert {"friction.p_max", "creep", "creep_fades", "gravity", "wall_mu", "pack.clump.sizes", "signals.nodes"} <= set(
+        rows
+    )
     assert all(found.startswith("0: ") or float(found) < 2e-2 for found in rows.values())

@@ -22,7 +22,7 @@ from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.contact.normal import hertz
-from gmem_jax.physics.contact.wall import wall_forces
+from gmem_jax.physics.contact.wall import wall_forces, wall_kinematics
 from gmem_jax.physics.grain import sized
 from gmem_jax.physics.rotation import cross, dot
 from gmem_jax.physics.search import PairFinder
@@ -218,7 +218,9 @@ class Comparison:
         planes = (getattr(self.planes, field) for field in ("lower", "upper", "lower_velocity", "upper_velocity"))
         scene = lammps.Scene(self.system.clump, *grains, *planes)
         folder.mkdir()
-        script = lammps.scene_script(scene, self.system.friction, MATERIAL, dt, folder, gravity=self.system.gravity)
+        system = self.system
+        more = {"gravity": system.gravity, "wall_mu": system.wall_mu}
+        script = lammps.scene_script(scene, system.friction, MATERIAL, dt, folder, **more)
         per_grain = self.system.clump.spheres
         run = lammps.run_lammps(script, folder, steps=steps, every=steps // frames, per_grain=per_grain)
         return run.position[1:], run.velocity[1:], run.spin[1:], np.abs(run.walls[1:])
@@ -302,6 +304,39 @@ def test_a_column_of_spheres_falls_on_the_floor_as_in_lammps(tmp_path):
     assert np.abs(ours[2][-1]).max() > 1e-4  # and they roll
     found = gaps(column, 0.1, 2000, 50, tmp_path, {1: gravity * 200.0, 2: gravity * 200.0, 3: ours[3].max()})
     assert max(found) < 1e-10
+
+
+def untwisted(*of_walls):
+    """Kinematics at walls without the turn about the normal; its arms are those of LAMMPS."""
+    kin = wall_kinematics(*of_walls)
+    return replace(kin, twist=jnp.zeros_like(kin.twist))
+
+
+@pytest.mark.parametrize(
+    ("law", "wall_mu"),
+    [
+        pytest.param(HOOKE, 5.0, id="H-stuck"),
+        pytest.param(MindlinRescaled(), 0.2, id="M1-sliding"),
+        pytest.param(HOOKE, 0.2, id="H-sliding", marks=pytest.mark.slow),
+        pytest.param(MindlinRescaled(), 5.0, id="M1-stuck", marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.usefixtures("lammps_kinematics")
+def test_a_sphere_on_a_wall_with_friction_moves_as_in_lammps(law, wall_mu, tmp_path, monkeypatch):
+    monkeypatch.setattr(dynamics, "wall_kinematics", untwisted)
+    lower = np.array([-np.inf, -np.inf, -1.0])
+    for moves in (0.0, SPEED):  # LAMMPS has two fixes for that
+        planes = replace(OPEN, lower=lower, lower_velocity=np.array([0.0, 0.0, moves]))
+        velocity, spin = [[SPEED, 0.5 * SPEED, -2.0 * SPEED]], [[SPEED, -SPEED, 3.0 * SPEED]]
+        system, state, _ = scenes.scene(gm.sphere(), [[0.0, 0.0, 0.0]], None, velocity, spin, friction=law)
+        system = replace(system, wall_mu=wall_mu)
+        state = replace(state, wall_history=dynamics.wall_histories(system, 1, 1))
+        wall = Comparison(system, state, planes)
+        found = gaps(wall, 0.1, 1000, 50, tmp_path, {1: SPEED, 2: SPEED})
+        (tmp_path / "run").rename(tmp_path / f"run{moves}")
+        assert max(found) < 1e-12  # of speeds and spins
+        turned = wall.ours(0.1, 1000, 50)[2]
+        assert np.abs(turned[-1] - spin).max() > 0.1 * SPEED
 
 
 # ---------------------------------------------------------------- a dense pack

@@ -30,6 +30,7 @@ class Kinematics:
     """Relative position and motion at P candidate contacts; [P, 3, B] vectors, [P, 1, B] scalars.
 
     The contact point is at x_i + n (R_i - p/2); "relative" means surface j minus surface i there.
+    `gmem_jax.physics.contact.wall.wall_kinematics` says what they are at walls.
 
     Attributes:
         normal: unit vector n from sphere i to sphere j.

@@ -65,14 +65,15 @@ struct Signature {
 // Arguments of the three tasks are those of the steps themselves, then, for derivatives, a number for each of the
 // results' or arguments' own; see `Task`.
 // gmem_jax/native/primitives.py: _library, _of_results, _of_arrays
-Signature signature(Task task, Law law) {
+Signature signature(Task task, Law law, bool rubs) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
                       {"validities", "P", ffi::PRED},   {"reference centres", "S3"},
                       {"smallest lengths", "3"},        {"images", "PI", ffi::S8},
                       {"radii", "KU"},                  {"sizes", "NU"},
                       {"offsets", "K3"}};
-  const Wants fields = fields_of_grains(), numbers = numbers_of_steps(), history = histories(law);
-  const Wants arguments = fields + pack + numbers + history, arrays = arrays_of_steps(law);
+  const Wants fields = fields_of_grains(), numbers = numbers_of_steps();
+  const Wants walls = wall_histories(law, rubs), history = histories(law) + walls;
+  const Wants arguments = fields + pack + numbers + history, arrays = arrays_of_steps(law) + walls;
   const Wants moved = fields + pressures() + history;
   switch (task) {
     case Task::tangent: return {arguments + arrays, moved};
@@ -82,7 +83,7 @@ Signature signature(Task task, Law law) {
 }
 
 ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                int64_t mixed, int64_t periodic, int64_t unequal, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+                int64_t mixed, int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   require_law(law, variant, points);
   require_axes(periodic);
   Problem problem{};
@@ -92,11 +93,14 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   problem.isotropic = isotropic != 0;
   problem.mixed = mixed != 0;
   problem.periodic = static_cast<int>(periodic);
+  problem.rubs = rubs != 0;
   require(!(periodic || unequal) || (task != Task::adjoint && !problem.mixed),
           "in a periodic box, and of unequal spheres, there are neither the adjoint nor mixed precision");
   require(!problem.mixed || (task == Task::forward && !is_layered(problem.law)),
           "there is no mixed precision for derivatives and the Mindlin law");
-  const Signature wanted = signature(task, problem.law);
+  require(!rubs || (task != Task::adjoint && !periodic && !problem.mixed && !is_layered(problem.law)),
+          "of walls with friction there are neither the adjoint, mixed precision, periodic boxes nor the Mindlin law");
+  const Signature wanted = signature(task, problem.law, problem.rubs);
   require(static_cast<std::size_t>(leaves) == histories(problem.law).size() && args.size() == wanted.arguments.size() &&
               rets.size() == wanted.results.size(),
           "the number of arguments or results is not that of the friction law");
@@ -127,8 +131,10 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   problem.stride = replicas;
   require(problem.grains > 0 && problem.spheres_per_grain > 0, "there is no grain");
   require(reader.size('S') == reader.size('N') * reader.size('K'), "there are not as many spheres as the grains have");
+  require(!rubs || leaves == 0 || reader.size('F') == kPlanes * reader.size('S'), "walls' histories are not those of all spheres");
   problem.history_aliased = task == Task::forward && leaves > 0;
-  for (int64_t leaf = 0; leaf < leaves; ++leaf)
+  const int64_t all_leaves = rubs ? 2 * leaves : leaves;
+  for (int64_t leaf = 0; leaf < all_leaves; ++leaf)
     problem.history_aliased &= in[kHistoryIn + leaf].data == out[kHistoryOut + leaf].data;
 
   // Collect the replicas by candidate list.
@@ -169,6 +175,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       lane.steps = static_cast<int>(rows);
       argument = kHistoryIn;
       for (int64_t leaf = 0; leaf < leaves; ++leaf) lane.history_in[leaf] = next_argument();
+      for (int64_t leaf = leaves; leaf < all_leaves; ++leaf) lane.wall_history_in[leaf - leaves] = next_argument();
       Lane slope = lane;
       if (task != Task::forward)
         for (int f = 0; f < kFields; ++f) slope.grains_in[f] = next_argument();
@@ -183,6 +190,10 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       for (int64_t leaf = 0; leaf < leaves; ++leaf) {
         lane.history_out[leaf] = slope.history_out[leaf] = next_result();
         if (task != Task::forward) slope.history_in[leaf] = next_argument();
+      }
+      for (int64_t leaf = 0; leaf < all_leaves - leaves; ++leaf) {
+        lane.wall_history_out[leaf] = slope.wall_history_out[leaf] = next_result();
+        if (task != Task::forward) slope.wall_history_in[leaf] = next_argument();
       }
       lanes[place.first->second].push_back(lane);
       slopes[place.first->second].push_back(slope);
@@ -213,8 +224,9 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 
 template <Task task>
 ffi::Error handle(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves, int64_t mixed,
-                  int64_t periodic, int64_t unequal, ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  return in_words([&] { return call(task, law, variant, points, isotropic, leaves, mixed, periodic, unequal, args, rets); });
+                  int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  return in_words(
+      [&] { return call(task, law, variant, points, isotropic, leaves, mixed, periodic, unequal, rubs, args, rets); });
 }
 
 auto binding() { return with_arguments(ffi::Ffi::Bind()); }

@@ -17,7 +17,7 @@ namespace gmem {
 
 // Axes are edges of a periodic box by which an image is moved I (none, or three), sizes where spheres differ in radius U
 // (none, or one), grains N, spheres of a grain K and of all S, candidates P, parameters R, steps T, numbers of the walls W,
-// Mindlin's points Q, replicas B.
+// Mindlin's points Q, contacts of spheres with walls that have friction F, replicas B.
 using Wants = std::vector<Wanted>;
 
 inline Wants operator+(Wants one, const Wants& other) {
@@ -32,6 +32,13 @@ inline Wants histories(Law law) {
       if (leaf.name) wants.push_back({leaf.name, leaf.axes});
     return wants;
   });
+}
+
+// ... of the spheres at walls with friction.
+inline Wants wall_histories(Law law, bool rubs) {
+  Wants wants = rubs ? histories(law) : Wants{};
+  for (Wanted& wanted : wants) wanted.name = "walls' " + wanted.name, wanted.axes[0] = 'F';
+  return wants;
 }
 
 inline bool is_layered(Law law) {
@@ -72,6 +79,7 @@ auto with_arguments(Binding&& binding) {
       .template Attr<int64_t>("mixed")
       .template Attr<int64_t>("periodic")
       .template Attr<int64_t>("unequal")
+      .template Attr<int64_t>("rubs")
       .RemainingArgs()
       .RemainingRets();
 }

@@ -9,6 +9,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 
 #include "cpu/histories.h"
 #include "cpu/problem.h"
@@ -51,6 +52,11 @@ struct Faces {
   Vec<V> through;
 };
 
+// Bits of the planes that a sphere of a unit remembers: now, and at any time since the call began.
+struct KnownPlanes {
+  unsigned char now, ever;
+};
+
 // The memory of an `Engine`.
 template <class Mode>
 struct EngineLayout {
@@ -64,6 +70,9 @@ struct EngineLayout {
   V* fastest;     // squares of the largest half-step velocity and spin, [chunks, 2]
   double* sections;  // of periodic boxes, as `walls`: see `section`
   V* through;        // ... and the forces through their faces, [domains, 3]
+  V* wall_history;   // of walls with friction, [units, wall_rows, Law::kHistory]
+  KnownPlanes* remembered;  // ... what of that is not 0, [units, spheres of a grain]
+  bool* remembers;         // ... whether anything is, [units]
   typename Mode::Layout of_mode;
 
   void place(const Problem& p, const Block& block, Arena& arena) {
@@ -75,6 +84,9 @@ struct EngineLayout {
     fastest = arena.take<V>(chunks * 2);
     sections = arena.take<double>(p.periodic ? chunks * 6 * kNumber : 0);
     through = arena.take<V>(p.periodic ? static_cast<std::size_t>(block.pack->plan->domains) * 3 : 0);
+    wall_history = arena.take<V>(p.rubs ? units * p.wall_rows() * Mode::OfLaw::kHistory : 0);
+    remembered = arena.take<KnownPlanes>(p.rubs ? units * p.spheres_per_grain : 0);
+    remembers = arena.take<bool>(p.rubs ? units : 0);
     of_mode.place(p, *block.pack->plan, arena);
   }
 };
@@ -84,6 +96,7 @@ struct Engine : EngineLayout<Mode> {
   using Layout = EngineLayout<Mode>;
   using V = typename Mode::Number;
   using Layout::hot, Layout::cold, Layout::offsets, Layout::walls, Layout::fastest, Layout::sections, Layout::through, Layout::kNumber;
+  using Layout::wall_history, Layout::remembered, Layout::remembers;
 
   const Problem& problem;
   const Block& block;
@@ -93,6 +106,7 @@ struct Engine : EngineLayout<Mode> {
   Mode mode;
   V parameter[kParameters];
   GrainParameters<V> constants;
+  WallLaw<V> wall_law;  // where walls have friction
   double arm;           // of the outermost sphere of a grain, of the largest where they differ in size
   double outer;         // radius about the centre of a grain of size 1 that holds it
   double travel = 0.0;  // how much closer any two spheres can have come since the call began
@@ -106,6 +120,7 @@ struct Engine : EngineLayout<Mode> {
     mode.use(this->of_mode, hot);
     for (int row = 0; row < kParameters; ++row) parameter[row] = mode.per_lane(&Lane::parameters, row);
     constants = GrainParameters<V>(parameter);
+    if (problem.rubs) wall_law = WallLaw<V>(parameter, mode.per_lane(&Lane::parameters, kWallMu));
     arm = outer = 0.0;
     for (int k = 0; k < problem.spheres_per_grain; ++k) {
       const double* body = block.pack->offsets + 3 * k;
@@ -170,6 +185,10 @@ struct Engine : EngineLayout<Mode> {
       return spheres_of(constants, m, offsets, problem.spheres_per_grain, arm, box, on,
                         [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     });
+    if (problem.rubs && (near || remembers[u])) {
+      const WallFriction<V> friction = rub(u, m, box);
+      on.force = on.force + friction.force, on.torque = on.torque + friction.torque;
+    }
     mode.put_grain(u, m.position, m.velocity, m.spin, on.force, on.torque);
     if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
   }
@@ -182,6 +201,63 @@ struct Engine : EngineLayout<Mode> {
                         box, on, [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     });
     return on;
+  }
+
+  // Friction of the walls on unit u; apart from `begin` likewise.
+  __attribute__((noinline)) WallFriction<V> rub(int u, HalfStep<V> m, WallState<V> box) {
+    using Law = typename Mode::OfLaw;
+    WallFriction<V> on{};
+    if constexpr (std::is_same<V, typename Mode::OfContacts>::value && !Law::kLayered) {
+      const Matrix<V> rotation = matrix(m.orientation);
+      GrainParameters<V> own = constants;
+      unsigned any = 0;
+      for (int k = 0; k < problem.spheres_per_grain; ++k) {
+        const V size = plan.size ? mode.size_of(u, &Size::one) : splat<V>(1.0);
+        const V radius = plan.size ? splat<V>(block.pack->radii[k]) * size : size;
+        if (plan.size) own.wall_stiffness = root(radius) * constants.wall_stiffness;
+        const Vec<V> body = with_offsets([&](const auto* offsets) { return body_at<V>(offsets + 3 * k); });
+        const Vec<V> lever = rotation * (plan.size ? size * body : body);
+        const std::size_t first = static_cast<std::size_t>(u) * problem.wall_rows() + static_cast<std::size_t>(kPlanes) * k;
+        KnownPlanes& planes = remembered[first / kPlanes];
+        const unsigned now = rub_walls<Law>(own, wall_law, m.position + lever, lever, add_cross(m.velocity, m.spin, lever), m.spin,
+                                            box, radius, wall_history + first * Law::kHistory, planes.now, on);
+        planes = {static_cast<unsigned char>(now), static_cast<unsigned char>(planes.ever | now)};
+        any |= now;
+      }
+      remembers[u] = any != 0;
+    }
+    return on;
+  }
+
+  // Calls `each` with the rows of unit u in the histories of walls: with the number among those of a grain, and where
+  // what is remembered and its bits are.
+  template <class Each>
+  void for_walls(int u, const Each& each) const {
+    const std::size_t first = static_cast<std::size_t>(u) * problem.wall_rows();
+    for (int row = 0; row < problem.wall_rows(); ++row)
+      each(row, wall_history + (first + row) * Mode::OfLaw::kHistory, remembered[(first + row) / kPlanes], row % kPlanes);
+  }
+
+  // From the arrays of the call ...
+  void load_walls(int u) {
+    remembers[u] = false;
+    for_walls(u, [&](int row, V* numbers, KnownPlanes& planes, int w) {
+      bool any = Mode::kDual;  // a derivative may be where the value is 0
+      for (int q = 0; q < Mode::OfLaw::kGiven; ++q) {
+        numbers[q] = mode.wall_history_in(u, row, q);
+        any |= (bits_less(numbers[q], V{}) | bits_less(V{}, numbers[q])) != 0;
+      }
+      if (w == 0) planes = {};
+      if (any) planes.now |= 1u << w, planes.ever |= 1u << w, remembers[u] = true;
+    });
+  }
+
+  // ... and back.
+  void unload_walls(int u, int steps_done) const {
+    for_walls(u, [&](int row, const V* numbers, const KnownPlanes& planes, int w) {
+      if (problem.history_aliased && !(planes.ever >> w & 1)) return;
+      for (int q = 0; q < Mode::OfLaw::kGiven; ++q) mode.wall_history_out(u, row, q, numbers[q], steps_done);
+    });
   }
 
   // What `begin` left of unit u: the same places.
@@ -293,6 +369,7 @@ struct Engine : EngineLayout<Mode> {
   void load() {
     const int units = Mode::units(problem);
     for (int u = share_begin(units); u < share_begin(units, 1); ++u) mode.load_unit(u, hot, cold);
+    for (int u = share_begin(units); problem.rubs && u < share_begin(units, 1); ++u) load_walls(u);
     const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
     for (int c = share_begin(plan.candidates); c < share_begin(plan.candidates, 1); ++c) load_history(mode, c, law);
     if constexpr (Mode::kDual)
@@ -312,6 +389,7 @@ struct Engine : EngineLayout<Mode> {
     if (rank == 0) mode.unload_pressure(pressure, steps_done);
     const int units = Mode::units(problem);
     for (int u = share_begin(units); u < share_begin(units, 1); ++u) mode.unload_unit(u, hot, cold, steps_done);
+    for (int u = share_begin(units); problem.rubs && u < share_begin(units, 1); ++u) unload_walls(u, steps_done);
     const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
     for (int c = share_begin(plan.candidates); c < share_begin(plan.candidates, 1); ++c)
       unload_history(mode, c, law, steps_done);

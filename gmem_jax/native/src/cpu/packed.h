@@ -114,6 +114,25 @@ struct Packed : PackedLayout<Law> {
     lane.history_out[place.leaf][place.row * problem.stride] = number;
   }
 
+  // Number q of the history in `row` of those that each grain of unit u has at walls.
+  V wall_history_in(int u, int row, int q) const {
+    V a;
+    for (int l = 0; l < W; ++l) {
+      const Place place = wall_place(u, l, row, q);
+      a[l] = lane.wall_history_in[place.leaf][place.row * problem.stride];
+    }
+    return a;
+  }
+  void wall_history_out(int u, int row, int q, V number, int) const {
+    for (int l = 0; l < W && u * W + l < problem.grains; ++l) {
+      const Place place = wall_place(u, l, row, q);
+      lane.wall_history_out[place.leaf][place.row * problem.stride] = number[l];
+    }
+  }
+  Place wall_place(int u, int l, int row, int q) const {
+    return place_of<Law>(static_cast<long long>(plan.grain[grain_in(u, l)]) * problem.wall_rows() + row, q);
+  }
+
   void mark_new(std::size_t c) const {
     marks.touched[c] = false;
     marks.next_check[c] = -1.0;  // not looked at yet

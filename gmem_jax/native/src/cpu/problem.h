@@ -41,8 +41,10 @@ struct Problem {
   std::ptrdiff_t stride;  // doubles between two rows of an array: replicas B of the innermost axis
   bool mixed = false;     // contacts in single precision; forward only
   int periodic = 0;       // bit of each axis along which the box is; not for the adjoint
+  bool rubs = false;      // walls have friction; not for the adjoint, periodic boxes and the Mindlin law
 
   int spheres() const { return grains * spheres_per_grain; }
+  int wall_rows() const { return kPlanes * spheres_per_grain; }  // of a grain in the histories of walls
 };
 
 // A candidate contact, in the numbering of its plan. The force goes from sphere `one` to sphere `other`, as listed.
@@ -107,6 +109,8 @@ struct Lane {
   double* grains_out[kFields];
   const double* history_in[kMaxHistory];
   double* history_out[kMaxHistory];
+  const double* wall_history_in[kMaxHistory];  // null where walls have no friction
+  double* wall_history_out[kMaxHistory];
   const double* parameters;
   const double* walls;
   double* pressure;

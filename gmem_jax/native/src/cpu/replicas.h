@@ -112,6 +112,10 @@ struct Replicas : ReplicasLayout<Law, V, C> {
       for (int leaf = 0; leaf < kMaxHistory; ++leaf)
         if (a.history_in[leaf])
           found &= b.history_in[leaf] == a.history_in[leaf] + l && b.history_out[leaf] == a.history_out[leaf] + l;
+      for (int leaf = 0; leaf < kMaxHistory; ++leaf)
+        if (a.wall_history_in[leaf])
+          found &= b.wall_history_in[leaf] == a.wall_history_in[leaf] + l &&
+                   b.wall_history_out[leaf] == a.wall_history_out[leaf] + l;
     }
     return found;
   }
@@ -215,6 +219,19 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   void history_out(Place place, C number, int steps_done) const {
     const auto out = [place](const Lane& lane) { return lane.history_out[place.leaf]; };
     write(out, place.row, convert<V>(number), steps_done);
+  }
+
+  // Number q of the history in `row` of those that the grain of unit u has at walls.
+  V wall_history_in(int u, int row, int q) const {
+    const Place place = wall_place(u, row, q);
+    return read([place](const Lane& lane) { return lane.wall_history_in[place.leaf]; }, place.row);
+  }
+  void wall_history_out(int u, int row, int q, V number, int steps_done) const {
+    const Place place = wall_place(u, row, q);
+    write([place](const Lane& lane) { return lane.wall_history_out[place.leaf]; }, place.row, number, steps_done);
+  }
+  Place wall_place(int u, int row, int q) const {
+    return place_of<Law>(static_cast<long long>(plan.grain[u]) * problem.wall_rows() + row, q);
   }
 
   void mark_new(std::size_t c) const {

@@ -174,8 +174,9 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 
 template <Task task>
 ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t,
-                  int64_t mixed, int64_t periodic, int64_t unequal, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+                  int64_t mixed, int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   return in_words([&] {
+    require(rubs == 0, "walls are without friction on GPUs");
     require(mixed == 0, "there is no mixed precision on GPUs");
     return call(task, law, variant, points, isotropic, periodic, unequal, stream, args, rets);
   });
@@ -184,7 +185,7 @@ ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, in
 // Before a program runs: a stream may be on its way into a graph when a call is made, and loading is no part of that.
 template <Task task>
 ffi::Error load(void* stream, int64_t law, int64_t variant, int64_t points, int64_t, int64_t, int64_t, int64_t periodic,
-                int64_t unequal, ffi::RemainingArgs, ffi::RemainingRets) {
+                int64_t unequal, int64_t, ffi::RemainingArgs, ffi::RemainingRets) {
   return in_words([&] {
     const Launcher loads(stream, which_of(task, law, variant, points, periodic, unequal));
     return ffi::Error::Success();

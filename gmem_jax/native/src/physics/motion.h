@@ -204,6 +204,72 @@ constexpr void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> le
   on.torque = add_cross(on.torque, lever, low - up);
 }
 
+// What friction of the walls does to a grain.
+template <class V>
+struct WallFriction {
+  Vec<V> force, torque;
+};
+
+// The law of the contacts at walls, and what it needs beside that.
+template <class V>
+struct WallLaw {
+  LawParameters<V> law;
+  V quarter_dt, normal_stiffness;
+
+  WallLaw() = default;
+
+  constexpr WallLaw(const V* parameter, V mu)
+      : law(parameter + kLaw, parameter[kDt]), quarter_dt(splat<V>(0.25) * parameter[kDt] * parameter[kSpinning]),
+        normal_stiffness(parameter[kNormalStiffness]) {
+    law.mu = mu;
+  }
+};
+
+// Adds to `on` the friction of the walls on one sphere of a grain, of a radius for which the walls have their stiffness.
+// `history` has what the law remembers of it at each plane, [kPlanes, Law::kHistory]; is that anything but 0, the plane's bit
+// of `remembered` is set. Returns these bits afterwards.
+// gmem_jax/physics/contact/wall.py: wall_kinematics, wall_friction
+template <class Law, class V>
+GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
+                         Vec<V> spin, const WallState<V>& box, V radius, V* history, unsigned remembered, WallFriction<V>& on) {
+  if (!remembered && !bits_less(V{}, deepest(radius, centre, box))) return 0;
+  const Vec<V> all{radius, radius, radius};
+  const Vec<V> lower = all - (centre - box.lower), upper = all - (box.upper - centre);
+  const Vec<V> low = box.lower_velocity - velocity, up = velocity - box.upper_velocity;
+  const V overlap[kPlanes] = {lower.x, lower.y, lower.z, upper.x, upper.y, upper.z};
+  const V closing[kPlanes] = {low.x, low.y, low.z, up.x, up.y, up.z};
+  const V zero{}, stiffer = p.wall_stiffness / walls.normal_stiffness;
+  Contact<V> c[kPlanes];
+  int count = 0;
+  unsigned touched = 0;
+  for (int w = 0; w < kPlanes; ++w) {
+    V* const own = history + w * Law::kHistory;
+    if (!bits_less(V{}, overlap[w])) {
+      for (int q = 0; remembered >> w & 1 && q < Law::kHistory; ++q) own[q] = V{};
+      continue;
+    }
+    touched |= 1u << w;
+    const V side = splat<V>(w < 3 ? -1.0 : 1.0);
+    Contact<V>& now = c[count++];
+    now.normal = {w % 3 == 0 ? side : zero, w % 3 == 1 ? side : zero, w % 3 == 2 ? side : zero};
+    now.overlap = overlap[w];
+    now.history = own;
+    const Vec<V> arm = radius * now.normal;
+    now.lever_one = lever + arm;
+    now.sliding = dot(velocity, now.normal) * now.normal - velocity - cross(spin, arm);
+    now.turned = walls.quarter_dt * dot(spin, now.normal);
+    const V safe = now.safe_overlap(), rooted = root(safe);
+    now.normal_force = hertz(now.touching(), safe, rooted, closing[w], p.wall_stiffness, p.normal_damping);
+    now.root_overlap = stiffer * rooted;
+  }
+  friction(Law{}, c, count, walls.law);
+  for (int n = 0; n < count; ++n) {
+    on.force = on.force + c[n].force;
+    on.torque = add_cross(on.torque, c[n].lever_one, c[n].force);
+  }
+  return touched;
+}
+
 // The centre of a sphere of a grain, and what the walls do to it if they are near.
 template <class V>
 constexpr GMEM_INLINE Vec<V> sphere_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Matrix<V>& rotation,

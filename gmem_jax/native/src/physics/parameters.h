@@ -7,6 +7,7 @@ namespace gmem {
 constexpr int kFields = 6;  // position, quaternion, velocity, spin, acceleration, spin rate
 constexpr int kWalls = 12;  // lower, upper, lower velocity, upper velocity
 constexpr int kMaxHistory = 3;
+constexpr int kPlanes = 6;  // that a sphere may touch: the lower walls of x, y and z, then the upper ones
 
 // What is wanted: all steps; their derivative along a direction; or, back from derivatives by all results, those by all
 // arguments.
@@ -22,8 +23,9 @@ enum class Variant { exact = 0, averaged = 1, paper = 2 };
 enum Parameter { kDt, kDrag, kMass, kInertia, kNormalStiffness = kInertia + 3, kNormalDamping, kWallStiffness, kLaw };
 constexpr int kLawParameters = 5;  // mu, stiffness, damping time, spinning, spacing of Mindlin's points
 constexpr int kGravity = kLaw + kLawParameters, kParameters = kGravity + 1;
-// ... and, after these, the lower and upper edges of the box before the first step, which a periodic one is carried from.
-constexpr int kCell = kParameters, kRows = kCell + 6;
+// ... and, after these, the lower and upper edges of the box before the first step, which a periodic one is carried from;
+// and the friction coefficient of the walls.
+constexpr int kCell = kParameters, kWallMu = kCell + 6, kRows = kWallMu + 1;
 constexpr int kSpinning = kLaw + 3;
 
 // Where a history has the overlap of the last step, if it has it; and Mindlin's `Layers`.

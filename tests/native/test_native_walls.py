@@ -1,0 +1,194 @@
+"""Walls with friction on the native backend, against the definition; their adjoint is that of plain JAX."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, assert_close
+
+import gmem_jax as gm
+from gmem_jax import native
+from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.wall import wall_forces
+from gmem_jax.physics.state import Box, State, replicate
+from gmem_jax.physics.step import System, start
+
+pytestmark = pytest.mark.skipif(not native.available()[0], reason="the library was not built")
+
+LAWS: dict[str, Any] = {
+    "H": gm.Hooke(mu=0.3),
+    "M1": gm.MindlinRescaled(mu=0.3),
+    "M2": gm.Mindlin(mu=0.3, points=8),
+}
+STEPS = 40
+QUICKLY = {"xla_backend_optimization_level": 0}
+Scene = tuple[System, State, Box]
+
+
+@functools.cache
+def thrown(law: str, replicas: int, file: Any = TETRA_27) -> Scene:
+    """27 grains that fly and spin between walls that shrink, more along one axis than another, and open along z."""
+    pack = gm.load_pack(file)
+    wall_mu = jnp.linspace(0.1, 0.4, replicas)
+    system = System(pack.clump, LAWS[law], pack.pairs, gm.Material(wall_rigidity=0.7), wall_mu=wall_mu)
+    places = replicate((pack.position[..., None], pack.quaternion[..., None]), replicas)
+    state = jax.jit(start, compiler_options=QUICKLY)(system, *places, pack.box)
+    draws = 8e-3 * np.random.default_rng(0).normal(size=(2, pack.grains, 3, 5))[..., :replicas]
+    grains = replace(state.grains, velocity=jnp.asarray(draws[0]), spin=jnp.asarray(draws[1]))
+    inwards = jnp.asarray([2e-3, 1e-3, -6e-3])[:, None] * jnp.linspace(1.0, 0.5, 5)[:replicas]
+    time, every = 0.3 * (1.0 + jnp.arange(STEPS))[:, None, None], jnp.ones((STEPS, 3, replicas))
+    lower, upper = pack.lower[:, None] + time * inwards, pack.upper[:, None] - 2.0 * time * inwards
+    boxes = Box(lower, upper, every * inwards, -2.0 * every * inwards, pack.periodic)
+    return system, replace(state, grains=grains), boxes
+
+
+def part(boxes: Box, which: slice) -> Box:
+    return jax.tree.map(lambda leaf: leaf[which], boxes)
+
+
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
+def moved(march: Callable[..., Any], system: System, state: State, boxes: Box) -> Any:
+    """All that a march gives, in two bins, and what walls remember between them."""
+    middle, pressure = march(system, state, part(boxes, slice(25)), 0.3, 0.01)
+    state, more = march(system, middle, part(boxes, slice(25, None)), 0.3, 0.01)
+    return state.grains, state.history, state.wall_history, pressure + more, middle.wall_history
+
+
+@pytest.mark.parametrize(
+    ("law", "replicas"),
+    [("M1", 5), *(pytest.param(*more, marks=pytest.mark.slow) for more in (("H", 5), ("H", 1), ("M1", 1)))],
+)
+def test_values_at_walls_with_friction_are_those_of_the_definition(law: str, replicas: int) -> None:
+    scene = thrown(law, replicas)
+    found = moved(native.march, *scene)
+    assert_close(found, moved(dynamics.march, *scene), 1e-12)  # one replica contact by contact, five side by side
+    middle, end = (np.any(np.asarray(jax.tree.leaves(each)[0]) != 0.0, axis=1) for each in (found[4], found[2]))
+    counts = (np.sum(middle & ~end), np.sum(end & ~middle), np.sum(middle & end))
+    assert min(counts) > 0  # contacts end, begin and stay
+
+
+def test_walls_of_this_scene_are_stuck_to_and_slid_on() -> None:
+    system, _, boxes = scene = thrown("M1", 5)
+    grains, _, history, *_ = moved(native.march, *scene)
+    table, _ = dynamics.sphere_table(system.clump, grains)
+    box, solid = part(boxes, -1), (system.material.wall_stiffness, system.material.normal_damping)  # type: ignore[arg-type]
+    forces = wall_forces(table[:, :3], table[:, 3:6], box, *solid)
+    _, force, _, _ = dynamics.wall_loads(system, grains, box, *forces, history, jnp.asarray(0.3))
+    limit = np.asarray(system.wall_mu) * np.asarray(jnp.concatenate(forces, axis=1)).reshape(force.shape[0], 5)
+    used = np.linalg.norm(force, axis=1)[limit > 0.0] / limit[limit > 0.0]
+    assert min(np.sum(used > 1.0 - 1e-9), np.sum(used < 0.9)) > 5
+
+
+@pytest.mark.parametrize("law", ["H", "M1"])
+def test_a_replica_between_walls_with_friction_has_the_same_bits_alone(law: str) -> None:
+    system, state, boxes = thrown(law, 5)
+    together = moved(native.march, system, state, boxes)
+    for replica in (0, 3):
+        state_of, boxes_of = jax.tree.map(lambda leaf, at=replica: leaf[..., at : at + 1], (state, boxes))
+        alone = moved(native.march, replace(system, wall_mu=system.wall_mu[replica]), state_of, boxes_of)  # type: ignore[index]
+        for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
+            np.testing.assert_array_equal(one[..., 0], other[..., replica])
+
+
+@pytest.mark.slow
+def test_values_of_grains_of_sizes_are_those_of_the_definition() -> None:
+    scene = thrown("M1", 5, SPREAD_27)
+    assert_close(moved(native.march, *scene), moved(dynamics.march, *scene), 1e-12)
+
+
+def slopes(march: Callable[..., Any], scene: Scene, steps: int) -> tuple[Callable[..., Any], Any]:
+    """What some steps give, as a function of all that they depend on; and that."""
+    system, state, boxes = scene
+    law: Any = system.friction
+    theta = {
+        "grains": state.grains,
+        "histories": (state.history, state.wall_history),
+        "law": {name: jnp.asarray(getattr(law, name)) for name in ("mu", "stiffness", "damping_time", "spinning")},
+        "wall_mu": system.wall_mu,
+        "rigidity": jnp.asarray(0.7),
+        "offsets": system.clump.offsets,
+        "boxes": part(boxes, slice(steps)),
+        "dt": jnp.asarray(0.3),
+    }
+
+    def end(theta: Any) -> Any:
+        material, clump = replace(system.material, wall_rigidity=theta["rigidity"]), system.clump
+        changed = replace(
+            system,
+            friction=replace(law, **theta["law"]),
+            material=material,
+            clump=replace(clump, offsets=theta["offsets"]),
+            wall_mu=theta["wall_mu"],
+        )
+        history, walls = theta["histories"]
+        before = replace(state, grains=theta["grains"], history=history, wall_history=walls)
+        after, pressure = march(changed, before, theta["boxes"], theta["dt"], 0.01)
+        return after.grains, after.history, after.wall_history, pressure
+
+    return end, theta
+
+
+def random_like(tree: Any) -> Any:
+    generator = np.random.default_rng(3)
+    return jax.tree.map(lambda leaf: jnp.asarray(generator.normal(size=jnp.shape(leaf))), tree)
+
+
+def rubbed(law: str) -> Scene:
+    """`thrown` after its first bin, so that walls have something to remember."""
+    system, state, boxes = thrown(law, 5)
+    advanced = jax.jit(native.march)(system, state, part(boxes, slice(25)), 0.3, 0.01)[0]
+    return system, advanced, part(boxes, slice(25, None))
+
+
+def derivatives(march: Callable[..., Any], law: str, backwards: bool) -> Any:
+    """Of 10 steps along some direction, and, if they are wanted, back from some weights."""
+    end, theta = slopes(march, rubbed(law), 10)
+
+    def both(theta: Any, along: Any) -> Any:
+        out, change = jax.jvp(end, (theta,), (along,))
+        return change, jax.vjp(end, theta)[1](random_like(out))[0] if backwards else ()
+
+    return jax.jit(both, compiler_options=QUICKLY)(theta, random_like(theta))
+
+
+@pytest.mark.parametrize(
+    ("law", "backwards"), [("H", False), *(pytest.param(law, True, marks=pytest.mark.slow) for law in ("H", "M1"))]
+)
+def test_derivatives_at_walls_with_friction_are_those_of_the_definition(law: str, backwards: bool) -> None:
+    found, expected = (derivatives(march, law, backwards) for march in (native.march, dynamics.march))
+    # Round-off of the one is some 1e-14, magnified in each step where contacts between grains have just begun (as much
+    # between smooth walls); the other is one program.
+    assert_close(found[0], expected[0], 1e-9)
+    assert_close(found[1], expected[1], 1e-12)
+    assert not backwards or float(np.abs(expected[1]["wall_mu"]).min()) > 0.0
+
+
+LACKING = pytest.mark.parametrize(("law", "file"), [("M2", TETRA_27), ("H", PERIODIC_XY_27)])
+
+
+@LACKING
+def test_what_the_library_has_not_is_refused(law: str, file: Any) -> None:
+    pack, friction = gm.load_pack(file), LAWS[law]
+    assert native.name("auto", friction, pack.periodic, smooth=False) == "jax"
+    with pytest.raises(ValueError, match="walls with friction"):
+        gm.Experiment(pack, gm.six_signals(), friction, wall_mu=0.1, backend="native")
+    system, state, boxes = thrown(law, 1, file)
+    with pytest.raises(NotImplementedError, match="walls with friction"):
+        jax.jit(native.march)(system, state, part(boxes, slice(3)), 0.3, 0.0)
+
+
+@pytest.mark.slow
+@LACKING
+def test_auto_takes_plain_jax_for_what_the_library_has_not(law: str, file: Any) -> None:
+    system, state, boxes = thrown(law, 1, file)
+    auto, plain = (
+        jax.jit(march, compiler_options=QUICKLY)(system, state, part(boxes, slice(3)), 0.3, 0.0)
+        for march in (native.marcher("auto"), dynamics.march)
+    )
+    assert_close(auto[0].wall_history, plain[0].wall_history, 1e-13)
+    assert np.any(np.asarray(jax.tree.leaves(auto[0].wall_history)[0]))
