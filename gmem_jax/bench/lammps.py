@@ -295,7 +295,7 @@ def scene_script(
 ) -> list[str]:
     """Everything up to `run`: files written to `folder`, contacts, walls and integrator; see `write_scene`.
 
-    `gravity` is its acceleration along -z, in R / t_c^2, and `wall_mu` the friction coefficient of walls; None for none.
+    `gravity` is its acceleration along -z, in R / t_c^2, `wall_mu` the friction coefficient of walls; None for none.
     """
     script = write_scene(scene, folder, skin=skin, every=every)
     script += pair_lines(friction, material, masses_of_types(scene.clump))
