@@ -13,7 +13,7 @@ from rich.table import Table
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import spread
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.signals import bin_average
@@ -381,13 +381,21 @@ def cell(value: Any) -> str:
     return Path(text).stem if text.endswith(".h5") else text
 
 
+NOT_OF_PAPER = ("creep", "creep_fades", "gravity", "wall_mu")
+"""Numbers of an experiment without which, as in the paper, what they stand for is not there."""
+
+
 def conditions(configuration: dict[str, Any]) -> str:
     """What a recall depends on first of all: law, mu, gamma0, delta0, t0, signals; its background if not SUB0.
 
-    Of another protocol than the paper's its stages, too.
+    Of another protocol than the paper's its stages, too; and what the paper has not, if it was given.
     """
-    amounts = ("mu", "gamma0", "delta0", "t0")
-    known = ", ".join(f"{name} = {_amount(configuration[name])}" for name in amounts)
+    known = ", ".join(f"{name} = {_amount(configuration[name])}" for name in ("mu", "gamma0", "delta0", "t0"))
+    more = (
+        f"{name} = {_amount(configuration[name])} {NUMBERS[name].metadata['unit']}".strip()
+        for name in NOT_OF_PAPER
+        if configuration.get(name) is not None
+    )
     form = configuration.get("experiment", {}).get("signals", {})
     count = len(configuration.get("signals", ()))
     named = {"six": "the six signals", "words": f"all {count} words of {plural(form.get('bits'), 'bit')}"}
@@ -396,7 +404,7 @@ def conditions(configuration: dict[str, Any]) -> str:
     background = configuration.get("background", "sub0")
     subtracted = "" if background == "sub0" else background.upper()
     stages = _stages(configuration.get("experiment", {}).get("protocol"))
-    return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", stored, subtracted, stages)))
+    return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", *more, stored, subtracted, stages)))
 
 
 def _stages(protocol: Any) -> str:
@@ -423,10 +431,12 @@ def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:
         return []
     if configuration["friction"] != "hooke" or not np.min(configuration["t0"]) >= SLOW_ENOUGH:
         return []
-    if any(written.get(name) != getattr(Experiment, name) for name in ("shear", "store", "hold", "protocol")):
+    as_published = ("shear", "store", "hold", "protocol", *NOT_OF_PAPER)
+    if any(written.get(name) != getattr(Experiment, name) for name in as_published):
         return []
     same = {key: configuration[key] for key in ("mu", "delta0", "gamma0")}
-    if "sizes" in configuration["grain"]:
+    boundary = configuration["pack_record"].get("recipe", {}).get("boundary", "walls")
+    if "sizes" in configuration["grain"] or boundary != "walls":
         return []
     shape = configuration["grain"]["shape"]
     kind, overlap = ("sphere", 1.0) if shape == "sphere" else _tetra(shape)
