@@ -1074,8 +1074,8 @@ MUTATIONS = (
     mutation(
         "servo-away-from-its-pressure",
         "simulation/strain.py",
-        "SERVO_GAIN * error",
-        "-SERVO_GAIN * error",
+        "1.0), SERVO_GAIN,",
+        "1.0), -SERVO_GAIN,",
         "test_held_walls_come_to_the_pressure_and_give_way",
     ),
     mutation(
@@ -1530,9 +1530,9 @@ MUTATIONS = (
     ),
     mutation(
         "piston-without-a-speed-limit",
-        "preparation/piston.py",
-        "- 1.0), -servo.speed, servo.speed)",
-        "- 1.0), -servo.speed, 9.0)",
+        "simulation/strain.py",
+        "- 1.0), -fastest, fastest)",
+        "- 1.0), -fastest, 9.0)",
         "test_the_piston_moves_with_the_error_of_the_pressure_at_most_at_its_speed",
     ),
     mutation(

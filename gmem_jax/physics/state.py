@@ -74,7 +74,7 @@ SENTENCES = {
     Status.RINGING: "the pack rings: F over its period is larger by more than 0.03; use a larger t0, or F over T1",
     Status.SHEAR_BEYOND_COMPRESSION: "the shear exceeds delta0 / 4, where the gain depends on it; use a smaller gamma0",
     Status.LARGE_WAVEFORM: "a waveform exceeds 2, and gains are per gamma0; use waveforms up to 1 and a larger gamma0",
-    Status.LARGE_FRICTION: "mu or wall_mu exceeds 10, as of no material: contacts hardly slide; use a smaller one",
+    Status.LARGE_FRICTION: "a friction coefficient exceeds 10, as of no material; use a smaller mu or wall_mu",
     Status.LARGE_STIFFNESS: "tangential springs are stiffer than Hertz contacts; use stiffness < 1.5 normal_stiffness",
     Status.RESTLESS: "steps look unstable (fast grains or strong dampers); use a smaller dt, damping_time or hold_drag",
     Status.ROUNDED: "round-off is 1 % of p_sig or more; use a larger gamma0, or precision double if it was mixed",
