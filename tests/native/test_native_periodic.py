@@ -73,7 +73,7 @@ def test_values_between_walls_along_one_axis(gravity: float | None) -> None:
     assert_close(*(jax.jit(functools.partial(moved, march))(*scene) for march in (native.march, dynamics.march)), 1e-11)
 
 
-@pytest.mark.parametrize("law", ["H", "M2"])
+@pytest.mark.parametrize("law", ["H", pytest.param("M2", marks=pytest.mark.slow)])
 def test_tangents_and_adjoints_are_those_of_the_definition(law: str) -> None:
     system, state, boxes = thrown(law, 2)
     draws = np.random.default_rng(1)
