@@ -10,13 +10,13 @@ the end the table is printed, mean and standard error over packs.
 """
 
 import argparse
-import csv
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from rows import done, note
 
 import gmem_jax as gm
 from gmem_jax.experiment.analysis import spread
@@ -88,21 +88,6 @@ def bits(recall: gm.Recall) -> dict[str, float]:
     return {f"bits read of {MANY} at {noise:g} Pa": decoded_bits(recall.p_sig, noise / PASCAL).bits for noise in NOISES}
 
 
-def done(path: Path) -> list[dict[str, str]]:
-    """The rows there are."""
-    return list(csv.DictReader(path.open())) if path.exists() else []
-
-
-def note(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Add rows."""
-    new = not path.exists()
-    with path.open("a") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        writer.writerows(rows)
-
-
 def main() -> None:
     """Run what is not done, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -128,7 +113,7 @@ def main() -> None:
             recall = gm.run(experiment(made, signals, condition), progress=False)
             own = {"pack": pack, "N": grains, "condition": name, "seconds": f"{time.process_time() - began:.0f}"}
             found = what(recall)
-            note(path, [own | {"quantity": key, "value": f"{value:.5g}"} for key, value in found.items()])
+            note(path, COLUMNS, [own | {"quantity": key, "value": f"{value:.5g}"} for key, value in found.items()])
             print(pack, name, gm.explain(recall.status), f"{own['seconds']} CPU s", flush=True)
     rows = done(path)
     for name, quantity in dict.fromkeys((row["condition"], row["quantity"]) for row in rows):

@@ -8,7 +8,6 @@ where it was killed. At the end the table is printed, mean and standard error ov
 """
 
 import argparse
-import csv
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -18,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from rows import done, note
 
 import gmem_jax as gm
 from gmem_jax import protocols
@@ -323,21 +323,6 @@ STUDIES: dict[str, Callable[[Case], Found]] = {
 }
 
 
-def done(path: Path) -> list[dict[str, str]]:
-    """The rows there are."""
-    return list(csv.DictReader(path.open())) if path.exists() else []
-
-
-def note(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Add rows."""
-    new = not path.exists()
-    with path.open("a") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        writer.writerows(rows)
-
-
 def table(rows: list[dict[str, str]]) -> Iterator[str]:
     """Mean and standard error over packs, a line for each quantity and size."""
     places = dict.fromkeys((row["study"], row["quantity"], row["N"]) for row in rows)
@@ -367,7 +352,7 @@ def main() -> None:
             found = STUDIES[study](case)
             seconds = f"{time.process_time() - began:.0f}"
             own = {"pack": name, "N": case.pack.grains, "study": study, "seconds": seconds}
-            note(path, [own | {"quantity": key, "value": f"{value:.5g}"} for key, value in found.items()])
+            note(path, COLUMNS, [own | {"quantity": key, "value": f"{value:.5g}"} for key, value in found.items()])
             print(f"{name} {study}: {seconds} CPU s", flush=True)
     print(*table(done(path)), sep="\n")
 
