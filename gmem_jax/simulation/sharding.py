@@ -61,17 +61,16 @@ class Placement:
         return placed
 
     def put_simulation(self, simulation: Simulation) -> Simulation:
-        """A simulation: lists and parameters of a law are split if replicas differ in them, the rest is everywhere."""
+        """A simulation: lists and numbers of a system are split if replicas differ in them, the rest is everywhere."""
         system = simulation.system
         reference = system.pairs.reference
         own = self._put_last(reference) if reference.shape[-1] > 1 else self._put(reference)
-        friction, wall_mu = jax.tree.map(self._put_number, (system.friction, system.wall_mu))
+        numbers = {name: getattr(system, name) for name in ("friction", "gravity", "wall_mu")}
+        numbers = jax.tree.map(self._put_number, numbers)
         everywhere: Simulation = jax.tree.map(self._put, simulation)
         pairs = replace(everywhere.system.pairs, reference=own)
         mark = jax.tree.map(self._put_last, simulation.mark)
-        return replace(
-            everywhere, system=replace(everywhere.system, pairs=pairs, friction=friction, wall_mu=wall_mu), mark=mark
-        )
+        return replace(everywhere, system=replace(everywhere.system, pairs=pairs, **numbers), mark=mark)
 
     def _put_number(self, leaf: Any) -> Any:
         """A number for all replicas, or one for each, [B]."""

@@ -27,7 +27,9 @@ def main(address: str, backend: str, target: str, processes: str = "1", number: 
     pack = with_skin(gm.load_pack(PACK), 0.05)  # lists are made anew on the way
     base = gm.Experiment(pack, gm.six_signals(), backend=backend, **SHORT)
     points = [gm.replace(base, {"friction.mu": mu, "gamma0": gamma0}) for mu, gamma0 in ((1.0, 1e-3), (0.4, 2e-3))]
-    recalls = [gm.run(base, batch=3), *run_several(points)]
+    # One number for each of seven replicas: of what is the same for all grains, and of the walls.
+    own = {"gravity": 1e-5 * np.arange(7.0), "wall_mu": 0.1 * np.arange(7.0)}
+    recalls = [gm.run(base, batch=3), *run_several(points), gm.run(gm.replace(base, own))]
     if number == "0":
         named = {f"p_sig-{place}": recall.p_sig for place, recall in enumerate(recalls)}
         status = [np.asarray(recall.status) for recall in recalls]
