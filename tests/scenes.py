@@ -13,6 +13,8 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.hooke import Hooke
+from gmem_jax.physics.contact.mindlin import Mindlin
+from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.grain import Clump, sphere, tetra
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import Pairs, slack, sphere_centres, tabulate
@@ -33,6 +35,7 @@ PERIODIC_XY_27 = TESTS / "data" / "periodic-xy-27.h5"  # between walls along z
 
 ELASTIC = Material(normal_damping=0.0)
 SPHERE = sphere()
+THREE_LAWS: dict[str, Any] = {"H": Hooke(mu=0.3), "M1": MindlinRescaled(mu=0.3), "M2": Mindlin(mu=0.3, points=8)}
 FREE = still_box(jnp.full((3, 1), -15.0), jnp.full((3, 1), 15.0))  # walls out of everybody's way
 
 cached_tetra = functools.lru_cache(tetra)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import assert_close, scene
+from scenes import THREE_LAWS, assert_close, scene
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -28,9 +28,7 @@ pytestmark = pytest.mark.skipif(not BUILT, reason=REASON)
 
 PACK = gm.load_pack("tetra-325-a")
 LAWS: dict[str, Any] = {
-    "H": gm.Hooke(mu=0.3),
-    "M1": gm.MindlinRescaled(mu=0.3),
-    "M2": gm.Mindlin(mu=0.3, points=8),
+    **THREE_LAWS,
     "narrow rings": gm.Mindlin(mu=0.3, points=60, p_max=0.02),  # some reached in one step, and overlaps beyond them
 }
 DT = 0.3

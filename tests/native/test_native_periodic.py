@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import PERIODIC_27, PERIODIC_XY_27, assert_close
+from scenes import PERIODIC_27, PERIODIC_XY_27, THREE_LAWS, assert_close
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -19,11 +19,6 @@ from gmem_jax.physics.step import System, start
 
 pytestmark = pytest.mark.skipif(not native.available()[0], reason="the library was not built")
 
-LAWS: dict[str, Any] = {
-    "H": gm.Hooke(mu=0.3),
-    "M1": gm.MindlinRescaled(mu=0.3),
-    "M2": gm.Mindlin(mu=0.3, points=8),
-}
 STEPS = 40
 QUICKLY = {"xla_backend_optimization_level": 0}
 Scene = tuple[System, State, Box]
@@ -32,7 +27,7 @@ Scene = tuple[System, State, Box]
 def thrown(law: str, replicas: int, file: Any = PERIODIC_27) -> Scene:
     """27 grains that fly, spin and touch through the faces of a box that shrinks, more along one axis than another."""
     pack = gm.load_pack(file)
-    system = System(pack.clump, LAWS[law], pack.pairs)
+    system = System(pack.clump, THREE_LAWS[law], pack.pairs)
     state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
     draws = 5e-3 * np.random.default_rng(0).normal(size=(2, pack.grains, 3, replicas))
     state = replicate(state, replicas)
@@ -56,7 +51,7 @@ def moved(march: Callable[..., Any], system: System, state: State, boxes: Box) -
 
 
 @pytest.mark.parametrize("replicas", [1, 5])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", THREE_LAWS)
 def test_values_are_those_of_the_definition(law: str, replicas: int) -> None:
     # One replica is computed contact by contact, five side by side. Seen: 6e-13.
     scene = thrown(law, replicas)

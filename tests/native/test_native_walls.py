@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, assert_close
+from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, THREE_LAWS, assert_close
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -20,11 +20,6 @@ from gmem_jax.physics.step import System, start
 
 pytestmark = pytest.mark.skipif(not native.available()[0], reason="the library was not built")
 
-LAWS: dict[str, Any] = {
-    "H": gm.Hooke(mu=0.3),
-    "M1": gm.MindlinRescaled(mu=0.3),
-    "M2": gm.Mindlin(mu=0.3, points=8),
-}
 STEPS = 40
 QUICKLY = {"xla_backend_optimization_level": 0}
 Scene = tuple[System, State, Box]
@@ -35,7 +30,7 @@ def thrown(law: str, replicas: int, file: Any = TETRA_27) -> Scene:
     """27 grains that fly and spin between walls that shrink, more along one axis than another, and open along z."""
     pack = gm.load_pack(file)
     wall_mu = jnp.linspace(0.1, 0.4, replicas)
-    system = System(pack.clump, LAWS[law], pack.pairs, gm.Material(wall_rigidity=0.7), wall_mu=wall_mu)
+    system = System(pack.clump, THREE_LAWS[law], pack.pairs, gm.Material(wall_rigidity=0.7), wall_mu=wall_mu)
     places = replicate((pack.position[..., None], pack.quaternion[..., None]), replicas)
     state = jax.jit(start, compiler_options=QUICKLY)(system, *places, pack.box)
     draws = 8e-3 * np.random.default_rng(0).normal(size=(2, pack.grains, 3, 5))[..., :replicas]
@@ -173,7 +168,7 @@ LACKING = pytest.mark.parametrize(("law", "file"), [("M2", TETRA_27), ("H", PERI
 
 @LACKING
 def test_what_the_library_has_not_is_refused(law: str, file: Any) -> None:
-    pack, friction = gm.load_pack(file), LAWS[law]
+    pack, friction = gm.load_pack(file), THREE_LAWS[law]
     assert native.name("auto", friction, pack.periodic, smooth=False) == "jax"
     with pytest.raises(ValueError, match="walls with friction"):
         gm.Experiment(pack, gm.six_signals(), friction, wall_mu=0.1, backend="native")
