@@ -11,7 +11,7 @@ step is damped more (Levenberg and Marquardt).
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.design.kernel import MemoryKernel, bumps, memory_kernel, nearest
+from gmem_jax.design.kernel import MemoryKernel, bumps, memory_kernel, nearest, written_sets
 from gmem_jax.design.waveforms import (
     Design,
     Work,
@@ -112,13 +112,15 @@ def design_by_kernel(
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
-        ValueError: if the kernel was measured at another gamma0 or delta0, or either differs between replicas, or there
-            are not as many waveforms to start from as signals.
+        ValueError: if the kernel was measured at another gamma0 or delta0, or either differs between replicas, there
+            are not as many waveforms to start from as signals, or there are several reads or channels.
         RunFailedError: if a simulation broke down.
     """
     require_kind("design_by_kernel", experiment, Experiment)
     tell = callback(progress)
     refuse_several_scales(experiment)
+    if len(written_sets(experiment)) > 1:
+        raise ValueError("a design by one kernel is of one channel; gm.design_waveforms designs several together")
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
     measured = require_whole("measured", measured)
     require_numbers(width=width, gain=gain, damping=damping)

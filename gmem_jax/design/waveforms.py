@@ -251,7 +251,7 @@ def design_waveforms(
     first = [nearest(basis, sets[name]) * one / own for name, one, own in zip(names, gains, own_gain, strict=True)]
     amplitudes = within_bounds(np.concatenate(first, axis=1))
     p_sig = recall("projected", amplitudes)
-    history = [fidelity(side_by_side(untouched))]
+    history = [float(np.mean(original.fidelity))]
     for iteration in range(iterations):
         local = jacobians(f"jacobian-{iteration}", amplitudes)
         damped = damping[min(iteration, len(damping) - 1)]

@@ -177,6 +177,8 @@ def test_designs_of_what_is_read_twice_are_refused(experiment: gm.Experiment) ->
         ValueError, match="this needs one read, and for each channel a set of waveforms; there are 2 reads"
     ):
         gm.design_waveforms(again)
+    with pytest.raises(ValueError, match=r"of one channel; gm.design_waveforms designs several together"):
+        gm.design_by_kernel(two_channels(experiment))
 
 
 def memory_of_another_kernel(
