@@ -4,9 +4,10 @@ python experiments/laboratory.py [-o laboratory] [--grains 3267] [--seeds 101,10
 
 Words of three bits at t0 = 1,800 with SUB2-BL, for which an experimenter needs one pack that is read twice. One thing
 at a time is as in a laboratory, and then all together (docs/laboratory.md says what they are). Words of six bits in a
-pack of --words grains say how many bits are read at a gauge's noise. Packs are prepared once and kept in the folder.
-Every condition of a pack adds its rows to laboratory.csv and is done once, so that it goes on where it was killed. At
-the end the table is printed, mean and standard error over packs.
+pack of --words grains say how many bits are read at a gauge's noise. Then one thing at a time is chosen otherwise than
+in the paper, and slopes say what a small change of gamma0 and of delta0 does. Packs are prepared once and kept in the
+folder. Every condition of a pack adds its rows to laboratory.csv and is done once, so that it goes on where it was
+killed. At the end the table is printed, mean and standard error over packs.
 """
 
 import argparse
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rows import done, note
 
@@ -26,23 +28,26 @@ FEW, MANY = 3, 6  # bits of the words whose F is measured, and of those that are
 NOISES = (1.0, 5.0, 20.0)  # Pa, in each of 256 bins
 PASCAL = float(gm.Material().modulus)
 DT = 0.8  # t_c
+OVERLAP = 0.6  # of the paper's grain
 WEIGHT = 1e-5  # R / t_c^2: silicone grains of R = 1 mm and E = 1 MPa (docs/physics.md, "Gravity")
 CREEP = {"creep": 1e-3, "creep_fades": 10.0}  # 1 % of a force with each e-fold of time in a stage: 2.3 % a decade
 COLUMNS = ("pack", "N", "condition", "quantity", "value", "seconds")
 
 
 class Condition(NamedTuple):
-    """One way in which a laboratory differs.
+    """One way in which an experiment differs from the paper's.
 
     Attributes:
         prepare: numbers of the recipe.
         run: numbers of the experiment.
         cycles: with friction, before anything is written.
+        overlap: of the grain's spheres.
     """
 
     prepare: dict[str, Any]
     run: dict[str, Any]
     cycles: int = 0
+    overlap: float = OVERLAP
 
 
 WALLS, SPREAD, GRAVITY = {"wall_mu": 0.3}, {"size_spread": 0.1}, {"gravity": WEIGHT}
@@ -55,14 +60,26 @@ CONDITIONS = {
     "rough-walls": Condition({}, WALLS),
     "all": Condition(SPREAD | GRAVITY, WALLS | GRAVITY | CREEP, 2),
 }
+CHOICES = {
+    "gamma0 = 3e-3": Condition({}, {"gamma0": 3e-3}),
+    "gamma0 = 1e-2": Condition({}, {"gamma0": 1e-2}),
+    "delta0 = 0.02": Condition({"delta0": 0.02}, {}),
+    "delta0 = 0.08": Condition({"delta0": 0.08}, {}),
+    "O = 0.8": Condition({}, {}, overlap=0.8),
+    "O = 0.9": Condition({}, {}, overlap=0.9),
+}
+SLOPES = "slopes"
 
 
-def prepared(folder: Path, grains: int, seed: int, numbers: dict[str, Any]) -> gm.Pack:
+def prepared(folder: Path, grains: int, seed: int, condition: Condition) -> gm.Pack:
     """A pack of the folder, made if it is not there."""
-    name = "-".join([f"tetra-{grains}-{seed}", *(f"{key}={value:g}" for key, value in numbers.items())])
+    shape = {} if condition.overlap == OVERLAP else {"O": condition.overlap}
+    numbers = {"grains": grains, "seed": seed, "dt": 0.5, **condition.prepare}
+    told = (f"{key}={value:g}" for key, value in (condition.prepare | shape).items())
+    name = "-".join([f"tetra-{grains}-{seed}", *told])
     path = folder / f"{name}.h5"
     if not path.exists():
-        gm.save_pack(path, gm.prepare(grains=grains, seed=seed, dt=0.5, name=name, progress=False, **numbers))
+        gm.save_pack(path, gm.prepare(grain=gm.tetra(condition.overlap), name=name, progress=False, **numbers))
     return gm.load_pack(path)
 
 
@@ -77,15 +94,45 @@ def experiment(pack: gm.Pack, signals: Any, condition: Condition) -> gm.Experime
     return gm.Experiment(pack, signals, protocol=gm.Protocol(first, *before, *stages), **common)
 
 
-def measures(recall: gm.Recall) -> dict[str, float]:
-    """G, F, and the size of what is to be measured."""
-    size = float(np.sqrt(np.mean(np.asarray(recall.p_sig) ** 2))) * PASCAL
-    return {"G": float(recall.gain), "F": float(recall.fidelity), "rms of p_sig (Pa)": size}
+def rms(p_sig: jax.Array) -> jax.Array:
+    """The size of what is to be measured, in Pa."""
+    return jnp.sqrt(jnp.mean(p_sig**2)) * PASCAL
 
 
-def bits(recall: gm.Recall) -> dict[str, float]:
-    """Of a word, that the linear decoder reads."""
-    return {f"bits read of {MANY} at {noise:g} Pa": decoded_bits(recall.p_sig, noise / PASCAL).bits for noise in NOISES}
+def together(status: jax.typing.ArrayLike) -> int:
+    """How all replicas ended."""
+    return int(np.bitwise_or.reduce(np.ravel(status)))
+
+
+def measures(experiment: gm.Experiment) -> tuple[dict[str, float], int]:
+    """G, F, and the size of the recall; and how the run ended."""
+    recall = gm.run(experiment, progress=False)
+    found = {"G": float(recall.gain), "F": float(recall.fidelity), "rms of p_sig (Pa)": float(rms(recall.p_sig))}
+    return found, together(recall.status)
+
+
+def bits(experiment: gm.Experiment) -> tuple[dict[str, float], int]:
+    """Bits of a word that the linear decoder reads; and how the run ended."""
+    recall = gm.run(experiment, progress=False)
+    read = {noise: decoded_bits(recall.p_sig, noise / PASCAL).bits for noise in NOISES}
+    return {f"bits read of {MANY} at {noise:g} Pa": value for noise, value in read.items()}, together(recall.status)
+
+
+def slopes(experiment: gm.Experiment) -> tuple[dict[str, float], int]:
+    """What F and ln(rms) of p_sig change by with ln(gamma0) and with ln(delta0); and how the run ended."""
+    found: dict[str, float] = {}
+    status = 0
+    for name, value in {"gamma0": experiment.gamma0, "delta0": experiment.compression}.items():
+
+        def both(value: jax.Array, name: str = name) -> tuple[jax.Array, jax.Array, jax.Array]:
+            recall = gm.recall(gm.replace(experiment, {name: value}))
+            return recall.fidelity, jnp.log(rms(recall.p_sig)), jnp.asarray(recall.status)
+
+        at = jnp.asarray(float(value))
+        (_, _, ended), (fidelity, size, _) = jax.jvp(both, (at,), (at,))
+        found |= {f"dF/dln({name})": float(fidelity), f"dln(rms)/dln({name})": float(size)}
+        status |= together(ended)
+    return found, status
 
 
 def main() -> None:
@@ -95,26 +142,26 @@ def main() -> None:
     parser.add_argument("--grains", type=int, default=3267)
     parser.add_argument("--seeds", default="101,102,103")
     parser.add_argument("--words", type=int, default=1024, help="grains of the pack that words are stored in, seed 101")
-    parser.add_argument("--only", default=",".join(CONDITIONS))
+    parser.add_argument("--only", default=",".join([*CONDITIONS, *CHOICES, SLOPES]))
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     arguments.output.mkdir(parents=True, exist_ok=True)
     path = arguments.output / "laboratory.csv"
     seeds = [int(seed) for seed in arguments.seeds.split(",")]
-    jobs = [(arguments.grains, seed, gm.words(FEW), measures) for seed in seeds]
-    jobs += [(arguments.words, 101, gm.words(MANY), bits)] if arguments.words else []
     for name in arguments.only.split(","):
-        for grains, seed, signals, what in jobs:
+        condition = (CONDITIONS | CHOICES).get(name, Condition({}, {}))
+        jobs = [(arguments.grains, seed, FEW, slopes if name == SLOPES else measures) for seed in seeds]
+        jobs += [(arguments.words, 101, MANY, bits)] if arguments.words and name != SLOPES else []
+        for grains, seed, length, measure in jobs:
             pack = f"tetra-{grains}-{seed}"
             if any((row["pack"], row["condition"]) == (pack, name) for row in done(path)):
                 continue
-            began, condition = time.process_time(), CONDITIONS[name]
-            made = prepared(arguments.output, grains, seed, condition.prepare)
-            recall = gm.run(experiment(made, signals, condition), progress=False)
+            began = time.process_time()
+            made = prepared(arguments.output, grains, seed, condition)
+            found, status = measure(experiment(made, gm.words(length), condition))
             own = {"pack": pack, "N": grains, "condition": name, "seconds": f"{time.process_time() - began:.0f}"}
-            found = what(recall)
             note(path, COLUMNS, [own | {"quantity": key, "value": f"{value:.5g}"} for key, value in found.items()])
-            print(pack, name, gm.explain(recall.status), f"{own['seconds']} CPU s", flush=True)
+            print(pack, name, gm.explain(status), f"{own['seconds']} CPU s", flush=True)
     rows = done(path)
     for name, quantity in dict.fromkeys((row["condition"], row["quantity"]) for row in rows):
         values = [float(row["value"]) for row in rows if (row["condition"], row["quantity"]) == (name, quantity)]

@@ -58,7 +58,9 @@ def mutation(name: str, file: str, text: str, wrong: str, *tests: str) -> Mutati
 
 
 DOMAINS = "test_spinning_sliding_grains_of_several_domains_move_as_defined"
-ACROSS = "test_both_modes_of_derivatives_cross_the_domains_as_defined"
+ACROSS = "test_derivatives_cross_the_domains_as_defined"
+AT_ROUGH_WALLS = "test_the_adjoint_at_walls_with_friction_is_the_transpose_of_the_tangent"
+IN_A_PERIODIC_BOX = "test_the_adjoint_in_a_periodic_box_is_the_transpose_of_the_tangent"
 UNEQUAL = "test_values_of_unequal_spheres_are_those_of_the_definition"
 KERNELS = "test_the_kernels_give_the_values_and_tangents_of_the_definition"
 AFAR = "test_grains_that_come_from_afar_meet_when_they_should"
@@ -707,8 +709,8 @@ MUTATIONS = (
     mutation(
         "native-faces-of-one-domain",
         "cpu/block.h",
-        "domain < plan.domains; ++domain)\n      through",
-        "domain < 0; ++domain)\n      through",
+        "domain < plan.domains; ++domain) sum",
+        "domain < 0; ++domain) sum",
         "test_values_are_those_of_the_definition[H-5]",
     ),
     mutation(
@@ -800,7 +802,7 @@ MUTATIONS = (
         "native/march.py",
         "(shape.radii, shape.sizes)",
         "(shape.radii,)",
-        "test_adjoints_of_unequal_spheres_and_derivatives_by_sizes_are_those_of_the_definition",
+        "test_derivatives_by_sizes_are_those_of_the_definition",
     ),
     # ---------------------------------------------------------------- the GPU's half of it
     mutation(
@@ -1321,14 +1323,70 @@ MUTATIONS = (
         "cpu/block.h",
         "if (deforms) return function(offsets);",
         "if (deforms) return function(block.pack->offsets);",
-        "test_both_modes_agree_with_plain_jax[H-True]",
+        "test_modes_agree_with_plain_jax[H-True-True]",
     ),
     mutation(
         "adjoint-of-offsets-of-the-first-chunk",
         "cpu/adjoint.h",
         "chunk < chunks(); ++chunk) of_offset",
         "chunk < 1; ++chunk) of_offset",
-        "test_both_modes_agree_with_plain_jax[H-True]",
+        "test_modes_agree_with_plain_jax[H-True-True]",
+    ),
+    mutation(
+        "adjoint-of-the-box-before-lost",
+        "cpu/adjoint.h",
+        "earlier_bar[q] += cell_bar_of_chunk(chunk)[kCellNumbers + q];",
+        "",
+        IN_A_PERIODIC_BOX + "[H-xyz]",
+    ),
+    mutation(
+        "adjoint-of-images-not-moved",
+        "physics/contact.h",
+        "  m.lever_one = m.lever_one + half;\n",
+        "",
+        IN_A_PERIODIC_BOX + "[H-xyz]",
+    ),
+    mutation(
+        "adjoint-of-sections-without-mass",
+        "cpu/adjoint.h",
+        "seed(parameter.row[kMass], *bar++);",
+        "++bar;",
+        IN_A_PERIODIC_BOX + "[H-xyz]",
+    ),
+    mutation(
+        "adjoint-of-unequal-spheres-on-walls",
+        "cpu/calculations.h",
+        "      parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;",
+        "",
+        "test_the_adjoint_of_unequal_spheres_is_the_transpose_of_their_tangent[H-spheres]",
+    ),
+    mutation(
+        "adjoint-of-rough-walls-for-large-spheres",
+        "cpu/calculations.h",
+        "\n    parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;",
+        "",
+        AT_ROUGH_WALLS + "[H-file2]",
+    ),
+    mutation(
+        "adjoint-of-rough-walls-remembers-later-steps",
+        "cpu/adjoint.h",
+        "else if (known.ever >> w & 1) std::fill_n(now, Law::kHistory, V{});",
+        "",
+        AT_ROUGH_WALLS + "[H-file0]",
+    ),
+    mutation(
+        "adjoint-of-rough-walls-that-let-go",
+        "cpu/adjoint.h",
+        "return void(std::fill_n(history_bar, Law::kHistory, V{}));",
+        "return;",
+        AT_ROUGH_WALLS + "[H-file0]",
+    ),
+    mutation(
+        "adjoint-of-rings-in-periodic-boxes",
+        "cpu/adjoint.h",
+        "if (general) move_to_image(input, taped_image, taped_cell);",
+        "",
+        IN_A_PERIODIC_BOX + "[M2-xyz]",
     ),
     mutation(
         "gpu-tangent-of-offsets-lost",

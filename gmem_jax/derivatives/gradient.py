@@ -5,7 +5,7 @@
 and the replay of one chunk. What is differentiated by is named: "gamma0", "friction.mu", "signals.amplitudes", ...
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ Loss = Callable[[Experiment, jax.Array], jax.Array]
 """From an experiment and its p_sig [S, 256] to a number."""
 
 STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
+LENGTHS = ("pack.clump.radii", "pack.clump.sizes")  # of spheres that are not all alike
 FORWARDS = 0.17  # of a gradient's time is the way forward
 
 Moving = tuple[Any, ...]  # grains, histories, held walls and periodic cell: what of a state can be differentiated
@@ -43,24 +44,33 @@ def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
     return experiment.compare(p_sig).fidelity
 
 
-def _is_moving(path: Any, leaf: Any) -> bool:
-    """Whether a number of a simulation is differentiated by: not the list or the mark."""
-    fixed = jax.tree_util.keystr(path).startswith((".system.pairs", ".mark"))
-    return not fixed and jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+def _fixed_by(names: Iterable[str]) -> tuple[str, ...]:
+    """Parts of a simulation that are not differentiated by: the list, the mark, and lengths that no name has.
+
+    The library has no derivatives by these lengths: where one is wanted, all are those of plain JAX.
+    """
+    lengths = [length for length in LENGTHS if not any(f"{length}.".startswith(f"{name}.") for name in names)]
+    return (".system.pairs", ".mark", *(length.replace("pack", ".system") for length in lengths))
 
 
-def _numbers(simulation: Simulation) -> list[jax.Array]:
+def _is_moving(path: Any, leaf: Any, fixed: tuple[str, ...]) -> bool:
+    """Whether a number of a simulation is differentiated by."""
+    floats = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+    return floats and not jax.tree_util.keystr(path).startswith(fixed)
+
+
+def _numbers(simulation: Simulation, fixed: tuple[str, ...]) -> list[jax.Array]:
     """The numbers of a simulation that are differentiated by."""
     leaves = jax.tree_util.tree_leaves_with_path(simulation)
-    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf)]
+    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf, fixed)]
 
 
-def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array]) -> Simulation:
+def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array], fixed: tuple[str, ...]) -> Simulation:
     """The simulation with other numbers in the place of `_numbers`."""
     left = iter(numbers)
     leaves, structure = jax.tree_util.tree_flatten_with_path(simulation)
     filled: Simulation = jax.tree.unflatten(
-        structure, [next(left) if _is_moving(path, leaf) else leaf for path, leaf in leaves]
+        structure, [next(left) if _is_moving(path, leaf, fixed) else leaf for path, leaf in leaves]
     )
     return filled
 
@@ -73,32 +83,36 @@ def _state(moving: Moving, status: jax.Array) -> State:
     return State(moving[0], moving[1], status, *moving[2:])
 
 
-def _push(simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int) -> Any:
+def _push(
+    simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int, fixed: tuple[str, ...]
+) -> Any:
     """A chunk and its tangent."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        changed = _with_numbers(simulation, numbers)
+        changed = _with_numbers(simulation, numbers, fixed)
         after, sample = rollout_chunk(changed, _state(moving, state.status), first, count, most)
         return (_moving(after), sample.pressure), (after.status, sample)
 
-    at = (_numbers(simulation), _moving(state))
+    at = (_numbers(simulation, fixed), _moving(state))
     (moving, _), slope, (status, sample) = jax.jvp(chunk, at, slopes, has_aux=True)
     return _state(moving, status), sample, slope
 
 
-def _pull(simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving, jax.Array]) -> Any:
+def _pull(
+    simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving, jax.Array], fixed: tuple[str, ...]
+) -> Any:
     """Derivatives by numbers and state before a chunk, from those by state and pressures after it."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
-        changed = _with_numbers(simulation, numbers)
+        changed = _with_numbers(simulation, numbers, fixed)
         after, sample = rollout(changed, _state(moving, state.status), rows)
         return _moving(after), sample.pressure
 
-    return jax.vjp(chunk, _numbers(simulation), _moving(state))[1](slopes)
+    return jax.vjp(chunk, _numbers(simulation, fixed), _moving(state))[1](slopes)
 
 
-_pushed = Compiled(_push, static_argnames="most")
-_pulled = Compiled(_pull)
+_pushed = Compiled(_push, static_argnames=("most", "fixed"))
+_pulled = Compiled(_pull, static_argnames="fixed")
 
 
 @dataclass
@@ -106,11 +120,13 @@ class _Pushing(Observer):
     """Carries a tangent along.
 
     Attributes:
+        fixed: what is not differentiated by.
         numbers: tangent of the simulation's numbers.
         moving: tangent of the state now; None as long as nothing has one.
         slopes: derivatives of the pressures of every stage, by chunks.
     """
 
+    fixed: tuple[str, ...]
     numbers: Any
     moving: Moving | None
     slopes: dict[str, list[np.ndarray]] = field(default_factory=dict)
@@ -121,7 +137,8 @@ class _Pushing(Observer):
         if self.moving is None:
             return None
         slopes = (self.numbers, self.moving)
-        after, sample, self._next = _pushed(chunk.simulation, chunk.state, chunk.row, chunk.count, slopes, most=CHUNK)
+        at = chunk.simulation, chunk.state, chunk.row, chunk.count
+        after, sample, self._next = _pushed(*at, slopes, most=CHUNK, fixed=self.fixed)
         return after, sample
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
@@ -150,6 +167,7 @@ class _Piece(NamedTuple):
 class _Remembering(Observer):
     """Remembers the way, to go back on it."""
 
+    fixed: tuple[str, ...]  # what is not differentiated by
     tape: list[_Piece] = field(default_factory=list)
     numbers: Any = None  # derivatives by the simulation's numbers so far
     reads: Mapping[str, np.ndarray] = field(default_factory=dict)  # derivatives by the pressures that are read
@@ -164,7 +182,7 @@ class _Remembering(Observer):
             shape = (count, 3, before.replicas)
             own = np.zeros(shape) if known is None else known[first : first + count]
             back_from = (slope, jnp.asarray(own))
-            by_numbers, by_state = _pulled(simulation, before, rows, back_from)
+            by_numbers, by_state = _pulled(simulation, before, rows, back_from, fixed=self.fixed)
             self.numbers = by_numbers if self.numbers is None else jax.tree.map(jnp.add, self.numbers, by_numbers)
             moving: Moving = by_state
             return moving
@@ -220,14 +238,15 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
     slope: Moving | None = None
     if any(map(acts_on_prefix, theta)):
         slope = jax.jvp(lambda theta: _moving(along(theta).begin()), (theta,), (tangent,))[1]
-    pushing = _Pushing(_number_slope(experiment, theta, tangent, sheared=False), slope)
+    fixed = _fixed_by(theta)
+    pushing = _Pushing(fixed, _number_slope(experiment, theta, tangent, fixed, sheared=False), slope)
     on.observers = (pushing,)
     samples = on.run_stages(*common)
     if pushing.moving is None:
         pushing.moving = jax.tree.map(jnp.zeros_like, _moving(on.state))
     if not wide:
         pushing.moving = jax.tree.map(lambda leaf: jnp.repeat(leaf, experiment.replicas, axis=-1), pushing.moving)
-    pushing.numbers = _number_slope(experiment, theta, tangent, sheared=True)
+    pushing.numbers = _number_slope(experiment, theta, tangent, fixed, sheared=True)
     apply_waveforms(on, experiment)
     samples |= on.run_stages(*own)
     pressure = {name: np.asarray(sample.pressure) for name, sample in samples.items()}
@@ -267,9 +286,9 @@ def _along(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
     return lambda theta: with_values(experiment, theta)
 
 
-def _number_slope(experiment: Experiment, theta: Any, tangent: Any, *, sheared: bool) -> Any:
+def _number_slope(experiment: Experiment, theta: Any, tangent: Any, fixed: tuple[str, ...], *, sheared: bool) -> Any:
     def numbers(theta: Any) -> list[jax.Array]:
-        return _numbers(with_values(experiment, theta).simulation(sheared=sheared))
+        return _numbers(with_values(experiment, theta).simulation(sheared=sheared), fixed)
 
     return jax.jvp(numbers, (theta,), (tangent,))[1]
 
@@ -330,7 +349,8 @@ def value_and_grad(
     common, own = experiment.phases
     on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))
     on.total_work = _work(experiment, on)
-    prefix, rest = _Remembering(), _Remembering()
+    fixed = _fixed_by(by)
+    prefix, rest = _Remembering(fixed), _Remembering(fixed)
     on.observers = (prefix,) if any(map(acts_on_prefix, by)) else ()
     _, pull_begin = jax.vjp(lambda theta: _moving(along(theta).begin()), theta)
     on.run_stages(*common)
@@ -358,7 +378,7 @@ def value_and_grad(
 
     def pull_numbers(sheared: bool, found: Any) -> Any:
         def numbers(theta: Any) -> list[jax.Array]:
-            return _numbers(along(theta).simulation(sheared=sheared))
+            return _numbers(along(theta).simulation(sheared=sheared), fixed)
 
         return jax.vjp(numbers, theta)[1](found)[0]
 

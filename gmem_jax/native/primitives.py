@@ -310,7 +310,7 @@ def _primitive(
         lacking = call.rubs and (call.periodic or call.points)  # which the library has not
         if lacking and not adjoint and not static["definition"].anywhere:
             raise NotImplementedError(NO_RUBBING)
-        if lacking or (adjoint and (call.periodic or call.unequal or call.rubs)):
+        if lacking:
             return in_plain_jax(context, *values, **static)
         return library(context, *values, **static)
 

@@ -1,7 +1,9 @@
 """Derivatives through whole, shortened experiments on 27 grains, and at the corners of the contact laws."""
 
 import dataclasses
+import functools
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import TETRA_27, with_skin
+from scenes import SPREAD_27, TETRA_27, with_skin
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -153,7 +155,7 @@ def test_every_name_has_the_derivative_of_differences(whole: gm.Experiment) -> N
 
 @pytest.mark.slow
 def test_the_friction_of_walls_has_the_derivative_of_differences_and_of_forward_mode(whole: gm.Experiment) -> None:
-    rough = gm.replace(whole, wall_mu=0.5)  # forwards in C++ where it is built, backwards in plain JAX
+    rough = gm.replace(whole, wall_mu=0.5)
     found = gm.value_and_grad(rough, ["wall_mu", "friction.mu"], loss=smooth)
     require_differences(rough, found.slope)
     assert all(abs(float(slope)) > 0.0 for slope in found.slope.values())
@@ -191,6 +193,24 @@ def test_a_gradient_by_the_whole_experiment_is_native(whole: gm.Experiment, monk
     monkeypatch.delattr(dynamics, "march")  # the definition of the steps
     slope = jax.eval_shape(jax.grad(score, allow_int=True), whole)
     assert slope.pack.clump.offsets.shape == (4, 3)
+
+
+@pytest.mark.skipif(not native.available()[0], reason=native.available()[1])
+def test_only_slopes_by_sizes_are_those_of_plain_jax(whole: gm.Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
+    unequal = gm.replace(whole, pack=gm.load_pack(SPREAD_27), delta0=None)
+    simulation, state = unequal.simulation(sheared=False), unequal.begin()
+    rows, slope = simulation.rows(unequal.phases[0][0], 0, 2), (gradient._moving(state), jnp.zeros((2, 3, 1)))
+    monkeypatch.delattr(sys.modules["gmem_jax.native.march"], "_plain")  # the definition of the steps
+
+    def pull(*names: str) -> Any:
+        fixed = gradient._fixed_by(names)
+        return jax.eval_shape(functools.partial(gradient._pull, fixed=fixed), simulation, state, rows, slope)
+
+    few, _ = pull("friction.mu", "pack.clump.offsets")
+    assert len(few) > 0
+    for name in ("pack", "pack.clump", "pack.clump.sizes"):
+        with pytest.raises(NameError, match="_plain"):
+            pull(name)
 
 
 def test_names_that_cannot_be_differentiated_by_are_refused(experiment: gm.Experiment) -> None:

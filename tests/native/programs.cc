@@ -138,7 +138,7 @@ void begin() {
   Motion m;
   const Real* in[] = {m.own, m.numbers};
   Real* bar[] = {m.own_bar, m.bar_of_numbers};
-  pull_back<StepBegin>(in, m.result_bar, bar);
+  pull_back<StepBegin<>>(in, m.result_bar, bar);
   const auto grain = leaves<Grain<Taped>>(m.own);
   const HalfStep<Taped> half = begin_step(leaves<GrainParameters<Taped>>(m.numbers), grain);
   const Real* seeds = m.result_bar;

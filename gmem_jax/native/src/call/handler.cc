@@ -94,12 +94,11 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   problem.mixed = mixed != 0;
   problem.periodic = static_cast<int>(periodic);
   problem.rubs = rubs != 0;
-  require(!(periodic || unequal) || (task != Task::adjoint && !problem.mixed),
-          "in a periodic box, and of unequal spheres, there are neither the adjoint nor mixed precision");
+  require(!(periodic || unequal) || !problem.mixed, "in a periodic box, and of unequal spheres, there is no mixed precision");
   require(!problem.mixed || (task == Task::forward && !is_layered(problem.law)),
           "there is no mixed precision for derivatives and the Mindlin law");
-  require(!rubs || (task != Task::adjoint && !periodic && !problem.mixed && !is_layered(problem.law)),
-          "of walls with friction there are neither the adjoint, mixed precision, periodic boxes nor the Mindlin law");
+  require(!rubs || (!periodic && !problem.mixed && !is_layered(problem.law)),
+          "of walls with friction there are neither mixed precision, periodic boxes nor the Mindlin law");
   const Signature wanted = signature(task, problem.law, problem.rubs);
   require(static_cast<std::size_t>(leaves) == histories(problem.law).size() && args.size() == wanted.arguments.size() &&
               rets.size() == wanted.results.size(),

@@ -73,14 +73,25 @@ struct AdjointLayout {
   V* history_bar;   // [candidates, kHistory and the forces of Mindlin's segments, 2 Q]
   bool* has_bar;    // [candidates]: whether their bars, and those of their remotes, may be other than zero
   V* domain_bar;    // [domains, kParameters + kLawNumbers]
-  V* chunk_bar;     // [chunks, kGrainNumbers and the offsets, 3 K]
+  V* chunk_bar;     // [chunks, kGrainNumbers, the offsets, 3 K, the mass, and kWallLawNumbers]
   V* wall_bar;      // [chunks, kWalls], of one step
+  // Where calculations are general (calculations.h):
+  V* faces;            // [steps, 2, 3]: sections of periodic boxes, and forces through their faces
+  V* domain_cell_bar;  // [domains, kCellNumbers], of one step
+  V* chunk_cell_bar;   // [chunks, 2, kCellNumbers], of the cell in that step and of the one before
+  // Where walls have friction, of what is remembered of them: at the beginning of each step, and which of it is not 0.
+  V* wall_history;        // [steps, N, wall_rows, kHistory]
+  unsigned char* planes;  // [steps, S], bits
+  V* wall_history_bar;    // [N, wall_rows, kHistory]
 
   // Numbers in the history of a contact.
   static int remembered(const Problem& p) { return Law::kHistory + (Law::kLayered ? 2 * p.points : 0); }
 
   // Rows of `chunk_bar`.
-  static int chunk_rows(const Problem& p) { return kGrainNumbers + 3 * p.spheres_per_grain; }
+  static int chunk_rows(const Problem& p) { return mass_row(p) + 1 + kWallLawNumbers; }
+  static int mass_row(const Problem& p) { return kGrainNumbers + 3 * p.spheres_per_grain; }
+
+  static bool is_general(const Problem& p, const Plan& plan) { return p.periodic || plan.radii; }
 
   // With `fills` the traces of the steps are written down too: one thread does it, the others see it after a barrier.
   void place(const Problem& p, const Block& block, Arena& arena, bool fills = false) {
@@ -109,6 +120,14 @@ struct AdjointLayout {
     domain_bar = arena.take<V>(static_cast<std::size_t>(plan.domains) * (kParameters + kLawNumbers));
     chunk_bar = arena.take<V>(chunks * chunk_rows(p));
     wall_bar = arena.take<V>(chunks * kWalls);
+    const bool general = is_general(p, plan);
+    faces = arena.take<V>(general ? steps * 6 : 0);
+    domain_cell_bar = arena.take<V>(general ? static_cast<std::size_t>(plan.domains) * kCellNumbers : 0);
+    chunk_cell_bar = arena.take<V>(general ? chunks * 2 * kCellNumbers : 0);
+    const std::size_t remembered_of_walls = p.rubs ? grains * p.wall_rows() * Law::kHistory : 0;
+    wall_history = arena.take<V>(steps * remembered_of_walls);
+    planes = arena.take<unsigned char>(p.rubs ? steps * p.spheres() : 0);
+    wall_history_bar = arena.take<V>(remembered_of_walls);
   }
 };
 
@@ -117,10 +136,12 @@ struct Adjoint : AdjointLayout<Law> {
   using Layout = AdjointLayout<Law>;
   using Layout::state, Layout::total, Layout::trace, Layout::state_bar, Layout::mid_bar, Layout::sphere_bar;
   using Layout::remote_bar, Layout::history_bar, Layout::has_bar, Layout::domain_bar;
-  using Layout::chunk_bar, Layout::wall_bar;
-  using Layout::remembered, Layout::chunk_rows;
+  using Layout::chunk_bar, Layout::wall_bar, Layout::faces, Layout::domain_cell_bar, Layout::chunk_cell_bar;
+  using Layout::wall_history, Layout::planes, Layout::wall_history_bar;
+  using Layout::remembered, Layout::chunk_rows, Layout::mass_row;
   using V = Real;
   using Forward = Engine<Replicas<Law, Real>>;
+  static constexpr int kNumbers = OneContact<Law, true>::kNumbers, kResults = OneContact<Law, true>::kResults;
 
   Forward forward;
   const Problem& problem;
@@ -129,17 +150,24 @@ struct Adjoint : AdjointLayout<Law> {
   Team& team;
   const int rank, steps;
   const bool adjacent;  // the lanes are neighbours in every array of bars
+  const bool general;
   Tape recorded;
-  V law_numbers[kLawNumbers], grain_numbers[kGrainNumbers], last_ring;
+  V law_numbers[kLawNumbers], grain_numbers[kGrainNumbers], wall_law_numbers[kWallLawNumbers], last_ring;
+  // Of the step that is gone back through: the cell in it and before it, their numbers, and the bars of what is on `faces`.
+  Cell<V> cell;
+  V cell_numbers[kCellNumbers], before_numbers[kCellNumbers], faces_bar[6];
+  V earlier_bar[kCellNumbers] = {};  // of the cell before the steps that were gone back through
 
   Adjoint(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : forward(problem, block, team, rank, scratch), problem(problem), block(block), plan(*block.pack->plan), team(team),
-        rank(rank), steps(block.lanes[0].steps), adjacent(forward.mode.neighbours(block.slopes)) {
+        rank(rank), steps(block.lanes[0].steps), adjacent(forward.mode.neighbours(block.slopes)),
+        general(Layout::is_general(problem, plan)) {
     Arena arena{static_cast<char*>(scratch)};
     this->place(problem, block, arena, rank == 0);  // `forward` has found the same at the beginning
     forward.mode.apart = true;
     store_numbers(law_numbers, LawParameters<V>(forward.parameter + kLaw, forward.parameter[kDt]));
     store_numbers(grain_numbers, forward.constants);
+    if (problem.rubs) store_numbers(wall_law_numbers, forward.wall_law);
     last_ring = splat<V>(problem.points - 2.0);
   }
 
@@ -148,6 +176,8 @@ struct Adjoint : AdjointLayout<Law> {
   int chunks() const { return gmem::GMEM_ISA::chunks(problem); }
   V* of_domain(int domain) const { return domain_bar + static_cast<std::size_t>(domain) * (kParameters + kLawNumbers); }
   V* of_chunk(int chunk) const { return chunk_bar + static_cast<std::size_t>(chunk) * chunk_rows(problem); }
+  V* cell_bar_of_domain(int domain) const { return domain_cell_bar + static_cast<std::size_t>(domain) * kCellNumbers; }
+  V* cell_bar_of_chunk(int chunk) const { return chunk_cell_bar + static_cast<std::size_t>(chunk) * 2 * kCellNumbers; }
   V* of_grain(V* array, int u, int rows) const { return array + static_cast<std::size_t>(u) * rows; }
 
   // Calls `each(u)` for this rank's grains.
@@ -174,12 +204,56 @@ struct Adjoint : AdjointLayout<Law> {
   V* state_of(int step, int u) const { return of_grain(state + static_cast<std::size_t>(step) * problem.grains * kState, u, kState); }
   V* total_of(int step, int u) const { return of_grain(total + static_cast<std::size_t>(step) * problem.grains * 6, u, 6); }
 
+  // What sphere k of grain u remembers of plane w, among the histories of all that begin at `histories`.
+  V* at_plane(V* histories, int u, int k, int w) const {
+    const std::size_t row = static_cast<std::size_t>(u) * problem.wall_rows() + static_cast<std::size_t>(kPlanes) * k + w;
+    return histories + row * Law::kHistory;
+  }
+  V* wall_history_at(int step) const {
+    return wall_history + static_cast<std::size_t>(step) * problem.grains * problem.wall_rows() * Law::kHistory;
+  }
+  unsigned char& planes_of(int step, int u, int k) const {
+    return planes[(static_cast<std::size_t>(step) * problem.grains + u) * problem.spheres_per_grain + k];
+  }
+
+  // Calls `each(k, w, planes)` for the planes of grain u's spheres, with what the forward steps know of those of sphere k.
+  template <class Each>
+  void for_planes(int u, const Each& each) const {
+    if (!problem.rubs) return;
+    for (int k = 0; k < problem.spheres_per_grain; ++k)
+      for (int w = 0; w < kPlanes; ++w)
+        each(k, w, forward.remembered[static_cast<std::size_t>(u) * problem.spheres_per_grain + k]);
+  }
+
+  // Keeps the numbers of grain u at the beginning of a step ...
+  void keep(int step, int u) const {
+    move_state(u, state_of(step, u), [](V& kept, V now) { kept = now; });
+    for_planes(u, [&](int k, int w, const KnownPlanes& known) {
+      planes_of(step, u, k) = known.now;
+      if (!(known.now >> w & 1)) return;
+      std::copy_n(at_plane(forward.wall_history, u, k, w), Law::kHistory, at_plane(wall_history_at(step), u, k, w));
+    });
+  }
+
+  // ... and brings them back.
+  void bring_back(int step, int u) const {
+    move_state(u, state_of(step, u), [](V kept, V& now) { now = kept; });
+    if (problem.rubs) forward.remembers[u] = false;
+    for_planes(u, [&](int k, int w, KnownPlanes& known) {
+      V* const now = at_plane(forward.wall_history, u, k, w);
+      known.now = planes_of(step, u, k);
+      forward.remembers[u] |= known.now != 0;
+      if (known.now >> w & 1) std::copy_n(at_plane(wall_history_at(step), u, k, w), Law::kHistory, now);
+      else if (known.ever >> w & 1) std::fill_n(now, Law::kHistory, V{});
+    });
+  }
+
   // --- forwards
 
   void go_forward() {
     forward.load();
     for (int step = 0; step < steps; ++step) {
-      for_grains([&](int u) { move_state(u, state_of(step, u), [](V& kept, V now) { kept = now; }); });
+      for_grains([&](int u) { keep(step, u); });
       team.barrier();
       forward.grains(false, true, step);
       forward.mode.trace = trace[step];
@@ -191,8 +265,13 @@ struct Adjoint : AdjointLayout<Law> {
         store_vec(total_of(step, u) + 3, torque);
       });
       team.barrier();
-      if (step + 1 < steps) forward.grains(true, false, 0);
+      if (general || step + 1 < steps) forward.grains(true, false, 0);
+      if (problem.periodic && rank == 0) {
+        store_vec(faces + 6 * step, forward.mode.sum_walls(forward.sections, chunks()));
+        store_vec(faces + 6 * step + 3, forward.sum_through());
+      }
     }
+    team.barrier();
   }
 
   // --- bars in and out
@@ -223,8 +302,23 @@ struct Adjoint : AdjointLayout<Law> {
       each(0, ring_place(problem, row, 0, q - Law::kHistory).row, q);
   }
 
+  // Calls `each(leaf, row in the arrays of the call, bar)` for the histories at walls of grain u.
+  template <class Each>
+  void for_wall_history(int u, const Each& each) const {
+    for_planes(u, [&](int k, int w, const KnownPlanes&) {
+      for (int q = 0; q < Law::kGiven; ++q) {
+        const Place place = forward.mode.wall_place(u, kPlanes * k + w, q);
+        each(place.leaf, place.row, at_plane(wall_history_bar, u, k, w)[q]);
+      }
+    });
+  }
+
   void load_bars() {
     for_grains([&](int u) {
+      for_wall_history(u, [&](int leaf, std::ptrdiff_t row, V& bar) {
+        const auto array = [leaf](const Lane& lane) { return lane.wall_history_in[leaf]; };
+        bar = forward.mode.read_lanes(block.slopes, adjacent, array, row);
+      });
       for_fields(u, [&](int f, std::ptrdiff_t row, int number) {
         of_grain(state_bar, u, kState)[number] =
             forward.mode.read_lanes(block.slopes, adjacent, [f](const Lane& lane) { return lane.grains_in[f]; }, row);
@@ -284,6 +378,9 @@ struct Adjoint : AdjointLayout<Law> {
 
   void unload_bars() {
     for_grains([&](int u) {
+      for_wall_history(u, [&](int leaf, std::ptrdiff_t row, V bar) {
+        write([leaf](const Lane& lane) { return lane.wall_history_out[leaf]; }, row, bar);
+      });
       for_fields(u, [&](int f, std::ptrdiff_t row, int number) {
         write([f](const Lane& lane) { return lane.grains_out[f]; }, row, of_grain(state_bar, u, kState)[number]);
       });
@@ -307,6 +404,8 @@ struct Adjoint : AdjointLayout<Law> {
     const TapedParameters parameter(forward.parameter);
     LawParameters<Taped> law(parameter.row + kLaw, parameter.row[kDt]);
     GrainParameters<Taped> of_grains(parameter.row);
+    const Taped wall_mu = leaf(forward.wall_law.law.mu);
+    WallLaw<Taped> of_walls(parameter.row, wall_mu);
     for (int domain = 0; domain < plan.domains; ++domain) {
       const V* bar = of_domain(domain);
       for (Taped number : parameter.row) seed(number, *bar++);
@@ -315,12 +414,18 @@ struct Adjoint : AdjointLayout<Law> {
     for (int chunk = 0; chunk < chunks(); ++chunk) {
       const V* bar = of_chunk(chunk);
       for_numbers(of_grains, [&](Taped number) { seed(number, *bar++); });
+      bar = of_chunk(chunk) + mass_row(problem);
+      seed(parameter.row[kMass], *bar++);
+      if (problem.rubs) for_numbers(of_walls, [&](Taped number) { seed(number, *bar++); });
     }
     recorded.reverse({});
-    V sum[kParameters] = {};
+    V sum[kRows] = {}, edges[kWalls] = {};
     parameter.add_bars(sum);
-    for (int r = 0; r < kRows; ++r)  // without periodic axes there is nothing before the steps
-      write([](const Lane& lane) { return lane.parameters_out; }, r, r < kParameters ? sum[r] : V{});
+    const V mu_bar = problem.rubs ? recorded.bar(wall_mu.slot) : V{};
+    if (problem.periodic) add_cell_bars(forward.cell_edges(-1), earlier_bar, edges);
+    sum[kWallMu] = mu_bar;
+    std::copy_n(edges, 6, sum + kCell);
+    for (int r = 0; r < kRows; ++r) write([](const Lane& lane) { return lane.parameters_out; }, r, sum[r]);
     for (int row = 0; row < 3 * problem.spheres_per_grain; ++row) {
       V of_offset{};
       for (int chunk = 0; chunk < chunks(); ++chunk) of_offset += of_chunk(chunk)[kGrainNumbers + row];
@@ -328,19 +433,42 @@ struct Adjoint : AdjointLayout<Law> {
     }
   }
 
+  // Adds the bars of a cell's numbers to those of the walls that it was made of.
+  void add_cell_bars(const WallState<V>& box, const V* cell_bar, V* to) {
+    recorded.clear();
+    const TapedWalls walls(box);
+    Cell<Taped> cell = Cell<Taped>::of(problem.periodic, walls.box);
+    for_numbers(cell, [&](Taped number) { seed(number, *cell_bar++); });
+    recorded.reverse({});
+    walls.add_bars(to);
+  }
+
   // --- backwards
 
   // The second half of a step, of one chunk of grains.
   void end_back(int chunk, int step) {
     const int of_spheres = 3 * problem.spheres_per_grain;
+    if (general) std::fill_n(cell_bar_of_chunk(chunk), 2 * kCellNumbers, V{});
     for (int u = chunk * kChunk; u < (chunk + 1) * kChunk && u < problem.grains; ++u) {
       V mid[kMid];
       store_numbers(mid, forward.half_step_of(u));
       std::copy_n(total_of(step, u), 6, mid + kMidForce);
-      const V* in[] = {mid, grain_numbers};
-      V* bar[] = {of_grain(mid_bar, u, kMid), of_chunk(chunk)};
-      if (problem.isotropic) pull_back<StepEnd<true>>(in, of_grain(state_bar, u, kState), bar);
-      else pull_back<StepEnd<false>>(in, of_grain(state_bar, u, kState), bar);
+      if (general) {
+        const Size size = plan.size ? plan.size[u] : Size{1.0, 1.0, 1.0, 1.0, 1.0};
+        const V power[] = {splat<V>(size.cube), splat<V>(size.inverse_cube), splat<V>(size.fifth), splat<V>(size.inverse_fifth)};
+        const V* in[] = {mid, grain_numbers, cell_numbers, forward.parameter + kMass, power};
+        V* bar[] = {of_grain(mid_bar, u, kMid), of_chunk(chunk), cell_bar_of_chunk(chunk), of_chunk(chunk) + mass_row(problem)};
+        V result_bar[kState + 3];
+        std::copy_n(of_grain(state_bar, u, kState), kState, result_bar);
+        std::copy_n(faces_bar, 3, result_bar + kState);
+        if (problem.isotropic) pull_back<StepEnd<true, true>>(in, result_bar, bar);
+        else pull_back<StepEnd<false, true>>(in, result_bar, bar);
+      } else {
+        const V* in[] = {mid, grain_numbers};
+        V* bar[] = {of_grain(mid_bar, u, kMid), of_chunk(chunk)};
+        if (problem.isotropic) pull_back<StepEnd<true>>(in, of_grain(state_bar, u, kState), bar);
+        else pull_back<StepEnd<false>>(in, of_grain(state_bar, u, kState), bar);
+      }
       std::fill_n(of_grain(sphere_bar, u, of_spheres), of_spheres, V{});
     }
   }
@@ -366,6 +494,7 @@ struct Adjoint : AdjointLayout<Law> {
     constexpr int kAhead = 4;
     const Trace<V>& seen = trace[step];
     const int first = plan.domain_candidate[domain], end = plan.domain_candidate[domain + 1];
+    if (general) std::fill_n(cell_bar_of_domain(domain), kCellNumbers, V{});
     if (first == end) return;
     int c = first;
     for (int n = first; n < seen.end[first]; ++n) {
@@ -375,9 +504,9 @@ struct Adjoint : AdjointLayout<Law> {
       bool changes = false;
       if constexpr (Law::kLayered) {
         changes = seen.segments[c] >= 0;
-        if (changes) rings_back(c, of_domain(domain), history, seen);
+        if (changes) rings_back(c, domain, history, seen);
       }
-      if (!changes) contact_back(c, of_domain(domain), history);
+      if (!changes) contact_back(c, domain, history);
       has_bar[c++] = true;
     }
     for (; c < end; ++c) forget(c);
@@ -407,6 +536,7 @@ struct Adjoint : AdjointLayout<Law> {
       for (int q = 0; q < kRemote; ++q) of_grain(remote_bar, remote, kRemote)[q] = V{};
   }
 
+  // Of a contact as it is between the grains themselves, not their images.
   ContactInput<V> input_of(const Candidate& pair) const {
     const auto centre = [&](int i) { return load_vec(forward.mode.sphere + 3 * static_cast<std::size_t>(i)); };
     return forward.mode.contact_input(pair, centre(pair.one), centre(pair.other));
@@ -425,64 +555,92 @@ struct Adjoint : AdjointLayout<Law> {
     const ContactLoads<V> loads = loads_bar(plan.candidate[c]);
     store_vec(to, loads.force), store_vec(to + 3, loads.torque_one), store_vec(to + 6, loads.torque_other);
     std::copy_n(history_of(c), Law::kHistory, to + 9);
+    std::copy_n(faces_bar + 3, 3, to + 9 + Law::kHistory);  // which only general calculations have
+  }
+
+  // What is constant of a contact; see `ContactConstant`.
+  void load_constants(std::size_t c, V* to) const {
+    const Image image = plan.image ? plan.image[c] : Image{0, 0, 0};
+    const Radii radii = plan.radii ? plan.radii[c] : Radii{2.0, 0.0, 1.0, 4.0};
+    const double constant[kContactConstants] = {1.0 * image.x, 1.0 * image.y, 1.0 * image.z, radii.reach, radii.lean, radii.root};
+    for (int n = 0; n < kContactConstants; ++n) to[n] = splat<V>(constant[n]);
   }
 
   // By the program, from the bars of its results to those of the contact's own numbers and of the parameters.
-  void contact_back(const ContactInput<V>& input, const V* history, const V* result_bar, V* parameter_bar,
+  void contact_back(std::size_t c, int domain, const ContactInput<V>& input, const V* history, const V* result_bar,
                     V* own_bar) const {
-    V own[OneContact<Law>::kNumbers];
+    V own[kNumbers], *const parameter_bar = of_domain(domain);
     store_numbers(own, input);
     std::copy_n(history, Law::kHistory, own + kInputs);
-    const V* in[] = {own, forward.parameter, law_numbers, &last_ring};
-    V* bar[] = {own_bar, parameter_bar, parameter_bar + kParameters};
-    pull_back<OneContact<Law>>(in, result_bar, bar);
+    if (general) {
+      V constants[kContactConstants];
+      load_constants(c, constants);
+      const V* in[] = {own, forward.parameter, law_numbers, &last_ring, cell_numbers, constants};
+      V* bar[] = {own_bar, parameter_bar, parameter_bar + kParameters, nullptr, cell_bar_of_domain(domain)};
+      pull_back<OneContact<Law, true>>(in, result_bar, bar);
+    } else {
+      const V* in[] = {own, forward.parameter, law_numbers, &last_ring};
+      V* bar[] = {own_bar, parameter_bar, parameter_bar + kParameters};
+      pull_back<OneContact<Law>>(in, result_bar, bar);
+    }
   }
 
-  void contact_back(std::size_t c, V* parameter_bar, const V* history) {
-    V own_bar[OneContact<Law>::kNumbers], result_bar[OneContact<Law>::kResults];
+  void contact_back(std::size_t c, int domain, const V* history) {
+    V own_bar[kNumbers], result_bar[kResults];
     load_result_bars(c, result_bar);
-    contact_back(input_of(plan.candidate[c]), history, result_bar, parameter_bar, own_bar);
+    contact_back(c, domain, input_of(plan.candidate[c]), history, result_bar, own_bar);
     std::copy_n(own_bar + kInputs, Law::kHistory, history_of(c));
     share_out(plan.candidate[c], load_numbers<ContactInput<V>>(own_bar));
   }
 
   // A contact that comes to another of Mindlin's rings in some lanes: by the tape in these, by the program in the others,
   // so that what happens in a lane leaves the bits of the others as they are.
-  void rings_back(std::size_t c, V* parameter_bar, const V* history, const Trace<V>& seen) {
+  void rings_back(std::size_t c, int domain, const V* history, const Trace<V>& seen) {
     recorded.clear();
     const TapedParameters parameter(forward.parameter);
     const LawParameters<Taped> law(parameter.row + kLaw, parameter.row[kDt]);
+    const int of_cell = recorded.mark().slots;
+    const Cell<Taped> taped_cell{leaf(cell.lower), leaf(cell.lengths), leaf(cell.rate)};
     const int first = recorded.mark().slots;
     const Candidate& pair = plan.candidate[c];
     const ContactInput<V> m = input_of(pair);
-    const ContactInput<Taped> input{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
-                                    leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
+    ContactInput<Taped> input{leaf(m.separation), leaf(m.lever_one), leaf(m.lever_other),
+                              leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
     Taped memory[Law::kHistory + 1];
     for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(history[q]);
-    Contact<Taped> contact;
-    contact.history = memory;
-    relative_motion(input, dot(input.separation, input.separation), contact);
-    close(&contact, 1, parameter.row);
     std::vector<Segment<Taped>> now;
     const int leaves = recorded.mark().slots, before = seen.segments[c];
     for (int k = 0; k < before; ++k) {
       const Segment<V>& segment = seen.segment[c * problem.points + k];
       now.push_back({{leaf(segment.force.along), leaf(segment.force.across)}, constant(segment.start)});
     }
-    friction(Law{}, &contact, 1, law, [&](int) { return Segments{problem.points, &now}; });
+    V constants[kContactConstants];
+    load_constants(c, constants);
+    const Vec<V> image = load_vec(constants + kImage);
+    const Vec<Taped> taped_image{constant(image.x), constant(image.y), constant(image.z)};
+    if (general) move_to_image(input, taped_image, taped_cell);
+    const Unequal<Taped> unequal{constant(constants[kReach]), constant(constants[kLean]), constant(constants[kRoot]),
+                                 input.spin_other - input.spin_one};
+    Contact<Taped> contact;
+    contact.history = memory;
+    relative_motion(input, dot(input.separation, input.separation), contact);
+    general ? close<true>(&contact, 1, parameter.row, &unequal) : close(&contact, 1, parameter.row);
+    rub<Law>(&contact, 1, law, general ? &unequal : nullptr, [&](int) { return Segments{problem.points, &now}; });
 
     const ContactLoads<Taped> found = push(contact);
+    const Vec<Taped> through = through_faces(taped_image, found.force);
     const Bits moves = changes_ring(history[kLastOverlap], contact.overlap.value);
-    V own_bar[OneContact<Law>::kNumbers], result_bar[OneContact<Law>::kResults], others[OneContact<Law>::kResults];
+    V own_bar[kNumbers], result_bar[kResults], others[kResults];
     load_result_bars(c, result_bar);
-    for (int r = 0; r < OneContact<Law>::kResults; ++r) others[r] = zero_unless(~moves, result_bar[r]);
-    contact_back(m, history, others, parameter_bar, own_bar);
+    for (int r = 0; r < kResults; ++r) others[r] = zero_unless(~moves, result_bar[r]);
+    contact_back(c, domain, m, history, others, own_bar);
 
     const auto seed_moving = [moves](Taped a, V bar) { seed(a, zero_unless(moves, bar)); };
     const V* from = result_bar;
     for (Vec<Taped> a : {found.force, found.torque_one, found.torque_other})
       for_numbers(a, [&](Taped number) { seed_moving(number, *from++); });
     for (int q = 0; q < Law::kHistory; ++q) seed_moving(memory[q], *from++);
+    for (Taped number : {through.x, through.y, through.z}) seed_moving(number, *from++);
     V *const bar = history_of(c), *const of_segments = bar + Law::kHistory;
     for (std::size_t k = 0; k < now.size(); ++k) {
       seed_moving(now[k].force.along, of_segments[2 * k]);
@@ -490,7 +648,8 @@ struct Adjoint : AdjointLayout<Law> {
     }
     recorded.reverse({});
 
-    parameter.add_bars(parameter_bar);
+    parameter.add_bars(of_domain(domain));
+    for (int q = 0; general && q < kCellNumbers; ++q) cell_bar_of_domain(domain)[q] += recorded.bar(of_cell + q);
     for (int q = 0; q < kInputs + Law::kHistory; ++q) own_bar[q] = select(moves, recorded.bar(first + q), own_bar[q]);
     std::copy_n(own_bar + kInputs, Law::kHistory, bar);
     for (int q = 0; q < 2 * problem.points; ++q)
@@ -538,7 +697,7 @@ struct Adjoint : AdjointLayout<Law> {
 
   // The first half of a step, of one chunk of grains; `on_wall` is the bar of the force on either wall of an axis.
   void begin_back(int chunk, int step, Vec<V> on_wall) {
-    const WallState<V> box = forward.walls_at(step);
+    const WallState<V> box = without(problem.periodic, forward.walls_at(step));
     V walls[kWalls];
     store_numbers(walls, box);
     V* const of_walls = wall_bar + static_cast<std::size_t>(chunk) * kWalls;
@@ -556,22 +715,55 @@ struct Adjoint : AdjointLayout<Law> {
       for (int k = 0; k < spheres; ++k) {
         V body[3];
         store_vec(body, body_at<V>(block.pack->offsets + 3 * k));
-        const V* in[] = {turned, grain_numbers, body, walls};
+        const double size = plan.size ? plan.size[u].one : 1.0, radius = plan.radii ? block.pack->radii[k] * size : 1.0;
+        const V constants[kSphereConstants] = {splat<V>(size), splat<V>(radius)};
+        const V* in[] = {turned, grain_numbers, body, walls, constants};
         V* bar[] = {turned_bar, of_chunk(chunk), of_chunk(chunk) + kGrainNumbers + 3 * k, of_walls};
         const Vec<V> centre = load_vec(forward.mode.sphere + 3 * (static_cast<std::size_t>(u) * spheres + k));
-        if (bits_less(V{}, deepest(splat<V>(1.0), centre, box))) {
+        if (bits_less(V{}, deepest(constants[kRadius], centre, box))) {
           V result_bar[OneSphere<true>::kResults];
           std::copy_n(of_spheres + 3 * k, 3, result_bar);
           std::copy_n(mid + kMidForce, 6, result_bar + 3);
           store_vec(result_bar + 9, on_wall), store_vec(result_bar + 12, on_wall);
-          pull_back<OneSphere<true>>(in, result_bar, bar);
+          plan.radii ? pull_back<OneSphere<true, true>>(in, result_bar, bar) : pull_back<OneSphere<true>>(in, result_bar, bar);
         } else {
-          pull_back<OneSphere<false>>(in, of_spheres + 3 * k, bar);
+          plan.radii ? pull_back<OneSphere<false, true>>(in, of_spheres + 3 * k, bar)
+                     : pull_back<OneSphere<false>>(in, of_spheres + 3 * k, bar);
         }
       }
-      const V* in[] = {state_of(step, u), grain_numbers};
-      V* bar[] = {of_grain(state_bar, u, kState), of_chunk(chunk)};
-      pull_back<StepBegin>(in, turned_bar, bar);
+      friction_back(step, u, chunk, turned, walls, turned_bar, of_walls);
+      V* const of_cell = general ? cell_bar_of_chunk(chunk) : nullptr;
+      const V* in[] = {state_of(step, u), grain_numbers, before_numbers, cell_numbers};
+      V* bar[] = {of_grain(state_bar, u, kState), of_chunk(chunk), of_cell + kCellNumbers, of_cell};
+      general ? pull_back<StepBegin<true>>(in, turned_bar, bar) : pull_back<StepBegin<>>(in, turned_bar, bar);
+    }
+  }
+
+  // Friction of the walls on grain u, of which the forward steps know which planes it touched in this step.
+  void friction_back(int step, int u, int chunk, const V* turned, const V* walls, V* turned_bar, V* of_walls) const {
+    if constexpr (!Law::kLayered) {
+      for_planes(u, [&](int k, int w, const KnownPlanes& known) {
+        V* const history_bar = at_plane(wall_history_bar, u, k, w);
+        if (!(known.now >> w & 1)) return void(std::fill_n(history_bar, Law::kHistory, V{}));
+        V body[3], history[Law::kHistory + 1] = {}, result_bar[OnePlane<Law, 0>::kResults];
+        store_vec(body, body_at<V>(block.pack->offsets + 3 * k));
+        if (planes_of(step, u, k) >> w & 1) std::copy_n(at_plane(wall_history_at(step), u, k, w), Law::kHistory, history);
+        std::copy_n(of_grain(mid_bar, u, kMid) + kMidForce, 6, result_bar);
+        std::copy_n(history_bar, Law::kHistory, result_bar + 6);
+        const double size = plan.size ? plan.size[u].one : 1.0, radius = plan.radii ? block.pack->radii[k] * size : 1.0;
+        const V constants[kSphereConstants] = {splat<V>(size), splat<V>(radius)};
+        V* const of = of_chunk(chunk);
+        const V* in[] = {turned, grain_numbers, body, walls, constants, history, wall_law_numbers};
+        V* bar[] = {turned_bar, of, of + kGrainNumbers + 3 * k, of_walls, nullptr, history_bar, of + mass_row(problem) + 1};
+        switch (w) {
+          case 0: return pull_back<OnePlane<Law, 0>>(in, result_bar, bar);
+          case 1: return pull_back<OnePlane<Law, 1>>(in, result_bar, bar);
+          case 2: return pull_back<OnePlane<Law, 2>>(in, result_bar, bar);
+          case 3: return pull_back<OnePlane<Law, 3>>(in, result_bar, bar);
+          case 4: return pull_back<OnePlane<Law, 4>>(in, result_bar, bar);
+          default: return pull_back<OnePlane<Law, 5>>(in, result_bar, bar);
+        }
+      });
     }
   }
 
@@ -586,30 +778,63 @@ struct Adjoint : AdjointLayout<Law> {
   }
 
   void step_back(int step, Vec<V> pressure_bar) {
-    if (step + 1 < steps) {  // the way forward ended midway in the last one
-      for_grains([&](int u) { move_state(u, state_of(step, u), [](V kept, V& now) { now = kept; }); });
+    if (general || step + 1 < steps) {  // otherwise the way forward ended midway in the last one
+      for_grains([&](int u) { bring_back(step, u); });
       team.barrier();
       forward.grains(false, true, step);
     }
+    V by_walls[kWalls] = {};
+    const Vec<V> on_wall = pressure_back(step, pressure_bar, by_walls);
     for_chunks([&](int chunk) { end_back(chunk, step); });
     team.share(Team::kContacts, rank, plan.domains);
     for (int domain; team.take(Team::kContacts, rank, &domain);) contacts_back(domain, step);
     team.barrier();
+    for_chunks([&](int chunk) { begin_back(chunk, step, on_wall); });
+    if (general && rank == 0) cell_back(step, by_walls);
+    for (int row = 0; rank == 0 && row < kWalls; ++row) {
+      for (int chunk = 0; chunk < chunks(); ++chunk) by_walls[row] += wall_bar[chunk * kWalls + row];
+      write([](const Lane& lane) { return lane.walls_out; }, static_cast<std::ptrdiff_t>(step) * kWalls + row, by_walls[row]);
+    }
+  }
 
+  // From the pressures of a step to what they were made of: the bar of the force on either wall of an axis, those of `faces`,
+  // and, added, those of the walls themselves.
+  Vec<V> pressure_back(int step, Vec<V> pressure_bar, V* by_walls) {
     recorded.clear();
     const TapedWalls walls(forward.walls_at(step));
     const int first = recorded.mark().slots;
     const Vec<Taped> force = leaf(forward.mode.sum_walls(forward.walls, chunks()));
     seed(pressure(walls.box, force), pressure_bar);
-    recorded.reverse({});
-    const Vec<V> on_wall = bars(first);
-    V by_walls[kWalls] = {};
-    walls.add_bars(by_walls);
-    for_chunks([&](int chunk) { begin_back(chunk, step, on_wall); });
-    for (int row = 0; rank == 0 && row < kWalls; ++row) {
-      for (int chunk = 0; chunk < chunks(); ++chunk) by_walls[row] += wall_bar[chunk * kWalls + row];
-      write([](const Lane& lane) { return lane.walls_out; }, static_cast<std::ptrdiff_t>(step) * kWalls + row, by_walls[row]);
+    if (general) {
+      cell = forward.cell_at(step);
+      store_numbers(cell_numbers, cell);
+      store_numbers(before_numbers, forward.cell_at(step - 1));
     }
+    const int on_faces = recorded.mark().slots;
+    if (problem.periodic) {
+      const Vec<Taped> sections = leaf(load_vec(faces + 6 * step)), through = leaf(load_vec(faces + 6 * step + 3));
+      const Cell<Taped> taped_cell = Cell<Taped>::of(problem.periodic, walls.box);
+      seed(section_pressure(problem.periodic, walls.box, taped_cell, sections, through), pressure_bar);
+    }
+    recorded.reverse({});
+    for (int row = 0; row < 6; ++row) faces_bar[row] = problem.periodic ? recorded.bar(on_faces + row) : V{};
+    walls.add_bars(by_walls);
+    return bars(first);
+  }
+
+  // The bars of the cell of a step, of which all have told theirs.
+  void cell_back(int step, V* by_walls) {
+    V bar[kCellNumbers];
+    std::copy_n(earlier_bar, kCellNumbers, bar);
+    std::fill_n(earlier_bar, kCellNumbers, V{});
+    for (int q = 0; q < kCellNumbers; ++q) {
+      for (int domain = 0; domain < plan.domains; ++domain) bar[q] += cell_bar_of_domain(domain)[q];
+      for (int chunk = 0; chunk < chunks(); ++chunk) {
+        bar[q] += cell_bar_of_chunk(chunk)[q];
+        earlier_bar[q] += cell_bar_of_chunk(chunk)[kCellNumbers + q];
+      }
+    }
+    add_cell_bars(forward.cell_edges(step), bar, by_walls);
   }
 
   void run() {

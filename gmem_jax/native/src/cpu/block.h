@@ -149,15 +149,18 @@ struct Engine : EngineLayout<Mode> {
     return {load_vec(w), load_vec(w + 3), load_vec(w + 6), load_vec(w + 9)};
   }
 
-  // Of a periodic box at the end of a step, or before the first.
-  Cell<V> cell_at(int step) const {
-    if (step >= 0) return Cell<V>::of(problem.periodic, walls_at(step));
+  // Of a periodic box at the end of a step, or before the first: its edges ...
+  WallState<V> cell_edges(int step) const {
+    if (step >= 0) return walls_at(step);
     V edge[6];
     for (int row = 0; row < 6; ++row) edge[row] = mode.per_lane(&Lane::parameters, kCell + row);
     WallState<V> box{};
     box.lower = load_vec(edge), box.upper = load_vec(edge + 3);
-    return Cell<V>::of(problem.periodic, box);
+    return box;
   }
+
+  // ... and what follows from them.
+  Cell<V> cell_at(int step) const { return Cell<V>::of(problem.periodic, cell_edges(step)); }
 
   // Unit u between two steps.
   Grain<V> still(int u) const {
@@ -353,10 +356,13 @@ struct Engine : EngineLayout<Mode> {
 
   // p of the periodic axes in the step that has just ended.
   Vec<V> section_pressure_at(int step) const {
-    Vec<V> through{};
-    for (int domain = 0; domain < plan.domains; ++domain)
-      through = through + load_vec(this->through + 3 * static_cast<std::size_t>(domain));
-    return section_pressure(problem.periodic, walls_at(step), cell_at(step), mode.sum_walls(sections, chunks(problem)), through);
+    return section_pressure(problem.periodic, walls_at(step), cell_at(step), mode.sum_walls(sections, chunks(problem)), sum_through());
+  }
+
+  Vec<V> sum_through() const {
+    Vec<V> sum{};
+    for (int domain = 0; domain < plan.domains; ++domain) sum = sum + load_vec(through + 3 * static_cast<std::size_t>(domain));
+    return sum;
   }
 
   // p of each axis in `step`.

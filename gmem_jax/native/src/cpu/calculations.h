@@ -38,6 +38,12 @@ constexpr void for_numbers(GrainParameters<V>& p, const Each& each) {
 constexpr int kGrainNumbers = 14;
 
 template <class V, class Each>
+constexpr void for_numbers(WallLaw<V>& walls, const Each& each) {
+  for_numbers(walls.law, each), each(walls.quarter_dt), each(walls.normal_stiffness);
+}
+constexpr int kWallLawNumbers = kLawNumbers + 2;
+
+template <class V, class Each>
 constexpr void for_numbers(Vec<V>& a, const Each& each) {
   each(a.x), each(a.y), each(a.z);
 }
@@ -69,6 +75,11 @@ constexpr void for_numbers(WallState<V>& a, const Each& each) {
   for_numbers(a.lower, each), for_numbers(a.upper, each);
   for_numbers(a.lower_velocity, each), for_numbers(a.upper_velocity, each);
 }
+template <class V, class Each>
+constexpr void for_numbers(Cell<V>& a, const Each& each) {
+  for_numbers(a.lower, each), for_numbers(a.lengths, each), for_numbers(a.rate, each);
+}
+constexpr int kCellNumbers = 9;
 
 // To and from arrays of them.
 template <class T>
@@ -103,48 +114,77 @@ struct SameRings {
 };
 constexpr void reattach(SameRings&, Layers<Symbol>&, Symbol, Symbol, double) {}
 
-// Arrays: the contact's input and history; the parameters; those of the law; and number `last` of `Reach`.
-// Results: `ContactLoads`; the history.
-template <class Law>
+// What is constant of one contact, where boxes are periodic or spheres differ: see `Image` and `Radii`.
+enum ContactConstant { kImage = 0, kReach = 3, kLean, kRoot, kContactConstants };
+// ... and of one grain, and of one of its spheres.
+enum GrainConstant { kCube = 0, kInverseCube, kFifth, kInverseFifth, kGrainConstants };
+enum SphereConstant { kSize = 0, kRadius, kSphereConstants };
+
+// Calculations are `general` where boxes are periodic or spheres differ. A `Cell` is without effect otherwise, as
+// are constants of equal spheres.
+
+// Arrays: the contact's input and history; the parameters; those of the law; number `last` of `Reach`; if general, the
+// cell, and what is constant of the contact.
+// Results: `ContactLoads`; the history; if general, the force through the faces of the cell.
+template <class Law, bool general = false>
 struct OneContact {
-  static constexpr int kNumbers = kInputs + Law::kHistory, kResults = 9 + Law::kHistory;
+  static constexpr int kNumbers = kInputs + Law::kHistory, kResults = 9 + Law::kHistory + (general ? 3 : 0);
 
   static constexpr Program record() {
     Program program;
-    const auto meeting = inputs<ContactInput<Symbol>>(program, 0, Bar::set);
+    auto meeting = inputs<ContactInput<Symbol>>(program, 0, Bar::set);
     Symbol history[Law::kHistory + 1] = {}, parameter[kParameters] = {};
     for (int q = 0; q < Law::kHistory; ++q) history[q] = input(program, 0, kInputs + q, Bar::set);
     for (int r = 0; r < kParameters; ++r) parameter[r] = input(program, 1, r, Bar::add);
     const auto law = inputs<LawParameters<Symbol>>(program, 2, Bar::add);
+    Vec<Symbol> image{};
+    Unequal<Symbol> unequal{};
+    if (general) {
+      const auto cell = inputs<Cell<Symbol>>(program, 4, Bar::add);
+      image = inputs<Vec<Symbol>>(program, 5, Bar::none, kImage);
+      move_to_image(meeting, image, cell);
+      unequal = {input(program, 5, kReach, Bar::none), input(program, 5, kLean, Bar::none), input(program, 5, kRoot, Bar::none),
+                 meeting.spin_other - meeting.spin_one};
+    }
     Contact<Symbol> contact{};
     contact.history = history;
     relative_motion(meeting, dot(meeting.separation, meeting.separation), contact);
-    close(&contact, 1, parameter);
+    close<general>(&contact, 1, parameter, &unequal);
     SameRings rings{};
     if constexpr (Law::kLayered) rings.end = input(program, 3, 0, Bar::none);
-    rub<Law>(&contact, 1, law, static_cast<const Unequal<Symbol>*>(nullptr), [&](int) { return rings; });
+    rub<Law>(&contact, 1, law, general ? &unequal : nullptr, [&](int) { return rings; });
     const ContactLoads<Symbol> found = push(contact);
     result(program, found.force), result(program, found.torque_one), result(program, found.torque_other);
     for (int q = 0; q < Law::kHistory; ++q) result(program, history[q]);
+    if (general) result(program, through_faces(image, found.force));
     return program;
   }
 };
 
-// Arrays: the grain's numbers; those of `GrainParameters`. Results: midway, and how it is turned.
+// Arrays: the grain's numbers; those of `GrainParameters`; if general, the cell before and at the end of the step.
+// Results: midway, and how it is turned.
+template <bool general = false>
 struct StepBegin {
   static constexpr Program record() {
     Program program;
     const auto grain = inputs<Grain<Symbol>>(program, 0, Bar::set);
     const auto parameters = inputs<GrainParameters<Symbol>>(program, 1, Bar::add);
-    const HalfStep<Symbol> half = begin_step(parameters, grain);
+    HalfStep<Symbol> half{};
+    if (general) {
+      const auto before = inputs<Cell<Symbol>>(program, 2, Bar::add), cell = inputs<Cell<Symbol>>(program, 3, Bar::add);
+      half = begin_step(parameters, grain, before, cell);
+    } else {
+      half = begin_step(parameters, grain);
+    }
     results(program, half);
     results(program, matrix(half.orientation));
     return program;
   }
 };
 
-// Arrays: the grain's numbers midway, with force and torque; those of `GrainParameters`. Results: at the end.
-template <bool isotropic>
+// Arrays: the grain's numbers midway, with force and torque; those of `GrainParameters`; if general, the cell, the mass of
+// a grain of size 1, and what is constant of the grain. Results: at the end; if general, what it adds to `section`.
+template <bool isotropic, bool general = false>
 struct StepEnd {
   static constexpr Program record() {
     Program program;
@@ -152,14 +192,25 @@ struct StepEnd {
     const auto force = inputs<Vec<Symbol>>(program, 0, Bar::set, kMidForce);
     const auto torque = inputs<Vec<Symbol>>(program, 0, Bar::set, kMidTorque);
     const auto parameters = inputs<GrainParameters<Symbol>>(program, 1, Bar::add);
-    results(program, end_step(parameters, isotropic, half, force, torque));
+    if (general) {
+      const auto cell = inputs<Cell<Symbol>>(program, 2, Bar::add);
+      const Symbol mass = input(program, 3, 0, Bar::add);
+      Symbol power[kGrainConstants] = {};
+      for (int n = 0; n < kGrainConstants; ++n) power[n] = input(program, 4, n, Bar::none);
+      const auto own = parameters.of_size(power[kInverseCube], power[kFifth], power[kInverseFifth]);
+      results(program, end_step(own, isotropic, half, force, torque, cell));
+      result(program, section(cell, power[kCube] * mass, half, force));
+    } else {
+      results(program, end_step(parameters, isotropic, half, force, torque));
+    }
     return program;
   }
 };
 
 // Arrays: the grain's numbers midway, and how it is turned; those of `GrainParameters`; where the sphere is in the grain;
-// the walls. Results: its centre; force, torque, and the forces on lower and upper walls.
-template <bool near>
+// the walls; if general, what is constant of the sphere. Results: its centre; force, torque, and the forces on lower and
+// upper walls.
+template <bool near, bool general = false>
 struct OneSphere {
   static constexpr int kResults = 15;
 
@@ -167,13 +218,53 @@ struct OneSphere {
     Program program;
     const auto half = inputs<HalfStep<Symbol>>(program, 0, Bar::add);
     const auto rotation = inputs<Matrix<Symbol>>(program, 0, Bar::add, kTurnedRotation);
-    const auto parameters = inputs<GrainParameters<Symbol>>(program, 1, Bar::add);
-    const auto body = inputs<Vec<Symbol>>(program, 2, Bar::add);
+    auto parameters = inputs<GrainParameters<Symbol>>(program, 1, Bar::add);
+    auto body = inputs<Vec<Symbol>>(program, 2, Bar::add);
     const auto box = inputs<WallState<Symbol>>(program, 3, Bar::add);
+    Symbol radius = Symbol::of(1.0);
+    if (general) {
+      radius = input(program, 4, kRadius, Bar::none);
+      body = input(program, 4, kSize, Bar::none) * body;
+      parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;
+    }
     WallForces<Symbol> on{};
-    result(program, sphere_of(parameters, half, rotation, body, near, box, on));
+    result(program, sphere_of(parameters, half, rotation, body, near, box, on, radius));
     if (!near) return program;
     result(program, on.force), result(program, on.torque), result(program, on.lower), result(program, on.upper);
+    return program;
+  }
+};
+
+// Arrays: as of `OneSphere` if general; then the history of the sphere at plane w; and those of `WallLaw`.
+// Results: force and torque by friction of the wall, and the history.
+template <class Law, int w>
+struct OnePlane {
+  static constexpr int kResults = 6 + Law::kHistory;
+
+  static constexpr Program record() {
+    Program program;
+    const auto half = inputs<HalfStep<Symbol>>(program, 0, Bar::add);
+    const auto rotation = inputs<Matrix<Symbol>>(program, 0, Bar::add, kTurnedRotation);
+    auto parameters = inputs<GrainParameters<Symbol>>(program, 1, Bar::add);
+    const auto body = inputs<Vec<Symbol>>(program, 2, Bar::add);
+    const auto box = inputs<WallState<Symbol>>(program, 3, Bar::add);
+    const Symbol size = input(program, 4, kSize, Bar::none), radius = input(program, 4, kRadius, Bar::none);
+    Symbol history[Law::kHistory + 1] = {};
+    for (int q = 0; q < Law::kHistory; ++q) history[q] = input(program, 5, q, Bar::set);
+    const auto walls = inputs<WallLaw<Symbol>>(program, 6, Bar::add);
+    parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;
+    const Vec<Symbol> lever = rotation * (size * body), centre = half.position + lever;
+    const Vec<Symbol> velocity = add_cross(half.velocity, half.spin, lever);
+    const Vec<Symbol> inside = w < 3 ? centre - box.lower : box.upper - centre;
+    const Vec<Symbol> closing = w < 3 ? box.lower_velocity - velocity : velocity - box.upper_velocity;
+    const auto along = [](const Vec<Symbol>& a) { return w % 3 == 0 ? a.x : w % 3 == 1 ? a.y : a.z; };
+    Contact<Symbol> contact{};
+    contact.history = history;
+    meet_plane(w, parameters, walls, parameters.wall_stiffness / walls.normal_stiffness, lever, velocity, half.spin, radius,
+               radius - along(inside), along(closing), contact);
+    friction(Law{}, &contact, 1, walls.law);
+    result(program, contact.force), result(program, cross(contact.lever_one, contact.force));
+    for (int q = 0; q < Law::kHistory; ++q) result(program, history[q]);
     return program;
   }
 };

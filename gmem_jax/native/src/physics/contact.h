@@ -33,6 +33,23 @@ constexpr GMEM_INLINE void to_image(ContactInput<V>& m, Vec<V> shift, const Cell
   m.velocity = m.velocity + cell.flow(m.lever_one - m.lever_other);
 }
 
+// ... of a contact whose separation and levers are still those of the second grain itself; `image` is how many edges lead to
+// its image along each axis.
+template <class V, class Cell>
+constexpr void move_to_image(ContactInput<V>& m, Vec<V> image, const Cell& cell) {
+  const Vec<V> shift = cell.shift(image), half = splat<V>(0.5) * shift;
+  m.separation = m.separation + shift;
+  m.lever_one = m.lever_one + half;
+  m.lever_other = m.lever_other + half;
+  to_image(m, shift, cell);
+}
+
+// What the force on the first grain of a contact adds to that through the faces of a periodic box.
+template <class V>
+constexpr GMEM_INLINE Vec<V> through_faces(Vec<V> image, Vec<V> force) {
+  return {-(image.x * force.x), -(image.y * force.y), -(image.z * force.z)};
+}
+
 // Levers and relative motion, unprojected. The first part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
 template <class V>

@@ -33,9 +33,8 @@ struct Cell {
   }
 
   // From one image of a place to another.
-  constexpr Vec<V> shift(double x, double y, double z) const {
-    return {splat<V>(x) * lengths.x, splat<V>(y) * lengths.y, splat<V>(z) * lengths.z};
-  }
+  constexpr Vec<V> shift(Vec<V> image) const { return {image.x * lengths.x, image.y * lengths.y, image.z * lengths.z}; }
+  constexpr Vec<V> shift(double x, double y, double z) const { return shift({splat<V>(x), splat<V>(y), splat<V>(z)}); }
   constexpr Vec<V> flow(Vec<V> apart) const { return {rate.x * apart.x, rate.y * apart.y, rate.z * apart.z}; }
 };
 
@@ -225,10 +224,27 @@ struct WallLaw {
   }
 };
 
+// A sphere's contact with plane w, but for its friction and its history; `stiffer` are walls than other spheres.
+// gmem_jax/physics/contact/wall.py: wall_kinematics
+template <class V>
+constexpr GMEM_INLINE void meet_plane(int w, const GrainParameters<V>& p, const WallLaw<V>& walls, V stiffer, Vec<V> lever,
+                                      Vec<V> velocity, Vec<V> spin, V radius, V overlap, V closing, Contact<V>& now) {
+  const V zero{}, side = splat<V>(w < 3 ? -1.0 : 1.0);
+  now.normal = {w % 3 == 0 ? side : zero, w % 3 == 1 ? side : zero, w % 3 == 2 ? side : zero};
+  now.overlap = overlap;
+  const Vec<V> arm = radius * now.normal;
+  now.lever_one = lever + arm;
+  now.sliding = dot(velocity, now.normal) * now.normal - velocity - cross(spin, arm);
+  now.turned = walls.quarter_dt * dot(spin, now.normal);
+  const V safe = now.safe_overlap(), rooted = root(safe);
+  now.normal_force = hertz(now.touching(), safe, rooted, closing, p.wall_stiffness, p.normal_damping);
+  now.root_overlap = stiffer * rooted;
+}
+
 // Adds to `on` the friction of the walls on one sphere of a grain, of a radius for which the walls have their stiffness.
 // `history` has what the law remembers of it at each plane, [kPlanes, Law::kHistory]; is that anything but 0, the plane's bit
 // of `remembered` is set. Returns these bits afterwards.
-// gmem_jax/physics/contact/wall.py: wall_kinematics, wall_friction
+// gmem_jax/physics/contact/wall.py: wall_friction
 template <class Law, class V>
 GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
                          Vec<V> spin, const WallState<V>& box, V radius, V* history, unsigned remembered, WallFriction<V>& on) {
@@ -238,7 +254,7 @@ GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& wa
   const Vec<V> low = box.lower_velocity - velocity, up = velocity - box.upper_velocity;
   const V overlap[kPlanes] = {lower.x, lower.y, lower.z, upper.x, upper.y, upper.z};
   const V closing[kPlanes] = {low.x, low.y, low.z, up.x, up.y, up.z};
-  const V zero{}, stiffer = p.wall_stiffness / walls.normal_stiffness;
+  const V stiffer = p.wall_stiffness / walls.normal_stiffness;
   Contact<V> c[kPlanes];
   int count = 0;
   unsigned touched = 0;
@@ -249,18 +265,9 @@ GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& wa
       continue;
     }
     touched |= 1u << w;
-    const V side = splat<V>(w < 3 ? -1.0 : 1.0);
     Contact<V>& now = c[count++];
-    now.normal = {w % 3 == 0 ? side : zero, w % 3 == 1 ? side : zero, w % 3 == 2 ? side : zero};
-    now.overlap = overlap[w];
     now.history = own;
-    const Vec<V> arm = radius * now.normal;
-    now.lever_one = lever + arm;
-    now.sliding = dot(velocity, now.normal) * now.normal - velocity - cross(spin, arm);
-    now.turned = walls.quarter_dt * dot(spin, now.normal);
-    const V safe = now.safe_overlap(), rooted = root(safe);
-    now.normal_force = hertz(now.touching(), safe, rooted, closing[w], p.wall_stiffness, p.normal_damping);
-    now.root_overlap = stiffer * rooted;
+    meet_plane(w, p, walls, stiffer, lever, velocity, spin, radius, overlap[w], closing[w], now);
   }
   friction(Law{}, c, count, walls.law);
   for (int n = 0; n < count; ++n) {
