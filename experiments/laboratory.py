@@ -154,7 +154,8 @@ def main() -> None:
         jobs += [(arguments.words, 101, MANY, bits)] if arguments.words and name != SLOPES else []
         for grains, seed, length, measure in jobs:
             pack = f"tetra-{grains}-{seed}"
-            if any((row["pack"], row["condition"]) == (pack, name) for row in done(path)):
+            known = [row["quantity"] for row in done(path) if (row["pack"], row["condition"]) == (pack, name)]
+            if any(quantity.startswith("bits") == (measure is bits) for quantity in known):
                 continue
             began = time.process_time()
             made = prepared(arguments.output, grains, seed, condition)
