@@ -41,6 +41,8 @@ struct Case {
   double reach;  // of the candidates
   int replicas;
   bool mixed = false;
+  bool general = false;  // in a periodic box, grains of sizes and of spheres that differ
+  bool rubs = false;     // walls have friction
 };
 
 // Grains of two spheres that touch their neighbours and the walls.
@@ -49,6 +51,8 @@ struct Scene {
   Numbers position, reference, smallest{1.0, 1.0, 1.0}, offsets{-0.5, 0.0, 0.0, 0.5, 0.0, 0.0};
   std::vector<int32_t> first, second;
   std::vector<char> valid;
+  std::vector<int8_t> images;
+  Numbers radii{1.0, 0.95}, sizes;
 
   explicit Scene(const Case& c) : grains(c.edge ? c.edge * c.edge * c.edge : 2) {
     const int edge = c.edge ? c.edge : 2;
@@ -66,6 +70,8 @@ struct Scene {
         if (first.size() % 5 == 2) list(-7, 1 << 30, false);  // padding may hold anything
         list(i, j, true);
       }
+    for (int g = 0; g < grains; ++g) sizes.push_back(1.0 + 0.03 * noise(g, 0, 12));
+    for (std::size_t row = 0; row < first.size(); ++row) images.insert(images.end(), {static_cast<int8_t>(row % 7 == 3), 0, 0});
   }
 
   void list(int i, int j, bool is_valid) { first.push_back(i), second.push_back(j), valid.push_back(is_valid); }
@@ -86,11 +92,13 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   };
   const auto small = [](int row, int l) { return 1e-3 * noise(row, l, 1); };
   const auto positive = [](int row, int l) { return 1e-3 * (1.5 + noise(row, l, 2)); };
-  const auto parameter = [](int row, int) {
+  const double box = 2.9 * (c.edge ? c.edge : 2);
+  const auto parameter = [&](int row, int) {
+    if (row >= kCell) return row == kWallMu ? 0.3 : row < kCell + 3 ? 0.0 : box;
     const double numbers[kRows] = {0.05, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.9, 0.06};
     return numbers[row];
   };
-  const auto wall = [&](int row, int) { return row % 12 < 3 ? 0.0 : row % 12 < 6 ? 2.9 * (c.edge ? c.edge : 2) : 1e-3; };
+  const auto wall = [&](int row, int) { return row % 12 < 3 ? 0.0 : row % 12 < 6 ? box : 1e-3; };
   const auto field = [&](int f) {
     return [&scene, f](int row, int l) {
       if (f == 0) return scene.position[row] + 1e-3 * noise(row, l, 3);
@@ -119,6 +127,12 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     slope.history_in[leaf] = array(rows, false, small);
     lane.history_out[leaf] = slope.history_out[leaf] = array(rows, true, small);
   }
+  for (std::size_t leaf = 0; c.rubs && leaf < sizes.size(); ++leaf) {
+    const int rows = sizes[leaf] * kPlanes * n * kSpheres;
+    lane.wall_history_in[leaf] = array(rows, false, [&](int row, int l) { return row % 5 ? small(row, l) : 0.0; });
+    slope.wall_history_in[leaf] = array(rows, false, small);
+    lane.wall_history_out[leaf] = slope.wall_history_out[leaf] = array(rows, true, small);
+  }
   lane.parameters = array(kRows, false, parameter);
   lane.walls = array(kSteps * kWalls, false, wall);
   slope.parameters = array(kRows, false, small);
@@ -128,16 +142,19 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   if (back) slope.parameters_out = array(kRows, true, small), slope.walls_out = array(kSteps * kWalls, true, small);
   if (back) slope.offsets_out = array(kSpheres * 3, true, small);
 
-  const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed};
+  const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed, c.general ? 7 : 0, c.rubs};
   const auto store = plan_for({n, kSpheres, candidates, scene.first.data(), scene.second.data(),
                                reinterpret_cast<const bool*>(scene.valid.data()), scene.reference.data(),
-                               scene.smallest.data()});
-  const Pack pack{&store->plan, scene.offsets.data()};
+                               scene.smallest.data(), c.general ? scene.images.data() : nullptr,
+                               c.general ? scene.radii.data() : nullptr, c.general ? scene.sizes.data() : nullptr});
+  const Pack pack{&store->plan, scene.offsets.data(), c.general ? scene.radii.data() : nullptr};
   const Kernel& kernel = forward ? steps::kernel : derivatives::kernel;
   const auto moved = [](Lane of, std::ptrdiff_t l) {
     for (int f = 0; f < kFields; ++f) of.grains_in[f] += l, of.grains_out[f] += l;
     for (int leaf = 0; leaf < kMaxHistory; ++leaf)
       if (of.history_in[leaf]) of.history_in[leaf] += l, of.history_out[leaf] += l;
+    for (int leaf = 0; leaf < kMaxHistory; ++leaf)
+      if (of.wall_history_in[leaf]) of.wall_history_in[leaf] += l, of.wall_history_out[leaf] += l;
     of.parameters += l, of.walls += l, of.offsets += l, of.pressure += l;
     if (of.parameters_out) of.parameters_out += l, of.walls_out += l, of.offsets_out += l;
     return of;
@@ -212,6 +229,22 @@ int main(int count, char** arguments) {
           for (Numbers& one : found) callers.emplace_back([&, to = &one] { *to = run(with(3), 3); });
           for (std::thread& caller : callers) caller.join();
           for (const Numbers& one : found) CHECK(same(one, alone));
+        }
+      }
+  // Periodic boxes of unequal spheres, and rough walls.
+  for (const auto& law : laws)
+    for (const Task task : {Task::forward, Task::tangent, Task::adjoint})
+      for (const bool rubs : {false, true}) {
+        const bool has = rubs ? law.law != Law::mindlin : law.law == Law::hooke || law.variant == Variant::paper;
+        const auto with = [&](int edge, int replicas) {
+          return Case{law.law, law.variant, task, edge, edge == 4 ? 4.5 : 2.5, replicas, false, !rubs, rubs};
+        };
+        if (!has || printed) continue;
+        for (const int edge : {3, 4}) {
+          const Numbers alone = run(with(edge, 1), 1);
+          for (const double number : alone) CHECK(std::isfinite(number));
+          for (const int threads : {2, 5}) CHECK(same(run(with(edge, 1), threads), alone));
+          if (edge == 3) CHECK(same(run(with(edge, 7), 2), alone));
         }
       }
   return failures != 0;
