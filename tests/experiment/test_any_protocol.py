@@ -301,7 +301,7 @@ def test_a_recall_of_several_reads_and_channels_is_kept_whole(tmp_path: Any) -> 
 
 
 def test_gradients_through_a_protocol_of_ones_own() -> None:
-    """Two channels, held walls, shaking, a partial read: both backends, and central differences."""
+    """Two channels, held walls, shaking, a partial read: against plain JAX and central differences."""
     stages = (gm.write(), gm.shake(0.3, 1, length=0.05, channel="z"), gm.hold(0.1, pressure=(None, None, 3e-3)))
     protocol = gm.Protocol(*stages, gm.read("half", to=0.5, length=0.3))
     sets = gm.signals(xy=ONE, z=OTHER)
@@ -310,12 +310,10 @@ def test_gradients_through_a_protocol_of_ones_own() -> None:
     def loss(experiment: gm.Experiment, p_sig: jax.Array) -> jax.Array:
         return 1e6 * jnp.sum(p_sig[0] * p_sig[0]) + jnp.sum(experiment.compare(p_sig).gain)
 
-    found, plain = (
-        gm.value_and_grad(gm.replace(one, backend=backend), ["gamma0", "friction.mu"], loss=loss, progress=False)
-        for backend in ("auto", "jax")
-    )
+    found = gm.value_and_grad(one, ["gamma0", "friction.mu"], loss=loss, progress=False)
+    plain = gm.run(gm.replace(one, backend="jax"), progress=False).p_sig
+    np.testing.assert_allclose(found.p_sig, plain, atol=1e-9 * float(jnp.abs(plain).max()))
     for name, slope in found.slope.items():
-        assert float(slope) == pytest.approx(float(plain.slope[name]), rel=1e-8), name
         middle, step = float(gm.replace(one, {}).gamma0 if name == "gamma0" else one.friction.mu), 1e-5
         values = []
         for sign in (1.0, -1.0):

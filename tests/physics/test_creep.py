@@ -86,12 +86,9 @@ def test_both_backends_creep_alike_and_are_differentiated() -> None:
     def loss(experiment: gm.Experiment, p_sig: jax.Array) -> jax.Array:
         return 1e6 * jnp.sum(p_sig**2)
 
-    fast, plain = (
-        gm.value_and_grad(gm.replace(one, backend=backend), ["creep"], loss=loss, progress=False)
-        for backend in ("auto", "jax")
-    )
-    np.testing.assert_allclose(fast.p_sig, plain.p_sig, atol=1e-9 * float(jnp.abs(plain.p_sig).max()))
-    assert float(fast.slope["creep"]) == pytest.approx(float(plain.slope["creep"]), rel=1e-9)
+    fast = gm.value_and_grad(one, ["creep"], loss=loss, progress=False)  # of plain JAX it is JAX's own, and slow
+    plain = gm.run(gm.replace(one, backend="jax"), progress=False).p_sig
+    np.testing.assert_allclose(fast.p_sig, plain, atol=1e-9 * float(jnp.abs(plain).max()))
     values = [
         float(loss(one, gm.run(gm.replace(one, creep=rate), progress=False).p_sig)) for rate in (0.020005, 0.019995)
     ]
