@@ -69,6 +69,7 @@ CHOICES = {
     "O = 0.9": Condition({}, {}, overlap=0.9),
 }
 SLOPES = "slopes"
+ALL = CONDITIONS | CHOICES | {SLOPES: Condition({}, {})}
 
 
 def prepared(folder: Path, grains: int, seed: int, condition: Condition) -> gm.Pack:
@@ -99,29 +100,28 @@ def rms(p_sig: jax.Array) -> jax.Array:
     return jnp.sqrt(jnp.mean(p_sig**2)) * PASCAL
 
 
-def together(status: jax.typing.ArrayLike) -> int:
-    """How all replicas ended."""
-    return int(np.bitwise_or.reduce(np.ravel(status)))
+Measured = tuple[dict[str, float], Any]
+"""Values by name, and the status of the replicas."""
 
 
-def measures(experiment: gm.Experiment) -> tuple[dict[str, float], int]:
-    """G, F, and the size of the recall; and how the run ended."""
+def measures(experiment: gm.Experiment) -> Measured:
+    """G, F, and the size of the recall."""
     recall = gm.run(experiment, progress=False)
     found = {"G": float(recall.gain), "F": float(recall.fidelity), "rms of p_sig (Pa)": float(rms(recall.p_sig))}
-    return found, together(recall.status)
+    return found, recall.status
 
 
-def bits(experiment: gm.Experiment) -> tuple[dict[str, float], int]:
-    """Bits of a word that the linear decoder reads; and how the run ended."""
+def bits(experiment: gm.Experiment) -> Measured:
+    """Bits of a word that the linear decoder reads."""
     recall = gm.run(experiment, progress=False)
     read = {noise: decoded_bits(recall.p_sig, noise / PASCAL).bits for noise in NOISES}
-    return {f"bits read of {MANY} at {noise:g} Pa": value for noise, value in read.items()}, together(recall.status)
+    return {f"bits read of {MANY} at {noise:g} Pa": value for noise, value in read.items()}, recall.status
 
 
-def slopes(experiment: gm.Experiment) -> tuple[dict[str, float], int]:
-    """What F and ln(rms) of p_sig change by with ln(gamma0) and with ln(delta0); and how the run ended."""
+def slopes(experiment: gm.Experiment) -> Measured:
+    """What F and ln(rms) of p_sig change by with ln(gamma0) and with ln(delta0)."""
     found: dict[str, float] = {}
-    status = 0
+    status: Any = 0
     for name, value in {"gamma0": experiment.gamma0, "delta0": experiment.compression}.items():
 
         def both(value: jax.Array, name: str = name) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -131,7 +131,7 @@ def slopes(experiment: gm.Experiment) -> tuple[dict[str, float], int]:
         at = jnp.asarray(float(value))
         (_, _, ended), (fidelity, size, _) = jax.jvp(both, (at,), (at,))
         found |= {f"dF/dln({name})": float(fidelity), f"dln(rms)/dln({name})": float(size)}
-        status |= together(ended)
+        status = status | np.asarray(ended)
     return found, status
 
 
@@ -142,14 +142,17 @@ def main() -> None:
     parser.add_argument("--grains", type=int, default=3267)
     parser.add_argument("--seeds", default="101,102,103")
     parser.add_argument("--words", type=int, default=1024, help="grains of the pack that words are stored in, seed 101")
-    parser.add_argument("--only", default=",".join([*CONDITIONS, *CHOICES, SLOPES]))
+    parser.add_argument("--only", default=",".join(ALL))
     arguments = parser.parse_args()
+    names = arguments.only.split(",")
+    if unknown := [name for name in names if name not in ALL]:
+        parser.error(f"--only: no condition {unknown[0]!r}; there are {', '.join(ALL)}")
     jax.config.update("jax_enable_x64", True)
     arguments.output.mkdir(parents=True, exist_ok=True)
     path = arguments.output / "laboratory.csv"
     seeds = [int(seed) for seed in arguments.seeds.split(",")]
-    for name in arguments.only.split(","):
-        condition = (CONDITIONS | CHOICES).get(name, Condition({}, {}))
+    for name in names:
+        condition = ALL[name]
         jobs = [(arguments.grains, seed, FEW, slopes if name == SLOPES else measures) for seed in seeds]
         jobs += [(arguments.words, 101, MANY, bits)] if arguments.words and name != SLOPES else []
         for grains, seed, length, measure in jobs:

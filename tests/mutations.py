@@ -1356,15 +1356,9 @@ MUTATIONS = (
     mutation(
         "adjoint-of-unequal-spheres-on-walls",
         "cpu/calculations.h",
-        "      parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;",
+        "parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;",
         "",
         "test_the_adjoint_of_unequal_spheres_is_the_transpose_of_their_tangent[H-spheres]",
-    ),
-    mutation(
-        "adjoint-of-rough-walls-for-large-spheres",
-        "cpu/calculations.h",
-        "\n    parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;",
-        "",
         AT_ROUGH_WALLS + "[H-file2]",
     ),
     mutation(

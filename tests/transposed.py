@@ -15,11 +15,14 @@ from gmem_jax.physics.step import System
 TOLERANCE = 1e-10
 
 
-def assert_transposed(system: System, state: State, boxes: Box, dt: float = 0.3, drag: float = 0.01) -> None:
+def assert_transposed(system: System, state: State, boxes: Box, dt: float = 0.3, drag: float = 0.01) -> Any:
     """The library's adjoint is the transpose of its tangent: w . (J d) = (J^T w) . d, for every argument of a call.
 
     J is the derivative of the steps, w weights of all that they give, d a direction along one argument, or along one
     row of the parameters.
+
+    Returns:
+        J^T w, `primitives.Arrays`.
     """
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
     numbers = jnp.asarray(dt), jnp.asarray(drag)
@@ -40,6 +43,7 @@ def assert_transposed(system: System, state: State, boxes: Box, dt: float = 0.3,
         forwards_by = np.concatenate([np.ravel(term) for term in _products(weights, push(along))])
         backwards_by = np.concatenate([np.ravel(term) for term in _products(bars, along)])
         assert abs(backwards_by.sum() - forwards_by.sum()) <= TOLERANCE * np.linalg.norm(forwards_by), name
+    return bars
 
 
 def _products(one: Any, other: Any) -> list[np.ndarray]:

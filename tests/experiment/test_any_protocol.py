@@ -300,12 +300,13 @@ def test_a_recall_of_several_reads_and_channels_is_kept_whole(tmp_path: Any) -> 
     assert float(data.gain.sel(read="one", channel="z", written="xy")) == float(recall.gain[0, 1, 0])
 
 
-def test_gradients_through_a_protocol_of_ones_own() -> None:
+@pytest.mark.parametrize("backend", ["auto", pytest.param("jax", marks=pytest.mark.slow)])
+def test_gradients_through_a_protocol_of_ones_own(backend: str) -> None:
     """Two channels, held walls, shaking, a partial read: against plain JAX and central differences."""
     stages = (gm.write(), gm.shake(0.3, 1, length=0.05, channel="z"), gm.hold(0.1, pressure=(None, None, 3e-3)))
     protocol = gm.Protocol(*stages, gm.read("half", to=0.5, length=0.3))
     sets = gm.signals(xy=ONE, z=OTHER)
-    one = experiment(protocol, sets, t0=20.0)
+    one = experiment(protocol, sets, backend=backend, t0=20.0)
 
     def loss(experiment: gm.Experiment, p_sig: jax.Array) -> jax.Array:
         return 1e6 * jnp.sum(p_sig[0] * p_sig[0]) + jnp.sum(experiment.compare(p_sig).gain)

@@ -80,13 +80,14 @@ def test_creep_that_cannot_be_is_refused(changes: dict[str, Any], reason: str) -
         gm.Experiment(PACK, ONE, **{**SHORT, **changes})
 
 
-def test_both_backends_creep_alike_and_are_differentiated() -> None:
-    one = gm.Experiment(PACK, ONE, creep=0.02, creep_fades=30.0, **{**SHORT, "t0": 20.0})
+@pytest.mark.parametrize("backend", ["auto", pytest.param("jax", marks=pytest.mark.slow)])
+def test_both_backends_creep_alike_and_are_differentiated(backend: str) -> None:
+    one = gm.Experiment(PACK, ONE, creep=0.02, creep_fades=30.0, backend=backend, **{**SHORT, "t0": 20.0})
 
     def loss(experiment: gm.Experiment, p_sig: jax.Array) -> jax.Array:
         return 1e6 * jnp.sum(p_sig**2)
 
-    fast = gm.value_and_grad(one, ["creep"], loss=loss, progress=False)  # of plain JAX it is JAX's own, and slow
+    fast = gm.value_and_grad(one, ["creep"], loss=loss, progress=False)
     plain = gm.run(gm.replace(one, backend="jax"), progress=False).p_sig
     np.testing.assert_allclose(fast.p_sig, plain, atol=1e-9 * float(jnp.abs(plain).max()))
     values = [

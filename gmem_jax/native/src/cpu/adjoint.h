@@ -558,6 +558,13 @@ struct Adjoint : AdjointLayout<Law> {
     std::copy_n(faces_bar + 3, 3, to + 9 + Law::kHistory);  // which only general calculations have
   }
 
+  // What is constant of sphere k of grain u; see `SphereConstant`.
+  void load_constants(int u, int k, V* to) const {
+    const double size = plan.size ? plan.size[u].one : 1.0;
+    to[kSize] = splat<V>(size);
+    to[kRadius] = splat<V>(plan.radii ? block.pack->radii[k] * size : 1.0);
+  }
+
   // What is constant of a contact; see `ContactConstant`.
   void load_constants(std::size_t c, V* to) const {
     const Image image = plan.image ? plan.image[c] : Image{0, 0, 0};
@@ -715,8 +722,8 @@ struct Adjoint : AdjointLayout<Law> {
       for (int k = 0; k < spheres; ++k) {
         V body[3];
         store_vec(body, body_at<V>(block.pack->offsets + 3 * k));
-        const double size = plan.size ? plan.size[u].one : 1.0, radius = plan.radii ? block.pack->radii[k] * size : 1.0;
-        const V constants[kSphereConstants] = {splat<V>(size), splat<V>(radius)};
+        V constants[kSphereConstants];
+        load_constants(u, k, constants);
         const V* in[] = {turned, grain_numbers, body, walls, constants};
         V* bar[] = {turned_bar, of_chunk(chunk), of_chunk(chunk) + kGrainNumbers + 3 * k, of_walls};
         const Vec<V> centre = load_vec(forward.mode.sphere + 3 * (static_cast<std::size_t>(u) * spheres + k));
@@ -750,8 +757,8 @@ struct Adjoint : AdjointLayout<Law> {
         if (planes_of(step, u, k) >> w & 1) std::copy_n(at_plane(wall_history_at(step), u, k, w), Law::kHistory, history);
         std::copy_n(of_grain(mid_bar, u, kMid) + kMidForce, 6, result_bar);
         std::copy_n(history_bar, Law::kHistory, result_bar + 6);
-        const double size = plan.size ? plan.size[u].one : 1.0, radius = plan.radii ? block.pack->radii[k] * size : 1.0;
-        const V constants[kSphereConstants] = {splat<V>(size), splat<V>(radius)};
+        V constants[kSphereConstants];
+        load_constants(u, k, constants);
         V* const of = of_chunk(chunk);
         const V* in[] = {turned, grain_numbers, body, walls, constants, history, wall_law_numbers};
         V* bar[] = {turned_bar, of, of + kGrainNumbers + 3 * k, of_walls, nullptr, history_bar, of + mass_row(problem) + 1};

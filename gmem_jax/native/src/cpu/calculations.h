@@ -207,6 +207,14 @@ struct StepEnd {
   }
 };
 
+// What the constants of a sphere, array 4, make of where it is and of how stiff walls are to it; its radius.
+constexpr Symbol scale(Program& program, Vec<Symbol>& body, GrainParameters<Symbol>& parameters) {
+  const Symbol radius = input(program, 4, kRadius, Bar::none);
+  body = input(program, 4, kSize, Bar::none) * body;
+  parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;
+  return radius;
+}
+
 // Arrays: the grain's numbers midway, and how it is turned; those of `GrainParameters`; where the sphere is in the grain;
 // the walls; if general, what is constant of the sphere. Results: its centre; force, torque, and the forces on lower and
 // upper walls.
@@ -221,12 +229,7 @@ struct OneSphere {
     auto parameters = inputs<GrainParameters<Symbol>>(program, 1, Bar::add);
     auto body = inputs<Vec<Symbol>>(program, 2, Bar::add);
     const auto box = inputs<WallState<Symbol>>(program, 3, Bar::add);
-    Symbol radius = Symbol::of(1.0);
-    if (general) {
-      radius = input(program, 4, kRadius, Bar::none);
-      body = input(program, 4, kSize, Bar::none) * body;
-      parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;
-    }
+    const Symbol radius = general ? scale(program, body, parameters) : Symbol::of(1.0);
     WallForces<Symbol> on{};
     result(program, sphere_of(parameters, half, rotation, body, near, box, on, radius));
     if (!near) return program;
@@ -246,14 +249,13 @@ struct OnePlane {
     const auto half = inputs<HalfStep<Symbol>>(program, 0, Bar::add);
     const auto rotation = inputs<Matrix<Symbol>>(program, 0, Bar::add, kTurnedRotation);
     auto parameters = inputs<GrainParameters<Symbol>>(program, 1, Bar::add);
-    const auto body = inputs<Vec<Symbol>>(program, 2, Bar::add);
+    auto body = inputs<Vec<Symbol>>(program, 2, Bar::add);
     const auto box = inputs<WallState<Symbol>>(program, 3, Bar::add);
-    const Symbol size = input(program, 4, kSize, Bar::none), radius = input(program, 4, kRadius, Bar::none);
+    const Symbol radius = scale(program, body, parameters);
     Symbol history[Law::kHistory + 1] = {};
     for (int q = 0; q < Law::kHistory; ++q) history[q] = input(program, 5, q, Bar::set);
     const auto walls = inputs<WallLaw<Symbol>>(program, 6, Bar::add);
-    parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;
-    const Vec<Symbol> lever = rotation * (size * body), centre = half.position + lever;
+    const Vec<Symbol> lever = rotation * body, centre = half.position + lever;
     const Vec<Symbol> velocity = add_cross(half.velocity, half.spin, lever);
     const Vec<Symbol> inside = w < 3 ? centre - box.lower : box.upper - centre;
     const Vec<Symbol> closing = w < 3 ? box.lower_velocity - velocity : velocity - box.upper_velocity;

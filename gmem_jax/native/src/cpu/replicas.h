@@ -371,7 +371,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
       if (!plan.image || !plan.image[touching[n]].any()) continue;
       const Image& image = plan.image[touching[n]];
       const Vec<V> force = convert<V>(found.force);
-      faces.through = faces.through - Vec<V>{splat<V>(image.x) * force.x, splat<V>(image.y) * force.y, splat<V>(image.z) * force.z};
+      faces.through = faces.through + through_faces({splat<V>(image.x), splat<V>(image.y), splat<V>(image.z)}, force);
     }
   }
 

@@ -431,7 +431,7 @@ GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int step, int sphere) {
         const signed char* image = a.image.of(on.entry) + 3ll * row[q];
         const Vec<V> moved{splat<V>(image[0]), splat<V>(image[1]), splat<V>(image[2])};
         if (second[q]) lever = lever - on.cell(step).shift(image[0], image[1], image[2]);
-        else sum.through = sum.through - Vec<V>{moved.x * force.x, moved.y * force.y, moved.z * force.z};
+        else sum.through = sum.through + through_faces(moved, force);
       }
       sum = sum + at_lever(second[q] ? -force : force, lever);
     }
