@@ -67,6 +67,7 @@ CHOICES = {
     "delta0 = 0.08": Condition({"delta0": 0.08}, {}),
     "O = 0.8": Condition({}, {}, overlap=0.8),
     "O = 0.9": Condition({}, {}, overlap=0.9),
+    "gamma0 = 3e-3 and O = 0.9": Condition({}, {"gamma0": 3e-3}, overlap=0.9),
 }
 SLOPES = "slopes"
 ALL = CONDITIONS | CHOICES | {SLOPES: Condition({}, {})}

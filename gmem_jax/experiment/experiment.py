@@ -182,8 +182,6 @@ class Experiment:
     def _check_wall_mu(self) -> None:
         if self.wall_mu is None:
             return
-        if self.backend == "native" and not native.rubs(self.friction, self.pack.periodic):
-            raise ValueError(native.NO_RUBBING)
         if not isinstance(self.friction, CoulombLaw):
             raise ValueError(
                 f"wall_mu takes the place of mu at walls, and {type(self.friction).__name__} has no mu: leave wall_mu "
@@ -341,7 +339,7 @@ class Experiment:
     @property
     def runs_on(self) -> native.Backend:
         """What `backend` means for this law and these walls on JAX's default device."""
-        return native.name(self.backend, self.friction, self.pack.periodic, self.wall_mu is None)
+        return native.name(self.backend, self.friction)
 
     @property
     def timing(self) -> Timing:

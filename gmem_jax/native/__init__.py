@@ -28,17 +28,15 @@ from gmem_jax.native.backend import (
     name,
     require_precision,
     resolve,
-    rubs,
     supports,
 )
 from gmem_jax.native.library import available, needs, require_threads
 from gmem_jax.native.march import March, march
-from gmem_jax.native.primitives import NO_RUBBING, TARGETS
+from gmem_jax.native.primitives import TARGETS
 from gmem_jax.native.search import search
 
 __all__ = [
     "BACKENDS",
-    "NO_RUBBING",
     "PRECISIONS",
     "TARGETS",
     "Backend",
@@ -53,7 +51,6 @@ __all__ = [
     "require_precision",
     "require_threads",
     "resolve",
-    "rubs",
     "search",
     "supports",
 ]

@@ -76,14 +76,12 @@ def _why_not(lacks: str, built: bool, said: str) -> str:
     return "" if client.platform == "cpu" else f"the native backend does not run on {client.platform}"
 
 
-def name(backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS, smooth: bool = True) -> Backend:
+def name(backend: str, law: FrictionLaw) -> Backend:
     """What "auto" means on JAX's default device, "jax" or "native"; others are themselves.
 
     Args:
         backend: as of `resolve`.
         law: likewise.
-        periodic: the periodic axes of the box.
-        smooth: whether walls are without friction.
 
     Raises:
         ValueError: if there is no such backend.
@@ -91,13 +89,7 @@ def name(backend: str, law: FrictionLaw, periodic: PeriodicAxes = WALLS, smooth:
     _require_known(backend)
     if backend != "auto":
         return cast(Backend, backend)
-    return resolve(backend, "double", law).name if smooth or rubs(law, periodic) else "jax"
-
-
-def rubs(law: FrictionLaw, periodic: PeriodicAxes) -> bool:
-    """Whether the native backend has walls with friction, for a law and in a box, on JAX's default device."""
-    entry = entry_of(law)
-    return entry is not None and not entry.layered and not any(periodic) and get_backend().platform == "cpu"
+    return resolve(backend, "double", law).name
 
 
 def _require_known(backend: str) -> None:

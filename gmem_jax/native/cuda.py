@@ -148,14 +148,14 @@ def is_sound(pairs: Any) -> jax.Array:
     return count & jnp.all(real | (rows == 2 * capacity))
 
 
-def between_steps(fixed: Any, history: Sequence[Any], grains: int, points: int, kinds: int, lanes: int) -> list[Any]:
+def between_steps(fixed: Any, history: Sequence[Any], grains: int, call: Any, kinds: int, lanes: int) -> list[Any]:
     """Shapes of what the kernels need from one step to the next; see src/cuda/arguments.h.
 
     Args:
         fixed: of the call.
-        history: of the call, leaves [1, P, ..., B].
+        history: of the call, leaves [1, P, ..., B], and [1, 6 S, ..., B] where walls have friction.
         grains: N.
-        points: Q of the Mindlin law, or 0.
+        call: its attributes, `gmem_jax.native.primitives.Call`.
         kinds: one for values, two for values and derivatives.
         lanes: replicas of all entries, L.
     """
@@ -165,11 +165,12 @@ def between_steps(fixed: Any, history: Sequence[Any], grains: int, points: int, 
         return jax.ShapeDtypeStruct((1, *shape, lanes), dtype)
 
     found = [array(kinds, grains, 9), array(kinds, spheres, 3), array(kinds, grains, 4)]
-    found += [array(kinds, spheres, 6), array(kinds, rows, 6), array(rows + spheres, dtype=jnp.uint8)]
+    found += [array(kinds, spheres, 12 if call.rubs else 6), array(kinds, rows, 6)]
+    found += [array(rows + spheres, dtype=jnp.uint8)]
     if kinds == 2:  # where there are values alone, histories are in the results
-        found += [array(kinds, rows, leaf.shape[2]) for leaf in history if leaf.ndim == 4]
-    if points:
-        found += [array(kinds, rows, 6), array(kinds, rows, points, 3), array(rows, dtype=jnp.int32)]
+        found += [array(kinds, *leaf.shape[1:3]) for leaf in history if leaf.ndim == 4]
+    for count in (rows, 6 * spheres)[: 1 + call.rubs if call.points else 0]:
+        found += [array(kinds, count, 6), array(kinds, count, call.points, 3), array(count, dtype=jnp.int32)]
     return found
 
 
@@ -213,7 +214,7 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
                 aliases[argument] = result
     _, grains, _, replicas = arrays.fields[0].shape
     lanes = entries * replicas
-    between = between_steps(fixed, arrays.history, grains, call.points, 2 if slopes else 1, lanes)
+    between = between_steps(fixed, arrays.history, grains, call, 2 if slopes else 1, lanes)
     ffi = jax.ffi.ffi_call(target, [*results, *between], input_output_aliases=aliases)
     found = ffi(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict())
     moved = [leaf.reshape(shape.shape) for leaf, shape in zip(found, shapes, strict=False)]

@@ -28,9 +28,6 @@ from gmem_jax.native import cuda
 from gmem_jax.physics.step import mark_varying
 
 TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint")
-NO_RUBBING = (
-    "the native backend has no walls with friction in periodic boxes, of law M2 and on GPUs; use backend='auto'"
-)
 
 
 class Call(NamedTuple):
@@ -305,22 +302,9 @@ def _primitive(
 
     in_plain_jax = mlir.lower_fun(elsewhere, multiple_results=True)
 
-    def on_cpu(context: mlir.LoweringRuleContext, *values: Any, **static: Any) -> Any:
-        call, adjoint = static["call"], target == "gmem_adjoint"
-        lacking = call.rubs and (call.periodic or call.points)  # which the library has not
-        if lacking and not adjoint and not static["definition"].anywhere:
-            raise NotImplementedError(NO_RUBBING)
-        if lacking:
-            return in_plain_jax(context, *values, **static)
-        return library(context, *values, **static)
-
     def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
         if static["call"].mixed:
             raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
-        if static["call"].rubs:
-            if target in cuda.CUDA_TARGETS and not definition.anywhere:
-                raise NotImplementedError(NO_RUBBING)
-            return in_plain_jax(context, *values, definition=definition, **static)
         if target in cuda.CUDA_TARGETS and not cuda.missing():
             return library(context, *values, on_gpu=True, **static)
         if target in cuda.CUDA_TARGETS and not definition.anywhere:
@@ -343,7 +327,7 @@ def _primitive(
     primitive.def_impl(alone)
     primitive.def_abstract_eval(abstract)
     batching.primitive_batchers[primitive] = batch
-    mlir.register_lowering(primitive, on_cpu, platform="cpu")
+    mlir.register_lowering(primitive, library, platform="cpu")
     mlir.register_lowering(primitive, on_cuda, platform="cuda")
     mlir.register_lowering(primitive, on_others)
     # `custom_partitioning` wants to know the devices, and JAX has no public name for saying so.

@@ -9,17 +9,17 @@ namespace cuda {
 namespace {
 
 // Of one thread.
-template <class V, class Law, bool periodic, bool unequal>
+template <class V, class Law, bool periodic, bool unequal, bool rubs>
 void run(GpuKernel kernel, const Arguments& a, int step, int thread) {
   namespace k = gmem::GMEM_ISA;
   switch (kernel) {
     case GpuKernel::enter: return k::enter<V, periodic, unequal>(a, thread);
-    case GpuKernel::remember: return k::remember<V, Law>(a, thread);
-    case GpuKernel::touch: return k::touch<V, Law, periodic, unequal>(a, step, thread);
+    case GpuKernel::remember: return k::remember<V, Law, rubs>(a, thread);
+    case GpuKernel::touch: return k::touch<V, Law, periodic, unequal, rubs>(a, step, thread);
     case GpuKernel::move:  // in the order of its sum it is the same
-    case GpuKernel::move_alone: return k::move_alone<V, periodic, unequal>(a, step, thread);
+    case GpuKernel::move_alone: return k::move_alone<V, periodic, unequal, rubs>(a, step, thread);
     case GpuKernel::collect: return k::collect<V>(a, step, thread);
-    case GpuKernel::leave: return k::leave<V, Law>(a, thread);
+    case GpuKernel::leave: return k::leave<V, Law, rubs>(a, thread);
   }
 }
 
@@ -30,8 +30,9 @@ Run run_of(const Which& which) {
     using L = decltype(law);
     const auto of_numbers = [&](auto number) -> Run {
       using V = decltype(number);
-      if (which.periodic) return which.unequal ? run<V, L, true, true> : run<V, L, true, false>;
-      return which.unequal ? run<V, L, false, true> : run<V, L, false, false>;
+      if (which.unequal) return which.periodic || which.rubs ? nullptr : run<V, L, false, true, false>;  // not tested
+      if (which.periodic) return which.rubs ? run<V, L, true, false, true> : run<V, L, true, false, false>;
+      return which.rubs ? run<V, L, false, false, true> : run<V, L, false, false, false>;
     };
     return which.task == Task::forward ? of_numbers(double{}) : of_numbers(gmem::GMEM_ISA::Dual<double>{});
   });

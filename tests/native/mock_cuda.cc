@@ -128,7 +128,7 @@ bool identify(const char* image, Which& which) {
     const bool tangent = name.find("-tangent") != std::string::npos;
     which = {static_cast<gmem::Law>(name[law + 4] - '0'), static_cast<gmem::Variant>(name[law + 5] - '0'),
              tangent ? gmem::Task::tangent : gmem::Task::forward, name.find("-periodic") != std::string::npos,
-             name.find("-unequal") != std::string::npos};
+             name.find("-unequal") != std::string::npos, name.find("-rubs") != std::string::npos};
     return true;
   }
   return false;

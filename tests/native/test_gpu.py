@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import export
-from scenes import PERIODIC_XY_27, SPREAD_27, assert_close, scene
+from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, assert_close, scene
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -95,14 +95,20 @@ def thrown(
     system = replace(system, clump=replace(system.clump, mass=system.clump.mass * spread))
     numbers = 0.3 * spread, 0.01 * (1.0 - spread)
     call, fixed, cell = call_of(system, periodic), fixed_of(system), state.cell
-    fields, history = jax.tree.leaves(grains), jax.tree.leaves(state.history)
+    fields, history = jax.tree.leaves(grains), jax.tree.leaves((state.history, state.wall_history))
     for begun in range(0, ago + 1, 10):
         boxes = walls(begun, lower, upper, speed, periodic)
-        arrays = arrays_of(system, grains, state.history, boxes, numbers, cell)._replace(fields=fields, history=history)
+        arrays = arrays_of(system, grains, state.history, boxes, numbers, cell, state.wall_history)
+        arrays = arrays._replace(fields=fields, history=history)
         if begun < ago:
             fields, _, history = emulate(call, fixed, arrays)
             cell = jax.tree.map(lambda leaf: leaf[-1], boxes) if any(periodic) else None
-    return call, fixed, arrays, PlainDefinition.of(system, state.history, periodic=periodic)
+    return (
+        call,
+        fixed,
+        arrays,
+        PlainDefinition.of(system, state.history, periodic=periodic, wall_history=state.wall_history),
+    )
 
 
 @functools.cache
@@ -149,11 +155,11 @@ def emulate_tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> 
     return primitives._results(arrays, found[: len(shapes)])
 
 
-def few(law: str, file: Path) -> Scene:
+def few(law: str, file: Path, wall_mu: float | None = None) -> Scene:
     """27 grains of a file; where they differ in size, their spheres do so, too."""
     pack = gm.load_pack(file)
     clump = pack.clump if pack.clump.equal else replace(pack.clump, radii=jnp.asarray([1.0, 0.98, 0.96, 1.0]))
-    system = System(clump, LAWS[law], pack.pairs)
+    system = System(clump, LAWS[law], pack.pairs, wall_mu=wall_mu)
     state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
     return thrown(system, state, pack.lower, pack.upper, periodic=pack.box.periodic)
 
@@ -163,6 +169,9 @@ SCENES |= {"spheres": spheres}
 # Grains between walls along z alone, whose contacts go through the faces of the box; and grains of many sizes.
 SCENES |= {f"periodic-{law}": functools.partial(few, law, PERIODIC_XY_27) for law in ("H", "M1")}
 SCENES |= {f"spread-{law}": functools.partial(few, law, SPREAD_27) for law in ("H", "M1", "M2-averaged")}
+# Between walls with friction.
+SCENES |= {f"rough-{law}": functools.partial(few, law, TETRA_27, 0.2) for law in ("M1", "M2-averaged")}
+SCENES |= {"rough-periodic": functools.partial(few, "H", PERIODIC_XY_27, 0.2)}
 SLOW_SCENES = ("frictionless", "M1", "M2-averaged")  # between others that say as much
 
 

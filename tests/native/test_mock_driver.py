@@ -30,7 +30,7 @@ from gmem_jax.native import build, cuda, library, primitives
 from gmem_jax.native.march import arrays_of, call_of, fixed_of
 from gmem_jax.native.primitives import Arrays, Call, Fixed
 from gmem_jax.physics.state import Box, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import System, start, wall_histories
 
 REPLICAS, STEPS = 3, 3
 QUICKLY = {"xla_backend_optimization_level": 0}  # for programs that run once
@@ -44,6 +44,8 @@ PERIODIC = "H in a box that is periodic along two axes"
 SPREAD = "H between grains of many sizes"
 FILES = {PERIODIC: PERIODIC_XY_27, SPREAD: SPREAD_27}
 LAWS |= dict.fromkeys(FILES, LAWS["H"])
+ROUGH = "M2-exact between walls with friction"
+LAWS |= {ROUGH: LAWS["M2-exact"]}
 Parts = tuple[Call, Fixed, Arrays, Arrays]
 
 
@@ -100,7 +102,7 @@ def at_rest(path: Path) -> tuple[Any, Any]:
 def parts_of(name: str) -> Parts:
     """Grains that fly and spin into each other, each replica at its own speed; and a direction."""
     pack, state = at_rest(FILES.get(name, TETRA_27))
-    system = System(pack.clump, LAWS[name], pack.pairs)
+    system = System(pack.clump, LAWS[name], pack.pairs, wall_mu=0.2 if name == ROUGH else None)
     draws = np.random.default_rng(0)
     scale = 5e-3 * np.linspace(0.5, 1.0, REPLICAS)
     velocity, spin = (scale * draws.normal(size=(pack.grains, 3, 1)) for _ in range(2))
@@ -110,7 +112,8 @@ def parts_of(name: str) -> Parts:
     grains = replace(replicate(state, REPLICAS).grains, velocity=velocity, spin=spin)
     history = system.friction.init(pack.pairs.capacity, REPLICAS, np.dtype(float))
     numbers = jnp.asarray(0.3), jnp.asarray(0.01)
-    arrays = jax.tree.map(jnp.asarray, arrays_of(system, grains, history, box, numbers, state.cell))
+    at_walls = wall_histories(system, REPLICAS, pack.grains)
+    arrays = jax.tree.map(jnp.asarray, arrays_of(system, grains, history, box, numbers, state.cell, at_walls))
     along = jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), arrays)
     return call_of(system, pack.box.periodic), fixed_of(system), arrays, along
 

@@ -29,12 +29,12 @@ STEPS = 40
 Scene = tuple[System, Any, Box]
 
 
-def thrown(law: str, replicas: int, isotropic: bool = True) -> Scene:
+def thrown(law: str, replicas: int, isotropic: bool = True, wall_mu: float | None = None) -> Scene:
     """A pack in a box that closes, each grain with a velocity and a spin of its own in every replica."""
     clump = replace(PACK.clump, isotropic=isotropic)
     if not isotropic:
         clump = replace(clump, inertia=clump.inertia * jnp.asarray([0.8, 1.0, 1.3]))
-    system = System(clump, LAWS[law], PACK.pairs)
+    system = System(clump, LAWS[law], PACK.pairs, wall_mu=wall_mu)
     state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
     draws = 5e-3 * np.random.default_rng(0).normal(size=(2, PACK.grains, 3, 1)) * np.linspace(1.0, 0.5, replicas)
     state = replicate(state, replicas)
@@ -49,7 +49,7 @@ def thrown(law: str, replicas: int, isotropic: bool = True) -> Scene:
 def moved(system: System, state: Any, boxes: Box) -> Any:
     """Grains, history and pressures after all steps."""
     found, pressure = march(system, state, boxes, 0.3, 0.01)
-    return found.grains, found.history, pressure
+    return found.grains, found.history, found.wall_history, pressure
 
 
 @jax.jit
@@ -78,6 +78,13 @@ def test_grains_with_unequal_moments_of_inertia() -> None:
     assert_close(*on_both(moved, lambda: thrown("H", 3, isotropic=False)), 1e-10)
 
 
+@pytest.mark.parametrize("law", ["H", "M1", "M2-averaged"])
+def test_between_walls_with_friction(law: str) -> None:
+    assert_close(*on_both(moved, lambda: thrown(law, 5, wall_mu=0.2)), 1e-10)
+    along = jnp.asarray(np.random.default_rng(1).normal(size=(STEPS, 3, 5)))
+    assert_close(*on_both(slopes, lambda: (*thrown(law, 5, wall_mu=0.2), along)), 1e-9)
+
+
 @pytest.mark.parametrize("law", ["H", "M2-averaged"])
 def test_a_replica_has_the_same_bits_alone_and_among_many(law: str) -> None:
     # Alone, several threads share the contacts of a grain; of 512 replicas (166,400 grains) each has one.
@@ -93,7 +100,7 @@ def test_a_list_that_leads_nowhere_gives_no_numbers() -> None:
     system, state, boxes = thrown("H", 3)
     for field, place, wrong in (("incidence", (5, 0), 10**8), ("second", (3,), 10**6), ("incidence", (5, 0), -7)):
         pairs = replace(PACK.pairs, **{field: getattr(PACK.pairs, field).at[place].set(wrong)})
-        grains, _, _ = moved(replace(system, pairs=pairs), state, boxes)
+        grains, *_ = moved(replace(system, pairs=pairs), state, boxes)
         assert np.all(np.isnan(np.asarray(grains.position)))
 
 

@@ -97,8 +97,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   require(!(periodic || unequal) || !problem.mixed, "in a periodic box, and of unequal spheres, there is no mixed precision");
   require(!problem.mixed || (task == Task::forward && !is_layered(problem.law)),
           "there is no mixed precision for derivatives and the Mindlin law");
-  require(!rubs || (!periodic && !problem.mixed && !is_layered(problem.law)),
-          "of walls with friction there are neither mixed precision, periodic boxes nor the Mindlin law");
+  require(!(rubs && problem.mixed), "at walls with friction there is no mixed precision");
   const Signature wanted = signature(task, problem.law, problem.rubs);
   require(static_cast<std::size_t>(leaves) == histories(problem.law).size() && args.size() == wanted.arguments.size() &&
               rets.size() == wanted.results.size(),

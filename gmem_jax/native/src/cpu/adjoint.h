@@ -82,7 +82,9 @@ struct AdjointLayout {
   // Where walls have friction, of what is remembered of them: at the beginning of each step, and which of it is not 0.
   V* wall_history;        // [steps, N, wall_rows, kHistory]
   unsigned char* planes;  // [steps, S], bits
-  V* wall_history_bar;    // [N, wall_rows, kHistory]
+  V* wall_history_bar;    // [N, wall_rows, kHistory and the forces of Mindlin's segments, 2 Q]
+  V* rubbed_bar;          // [N, 3], in periodic boxes: of `rubbed`
+  Trace<V>* wall_trace;   // [steps]: of Mindlin's segments at walls, [N, wall_rows, ...]
 
   // Numbers in the history of a contact.
   static int remembered(const Problem& p) { return Law::kHistory + (Law::kLayered ? 2 * p.points : 0); }
@@ -124,10 +126,18 @@ struct AdjointLayout {
     faces = arena.take<V>(general ? steps * 6 : 0);
     domain_cell_bar = arena.take<V>(general ? static_cast<std::size_t>(plan.domains) * kCellNumbers : 0);
     chunk_cell_bar = arena.take<V>(general ? chunks * 2 * kCellNumbers : 0);
-    const std::size_t remembered_of_walls = p.rubs ? grains * p.wall_rows() * Law::kHistory : 0;
-    wall_history = arena.take<V>(steps * remembered_of_walls);
+    wall_history = arena.take<V>(p.rubs ? steps * grains * p.wall_rows() * Law::kHistory : 0);
     planes = arena.take<unsigned char>(p.rubs ? steps * p.spheres() : 0);
-    wall_history_bar = arena.take<V>(remembered_of_walls);
+    const std::size_t wall_rows = p.rubs ? grains * p.wall_rows() : 0, rings = Law::kLayered ? p.points : 0;
+    wall_history_bar = arena.take<V>(wall_rows * remembered(p));
+    rubbed_bar = arena.take<V>(p.rubs && p.periodic ? grains * 3 : 0);
+    wall_trace = arena.take<Trace<V>>(Law::kLayered && p.rubs ? steps : 0);
+    for (std::size_t step = 0; Law::kLayered && p.rubs && step < steps; ++step) {
+      Trace<V> t;
+      t.segment = arena.take<Segment<V>>(wall_rows * rings);
+      t.segments = arena.take<int>(wall_rows);
+      if (fills) wall_trace[step] = t;
+    }
   }
 };
 
@@ -137,7 +147,7 @@ struct Adjoint : AdjointLayout<Law> {
   using Layout::state, Layout::total, Layout::trace, Layout::state_bar, Layout::mid_bar, Layout::sphere_bar;
   using Layout::remote_bar, Layout::history_bar, Layout::has_bar, Layout::domain_bar;
   using Layout::chunk_bar, Layout::wall_bar, Layout::faces, Layout::domain_cell_bar, Layout::chunk_cell_bar;
-  using Layout::wall_history, Layout::planes, Layout::wall_history_bar;
+  using Layout::wall_history, Layout::planes, Layout::wall_history_bar, Layout::rubbed_bar, Layout::wall_trace;
   using Layout::remembered, Layout::chunk_rows, Layout::mass_row;
   using V = Real;
   using Forward = Engine<Replicas<Law, Real>>;
@@ -204,11 +214,12 @@ struct Adjoint : AdjointLayout<Law> {
   V* state_of(int step, int u) const { return of_grain(state + static_cast<std::size_t>(step) * problem.grains * kState, u, kState); }
   V* total_of(int step, int u) const { return of_grain(total + static_cast<std::size_t>(step) * problem.grains * 6, u, 6); }
 
-  // What sphere k of grain u remembers of plane w, among the histories of all that begin at `histories`.
-  V* at_plane(V* histories, int u, int k, int w) const {
-    const std::size_t row = static_cast<std::size_t>(u) * problem.wall_rows() + static_cast<std::size_t>(kPlanes) * k + w;
-    return histories + row * Law::kHistory;
+  // What sphere k of grain u remembers of plane w, among the histories of all that begin at `histories`; and its bars.
+  std::size_t plane_row(int u, int k, int w) const {
+    return static_cast<std::size_t>(u) * problem.wall_rows() + static_cast<std::size_t>(kPlanes) * k + w;
   }
+  V* at_plane(V* histories, int u, int k, int w) const { return histories + plane_row(u, k, w) * Law::kHistory; }
+  V* bar_at_plane(int u, int k, int w) const { return wall_history_bar + plane_row(u, k, w) * remembered(problem); }
   V* wall_history_at(int step) const {
     return wall_history + static_cast<std::size_t>(step) * problem.grains * problem.wall_rows() * Law::kHistory;
   }
@@ -230,6 +241,7 @@ struct Adjoint : AdjointLayout<Law> {
     move_state(u, state_of(step, u), [](V& kept, V now) { kept = now; });
     for_planes(u, [&](int k, int w, const KnownPlanes& known) {
       planes_of(step, u, k) = known.now;
+      if constexpr (Law::kLayered) wall_trace[step].segments[plane_row(u, k, w)] = -1;
       if (!(known.now >> w & 1)) return;
       std::copy_n(at_plane(forward.wall_history, u, k, w), Law::kHistory, at_plane(wall_history_at(step), u, k, w));
     });
@@ -246,6 +258,23 @@ struct Adjoint : AdjointLayout<Law> {
       if (known.now >> w & 1) std::copy_n(at_plane(wall_history_at(step), u, k, w), Law::kHistory, now);
       else if (known.ever >> w & 1) std::fill_n(now, Law::kHistory, V{});
     });
+    restore_segments(step, u);
+  }
+
+  // Mindlin's segments of grain u at walls, as they were before a step changed them.
+  void restore_segments(int step, int u) const {
+    if constexpr (Law::kLayered)
+      for_planes(u, [&](int k, int w, const KnownPlanes&) {
+        const std::size_t row = plane_row(u, k, w);
+        const int before = wall_trace[step].segments[row];
+        StoredSegments<V> segments = forward.wall_segments_of(row);
+        for (int n = 0; n < before; ++n) segments.set(n, wall_trace[step].segment[row * problem.points + n]);
+        if (before >= 0) *segments.stored = before;
+      });
+  }
+
+  void trace_walls(int step) {
+    if (Law::kLayered && problem.rubs) forward.trace = wall_trace[step];
   }
 
   // --- forwards
@@ -255,6 +284,7 @@ struct Adjoint : AdjointLayout<Law> {
     for (int step = 0; step < steps; ++step) {
       for_grains([&](int u) { keep(step, u); });
       team.barrier();
+      trace_walls(step);
       forward.grains(false, true, step);
       forward.mode.trace = trace[step];
       forward.contacts();
@@ -306,10 +336,8 @@ struct Adjoint : AdjointLayout<Law> {
   template <class Each>
   void for_wall_history(int u, const Each& each) const {
     for_planes(u, [&](int k, int w, const KnownPlanes&) {
-      for (int q = 0; q < Law::kGiven; ++q) {
-        const Place place = forward.mode.wall_place(u, kPlanes * k + w, q);
-        each(place.leaf, place.row, at_plane(wall_history_bar, u, k, w)[q]);
-      }
+      for_history(forward.mode.wall_row(u, kPlanes * k + w),
+                  [&](int leaf, std::ptrdiff_t row, int q) { each(leaf, row, bar_at_plane(u, k, w)[q]); });
     });
   }
 
@@ -319,6 +347,11 @@ struct Adjoint : AdjointLayout<Law> {
         const auto array = [leaf](const Lane& lane) { return lane.wall_history_in[leaf]; };
         bar = forward.mode.read_lanes(block.slopes, adjacent, array, row);
       });
+      if constexpr (Law::kLayered)
+        for_planes(u, [&](int k, int w, const KnownPlanes&) {
+          const std::size_t row = plane_row(u, k, w);
+          to_layers(bar_at_plane(u, k, w), forward.wall_segments_of(row), forward.wall_outermost(row));
+        });
       for_fields(u, [&](int f, std::ptrdiff_t row, int number) {
         of_grain(state_bar, u, kState)[number] =
             forward.mode.read_lanes(block.slopes, adjacent, [f](const Lane& lane) { return lane.grains_in[f]; }, row);
@@ -331,8 +364,11 @@ struct Adjoint : AdjointLayout<Law> {
       });
     const int first = forward.share_begin(plan.candidates);
     std::fill_n(has_bar + first, forward.share_begin(plan.candidates, 1) - first, true);
-    if constexpr (Law::kLayered)
-      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c) to_layers(c);
+    if constexpr (Law::kLayered) {
+      const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
+      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
+        to_layers(history_of(c), forward.mode.segments_of(c), forward.mode.outermost(c, law));
+    }
     if (rank == 0) {
       std::memset(domain_bar, 0, sizeof(V) * plan.domains * (kParameters + kLawNumbers));
       std::memset(chunk_bar, 0, sizeof(V) * chunks() * chunk_rows(problem));
@@ -340,13 +376,10 @@ struct Adjoint : AdjointLayout<Law> {
     team.barrier();
   }
 
-  // From the bars of rings to those of the layers and segments that they are in at the end.
-  void to_layers(std::size_t c) {
-    const StoredSegments<V> segments = forward.mode.segments_of(c);
-    const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
-    const V outer = forward.mode.outermost(c, law);
-    V *layers = history_of(c) + kLayers, *ring = history_of(c) + Law::kHistory;
-    for (int q = kLayers; q < Law::kHistory; ++q) history_of(c)[q] = V{};
+  // From the bars of rings to those of the layers and segments that they are in at the end, in the bars of one history.
+  void to_layers(V* history, const StoredSegments<V>& segments, V outer) {
+    V *layers = history + kLayers, *ring = history + Law::kHistory;
+    for (int q = kLayers; q < Law::kHistory; ++q) history[q] = V{};
     for (int l = 0; l < W; ++l)
       for (int k = 0, j = 0; j < problem.points; ++j) {
         if (k + 1 < segments.count() && segments.get(k + 1).start[l] <= j) ++k;
@@ -359,14 +392,15 @@ struct Adjoint : AdjointLayout<Law> {
       }
   }
 
-  // From the bars of layers and segments at the beginning, when each ring is a segment, to those of the rings.
-  void to_rings(std::size_t c) {
+  // From the bars of layers and segments at the beginning, when each ring is a segment, to those of the rings; of the history in
+  // `row`, of contacts between grains or with walls.
+  void to_rings(V* history, std::ptrdiff_t row, const double* const (Lane::*histories)[kMaxHistory]) {
     const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
-    const Place place = place_of<Law>(plan.candidate[c].row, kLastOverlap);
-    const V overlap = forward.mode.read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row);
+    const Place place = place_of<Law>(row, kLastOverlap);
+    const V overlap = forward.mode.read([&](const Lane& lane) { return (lane.*histories)[place.leaf]; }, place.row);
     const V outer = Reach<V, Law::variant>(overlap, law, last_ring).outer;
-    const V *layers = history_of(c) + kLayers;
-    V* ring = history_of(c) + Law::kHistory;
+    const V* layers = history + kLayers;
+    V* ring = history + Law::kHistory;
     for (int j = 0; j < problem.points; ++j) {
       const V at = splat<V>(j), weight = splat<V>(j == 0 ? 1.0 - kLacking<Law::variant> : 1.0);
       for (int axis = 0; axis < 2; ++axis) {
@@ -378,6 +412,10 @@ struct Adjoint : AdjointLayout<Law> {
 
   void unload_bars() {
     for_grains([&](int u) {
+      if constexpr (Law::kLayered)
+        for_planes(u, [&](int k, int w, const KnownPlanes&) {
+          to_rings(bar_at_plane(u, k, w), forward.mode.wall_row(u, kPlanes * k + w), &Lane::wall_history_in);
+        });
       for_wall_history(u, [&](int leaf, std::ptrdiff_t row, V bar) {
         write([leaf](const Lane& lane) { return lane.wall_history_out[leaf]; }, row, bar);
       });
@@ -386,7 +424,8 @@ struct Adjoint : AdjointLayout<Law> {
       });
     });
     if constexpr (Law::kLayered)
-      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c) to_rings(c);
+      for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
+        to_rings(history_of(c), plan.candidate[c].row, &Lane::history_in);
     for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
       for_history(plan.candidate[c].row, [&](int leaf, std::ptrdiff_t row, int q) {
         write([leaf](const Lane& lane) { return lane.history_out[leaf]; }, row, history_of(c)[q]);
@@ -456,8 +495,12 @@ struct Adjoint : AdjointLayout<Law> {
       if (general) {
         const Size size = plan.size ? plan.size[u] : Size{1.0, 1.0, 1.0, 1.0, 1.0};
         const V power[] = {splat<V>(size.cube), splat<V>(size.inverse_cube), splat<V>(size.fifth), splat<V>(size.inverse_fifth)};
-        const V* in[] = {mid, grain_numbers, cell_numbers, forward.parameter + kMass, power};
-        V* bar[] = {of_grain(mid_bar, u, kMid), of_chunk(chunk), cell_bar_of_chunk(chunk), of_chunk(chunk) + mass_row(problem)};
+        V nothing[3] = {}, unused[3];
+        const bool rubs = problem.rubs && problem.periodic;
+        const V* in[] = {mid, grain_numbers, cell_numbers, forward.parameter + kMass, power,
+                         rubs ? of_grain(forward.rubbed, u, 3) : nothing};
+        V* bar[] = {of_grain(mid_bar, u, kMid), of_chunk(chunk), cell_bar_of_chunk(chunk), of_chunk(chunk) + mass_row(problem),
+                    nullptr, rubs ? of_grain(rubbed_bar, u, 3) : unused};
         V result_bar[kState + 3];
         std::copy_n(of_grain(state_bar, u, kState), kState, result_bar);
         std::copy_n(faces_bar, 3, result_bar + kState);
@@ -615,23 +658,18 @@ struct Adjoint : AdjointLayout<Law> {
                               leaf(m.velocity),   leaf(m.spin_one),  leaf(m.spin_other)};
     Taped memory[Law::kHistory + 1];
     for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(history[q]);
-    std::vector<Segment<Taped>> now;
     const int leaves = recorded.mark().slots, before = seen.segments[c];
-    for (int k = 0; k < before; ++k) {
-      const Segment<V>& segment = seen.segment[c * problem.points + k];
-      now.push_back({{leaf(segment.force.along), leaf(segment.force.across)}, constant(segment.start)});
-    }
+    std::vector<Segment<Taped>> now = taped(seen.segment + c * problem.points, before);
     V constants[kContactConstants];
     load_constants(c, constants);
     const Vec<V> image = load_vec(constants + kImage);
     const Vec<Taped> taped_image{constant(image.x), constant(image.y), constant(image.z)};
     if (general) move_to_image(input, taped_image, taped_cell);
-    const Unequal<Taped> unequal{constant(constants[kReach]), constant(constants[kLean]), constant(constants[kRoot]),
-                                 input.spin_other - input.spin_one};
+    const Unequal<Taped> unequal{constant(constants[kReach]), constant(constants[kLean]), constant(constants[kRoot])};
     Contact<Taped> contact;
     contact.history = memory;
     relative_motion(input, dot(input.separation, input.separation), contact);
-    general ? close<true>(&contact, 1, parameter.row, &unequal) : close(&contact, 1, parameter.row);
+    general ? close<true>(&contact, 1, parameter.row, &unequal, [&](int) { return input; }) : close(&contact, 1, parameter.row);
     rub<Law>(&contact, 1, law, general ? &unequal : nullptr, [&](int) { return Segments{problem.points, &now}; });
 
     const ContactLoads<Taped> found = push(contact);
@@ -648,20 +686,35 @@ struct Adjoint : AdjointLayout<Law> {
       for_numbers(a, [&](Taped number) { seed_moving(number, *from++); });
     for (int q = 0; q < Law::kHistory; ++q) seed_moving(memory[q], *from++);
     for (Taped number : {through.x, through.y, through.z}) seed_moving(number, *from++);
-    V *const bar = history_of(c), *const of_segments = bar + Law::kHistory;
-    for (std::size_t k = 0; k < now.size(); ++k) {
-      seed_moving(now[k].force.along, of_segments[2 * k]);
-      seed_moving(now[k].force.across, of_segments[2 * k + 1]);
-    }
+    V* const bar = history_of(c);
+    seed_segments(now, bar + Law::kHistory, moves);
     recorded.reverse({});
 
     parameter.add_bars(of_domain(domain));
     for (int q = 0; general && q < kCellNumbers; ++q) cell_bar_of_domain(domain)[q] += recorded.bar(of_cell + q);
     for (int q = 0; q < kInputs + Law::kHistory; ++q) own_bar[q] = select(moves, recorded.bar(first + q), own_bar[q]);
     std::copy_n(own_bar + kInputs, Law::kHistory, bar);
-    for (int q = 0; q < 2 * problem.points; ++q)
-      of_segments[q] = select(moves, q < 2 * before ? recorded.bar(leaves + q) : V{}, of_segments[q]);
+    take_segments(leaves, before, moves, bar + Law::kHistory);
     share_out(pair, load_numbers<ContactInput<V>>(own_bar));
+  }
+
+  // Mindlin's segments on the tape, the bars of those that the law left, and those of the former ones: their forces are `leaves`
+  // on the tape; in the lanes that `move`.
+  static std::vector<Segment<Taped>> taped(const Segment<V>* seen, int count) {
+    std::vector<Segment<Taped>> all;
+    for (int k = 0; k < count; ++k)
+      all.push_back({{leaf(seen[k].force.along), leaf(seen[k].force.across)}, constant(seen[k].start)});
+    return all;
+  }
+  static void seed_segments(const std::vector<Segment<Taped>>& now, const V* bar, Bits moves) {
+    for (std::size_t k = 0; k < now.size(); ++k) {
+      seed(now[k].force.along, zero_unless(moves, bar[2 * k]));
+      seed(now[k].force.across, zero_unless(moves, bar[2 * k + 1]));
+    }
+  }
+  void take_segments(int leaves, int before, Bits moves, V* bar) {
+    for (int q = 0; q < 2 * problem.points; ++q)
+      bar[q] = select(moves, q < 2 * before ? recorded.bar(leaves + q) : V{}, bar[q]);
   }
 
   // Whether a contact comes to another ring as its overlap changes from one value to another.
@@ -747,31 +800,75 @@ struct Adjoint : AdjointLayout<Law> {
   }
 
   // Friction of the walls on grain u, of which the forward steps know which planes it touched in this step.
-  void friction_back(int step, int u, int chunk, const V* turned, const V* walls, V* turned_bar, V* of_walls) const {
-    if constexpr (!Law::kLayered) {
-      for_planes(u, [&](int k, int w, const KnownPlanes& known) {
-        V* const history_bar = at_plane(wall_history_bar, u, k, w);
-        if (!(known.now >> w & 1)) return void(std::fill_n(history_bar, Law::kHistory, V{}));
-        V body[3], history[Law::kHistory + 1] = {}, result_bar[OnePlane<Law, 0>::kResults];
-        store_vec(body, body_at<V>(block.pack->offsets + 3 * k));
-        if (planes_of(step, u, k) >> w & 1) std::copy_n(at_plane(wall_history_at(step), u, k, w), Law::kHistory, history);
-        std::copy_n(of_grain(mid_bar, u, kMid) + kMidForce, 6, result_bar);
-        std::copy_n(history_bar, Law::kHistory, result_bar + 6);
-        V constants[kSphereConstants];
-        load_constants(u, k, constants);
-        V* const of = of_chunk(chunk);
-        const V* in[] = {turned, grain_numbers, body, walls, constants, history, wall_law_numbers};
-        V* bar[] = {turned_bar, of, of + kGrainNumbers + 3 * k, of_walls, nullptr, history_bar, of + mass_row(problem) + 1};
-        switch (w) {
-          case 0: return pull_back<OnePlane<Law, 0>>(in, result_bar, bar);
-          case 1: return pull_back<OnePlane<Law, 1>>(in, result_bar, bar);
-          case 2: return pull_back<OnePlane<Law, 2>>(in, result_bar, bar);
-          case 3: return pull_back<OnePlane<Law, 3>>(in, result_bar, bar);
-          case 4: return pull_back<OnePlane<Law, 4>>(in, result_bar, bar);
-          default: return pull_back<OnePlane<Law, 5>>(in, result_bar, bar);
-        }
-      });
-    }
+  void friction_back(int step, int u, int chunk, const V* turned, const V* walls, V* turned_bar, V* of_walls) {
+    for_planes(u, [&](int k, int w, const KnownPlanes& known) {
+      V* const history_bar = bar_at_plane(u, k, w);
+      if (!(known.now >> w & 1)) return void(std::fill_n(history_bar, remembered(problem), V{}));
+      V body[3], history[Law::kHistory + 1] = {}, result_bar[OnePlane<Law>::kResults], constants[kPlaneConstants];
+      store_vec(body, body_at<V>(block.pack->offsets + 3 * k));
+      if (planes_of(step, u, k) >> w & 1) std::copy_n(at_plane(wall_history_at(step), u, k, w), Law::kHistory, history);
+      std::copy_n(of_grain(mid_bar, u, kMid) + kMidForce, 6, result_bar);
+      if (problem.periodic) add_vec(result_bar, load_vec(of_grain(rubbed_bar, u, 3)));
+      std::copy_n(history_bar, Law::kHistory, result_bar + 6);
+      load_constants(u, k, constants);
+      store_vec(constants + kNormal, normal_of_plane<V>(w));
+      V* const of = of_chunk(chunk);
+      const V* in[] = {turned, grain_numbers, body, walls + w, constants, history, wall_law_numbers, &last_ring};
+      V* bar[] = {turned_bar, of, of + kGrainNumbers + 3 * k, of_walls + w, nullptr, history_bar, of + mass_row(problem) + 1};
+      if constexpr (Law::kLayered) {
+        const std::size_t row = plane_row(u, k, w);
+        const int before = wall_trace[step].segments[row];
+        if (before >= 0) return plane_rings_back(in, result_bar, bar, wall_trace[step].segment + row * problem.points, before);
+      }
+      pull_back<OnePlane<Law>>(in, result_bar, bar);
+    });
+  }
+
+  // As `rings_back`, of a sphere at a plane; arguments as of `pull_back`.
+  void plane_rings_back(const V* const* in, const V* result_bar, V* const* bar, const Segment<V>* seen, int before) {
+    recorded.clear();
+    const int first = recorded.mark().slots;
+    const auto leaves_of = [](auto numbers, const V* from) {
+      for_numbers(numbers, [&](Taped& number) { number = leaf(*from++); });
+      return numbers;
+    };
+    const auto half = leaves_of(HalfStep<Taped>{}, in[0]);
+    const auto rotation = leaves_of(Matrix<Taped>{}, in[0] + kTurnedRotation);
+    const auto parameters = leaves_of(GrainParameters<Taped>{}, in[1]);
+    const auto body = leaves_of(Vec<Taped>{}, in[2]);
+    const Taped at = leaf(in[3][0]), moves_at = leaf(in[3][kPlanes]);
+    const auto walls = leaves_of(WallLaw<Taped>{}, in[6]);
+    const Taped size = constant(in[4][kSize]), radius = constant(in[4][kRadius]);
+    const Vec<V> along = load_vec(in[4] + kNormal);
+    const Vec<Taped> normal{constant(along.x), constant(along.y), constant(along.z)};
+    const int own = recorded.mark().slots;
+    Taped memory[Law::kHistory + 1];
+    for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(in[5][q]);
+    const int leaves = recorded.mark().slots;
+    std::vector<Segment<Taped>> now = taped(seen, before);
+    Contact<Taped> contact;
+    const auto on = rub_plane<Law>(half, rotation, size * body, radius, root(radius) * parameters.wall_stiffness,
+                                   parameters.normal_damping, at, moves_at, normal, walls, memory,
+                                   [&](int) { return Segments{problem.points, &now}; }, contact);
+    const Bits moves = changes_ring(in[5][kLastOverlap], contact.overlap.value);
+    V others[OnePlane<Law>::kResults], *const of_segments = bar[5] + Law::kHistory;
+    for (int r = 0; r < OnePlane<Law>::kResults; ++r) others[r] = zero_unless(~moves, result_bar[r]);
+    pull_back<OnePlane<Law>>(in, others, bar);
+
+    const V* from = result_bar;
+    for (Vec<Taped> a : {on.force, on.torque})
+      for_numbers(a, [&](Taped number) { seed(number, zero_unless(moves, *from++)); });
+    for (int q = 0; q < Law::kHistory; ++q) seed(memory[q], zero_unless(moves, *from++));
+    seed_segments(now, of_segments, moves);
+    recorded.reverse({});
+    int slot = first;
+    const auto add_bars = [&](V* to, int count) {
+      for (int q = 0; q < count; ++q) to[q] += recorded.bar(slot++);
+    };
+    add_bars(bar[0], kTurned), add_bars(bar[1], kGrainNumbers), add_bars(bar[2], 3);
+    add_bars(bar[3], 1), add_bars(bar[3] + kPlanes, 1), add_bars(bar[6], kWallLawNumbers);
+    for (int q = 0; q < Law::kHistory; ++q) bar[5][q] = select(moves, recorded.bar(own + q), bar[5][q]);
+    take_segments(leaves, before, moves, of_segments);
   }
 
   void take_remotes(int u, V* bar) {
@@ -788,6 +885,7 @@ struct Adjoint : AdjointLayout<Law> {
     if (general || step + 1 < steps) {  // otherwise the way forward ended midway in the last one
       for_grains([&](int u) { bring_back(step, u); });
       team.barrier();
+      trace_walls(step);
       forward.grains(false, true, step);
     }
     V by_walls[kWalls] = {};
@@ -797,6 +895,7 @@ struct Adjoint : AdjointLayout<Law> {
     for (int domain; team.take(Team::kContacts, rank, &domain);) contacts_back(domain, step);
     team.barrier();
     for_chunks([&](int chunk) { begin_back(chunk, step, on_wall); });
+    for_grains([&](int u) { restore_segments(step, u); });
     if (general && rank == 0) cell_back(step, by_walls);
     for (int row = 0; rank == 0 && row < kWalls; ++row) {
       for (int chunk = 0; chunk < chunks(); ++chunk) by_walls[row] += wall_bar[chunk * kWalls + row];

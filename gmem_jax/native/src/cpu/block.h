@@ -57,6 +57,16 @@ struct KnownPlanes {
   unsigned char now, ever;
 };
 
+// What the histories of the contacts were when a step looked at them; kept where the step is to be gone through backwards.
+template <class V>
+struct Trace {
+  int* touching = nullptr;        // [candidates]: those of each domain that touch, in order, from its first candidate on
+  int* end = nullptr;             // [candidates]: where these end, at the first candidate of each domain
+  V* history = nullptr;           // [candidates, kHistory] of the law: theirs, in the places of `touching`
+  Segment<V>* segment = nullptr;  // [candidates, Q], where a contact came to another ring
+  int* segments = nullptr;        // [candidates]; -1 where it did not
+};
+
 // The memory of an `Engine`.
 template <class Mode>
 struct EngineLayout {
@@ -72,7 +82,10 @@ struct EngineLayout {
   V* through;        // ... and the forces through their faces, [domains, 3]
   V* wall_history;   // of walls with friction, [units, wall_rows, Law::kHistory]
   KnownPlanes* remembered;  // ... what of that is not 0, [units, spheres of a grain]
-  bool* remembers;         // ... whether anything is, [units]
+  bool* remembers;          // ... whether anything is, [units]
+  Segment<V>* wall_segment;  // ... of the Mindlin law, [Q, units, wall_rows]
+  int *wall_segments, *wall_rings;  // ... how many, and as in `Marks`, [units, wall_rows]
+  V* rubbed;                 // what their friction is of the force on a unit in a periodic box, [units, 3]
   typename Mode::Layout of_mode;
 
   void place(const Problem& p, const Block& block, Arena& arena) {
@@ -87,6 +100,11 @@ struct EngineLayout {
     wall_history = arena.take<V>(p.rubs ? units * p.wall_rows() * Mode::OfLaw::kHistory : 0);
     remembered = arena.take<KnownPlanes>(p.rubs ? units * p.spheres_per_grain : 0);
     remembers = arena.take<bool>(p.rubs ? units : 0);
+    const std::size_t layered = p.rubs && Mode::OfLaw::kLayered ? units * p.wall_rows() : 0;
+    wall_segment = arena.take<Segment<V>>(layered * p.points);
+    wall_segments = arena.take<int>(layered);
+    wall_rings = arena.take<int>(layered);
+    rubbed = arena.take<V>(p.rubs && p.periodic ? units * 3 : 0);
     of_mode.place(p, *block.pack->plan, arena);
   }
 };
@@ -97,6 +115,7 @@ struct Engine : EngineLayout<Mode> {
   using V = typename Mode::Number;
   using Layout::hot, Layout::cold, Layout::offsets, Layout::walls, Layout::fastest, Layout::sections, Layout::through, Layout::kNumber;
   using Layout::wall_history, Layout::remembered, Layout::remembers;
+  using Layout::wall_segment, Layout::wall_segments, Layout::wall_rings, Layout::rubbed;
 
   const Problem& problem;
   const Block& block;
@@ -112,6 +131,7 @@ struct Engine : EngineLayout<Mode> {
   double travel = 0.0;  // how much closer any two spheres can have come since the call began
   int current = 0;      // step under way
   bool deforms = false;  // whether the shape of a grain has a derivative
+  Trace<V> trace;        // of contacts with walls: its segments alone, see `Replicas::trace`
 
   Engine(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : problem(problem), block(block), plan(*block.pack->plan), team(team), rank(rank), mode(problem, block) {
@@ -188,10 +208,12 @@ struct Engine : EngineLayout<Mode> {
       return spheres_of(constants, m, offsets, problem.spheres_per_grain, arm, box, on,
                         [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     });
+    WallFriction<V> friction{};
     if (problem.rubs && (near || remembers[u])) {
-      const WallFriction<V> friction = rub(u, m, box);
+      friction = rub(u, m, box);
       on.force = on.force + friction.force, on.torque = on.torque + friction.torque;
     }
+    if (problem.rubs && problem.periodic) store_vec(rubbed + 3 * static_cast<std::size_t>(u), friction.force);
     mode.put_grain(u, m.position, m.velocity, m.spin, on.force, on.torque);
     if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
   }
@@ -210,7 +232,7 @@ struct Engine : EngineLayout<Mode> {
   __attribute__((noinline)) WallFriction<V> rub(int u, HalfStep<V> m, WallState<V> box) {
     using Law = typename Mode::OfLaw;
     WallFriction<V> on{};
-    if constexpr (std::is_same<V, typename Mode::OfContacts>::value && !Law::kLayered) {
+    if constexpr (std::is_same<V, typename Mode::OfContacts>::value) {
       const Matrix<V> rotation = matrix(m.orientation);
       GrainParameters<V> own = constants;
       unsigned any = 0;
@@ -223,13 +245,29 @@ struct Engine : EngineLayout<Mode> {
         const std::size_t first = static_cast<std::size_t>(u) * problem.wall_rows() + static_cast<std::size_t>(kPlanes) * k;
         KnownPlanes& planes = remembered[first / kPlanes];
         const unsigned now = rub_walls<Law>(own, wall_law, m.position + lever, lever, add_cross(m.velocity, m.spin, lever), m.spin,
-                                            box, radius, wall_history + first * Law::kHistory, planes.now, on);
+                                            box, radius, wall_history + first * Law::kHistory, planes.now,
+                                            [&](int w) { return wall_segments_of(first + w); }, on);
         planes = {static_cast<unsigned char>(now), static_cast<unsigned char>(planes.ever | now)};
         any |= now;
       }
       remembers[u] = any != 0;
     }
     return on;
+  }
+
+  // Mindlin's segments in a row of the histories of walls.
+  StoredSegments<V> wall_segments_of(std::size_t row) const {
+    const std::ptrdiff_t rows = static_cast<std::ptrdiff_t>(Mode::units(problem)) * problem.wall_rows();
+    StoredSegments<V> found{wall_segment + row, rows, wall_segments + row, problem.points};
+    if (trace.segments) found.seen = trace.segment + row * problem.points, found.seen_count = trace.segments + row;
+    return found;
+  }
+
+  // The outermost ring in a row of these histories.
+  V wall_outermost(std::size_t row) const {
+    using Law = typename Mode::OfLaw;
+    const V last = splat<V>(problem.points - 2.0);
+    return Reach<V, Law::variant>(wall_history[row * Law::kHistory + kLastOverlap], wall_law.law, last).outer;
   }
 
   // Calls `each` with the rows of unit u in the histories of walls: with the number among those of a grain, and where
@@ -247,19 +285,42 @@ struct Engine : EngineLayout<Mode> {
     for_walls(u, [&](int row, V* numbers, KnownPlanes& planes, int w) {
       bool any = Mode::kDual;  // a derivative may be where the value is 0
       for (int q = 0; q < Mode::OfLaw::kGiven; ++q) {
-        numbers[q] = mode.wall_history_in(u, row, q);
+        numbers[q] = mode.wall_in(u, row, [q](std::ptrdiff_t at) { return place_of<typename Mode::OfLaw>(at, q); });
         any |= (bits_less(numbers[q], V{}) | bits_less(V{}, numbers[q])) != 0;
       }
       if (w == 0) planes = {};
+      if constexpr (Mode::OfLaw::kLayered) load_wall_rings(u, row, numbers);
       if (any) planes.now |= 1u << w, planes.ever |= 1u << w, remembers[u] = true;
     });
+  }
+
+  // ... and Mindlin's rings ...
+  void load_wall_rings(int u, int row, V* numbers) {
+    const std::size_t of_all = static_cast<std::size_t>(u) * problem.wall_rows() + row;
+    const V outer = wall_outermost(of_all);
+    wall_rings[of_all] = rings_of(problem, outer);
+    const auto number = [&](int j, int axis) {
+      return mode.wall_in(u, row, [&](std::ptrdiff_t at) { return ring_place(problem, at, j, axis); });
+    };
+    const auto ring = [&](int j) { return Flat<V>{number(j, 0), number(j, 1)}; };
+    store_layers(numbers + kLayers, wall_segments_of(of_all).load(outer, kLacking<Mode::OfLaw::variant>, mode.apart, ring));
   }
 
   // ... and back.
   void unload_walls(int u, int steps_done) const {
     for_walls(u, [&](int row, const V* numbers, const KnownPlanes& planes, int w) {
       if (problem.history_aliased && !(planes.ever >> w & 1)) return;
-      for (int q = 0; q < Mode::OfLaw::kGiven; ++q) mode.wall_history_out(u, row, q, numbers[q], steps_done);
+      for (int q = 0; q < Mode::OfLaw::kGiven; ++q)
+        mode.wall_out(u, row, [q](std::ptrdiff_t at) { return place_of<typename Mode::OfLaw>(at, q); }, numbers[q], steps_done);
+      if constexpr (Mode::OfLaw::kLayered) {
+        const std::size_t of_all = static_cast<std::size_t>(u) * problem.wall_rows() + row;
+        const V outer = wall_outermost(of_all);
+        const auto put_number = [&](int j, int axis, V number) {
+          mode.wall_out(u, row, [&](std::ptrdiff_t at) { return ring_place(problem, at, j, axis); }, number, steps_done);
+        };
+        const auto put = [&](int j, const Flat<V>& force) { put_number(j, 0, force.along), put_number(j, 1, force.across); };
+        wall_segments_of(of_all).unload(load_layers(numbers + kLayers), outer, rings_to_write(problem, wall_rings[of_all], outer), put);
+      }
     });
   }
 
@@ -282,7 +343,8 @@ struct Engine : EngineLayout<Mode> {
     mode.total_force(u, force, torque);
     const HalfStep<V> half = half_step_of(u);
     if (!cell) return end_step(own, problem.isotropic, half, force, torque);
-    mode.add_walls(u, sums, section(*cell, mass, half, force), Vec<V>{});
+    const Vec<V> by_contacts = problem.rubs ? force - load_vec(rubbed + 3 * static_cast<std::size_t>(u)) : force;
+    mode.add_walls(u, sums, section(*cell, mass, half, by_contacts), Vec<V>{});
     return end_step(own, problem.isotropic, half, force, torque, *cell);
   }
 

@@ -118,7 +118,7 @@ constexpr void reattach(SameRings&, Layers<Symbol>&, Symbol, Symbol, double) {}
 enum ContactConstant { kImage = 0, kReach = 3, kLean, kRoot, kContactConstants };
 // ... and of one grain, and of one of its spheres.
 enum GrainConstant { kCube = 0, kInverseCube, kFifth, kInverseFifth, kGrainConstants };
-enum SphereConstant { kSize = 0, kRadius, kSphereConstants };
+enum SphereConstant { kSize = 0, kRadius, kSphereConstants, kNormal = kSphereConstants, kPlaneConstants = kNormal + 3 };
 
 // Calculations are `general` where boxes are periodic or spheres differ. A `Cell` is without effect otherwise, as
 // are constants of equal spheres.
@@ -143,13 +143,13 @@ struct OneContact {
       const auto cell = inputs<Cell<Symbol>>(program, 4, Bar::add);
       image = inputs<Vec<Symbol>>(program, 5, Bar::none, kImage);
       move_to_image(meeting, image, cell);
-      unequal = {input(program, 5, kReach, Bar::none), input(program, 5, kLean, Bar::none), input(program, 5, kRoot, Bar::none),
-                 meeting.spin_other - meeting.spin_one};
+      unequal = {input(program, 5, kReach, Bar::none), input(program, 5, kLean, Bar::none), input(program, 5, kRoot, Bar::none)};
     }
     Contact<Symbol> contact{};
     contact.history = history;
     relative_motion(meeting, dot(meeting.separation, meeting.separation), contact);
-    close<general>(&contact, 1, parameter, &unequal);
+    if constexpr (general) close<true>(&contact, 1, parameter, &unequal, [&](int) { return meeting; });
+    else close(&contact, 1, parameter);
     SameRings rings{};
     if constexpr (Law::kLayered) rings.end = input(program, 3, 0, Bar::none);
     rub<Law>(&contact, 1, law, general ? &unequal : nullptr, [&](int) { return rings; });
@@ -183,7 +183,8 @@ struct StepBegin {
 };
 
 // Arrays: the grain's numbers midway, with force and torque; those of `GrainParameters`; if general, the cell, the mass of
-// a grain of size 1, and what is constant of the grain. Results: at the end; if general, what it adds to `section`.
+// a grain of size 1, what is constant of the grain, and what of the force is friction of walls. Results: at the end; if
+// general, what it adds to `section`.
 template <bool isotropic, bool general = false>
 struct StepEnd {
   static constexpr Program record() {
@@ -199,7 +200,8 @@ struct StepEnd {
       for (int n = 0; n < kGrainConstants; ++n) power[n] = input(program, 4, n, Bar::none);
       const auto own = parameters.of_size(power[kInverseCube], power[kFifth], power[kInverseFifth]);
       results(program, end_step(own, isotropic, half, force, torque, cell));
-      result(program, section(cell, power[kCube] * mass, half, force));
+      const auto rubbed = inputs<Vec<Symbol>>(program, 5, Bar::set);
+      result(program, section(cell, power[kCube] * mass, half, force - rubbed));
     } else {
       results(program, end_step(parameters, isotropic, half, force, torque));
     }
@@ -238,9 +240,28 @@ struct OneSphere {
   }
 };
 
-// Arrays: as of `OneSphere` if general; then the history of the sphere at plane w; and those of `WallLaw`.
+// Friction of a plane of the walls on a sphere, as a force and a torque on its grain. `at` and `moves` are place and velocity
+// of the plane, `side` is -1 for a lower and 1 for an upper one, and `normal` leads to it.
+template <class Law, class V, class SegmentsOf>
+constexpr WallFriction<V> rub_plane(const HalfStep<V>& half, const Matrix<V>& rotation, Vec<V> body, V radius, V stiffness,
+                                    V damping_time, V at, V moves, Vec<V> normal, const WallLaw<V>& walls, V* history,
+                                    const SegmentsOf& segments_of, Contact<V>& contact) {
+  const Vec<V> lever = rotation * body;
+  const Vec<V> velocity = add_cross(half.velocity, half.spin, lever);
+  const V side = normal.x + (normal.y + normal.z);
+  const V inside = side * at - dot(half.position + lever, normal), closing = dot(velocity, normal) - side * moves;
+  Unequal<V> stiffer{};
+  stiffer.root = stiffness / walls.normal_stiffness;
+  contact.history = history;
+  meet_plane(normal, walls, damping_time, lever, velocity, half.spin, radius, radius - inside, closing, contact);
+  rub<Law>(&contact, 1, walls.law, &stiffer, segments_of);
+  return {contact.force, cross(contact.lever_one, contact.force)};
+}
+
+// Arrays: as of `OneSphere` if general, but of the walls the plane's place and, `kPlanes` on, its velocity, and the constants
+// with the normal of the plane; then the history of the sphere at it; those of `WallLaw`; and number `last` of `Reach`.
 // Results: force and torque by friction of the wall, and the history.
-template <class Law, int w>
+template <class Law>
 struct OnePlane {
   static constexpr int kResults = 6 + Law::kHistory;
 
@@ -250,22 +271,18 @@ struct OnePlane {
     const auto rotation = inputs<Matrix<Symbol>>(program, 0, Bar::add, kTurnedRotation);
     auto parameters = inputs<GrainParameters<Symbol>>(program, 1, Bar::add);
     auto body = inputs<Vec<Symbol>>(program, 2, Bar::add);
-    const auto box = inputs<WallState<Symbol>>(program, 3, Bar::add);
+    const Symbol at = input(program, 3, 0, Bar::add), moves = input(program, 3, kPlanes, Bar::add);
+    const auto normal = inputs<Vec<Symbol>>(program, 4, Bar::none, kNormal);
     const Symbol radius = scale(program, body, parameters);
     Symbol history[Law::kHistory + 1] = {};
     for (int q = 0; q < Law::kHistory; ++q) history[q] = input(program, 5, q, Bar::set);
     const auto walls = inputs<WallLaw<Symbol>>(program, 6, Bar::add);
-    const Vec<Symbol> lever = rotation * body, centre = half.position + lever;
-    const Vec<Symbol> velocity = add_cross(half.velocity, half.spin, lever);
-    const Vec<Symbol> inside = w < 3 ? centre - box.lower : box.upper - centre;
-    const Vec<Symbol> closing = w < 3 ? box.lower_velocity - velocity : velocity - box.upper_velocity;
-    const auto along = [](const Vec<Symbol>& a) { return w % 3 == 0 ? a.x : w % 3 == 1 ? a.y : a.z; };
+    SameRings rings{};
+    if constexpr (Law::kLayered) rings.end = input(program, 7, 0, Bar::none);
     Contact<Symbol> contact{};
-    contact.history = history;
-    meet_plane(w, parameters, walls, parameters.wall_stiffness / walls.normal_stiffness, lever, velocity, half.spin, radius,
-               radius - along(inside), along(closing), contact);
-    friction(Law{}, &contact, 1, walls.law);
-    result(program, contact.force), result(program, cross(contact.lever_one, contact.force));
+    const auto on = rub_plane<Law>(half, rotation, body, radius, parameters.wall_stiffness, parameters.normal_damping, at, moves,
+                                   normal, walls, history, [&](int) { return rings; }, contact);
+    result(program, on.force), result(program, on.torque);
     for (int q = 0; q < Law::kHistory; ++q) result(program, history[q]);
     return program;
   }

@@ -114,23 +114,26 @@ struct Packed : PackedLayout<Law> {
     lane.history_out[place.leaf][place.row * problem.stride] = number;
   }
 
-  // Number q of the history in `row` of those that each grain of unit u has at walls.
-  V wall_history_in(int u, int row, int q) const {
+  // A number of the history in `row` of those that each grain of unit u has at walls; `place_at` has its place by the row of
+  // all.
+  template <class PlaceAt>
+  V wall_in(int u, int row, const PlaceAt& place_at) const {
     V a;
     for (int l = 0; l < W; ++l) {
-      const Place place = wall_place(u, l, row, q);
+      const Place place = place_at(wall_row(u, l, row));
       a[l] = lane.wall_history_in[place.leaf][place.row * problem.stride];
     }
     return a;
   }
-  void wall_history_out(int u, int row, int q, V number, int) const {
+  template <class PlaceAt>
+  void wall_out(int u, int row, const PlaceAt& place_at, V number, int) const {
     for (int l = 0; l < W && u * W + l < problem.grains; ++l) {
-      const Place place = wall_place(u, l, row, q);
+      const Place place = place_at(wall_row(u, l, row));
       lane.wall_history_out[place.leaf][place.row * problem.stride] = number[l];
     }
   }
-  Place wall_place(int u, int l, int row, int q) const {
-    return place_of<Law>(static_cast<long long>(plan.grain[grain_in(u, l)]) * problem.wall_rows() + row, q);
+  std::ptrdiff_t wall_row(int u, int l, int row) const {
+    return static_cast<std::ptrdiff_t>(plan.grain[grain_in(u, l)]) * problem.wall_rows() + row;
   }
 
   void mark_new(std::size_t c) const {
@@ -299,6 +302,7 @@ struct Packed : PackedLayout<Law> {
     constexpr int kGroups = kTogether;
     Group group[kGroups];
     Contact<V> contact[kGroups];
+    ContactInput<V> input[kGroups];
     Unequal<V> unequal[kGroups];
     V memory[kGroups][kHistoryRows ? 4 * kHistoryRows : 1];
     const int groups = (count + W - 1) / W;
@@ -307,10 +311,10 @@ struct Packed : PackedLayout<Law> {
       contact[n].history = memory[n];
       read_history(group[n], memory[n]);
       const ContactInput<V> m = contact_input(group[n], plan.image ? &faces.cell : nullptr);
-      if (plan.radii) unequal[n] = unequal_of(group[n], m);
+      if (plan.radii) unequal[n] = unequal_of(group[n]), input[n] = m;
       relative_motion(m, dot(m.separation, m.separation), contact[n]);
     }
-    plan.radii ? close<true>(contact, groups, parameter, unequal) : close(contact, groups, parameter);
+    plan.radii ? close<true>(contact, groups, parameter, unequal, [&](int n) { return input[n]; }) : close(contact, groups, parameter);
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
     rub<Law>(contact, groups, law, plan.radii ? unequal : nullptr, [&](int n) { return segments_of(group[n]); });
     for (int n = 0; n < groups; ++n) {
@@ -367,10 +371,10 @@ struct Packed : PackedLayout<Law> {
     return input;
   }
 
-  Unequal<V> unequal_of(const Group& g, const ContactInput<V>& m) const {
+  Unequal<V> unequal_of(const Group& g) const {
     const Rows rows = load_rows([&](int l) { return reinterpret_cast<const Row*>(plan.radii + g.c[l]); });
     const Vec<V> radii = columns(rows);
-    return {radii.x, radii.y, radii.z, m.spin_other - m.spin_one};
+    return {radii.x, radii.y, radii.z};
   }
 
   void read_history(const Group& g, V* memory) const {

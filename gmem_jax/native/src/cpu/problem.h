@@ -41,7 +41,7 @@ struct Problem {
   std::ptrdiff_t stride;  // doubles between two rows of an array: replicas B of the innermost axis
   bool mixed = false;     // contacts in single precision; forward only
   int periodic = 0;       // bit of each axis along which the box is
-  bool rubs = false;      // walls have friction; not for periodic boxes and the Mindlin law
+  bool rubs = false;      // walls have friction; not in mixed precision
 
   int spheres() const { return grains * spheres_per_grain; }
   int wall_rows() const { return kPlanes * spheres_per_grain; }  // of a grain in the histories of walls

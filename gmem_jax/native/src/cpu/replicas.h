@@ -14,16 +14,6 @@
 namespace gmem {
 namespace GMEM_ISA {
 
-// What the histories of the contacts were when a step looked at them; kept where the step is to be gone through backwards.
-template <class V>
-struct Trace {
-  int* touching = nullptr;  // [candidates]: those of each domain that touch, in order, from its first candidate on
-  int* end;                 // [candidates]: where these end, at the first candidate of each domain
-  V* history;               // [candidates, kHistory] of the law: theirs, in the places of `touching`
-  Segment<V>* segment;      // [candidates, Q], where a contact came to another ring
-  int* segments;            // [candidates]; -1 where it did not
-};
-
 template <class V>
 constexpr int kReplicas = std::is_same<V, Pair>::value ? 2 * W : W;
 
@@ -221,17 +211,20 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     write(out, place.row, convert<V>(number), steps_done);
   }
 
-  // Number q of the history in `row` of those that the grain of unit u has at walls.
-  V wall_history_in(int u, int row, int q) const {
-    const Place place = wall_place(u, row, q);
+  // A number of the history in `row` of those that the grain of unit u has at walls; `place_at` has its place by the row of
+  // all.
+  template <class PlaceAt>
+  V wall_in(int u, int row, const PlaceAt& place_at) const {
+    const Place place = place_at(wall_row(u, row));
     return read([place](const Lane& lane) { return lane.wall_history_in[place.leaf]; }, place.row);
   }
-  void wall_history_out(int u, int row, int q, V number, int steps_done) const {
-    const Place place = wall_place(u, row, q);
+  template <class PlaceAt>
+  void wall_out(int u, int row, const PlaceAt& place_at, V number, int steps_done) const {
+    const Place place = place_at(wall_row(u, row));
     write([place](const Lane& lane) { return lane.wall_history_out[place.leaf]; }, place.row, number, steps_done);
   }
-  Place wall_place(int u, int row, int q) const {
-    return place_of<Law>(static_cast<long long>(plan.grain[u]) * problem.wall_rows() + row, q);
+  std::ptrdiff_t wall_row(int u, int row) const {
+    return static_cast<std::ptrdiff_t>(plan.grain[u]) * problem.wall_rows() + row;
   }
 
   void mark_new(std::size_t c) const {
@@ -334,12 +327,12 @@ struct Replicas : ReplicasLayout<Law, V, C> {
         }
         marks.touched[c] = true;
         if (trace.touching) remember(c, remembered++);
-        ContactInput<C> input = contact_input(pair, one, other);
-        if constexpr (!kMixed)
-          if (plan.image) to_image(input, shift(faces.cell, c), faces.cell);
-        if constexpr (differ)
-          unequal[count] = {splat<C>(radii->reach), splat<C>(radii->lean), splat<C>(radii->root), input.spin_other - input.spin_one};
-        relative_motion(input, convert<C>(square), contact[count]);
+        if constexpr (differ) {
+          unequal[count] = {splat<C>(radii->reach), splat<C>(radii->lean), splat<C>(radii->root)};
+          contact[count].normal = other - one, contact[count].square = square;
+        } else {
+          relative_motion(input_of(c, one, other, faces.cell), convert<C>(square), contact[count]);
+        }
         if constexpr (kMixed) contact[count].before = convert<C>(contact_square - square);
         contact[count].history = history + static_cast<std::size_t>(c) * Law::kHistory;
         touching[count++] = c;
@@ -352,6 +345,14 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     if (trace.touching && first < end) trace.end[first] = remembered;
   }
 
+  // Of a contact between spheres at these places, that of the image if the box is periodic.
+  GMEM_INLINE ContactInput<C> input_of(std::size_t c, Vec<V> one, Vec<V> other, const Cell<V>& cell) const {
+    ContactInput<C> input = contact_input(plan.candidate[c], one, other);
+    if constexpr (!kMixed)
+      if (plan.image) to_image(input, shift(cell, c), cell);
+    return input;
+  }
+
   Vec<V> shift(const Cell<V>& cell, std::size_t c) const {
     const Image& image = plan.image[c];
     return cell.shift(image.x, image.y, image.z);
@@ -361,8 +362,16 @@ struct Replicas : ReplicasLayout<Law, V, C> {
                const LawParameters<C>& law, Faces<V>& faces) {
     if constexpr (kMixed) {
       close(contact, count, parameter);
+    } else if (unequal) {
+      close<true>(contact, count, parameter, unequal, [&](int n) {
+        const Candidate& pair = plan.candidate[touching[n]];
+        const Vec<V> one = load_vec(sphere + 3 * static_cast<std::size_t>(pair.one));
+        Vec<V> other = load_vec(sphere + 3 * static_cast<std::size_t>(pair.other));
+        if (plan.image) other = other + shift(faces.cell, touching[n]);
+        return input_of(touching[n], one, other, faces.cell);
+      });
     } else {
-      unequal ? close<true>(contact, count, parameter, unequal) : close(contact, count, parameter);
+      close(contact, count, parameter);
     }
     rub<Law>(contact, count, law, unequal, [&](auto n) { return segments_of(touching[n]); });
     for (int n = 0; n < count; ++n) {

@@ -52,6 +52,17 @@ struct alignas(16) Four {
   int of[4];
 };
 
+// What is remembered of contacts between grains, or with walls that have friction: `rows` of them.
+struct Memories {
+  int rows;
+  Table history_in[kMaxHistory], history_out[kMaxHistory];
+  // Between steps.
+  Table history[kMaxHistory];  // as in the arrays of the call, but for Mindlin's rings, which these replace:
+  Table layers;                // `Layers`, [rows, 6, L]
+  Table segments;              // force and first ring, [rows, Q, 3, L]
+  int* stored;                 // ... how many, [rows, L]
+};
+
 struct Arguments {
   int grains, spheres, rows, columns, points, steps;  // N, K, P, C, Q, T
   int replicas, lanes;                                // B, L
@@ -65,19 +76,19 @@ struct Arguments {
   Entries<const double> offsets;       // sphere centres of a grain, [K, 3]
   Entries<const double> along_offsets;  // ... and their derivatives, where there are any, [K, 3, B]
   Entries<const double> radii, sizes;  // where spheres differ in radius: of those of a grain of size 1, and of grains; [K], [N]
-  Table parameters, walls, grains_in[kFields], history_in[kMaxHistory];
-  Table grains_out[kFields], history_out[kMaxHistory], pressure_out;  // values, or derivatives where they are wanted
+  Table parameters, walls, grains_in[kFields];
+  Table grains_out[kFields], pressure_out;  // values, or derivatives where they are wanted
+  Memories contacts, at_walls;              // of the candidates, P; and of every sphere at `kPlanes` planes
   // Between steps.
   Table hot;                   // position, velocity, spin, [N, 9, L]
   Table sphere;                // centres, [N K, 3, L]
   Table cold;                  // orientation, [N, 4, L]
-  Table wall;                  // force of the walls, and their pressures summed over steps, [N K, 6, L]
+  Table wall;                  // force of the walls, and their pressures summed over steps; if they have friction, its torque about
+                               // the sphere's centre and its force; [N K, of_wall, L]
+  int of_wall;                 // 6, or 12
   Table load;                  // of candidates that touch, [P, kLoad, L]
-  unsigned char* touching;     // which candidates touch, and which spheres the walls, [P + N K, L]
-  Table history[kMaxHistory];  // as in the arrays of the call, but for Mindlin's rings, which these replace:
-  Table layers;                // `Layers`, [P, 6, L]
-  Table segments;              // force and first ring, [P, Q, 3, L]
-  int* stored;                 // ... how many, [P, L]
+  unsigned char* touching;     // which candidates touch, and which spheres the walls (bits of planes that have friction),
+                               // [P + N K, L]
 };
 
 enum class GpuKernel { enter, remember, touch, move, move_alone, collect, leave };

@@ -172,6 +172,7 @@ std::string compiled(const std::string& target, const Which& which, std::string*
       "-DGMEM_LAW=" + law_as_type(which),
       "-DGMEM_PERIODIC=" + std::to_string(which.periodic),
       "-DGMEM_UNEQUAL=" + std::to_string(which.unequal),
+      "-DGMEM_RUBS=" + std::to_string(which.rubs),
       std::string("-DGMEM_NUMBER=") + (which.task == Task::forward ? "double" : "Dual<double>")};
   if (log) options.emplace_back("--ptxas-options=-v");
   std::istringstream more(trial_options());
@@ -232,7 +233,8 @@ std::string code_for(const std::string& architecture, const Which& which, bool a
   if (log && is_ptx(target)) throw std::runtime_error("NVRTC " + version + " does not know " + architecture);
   const std::string law = "-law" + std::to_string(static_cast<int>(which.law)) +
                           std::to_string(static_cast<int>(which.variant)) +
-                          (which.periodic ? "-periodic" : "") + (which.unequal ? "-unequal" : "") + (which.task == Task::forward ? "" : "-tangent");
+                          (which.periodic ? "-periodic" : "") + (which.unequal ? "-unequal" : "") +
+                          (which.rubs ? "-rubs" : "") + (which.task == Task::forward ? "" : "-tangent");
   const std::string path = paths().cache + "/" + GMEM_SOURCE_HASH + "-" + target + "-nvrtc" + version + law +
                            (is_ptx(target) ? ".ptx" : ".cubin");
   const bool keeps = !paths().cache.empty() && trial_options().empty();
@@ -269,7 +271,7 @@ extern "C" int gmem_cuda_compile(const char* architecture, int law, int variant,
   return gmem::cuda::in_one_line(said, size, [&] {
     std::string log;
     const auto task = tangent ? gmem::Task::tangent : gmem::Task::forward;
-    const gmem::cuda::Which which{static_cast<gmem::Law>(law), static_cast<gmem::Variant>(variant), task, false, false};
+    const gmem::cuda::Which which{static_cast<gmem::Law>(law), static_cast<gmem::Variant>(variant), task, false, false, false};
     gmem::cuda::code_for(architecture, which, true, &log);
     return log;
   });

@@ -16,6 +16,7 @@ struct Which {
   Task task;
   bool periodic;  // whether the box may be so
   bool unequal;   // whether spheres may differ in radius
+  bool rubs;      // whether walls have friction
 };
 
 // Further options for NVRTC, for trials: of the environment's GMEM_NVRTC, as "-DGMEM_BLOCK=256".

@@ -22,26 +22,28 @@ constexpr int kFew = 1 << 17;  // grains times lanes from which on one thread a 
 constexpr int kOfPack = 8;  // arguments that belong to a pack
 
 // Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain O,
-// of a load F, of `Layers` Y, derivatives and values D, lanes L.
+// of a load E, of a sphere at the walls X, of `Layers` Y, derivatives and values D, lanes L.
 // gmem_jax/native/cuda.py: call_kernels, between_steps
-Wants arguments_of(Task task, Law law) {
+Wants arguments_of(Task task, Law law, bool rubs) {
   const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32}, {"validity", "P", ffi::PRED},
                       {"incidence", "SC", ffi::S32},    {"images", "PI", ffi::S8},
                       {"offsets", "K3"},                {"radii", "KU"},              {"sizes", "NU"}};
-  const Wants all = fields_of_grains() + pack + numbers_of_steps() + histories(law);
-  return task == Task::tangent ? all + arrays_of_steps(law) : all;
+  const Wants walls = wall_histories(law, rubs), all = fields_of_grains() + pack + numbers_of_steps() + histories(law) + walls;
+  return task == Task::tangent ? all + arrays_of_steps(law) + walls : all;
 }
 
 // Histories of the tangent are kept with their values.
-Wants results_of(Task task, Law law) {
-  Wants all = fields_of_grains() + pressures() + histories(law);
+Wants results_of(Task task, Law law, bool rubs) {
+  const Wants remembered = histories(law) + wall_histories(law, rubs);
+  Wants all = fields_of_grains() + pressures() + remembered;
   all = all + Wants{{"hot", "DN9L"},   {"spheres", "DS3L"}, {"cold", "DNOL"},
-                    {"walls", "DSFL"}, {"loads", "DPFL"}, {"touching", "AL", ffi::U8}};
-  const bool layered = is_layered(law);
+                    {"walls", "DSXL"}, {"loads", "DPEL"}, {"touching", "AL", ffi::U8}};
   if (task == Task::tangent)
-    for (const Wanted& leaf : histories(law))
+    for (const Wanted& leaf : remembered)
       if (leaf.axes.size() == 3) all.push_back({leaf.name, std::string("D") + leaf.axes.substr(0, 2) + "L"});
-  if (layered) all = all + Wants{{"layers", "DPYL"}, {"segments", "DPQ3L"}, {"stored", "PL", ffi::S32}};
+  if (!is_layered(law)) return all;
+  all = all + Wants{{"layers", "DPYL"}, {"segments", "DPQ3L"}, {"stored", "PL", ffi::S32}};
+  if (rubs) all = all + Wants{{"walls' layers", "DFYL"}, {"walls' segments", "DFQ3L"}, {"walls' stored", "FL", ffi::S32}};
   return all;
 }
 
@@ -55,16 +57,16 @@ int threads_for(int64_t many) {
   return static_cast<int>(many);
 }
 
-Which which_of(Task task, int64_t law, int64_t variant, int64_t points, int64_t periodic, int64_t unequal) {
+Which which_of(Task task, int64_t law, int64_t variant, int64_t points, int64_t periodic, int64_t unequal, int64_t rubs) {
   require_law(law, variant, points);
   require_axes(periodic);
-  return {static_cast<Law>(law), static_cast<Variant>(variant), task, periodic != 0, unequal != 0};
+  return {static_cast<Law>(law), static_cast<Variant>(variant), task, periodic != 0, unequal != 0, rubs != 0};
 }
 
 ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t periodic,
-                int64_t unequal, void* stream, ffi::RemainingArgs args, ffi::RemainingRets rets) {
-  const Which which = which_of(task, law, variant, points, periodic, unequal);
-  const Wants wanted = arguments_of(task, which.law), given = results_of(task, which.law);
+                int64_t unequal, int64_t rubs, void* stream, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+  const Which which = which_of(task, law, variant, points, periodic, unequal, rubs);
+  const Wants wanted = arguments_of(task, which.law, which.rubs), given = results_of(task, which.law, which.rubs);
   require(args.size() == wanted.size() && rets.size() == given.size(),
           "the number of arguments or results is not that of the friction law");
   std::vector<ffi::AnyBuffer> results;
@@ -78,7 +80,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   reader.size('W') = kWalls;
   reader.size('Q') = points;
   reader.size('O') = 4;
-  reader.size('F') = kLoad;
+  reader.size('E') = kLoad;
+  reader.size('X') = rubs ? 12 : 6;
   reader.size('Y') = kOfLayers;
   reader.size('D') = task == Task::forward ? 1 : 2;
   std::vector<Array> in, out;
@@ -87,7 +90,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   reader.size('L') = dims[0] * reader.size('B');
   reader.size('A') = reader.size('P') + reader.size('S');
   for (std::size_t i = 0; i < results.size(); ++i) out.push_back(reader.read(results[i], given[i]));
-  const std::size_t leaves = histories(which.law).size(), fresh = kFields + 1 + leaves;
+  const std::size_t leaves = histories(which.law).size(), all_leaves = rubs ? 2 * leaves : leaves;
+  const std::size_t fresh = kFields + 1 + all_leaves;
   for (std::size_t i = 0; i < fresh; ++i)
     require(results[i].dimensions()[0] == dims[0], "results differ in their leading axes");
 
@@ -105,12 +109,13 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.tangent = task == Task::tangent;
   require(a.grains > 0 && a.spheres > 0, "there is no grain");
   require(a.lanes > 0, "there is no replica");
+  require(!rubs || leaves == 0 || reader.size('F') == kPlanes * reader.size('S'), "walls' histories are not those of all spheres");
   require(a.columns % 4 == 0, "columns of the incidence should come in fours");
   require(reader.size('S') == reader.size('N') * reader.size('K'), "spheres are not as many as grains have");
   a.by_replicas = Divisor(a.replicas), a.by_lanes = Divisor(a.lanes), a.by_spheres = Divisor(a.spheres);
 
   // Tables in the order of arguments and results.
-  std::size_t argument = 0, slope = kFields + kOfPack + 2 + leaves, result = 0;
+  std::size_t argument = 0, slope = kFields + kOfPack + 2 + all_leaves, result = 0;
   const auto read = [&] {
     Table table{entries<double>(in[argument++]), {nullptr, 0}, a.replicas};
     if (task == Task::tangent) table.slope = entries<double>(in[slope++]);
@@ -130,10 +135,16 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.parameters = read();
   a.walls = read();
   if (task == Task::tangent) a.along_offsets = entries<const double>(in[slope++]);
-  for (std::size_t leaf = 0; leaf < leaves; ++leaf) a.history_in[leaf] = read();
+  a.contacts.rows = a.rows, a.at_walls.rows = rubs ? kPlanes * a.grains * a.spheres : 0;
+  a.of_wall = rubs ? 12 : 6;
+  std::vector<Memories*> kept{&a.contacts};
+  if (rubs) kept.push_back(&a.at_walls);
+  for (Memories* of : kept)
+    for (std::size_t leaf = 0; leaf < leaves; ++leaf) of->history_in[leaf] = read();
   for (Table& field : a.grains_out) field = write();
   a.pressure_out = write();
-  for (std::size_t leaf = 0; leaf < leaves; ++leaf) a.history_out[leaf] = write();
+  for (Memories* of : kept)
+    for (std::size_t leaf = 0; leaf < leaves; ++leaf) of->history_out[leaf] = write();
   const auto between = [&](int64_t rows) {
     double* values = reinterpret_cast<double*>(out[result++].data);
     return Table{{values, a.replicas}, {values + rows * a.lanes, a.replicas}, a.lanes};
@@ -141,26 +152,29 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.hot = between(a.grains * int64_t{9});
   a.sphere = between(reader.size('S') * 3);
   a.cold = between(a.grains * int64_t{4});
-  a.wall = between(reader.size('S') * 6);
+  a.wall = between(reader.size('S') * a.of_wall);
   a.load = between(a.rows * int64_t{kLoad});
   a.touching = reinterpret_cast<unsigned char*>(out[result++].data);
   const bool layered = is_layered(which.law);
-  for (std::size_t leaf = 0; leaf < leaves; ++leaf) {
-    const std::string axes = histories(which.law)[leaf].axes;  // "P3B", "P1B"; of the rings "PQ2B"
-    const bool kept = a.tangent && axes.size() == 3;
-    a.history[leaf] = kept ? between(a.rows * int64_t{axes[1] - '0'}) : a.history_out[leaf];
-  }
-  if (layered) {
-    a.layers = between(a.rows * int64_t{kOfLayers});
-    a.segments = between(a.rows * points * 3);
-    a.stored = reinterpret_cast<int*>(out[result++].data);
+  for (Memories* of : kept)
+    for (std::size_t leaf = 0; leaf < leaves; ++leaf) {
+      const std::string axes = histories(which.law)[leaf].axes;  // "P3B", "P1B"; of the rings "PQ2B"
+      const bool apart = a.tangent && axes.size() == 3;
+      of->history[leaf] = apart ? between(of->rows * int64_t{axes[1] - '0'}) : of->history_out[leaf];
+    }
+  for (Memories* of : kept) {
+    if (!layered) continue;
+    of->layers = between(of->rows * int64_t{kOfLayers});
+    of->segments = between(of->rows * points * 3);
+    of->stored = reinterpret_cast<int*>(out[result++].data);
   }
 
   const int spheres = a.grains * a.spheres;
-  threads_for((a.rows + int64_t{spheres}) * std::max<int64_t>({9, 3 * points, a.lanes}));  // rows of tables; threads
+  const int64_t most_rows = std::max<int64_t>(a.rows + int64_t{spheres}, a.at_walls.rows);
+  threads_for(most_rows * std::max<int64_t>({12, 3 * points, a.lanes}));  // rows of tables; threads
   const Launcher launch(stream, which);
   launch(GpuKernel::enter, a.grains, a);
-  launch(GpuKernel::remember, a.rows, a);
+  launch(GpuKernel::remember, rubs ? a.rows + spheres : a.rows, a);
   const GpuKernel move = a.grains * int64_t{a.lanes} < kFew ? GpuKernel::move : GpuKernel::move_alone;
   for (int step = 0; step < a.steps; ++step) {
     launch(GpuKernel::touch, a.rows + spheres, a, step);
@@ -168,7 +182,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   }
   for (int stride = 1; stride < spheres; stride *= kChunk)
     launch(GpuKernel::collect, (spheres + kChunk * stride - 1) / (kChunk * stride) * 3, a, stride);
-  launch(GpuKernel::leave, layered || a.tangent ? std::max(a.rows, 3) : 3, a);
+  launch(GpuKernel::leave, !layered && !a.tangent ? 3 : rubs ? a.rows + spheres : std::max(a.rows, 3), a);
   return ffi::Error::Success();
 }
 
@@ -176,18 +190,17 @@ template <Task task>
 ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t,
                   int64_t mixed, int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   return in_words([&] {
-    require(rubs == 0, "walls are without friction on GPUs");
     require(mixed == 0, "there is no mixed precision on GPUs");
-    return call(task, law, variant, points, isotropic, periodic, unequal, stream, args, rets);
+    return call(task, law, variant, points, isotropic, periodic, unequal, rubs, stream, args, rets);
   });
 }
 
 // Before a program runs: a stream may be on its way into a graph when a call is made, and loading is no part of that.
 template <Task task>
 ffi::Error load(void* stream, int64_t law, int64_t variant, int64_t points, int64_t, int64_t, int64_t, int64_t periodic,
-                int64_t unequal, int64_t, ffi::RemainingArgs, ffi::RemainingRets) {
+                int64_t unequal, int64_t rubs, ffi::RemainingArgs, ffi::RemainingRets) {
   return in_words([&] {
-    const Launcher loads(stream, which_of(task, law, variant, points, periodic, unequal));
+    const Launcher loads(stream, which_of(task, law, variant, points, periodic, unequal, rubs));
     return ffi::Error::Success();
   });
 }

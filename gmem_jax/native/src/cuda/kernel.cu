@@ -16,7 +16,7 @@ inline int thread() { return blockIdx.x * blockDim.x + threadIdx.x; }
 
 // Blocks of 128 threads that shall fit into a multiprocessor: 8 leave 64 registers to a thread. Tried on an H200; more
 // threads hide more of the memory's latency than a few spilt numbers cost. Other values by GMEM_NVRTC="-DGMEM_TOUCH=6".
-constexpr bool kPlain = !__is_class(Number), kPeriodic = GMEM_PERIODIC, kUnequal = GMEM_UNEQUAL;
+constexpr bool kPlain = !__is_class(Number), kPeriodic = GMEM_PERIODIC, kUnequal = GMEM_UNEQUAL, kRubs = GMEM_RUBS;
 #ifndef GMEM_TOUCH
 #define GMEM_TOUCH (!kPlain ? 2 : GMEM_LAW::kLayered ? 4 : 8)
 #endif
@@ -27,11 +27,11 @@ constexpr bool kPlain = !__is_class(Number), kPeriodic = GMEM_PERIODIC, kUnequal
 #define GMEM_GIVEN const __grid_constant__ Arguments a, int step
 
 GMEM_KERNEL(128, 2) enter(GMEM_GIVEN) { gmem::GMEM_ISA::enter<Number, kPeriodic, kUnequal>(a, thread()); }
-GMEM_KERNEL(128, 4) remember(GMEM_GIVEN) { gmem::GMEM_ISA::remember<Number, GMEM_LAW>(a, thread()); }
-GMEM_KERNEL(128, GMEM_TOUCH) touch(GMEM_GIVEN) { gmem::GMEM_ISA::touch<Number, GMEM_LAW, kPeriodic, kUnequal>(a, step, thread()); }
-GMEM_KERNEL(128, GMEM_MOVE) move_alone(GMEM_GIVEN) { gmem::GMEM_ISA::move_alone<Number, kPeriodic, kUnequal>(a, step, thread()); }
+GMEM_KERNEL(128, 4) remember(GMEM_GIVEN) { gmem::GMEM_ISA::remember<Number, GMEM_LAW, kRubs>(a, thread()); }
+GMEM_KERNEL(128, GMEM_TOUCH) touch(GMEM_GIVEN) { gmem::GMEM_ISA::touch<Number, GMEM_LAW, kPeriodic, kUnequal, kRubs>(a, step, thread()); }
+GMEM_KERNEL(128, GMEM_MOVE) move_alone(GMEM_GIVEN) { gmem::GMEM_ISA::move_alone<Number, kPeriodic, kUnequal, kRubs>(a, step, thread()); }
 GMEM_KERNEL(128, 4) collect(GMEM_GIVEN) { gmem::GMEM_ISA::collect<Number>(a, step, thread()); }
-GMEM_KERNEL(128, 4) leave(GMEM_GIVEN) { gmem::GMEM_ISA::leave<Number, GMEM_LAW>(a, thread()); }
+GMEM_KERNEL(128, 4) leave(GMEM_GIVEN) { gmem::GMEM_ISA::leave<Number, GMEM_LAW, kRubs>(a, thread()); }
 
 GMEM_KERNEL(kItems * kWorkers, 2) move(GMEM_GIVEN) {
   __shared__ Load<Number> part[kWorkers][kItems];
@@ -39,7 +39,7 @@ GMEM_KERNEL(kItems * kWorkers, 2) move(GMEM_GIVEN) {
   const ReplicaView<Number> on(a, blockIdx.x * kItems + slot);
   Load<Number> sum{};
   for (int first = 0; first < a.spheres; first += kWorkers) {
-    part[worker][slot] = loads_of<Number, kPeriodic>(on, step, first + worker);
+    part[worker][slot] = loads_of<Number, kPeriodic, kRubs>(on, step, first + worker);
     __syncthreads();
     for (int w = 0; worker == 0 && w < kWorkers && first + w < a.spheres; ++w) sum = sum + part[w][slot];
     if (first + kWorkers < a.spheres) __syncthreads();

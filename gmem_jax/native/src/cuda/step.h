@@ -21,6 +21,7 @@ using cuda::Four;
 using cuda::kChunk;
 using cuda::kLoad;
 using cuda::kOfLayers;
+using cuda::Memories;
 using cuda::Table;
 
 // The numbers of one lane in a table.
@@ -115,6 +116,7 @@ struct Segments {
     at.put(3 * k, segment.force.along), at.put(3 * k + 1, segment.force.across), at.put(3 * k + 2, segment.start);
   }
   void keep(V counts) const { *stored = static_cast<int>(largest(counts)); }
+  void forget() const { *stored = 0; }
   void remember() const {}
 
   // From rings up to `outer`, of which `ring(j)` reads one.
@@ -148,26 +150,25 @@ struct Segments {
 
 // The overlap that a contact had in the last step, for laws that remember it.
 template <class V, class Law>
-V last_overlap(const ReplicaView<V>& on, int row) {
+V last_overlap(const ReplicaView<V>& on, const Memories& kept, int row) {
   const Place place = place_of<Law>(row, kLastOverlap);
-  return on.in(on.a.history[place.leaf])[static_cast<int>(place.row)];
+  return on.in(kept.history[place.leaf])[static_cast<int>(place.row)];
 }
 
 // The outermost ring that a contact has reached.
 template <class V, class Law>
-int outermost(const ReplicaView<V>& on, int row, const LawParameters<V>& law) {
-  const Reach<V, Law::variant> reach(last_overlap<V, Law>(on, row), law, splat<V>(on.a.points - 2.0));
+int outermost(const ReplicaView<V>& on, const Memories& kept, int row, const LawParameters<V>& law) {
+  const Reach<V, Law::variant> reach(last_overlap<V, Law>(on, kept, row), law, splat<V>(on.a.points - 2.0));
   return static_cast<int>(largest(reach.outer));
 }
 
 template <class V>
-Segments<V> segments_of(const ReplicaView<V>& on, int row) {
-  const Arguments& a = on.a;
-  Column<V> at = on.in(a.segments);
-  const long long before = static_cast<long long>(row) * a.points * 3 * a.segments.stride;
+Segments<V> segments_of(const ReplicaView<V>& on, const Memories& kept, int row) {
+  Column<V> at = on.in(kept.segments);
+  const long long before = static_cast<long long>(row) * on.a.points * 3 * kept.segments.stride;
   at.value += before;
   if (__is_class(V)) at.slope += before;
-  return {at, a.stored + on.of_lane(row), a.points};
+  return {at, kept.stored + on.of_lane(row), on.a.points};
 }
 
 // Of the spheres of a pack in which they differ: the radius of one, and the size of a grain.
@@ -222,34 +223,45 @@ GrainParameters<V> read_parameters(const ReplicaView<V>& on, V* parameter) {
   return GrainParameters<V>(parameter);
 }
 
-// The history of a candidate, from the arrays of the call. Thread of candidate and lane.
+// A history of those in `kept`, from the arrays of the call, if it is `listed` there; whether it has anything.
 template <class V, class Law>
-void remember(const Arguments& a, int thread) {
-  const ReplicaView<V> on(a, thread);
-  const int row = on.item;
-  if (row >= a.rows) return;
-  const bool listed = a.valid.of(on.entry)[row];
+bool remember(const ReplicaView<V>& on, const Memories& kept, int row, bool listed) {
+  const Arguments& a = on.a;
   bool remembers = false;
   for (int n = 0; n < Law::kGiven; ++n) {
     const Place place = place_of<Law>(row, n);
     const int at = static_cast<int>(place.row);
-    const Column<V> from = on.in(a.history_in[place.leaf]), to = on.in(a.history[place.leaf]);
+    const Column<V> from = on.in(kept.history_in[place.leaf]), to = on.in(kept.history[place.leaf]);
     const V number = listed ? from[at] : V{};
     if (from.value != to.value || !listed) to.put(at, number);
     remembers = remembers || !is_zero(number);
   }
-  a.touching[on.of_lane(row)] = remembers;
   if constexpr (Law::kLayered) {
     V parameter[kParameters];
     read_parameters(on, parameter);
     const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
-    const Column<V> rings = on.in(a.history_in[0]);
-    const int first = 2 * row * a.points, outer = listed ? outermost<V, Law>(on, row, law) : -1;
+    const Column<V> rings = on.in(kept.history_in[0]);
+    const int first = 2 * row * a.points, outer = listed ? outermost<V, Law>(on, kept, row, law) : -1;
     V layers[kOfLayers];
-    store_layers(layers, segments_of(on, row).load(outer, kLacking<Law::variant>, [&](int j) {
+    store_layers(layers, segments_of(on, kept, row).load(outer, kLacking<Law::variant>, [&](int j) {
       return Flat<V>{rings[first + 2 * j], rings[first + 2 * j + 1]};
     }));
-    for (int n = 0; n < kOfLayers; ++n) on.in(a.layers).put(kOfLayers * row + n, layers[n]);
+    for (int n = 0; n < kOfLayers; ++n) on.in(kept.layers).put(kOfLayers * row + n, layers[n]);
+  }
+  return remembers;
+}
+
+// Thread of candidate, or of sphere at walls that have friction, and lane.
+template <class V, class Law, bool rubs>
+void remember(const Arguments& a, int thread) {
+  const ReplicaView<V> on(a, thread);
+  const int row = on.item, sphere = row - a.rows;
+  if (row < a.rows) {
+    a.touching[on.of_lane(row)] = remember<V, Law>(on, a.contacts, row, a.valid.of(on.entry)[row]);
+  } else if (rubs && sphere < a.grains * a.spheres) {
+    unsigned planes = 0;
+    for (int w = 0; w < kPlanes; ++w) planes |= remember<V, Law>(on, a.at_walls, kPlanes * sphere + w, true) << w;
+    a.touching[on.of_lane(row)] = static_cast<unsigned char>(planes);
   }
 }
 
@@ -265,7 +277,7 @@ void enter(const Arguments& a, int thread) {
   const Column<V> q = on.in(a.grains_in[1]);
   const Grain<V> from{field(0), {q[grain * 4], q.vec(grain * 4 + 1)}, field(2), field(3), field(4), field(5)};
   for (int k = 0; k < a.spheres; ++k) {
-    on.in(a.wall).put(6 * (grain * a.spheres + k) + 3, Vec<V>{});
+    on.in(a.wall).put(a.of_wall * (grain * a.spheres + k) + 3, Vec<V>{});
     a.touching[on.of_lane(a.rows + grain * a.spheres + k)] = 0;
   }
   if (a.steps == 0) return deliver(on, from);
@@ -276,6 +288,7 @@ void enter(const Arguments& a, int thread) {
 template <class V, class Law>
 struct Memory {
   const ReplicaView<V>& on;
+  const Memories& kept;
   int row;
   V number[Law::kHistory + 1];
 
@@ -283,10 +296,10 @@ struct Memory {
   void each(const Each& each) {
     for (int n = 0; n < Law::kGiven; ++n) {
       const Place place = place_of<Law>(row, n);
-      each(on.in(on.a.history[place.leaf]), static_cast<int>(place.row), number[n]);
+      each(on.in(kept.history[place.leaf]), static_cast<int>(place.row), number[n]);
     }
     for (int n = Law::kGiven; n < Law::kHistory; ++n)
-      each(on.in(on.a.layers), kOfLayers * row + n - Law::kGiven, number[n]);
+      each(on.in(kept.layers), kOfLayers * row + n - Law::kGiven, number[n]);
   }
   void read() {
     each([](const Column<V>& from, int at, V& number) { number = from[at]; });
@@ -297,12 +310,40 @@ struct Memory {
   // Spheres that are apart have nothing to remember.
   void forget() {
     each([](const Column<V>& to, int at, V&) { to.put(at, V{}); });
-    if constexpr (Law::kLayered) segments_of(on, row).keep(V{});
+    if constexpr (Law::kLayered) segments_of(on, kept, row).forget();
   }
 };
 
+// Friction of the walls on a sphere; returns the planes that it touches. `known` are those that it remembers.
+template <class V, class Law>
+unsigned rub_planes(const ReplicaView<V>& on, const GrainParameters<V>& constants, const V* parameter, int number, Vec<V> centre,
+                   Vec<V> lever, Vec<V> velocity, Vec<V> spin, const WallState<V>& box, V radius, unsigned known) {
+  const Arguments& a = on.a;
+  const int first = kPlanes * number, at = a.of_wall * number;
+  V history[kPlanes * Law::kHistory + 1];
+  for (int w = 0; w < kPlanes; ++w) {
+    Memory<V, Law> memory{on, a.at_walls, first + w, {}};
+    if (known >> w & 1) memory.read();
+    for (int n = 0; n < Law::kHistory; ++n) history[w * Law::kHistory + n] = memory.number[n];
+  }
+  const WallLaw<V> walls(parameter, on.in(a.parameters)[kWallMu]);
+  WallFriction<V> found{};
+  const unsigned now = rub_walls<Law>(constants, walls, centre, lever, velocity, spin, box, radius, history, known,
+                                      [&](int w) { return segments_of(on, a.at_walls, first + w); }, found);
+  for (int w = 0; w < kPlanes; ++w) {
+    if (!((known | now) >> w & 1)) continue;
+    Memory<V, Law> memory{on, a.at_walls, first + w, {}};
+    for (int n = 0; n < Law::kHistory; ++n) memory.number[n] = history[w * Law::kHistory + n];
+    memory.write();
+  }
+  const Column<V> wall = on.in(a.wall);
+  wall.put(at, wall.vec(at) + found.force);
+  wall.put(at + 6, found.torque - cross(lever, found.force)), wall.put(at + 9, found.force);
+  return now;
+}
+
 // The forces of the walls on a sphere.
-template <class V, bool periodic, bool unequal>
+template <class V, class Law, bool periodic, bool unequal, bool rubs>
 void touch_walls(const ReplicaView<V>& on, int step, int number) {
   const Arguments& a = on.a;
   if (number >= a.grains * a.spheres) return;
@@ -312,26 +353,29 @@ void touch_walls(const ReplicaView<V>& on, int step, int number) {
   V radius = splat<V>(1.0);
   if constexpr (unequal) radius = splat<V>(radius_of(on, number));
   const bool touches = bits_less(V{}, deepest(radius, centre, box));
-  if (touches != static_cast<bool>(touching)) touching = touches;
-  if (!touches) return;
+  if (!rubs && touches != static_cast<bool>(touching)) touching = touches;
+  if (!touches && !(rubs && touching)) return;
   V parameter[kParameters];
   GrainParameters<V> constants = read_parameters(on, parameter);
   if constexpr (unequal) constants.wall_stiffness = root(radius) * constants.wall_stiffness;
   const Column<V> hot = on.in(a.hot), wall = on.in(a.wall);
-  const int h = 9 * a.by_spheres.of(number);
-  const Vec<V> lever = centre - hot.vec(h);
+  const int h = 9 * a.by_spheres.of(number), at = a.of_wall * number;
+  const Vec<V> lever = centre - hot.vec(h), spin = hot.vec(h + 6), velocity = add_cross(hot.vec(h + 3), spin, lever);
   WallForces<V> found{};
-  touch_walls(constants, centre, lever, add_cross(hot.vec(h + 3), hot.vec(h + 6), lever), box, found, radius);
-  wall.put(6 * number, found.force);
-  wall.put(6 * number + 3, wall.vec(6 * number + 3) + pressure(edges, found.lower + found.upper));
+  touch_walls(constants, centre, lever, velocity, box, found, radius);
+  wall.put(at, found.force);
+  wall.put(at + 3, wall.vec(at + 3) + pressure(edges, found.lower + found.upper));
+  if constexpr (rubs)
+    touching = static_cast<unsigned char>(
+        rub_planes<V, Law>(on, constants, parameter, number, centre, lever, velocity, spin, box, radius, touching));
 }
 
 // The forces between the spheres of a candidate, or of the walls on a sphere. Thread of candidate or sphere, and lane.
-template <class V, class Law, bool periodic, bool unequal>
+template <class V, class Law, bool periodic, bool unequal, bool rubs>
 void touch(const Arguments& a, int step, int thread) {
   const ReplicaView<V> on(a, thread);
   const int row = on.item;
-  if (row >= a.rows) return touch_walls<V, periodic, unequal>(on, step, row - a.rows);
+  if (row >= a.rows) return touch_walls<V, Law, periodic, unequal, rubs>(on, step, row - a.rows);
   if (!a.valid.of(on.entry)[row]) return;
   const int one = a.first.of(on.entry)[row], other = a.second.of(on.entry)[row];
   const unsigned all = static_cast<unsigned>(a.grains * a.spheres);
@@ -348,13 +392,13 @@ void touch(const Arguments& a, int step, int thread) {
   const Vec<V> here = sphere.vec(3 * one), listed = sphere.vec(3 * other);
   const Vec<V> there = periodic ? listed + shift : listed, gap = there - here;
   const V square = dot(gap, gap);
-  Memory<V, Law> memory{on, row, {}};
+  Memory<V, Law> memory{on, a.contacts, row, {}};
   Unequal<V> differing{};
   double reach = 2.0;
   if constexpr (unequal) {
     const double radius = radius_of(on, one), of_other = radius_of(on, other);
     reach = radius + of_other;
-    differing = {splat<V>(reach), splat<V>(0.5 * (radius - of_other)), splat<V>(root(2.0 * radius * of_other / reach)), {}};
+    differing = {splat<V>(reach), splat<V>(0.5 * (radius - of_other)), splat<V>(root(2.0 * radius * of_other / reach))};
   }
   if (!bits_less(square, splat<V>(reach * reach))) {
     if (touched) memory.forget(), touching = 0;
@@ -373,9 +417,9 @@ void touch(const Arguments& a, int step, int thread) {
   Contact<V> contact;
   relative_motion(input, square, contact);
   contact.history = memory.number;
-  differing.spin_difference = input.spin_other - input.spin_one;
-  close<unequal>(&contact, 1, parameter, &differing);
-  rub<Law>(&contact, 1, law, unequal ? &differing : nullptr, [&](int) { return segments_of(on, row); });
+  if constexpr (unequal) close<true>(&contact, 1, parameter, &differing, [&](int) { return input; });
+  else close(&contact, 1, parameter);
+  rub<Law>(&contact, 1, law, unequal ? &differing : nullptr, [&](int) { return segments_of(on, a.contacts, row); });
   if constexpr (unequal) point = point + differing.lean * contact.normal;
   memory.write();
   load.put(kLoad * row, fnma(contact.normal_force, contact.normal, contact.force));
@@ -388,19 +432,20 @@ template <class V>
 struct Load {
   Vec<V> force, torque;
   Vec<V> through;  // the faces of a periodic box, of contacts in which it is the first
+  Vec<V> rubbed;   // what of the force is friction of the walls
 };
 
 template <class V>
 inline Load<V> operator+(const Load<V>& one, const Load<V>& other) {
-  return {one.force + other.force, one.torque + other.torque, one.through + other.through};
+  return {one.force + other.force, one.torque + other.torque, one.through + other.through, one.rubbed + other.rubbed};
 }
 
 // A force that acts `lever` away from the grain's centre.
 template <class V>
-inline Load<V> at_lever(Vec<V> force, Vec<V> lever) { return {force, cross(lever, force), {}}; }
+inline Load<V> at_lever(Vec<V> force, Vec<V> lever) { return {force, cross(lever, force), {}, {}}; }
 
 // The sum over the contacts of a sphere of a grain, walls included.
-template <class V, bool periodic>
+template <class V, bool periodic, bool rubs>
 GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int step, int sphere) {
   const Arguments& a = on.a;
   Load<V> sum{};
@@ -409,8 +454,13 @@ GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int step, int sphere) {
   const Four* listed = a.incidence.of(on.entry) + static_cast<long long>(number) * fours;
   const Column<V> load = on.in(a.load);
   const Vec<V> position = on.in(a.hot).vec(9 * on.item);
-  if (a.touching[on.of_lane(rows + number)])
-    sum = at_lever(on.in(a.wall).vec(6 * number), on.in(a.sphere).vec(3 * number) - position);
+  if (a.touching[on.of_lane(rows + number)]) {
+    const Column<V> wall = on.in(a.wall);
+    const int at = a.of_wall * number;
+    sum = at_lever(wall.vec(at), on.in(a.sphere).vec(3 * number) - position);
+    if constexpr (rubs) sum.torque = sum.torque + wall.vec(at + 6);
+    if constexpr (rubs && periodic) sum.rubbed = wall.vec(at + 9);
+  }
   Four next = listed[0];
   for (int n = 1; n <= fours; ++n) {
     const Four now = next;
@@ -460,9 +510,9 @@ GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
   if constexpr (periodic) {
     const WallState<V> box = on.walls(step);
     const Cell<V> cell = Cell<V>::of(a.periodic, box);
-    const Vec<V> own_part = section(cell, mass, half, load.force);
+    const Vec<V> own_part = section(cell, mass, half, load.force - load.rubbed);
     const Column<V> wall = on.in(a.wall);
-    const int at = 6 * on.item * a.spheres + 3;
+    const int at = a.of_wall * on.item * a.spheres + 3;
     wall.put(at, wall.vec(at) + section_pressure(a.periodic, box, cell, own_part, load.through));
     after = end_step(own, a.isotropic, half, load.force, load.torque, cell);
   } else {
@@ -473,11 +523,11 @@ GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
 }
 
 // One thread for all spheres of a grain.
-template <class V, bool periodic, bool unequal>
+template <class V, bool periodic, bool unequal, bool rubs>
 void move_alone(const Arguments& a, int step, int thread) {
   const ReplicaView<V> on(a, thread);
   Load<V> sum{};
-  for (int k = 0; k < a.spheres; ++k) sum = sum + loads_of<V, periodic>(on, step, k);
+  for (int k = 0; k < a.spheres; ++k) sum = sum + loads_of<V, periodic, rubs>(on, step, k);
   move<V, periodic, unequal>(on, step, sum);
 }
 
@@ -491,33 +541,41 @@ void collect(const Arguments& a, int stride, int thread) {
   const Column<V> wall = on.in(a.wall);
   const int all = a.grains * a.spheres, end = first + kChunk * stride < all ? first + kChunk * stride : all;
   V total{};
-  for (int sphere = first; sphere < end; sphere += stride) total = total + wall[6 * sphere + 3 + axis];
-  wall.put(6 * first + 3 + axis, total);
+  for (int sphere = first; sphere < end; sphere += stride) total = total + wall[a.of_wall * sphere + 3 + axis];
+  wall.put(a.of_wall * first + 3 + axis, total);
 }
 
-// Pressures, and of histories what is not yet in the arrays of the call, to these. Thread of axis or candidate, and lane.
+// What is not yet in the arrays of the call of a history of those in `kept`.
 template <class V, class Law>
-void leave(const Arguments& a, int thread) {
-  const ReplicaView<V> on(a, thread);
-  const int row = on.item;
-  if (row < 3) on.out(a.pressure_out).put(row, result(on.in(a.wall)[3 + row]));
-  if (row >= a.rows) return;
+void leave(const ReplicaView<V>& on, const Memories& kept, int row) {
+  const Arguments& a = on.a;
   for (int n = 0; a.tangent && n < Law::kGiven; ++n) {
     const Place place = place_of<Law>(row, n);
     const int at = static_cast<int>(place.row);
-    on.out(a.history_out[place.leaf]).put(at, result(on.in(a.history[place.leaf])[at]));
+    on.out(kept.history_out[place.leaf]).put(at, result(on.in(kept.history[place.leaf])[at]));
   }
   if constexpr (Law::kLayered) {
-    const Column<double> out = on.out(a.history_out[0]);
+    const Column<double> out = on.out(kept.history_out[0]);
     V parameter[kParameters], layers[kOfLayers];
     read_parameters(on, parameter);
     const LawParameters<V> law(parameter + kLaw, parameter[kDt]);
-    for (int n = 0; n < kOfLayers; ++n) layers[n] = on.in(a.layers)[kOfLayers * row + n];
-    const int first = 2 * row * a.points;
-    segments_of(on, row).unload(load_layers(layers), outermost<V, Law>(on, row, law), [&](int j, Flat<V> f) {
+    for (int n = 0; n < kOfLayers; ++n) layers[n] = on.in(kept.layers)[kOfLayers * row + n];
+    const int first = 2 * row * a.points, outer = outermost<V, Law>(on, kept, row, law);
+    segments_of(on, kept, row).unload(load_layers(layers), outer, [&](int j, Flat<V> f) {
       out.put(first + 2 * j, result(f.along)), out.put(first + 2 * j + 1, result(f.across));
     });
   }
+}
+
+// Pressures and histories, to the arrays of the call. Thread of axis, candidate, or sphere at walls that have friction, and lane.
+template <class V, class Law, bool rubs>
+void leave(const Arguments& a, int thread) {
+  const ReplicaView<V> on(a, thread);
+  const int row = on.item, sphere = row - a.rows;
+  if (row < 3) on.out(a.pressure_out).put(row, result(on.in(a.wall)[3 + row]));
+  if (row < a.rows) return leave<V, Law>(on, a.contacts, row);
+  if (!rubs || sphere >= a.grains * a.spheres) return;
+  for (int w = 0; w < kPlanes; ++w) leave<V, Law>(on, a.at_walls, kPlanes * sphere + w);
 }
 
 }  // namespace GMEM_ISA

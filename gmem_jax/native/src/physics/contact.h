@@ -20,8 +20,7 @@ struct ContactInput {
 // gmem_jax/physics/contact/kinematics.py: Unequal
 template <class V>
 struct Unequal {
-  V reach, lean, root;     // as of `Radii` in cpu/problem.h
-  Vec<V> spin_difference;  // of the grains, j - i
+  V reach, lean, root;  // as of `Radii` in cpu/problem.h
 };
 
 // From the second grain to its image in a periodic box (`Cell` of motion.h), which `shift` leads to. Levers already end
@@ -66,26 +65,33 @@ constexpr GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, C
 template <class V>
 constexpr GMEM_INLINE V overlap_of(const Contact<V>& c) { return fnma(c.square, c.inverse, splat<V>(2.0)); }
 
-// The contact is no longer halfway between the spheres.
+// Of a contact that is not halfway between the spheres, whose normal is known.
 template <class V>
-constexpr GMEM_INLINE void lean(Contact<V>& c, const Unequal<V>& unequal) {
-  const Vec<V> moved = unequal.lean * c.normal;
-  c.lever_one = c.lever_one + moved;
-  c.lever_other = c.lever_other + moved;
-  c.sliding = add_cross(c.sliding, unequal.spin_difference, moved);
+constexpr GMEM_INLINE void leaning_motion(ContactInput<V> m, V lean, Contact<V>& c) {
+  m.lever_one = fma(lean, c.normal, m.lever_one);
+  m.lever_other = fma(lean, c.normal, m.lever_other);
+  m.separation = c.normal;
+  relative_motion(m, c.square, c);
 }
+
+// Of contacts halfway between the spheres, whose motion is known from the beginning.
+struct Halfway {
+  constexpr void operator()(int) const {}
+};
 
 // From what `relative_motion` left to normals, sliding velocities and normal forces. The second part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
-// Where spheres differ in radius, roots of overlaps and forces are still those of a harmonic mean of 1: see `rub`.
-template <bool differ = false, class V>
-constexpr void close(Contact<V>* c, int count, const V* parameter, const Unequal<V>* unequal = nullptr) {
+// Where spheres differ in radius, there need only be separations and squares yet: motion is that of `input_of(n)`. Roots of
+// overlaps and forces are still those of a harmonic mean of 1: see `rub`.
+template <bool differ = false, class V, class InputOf = Halfway>
+constexpr void close(Contact<V>* c, int count, const V* parameter, const Unequal<V>* unequal = nullptr,
+                     const InputOf& input_of = {}) {
   const V quarter_dt = splat<V>(0.25) * parameter[kDt] * parameter[kSpinning];
   invert_roots(c, count);
   for (int n = 0; n < count; ++n) {
     const Vec<V> normal = c[n].inverse * c[n].normal;
     c[n].normal = normal;
-    if constexpr (differ) lean(c[n], unequal[n]);
+    if constexpr (differ) leaning_motion(input_of(n), unequal[n].lean, c[n]);
     const V along = dot(c[n].sliding, normal);
     c[n].sliding = fnma(along, normal, c[n].sliding);
     c[n].normal_force = -along;  // for now, the closing velocity

@@ -2,7 +2,7 @@
 
 #pragma once
 
-#include "physics/laws.h"
+#include "physics/contact.h"
 #include "physics/rotation.h"
 
 namespace gmem {
@@ -209,7 +209,8 @@ struct WallFriction {
   Vec<V> force, torque;
 };
 
-// The law of the contacts at walls, and what it needs beside that.
+// The law of the contacts at walls, and what it needs beside that. They are contacts whose radii have another harmonic mean:
+// `stiffer`, its root, is by how much walls are stiffer than spheres of radius 1. See `rub`.
 template <class V>
 struct WallLaw {
   LawParameters<V> law;
@@ -224,52 +225,65 @@ struct WallLaw {
   }
 };
 
-// A sphere's contact with plane w, but for its friction and its history; `stiffer` are walls than other spheres.
+// A sphere's contact with a plane that is along `normal`, but for its friction and its history.
 // gmem_jax/physics/contact/wall.py: wall_kinematics
 template <class V>
-constexpr GMEM_INLINE void meet_plane(int w, const GrainParameters<V>& p, const WallLaw<V>& walls, V stiffer, Vec<V> lever,
-                                      Vec<V> velocity, Vec<V> spin, V radius, V overlap, V closing, Contact<V>& now) {
-  const V zero{}, side = splat<V>(w < 3 ? -1.0 : 1.0);
-  now.normal = {w % 3 == 0 ? side : zero, w % 3 == 1 ? side : zero, w % 3 == 2 ? side : zero};
+constexpr GMEM_INLINE void meet_plane(Vec<V> normal, const WallLaw<V>& walls, V damping_time, Vec<V> lever, Vec<V> velocity,
+                                      Vec<V> spin, V radius, V overlap, V closing, Contact<V>& now) {
+  now.normal = normal;
   now.overlap = overlap;
   const Vec<V> arm = radius * now.normal;
   now.lever_one = lever + arm;
   now.sliding = dot(velocity, now.normal) * now.normal - velocity - cross(spin, arm);
   now.turned = walls.quarter_dt * dot(spin, now.normal);
-  const V safe = now.safe_overlap(), rooted = root(safe);
-  now.normal_force = hertz(now.touching(), safe, rooted, closing, p.wall_stiffness, p.normal_damping);
-  now.root_overlap = stiffer * rooted;
+  const V safe = now.safe_overlap();
+  now.root_overlap = root(safe);
+  now.normal_force = hertz(now.touching(), safe, now.root_overlap, closing, walls.normal_stiffness, damping_time);
+}
+
+// From the centre of the box to plane w.
+template <class V>
+constexpr Vec<V> normal_of_plane(int w) {
+  const V zero{}, side = splat<V>(w < 3 ? -1.0 : 1.0);
+  return {w % 3 == 0 ? side : zero, w % 3 == 1 ? side : zero, w % 3 == 2 ? side : zero};
 }
 
 // Adds to `on` the friction of the walls on one sphere of a grain, of a radius for which the walls have their stiffness.
-// `history` has what the law remembers of it at each plane, [kPlanes, Law::kHistory]; is that anything but 0, the plane's bit
-// of `remembered` is set. Returns these bits afterwards.
+// `history` has what the law remembers of it at each plane, [kPlanes, Law::kHistory], and `segments_of(w)` Mindlin's
+// segments at plane w; is that anything but 0, the plane's bit of `remembered` is set. Returns these bits afterwards.
 // gmem_jax/physics/contact/wall.py: wall_friction
-template <class Law, class V>
+template <class Law, class V, class SegmentsOf>
 GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
-                         Vec<V> spin, const WallState<V>& box, V radius, V* history, unsigned remembered, WallFriction<V>& on) {
+                               Vec<V> spin, const WallState<V>& box, V radius, V* history, unsigned remembered,
+                               const SegmentsOf& segments_of, WallFriction<V>& on) {
   if (!remembered && !bits_less(V{}, deepest(radius, centre, box))) return 0;
   const Vec<V> all{radius, radius, radius};
   const Vec<V> lower = all - (centre - box.lower), upper = all - (box.upper - centre);
   const Vec<V> low = box.lower_velocity - velocity, up = velocity - box.upper_velocity;
   const V overlap[kPlanes] = {lower.x, lower.y, lower.z, upper.x, upper.y, upper.z};
   const V closing[kPlanes] = {low.x, low.y, low.z, up.x, up.y, up.z};
-  const V stiffer = p.wall_stiffness / walls.normal_stiffness;
   Contact<V> c[kPlanes];
-  int count = 0;
+  Unequal<V> stiffer[kPlanes];
+  int count = 0, plane[kPlanes];
   unsigned touched = 0;
   for (int w = 0; w < kPlanes; ++w) {
     V* const own = history + w * Law::kHistory;
     if (!bits_less(V{}, overlap[w])) {
-      for (int q = 0; remembered >> w & 1 && q < Law::kHistory; ++q) own[q] = V{};
+      if (!(remembered >> w & 1)) continue;
+      for (int q = 0; q < Law::kHistory; ++q) own[q] = V{};
+      if constexpr (Law::kLayered) segments_of(w).forget();
       continue;
     }
     touched |= 1u << w;
-    Contact<V>& now = c[count++];
-    now.history = own;
-    meet_plane(w, p, walls, stiffer, lever, velocity, spin, radius, overlap[w], closing[w], now);
+    c[count].history = own;
+    stiffer[count].root = p.wall_stiffness / walls.normal_stiffness;
+    meet_plane(normal_of_plane<V>(w), walls, p.normal_damping, lever, velocity, spin, radius, overlap[w], closing[w], c[count]);
+    plane[count++] = w;
   }
-  friction(Law{}, c, count, walls.law);
+  for (int done = 0; done < count; done += kTogether) {
+    const int more = count - done < kTogether ? count - done : kTogether;
+    rub<Law>(c + done, more, walls.law, stiffer + done, [&](int n) { return segments_of(plane[done + n]); });
+  }
   for (int n = 0; n < count; ++n) {
     on.force = on.force + c[n].force;
     on.torque = add_cross(on.torque, c[n].lever_one, c[n].force);

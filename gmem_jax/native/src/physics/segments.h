@@ -97,6 +97,7 @@ struct StoredSegments {
   const Segment<V>& get(int k) const { return first[k * stride]; }
   void set(int k, const Segment<V>& segment) { static_cast<Segment<V>&>(first[k * stride]) = segment; }
   void keep(V counts) { *stored = static_cast<int>(largest(counts)); }
+  void forget() { remember(), *stored = 0; }
   void remember() const {
     if (!seen) return;
     *seen_count = count();
