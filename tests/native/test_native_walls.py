@@ -28,8 +28,9 @@ Scene = tuple[System, State, Box]
 
 @functools.cache
 def thrown(law: str, replicas: int, file: Any = TETRA_27) -> Scene:
-    """27 grains that fly and spin between walls that shrink, more along one axis than another, and open along z; or, in a
-    periodic box, shrink along z too.
+    """27 grains that fly and spin between walls that shrink, more along one axis than another, and open along z.
+
+    In a periodic box they shrink along z too.
     """
     pack = gm.load_pack(file)
     wall_mu = jnp.linspace(0.1, 0.4, replicas)
