@@ -60,14 +60,16 @@ CONDITIONS = {
     "rough-walls": Condition({}, WALLS),
     "all": Condition(SPREAD | GRAVITY, WALLS | GRAVITY | CREEP, 2),
 }
+STRONGER = {"gamma0": 3e-3}
 CHOICES = {
-    "gamma0 = 3e-3": Condition({}, {"gamma0": 3e-3}),
+    "gamma0 = 3e-3": Condition({}, STRONGER),
     "gamma0 = 1e-2": Condition({}, {"gamma0": 1e-2}),
     "delta0 = 0.02": Condition({"delta0": 0.02}, {}),
     "delta0 = 0.08": Condition({"delta0": 0.08}, {}),
     "O = 0.8": Condition({}, {}, overlap=0.8),
     "O = 0.9": Condition({}, {}, overlap=0.9),
-    "gamma0 = 3e-3 and O = 0.9": Condition({}, {"gamma0": 3e-3}, overlap=0.9),
+    "gamma0 = 3e-3 and O = 0.9": Condition({}, STRONGER, overlap=0.9),
+    "all with gamma0 = 3e-3 and O = 0.9": CONDITIONS["all"]._replace(run=CONDITIONS["all"].run | STRONGER, overlap=0.9),
 }
 SLOPES = "slopes"
 ALL = CONDITIONS | CHOICES | {SLOPES: Condition({}, {})}

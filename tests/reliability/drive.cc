@@ -42,7 +42,7 @@ struct Case {
   int replicas;
   bool mixed = false;
   bool general = false;  // in a periodic box, grains of sizes and of spheres that differ
-  bool rubs = false;     // walls have friction
+  bool rubs = false;     // walls have friction; along z alone if the box is periodic
 };
 
 // Grains of two spheres that touch their neighbours and the walls.
@@ -129,7 +129,10 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   }
   for (std::size_t leaf = 0; c.rubs && leaf < sizes.size(); ++leaf) {
     const int rows = sizes[leaf] * kPlanes * n * kSpheres;
-    lane.wall_history_in[leaf] = array(rows, false, [&](int row, int l) { return row % 5 ? small(row, l) : 0.0; });
+    const bool overlap = sizes[leaf] == 1;
+    lane.wall_history_in[leaf] = array(rows, false, [&](int row, int l) {
+      return row % 5 == 0 ? 0.0 : overlap ? positive(row, l) : small(row, l);
+    });
     slope.wall_history_in[leaf] = array(rows, false, small);
     lane.wall_history_out[leaf] = slope.wall_history_out[leaf] = array(rows, true, small);
   }
@@ -142,7 +145,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   if (back) slope.parameters_out = array(kRows, true, small), slope.walls_out = array(kSteps * kWalls, true, small);
   if (back) slope.offsets_out = array(kSpheres * 3, true, small);
 
-  const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed, c.general ? 7 : 0, c.rubs};
+  const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed, c.general ? c.rubs ? 3 : 7 : 0, c.rubs};
   const auto store = plan_for({n, kSpheres, candidates, scene.first.data(), scene.second.data(),
                                reinterpret_cast<const bool*>(scene.valid.data()), scene.reference.data(),
                                scene.smallest.data(), c.general ? scene.images.data() : nullptr,
@@ -231,13 +234,14 @@ int main(int count, char** arguments) {
           for (const Numbers& one : found) CHECK(same(one, alone));
         }
       }
-  // Periodic boxes of unequal spheres, and rough walls.
+  // Periodic boxes of unequal spheres, rough walls, and both.
   for (const auto& law : laws)
     for (const Task task : {Task::forward, Task::tangent, Task::adjoint})
-      for (const bool rubs : {false, true}) {
-        const bool has = rubs ? law.law != Law::mindlin : law.law == Law::hooke || law.variant == Variant::paper;
+      for (const int kind : {0, 1, 2}) {
+        const bool general = kind != 1, rubs = kind != 0;
+        const bool has = !general ? law.law != Law::mindlin : law.law == Law::hooke || law.variant == Variant::paper;
         const auto with = [&](int edge, int replicas) {
-          return Case{law.law, law.variant, task, edge, edge == 4 ? 4.5 : 2.5, replicas, false, !rubs, rubs};
+          return Case{law.law, law.variant, task, edge, edge == 4 ? 4.5 : 2.5, replicas, false, general, rubs};
         };
         if (!has || printed) continue;
         for (const int edge : {3, 4}) {
