@@ -23,10 +23,11 @@ test: install-dev
 	$(REBUILD)
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow" $(TESTS)
 
-# Cases of ten seconds and more that say of others what a quicker one says, and what takes minutes for one statement.
+# Cases of ten seconds and more that say of others what a quicker one says, and what takes minutes for one statement. Their
+# programs are as a user's are; those of the others are compiled in half of the time (tests/conftest.py).
 test-slow: install-dev
 	$(REBUILD)
-	$(BIN)/pytest -n 2 --dist loadgroup -m slow $(TESTS)
+	XLA_FLAGS= $(BIN)/pytest -n 2 --dist loadgroup -m slow $(TESTS)
 
 # Wrong code that the tests must notice; an hour or two. Names of mutations: make mutations NAMES="step-* native-*"
 mutations: install-dev

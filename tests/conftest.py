@@ -13,6 +13,11 @@ if "GMEM_COMPILE_CACHE" not in os.environ:
     os.environ["GMEM_COMPILE_CACHE"] = programs.name
     atexit.register(programs.cleanup)
 
+# Much of the time of all tests is LLVM's, which makes programs fast that are small and run once. The slow tests have
+# programs as a user's are: there XLA_FLAGS is set (Makefile).
+if "XLA_FLAGS" not in os.environ:
+    os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
+
 import jax
 import pytest
 

@@ -69,8 +69,8 @@ def test_a_wheel_serves_every_python_of_one_platform(built: Built) -> None:
 def test_the_wheel_is_small(built: Built) -> None:
     library = ROOT / "gmem_jax" / "native" / build.LIBRARY
     size = built.wheel.stat().st_size + (len(zlib.compress(library.read_bytes())) if library.exists() else 0)
-    # 15.1 MB: 12.7 of packs, whose arrays name their dimensions for xarray (0.7 MB in the eight that did not before).
-    assert size < 16e6, f"{size / 1e6:.1f} MB with the library"
+    # 16.4 MB: 12.7 of packs, and 2.9 of the library, which has each law's derivatives for three instruction sets.
+    assert size < 17e6, f"{size / 1e6:.1f} MB with the library"
 
 
 def test_without_a_compiler_it_is_built_and_says_so(built: Built) -> None:

@@ -61,7 +61,8 @@ def test_a_second_write_after_a_silent_first_is_the_papers() -> None:
     twice = run(protocol, gm.signals(first=SILENT, second=ONE))
     once = run(protocols.paper(0.1))
     assert not np.any(twice.p_sig[0])
-    np.testing.assert_array_equal(twice.p_sig[1], once.p_sig)
+    # Two programs of the same steps, whose round-off grows with contacts that begin: 2e-13 was seen.
+    np.testing.assert_allclose(twice.p_sig[1], once.p_sig, atol=1e-11 * np.abs(once.p_sig).max())
     assert float(twice.gain[1]) == pytest.approx(float(once.gain), rel=1e-12)
 
 

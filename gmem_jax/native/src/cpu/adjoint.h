@@ -261,7 +261,7 @@ struct Adjoint : AdjointLayout<Law> {
     restore_segments(step, u);
   }
 
-  // Mindlin's segments of grain u at walls, as they were before a step changed them.
+  // Mindlin's segments of grain u at walls that a step changes, as they were before. (Others are not looked at in it.)
   void restore_segments(int step, int u) const {
     if constexpr (Law::kLayered)
       for_planes(u, [&](int k, int w, const KnownPlanes&) {
@@ -493,8 +493,8 @@ struct Adjoint : AdjointLayout<Law> {
       store_numbers(mid, forward.half_step_of(u));
       std::copy_n(total_of(step, u), 6, mid + kMidForce);
       if (general) {
-        const Size size = plan.size ? plan.size[u] : Size{1.0, 1.0, 1.0, 1.0, 1.0};
-        const V power[] = {splat<V>(size.cube), splat<V>(size.inverse_cube), splat<V>(size.fifth), splat<V>(size.inverse_fifth)};
+        const Size size = plan.size ? plan.size[u] : Size{1.0, 1.0, 1.0, 1.0};
+        const V power[] = {splat<V>(size.cube), splat<V>(size.inverse_cube), splat<V>(size.inverse_fifth)};
         V nothing[3] = {}, unused[3];
         const bool rubs = problem.rubs && problem.periodic;
         const V* in[] = {mid, grain_numbers, cell_numbers, forward.parameter + kMass, power,
@@ -895,7 +895,6 @@ struct Adjoint : AdjointLayout<Law> {
     for (int domain; team.take(Team::kContacts, rank, &domain);) contacts_back(domain, step);
     team.barrier();
     for_chunks([&](int chunk) { begin_back(chunk, step, on_wall); });
-    for_grains([&](int u) { restore_segments(step, u); });
     if (general && rank == 0) cell_back(step, by_walls);
     for (int row = 0; rank == 0 && row < kWalls; ++row) {
       for (int chunk = 0; chunk < chunks(); ++chunk) by_walls[row] += wall_bar[chunk * kWalls + row];

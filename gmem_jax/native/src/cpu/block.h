@@ -128,6 +128,7 @@ struct Engine : EngineLayout<Mode> {
   WallLaw<V> wall_law;  // where walls have friction
   double arm;           // of the outermost sphere of a grain, of the largest where they differ in size
   double outer;         // radius about the centre of a grain of size 1 that holds it
+  WallState<V> box_now;  // in the step under way, without walls along periodic axes
   double travel = 0.0;  // how much closer any two spheres can have come since the call began
   int current = 0;      // step under way
   bool deforms = false;  // whether the shape of a grain has a derivative
@@ -202,15 +203,18 @@ struct Engine : EngineLayout<Mode> {
     store_vec(h + kVelocity, m.velocity);
     store_vec(h + kSpin, m.spin);
     WallForces<V> on{};
-    bool near = true;
-    if (plan.size) on = unequal_spheres(u, m, box);
-    else near = with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
+    bool near = false;
+    if (plan.size) {
+      WallForces<V> found{};
+      near = unequal_spheres(u, found);
+      if (near) on = found;
+    } else near = with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
       return spheres_of(constants, m, offsets, problem.spheres_per_grain, arm, box, on,
                         [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     });
     WallFriction<V> friction{};
     if (problem.rubs && (near || remembers[u])) {
-      friction = rub(u, m, box);
+      friction = rub(u);
       on.force = on.force + friction.force, on.torque = on.torque + friction.torque;
     }
     if (problem.rubs && problem.periodic) store_vec(rubbed + 3 * static_cast<std::size_t>(u), friction.force);
@@ -218,19 +222,19 @@ struct Engine : EngineLayout<Mode> {
     if (near) mode.add_walls(u, wall_sums, on.lower, on.upper);
   }
 
-  // Apart from `begin`, and given copies: so what `begin` does of equal spheres stays in registers.
-  __attribute__((noinline)) WallForces<V> unequal_spheres(int u, HalfStep<V> m, WallState<V> box) {
-    WallForces<V> on{};
-    with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
+  // Apart from `begin`, and of what that has stored: so what it does of equal spheres stays in registers.
+  __attribute__((noinline)) bool unequal_spheres(int u, WallForces<V>& on) {
+    const HalfStep<V> m = half_step_of(u);
+    return with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
       return spheres_of(constants, m, offsets, block.pack->radii, problem.spheres_per_grain, mode.size_of(u, &Size::one), outer,
-                        box, on, [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+                        box_now, on, [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     });
-    return on;
   }
 
   // Friction of the walls on unit u; apart from `begin` likewise.
-  __attribute__((noinline)) WallFriction<V> rub(int u, HalfStep<V> m, WallState<V> box) {
+  __attribute__((noinline)) WallFriction<V> rub(int u) {
     using Law = typename Mode::OfLaw;
+    const HalfStep<V> m = half_step_of(u);
     WallFriction<V> on{};
     if constexpr (std::is_same<V, typename Mode::OfContacts>::value) {
       const Matrix<V> rotation = matrix(m.orientation);
@@ -245,7 +249,7 @@ struct Engine : EngineLayout<Mode> {
         const std::size_t first = static_cast<std::size_t>(u) * problem.wall_rows() + static_cast<std::size_t>(kPlanes) * k;
         KnownPlanes& planes = remembered[first / kPlanes];
         const unsigned now = rub_walls<Law>(own, wall_law, m.position + lever, lever, add_cross(m.velocity, m.spin, lever), m.spin,
-                                            box, radius, wall_history + first * Law::kHistory, planes.now,
+                                            box_now, radius, wall_history + first * Law::kHistory, planes.now,
                                             [&](int w) { return wall_segments_of(first + w); }, on);
         planes = {static_cast<unsigned char>(now), static_cast<unsigned char>(planes.ever | now)};
         any |= now;
@@ -332,20 +336,20 @@ struct Engine : EngineLayout<Mode> {
 
   // Second half: accelerations and velocities. In a periodic box of `cell` sums up its sections.
   Grain<V> finish(int u, const Cell<V>* cell, double* sums) const {
-    if (!plan.size) return finish(u, constants, parameter[kMass], cell, sums);
-    const auto power = [&](double Size::*power) { return mode.size_of(u, power); };
-    const GrainParameters<V> own = constants.of_size(power(&Size::inverse_cube), power(&Size::fifth), power(&Size::inverse_fifth));
-    return finish(u, own, power(&Size::cube) * parameter[kMass], cell, sums);
-  }
-
-  Grain<V> finish(int u, const GrainParameters<V>& own, V mass, const Cell<V>* cell, double* sums) const {
     Vec<V> force, torque;
     mode.total_force(u, force, torque);
     const HalfStep<V> half = half_step_of(u);
-    if (!cell) return end_step(own, problem.isotropic, half, force, torque);
-    const Vec<V> by_contacts = problem.rubs ? force - load_vec(rubbed + 3 * static_cast<std::size_t>(u)) : force;
-    mode.add_walls(u, sums, section(*cell, mass, half, by_contacts), Vec<V>{});
-    return end_step(own, problem.isotropic, half, force, torque, *cell);
+    if (cell) {
+      const V mass = plan.size ? mode.size_of(u, &Size::cube) * parameter[kMass] : parameter[kMass];
+      const Vec<V> by_contacts = problem.rubs ? force - load_vec(rubbed + 3 * static_cast<std::size_t>(u)) : force;
+      mode.add_walls(u, sums, section(*cell, mass, half, by_contacts), Vec<V>{});
+    }
+    if (plan.size) {
+      force = mode.size_of(u, &Size::inverse_cube) * force;
+      torque = mode.size_of(u, &Size::inverse_fifth) * torque;
+    }
+    return cell ? end_step(constants, problem.isotropic, half, force, torque, *cell)
+                : end_step(constants, problem.isotropic, half, force, torque);
   }
 
   void keep(int u, const Grain<V>& g) {
@@ -360,7 +364,7 @@ struct Engine : EngineLayout<Mode> {
   // One pass over the grains: `ends` the step in progress and/or `begins` step number `step`.
   void grains(bool ends, bool begins, int step) {
     const int periodic = problem.periodic;
-    const WallState<V> box = begins ? without(periodic, walls_at(step)) : WallState<V>{};
+    const WallState<V> box = box_now = begins ? without(periodic, walls_at(step)) : WallState<V>{};
     const Cell<V> ended = periodic ? cell_at(current) : Cell<V>{}, before = periodic ? cell_at(step - 1) : Cell<V>{};
     const Cell<V> cell = periodic && begins ? cell_at(step) : Cell<V>{};
     team.share(Team::kGrains, rank, chunks(problem));

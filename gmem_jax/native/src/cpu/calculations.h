@@ -117,7 +117,7 @@ constexpr void reattach(SameRings&, Layers<Symbol>&, Symbol, Symbol, double) {}
 // What is constant of one contact, where boxes are periodic or spheres differ: see `Image` and `Radii`.
 enum ContactConstant { kImage = 0, kReach = 3, kLean, kRoot, kContactConstants };
 // ... and of one grain, and of one of its spheres.
-enum GrainConstant { kCube = 0, kInverseCube, kFifth, kInverseFifth, kGrainConstants };
+enum GrainConstant { kCube = 0, kInverseCube, kInverseFifth, kGrainConstants };
 enum SphereConstant { kSize = 0, kRadius, kSphereConstants, kNormal = kSphereConstants, kPlaneConstants = kNormal + 3 };
 
 // Calculations are `general` where boxes are periodic or spheres differ. A `Cell` is without effect otherwise, as
@@ -198,8 +198,8 @@ struct StepEnd {
       const Symbol mass = input(program, 3, 0, Bar::add);
       Symbol power[kGrainConstants] = {};
       for (int n = 0; n < kGrainConstants; ++n) power[n] = input(program, 4, n, Bar::none);
-      const auto own = parameters.of_size(power[kInverseCube], power[kFifth], power[kInverseFifth]);
-      results(program, end_step(own, isotropic, half, force, torque, cell));
+      const auto by_mass = power[kInverseCube] * force, by_inertia = power[kInverseFifth] * torque;
+      results(program, end_step(parameters, isotropic, half, by_mass, by_inertia, cell));
       const auto rubbed = inputs<Vec<Symbol>>(program, 5, Bar::set);
       result(program, section(cell, power[kCube] * mass, half, force - rubbed));
     } else {

@@ -311,8 +311,13 @@ struct Packed : PackedLayout<Law> {
       contact[n].history = memory[n];
       read_history(group[n], memory[n]);
       const ContactInput<V> m = contact_input(group[n], plan.image ? &faces.cell : nullptr);
-      if (plan.radii) unequal[n] = unequal_of(group[n]), input[n] = m;
-      relative_motion(m, dot(m.separation, m.separation), contact[n]);
+      const V square = dot(m.separation, m.separation);
+      if (plan.radii) {
+        unequal[n] = unequal_of(group[n]), input[n] = m;
+        contact[n].normal = m.separation, contact[n].square = square;
+      } else {
+        relative_motion(m, square, contact[n]);
+      }
     }
     plan.radii ? close<true>(contact, groups, parameter, unequal, [&](int n) { return input[n]; }) : close(contact, groups, parameter);
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);

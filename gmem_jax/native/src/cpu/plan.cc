@@ -153,8 +153,8 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
   double largest = 1.0, widest = 1.0;
   if (list.radii) {
     for (const int32_t grain : store->grain) {
-      const double size = list.sizes[grain], cube = size * size * size, fifth = cube * size * size;
-      store->size.push_back({size, cube, 1.0 / cube, fifth, 1.0 / fifth});
+      const double size = list.sizes[grain], cube = size * size * size;
+      store->size.push_back({size, cube, 1.0 / cube, 1.0 / (cube * size * size)});
     }
     for (const Candidate& c : candidates) {
       const double one = store->size[c.grain_one].one * list.radii[c.one % spheres];

@@ -75,7 +75,7 @@ struct alignas(32) Radii {
 
 // Powers of the size of a grain.
 struct Size {
-  double one, cube, inverse_cube, fifth, inverse_fifth;
+  double one, cube, inverse_cube, inverse_fifth;
 };
 
 // The candidate list, sorted for memory and threads; see plan.h. Grains and spheres are numbered anew.

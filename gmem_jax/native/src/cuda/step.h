@@ -500,11 +500,11 @@ GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
   const HalfStep<V> half{hot.vec(h), {cold[c], cold.vec(c + 1)}, hot.vec(h + 3), hot.vec(h + 6)};
   V parameter[kParameters];
   const GrainParameters<V> constants = read_parameters(on, parameter);
-  GrainParameters<V> own = constants;
+  Vec<V> force = load.force, torque = load.torque;
   V mass = parameter[kMass];
   if constexpr (unequal) {
-    const double size = size_of(on, on.item), cube = size * size * size, fifth = cube * size * size;
-    own = constants.of_size(splat<V>(1.0 / cube), splat<V>(fifth), splat<V>(1.0 / fifth)), mass = splat<V>(cube) * mass;
+    const double size = size_of(on, on.item), cube = size * size * size;
+    force = splat<V>(1.0 / cube) * force, torque = splat<V>(1.0 / (cube * size * size)) * torque, mass = splat<V>(cube) * mass;
   }
   Grain<V> after{};
   if constexpr (periodic) {
@@ -514,9 +514,9 @@ GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
     const Column<V> wall = on.in(a.wall);
     const int at = a.of_wall * on.item * a.spheres + 3;
     wall.put(at, wall.vec(at) + section_pressure(a.periodic, box, cell, own_part, load.through));
-    after = end_step(own, a.isotropic, half, load.force, load.torque, cell);
+    after = end_step(constants, a.isotropic, half, force, torque, cell);
   } else {
-    after = end_step(own, a.isotropic, half, load.force, load.torque);
+    after = end_step(constants, a.isotropic, half, force, torque);
   }
   if (step + 1 == a.steps) return deliver(on, after);
   begin<V, periodic, unequal>(on, step + 1, constants, after);

@@ -80,18 +80,6 @@ struct GrainParameters {
       inverse_inertia[axis] = splat<V>(1.0) / inertia[axis];
     }
   }
-
-  // Of a grain of another size, of which these are powers.
-  // gmem_jax/physics/grain.py: Clump.scaled
-  constexpr GrainParameters of_size(V inverse_cube, V fifth, V inverse_fifth) const {
-    GrainParameters p = *this;
-    p.inverse_mass = inverse_cube * p.inverse_mass;
-    for (int axis = 0; axis < 3; ++axis) {
-      p.inertia[axis] = fifth * p.inertia[axis];
-      p.inverse_inertia[axis] = inverse_fifth * p.inverse_inertia[axis];
-    }
-    return p;
-  }
 };
 
 // First half of a step.
@@ -132,7 +120,9 @@ constexpr Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropi
   return rotation * rate(fma(p.half_dt, rate(body_spin), body_spin));
 }
 
-// Second half: accelerations and velocities; position and orientation stay.
+// Second half: accelerations and velocities; position and orientation stay. A grain of another size is moved by a force and a
+// torque as one of size 1 is by that force over the third, and that torque over the fifth power of its size.
+// gmem_jax/physics/grain.py: Clump.scaled
 // gmem_jax/physics/step.py: step (from the forces on)
 template <class V>
 constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotropic, const HalfStep<V>& m, Vec<V> force,
@@ -330,11 +320,16 @@ GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, c
                             int spheres, V size, double outer, const WallState<V>& box, WallForces<V>& on, const Put& put) {
   const Matrix<V> rotation = matrix(m.orientation);
   const bool near = bits_less(V{}, deepest(splat<V>(outer) * size, m.position, box)) != 0;
-  GrainParameters<V> own = p;
   for (int k = 0; k < spheres; ++k) {
+    const Vec<V> body = size * body_at<V>(offsets + 3 * k);
+    if (!near) {
+      put(k, m.position + rotation * body);
+      continue;
+    }
     const V radius = splat<V>(radii[k]) * size;
-    if (near) own.wall_stiffness = root(radius) * p.wall_stiffness;
-    put(k, sphere_of(own, m, rotation, size * body_at<V>(offsets + 3 * k), near, box, on, radius));
+    GrainParameters<V> own = p;
+    own.wall_stiffness = root(radius) * p.wall_stiffness;
+    put(k, sphere_of(own, m, rotation, body, near, box, on, radius));
   }
   return near;
 }
