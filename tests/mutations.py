@@ -772,15 +772,15 @@ MUTATIONS = (
     mutation(
         "native-size-inertia",
         "cpu/plan.cc",
-        "fifth = cube * size * size;",
-        "fifth = cube;",
+        "1.0 / (cube * size * size)",
+        "1.0 / cube",
         f"{UNEQUAL}[H]",
     ),
     mutation(
         "native-size-walls",
         "physics/motion.h",
-        "if (near) own.wall_stiffness = root(radius) * p.wall_stiffness;",
-        "",
+        "own.wall_stiffness = root(radius) * p.wall_stiffness;\n    put(",
+        "put(",
         f"{UNEQUAL}[frictionless]",
     ),
     mutation(
@@ -793,7 +793,7 @@ MUTATIONS = (
     mutation(
         "native-size-section",
         "cpu/block.h",
-        "power(&Size::cube) * parameter[kMass]",
+        "mode.size_of(u, &Size::cube) * parameter[kMass]",
         "parameter[kMass]",
         "test_values_of_bidisperse_spheres_and_in_periodic_boxes_are_those_of_the_definition[M1-periodic]",
     ),
