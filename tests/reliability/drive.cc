@@ -239,7 +239,7 @@ int main(int count, char** arguments) {
     for (const Task task : {Task::forward, Task::tangent, Task::adjoint})
       for (const int kind : {0, 1, 2}) {
         const bool general = kind != 1, rubs = kind != 0;
-        const bool has = !general ? law.law != Law::mindlin : law.law == Law::hooke || law.variant == Variant::paper;
+        const bool some = law.law == Law::hooke || law.variant == Variant::paper, has = general ? some : !some && law.law != Law::mindlin;
         const auto with = [&](int edge, int replicas) {
           return Case{law.law, law.variant, task, edge, edge == 4 ? 4.5 : 2.5, replicas, false, general, rubs};
         };
