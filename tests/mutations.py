@@ -122,8 +122,8 @@ MUTATIONS = (
     mutation(
         "native-walls-rings-as-stiff-as-between-grains",
         "physics/motion.h",
-        "stiffer[count].root = p.wall_stiffness / walls.normal_stiffness;",
-        "stiffer[count].root = splat<V>(1.0);",
+        "const V stiffer_by = p.wall_stiffness / walls.normal_stiffness;",
+        "const V stiffer_by = splat<V>(1.0);",
         "test_values_at_walls_with_friction_are_those_of_the_definition[M2-5-file1]",
     ),
     mutation(

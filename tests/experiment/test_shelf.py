@@ -56,13 +56,13 @@ def test_the_papers_two_are_those_of_an_experiment_without_a_protocol() -> None:
     assert protocols.long_storage(2.0) == protocols.paper()
 
 
+@pytest.mark.slow  # whose programs are optimised: to the last bit these two agree only then
 def test_a_second_write_after_a_silent_first_is_the_papers() -> None:
     protocol = protocols.write_read_write_read(0.1, cycles=0).with_value("store.length", 0.2)
     twice = run(protocol, gm.signals(first=SILENT, second=ONE))
     once = run(protocols.paper(0.1))
     assert not np.any(twice.p_sig[0])
-    # Two programs of the same steps, whose round-off grows with contacts that begin: 2e-13 was seen.
-    np.testing.assert_allclose(twice.p_sig[1], once.p_sig, atol=1e-11 * np.abs(once.p_sig).max())
+    np.testing.assert_array_equal(twice.p_sig[1], once.p_sig)
     assert float(twice.gain[1]) == pytest.approx(float(once.gain), rel=1e-12)
 
 

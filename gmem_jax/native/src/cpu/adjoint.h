@@ -214,10 +214,9 @@ struct Adjoint : AdjointLayout<Law> {
   V* state_of(int step, int u) const { return of_grain(state + static_cast<std::size_t>(step) * problem.grains * kState, u, kState); }
   V* total_of(int step, int u) const { return of_grain(total + static_cast<std::size_t>(step) * problem.grains * 6, u, 6); }
 
-  // What sphere k of grain u remembers of plane w, among the histories of all that begin at `histories`; and its bars.
-  std::size_t plane_row(int u, int k, int w) const {
-    return static_cast<std::size_t>(u) * problem.wall_rows() + static_cast<std::size_t>(kPlanes) * k + w;
-  }
+  // What sphere k of grain u remembers of plane w: its row, where it is among the histories of all that begin at `histories`,
+  // and its bars.
+  std::size_t plane_row(int u, int k, int w) const { return forward.wall_row(u, kPlanes * k + w); }
   V* at_plane(V* histories, int u, int k, int w) const { return histories + plane_row(u, k, w) * Law::kHistory; }
   V* bar_at_plane(int u, int k, int w) const { return wall_history_bar + plane_row(u, k, w) * remembered(problem); }
   V* wall_history_at(int step) const {

@@ -246,7 +246,7 @@ struct Engine : EngineLayout<Mode> {
         if (plan.size) own.wall_stiffness = root(radius) * constants.wall_stiffness;
         const Vec<V> body = with_offsets([&](const auto* offsets) { return body_at<V>(offsets + 3 * k); });
         const Vec<V> lever = rotation * (plan.size ? size * body : body);
-        const std::size_t first = static_cast<std::size_t>(u) * problem.wall_rows() + static_cast<std::size_t>(kPlanes) * k;
+        const std::size_t first = wall_row(u, kPlanes * k);
         KnownPlanes& planes = remembered[first / kPlanes];
         const unsigned now = rub_walls<Law>(own, wall_law, m.position + lever, lever, add_cross(m.velocity, m.spin, lever), m.spin,
                                             box_now, radius, wall_history + first * Law::kHistory, planes.now,
@@ -274,57 +274,54 @@ struct Engine : EngineLayout<Mode> {
     return Reach<V, Law::variant>(wall_history[row * Law::kHistory + kLastOverlap], wall_law.law, last).outer;
   }
 
-  // Calls `each` with the rows of unit u in the histories of walls: with the number among those of a grain, and where
-  // what is remembered and its bits are.
+  // Row `row` of those of unit u in the histories of walls.
+  std::size_t wall_row(int u, int row) const { return static_cast<std::size_t>(u) * problem.wall_rows() + row; }
+
+  // Calls `each` with the rows of unit u in the histories of walls: with the number among those of a grain and of all, and
+  // the bits of what its sphere remembers.
   template <class Each>
   void for_walls(int u, const Each& each) const {
-    const std::size_t first = static_cast<std::size_t>(u) * problem.wall_rows();
     for (int row = 0; row < problem.wall_rows(); ++row)
-      each(row, wall_history + (first + row) * Mode::OfLaw::kHistory, remembered[(first + row) / kPlanes], row % kPlanes);
+      each(row, wall_row(u, row), remembered[wall_row(u, row) / kPlanes]);
   }
 
   // From the arrays of the call ...
   void load_walls(int u) {
+    using Law = typename Mode::OfLaw;
     remembers[u] = false;
-    for_walls(u, [&](int row, V* numbers, KnownPlanes& planes, int w) {
+    for_walls(u, [&](int row, std::size_t of_all, KnownPlanes& planes) {
+      const int w = row % kPlanes;
+      V* const numbers = wall_history + of_all * Law::kHistory;
       bool any = Mode::kDual;  // a derivative may be where the value is 0
-      for (int q = 0; q < Mode::OfLaw::kGiven; ++q) {
-        numbers[q] = mode.wall_in(u, row, [q](std::ptrdiff_t at) { return place_of<typename Mode::OfLaw>(at, q); });
+      for (int q = 0; q < Law::kGiven; ++q) {
+        numbers[q] = mode.wall_in(u, row, [q](std::ptrdiff_t at) { return place_of<Law>(at, q); });
         any |= (bits_less(numbers[q], V{}) | bits_less(V{}, numbers[q])) != 0;
       }
       if (w == 0) planes = {};
-      if constexpr (Mode::OfLaw::kLayered) load_wall_rings(u, row, numbers);
+      if constexpr (Law::kLayered) {
+        const V outer = wall_outermost(of_all);
+        wall_rings[of_all] = rings_of(problem, outer);
+        load_rings<Law>(numbers, wall_segments_of(of_all), outer, mode.apart, [&](int j, int axis) {
+          return mode.wall_in(u, row, [&](std::ptrdiff_t at) { return ring_place(problem, at, j, axis); });
+        });
+      }
       if (any) planes.now |= 1u << w, planes.ever |= 1u << w, remembers[u] = true;
     });
   }
 
-  // ... and Mindlin's rings ...
-  void load_wall_rings(int u, int row, V* numbers) {
-    const std::size_t of_all = static_cast<std::size_t>(u) * problem.wall_rows() + row;
-    const V outer = wall_outermost(of_all);
-    wall_rings[of_all] = rings_of(problem, outer);
-    const auto number = [&](int j, int axis) {
-      return mode.wall_in(u, row, [&](std::ptrdiff_t at) { return ring_place(problem, at, j, axis); });
-    };
-    const auto ring = [&](int j) { return Flat<V>{number(j, 0), number(j, 1)}; };
-    store_layers(numbers + kLayers, wall_segments_of(of_all).load(outer, kLacking<Mode::OfLaw::variant>, mode.apart, ring));
-  }
-
   // ... and back.
   void unload_walls(int u, int steps_done) const {
-    for_walls(u, [&](int row, const V* numbers, const KnownPlanes& planes, int w) {
-      if (problem.history_aliased && !(planes.ever >> w & 1)) return;
-      for (int q = 0; q < Mode::OfLaw::kGiven; ++q)
-        mode.wall_out(u, row, [q](std::ptrdiff_t at) { return place_of<typename Mode::OfLaw>(at, q); }, numbers[q], steps_done);
-      if constexpr (Mode::OfLaw::kLayered) {
-        const std::size_t of_all = static_cast<std::size_t>(u) * problem.wall_rows() + row;
-        const V outer = wall_outermost(of_all);
-        const auto put_number = [&](int j, int axis, V number) {
-          mode.wall_out(u, row, [&](std::ptrdiff_t at) { return ring_place(problem, at, j, axis); }, number, steps_done);
-        };
-        const auto put = [&](int j, const Flat<V>& force) { put_number(j, 0, force.along), put_number(j, 1, force.across); };
-        wall_segments_of(of_all).unload(load_layers(numbers + kLayers), outer, rings_to_write(problem, wall_rings[of_all], outer), put);
-      }
+    using Law = typename Mode::OfLaw;
+    for_walls(u, [&](int row, std::size_t of_all, const KnownPlanes& planes) {
+      if (problem.history_aliased && !(planes.ever >> row % kPlanes & 1)) return;
+      const V* const numbers = wall_history + of_all * Law::kHistory;
+      for (int q = 0; q < Law::kGiven; ++q)
+        mode.wall_out(u, row, [q](std::ptrdiff_t at) { return place_of<Law>(at, q); }, numbers[q], steps_done);
+      if constexpr (Law::kLayered)
+        unload_rings(problem, numbers, wall_segments_of(of_all), wall_outermost(of_all), wall_rings[of_all],
+                     [&](int j, int axis, const V& number) {
+                       mode.wall_out(u, row, [&](std::ptrdiff_t at) { return ring_place(problem, at, j, axis); }, number, steps_done);
+                     });
     });
   }
 

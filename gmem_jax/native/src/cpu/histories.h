@@ -63,8 +63,27 @@ int rings_to_write(const Problem& p, int before, V outer) {
 }
 
 // Where number `axis` of ring j lies in the arrays of a call.
-inline Place ring_place(const Problem& p, std::ptrdiff_t row, int j, int axis = 0) {
+inline Place ring_place(const Problem& p, std::ptrdiff_t row, int j, int axis) {
   return {0, (row * p.points + j) * 2 + axis};
+}
+
+// Mindlin's rings, of which `number(j, axis)` is one in the arrays of a call, to the layers and segments of a history ...
+template <class Law, class V, class Segments, class Outer, class Number>
+void load_rings(V* history, Segments segments, Outer outer, bool apart, const Number& number) {
+  const auto ring = [&](int j) {
+    const auto along = number(j, 0);
+    return Flat<V>{along, number(j, 1)};
+  };
+  store_layers(history + kLayers, segments.load(outer, kLacking<Law::variant>, apart, ring));
+}
+
+// ... and back, by `put(j, axis, number)`; `before` are the rings that there were at first.
+template <class V, class Segments, class Outer, class Put>
+void unload_rings(const Problem& p, const V* history, const Segments& segments, Outer outer, int before, const Put& put) {
+  segments.unload(load_layers(history + kLayers), outer, rings_to_write(p, before, outer), [&](int j, const auto& force) {
+    put(j, 0, force.along);
+    put(j, 1, force.across);
+  });
 }
 
 // The history of candidate c, from the arrays of the call to where a mode keeps it.
@@ -77,13 +96,8 @@ void load_history(Mode& mode, std::ptrdiff_t c, const LawParameters<V>& law) {
   if constexpr (Law::kLayered) {
     const auto outer = mode.outermost(c, law);
     mode.marks.rings[c] = rings_of(mode.problem, outer);
-    const auto ring = [&](int j) {
-      using Number = decltype(mode.history_in(Place{}));
-      const Number along = mode.history_in(ring_place(mode.problem, row, j));
-      return Flat<Number>{along, mode.history_in(ring_place(mode.problem, row, j, 1))};
-    };
-    const auto layers = mode.segments_of(c).load(outer, kLacking<Law::variant>, mode.apart, ring);
-    store_layers(&mode.remembered(c, kLayers), layers);
+    const auto number = [&](int j, int axis) { return mode.history_in(ring_place(mode.problem, row, j, axis)); };
+    load_rings<Law>(&mode.remembered(c, 0), mode.segments_of(c), outer, mode.apart, number);
   }
 }
 
@@ -95,12 +109,10 @@ void unload_history(const Mode& mode, std::ptrdiff_t c, const LawParameters<V>& 
   for (int q = 0; q < Law::kGiven; ++q) mode.history_out(place_of<Law>(row, q), mode.remembered(c, q), steps_done);
   if constexpr (Law::kLayered) {
     const auto outer = mode.outermost(c, law);
-    const auto layers = load_layers(&mode.remembered(c, kLayers));
-    const int end = rings_to_write(mode.problem, mode.marks.rings[c], outer);
-    mode.segments_of(c).unload(layers, outer, end, [&](int j, const auto& force) {
-      mode.history_out(ring_place(mode.problem, row, j), force.along, steps_done);
-      mode.history_out(ring_place(mode.problem, row, j, 1), force.across, steps_done);
-    });
+    unload_rings(mode.problem, &mode.remembered(c, 0), mode.segments_of(c), outer, mode.marks.rings[c],
+                 [&](int j, int axis, const auto& number) {
+                   mode.history_out(ring_place(mode.problem, row, j, axis), number, steps_done);
+                 });
   }
 }
 

@@ -52,9 +52,8 @@ struct alignas(16) Four {
   int of[4];
 };
 
-// What is remembered of contacts between grains, or with walls that have friction: `rows` of them.
+// What is remembered of contacts between grains, or with walls that have friction.
 struct Memories {
-  int rows;
   Table history_in[kMaxHistory], history_out[kMaxHistory];
   // Between steps.
   Table history[kMaxHistory];  // as in the arrays of the call, but for Mindlin's rings, which these replace:

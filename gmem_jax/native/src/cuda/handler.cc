@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cstdint>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "call/signature.h"
@@ -135,15 +136,15 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.parameters = read();
   a.walls = read();
   if (task == Task::tangent) a.along_offsets = entries<const double>(in[slope++]);
-  a.contacts.rows = a.rows, a.at_walls.rows = rubs ? kPlanes * a.grains * a.spheres : 0;
-  a.of_wall = rubs ? 12 : 6;
-  std::vector<Memories*> kept{&a.contacts};
-  if (rubs) kept.push_back(&a.at_walls);
-  for (Memories* of : kept)
+  a.of_wall = static_cast<int>(reader.size('X'));
+  const int64_t wall_rows = rubs ? kPlanes * reader.size('S') : 0;
+  std::vector<std::pair<Memories*, int64_t>> kept{{&a.contacts, a.rows}};  // with their rows
+  if (rubs) kept.emplace_back(&a.at_walls, wall_rows);
+  for (const auto& [of, rows] : kept)
     for (std::size_t leaf = 0; leaf < leaves; ++leaf) of->history_in[leaf] = read();
   for (Table& field : a.grains_out) field = write();
   a.pressure_out = write();
-  for (Memories* of : kept)
+  for (const auto& [of, rows] : kept)
     for (std::size_t leaf = 0; leaf < leaves; ++leaf) of->history_out[leaf] = write();
   const auto between = [&](int64_t rows) {
     double* values = reinterpret_cast<double*>(out[result++].data);
@@ -156,21 +157,21 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.load = between(a.rows * int64_t{kLoad});
   a.touching = reinterpret_cast<unsigned char*>(out[result++].data);
   const bool layered = is_layered(which.law);
-  for (Memories* of : kept)
+  for (const auto& [of, rows] : kept)
     for (std::size_t leaf = 0; leaf < leaves; ++leaf) {
       const std::string axes = histories(which.law)[leaf].axes;  // "P3B", "P1B"; of the rings "PQ2B"
       const bool apart = a.tangent && axes.size() == 3;
-      of->history[leaf] = apart ? between(of->rows * int64_t{axes[1] - '0'}) : of->history_out[leaf];
+      of->history[leaf] = apart ? between(rows * int64_t{axes[1] - '0'}) : of->history_out[leaf];
     }
-  for (Memories* of : kept) {
+  for (const auto& [of, rows] : kept) {
     if (!layered) continue;
-    of->layers = between(of->rows * int64_t{kOfLayers});
-    of->segments = between(of->rows * points * 3);
+    of->layers = between(rows * int64_t{kOfLayers});
+    of->segments = between(rows * points * 3);
     of->stored = reinterpret_cast<int*>(out[result++].data);
   }
 
   const int spheres = a.grains * a.spheres;
-  const int64_t most_rows = std::max<int64_t>(a.rows + int64_t{spheres}, a.at_walls.rows);
+  const int64_t most_rows = std::max<int64_t>(a.rows + int64_t{spheres}, wall_rows);
   threads_for(most_rows * std::max<int64_t>({12, 3 * points, a.lanes}));  // rows of tables; threads
   const Launcher launch(stream, which);
   launch(GpuKernel::enter, a.grains, a);

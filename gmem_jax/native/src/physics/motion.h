@@ -252,6 +252,7 @@ GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& wa
   const Vec<V> low = box.lower_velocity - velocity, up = velocity - box.upper_velocity;
   const V overlap[kPlanes] = {lower.x, lower.y, lower.z, upper.x, upper.y, upper.z};
   const V closing[kPlanes] = {low.x, low.y, low.z, up.x, up.y, up.z};
+  const V stiffer_by = p.wall_stiffness / walls.normal_stiffness;
   Contact<V> c[kPlanes];
   Unequal<V> stiffer[kPlanes];
   int count = 0, plane[kPlanes];
@@ -266,7 +267,7 @@ GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& wa
     }
     touched |= 1u << w;
     c[count].history = own;
-    stiffer[count].root = p.wall_stiffness / walls.normal_stiffness;
+    stiffer[count].root = stiffer_by;
     meet_plane(normal_of_plane<V>(w), walls, p.normal_damping, lever, velocity, spin, radius, overlap[w], closing[w], c[count]);
     plane[count++] = w;
   }
