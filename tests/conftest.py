@@ -4,6 +4,7 @@ import atexit
 import os
 import tempfile
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 # Workers of xdist, and the processes that tests start, find what others have compiled. It is gone at the end.
@@ -13,10 +14,13 @@ if "GMEM_COMPILE_CACHE" not in os.environ:
     os.environ["GMEM_COMPILE_CACHE"] = programs.name
     atexit.register(programs.cleanup)
 
-# Much of the time of all tests is LLVM's, which makes programs fast that are small and run once. The slow tests have
-# programs as a user's are: there XLA_FLAGS is set (Makefile).
+# Much of the time of all tests is the compiler's, which makes programs fast that are small and run once. The slow tests
+# have programs as a user's are: there XLA_FLAGS is set (Makefile). The emitters of fusions, which XLA can do without up
+# to jaxlib 0.9, take half of the time that is left; an unknown flag ends the process.
 if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
+    if version("jaxlib").startswith("0.9."):
+        os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
 
 import jax
 import pytest

@@ -1,10 +1,12 @@
 """Derivatives of a whole memory experiment on the host, chunk by chunk, in both directions.
 
 `jax.grad` and `jax.jvp` of `gm.fidelity` work as they are. The observers here do the same in the chunks of
-`simulation.runner`: they report progress, compile small programs, make stale lists anew, and need one state per chunk
-and the replay of one chunk. What is differentiated by is named: "gamma0", "friction.mu", "signals.amplitudes", ...
+`simulation.runner`: they report progress, compile small programs, make stale lists anew, and keep the states before all
+bins as long as there is room, then those before all chunks. What is differentiated by is named: "gamma0",
+"friction.mu", "signals.amplitudes", ...
 """
 
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
@@ -12,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, value_at
@@ -22,7 +25,7 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint
 from gmem_jax.simulation.compiled import Compiled
-from gmem_jax.simulation.loop import Simulation, rollout, rollout_chunk
+from gmem_jax.simulation.loop import Simulation, bin_step, rollout_chunk
 from gmem_jax.simulation.observers import CHUNK, Chunk, Move, Observer
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within, work_of
 from gmem_jax.simulation.protocol import Bin
@@ -34,7 +37,8 @@ Loss = Callable[[Experiment, jax.Array], jax.Array]
 
 STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
 LENGTHS = ("pack.clump.radii", "pack.clump.sizes")  # of spheres that are not all alike
-FORWARDS = 0.17  # of a gradient's time is the way forward
+FORWARDS = 0.2  # of a gradient's time is the way forward
+ROOM = 2**30  # bytes that one way may keep of its states; those of later chunks are computed again on the way back
 
 Moving = tuple[Any, ...]  # grains, histories, held walls and periodic cell: what of a state can be differentiated
 
@@ -98,21 +102,52 @@ def _push(
     return _state(moving, status), sample, slope
 
 
+def _before(state: State, sample: Sample) -> tuple[Moving, Sample]:
+    """Keep the state before a bin too."""
+    return _moving(state), sample
+
+
 def _pull(
-    simulation: Simulation, state: State, rows: Bin, slopes: tuple[Moving, jax.Array], fixed: tuple[str, ...]
+    simulation: Simulation,
+    before: Moving,
+    first: Bin,
+    count: Any,
+    slopes: tuple[Moving, jax.Array],
+    fixed: tuple[str, ...],
 ) -> Any:
-    """Derivatives by numbers and state before a chunk, from those by state and pressures after it."""
+    """Derivatives by numbers and state before a chunk, from those by the state after it and the pressures of its bins.
 
-    def chunk(numbers: Any, moving: Moving) -> Any:
-        changed = _with_numbers(simulation, numbers, fixed)
-        after, sample = rollout(changed, _state(moving, state.status), rows)
-        return _moving(after), sample.pressure
+    Args:
+        simulation: what is run.
+        before: states before its bins, leaves [most, ..., B].
+        first: the first bin.
+        count: of the bins.
+        slopes: derivatives; by the pressures [most, 3, B].
+        fixed: what is not differentiated by.
+    """
+    numbers, status = _numbers(simulation, fixed), jnp.zeros(slopes[1].shape[-1], jnp.int32)
 
-    return jax.vjp(chunk, _numbers(simulation, fixed), _moving(state))[1](slopes)
+    def one(done: jax.Array, carry: Any) -> Any:
+        place = count - 1 - done
+        by_state, by_numbers = carry
+
+        def step(numbers: Any, moving: Moving) -> tuple[Moving, jax.Array]:
+            changed = _with_numbers(simulation, numbers, fixed)
+            row = first._replace(number=first.number + place)
+            after, sample = bin_step(changed, _state(moving, status), row)
+            return _moving(after), sample.pressure
+
+        at = jax.tree.map(lambda leaf: leaf[place], before)
+        more, by_state = jax.vjp(step, numbers, at)[1]((by_state, slopes[1][place]))
+        return by_state, jax.tree.map(jnp.add, by_numbers, more)
+
+    by_state, by_numbers = lax.fori_loop(0, count, one, (slopes[0], jax.tree.map(jnp.zeros_like, numbers)))
+    return by_numbers, by_state
 
 
 _pushed = Compiled(_push, static_argnames=("most", "fixed"))
 _pulled = Compiled(_pull, static_argnames="fixed")
+_recorded = Compiled(functools.partial(rollout_chunk, keep=_before), static_argnames="most")
 
 
 @dataclass
@@ -168,26 +203,37 @@ class _Remembering(Observer):
     """Remembers the way, to go back on it."""
 
     fixed: tuple[str, ...]  # what is not differentiated by
+    room: int  # bytes that are left for states
     tape: list[_Piece] = field(default_factory=list)
     numbers: Any = None  # derivatives by the simulation's numbers so far
     reads: Mapping[str, np.ndarray] = field(default_factory=dict)  # derivatives by the pressures that are read
+    _next: Moving | None = None
+
+    def step(self, chunk: Chunk) -> tuple[State, Sample] | None:
+        """Run the chunk, keeping the states before its bins, if there is room for them."""
+        if self.room <= 0:
+            return None
+        state, (self._next, sample) = _recorded(chunk.simulation, chunk.state, chunk.row, chunk.count, most=CHUNK)
+        self.room -= sum(leaf.nbytes for leaf in jax.tree.leaves(self._next))
+        return state, sample
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
-        """Remember the state before the chunk, and how to go back through it."""
-        simulation, before, first, count = chunk.simulation, chunk.state, chunk.first, chunk.count
-        rows = simulation.rows(chunk.stage, first, count)
+        """Remember how to go back through the chunk."""
+        at, count = (chunk.simulation, chunk.state, chunk.row, chunk.count), chunk.count
+        states, self._next = self._next, None
 
         def back(slope: Moving) -> Moving:
+            before = _recorded(*at, most=CHUNK)[1][0] if states is None else states
+            own = np.zeros((CHUNK, 3, at[1].replicas))
             known = self.reads.get(chunk.stage.name)
-            shape = (count, 3, before.replicas)
-            own = np.zeros(shape) if known is None else known[first : first + count]
-            back_from = (slope, jnp.asarray(own))
-            by_numbers, by_state = _pulled(simulation, before, rows, back_from, fixed=self.fixed)
+            if known is not None:
+                own[:count] = known[chunk.first : chunk.first + count]
+            moving: Moving
+            by_numbers, moving = _pulled(at[0], before, at[2], count, (slope, jnp.asarray(own)), fixed=self.fixed)
             self.numbers = by_numbers if self.numbers is None else jax.tree.map(jnp.add, self.numbers, by_numbers)
-            moving: Moving = by_state
             return moving
 
-        self.tape.append(_Piece(back, chunk.stage.name, count * before.replicas))
+        self.tape.append(_Piece(back, chunk.stage.name, count * at[1].replicas))
 
     def rebuild(self, history: Any, move: Move, blank: Any) -> None:
         """Remember how the history was moved."""
@@ -328,8 +374,9 @@ def value_and_grad(
 ) -> Gradient:
     """Reverse mode: a number and its derivatives by all parameters, through the whole experiment.
 
-    The way forward keeps the state at the start of each chunk; the way back replays chunk after chunk and, within it,
-    bin after bin. On the native backend both happen in the library, for some six forward runs in all.
+    The way forward keeps the state before each bin, in up to a GB, and beyond it the state before each chunk of 32. The
+    way back replays such a chunk, and every bin. On the native backend bins are differentiated in the library; a
+    gradient costs some four forward runs, and one more where chunks are replayed.
 
     Args:
         experiment: where.
@@ -350,7 +397,7 @@ def value_and_grad(
     on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))
     on.total_work = _work(experiment, on)
     fixed = _fixed_by(by)
-    prefix, rest = _Remembering(fixed), _Remembering(fixed)
+    prefix, rest = _Remembering(fixed, ROOM), _Remembering(fixed, ROOM)
     on.observers = (prefix,) if any(map(acts_on_prefix, by)) else ()
     _, pull_begin = jax.vjp(lambda theta: _moving(along(theta).begin()), theta)
     on.run_stages(*common)

@@ -204,6 +204,15 @@ def rollout(simulation: Simulation, state: State, rows: Bin) -> tuple[State, Sam
     return scan.scan(lambda state, row: bin_step(simulation, state, row), state, rows)
 
 
+Keep = Callable[[State, Sample], Any]
+"""What is kept of a bin, arrays: of the state before it and its sample."""
+
+
+def sample_of(state: State, sample: Sample) -> Sample:
+    """The sample alone: a `Keep`."""
+    return sample
+
+
 def rollout_stages(simulation: Simulation, state: State, stages: tuple[Stage, ...]) -> tuple[Simulation, State, Sample]:
     """Stages one after the other; the simulation with its last mark, the state after them, and their samples."""
     parts, first = [], 0
@@ -220,22 +229,26 @@ def rollout_stages(simulation: Simulation, state: State, stages: tuple[Stage, ..
 
 
 def rollout_chunk(
-    simulation: Simulation, state: State, first: Bin, count: jax.Array | None, most: int
-) -> tuple[State, Sample]:
+    simulation: Simulation, state: State, first: Bin, count: jax.Array | None, most: int, keep: Keep = sample_of
+) -> tuple[State, Any]:
     """`count` bins of one stage from the bin `first`, in a program for any count up to `most`; not for reverse mode.
 
     Without a count, `most`: a GPU whose program knows the number of bins does not wait for the host after each.
 
     Returns:
-        The state, and samples with a leading axis [most], zero beyond `count`.
+        The state, and what was to be kept with a leading axis [most], zero beyond `count`.
     """
+
+    def step(state: State, place: Any) -> tuple[State, Any]:
+        after, sample = bin_step(simulation, state, first._replace(number=first.number + place))
+        return after, keep(state, sample)
 
     def one(place: jax.Array, carry: tuple[State, Any]) -> tuple[State, Any]:
         state, kept = carry
-        state, sample = bin_step(simulation, state, first._replace(number=first.number + place))
-        return state, jax.tree.map(lambda all_, new: all_.at[place].set(new), kept, sample)
+        state, new = step(state, place)
+        return state, jax.tree.map(lambda all_, leaf: all_.at[place].set(leaf), kept, new)
 
-    shape = jax.eval_shape(lambda: bin_step(simulation, state, first)[1])
+    shape = jax.eval_shape(lambda: step(state, 0)[1])
     blank = jax.tree.map(lambda leaf: jnp.zeros((most, *leaf.shape), leaf.dtype), shape)
-    done: tuple[State, Sample] = lax.fori_loop(0, most if count is None else count, one, (state, blank))
+    done: tuple[State, Any] = lax.fori_loop(0, most if count is None else count, one, (state, blank))
     return done

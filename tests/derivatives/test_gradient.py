@@ -80,6 +80,12 @@ def test_the_reverse_sweep_agrees_with_the_forward_one(experiment: gm.Experiment
     assert np.any(found.slope["pack.position"] != 0.0)
 
 
+def test_states_are_kept_or_computed_again(experiment: gm.Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = gm.value_and_grad(experiment, EVERYTHING)
+    monkeypatch.setattr(gradient, "ROOM", 1)  # each way keeps those of its first chunk
+    assert gm.value_and_grad(experiment, EVERYTHING) == kept
+
+
 def test_the_exact_jacobian_agrees_with_central_differences(
     experiment: gm.Experiment, exact: jacobian.Jacobian
 ) -> None:
@@ -140,6 +146,7 @@ def require_differences(experiment: gm.Experiment, slopes: dict[str, Any]) -> No
         np.testing.assert_allclose(np.vdot(slope, toss), difference, rtol=2e-2, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_every_name_has_the_derivative_of_differences(whole: gm.Experiment) -> None:
     names = all_names(whole)
     assert {"pack.lower", "pack.quaternion", "pack.clump.inertia", "material.poisson", "t0", "hold_drag"} < set(names)
@@ -199,12 +206,13 @@ def test_a_gradient_by_the_whole_experiment_is_native(whole: gm.Experiment, monk
 def test_only_slopes_by_sizes_are_those_of_plain_jax(whole: gm.Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
     unequal = gm.replace(whole, pack=gm.load_pack(SPREAD_27), delta0=None)
     simulation, state = unequal.simulation(sheared=False), unequal.begin()
-    rows, slope = simulation.rows(unequal.phases[0][0], 0, 2), (gradient._moving(state), jnp.zeros((2, 3, 1)))
+    row, moving = simulation.rows(unequal.phases[0][0], 0), gradient._moving(state)
+    before, slope = jax.tree.map(lambda leaf: leaf[None], moving), (moving, jnp.zeros((1, 3, 1)))
     monkeypatch.delattr(sys.modules["gmem_jax.native.march"], "_plain")  # the definition of the steps
 
     def pull(*names: str) -> Any:
         fixed = gradient._fixed_by(names)
-        return jax.eval_shape(functools.partial(gradient._pull, fixed=fixed), simulation, state, rows, slope)
+        return jax.eval_shape(functools.partial(gradient._pull, fixed=fixed), simulation, before, row, 1, slope)
 
     few, _ = pull("friction.mu", "pack.clump.offsets")
     assert len(few) > 0

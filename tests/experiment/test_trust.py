@@ -227,6 +227,7 @@ def test_round_off_is_as_large_as_the_recall_says() -> None:
     assert [gm.Status.ROUNDED in Status(int(found.status[1])) for found in (one, other)] == [False, True]
 
 
+@pytest.mark.slow
 def test_mixed_precision_says_where_it_ends() -> None:
     def recall(gamma0: float) -> gm.Recall:
         short = {"rest": 0.05, "hold": 0.05, "store": 0.2}

@@ -34,7 +34,6 @@ from gmem_jax.simulation.protocol import Drive, Stage
 
 BUILT, REASON = native.available()
 pytestmark = [
-    pytest.mark.xdist_group("gpu"),  # the emulation is compiled once
     pytest.mark.skipif(not BUILT, reason=REASON),  # without a C++ compiler there is nothing to compile it with
 ]
 needs_nvrtc = pytest.mark.skipif(bool(cuda.missing()), reason=cuda.missing())

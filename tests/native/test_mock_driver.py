@@ -311,7 +311,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("driver")
 
 
-@pytest.mark.xdist_group("gpu")
 @pytest.mark.skipif(not native.available()[0], reason=native.available()[1])
 @pytest.mark.skipif(bool(cuda.missing()), reason=cuda.missing())
 @pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.slow] * (case in SLOW)) for case in CASES])

@@ -23,7 +23,6 @@ except RuntimeError:
     GPU = None
 pytestmark = [
     pytest.mark.skipif(GPU is None or not native.available()[0], reason="JAX sees no CUDA GPU here"),
-    pytest.mark.xdist_group("gpu"),
 ]
 STEPS = 40
 Scene = tuple[System, Any, Box]

@@ -13,7 +13,7 @@ from scenes import TESTS
 from gmem_jax import native
 
 Numbers = dict[str, np.ndarray]
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("devices")]  # the numbers of one device are computed once
+pytestmark = pytest.mark.slow
 HERE = Path(__file__).parent
 BUILT, REASON = native.available()
 

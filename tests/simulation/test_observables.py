@@ -346,6 +346,7 @@ def run_on(backend: str) -> gm.Recall:
 
 
 @pytest.mark.skipif(not native.available()[0], reason=native.available()[1])
+@pytest.mark.slow
 def test_both_backends_see_the_same() -> None:
     one, other = run_on("native"), run_on("jax")
     for stage, sample in one.stages.items():
