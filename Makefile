@@ -13,7 +13,7 @@ demo: install
 
 # Units and physics: what to run after every change. Its budget is two minutes on two quiet cores; what fewer experiments
 # make use of is left to `make test`.
-QUICK := $(filter-out %/test_creep.py %/test_order.py %/test_periodic.py %/test_sizes.py,$(wildcard tests/physics/test_*.py)) \
+QUICK := $(filter-out %/test_creep.py %/test_order.py %/test_periodic.py %/test_sizes.py,$(wildcard tests/physics/*.py)) \
   tests/simulation/test_drive.py tests/simulation/test_protocol.py tests/experiment/test_analysis.py \
   tests/experiment/test_samples.py tests/experiment/test_signals.py tests/files/test_columns.py tests/reading/test_readers.py \
   tests/reading/test_capacity.py

@@ -383,7 +383,7 @@ def value_and_grad(
         by: what to differentiate by: dotted names of floats or of parts that hold them, like "signals.amplitudes",
             "friction.mu", "t0", "pack.clump" or "pack.position". None within another.
         loss: what is differentiated; default the fidelity.
-        checkpoint: where to go on and to keep how far it is on the way back; the way forward, a sixth, is done again.
+        checkpoint: where to go on and to keep how far it is on the way back; the way forward, a fifth, is done again.
         progress: told about every chunk of both ways; default a bar in a terminal or a notebook, False for none.
 
     Raises:
