@@ -26,7 +26,7 @@ from gmem_jax.physics.state import State
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint
 from gmem_jax.simulation.compiled import Compiled
 from gmem_jax.simulation.loop import Simulation, bin_step, rollout_chunk
-from gmem_jax.simulation.observers import CHUNK, Chunk, Move, Observer
+from gmem_jax.simulation.observers import CHUNK, Chunk, Move, Observer, told_of
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within, work_of
 from gmem_jax.simulation.protocol import Bin
 from gmem_jax.simulation.runner import Runner
@@ -121,10 +121,11 @@ def _pull(
         simulation: what is run.
         before: states before its bins, leaves [most, ..., B].
         first: the first bin.
-        count: of the bins.
+        count: of the bins; None for as many as there are states.
         slopes: derivatives; by the pressures [most, 3, B].
         fixed: what is not differentiated by.
     """
+    count = len(slopes[1]) if count is None else count
     numbers, status = _numbers(simulation, fixed), jnp.zeros(slopes[1].shape[-1], jnp.int32)
 
     def one(done: jax.Array, carry: Any) -> Any:
@@ -213,27 +214,28 @@ class _Remembering(Observer):
         """Run the chunk, keeping the states before its bins, if there is room for them."""
         if self.room <= 0:
             return None
-        state, (self._next, sample) = _recorded(chunk.simulation, chunk.state, chunk.row, chunk.count, most=CHUNK)
-        self.room -= sum(leaf.nbytes for leaf in jax.tree.leaves(self._next))
+        state, (self._next, sample) = chunk.run(program=_recorded)
         return state, sample
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
         """Remember how to go back through the chunk."""
-        at, count = (chunk.simulation, chunk.state, chunk.row, chunk.count), chunk.count
+        count, replicas = chunk.count, chunk.state.replicas
         states, self._next = self._next, None
+        self.room -= sum(leaf.nbytes for leaf in jax.tree.leaves(states))
 
         def back(slope: Moving) -> Moving:
-            before = _recorded(*at, most=CHUNK)[1][0] if states is None else states
-            own = np.zeros((CHUNK, 3, at[1].replicas))
+            before = chunk.run(program=_recorded)[1][0] if states is None else states
+            own = np.zeros((CHUNK, 3, replicas))
             known = self.reads.get(chunk.stage.name)
             if known is not None:
                 own[:count] = known[chunk.first : chunk.first + count]
             moving: Moving
-            by_numbers, moving = _pulled(at[0], before, at[2], count, (slope, jnp.asarray(own)), fixed=self.fixed)
+            at, slopes = (chunk.simulation, before, chunk.row), (slope, jnp.asarray(own))
+            by_numbers, moving = _pulled(*at, told_of(count, CHUNK), slopes, fixed=self.fixed)
             self.numbers = by_numbers if self.numbers is None else jax.tree.map(jnp.add, self.numbers, by_numbers)
             return moving
 
-        self.tape.append(_Piece(back, chunk.stage.name, count * at[1].replicas))
+        self.tape.append(_Piece(back, chunk.stage.name, count * replicas))
 
     def rebuild(self, history: Any, move: Move, blank: Any) -> None:
         """Remember how the history was moved."""

@@ -204,15 +204,6 @@ def rollout(simulation: Simulation, state: State, rows: Bin) -> tuple[State, Sam
     return scan.scan(lambda state, row: bin_step(simulation, state, row), state, rows)
 
 
-Keep = Callable[[State, Sample], Any]
-"""What is kept of a bin, arrays: of the state before it and its sample."""
-
-
-def sample_of(state: State, sample: Sample) -> Sample:
-    """The sample alone: a `Keep`."""
-    return sample
-
-
 def rollout_stages(simulation: Simulation, state: State, stages: tuple[Stage, ...]) -> tuple[Simulation, State, Sample]:
     """Stages one after the other; the simulation with its last mark, the state after them, and their samples."""
     parts, first = [], 0
@@ -226,6 +217,15 @@ def rollout_stages(simulation: Simulation, state: State, stages: tuple[Stage, ..
         first = place
     joined: Sample = parts[0] if len(parts) == 1 else jax.tree.map(lambda *each: jnp.concatenate(each), *parts)
     return simulation, state, joined
+
+
+Keep = Callable[[State, Sample], Any]
+"""What is kept of a bin, arrays: of the state before it and its sample."""
+
+
+def sample_of(state: State, sample: Sample) -> Sample:
+    """The sample alone: a `Keep`."""
+    return sample
 
 
 def rollout_chunk(

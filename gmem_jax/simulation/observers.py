@@ -69,10 +69,13 @@ class Chunk:
         """Whether its last bin is the stage's."""
         return self.first + self.count == self.stage.bins
 
-    def run(self, bins: int | None = None) -> tuple[State, Sample]:
-        """Run it, or its first bins; samples have a leading axis of `CHUNK`, of which the bins that were run count."""
+    def run(self, bins: int | None = None, program: Compiled = forward) -> tuple[State, Any]:
+        """Run it, or its first bins; samples have a leading axis of `CHUNK`, of which the bins that were run count.
+
+        Another program is `rollout_chunk` that keeps more than samples.
+        """
         count = told_of(self.count if bins is None else bins, CHUNK)
-        done: tuple[State, Sample] = forward(self.simulation, self.state, self.row, count, most=CHUNK)
+        done: tuple[State, Any] = program(self.simulation, self.state, self.row, count, most=CHUNK)
         return done
 
 
