@@ -26,8 +26,11 @@ class BuildWithNative(build_py):
         super().run()
         builder = load_builder()
         root = SOURCE.parent.parent.parent if self.editable_mode else Path(self.build_lib)
+        library = root / "gmem_jax" / "native" / builder.LIBRARY
+        if self.editable_mode and builder.is_current(library):
+            return  # a second environment of the same folder
         try:
-            builder.build(root / "gmem_jax" / "native" / builder.LIBRARY)
+            builder.build(library)
         except builder.BuildError as reason:
             print(f"gmem_jax: no native backend, plain JAX will be used: {reason}")
 

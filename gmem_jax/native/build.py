@@ -83,7 +83,8 @@ def is_stale(library: ctypes.CDLL) -> bool:
     return source_hash() not in ("", compiled)
 
 
-def _is_current(target: Path) -> bool:
+def is_current(target: Path) -> bool:
+    """Whether the library at `target` is made of the sources beside this file."""
     try:
         return not is_stale(ctypes.CDLL(str(target)))
     except OSError:
@@ -139,7 +140,7 @@ def build(target: Path) -> None:
 
 if __name__ == "__main__":
     try:
-        if "--if-stale" not in sys.argv or not _is_current(HERE / LIBRARY):
+        if "--if-stale" not in sys.argv or not is_current(HERE / LIBRARY):
             build(HERE / LIBRARY)
     except BuildError as reason:
         sys.exit(str(reason))
