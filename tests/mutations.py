@@ -751,7 +751,7 @@ MUTATIONS = (
     mutation(
         "native-unequal-contact-halfway",
         "physics/contact.h",
-        "m.lever_other = fma(lean, c.normal, m.lever_other);",
+        "c.lever_other = c.lever_other + moved;",
         "",
         f"{UNEQUAL}[H]",
     ),

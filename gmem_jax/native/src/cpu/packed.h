@@ -302,7 +302,7 @@ struct Packed : PackedLayout<Law> {
     constexpr int kGroups = kTogether;
     Group group[kGroups];
     Contact<V> contact[kGroups];
-    ContactInput<V> input[kGroups];
+    Vec<V> spin[kGroups];
     Unequal<V> unequal[kGroups];
     V memory[kGroups][kHistoryRows ? 4 * kHistoryRows : 1];
     const int groups = (count + W - 1) / W;
@@ -311,15 +311,10 @@ struct Packed : PackedLayout<Law> {
       contact[n].history = memory[n];
       read_history(group[n], memory[n]);
       const ContactInput<V> m = contact_input(group[n], plan.image ? &faces.cell : nullptr);
-      const V square = dot(m.separation, m.separation);
-      if (plan.radii) {
-        unequal[n] = unequal_of(group[n]), input[n] = m;
-        contact[n].normal = m.separation, contact[n].square = square;
-      } else {
-        relative_motion(m, square, contact[n]);
-      }
+      relative_motion(m, dot(m.separation, m.separation), contact[n]);
+      if (plan.radii) unequal[n] = unequal_of(group[n]), spin[n] = m.spin_other - m.spin_one;
     }
-    plan.radii ? close<true>(contact, groups, parameter, unequal, [&](int n) { return input[n]; }) : close(contact, groups, parameter);
+    plan.radii ? close<true>(contact, groups, parameter, unequal, [&](int n) { return spin[n]; }) : close(contact, groups, parameter);
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
     rub<Law>(contact, groups, law, plan.radii ? unequal : nullptr, [&](int n) { return segments_of(group[n]); });
     for (int n = 0; n < groups; ++n) {

@@ -65,13 +65,22 @@ constexpr GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, C
 template <class V>
 constexpr GMEM_INLINE V overlap_of(const Contact<V>& c) { return fnma(c.square, c.inverse, splat<V>(2.0)); }
 
-// Of a contact that is not halfway between the spheres, whose normal is known.
+// From the motion of a contact halfway between the spheres to that of one that is not. Its normal is known, and `spin`, by how
+// much the second grain spins faster.
 template <class V>
-constexpr GMEM_INLINE void leaning_motion(ContactInput<V> m, V lean, Contact<V>& c) {
-  m.lever_one = fma(lean, c.normal, m.lever_one);
-  m.lever_other = fma(lean, c.normal, m.lever_other);
+constexpr GMEM_INLINE void lean_over(Vec<V> spin, V lean, Contact<V>& c) {
+  const Vec<V> moved = lean * c.normal;
+  c.lever_one = c.lever_one + moved;
+  c.lever_other = c.lever_other + moved;
+  c.sliding = add_cross(c.sliding, spin, moved);
+}
+
+// ... where that motion is not found yet either.
+template <class V>
+constexpr GMEM_INLINE void lean_over(ContactInput<V> m, V lean, Contact<V>& c) {
   m.separation = c.normal;
   relative_motion(m, c.square, c);
+  lean_over(m.spin_other - m.spin_one, lean, c);
 }
 
 // Of contacts halfway between the spheres, whose motion is known from the beginning.
@@ -81,17 +90,17 @@ struct Halfway {
 
 // From what `relative_motion` left to normals, sliding velocities and normal forces. The second part of
 // gmem_jax/physics/contact/kinematics.py: kinematics
-// Where spheres differ in radius, there need only be separations and squares yet: motion is that of `input_of(n)`. Roots of
-// overlaps and forces are still those of a harmonic mean of 1: see `rub`.
-template <bool differ = false, class V, class InputOf = Halfway>
+// Where spheres differ in radius, `lean_over` has what `motion_of(n)` returns; there need only be separations and squares
+// before, if that is a `ContactInput`. Roots of overlaps and forces are still those of a harmonic mean of 1: see `rub`.
+template <bool differ = false, class V, class MotionOf = Halfway>
 constexpr void close(Contact<V>* c, int count, const V* parameter, const Unequal<V>* unequal = nullptr,
-                     const InputOf& input_of = {}) {
+                     const MotionOf& motion_of = {}) {
   const V quarter_dt = splat<V>(0.25) * parameter[kDt] * parameter[kSpinning];
   invert_roots(c, count);
   for (int n = 0; n < count; ++n) {
     const Vec<V> normal = c[n].inverse * c[n].normal;
     c[n].normal = normal;
-    if constexpr (differ) leaning_motion(input_of(n), unequal[n].lean, c[n]);
+    if constexpr (differ) lean_over(motion_of(n), unequal[n].lean, c[n]);
     const V along = dot(c[n].sliding, normal);
     c[n].sliding = fnma(along, normal, c[n].sliding);
     c[n].normal_force = -along;  // for now, the closing velocity
