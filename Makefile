@@ -54,6 +54,7 @@ arm: install-dev
 check: install-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/clang-format --dry-run --Werror $$(find gmem_jax tests -name '*.h' -o -name '*.cc' -o -name '*.cu')
 	$(BIN)/mypy
 	$(BIN)/mypy experiments docs/make
 

@@ -50,7 +50,8 @@ def measure(grains: int, replicas: int, steps: int, source: str) -> dict[str, fl
     from gmem_jax import native
     from gmem_jax.experiment.pack import find_pairs
     from gmem_jax.physics.state import Box, replicate, still_box
-    from gmem_jax.physics.step import System, start
+    from gmem_jax.physics.step import start
+    from gmem_jax.physics.system import System
 
     clump = gm.load_pack(source).clump
     position, quaternion, lengths = heap(grains, source)

@@ -36,7 +36,8 @@ def measure(pack: str, replicas: int, backend: str, steps: int, repeats: int) ->
     import gmem_jax as gm
     from gmem_jax import native
     from gmem_jax.physics.state import Box, replicate
-    from gmem_jax.physics.step import System, start
+    from gmem_jax.physics.step import start
+    from gmem_jax.physics.system import System
 
     chosen = gm.load_pack(pack)
     system = System(chosen.clump, gm.Hooke(), chosen.pairs)

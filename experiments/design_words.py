@@ -25,8 +25,8 @@ from packs import over_packs
 
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import KERNEL_BUMP_WIDTH, KERNEL_BUMPS
-from gmem_jax.experiment.recall import LARGEST_BATCH
 from gmem_jax.experiment.record import key_of_run
+from gmem_jax.experiment.run import LARGEST_BATCH
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.reading import training
@@ -34,8 +34,8 @@ from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import linear_decoder, nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
+from gmem_jax.show.numbers import published
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
-from gmem_jax.show.tables import published
 
 TABLE = "words.csv"
 Row = dict[str, str | int | float]

@@ -33,8 +33,8 @@ from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import nearest_template
 from gmem_jax.reproduce.draw import OURS, THEIRS
 from gmem_jax.reproduce.figures import SHOWN_WORD
+from gmem_jax.show.numbers import published
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
-from gmem_jax.show.tables import published
 
 SHOWN_OF = 10  # bits of the word that the paper shows
 Row = dict[str, str | int | float]

@@ -19,8 +19,9 @@ import numpy as np
 from console import say
 
 import gmem_jax as gm
-from gmem_jax.derivatives import gradient, jacobian
-from gmem_jax.experiment.experiment import value_at
+from gmem_jax.derivatives import jacobian
+from gmem_jax.derivatives.push import push
+from gmem_jax.experiment.changes import value_at
 
 AMPLITUDES = 16
 STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -53,7 +54,7 @@ def check_prefix(experiment: gm.Experiment) -> dict[float, np.ndarray]:
     def joined(pressure: Any) -> np.ndarray:
         return np.concatenate([np.asarray(pressure[name])[..., -1] for name in pressure])
 
-    exact = joined(gradient.push(experiment, {"friction.mu": 1.0}, progress=say).slope)
+    exact = joined(push(experiment, {"friction.mu": 1.0}, progress=say).slope)
     by_bin = {}
     for step in STEPS:
         sides = []
@@ -73,7 +74,7 @@ def check_fidelity(experiment: gm.Experiment) -> tuple[list[list[Any]], float]:
     reverse = gm.value_and_grad(experiment, names, progress=say)
     toss = np.random.default_rng(0).normal(size=theta["signals.amplitudes"].shape)
     direction = {"signals.amplitudes": jnp.asarray(toss), **{name: theta[name] for name in SCALARS}}
-    pushed = gradient.push(experiment, direction, progress=say)
+    pushed = push(experiment, direction, progress=say)
 
     def score(theta: Any, p_sig: jax.Array) -> jax.Array:
         return gm.replace(experiment, theta).compare(p_sig).fidelity

@@ -23,9 +23,9 @@ import gmem_jax as gm
 from gmem_jax import protocols
 from gmem_jax.design.kernel import MemoryKernel
 from gmem_jax.experiment.analysis import spread
-from gmem_jax.experiment.recall import Prefix, prefix_of
+from gmem_jax.experiment.run import Prefix, prefix_of
 from gmem_jax.reading import capacity
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 jax.config.update("jax_enable_x64", True)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 import gmem_jax as gm
 from gmem_jax import classify
-from gmem_jax.experiment.recall import Prefix, prefix_of, run
+from gmem_jax.experiment.run import Prefix, prefix_of, run
 from gmem_jax.experiment.signals import bit_width
 from gmem_jax.physics.material import Material
 

@@ -20,10 +20,12 @@ if TYPE_CHECKING or not gmem_start.alone:
     from gmem_jax.design.kernel import KernelMatrix, MemoryKernel, kernel_matrix, memory_kernel
     from gmem_jax.errors import FileFormatError, RunFailedError
     from gmem_jax.experiment.analysis import running_mean
-    from gmem_jax.experiment.experiment import Experiment, replace
+    from gmem_jax.experiment.changes import replace
+    from gmem_jax.experiment.experiment import Experiment
     from gmem_jax.experiment.pack import Pack, pack_from, stack
-    from gmem_jax.experiment.recall import Recall, fidelity, gain, recall, run
+    from gmem_jax.experiment.recall import Recall, fidelity, gain, recall
     from gmem_jax.experiment.record import describe, to_dict
+    from gmem_jax.experiment.run import run
     from gmem_jax.experiment.samples import waveform_from
     from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, signals, six_signals, waveform, words
     from gmem_jax.experiment.stages import compress, cycle, hold, read, rest, shake, train, write
@@ -45,7 +47,8 @@ if TYPE_CHECKING or not gmem_start.alone:
     from gmem_jax.preparation.grading import lognormal, mixture
     from gmem_jax.preparation.preparation import prepare
     from gmem_jax.preparation.recipe import Recipe
-    from gmem_jax.simulation.protocol import Drive, Protocol, Stage
+    from gmem_jax.simulation.protocol import Protocol
+    from gmem_jax.simulation.stage import Drive, Stage
 
 if TYPE_CHECKING:
     from gmem_jax.design.by_kernel import design_by_kernel

@@ -156,7 +156,7 @@ MUTATIONS = (
     ),
     mutation(
         "step-gravity-upwards",
-        "physics/step.py",
+        "physics/system.py",
         ".add(-jnp.asarray(self.gravity",
         ".add(jnp.asarray(self.gravity",
         "test_a_free_grain_falls_as_galilei_says",
@@ -191,7 +191,7 @@ MUTATIONS = (
     ),
     mutation(
         "step-torque-sign",
-        "physics/step.py",
+        "physics/forces.py",
         "torque = kin.arm * cross(kin.normal, tangential)",
         "torque = kin.arm * cross(tangential, kin.normal)",
         "test_an_oblique_collision_conserves_momentum_and_angular_momentum",
@@ -275,7 +275,7 @@ MUTATIONS = (
     ),
     mutation(
         "images-do-not-move-with-the-cell",
-        "physics/step.py",
+        "physics/forces.py",
         "velocity += image_shifts(pairs, cell.growth)",
         "velocity += 0.0",
         "test_where_the_cell_is_cut_changes_nothing[shift1]",
@@ -289,14 +289,14 @@ MUTATIONS = (
     ),
     mutation(
         "pressure-without-momentum-flux",
-        "physics/step.py",
+        "physics/forces.py",
         "force * place + clump.masses * grains.velocity**2",
         "force * place",
         "test_the_pressure_of_a_step_is_the_stress_of_its_contacts_and_the_flux_of_momentum",
     ),
     mutation(
         "one-arm-for-two-radii",
-        "physics/step.py",
+        "physics/forces.py",
         "else kin.other_arm * cross(kin.normal, tangential)",
         "else torque",
         "test_an_oblique_collision_of_unequal_spheres_keeps_momentum_and_angular_momentum[H]",
@@ -744,8 +744,8 @@ MUTATIONS = (
     mutation(
         "native-faces-of-one-domain",
         "cpu/block.h",
-        "domain < plan.domains; ++domain) sum",
-        "domain < 0; ++domain) sum",
+        "domain < plan.domains; ++domain)\n      sum",
+        "domain < 0; ++domain)\n      sum",
         "test_values_are_those_of_the_definition[H-5]",
     ),
     mutation(
@@ -1026,7 +1026,7 @@ MUTATIONS = (
     ),
     mutation(
         "bins-rounded-down",
-        "simulation/protocol.py",
+        "simulation/stage.py",
         "math.ceil(self.length * BINS - 1e-9)",
         "math.floor(self.length * BINS + 1e-9)",
         "test_a_hold_is_rounded_up_to_whole_bins",
@@ -1482,7 +1482,7 @@ MUTATIONS = (
     ),
     mutation(
         "last-signal-for-the-zero-signal",
-        "experiment/recall.py",
+        "experiment/run.py",
         "np.asarray(other)[..., 1:]",
         "np.asarray(other)[..., :-1]",
         "test_batches_are_one_run_and_can_be_resumed",
@@ -1490,7 +1490,7 @@ MUTATIONS = (
     # ---------------------------------------------------------------- derivatives
     mutation(
         "tangent-forgotten-at-renewal",
-        "derivatives/gradient.py",
+        "derivatives/push.py",
         "move(history, jax.tree.map(jnp.zeros_like, blank))",
         "jax.tree.map(jnp.zeros_like, blank)",
         "test_derivatives_do_not_mind_lists_that_are_made_anew[friction.mu]",
@@ -1822,7 +1822,7 @@ MUTATIONS = (
     ),
     mutation(
         "another-target",
-        "show/tables.py",
+        "show/numbers.py",
         'wanted = bin_average(signals_from_dict(configuration["target"]))',
         "wanted = jnp.asarray(recall.J)",
         "test_a_recall_of_designed_waveforms_is_compared_with_their_target_too",

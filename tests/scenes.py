@@ -22,8 +22,8 @@ from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.rotation import uniform
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, Grains, State, replicate, still_box
-from gmem_jax.simulation.protocol import Bin, Lane
 from gmem_jax.simulation.sample import Sample, end_bin
+from gmem_jax.simulation.stage import Bin, Lane
 from gmem_jax.simulation.strain import StrainPath
 
 TESTS = Path(__file__).parent

@@ -9,7 +9,7 @@ import numpy as np
 from gmem_jax.native import primitives
 from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of
 from gmem_jax.physics.state import Box, State
-from gmem_jax.physics.step import System
+from gmem_jax.physics.system import System
 
 # Round-off of a sum of a thousand numbers; more where steps magnify it, as 3e-12 in a periodic box with law M2.
 TOLERANCE = 1e-10

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import gmem_jax as gm
-from gmem_jax.derivatives import gradient
-from gmem_jax.experiment.experiment import acts_on_prefix, value_at
+from gmem_jax.derivatives.push import push
+from gmem_jax.experiment.changes import value_at
+from gmem_jax.experiment.experiment import acts_on_prefix
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "derivatives.md"
@@ -78,7 +79,7 @@ def errors(experiment: gm.Experiment, name: str, slope: Any) -> tuple[float, flo
         along = float(np.vdot(np.asarray(slope), toss))
         found.append(abs(along - (up - down) / (2.0 * STEP)) / max(abs(along), 1e-300))
         if not forward:
-            pushed = gradient.push(experiment, {name: jnp.asarray(toss)}).p_sig_slope
+            pushed = push(experiment, {name: jnp.asarray(toss)}).p_sig_slope
             forward.append(abs(float(score(experiment, jnp.asarray(pushed))) - along) / max(abs(along), 1e-300))
     return float(np.median(found)), forward[0]
 

@@ -20,7 +20,7 @@ from drawn_words import over_packs, read_rows
 from gmem_jax.reproduce import draw
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, compared, comparison_rows, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES
-from gmem_jax.show.tables import published
+from gmem_jax.show.numbers import published
 
 HERE = Path(__file__).parents[1] / "results"
 OWN = HERE / "points.csv"

@@ -14,7 +14,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from gmem_jax.experiment import protocols
-from gmem_jax.simulation.protocol import Drive, Protocol
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import Drive
 
 OUTPUT = Path(__file__).parents[1] / "protocols.png"
 SHELF: tuple[Callable[[], Protocol], ...] = (

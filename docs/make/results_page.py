@@ -23,7 +23,7 @@ from gmem_jax.reproduce import draw
 from gmem_jax.reproduce.compare import comparison_rows, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import SCHEMATICS
-from gmem_jax.show.tables import published
+from gmem_jax.show.numbers import published
 
 HERE = Path(__file__).parents[1] / "results"
 JOINED = {  # figures that no one command makes

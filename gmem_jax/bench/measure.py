@@ -31,7 +31,7 @@ from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance
-from gmem_jax.experiment.recall import run
+from gmem_jax.experiment.run import run
 from gmem_jax.experiment.signals import Bumps
 from gmem_jax.physics.contact import laws
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -40,12 +40,12 @@ from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.rotation import matrix
 from gmem_jax.physics.state import Grains, State, Status, explain, replicate, still_box
-from gmem_jax.physics.step import System
+from gmem_jax.physics.system import System
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.neighbors import SKIN, pair_finder
 from gmem_jax.simulation.observers import forward, told_of
-from gmem_jax.simulation.protocol import Drive, Stage
 from gmem_jax.simulation.runner import status_of
+from gmem_jax.simulation.stage import Drive, Stage
 from gmem_jax.simulation.strain import smallest_box
 from gmem_jax.sweeps.executors import cores
 

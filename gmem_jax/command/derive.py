@@ -35,9 +35,10 @@ from gmem_jax.design.by_kernel import (
 from gmem_jax.design.drive import PARAMETERS, design_drive, start_within
 from gmem_jax.design.kernel import memory_kernel, relative_error
 from gmem_jax.design.stored import save_kernel
-from gmem_jax.experiment.experiment import Experiment, value_at
-from gmem_jax.experiment.recall import COPIES, prefix_of, replica_bins, run, run_bytes
+from gmem_jax.experiment.changes import value_at
+from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.record import describe, fingerprint, key_of_run, pack_fingerprint
+from gmem_jax.experiment.run import COPIES, prefix_of, replica_bins, run, run_bytes
 from gmem_jax.experiment.signals import Bumps, Spline
 from gmem_jax.files import schemas
 from gmem_jax.files.results import save_result

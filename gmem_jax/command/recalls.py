@@ -31,8 +31,8 @@ from gmem_jax.command.options import ExperimentOptions, with_experiment
 from gmem_jax.command.resuming import Restart, batch_for, foresee, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.recall import frame_schedule, replica_bins, run, run_bytes
 from gmem_jax.experiment.record import key_of_run, signals_to_dict
+from gmem_jax.experiment.run import frame_schedule, replica_bins, run, run_bytes
 from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.experiment.stepping import at_accuracy, require_stable, stable_step
 from gmem_jax.files.cache import list_packs

@@ -11,7 +11,7 @@ import typer
 
 from gmem_jax.command.console import InputError, RunInterruptedError, log
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.recall import default_batch
+from gmem_jax.experiment.run import default_batch
 from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import remove_leftovers
 from gmem_jax.physics.numbers import plural

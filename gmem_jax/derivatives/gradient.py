@@ -1,14 +1,14 @@
-"""Derivatives of a whole memory experiment on the host, chunk by chunk, in both directions.
+"""Reverse mode: the gradient of a number by what an experiment depends on, chunk by chunk on the host.
 
-`jax.grad` and `jax.jvp` of `gm.fidelity` work as they are. The observers here do the same in the chunks of
-`simulation.runner`: they report progress, compile small programs, make stale lists anew, and keep the states before all
-bins as long as there is room, then those before all chunks. What is differentiated by is named: "gamma0",
+`jax.grad` and `jax.jvp` of `gm.fidelity` work as they are. The observer here does the same in the chunks of
+`simulation.runner`: it reports progress, compiles small programs, makes stale lists anew, and keeps the states before
+all bins as long as there is room, then those before all chunks. What is differentiated by is named: "gamma0",
 "friction.mu", "signals.amplitudes", ...
 """
 
 import functools
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
@@ -16,10 +16,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from gmem_jax.experiment.arguments import require_kind, require_several
-from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, value_at
-from gmem_jax.experiment.experiment import replace as with_values
-from gmem_jax.experiment.recall import apply_waveforms, runner_of
+from gmem_jax.derivatives.moving import (
+    Moving,
+    at_values,
+    fixed_by,
+    moving_of,
+    numbers_of,
+    state_of,
+    theta_of,
+    whole_work,
+    with_numbers,
+)
+from gmem_jax.experiment.arguments import require_kind
+from gmem_jax.experiment.experiment import Experiment, acts_on_prefix
+from gmem_jax.experiment.run import apply_waveforms, runner_of
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State
@@ -27,20 +37,15 @@ from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint
 from gmem_jax.simulation.compiled import Compiled
 from gmem_jax.simulation.loop import Simulation, bin_step, rollout_chunk
 from gmem_jax.simulation.observers import CHUNK, Chunk, Move, Observer, told_of
-from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within, work_of
-from gmem_jax.simulation.protocol import Bin
-from gmem_jax.simulation.runner import Runner
+from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within
 from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.stage import Bin
 
 Loss = Callable[[Experiment, jax.Array], jax.Array]
 """From an experiment and its p_sig [S, 256] to a number."""
 
-STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
-LENGTHS = ("pack.clump.radii", "pack.clump.sizes")  # of spheres that are not all alike
 FORWARDS = 0.2  # of a gradient's time is the way forward
 ROOM = 2**30  # bytes that one way may keep of its states; those of later chunks are computed again on the way back
-
-Moving = tuple[Any, ...]  # grains, histories, held walls and periodic cell: what of a state can be differentiated
 
 
 def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
@@ -48,63 +53,9 @@ def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
     return experiment.compare(p_sig).fidelity
 
 
-def _fixed_by(names: Iterable[str]) -> tuple[str, ...]:
-    """Parts of a simulation that are not differentiated by: the list, the mark, and lengths that no name has.
-
-    The library has no derivatives by these lengths: where one is wanted, all are those of plain JAX.
-    """
-    lengths = [length for length in LENGTHS if not any(f"{length}.".startswith(f"{name}.") for name in names)]
-    return (".system.pairs", ".mark", *(length.replace("pack", ".system") for length in lengths))
-
-
-def _is_moving(path: Any, leaf: Any, fixed: tuple[str, ...]) -> bool:
-    """Whether a number of a simulation is differentiated by."""
-    floats = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
-    return floats and not jax.tree_util.keystr(path).startswith(fixed)
-
-
-def _numbers(simulation: Simulation, fixed: tuple[str, ...]) -> list[jax.Array]:
-    """The numbers of a simulation that are differentiated by."""
-    leaves = jax.tree_util.tree_leaves_with_path(simulation)
-    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf, fixed)]
-
-
-def _with_numbers(simulation: Simulation, numbers: Sequence[jax.Array], fixed: tuple[str, ...]) -> Simulation:
-    """The simulation with other numbers in the place of `_numbers`."""
-    left = iter(numbers)
-    leaves, structure = jax.tree_util.tree_flatten_with_path(simulation)
-    filled: Simulation = jax.tree.unflatten(
-        structure, [next(left) if _is_moving(path, leaf, fixed) else leaf for path, leaf in leaves]
-    )
-    return filled
-
-
-def _moving(state: State) -> Moving:
-    return state.grains, state.history, state.servo, state.cell, state.wall_history
-
-
-def _state(moving: Moving, status: jax.Array) -> State:
-    return State(moving[0], moving[1], status, *moving[2:])
-
-
-def _push(
-    simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int, fixed: tuple[str, ...]
-) -> Any:
-    """A chunk and its tangent."""
-
-    def chunk(numbers: Any, moving: Moving) -> Any:
-        changed = _with_numbers(simulation, numbers, fixed)
-        after, sample = rollout_chunk(changed, _state(moving, state.status), first, count, most)
-        return (_moving(after), sample.pressure), (after.status, sample)
-
-    at = (_numbers(simulation, fixed), _moving(state))
-    (moving, _), slope, (status, sample) = jax.jvp(chunk, at, slopes, has_aux=True)
-    return _state(moving, status), sample, slope
-
-
 def _before(state: State, sample: Sample) -> tuple[Moving, Sample]:
     """Keep the state before a bin too."""
-    return _moving(state), sample
+    return moving_of(state), sample
 
 
 def _pull(
@@ -126,17 +77,17 @@ def _pull(
         fixed: what is not differentiated by.
     """
     count = len(slopes[1]) if count is None else count
-    numbers, status = _numbers(simulation, fixed), jnp.zeros(slopes[1].shape[-1], jnp.int32)
+    numbers, status = numbers_of(simulation, fixed), jnp.zeros(slopes[1].shape[-1], jnp.int32)
 
     def one(done: jax.Array, carry: Any) -> Any:
         place = count - 1 - done
         by_state, by_numbers = carry
 
         def step(numbers: Any, moving: Moving) -> tuple[Moving, jax.Array]:
-            changed = _with_numbers(simulation, numbers, fixed)
+            changed = with_numbers(simulation, numbers, fixed)
             row = first._replace(number=first.number + place)
-            after, sample = bin_step(changed, _state(moving, status), row)
-            return _moving(after), sample.pressure
+            after, sample = bin_step(changed, state_of(moving, status), row)
+            return moving_of(after), sample.pressure
 
         at = jax.tree.map(lambda leaf: leaf[place], before)
         more, by_state = jax.vjp(step, numbers, at)[1]((by_state, slopes[1][place]))
@@ -146,49 +97,8 @@ def _pull(
     return by_numbers, by_state
 
 
-_pushed = Compiled(_push, static_argnames=("most", "fixed"))
 _pulled = Compiled(_pull, static_argnames="fixed")
 _recorded = Compiled(functools.partial(rollout_chunk, keep=_before), static_argnames="most")
-
-
-@dataclass
-class _Pushing(Observer):
-    """Carries a tangent along.
-
-    Attributes:
-        fixed: what is not differentiated by.
-        numbers: tangent of the simulation's numbers.
-        moving: tangent of the state now; None as long as nothing has one.
-        slopes: derivatives of the pressures of every stage, by chunks.
-    """
-
-    fixed: tuple[str, ...]
-    numbers: Any
-    moving: Moving | None
-    slopes: dict[str, list[np.ndarray]] = field(default_factory=dict)
-    _next: tuple[Moving, jax.Array] | None = None
-
-    def step(self, chunk: Chunk) -> tuple[State, Sample] | None:
-        """Run the chunk with its tangent."""
-        if self.moving is None:
-            return None
-        slopes = (self.numbers, self.moving)
-        at = chunk.simulation, chunk.state, chunk.row, chunk.count
-        after, sample, self._next = _pushed(*at, slopes, most=CHUNK, fixed=self.fixed)
-        return after, sample
-
-    def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
-        """Keep the derivatives of the pressures."""
-        change = jnp.zeros_like(sample.pressure)
-        if self._next is not None:
-            (self.moving, change), self._next = self._next, None
-        self.slopes.setdefault(chunk.stage.name, []).append(np.asarray(change)[: chunk.count])
-
-    def rebuild(self, history: Any, move: Move, blank: Any) -> None:
-        """Move the tangent of the history too."""
-        if self.moving is not None:
-            grains, history, *others = self.moving
-            self.moving = grains, move(history, jax.tree.map(jnp.zeros_like, blank)), *others
 
 
 class _Piece(NamedTuple):
@@ -243,109 +153,6 @@ class _Remembering(Observer):
         self.tape.append(_Piece(lambda slope: (slope[0], pull(slope[1])[0], *slope[2:])))
 
 
-@dataclass(frozen=True)
-class Pushed:
-    """A run and its tangent.
-
-    Attributes:
-        pressure: p of every stage by name, [bins, 3, B], in E.
-        slope: their derivatives along the direction, likewise.
-        p_sig: recalled signals, [S, 256].
-        p_sig_slope: their derivatives.
-    """
-
-    pressure: dict[str, np.ndarray]
-    slope: dict[str, np.ndarray]
-    p_sig: jax.Array
-    p_sig_slope: jax.Array
-
-
-@usual_rules()
-def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Progress = silent) -> Pushed:
-    """Forward mode: the derivative of a whole experiment along a direction.
-
-    Several derivatives at once are replicas: repeat a signal as often as there are parameters, and let the direction
-    change another parameter in each (see `jacobian.exact`). A tangent costs some 2.5 runs on the native backend; the
-    shear-free prefix is not differentiated if no parameter acts on it.
-
-    Args:
-        experiment: where.
-        direction: tangents by the name of what changes, each a pytree like what stands there.
-        progress: told about every chunk.
-
-    Raises:
-        ValueError: for a name that is no field.
-        RunFailedError: if the simulation broke down.
-    """
-    theta, tangent = _theta(experiment, direction), jax.tree.map(jnp.asarray, dict(direction))
-    along = _along(experiment)
-    common, own = experiment.phases
-    on = runner_of(experiment, progress=progress)
-    on.total_work = _work(experiment, on)
-    wide = on.state.replicas > 1
-    slope: Moving | None = None
-    if any(map(acts_on_prefix, theta)):
-        slope = jax.jvp(lambda theta: _moving(along(theta).begin()), (theta,), (tangent,))[1]
-    fixed = _fixed_by(theta)
-    pushing = _Pushing(fixed, _number_slope(experiment, theta, tangent, fixed, sheared=False), slope)
-    on.observers = (pushing,)
-    samples = on.run_stages(*common)
-    if pushing.moving is None:
-        pushing.moving = jax.tree.map(jnp.zeros_like, _moving(on.state))
-    if not wide:
-        pushing.moving = jax.tree.map(lambda leaf: jnp.repeat(leaf, experiment.replicas, axis=-1), pushing.moving)
-    pushing.numbers = _number_slope(experiment, theta, tangent, fixed, sheared=True)
-    apply_waveforms(on, experiment)
-    samples |= on.run_stages(*own)
-    pressure = {name: np.asarray(sample.pressure) for name, sample in samples.items()}
-    slopes = {name: np.concatenate(parts) for name, parts in pushing.slopes.items()}
-    read, change = ({name: jnp.asarray(of[name]) for name in experiment.protocol.reads} for of in (pressure, slopes))
-    return Pushed(pressure, slopes, experiment.recalled(read), experiment.recalled(change))
-
-
-def _theta(experiment: Experiment, names: Any) -> dict[str, Any]:
-    """What stands at names, as arrays.
-
-    Raises:
-        ValueError: if there is no such name, it holds what has no derivative, or it is within another.
-    """
-    require_several(names, "by")
-    found = {name: value_at(experiment, name) for name in names}
-    for name, tree in found.items():
-        if inside := next((other for other in found if name.startswith(f"{other}.")), ""):
-            raise ValueError(f"{name} is part of {inside}; name one of them")
-        if name in STATIC_FIELDS or tree is None or not all(map(_is_number, jax.tree.leaves(tree))):
-            raise ValueError(
-                f"{name} is fixed when a program is compiled and has no derivative; "
-                "numbers like gamma0, friction.mu, signals.amplitudes and pack.position have"
-            )
-    theta = {name: jax.tree.map(jnp.asarray, tree) for name, tree in found.items()}
-    for name, tree in theta.items():
-        if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
-            raise ValueError(f"{name} holds more than floats; name what to differentiate by, like pack.position")
-    return theta
-
-
-def _is_number(leaf: Any) -> bool:
-    return isinstance(leaf, float | int | np.ndarray | jax.Array)
-
-
-def _along(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
-    return lambda theta: with_values(experiment, theta)
-
-
-def _number_slope(experiment: Experiment, theta: Any, tangent: Any, fixed: tuple[str, ...], *, sheared: bool) -> Any:
-    def numbers(theta: Any) -> list[jax.Array]:
-        return _numbers(with_values(experiment, theta).simulation(sheared=sheared), fixed)
-
-    return jax.jvp(numbers, (theta,), (tangent,))[1]
-
-
-def _work(experiment: Experiment, on: Runner) -> float:
-    common, own = experiment.phases
-    return work_of(common, on.state.replicas) + work_of(own, experiment.replicas)
-
-
 @comparable
 @dataclass(frozen=True)
 class Gradient:
@@ -394,16 +201,16 @@ def value_and_grad(
     """
     require_kind("value_and_grad", experiment, Experiment)
     tell = callback(progress)
-    theta, along = _theta(experiment, by), _along(experiment)
+    theta, along = theta_of(experiment, by), at_values(experiment)
     common, own = experiment.phases
     on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))
-    on.total_work = _work(experiment, on)
-    fixed = _fixed_by(by)
+    on.total_work = whole_work(experiment, on)
+    fixed = fixed_by(by)
     prefix, rest = _Remembering(fixed, ROOM), _Remembering(fixed, ROOM)
     on.observers = (prefix,) if any(map(acts_on_prefix, by)) else ()
-    _, pull_begin = jax.vjp(lambda theta: _moving(along(theta).begin()), theta)
+    _, pull_begin = jax.vjp(lambda theta: moving_of(along(theta).begin()), theta)
     on.run_stages(*common)
-    fan_out = jax.linear_transpose(_fan_out(experiment), _moving(on.state))
+    fan_out = jax.linear_transpose(_fan_out(experiment), moving_of(on.state))
     on.observers = (rest,)
     apply_waveforms(on, experiment)
     samples = on.run_stages(*own)
@@ -427,11 +234,11 @@ def value_and_grad(
 
     def pull_numbers(sheared: bool, found: Any) -> Any:
         def numbers(theta: Any) -> list[jax.Array]:
-            return _numbers(along(theta).simulation(sheared=sheared), fixed)
+            return numbers_of(along(theta).simulation(sheared=sheared), fixed)
 
         return jax.vjp(numbers, theta)[1](found)[0]
 
-    back = jax.tree.map(jnp.zeros_like, _moving(on.state))
+    back = jax.tree.map(jnp.zeros_like, moving_of(on.state))
     way = _Backwards(within(tell, FORWARDS, 1.0), (rest, prefix), checkpoint)
     back = way.through(rest, back)
     slope = jax.tree.map(jnp.add, slope, pull_numbers(True, rest.numbers))
@@ -446,7 +253,7 @@ def value_and_grad(
 def _fan_out(experiment: Experiment) -> Callable[[Moving], Moving]:
     def spread(moving: Moving) -> Moving:
         status = jnp.zeros(moving[0].position.shape[-1], jnp.int32)
-        return _moving(experiment.fan_out(_state(moving, status)))
+        return moving_of(experiment.fan_out(state_of(moving, status)))
 
     return spread
 

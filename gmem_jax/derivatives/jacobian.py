@@ -10,11 +10,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.derivatives import gradient
+from gmem_jax.derivatives.push import push
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.arguments import require_kind
-from gmem_jax.experiment.experiment import Experiment, replace, value_at
-from gmem_jax.experiment.recall import Recall, run
+from gmem_jax.experiment.changes import replace, value_at
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.run import run
 from gmem_jax.experiment.signals import Bumps
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
@@ -96,7 +98,7 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
         "signals.amplitudes": jnp.asarray(np.eye(n + 1, n)),
         "gamma0": jnp.zeros(n + 2).at[-1].set(1.0),
     }
-    pushed = gradient.push(drive, direction, progress=within(tell, 0.0, SHARE))
+    pushed = push(drive, direction, progress=within(tell, 0.0, SHARE))
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
     p_sig, p_xy = [np.asarray(pushed.p_sig_slope)], [_p_xy(experiment, pushed.slope)[1:]]
@@ -107,7 +109,7 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
         "friction.mu": jnp.asarray([1.0, 0.0, 1.0, 0.0]),
         "friction.stiffness": jnp.asarray([0.0, 1.0, 0.0, 1.0]),
     }
-    pushed = gradient.push(laws, direction, progress=within(tell, SHARE, 1.0))
+    pushed = push(laws, direction, progress=within(tell, SHARE, 1.0))
     change = np.asarray(analysis.recalled(jnp.asarray(pushed.slope[experiment.protocol.reads[0]])))
     p_sig.append(-(change[2:] - change[:2]))
     p_xy.append(_p_xy(experiment, pushed.slope)[2:])

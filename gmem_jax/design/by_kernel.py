@@ -23,8 +23,9 @@ from gmem_jax.design.waveforms import (
     verified,
 )
 from gmem_jax.experiment.arguments import require_kind
-from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.recall import PREFIX, prefix_of, run
+from gmem_jax.experiment.changes import replace
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.run import PREFIX, prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline
 from gmem_jax.physics.numbers import plural, require_numbers, require_whole
 from gmem_jax.physics.rules import usual_rules

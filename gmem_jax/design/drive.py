@@ -7,8 +7,9 @@ import jax
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_kind, require_several
-from gmem_jax.experiment.experiment import Experiment, replace, value_at
-from gmem_jax.experiment.recall import run
+from gmem_jax.experiment.changes import replace, value_at
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.run import run
 from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules

@@ -14,15 +14,16 @@ import numpy as np
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.arguments import require_kind
-from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.recall import Prefix, run
+from gmem_jax.experiment.changes import replace
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.run import Prefix, run
 from gmem_jax.experiment.signals import Bumps, Signals, bin_average, signals
 from gmem_jax.physics.numbers import plural, require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 QUADRATURE_POINTS = 2048  # points of v for inner products of basis functions
 
@@ -170,7 +171,7 @@ def memory_kernel(
         experiment: pack and parameters; its signals do not matter.
         n: basis waveforms; 2 n + 1 replicas are run.
         width: of the bumps; narrow ones drive the walls faster.
-        prefix: what `recall.prefix_of` gave for the same pack and law, if there is one.
+        prefix: what `run.prefix_of` gave for the same pack and law, if there is one.
         cache: asked for the recalls of the basis, so that a long run can be resumed (see `gmem_jax.files.checkpoints`).
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 

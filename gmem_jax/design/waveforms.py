@@ -1,7 +1,7 @@
 """Inverse design: waveforms whose nonlinear recall follows wanted curves, on one channel or on several at once.
 
 Waveforms are corrected by the exact Jacobian of the recall around the present ones: one tangent per amplitude, as
-replicas of one run (`gradient.push`). A damped Gauss-Newton step is simulated before it is accepted,
+replicas of one run (`derivatives.push`). A damped Gauss-Newton step is simulated before it is accepted,
 whole and in parts.
 """
 
@@ -13,18 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
-from gmem_jax.derivatives.gradient import push
+from gmem_jax.derivatives.push import push
 from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest, written_sets
 from gmem_jax.experiment.arguments import require_kind
-from gmem_jax.experiment.experiment import Experiment, replace
-from gmem_jax.experiment.recall import prefix_of, run
+from gmem_jax.experiment.changes import replace
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.run import prefix_of, run
 from gmem_jax.experiment.signals import Bumps, Signals, Spline, signals, waveform
 from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)

@@ -1,5 +1,6 @@
 """What is refused when an experiment is made or run, beside impossible numbers and shapes that do not fit."""
 
+import math
 from typing import Any
 
 import jax
@@ -9,12 +10,33 @@ import numpy as np
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.readings import Readings
 from gmem_jax.physics.boundary import PeriodicAxes
+from gmem_jax.physics.contact.creep import RelaxingLaw
+from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.numbers import require_numbers, said
 from gmem_jax.physics.pairs import sphere_offsets
 from gmem_jax.physics.pytree import Scalar, traced
 from gmem_jax.physics.rotation import unit
 from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import BINS
+
+FASTEST_CREEP = 0.05  # of an elastic force in a bin: it relaxes once in each
+
+
+def static_number(name: str, value: Any) -> float:
+    """A number that a program is compiled for.
+
+    Raises:
+        ValueError: if it is traced, none, negative, or not finite.
+    """
+    if traced(value) or value is None or np.ndim(value):
+        raise ValueError(f"{name} is fixed when a program is compiled: it must be a number, got {said(value)}")
+    require_numbers(**{name: value})
+    number = float(value)
+    if not 0.0 <= number < math.inf:
+        raise ValueError(f"{name} must be in [0, inf), got {value}")
+    return number
 
 
 def require_double(**parts: Any) -> None:
@@ -70,6 +92,39 @@ def require_walls(periodic: PeriodicAxes, material: Material, wall_mu: Scalar | 
         raise ValueError("wall_rigidity: a box that is periodic along all axes has no walls")
     if all(periodic) and wall_mu is not None:
         raise ValueError("wall_mu: a box that is periodic along all axes has no walls")
+
+
+def require_slippery(friction: FrictionLaw, wall_mu: Scalar | None) -> None:
+    """Refuse friction of the walls under a law that has no limit for it to take the place of.
+
+    Raises:
+        ValueError: saying so.
+    """
+    if wall_mu is not None and not isinstance(friction, CoulombLaw):
+        raise ValueError(
+            f"wall_mu takes the place of mu at walls, and {type(friction).__name__} has no mu: leave wall_mu out, or "
+            "use another friction law"
+        )
+
+
+def require_slow_creep(friction: FrictionLaw, creep: Scalar | None, fades: Scalar | None, t0: Scalar) -> None:
+    """Refuse creep that a law cannot have, or that is too fast for the bins that it acts between.
+
+    Raises:
+        ValueError: saying which.
+    """
+    if creep is None:
+        if fades is not None:
+            raise ValueError("creep_fades says when creep becomes slower, and there is none: give creep, a rate")
+        return
+    if not isinstance(friction, RelaxingLaw):
+        raise ValueError(f"creep: {type(friction).__name__} has no elastic forces that could relax")
+    in_a_bin = creep * t0 / BINS
+    if not traced(in_a_bin) and np.max(np.asarray(in_a_bin)) > FASTEST_CREEP:
+        raise ValueError(
+            f"creep relaxes {np.max(np.asarray(in_a_bin)):.2g} of a force in a bin of t0 / 256, must be at most "
+            f"{FASTEST_CREEP}; use a smaller creep"
+        )
 
 
 def require_memory(protocol: Protocol, background: str) -> None:

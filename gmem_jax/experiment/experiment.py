@@ -1,6 +1,5 @@
 """The one description of a memory experiment: every field, default and check (paper, Secs. II and III)."""
 
-import copy
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -14,32 +13,41 @@ import numpy as np
 from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
-from gmem_jax.experiment.arguments import named_observers, require_kind, require_once, require_parts
-from gmem_jax.experiment.asked import require_double, require_memory, require_seen, require_told_apart, require_walls
+from gmem_jax.experiment.arguments import named_observers, require_parts
+from gmem_jax.experiment.asked import (
+    require_double,
+    require_memory,
+    require_seen,
+    require_slippery,
+    require_slow_creep,
+    require_told_apart,
+    require_walls,
+    static_number,
+)
 from gmem_jax.experiment.html import Facts, brief, facts, line
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocols import Shear, memory_protocol
 from gmem_jax.experiment.readings import Readings
-from gmem_jax.experiment.signals import Signals, SignalSets, bin_average, part, sets_of, waveform
+from gmem_jax.experiment.signals import Signals, SignalSets, bin_average, sets_of, waveform
 from gmem_jax.native import Backend, Precision
-from gmem_jax.physics.contact.creep import RelaxingLaw
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.own_law import require_law
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.numbers import require_numbers, require_whole, said
+from gmem_jax.physics.numbers import require_whole
 from gmem_jax.physics.pytree import Scalar, out_of_range, parameter, pytree, static, traced, validate
 from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import State, Status, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.loop import Observe, Simulation, at_rest
-from gmem_jax.simulation.protocol import BINS, Columns, Drive, Lane, Protocol, Stage
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import BINS, Columns, Drive, Lane, Stage
 from gmem_jax.simulation.strain import COMPRESSIONS, Sine, StrainPath, Waveforms
 
-FASTEST_CREEP = 0.05  # of an elastic force in a bin: it relaxes once in each
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
 MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
@@ -141,7 +149,7 @@ class Experiment:
     def __post_init__(self) -> None:
         require_parts(self.pack, self.signals, self.friction)
         for name in ("dt", "rest", "hold", "store"):
-            object.__setattr__(self, name, _static_number(name, getattr(self, name)))
+            object.__setattr__(self, name, static_number(name, getattr(self, name)))
         object.__setattr__(self, "background", str(self.background).lower())
         object.__setattr__(self, "observe", named_observers(self.observe))
         validate(self)
@@ -168,8 +176,8 @@ class Experiment:
         if not native.supports(self.friction) and not traced(self.friction):
             require_law(self.friction, self.replicas)
         self._check_waveforms()
-        self._check_wall_mu()
-        self._check_creep()
+        require_slippery(self.friction, self.wall_mu)
+        require_slow_creep(self.friction, self.creep, self.creep_fades, self.t0)
         step = self.timing.dt
         if not traced(step) and not np.all(np.asarray(step) >= LEAST_STEP):
             raise ValueError(f"t0 = {np.min(self.t0):g} is too short: steps must be {LEAST_STEP:g} t_c or longer")
@@ -177,29 +185,6 @@ class Experiment:
             raise ValueError(
                 f"steps = {self.steps_per_bin} makes a time step of {np.max(step):g} t_c, which must be at most "
                 f"{LARGEST_STEP}; give more steps, or none to have them chosen"
-            )
-
-    def _check_wall_mu(self) -> None:
-        if self.wall_mu is None:
-            return
-        if not isinstance(self.friction, CoulombLaw):
-            raise ValueError(
-                f"wall_mu takes the place of mu at walls, and {type(self.friction).__name__} has no mu: leave wall_mu "
-                "out, or use another friction law"
-            )
-
-    def _check_creep(self) -> None:
-        if self.creep is None:
-            if self.creep_fades is not None:
-                raise ValueError("creep_fades says when creep becomes slower, and there is none: give creep, a rate")
-            return
-        if not isinstance(self.friction, RelaxingLaw):
-            raise ValueError(f"creep: {type(self.friction).__name__} has no elastic forces that could relax")
-        in_a_bin = self.creep * self.t0 / BINS
-        if not traced(in_a_bin) and np.max(np.asarray(in_a_bin)) > FASTEST_CREEP:
-            raise ValueError(
-                f"creep relaxes {np.max(np.asarray(in_a_bin)):.2g} of a force in a bin of t0 / 256, must be at most "
-                f"{FASTEST_CREEP}; use a smaller creep"
             )
 
     def _whole_steps(self) -> int:
@@ -468,16 +453,6 @@ def _probe(signals: Signals) -> tuple[jax.Array, jax.Array]:
     return _ends(signals), signals.shear((jnp.arange(BINS) + 0.5) / BINS)
 
 
-def _static_number(name: str, value: Any) -> float:
-    if traced(value) or value is None or np.ndim(value):
-        raise ValueError(f"{name} is fixed when a program is compiled: it must be a number, got {said(value)}")
-    require_numbers(**{name: value})
-    number = float(value)
-    if not 0.0 <= number < math.inf:
-        raise ValueError(f"{name} must be in [0, inf), got {value}")
-    return number
-
-
 NUMBERS = {entry.name: entry for entry in fields(Experiment) if entry.metadata.get("words")}
 """The numbers and choices of an experiment by name, each with what is to be known of it in its metadata: `words`,
 `unit` and `interval`; whether it `varies` between replicas; whether it acts only `after_prefix`. Options, the names in
@@ -497,82 +472,3 @@ def replica_parameters(experiment: Experiment) -> dict[str, Any]:
     of_law = {f"friction.{field.name}": getattr(law, field.name) for field in fields(law)} if is_dataclass(law) else {}
     numbers = {**own, **of_law}
     return {name: value for name, value in numbers.items() if isinstance(value, float | jax.Array)}
-
-
-@usual_rules()
-def replace(experiment: Experiment, values: Mapping[str, Any] | None = None, /, **changes: Any) -> Experiment:
-    """The same experiment with other fields.
-
-    A traced t0 keeps the number of steps that the experiment has; a concrete one has it chosen anew unless it was
-    given.
-
-    Args:
-        experiment: the experiment; it stays as it is.
-        values: what changes by dotted name, like {"friction.mu": 0.5}.
-        changes: what changes by field.
-
-    Raises:
-        ValueError: if there is no such field, it is given twice, or the new experiment is impossible.
-    """
-    require_kind("replace", experiment, Experiment)
-    found: dict[str, Any] = dict(changes)
-    require_once(values or {}, changes)
-    for path, value in (values or {}).items():
-        name, *deeper = path.split(".")
-        _require_field(experiment, name)
-        before = found.get(name, getattr(experiment, name))
-        found[name] = _with(before, deeper, value)
-    for name in found:
-        _require_field(experiment, name)
-    if traced(found.get("t0")):
-        found.setdefault("steps", experiment.steps_per_bin)
-    if experiment.is_paper:  # it is made anew of the new numbers and sets
-        found.setdefault("protocol", None)
-    return dataclasses.replace(experiment, **found)
-
-
-def with_part(experiment: Experiment, first: int, last: int) -> Experiment:
-    """The same experiment with waveforms number `first` to `last` - 1 alone, be they silent: the whole set is not."""
-    few = copy.copy(experiment)
-    object.__setattr__(few, "signals", part(experiment.signals, first, last))
-    return few
-
-
-def _with(tree: Any, path: list[str], value: Any) -> Any:
-    if not path:
-        return value
-    if isinstance(tree, Protocol):
-        return tree.with_value(".".join(path), value)
-    if isinstance(tree, SignalSets) and path[0] in tree.names:
-        sets = [_with(one, path[1:], value) if name == path[0] else one for name, one in sets_of(tree).items()]
-        return SignalSets(tuple(sets), tree.names)
-    _require_field(tree, path[0])
-    return dataclasses.replace(tree, **{path[0]: _with(getattr(tree, path[0]), path[1:], value)})
-
-
-def value_at(experiment: Experiment, path: str) -> Any:
-    """What stands at a dotted name, like "friction.mu"; defaults resolved.
-
-    Raises:
-        ValueError: if there is no such field.
-    """
-    resolved: dict[str, Any] = {"delta0": experiment.compression, "hold_drag": experiment.drag}
-    if path in resolved:
-        return resolved[path]
-    found: Any = experiment
-    for name in path.split("."):
-        if isinstance(found, SignalSets) and name in found.names:
-            found = sets_of(found)[name]
-            continue
-        _require_field(found, name)
-        found = getattr(found, name)
-    return found
-
-
-def _require_field(tree: Any, name: str) -> None:
-    names = [field.name for field in fields(tree)] if is_dataclass(tree) else []
-    if name not in names:
-        parts = [part for part in names if is_dataclass(getattr(tree, part))]
-        near = [f"{part}.{name}" for part in parts if any(one.name == name for one in fields(getattr(tree, part)))]
-        meant = f" (meant is {' or '.join(near)}?)" if near else ""
-        raise ValueError(f"{type(tree).__name__} has no field {name!r}{meant}; it has {', '.join(names) or 'none'}")

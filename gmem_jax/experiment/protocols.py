@@ -10,7 +10,8 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from gmem_jax.experiment.stages import compress, cycle, hold, read, rest, shake, train, write
-from gmem_jax.simulation.protocol import OWN, Protocol, Stage
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import OWN, Stage
 
 Shear = Literal["during", "before"]
 """When waveforms are applied: during the compression, or before it."""

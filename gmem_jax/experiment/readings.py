@@ -15,7 +15,8 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.simulation.channels import CHANNELS
-from gmem_jax.simulation.protocol import BINS, Drive, Protocol, Stage
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import BINS, Drive, Stage
 
 
 class Readings(NamedTuple):

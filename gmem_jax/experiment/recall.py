@@ -2,45 +2,33 @@
 
 import dataclasses
 import json
-import time
-import warnings
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment import html
-from gmem_jax.experiment.arguments import require_kind, require_several
-from gmem_jax.experiment.asked import require_double, require_inside
-from gmem_jax.experiment.experiment import Experiment, replica_parameters, with_part
+from gmem_jax.experiment.arguments import require_kind
+from gmem_jax.experiment.asked import require_double
+from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.record import describe
-from gmem_jax.experiment.stepping import require_stable
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
-from gmem_jax.physics.numbers import plural, require_whole
+from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, State, Status, combined_status, explain, replicate
-from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
-from gmem_jax.simulation.compiled import Compiled, require_x64
-from gmem_jax.simulation.frames import FrameRecorder, Frames, FrameSchedule, concatenate, places, places_at
+from gmem_jax.simulation.compiled import require_x64
+from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.loop import Simulation, rollout_stages
-from gmem_jax.simulation.observers import CHUNK
-from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, work_of
-from gmem_jax.simulation.protocol import BINS, Protocol, Stage
-from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
+from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.sample import Sample
-from gmem_jax.simulation.sharding import placement_of
-from gmem_jax.simulation.strain import smallest_box
+from gmem_jax.simulation.stage import BINS, Stage
 
 REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than this part of the walls' speed
-COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
-GRAIN_BYTES = 800  # of a grain's own numbers and its spheres'
-PREFIX = "prefix"  # name of the part of a run that is common to all waveforms
-LARGEST_BATCH = 63  # signals; with the zero signal they fill whole vectors of every CPU
 
 
 @pytree
@@ -167,7 +155,7 @@ def _number(kind: str, known: tuple[str, ...], wanted: str | int) -> int:
     raise ValueError(f"the recall has no {kind} {wanted!r}; it has {', '.join(known)}")
 
 
-def _compared(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> tuple[Recall, jax.Array]:
+def unjudged(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> tuple[Recall, jax.Array]:
     """Subtract the background and compare with the integrals; and round-off in p_sig over its size, [S]."""
     pack, t0 = experiment.pack, experiment.t0
     step = experiment.timing.dt
@@ -203,15 +191,15 @@ def _compared(experiment: Experiment, stages: OrderedDict[str, Sample], status: 
     return made, noise / readable(experiment, found)
 
 
-def _judged(experiment: Experiment, stages: OrderedDict[str, Sample], found: Recall, noise: jax.Array) -> jax.Array:
+def judged(experiment: Experiment, stages: OrderedDict[str, Sample], found: Recall, noise: jax.Array) -> jax.Array:
     """The status of a recall, and what makes it doubtful."""
     return found.status | validity(experiment, stages, found.fidelity, found.windowed_fidelity, noise)
 
 
 def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
     """The recall that the samples of all stages make."""
-    found, noise = _compared(experiment, stages, status)
-    return dataclasses.replace(found, status=_judged(experiment, stages, found, noise))
+    found, noise = unjudged(experiment, stages, status)
+    return dataclasses.replace(found, status=judged(experiment, stages, found, noise))
 
 
 def _by_stage(sample: Sample, stages: tuple[Stage, ...]) -> "OrderedDict[str, Sample]":
@@ -264,40 +252,6 @@ def gain(experiment: Experiment) -> jax.Array:
     return recall(experiment).gain
 
 
-_begin = Experiment.begin
-_fan_out = Compiled(Experiment.fan_out)
-_compare = Compiled(_compared)
-_judge = Compiled(_judged, quick=True)
-
-
-def finished(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
-    """`finish` on the host, in two programs, of which one need not be fast."""
-    found, noise = _compare(experiment, stages, status)
-    judged: Recall = dataclasses.replace(found, status=_judge(experiment, stages, found, noise))
-    return judged
-
-
-def runner_of(experiment: Experiment, **options: Any) -> Runner:
-    """A runner at the beginning of the experiment.
-
-    Raises:
-        ValueError: if 64-bit mode is off, or was when the pack or the signals were made; or the experiment is traced;
-            or its time step is not stable.
-    """
-    require_x64()
-    require_double(pack=experiment.pack, signals=experiment.signals)
-    if traced(experiment):
-        raise ValueError("gm.run works on the host; inside jax.jit, jax.vmap or jax.grad use gm.recall")
-    require_inside(experiment.pack)
-    require_stable(experiment)
-    pack, deepest = experiment.pack, float(np.max(np.asarray(experiment.compression)))
-    smallest = smallest_box(np.asarray(pack.lower), np.asarray(pack.upper), deepest)
-    state = _begin(experiment)
-    raise_if_fatal(status_of(state), "begin")
-    simulation = experiment.simulation(sheared=False)
-    return Runner(simulation.marked(state, experiment.protocol.stages[0]), state, smallest, **options)
-
-
 def with_waveforms(experiment: Experiment, before: Simulation, state: State) -> Simulation:
     """What is run after the prefix, for a state of all replicas; `before` is what was run in it.
 
@@ -309,192 +263,3 @@ def with_waveforms(experiment: Experiment, before: Simulation, state: State) -> 
     mark = before.mark
     narrow = mark is not None and mark.touching.shape[-1] == 1 < state.replicas
     return dataclasses.replace(simulation, mark=replicate(mark, state.replicas) if narrow else mark)
-
-
-def apply_waveforms(runner: Runner, experiment: Experiment) -> None:
-    """Bring a runner from the end of the prefix to the first sheared stage: all replicas, with their waveforms."""
-    pairs, runner.state = runner.simulation.system.pairs, _fan_out(experiment, runner.state)
-    runner.simulation = with_waveforms(experiment, runner.simulation, runner.state).with_pairs(pairs)
-
-
-class Prefix(NamedTuple):
-    """The stages that all waveforms have in common, done.
-
-    Attributes:
-        runner: at their end.
-        samples: theirs.
-    """
-
-    runner: Runner
-    samples: "OrderedDict[str, Sample]"
-
-
-@usual_rules()
-def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress: Progress = silent) -> Prefix:
-    """Run the shear-free prefix, common to all waveforms on this pack under this law, for any number of `run`.
-
-    Args:
-        experiment: pack, law and protocol.
-        cache: asked for the part "prefix".
-        progress: told about every chunk.
-
-    Raises:
-        RunFailedError: if the simulation broke down.
-    """
-    common, _ = experiment.phases
-    runner = runner_of(experiment, progress=progress)
-    runner.total_work = work_of(common, runner.state.replicas)
-    return Prefix(runner, runner.run_cached(PREFIX, cache, *common))
-
-
-@usual_rules()
-@shows_progress
-def run(
-    experiment: Experiment,
-    *,
-    prefix: Prefix | None = None,
-    batch: int | None = None,
-    devices: Sequence[jax.Device] | None = None,
-    frames: int = 0,
-    frames_of: int = 1,
-    frames_at: Sequence[float] = (),
-    cache: ResultCache = no_cache,
-    progress: ProgressChoice = None,
-) -> Recall:
-    """Run an experiment on the host, in chunks: stale neighbour lists are built anew, a broken run raises.
-
-    With several processes (`jax.distributed`) all must call it alike, and all get the recall; one should keep it.
-
-    Args:
-        experiment: the experiment.
-        prefix: what `prefix_of` gave for the same pack and law, if it was run already.
-        batch: signals that run together; default all of them. Each batch has a zero signal of its own.
-        devices: that share out the replicas; default all that JAX sees, also those of other processes.
-        frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
-        frames_of: the signal whose they are, from 1; 0 for the zero signal.
-        frames_at: compressions u, 0 to 1, at which more are kept, each time that the run passes them, to the next of
-            256 bins: u = 0.5 gives one of every compression and decompression.
-        cache: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).
-        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
-
-    Raises:
-        ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
-            for a time step that is not stable (see `stable_step`); for too many or too few frames, a u beyond 0 and 1,
-            frames of a prefix that was run before, or a signal that there is not.
-        TypeError: if it is no `Experiment`.
-        RunFailedError: if the simulation broke down.
-    """
-    require_kind("run", experiment, Experiment)
-    began, tell = time.perf_counter(), callback(progress)
-    count = experiment.signals.count
-    size = count if batch is None else require_whole("batch", batch, 1)
-    if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
-        raise ValueError("parameters with a value for each replica need all signals in one batch")
-    schedule = frame_schedule(experiment, frames, frames_of, frames_at)
-    if prefix and schedule.wanted:
-        raise ValueError("frames begin with the prefix: run it in the same call")
-    warn_of_another_compression(experiment)
-    common, own = experiment.phases
-    firsts = range(0, count, size)
-    work = sum(work_of(own, 1 + min(size, count - first)) for first in firsts)
-    recorders = [FrameRecorder(schedule)] if schedule.wanted else []
-    if prefix is None:
-        runner = runner_of(experiment, progress=tell, observers=tuple(recorders))
-        runner.total_work = work_of(common, runner.state.replicas) + work
-        prefix = Prefix(runner, runner.run_cached(PREFIX, cache, *common))
-        done = work_of(common, runner.state.replicas)
-    else:
-        runner = prefix.runner.fork(progress=tell, total_work=work)
-        done = 0.0
-    parts: list[tuple[dict[str, Sample], jax.Array]] = []
-    recorded = recorders[0].recorded if recorders else OrderedDict()
-    for number, first in enumerate(firsts):
-        last = min(first + size, count)
-        few = experiment if size >= count else with_part(experiment, first, last)
-        wanted = bool(recorders) and (first < frames_of <= last or frames_of == first == 0)
-        recorder = FrameRecorder(FrameSchedule(schedule.wanted if wanted else {}, max(0, frames_of - first)))
-        recorder.restore(recorded)
-        on = runner.fork(work=done, observers=(recorder,))
-
-        def run_batch(
-            checkpoint: Checkpoint, few: Experiment = few, on: Runner = on, recorder: FrameRecorder = recorder
-        ) -> Any:
-            apply_waveforms(on, few)
-            on.place_on(placement_of(few.replicas, devices))
-            samples = on.run_stages(*own, checkpoint=checkpoint)
-            return (samples, on.status()), recorder.saved()
-
-        found_part, seen = cache(f"batch-{number:04d}", run_batch)
-        parts.append(found_part)
-        recorded = seen if wanted else recorded
-        done += work_of(own, 1 + last - first)
-    after_prefix, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
-    found: Recall = finished(experiment, prefix.samples | after_prefix, jnp.asarray(status))
-    found = found.described(describe(experiment, time.perf_counter() - began))
-    if not schedule.wanted:
-        return found
-    pack = experiment.pack
-    return dataclasses.replace(found, frames=concatenate(recorded, pack.clump, frames_of, periodic=pack.periodic))
-
-
-def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[float] = ()) -> FrameSchedule:
-    """What is to be recorded of a run: `frames` configurations of the replica of a signal, and those `at` compressions.
-
-    Raises:
-        ValueError: for too many or too few, a u beyond 0 and 1, or a signal that there is not.
-    """
-    frames, of = require_whole("frames", frames), require_whole("frames_of", of)
-    require_several(at, "frames_at")
-    if of > experiment.signals.count:
-        raise ValueError(f"frames of signal {of}: there are signals 1 to {experiment.signals.count}, and 0 for none")
-    stages = experiment.protocol.stages
-    along = [places(stages, frames, CHUNK)] if frames else []
-    wanted = [*along, places_at(stages, at)]
-    both = {stage.name: sorted({bins for each in wanted for bins in each.get(stage.name, ())}) for stage in stages}
-    return FrameSchedule({name: found for name, found in both.items() if found}, of)
-
-
-def replica_bins(experiment: Experiment, batch: int) -> int:
-    """Bins times replicas of a run, of which the prefix has one and each batch one for no signal."""
-    before, after = (sum(stage.bins for stage in some) for some in experiment.phases)
-    count = experiment.signals.count
-    return before + after * (count + -(-count // batch))
-
-
-def _join(first: Any, *others: Any) -> np.ndarray:
-    """Replicas of several batches, innermost; the zero signal of the first stands for all."""
-    return np.concatenate([np.asarray(first), *(np.asarray(other)[..., 1:] for other in others)], axis=-1)
-
-
-class OtherCompressionWarning(UserWarning):
-    """A pack was cycled with another delta0: `Status.OTHER_COMPRESSION`, said before the run."""
-
-
-def warn_of_another_compression(experiment: Experiment) -> None:
-    """Warn of a delta0 that the pack was not made for."""
-    own = float(experiment.pack.delta0)
-    if not np.allclose(np.asarray(experiment.compression), own):
-        warnings.warn(
-            f"{experiment.pack.name} was cycled with delta0 = {own:g}, not {experiment.delta0}: its memory of the "
-            "preparation differs from the paper's; prepare a pack for this delta0",
-            OtherCompressionWarning,
-            stacklevel=3,
-        )
-
-
-def _replica_bytes(experiment: Experiment) -> int:
-    """Memory that a replica takes while it runs."""
-    pairs = experiment.pack.pairs
-    history = jax.eval_shape(lambda: experiment.friction.init(pairs.capacity, 1, jnp.zeros(()).dtype))
-    contacts: int = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(history))
-    return COPIES * (contacts + GRAIN_BYTES * experiment.pack.grains)
-
-
-def run_bytes(experiment: Experiment, batch: int) -> int:
-    """Memory that a run of `batch` signals and the zero signal will take."""
-    return (batch + 1) * _replica_bytes(experiment)
-
-
-def default_batch(experiment: Experiment, available: int) -> int:
-    """Signals that may run together in half of the `available` bytes; at most `LARGEST_BATCH`."""
-    return int(max(1, min(LARGEST_BATCH, 0.5 * available / _replica_bytes(experiment) - 1)))

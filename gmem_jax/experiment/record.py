@@ -8,7 +8,8 @@ import jax
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_kind
-from gmem_jax.experiment.experiment import NUMBERS, Experiment, value_at
+from gmem_jax.experiment.changes import value_at
+from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance, sources
 from gmem_jax.experiment.signals import (

@@ -8,7 +8,7 @@ import numpy as np
 
 from gmem_jax.experiment.signals import Spline, waveform
 from gmem_jax.physics.numbers import is_real, require_numbers, said
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 STEEPEST = 0.2  # of its largest value, that a waveform may change by within a bin. Words of 12 bits, the steepest there
 # are, have 0.196. Noise that makes 0.23 changes J by 1 % and what a pack gives back by 29 %; see docs/howto/waveform.md

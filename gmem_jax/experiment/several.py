@@ -15,9 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, replace, replica_parameters, value_at
-from gmem_jax.experiment.recall import PREFIX, Recall, finished, runner_of, warn_of_another_compression
+from gmem_jax.experiment.changes import replace, value_at
+from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, replica_parameters
+from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import describe
+from gmem_jax.experiment.run import PREFIX, finished, runner_of, warn_of_another_compression
 from gmem_jax.experiment.signals import Signals, SignalSets, bin_average
 from gmem_jax.physics.pytree import pytree
 from gmem_jax.physics.rules import usual_rules

@@ -17,7 +17,7 @@ from gmem_jax.experiment.html import line
 from gmem_jax.physics.numbers import is_real, plural, require_numbers, said
 from gmem_jax.physics.pytree import Scalar, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 LONGEST_WORD = 12  # bits
 PAD = 2.0  # bits left free at either end of a word

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.signals import Signals
-from gmem_jax.simulation.protocol import BINS, OWN, SINE, Along, Drive, Role, Stage
+from gmem_jax.simulation.stage import BINS, OWN, SINE, Along, Drive, Role, Stage
 
 Waveform = str | Signals | Sequence[float] | np.ndarray
 """What a stage writes: the name of a set, "sine:n", one waveform, or its samples at k / (n + 1)."""

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_kind
+from gmem_jax.experiment.changes import replace as with_changes
 from gmem_jax.experiment.experiment import USUAL_STEP, Experiment
-from gmem_jax.experiment.experiment import replace as with_changes
 from gmem_jax.experiment.record import fingerprint, pack_fingerprint
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.frictionless import Frictionless

@@ -21,8 +21,8 @@ from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.physics.state import Status
-from gmem_jax.simulation.protocol import BINS
 from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.stage import BINS
 
 DEEPEST = 0.2  # R; there a contact's radius is 0.32 R, which Hertz takes for small. delta0 = 0.05 makes 0.14 to 0.17
 FASTEST = 5e-3  # inertial number; at 6e-3 (t0 = 180) F is 0.25 to 0.29 on packs that have 0.68 to 0.87 when not hurried

@@ -10,7 +10,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.experiment.experiment import NUMBERS, Experiment, replace
+from gmem_jax.experiment.changes import replace
+from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.record import PARTS, pack_fingerprint
 from gmem_jax.experiment.signals import Signals, SignalSets, signals

@@ -13,7 +13,7 @@ from gmem_jax.files.hdf5 import OBSERVED, observed_array
 from gmem_jax.files.measures import of_each
 from gmem_jax.files.schemas import RECALL, STAGE, declared_of_recall
 from gmem_jax.files.validation import optional
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 
 def to_xarray(recall: Recall) -> Any:

@@ -21,8 +21,8 @@ from gmem_jax.files.seal import BLOCK, HDF5, require_sealed, seal
 from gmem_jax.files.tree import Tree
 from gmem_jax.files.validation import Array, fit, refusing
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes, periodic_axes
-from gmem_jax.simulation.protocol import BINS
 from gmem_jax.simulation.sample import MEASURED, Sample
+from gmem_jax.simulation.stage import BINS
 
 OBSERVED = "observed_"  # begins the names of what observers gave
 

@@ -32,7 +32,8 @@ from gmem_jax.files.atomic import atomic
 from gmem_jax.files.validation import is_number, refusing, title, whole
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.channels import CHANNELS
-from gmem_jax.simulation.protocol import Drive, Protocol, Stage
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import Drive, Stage
 
 BUILDERS: dict[str, Callable[..., Stage | tuple[Stage, ...]]] = {
     one.__name__: one

@@ -32,8 +32,9 @@ from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import WARNINGS, Status
 from gmem_jax.simulation.channels import CHANNELS
-from gmem_jax.simulation.protocol import BINS, Protocol
+from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.stage import BINS
 
 _EVERY_BIT = int(sum(Status))
 

@@ -2,7 +2,7 @@
 
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.files.schemas import STAGE
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 FIXED_BYTES = 1.0e5  # of a file: names, units, scales; measured 1.0e5 on recalls, 2.5e5 on packs with their stages
 PACK_BYTES = 408.0  # of a grain and its candidates, on packs of 325 to 10,240

@@ -17,7 +17,7 @@ import numpy as np
 from gmem_jax.errors import FileFormatError
 from gmem_jax.physics.grain import require_radii
 from gmem_jax.physics.rules import require_started
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 DTYPES = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",), "text": ("bytes",)}
 FIXED_LENGTHS = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that have one length in every file

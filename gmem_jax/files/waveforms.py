@@ -30,7 +30,7 @@ from gmem_jax.files.atomic import atomic
 from gmem_jax.files.columns import SampleTable, read_columns
 from gmem_jax.files.validation import json_of, numbers, read_npy, refusing, require_fields, require_kinds, title
 from gmem_jax.physics.rules import usual_rules
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 OF_WORDS = ("word_pad", "word_width")
 OF_SAMPLES = ("smooth", "taper", "scale")

@@ -22,7 +22,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import LAWS, entry_of
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.state import Box, Grains, State
-from gmem_jax.physics.step import System
+from gmem_jax.physics.system import System
 
 March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 """The signature of `gmem_jax.physics.step.march`."""

@@ -25,7 +25,7 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import interval
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import still_box
-from gmem_jax.physics.step import System
+from gmem_jax.physics.system import System
 from gmem_jax.preparation.ringing import ringing_period
 from gmem_jax.simulation.neighbors import SKIN
 from gmem_jax.simulation.progress import Progress, silent

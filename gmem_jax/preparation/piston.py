@@ -13,7 +13,7 @@ from gmem_jax.native import March
 from gmem_jax.physics.pairs import slack, sphere_centres
 from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.state import Box, State
-from gmem_jax.physics.step import System
+from gmem_jax.physics.system import System
 from gmem_jax.simulation.sample import check
 from gmem_jax.simulation.strain import servo_rate
 

@@ -25,7 +25,8 @@ from gmem_jax.physics.grain import Clump, tetra
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Grains, still_box
-from gmem_jax.physics.step import System, accelerate, start
+from gmem_jax.physics.step import accelerate, start
+from gmem_jax.physics.system import System
 from gmem_jax.preparation.piston import STEPS_PER_CHECK, Pressed, Servo, largest_speed, press
 from gmem_jax.preparation.recipe import (
     FREE_SKIN,
@@ -47,9 +48,9 @@ from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.neighbors import pair_finder
 from gmem_jax.simulation.observers import Chunk
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, work_of, work_of_bin
-from gmem_jax.simulation.protocol import Stage
 from gmem_jax.simulation.runner import Runner, raise_if_fatal, status_of
 from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.stage import Stage
 from gmem_jax.simulation.strain import StrainPath, smallest_box
 
 FREE_CANDIDATES = 68  # a grain of a pressed pack with that skin: one program for all lists

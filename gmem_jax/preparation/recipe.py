@@ -15,7 +15,7 @@ from gmem_jax.physics.grain import Clump, sized
 from gmem_jax.physics.numbers import is_real, said
 from gmem_jax.physics.pytree import interval
 from gmem_jax.preparation.grading import LARGEST_SPREAD, lognormal, mixture
-from gmem_jax.simulation.protocol import BINS, Stage
+from gmem_jax.simulation.stage import BINS, Stage
 from gmem_jax.simulation.strain import COMPRESSIONS
 
 SETTLING = 500.0  # t_c that coming to rest took per R of a dense pack's height (170 to 880, N = 325 to 10,240)

@@ -10,11 +10,12 @@ from gmem_jax.errors import RunFailedError
 from gmem_jax.files.pack_validation import LISTENED, PERIODS, period_bounds
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.state import Box
-from gmem_jax.physics.step import System, accelerate, start
+from gmem_jax.physics.step import accelerate, start
+from gmem_jax.physics.system import System
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.progress import Progress, silent, work_of
-from gmem_jax.simulation.protocol import BINS, Stage
 from gmem_jax.simulation.runner import Runner
+from gmem_jax.simulation.stage import BINS, Stage
 from gmem_jax.simulation.strain import StrainPath, stretched
 
 KICK = 2.0e-5  # strain rate of the kick, 1 / t_c: strains of about 1e-4, below which the response is linear enough

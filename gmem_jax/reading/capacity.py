@@ -13,7 +13,7 @@ import numpy as np
 from gmem_jax.design.kernel import KernelMatrix, MemoryKernel
 from gmem_jax.experiment.signals import word_bits
 from gmem_jax.reading.readers import linear_decoder
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 BOOTSTRAP = 400  # samples of the words for an error bar
 POINTS = 512  # of v where waveforms are held to their bound

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 
 from gmem_jax.experiment.signals import bin_average, bit_width, words
 from gmem_jax.physics import chance
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 RATIOS = 64  # of noise to signal at which the size of a set is calculated, and joined by straight lines: right to 1e-5
 

@@ -15,7 +15,7 @@ from flax import linen as nn
 
 from gmem_jax.physics import chance
 from gmem_jax.reading.lessons import TrainingConfig
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 
 class Perceptron(nn.Module):

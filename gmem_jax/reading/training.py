@@ -32,7 +32,7 @@ from gmem_jax.physics import chance
 from gmem_jax.reading.lessons import Examples, TrainingConfig, examples
 from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
 from gmem_jax.simulation.progress import silent
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 STEPS_PER_CALL = 250  # to a call from the host: a second or so, and one check of the validation accuracy
 QUICK_CHECK = 4_096  # held-out examples tried after every call

@@ -89,7 +89,7 @@ def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]
 
     Args:
         packs: what names them.
-        runs: values of points and summaries of their recalls (`show.tables.summary`); points that failed are missing.
+        runs: values of points and summaries of their recalls (`show.numbers.summary`); points that failed are missing.
         t0: at which they were run: below the paper's, G and F are those after averaging over the ringing period.
     """
     known = list(runs)

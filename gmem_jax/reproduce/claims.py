@@ -11,14 +11,15 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import compare, recalled, remembered_after, spread
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.recall import Recall, apply_waveforms, runner_of
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.run import apply_waveforms, runner_of
 from gmem_jax.experiment.signals import six_signals
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.state import State
 from gmem_jax.reproduce.figures import Values, crossed
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 STORES = (0.5, 2.0, 8.0)  # t0
 STANDARD_STORE = 2.0

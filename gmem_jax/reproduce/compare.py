@@ -11,7 +11,7 @@ from gmem_jax.experiment.analysis import spread
 from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.contact.laws import LAWS
 from gmem_jax.physics.state import combined_status
-from gmem_jax.show.tables import published, summary
+from gmem_jax.show.numbers import published, summary
 from gmem_jax.sweeps.store import Store
 
 PAPER_GRAINS = 10_240
@@ -48,7 +48,7 @@ class Conditions:
 
 
 class ComputedPoint(NamedTuple):
-    """One pack at some conditions: `show.tables.summary` of its recall, and where that lies."""
+    """One pack at some conditions: `show.numbers.summary` of its recall, and where that lies."""
 
     conditions: Conditions
     numbers: dict[str, Any]

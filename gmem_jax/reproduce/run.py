@@ -47,10 +47,10 @@ from gmem_jax.reproduce.figures import (
 )
 from gmem_jax.reproduce.single_contact import convergence_figure, laws_figure
 from gmem_jax.reproduce.two_grains import two_grains_figure
+from gmem_jax.show.numbers import summary
 from gmem_jax.show.recalls import recall_figure
 from gmem_jax.show.render import packs_figure
 from gmem_jax.show.render_matplotlib import to_matplotlib
-from gmem_jax.show.tables import summary
 from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.progress import Progress, silent
 from gmem_jax.sweeps.executors import Executor, Processes

@@ -22,7 +22,7 @@ from gmem_jax.physics.contact.path import contact_path
 from gmem_jax.reproduce.figures import DELTA0
 from gmem_jax.reproduce.single_contact import write_columns
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 STORE = 0.2  # t0, in the picture
 POINTS_PER_BIN = 4  # points to a bin

@@ -17,7 +17,7 @@ from gmem_jax.physics.state import Grains
 from gmem_jax.show.figure import Curve, Discs, Figure, Image, Panel, U, grid, ramp, shown_part, u_label
 from gmem_jax.show.recalls import MOST_OF_PAGE, SHEAR
 from gmem_jax.simulation.frames import radii_of_spheres
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 PASCAL = float(Material().modulus)
 

@@ -8,8 +8,8 @@ import numpy as np
 from gmem_jax.files.validation import is_number
 from gmem_jax.physics.material import Material
 from gmem_jax.show.figure import CYCLE, GREY, Curve, Figure, Panel, U
-from gmem_jax.simulation.protocol import BINS
 from gmem_jax.simulation.sample import MEASURED, Measured, Sample
+from gmem_jax.simulation.stage import BINS
 
 AGAINST = ("time", "u")
 ZERO = "zero signal"

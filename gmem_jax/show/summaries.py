@@ -32,6 +32,7 @@ from gmem_jax.physics.numbers import plural
 from gmem_jax.reading.readers import confusion
 from gmem_jax.show import figures, sweeps, tables
 from gmem_jax.show.figure import Figure
+from gmem_jax.show.numbers import summary
 from gmem_jax.show.recalls import MOST_OF_PAGE, OF_SIGNALS, PICTURES, place_of, recall_figure, signals_figure
 from gmem_jax.show.scene import rest_frames
 from gmem_jax.show.stages import QUANTITIES, observed_quantities, series_figures, stages_figure
@@ -151,7 +152,7 @@ def of_recall(
     recall: Recall, name: str = "", *, against: str = "time", signals: Sequence[int] = (), each: bool = False
 ) -> Summary:
     """What is said of a recall; see `summary_of`."""
-    configuration, row = recall.configuration, tables.summary(recall)
+    configuration, row = recall.configuration, summary(recall)
     choice: dict[str, Any] = {"against": against, "signals": signals}
     pictures = (*PICTURES, *observed_quantities(recall.stages, configuration.get("observed", {})))
     drawn: dict[str, Draw] = {what: partial(recall_figure, recall, what, configuration, **choice) for what in pictures}

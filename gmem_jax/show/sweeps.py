@@ -11,7 +11,8 @@ from gmem_jax.files.validation import is_number
 from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import SENTENCES, Status, combined_status
 from gmem_jax.show.figure import Curve, Figure, Panel, ramp
-from gmem_jax.show.tables import cell, decimal, status_words
+from gmem_jax.show.numbers import status_words
+from gmem_jax.show.tables import cell, decimal
 from gmem_jax.sweeps.curves import Line, axes_of, is_sample, lines_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.table import names_in, points_in

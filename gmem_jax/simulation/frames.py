@@ -13,15 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
+from gmem_jax.physics.forces import contact_loads, relative_motion, sphere_table
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.numbers import require_numbers
 from gmem_jax.physics.pytree import pytree, short_repr, static
 from gmem_jax.physics.state import State
-from gmem_jax.physics.step import System, contact_loads, relative_motion, sphere_table
+from gmem_jax.physics.system import System
 from gmem_jax.simulation.observers import Chunk, Observer
-from gmem_jax.simulation.protocol import Stage
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.sharding import to_host
+from gmem_jax.simulation.stage import Stage
 
 FEWEST_FRAMES = 2  # the first configuration and the last
 

@@ -21,10 +21,11 @@ from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.pairs import Pairs
 from gmem_jax.physics.pytree import Scalar, pytree, static
 from gmem_jax.physics.state import Box, Grains, HeldWalls, State
-from gmem_jax.physics.step import System, mark_varying
+from gmem_jax.physics.step import mark_varying
+from gmem_jax.physics.system import System
 from gmem_jax.simulation import scan
-from gmem_jax.simulation.protocol import Bin, Columns, Stage, table
 from gmem_jax.simulation.sample import Sample, end_bin, overlaps
+from gmem_jax.simulation.stage import Bin, Columns, Stage, table
 from gmem_jax.simulation.strain import StrainPath, servo_strain, stretched
 
 Observe = Callable[["Simulation", State], Any]

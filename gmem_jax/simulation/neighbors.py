@@ -10,7 +10,7 @@ from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import slack, sphere_centres
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, State
-from gmem_jax.physics.step import System
+from gmem_jax.physics.system import System
 
 SKIN = 0.3
 """Skin of the neighbour list of an experiment, in R. Measured non-affine displacements over a full compression stay

@@ -23,11 +23,11 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.kinematics import Kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.contact.wall import PLANES, wall_forces
+from gmem_jax.physics.forces import contact_loads, relative_motion, sphere_table, wall_loads
 from gmem_jax.physics.pairs import image_shifts
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.rotation import cross, dot
 from gmem_jax.physics.state import State
-from gmem_jax.physics.step import contact_loads, relative_motion, sphere_table, wall_loads
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.sample import overlaps
 

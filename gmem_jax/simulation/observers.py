@@ -16,8 +16,8 @@ from gmem_jax.physics.state import State
 from gmem_jax.simulation.checkpoints import Checkpoint
 from gmem_jax.simulation.compiled import Compiled
 from gmem_jax.simulation.loop import Simulation, rollout_chunk
-from gmem_jax.simulation.protocol import Bin, Stage
 from gmem_jax.simulation.sample import Sample
+from gmem_jax.simulation.stage import Bin, Stage
 
 CHUNK = 32  # bins per call: some seconds of work at most, a few milliseconds of overhead
 

@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from html import escape
 from typing import Any, ParamSpec, TypeVar
 
-from gmem_jax.simulation.protocol import Stage
+from gmem_jax.simulation.stage import Stage
 
 Progress = Callable[[str, float, float], None]
 """Called with the stage's name, the simulated time so far (t_c) and the fraction of the whole work done (0 to 1)."""

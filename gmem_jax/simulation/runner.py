@@ -23,10 +23,10 @@ from gmem_jax.simulation.loop import Mark, Simulation
 from gmem_jax.simulation.neighbors import LARGEST_SKIN, SKIN, pair_finder, skin_left
 from gmem_jax.simulation.observers import CHUNK, CheckpointWriter, Chunk, Observer, SampleRecorder
 from gmem_jax.simulation.progress import Progress, silent, work_of_bin
-from gmem_jax.simulation.protocol import Bin, Stage
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.sharding import Placement, to_host
 from gmem_jax.simulation.stability import cause
+from gmem_jax.simulation.stage import Bin, Stage
 
 
 def status_of(state: State) -> int:

@@ -9,12 +9,13 @@ from jax import lax
 
 from gmem_jax.physics.contact.friction import largest_overlap
 from gmem_jax.physics.contact.wall import wall_kinematics
+from gmem_jax.physics.forces import sphere_table
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import image_shifts, slack, sphere_centres, touching_distance
 from gmem_jax.physics.pytree import Scalar, pytree, short_repr
 from gmem_jax.physics.rotation import dot, matrix
 from gmem_jax.physics.state import Box, State, Status
-from gmem_jax.physics.step import System, sphere_table
+from gmem_jax.physics.system import System
 
 
 class Measured(NamedTuple):

@@ -11,7 +11,7 @@ from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.pytree import Scalar, pytree, static
 from gmem_jax.physics.state import Box, HeldWalls
 from gmem_jax.simulation.channels import CHANNELS
-from gmem_jax.simulation.protocol import Bin, Lane, Numbers
+from gmem_jax.simulation.stage import Bin, Lane, Numbers
 
 COMPRESSIONS = "[1e-9, 0.5)"  # delta0 of a compression: of less, rounding leaves the walls where they are
 SERVO_GAIN = 2.5e-4  # strain in a bin for a relative error of 1: stresses follow within some 20 bins, and do not ring

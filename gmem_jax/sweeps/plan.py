@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.recall import default_batch, replica_bins
 from gmem_jax.experiment.record import key_of_run, to_dict
+from gmem_jax.experiment.run import default_batch, replica_bins
 from gmem_jax.experiment.several import match
 
 ABREAST = 64  # replicas of a run at most: whole vectors of every CPU, and enough for every thread

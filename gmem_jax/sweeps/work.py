@@ -25,7 +25,8 @@ import jax
 
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.recall import OtherCompressionWarning, Recall, run
+from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.run import OtherCompressionWarning, run
 from gmem_jax.experiment.several import run_several
 from gmem_jax.files.checkpoints import Checkpoints, part_with
 from gmem_jax.files.compilation_cache import keep_programs

@@ -15,6 +15,7 @@ from gmem_jax.command import packs, recalls
 from gmem_jax.files.results import finite
 from gmem_jax.files.waveforms import load_target
 from gmem_jax.show import tables
+from gmem_jax.show.numbers import note_on_size
 
 
 @pytest.fixture
@@ -274,9 +275,9 @@ def test_a_pack_of_several_sizes_is_foreseen_and_shown(
 
 def test_a_recall_of_few_spheres_says_that_they_hold_little() -> None:
     few = {"grains": 325, "grain": {"shape": "sphere"}}
-    assert "325 spheres hold little: G = 0.04 ± 0.03 and F = 0.3 ± 0.2 were measured" in tables.note_on_size(few)
-    assert tables.note_on_size({**few, "grains": 3267}) == ""
-    assert tables.note_on_size({**few, "grain": {"shape": "tetra(0.6)"}}) == ""
+    assert "325 spheres hold little: G = 0.04 ± 0.03 and F = 0.3 ± 0.2 were measured" in note_on_size(few)
+    assert note_on_size({**few, "grains": 3267}) == ""
+    assert note_on_size({**few, "grain": {"shape": "tetra(0.6)"}}) == ""
 
 
 def test_the_demo_stores_in_the_pack_of_the_middle_and_says_what_packs_differ_by(

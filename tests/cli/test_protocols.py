@@ -15,6 +15,7 @@ from gmem_jax.experiment import analysis
 from gmem_jax.files.sizes import recall_bytes
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.show import tables
+from gmem_jax.show.numbers import summary
 from gmem_jax.show.recalls import recall_figure
 from gmem_jax.show.summaries import of_recall
 from gmem_jax.sweeps.plan import plan, point
@@ -155,7 +156,7 @@ def test_backgrounds_are_those_of_the_channel() -> None:
     protocol = gm.Protocol(gm.write(z="xy"), gm.read(), gm.compress(1.0), gm.read())
     experiment = gm.Experiment(gm.load_pack(PACK), ONE, protocol=protocol, background="sub2", t0=20.0, gamma0=0.01)
     recall = gm.run(experiment, progress=False)
-    found = tables.summary(recall)["backgrounds"]["sub2"]
+    found = summary(recall)["backgrounds"]["sub2"]
     assert found["gain"] == pytest.approx(float(recall.gain), rel=1e-9)
     assert found["fidelity"] == pytest.approx(float(recall.fidelity), rel=1e-9)
     assert recall.channels == ("z",)
@@ -228,7 +229,7 @@ def test_the_size_of_a_file_counts_reads_channels_and_what_is_recorded(several: 
 
 
 def test_the_papers_recall_is_told_as_before(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
-    row = tables.summary(recalled[1])
+    row = summary(recalled[1])
     assert list(row)[:6] == ["pack", "grains", *analysis.MEASURES]
     assert not {"each", "reads", "channels"} & set(row)
     assert [str(column.header) for column in tables.recall_table([row], recalled[1].configuration).columns] == [

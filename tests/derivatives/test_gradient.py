@@ -16,8 +16,11 @@ from scenes import SPREAD_27, TETRA_27, with_skin
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.derivatives import gradient, jacobian
-from gmem_jax.experiment.experiment import acts_on_prefix, value_at
-from gmem_jax.experiment.recall import run
+from gmem_jax.derivatives.moving import fixed_by, moving_of
+from gmem_jax.derivatives.push import push
+from gmem_jax.experiment.changes import value_at
+from gmem_jax.experiment.experiment import acts_on_prefix
+from gmem_jax.experiment.run import run
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.normal import hertz
@@ -166,7 +169,7 @@ def test_the_friction_of_walls_has_the_derivative_of_differences_and_of_forward_
     found = gm.value_and_grad(rough, ["wall_mu", "friction.mu"], loss=smooth)
     require_differences(rough, found.slope)
     assert all(abs(float(slope)) > 0.0 for slope in found.slope.values())
-    along = gradient.push(rough, {"wall_mu": jnp.asarray(1.0)})
+    along = push(rough, {"wall_mu": jnp.asarray(1.0)})
     slope = jax.jvp(lambda p_sig: smooth(rough, p_sig), (along.p_sig,), (along.p_sig_slope,))[1]
     np.testing.assert_allclose(slope, found.slope["wall_mu"], rtol=1e-8)  # round-off of 700 steps
 
@@ -190,7 +193,7 @@ def test_every_name_has_the_derivative_of_grad_by_the_whole_experiment(whole: gm
 def test_the_forward_mode_has_the_shape_of_the_grain_too(whole: gm.Experiment) -> None:
     name = "pack.clump.offsets"
     offsets, toss = whole.pack.clump.offsets, jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
-    along = gradient.push(whole, {name: toss}).p_sig_slope
+    along = push(whole, {name: toss}).p_sig_slope
     up, down = (run(gm.replace(whole, {name: offsets + by * toss})).p_sig for by in (1e-7, -1e-7))
     np.testing.assert_allclose(along, (up - down) / 2e-7, atol=2e-2 * np.abs(along).max())
 
@@ -206,12 +209,12 @@ def test_a_gradient_by_the_whole_experiment_is_native(whole: gm.Experiment, monk
 def test_only_slopes_by_sizes_are_those_of_plain_jax(whole: gm.Experiment, monkeypatch: pytest.MonkeyPatch) -> None:
     unequal = gm.replace(whole, pack=gm.load_pack(SPREAD_27), delta0=None)
     simulation, state = unequal.simulation(sheared=False), unequal.begin()
-    row, moving = simulation.rows(unequal.phases[0][0], 0), gradient._moving(state)
+    row, moving = simulation.rows(unequal.phases[0][0], 0), moving_of(state)
     before, slope = jax.tree.map(lambda leaf: leaf[None], moving), (moving, jnp.zeros((1, 3, 1)))
     monkeypatch.delattr(sys.modules["gmem_jax.native.march"], "_plain")  # the definition of the steps
 
     def pull(*names: str) -> Any:
-        fixed = gradient._fixed_by(names)
+        fixed = fixed_by(names)
         return jax.eval_shape(functools.partial(gradient._pull, fixed=fixed), simulation, before, row, 1, slope)
 
     few, _ = pull("friction.mu", "pack.clump.offsets")
@@ -377,7 +380,7 @@ def test_a_second_readout_as_background_is_differentiated_too(experiment: gm.Exp
     step = 1e-8
     up, down = (float(run(gm.replace(short, gamma0=1e-3 + sign * step)).gain) for sign in (1.0, -1.0))
     np.testing.assert_allclose(found.slope["gamma0"], (up - down) / (2.0 * step), rtol=1e-3)
-    along = gradient.push(short, {"gamma0": jnp.asarray(1.0)})
+    along = push(short, {"gamma0": jnp.asarray(1.0)})
     np.testing.assert_allclose(along.p_sig, found.p_sig, rtol=1e-10, atol=1e-18)
 
 
@@ -389,7 +392,7 @@ def test_derivatives_do_not_mind_lists_that_are_made_anew(experiment: gm.Experim
     # The same contacts in the same order, but sums over other tables: round-off of some 900 steps.
     np.testing.assert_allclose(narrow.slope[by], wide.slope[by], rtol=1e-6)
     direction = {by: jnp.asarray(1.0)}
-    one, other = (gradient.push(e, direction) for e in (short, tight))
+    one, other = (push(e, direction) for e in (short, tight))
     scale = np.abs(one.p_sig_slope).max()
     np.testing.assert_allclose(other.p_sig_slope, one.p_sig_slope, atol=1e-6 * scale)
 

@@ -13,10 +13,10 @@ from scenes import TETRA_27
 import gmem_jax as gm
 from gmem_jax.design import by_kernel, drive, waveforms
 from gmem_jax.design import kernel as response
-from gmem_jax.experiment.recall import prefix_of, run
+from gmem_jax.experiment.run import prefix_of, run
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.simulation.checkpoints import NO_CHECKPOINT, Checkpoint, ResultCache
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 PACK = TETRA_27
 SHORT = {"t0": 75.0, "dt": 0.3, "rest": 0.1, "hold": 0.1, "store": 0.2}

@@ -11,13 +11,14 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
-from gmem_jax.derivatives.gradient import push
+from gmem_jax.derivatives.push import push
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.protocols import memory_protocol
 from gmem_jax.experiment.readings import placed
 from gmem_jax.experiment.record import key_of_run
 from gmem_jax.simulation.channels import CHANNELS
-from gmem_jax.simulation.protocol import Drive, Protocol, Stage
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import Drive, Stage
 
 PACK = gm.load_pack(TETRA_27)
 ONE = gm.Bumps(jnp.asarray([[1.0], [-1.0]]), jnp.full((2, 1), 0.5), 0.6)

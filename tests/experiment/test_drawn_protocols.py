@@ -14,7 +14,8 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.errors import RunFailedError
-from gmem_jax.simulation.protocol import Protocol, Stage
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import Stage
 
 PACK = gm.load_pack(TETRA_27)
 BUMP = gm.Bumps(jnp.asarray([[1.0]]), jnp.asarray([[0.5]]), 0.6)

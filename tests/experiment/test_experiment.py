@@ -14,7 +14,7 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment import recall as recalls
-from gmem_jax.experiment.experiment import value_at
+from gmem_jax.experiment.changes import value_at
 from gmem_jax.physics.rotation import unit
 
 PACK = gm.load_pack(TETRA_27)

@@ -9,11 +9,11 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
-from gmem_jax.experiment.recall import COPIES, GRAIN_BYTES, apply_waveforms, default_batch, runner_of
+from gmem_jax.experiment.run import COPIES, GRAIN_BYTES, apply_waveforms, default_batch, runner_of
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.simulation.checkpoints import no_cache
 from gmem_jax.simulation.observers import forward
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 PACK = TETRA_27
 SHORT = {"t0": 75.0, "dt": 0.3, "store": 0.2}  # one step per bin: some 1,200 steps in all

@@ -190,7 +190,7 @@ def test_a_run_that_deserves_a_doubt_has_it_and_its_numbers(changes: dict[str, f
 
 def test_steps_too_long_are_told_by_grains_that_do_not_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps of 1.76 t_c for springs that are stable up to 0.82 and 0.73 (27 and 325 grains)."""
-    monkeypatch.setattr("gmem_jax.experiment.recall.require_stable", lambda _: None)
+    monkeypatch.setattr("gmem_jax.experiment.run.require_stable", lambda _: None)
     short = {"rest": 0.02, "hold": 0.02, "store": 0.1}
     for pack in (PACK, LARGER):
         bumps, law = two_bumps(1.0, -0.6), gm.Hooke(stiffness=0.93)

@@ -7,7 +7,7 @@ import numpy as np
 import gmem_jax as gm
 from gmem_jax.files.measures import of_each
 from gmem_jax.files.sizes import in_time, pack_bytes, recall_bytes
-from gmem_jax.show.tables import summary
+from gmem_jax.show.numbers import summary
 
 
 def test_each_signal_has_measures_of_its_own(recalled: tuple[gm.Experiment, gm.Recall]) -> None:

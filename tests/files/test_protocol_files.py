@@ -12,7 +12,8 @@ from gmem_jax.experiment import protocols
 from gmem_jax.files.configuration import named_experiment
 from gmem_jax.files.protocols import named_protocol, read_protocol, ready_protocols
 from gmem_jax.files.waveforms import named_signals
-from gmem_jax.simulation.protocol import Drive, Protocol, Stage
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import Drive, Stage
 
 PACK = gm.load_pack(TETRA_27)
 MINE = """

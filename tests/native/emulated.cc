@@ -39,8 +39,8 @@ Run run_of(const Which& which) {
 }
 
 template <Task task>
-xla::ffi::Error emulate(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                        int64_t mixed, int64_t periodic, int64_t unequal, int64_t rubs, xla::ffi::RemainingArgs args,
+xla::ffi::Error emulate(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves, int64_t mixed,
+                        int64_t periodic, int64_t unequal, int64_t rubs, xla::ffi::RemainingArgs args,
                         xla::ffi::RemainingRets rets) {
   return handle<task>(nullptr, law, variant, points, isotropic, leaves, mixed, periodic, unequal, rubs, args, rets);
 }

@@ -19,8 +19,16 @@ using gmem::cuda::Arguments;
 using gmem::cuda::GpuKernel;
 using gmem::cuda::Which;
 
-enum { kOk = 0, kInvalidValue = 1, kOutOfMemory = 2, kInvalidImage = 200, kInvalidContext = 201,
-       kNoBinary = 209, kNotFound = 500, kCaptureUnsupported = 900 };
+enum {
+  kOk = 0,
+  kInvalidValue = 1,
+  kOutOfMemory = 2,
+  kInvalidImage = 200,
+  kInvalidContext = 201,
+  kNoBinary = 209,
+  kNotFound = 500,
+  kCaptureUnsupported = 900
+};
 enum { kRelaxed = 2, kMostThreads = 0, kMajor = 75, kMinor = 76 };
 constexpr const char* kKernels[] = {"enter", "remember", "touch", "move", "move_alone", "collect", "leave"};
 
@@ -126,9 +134,9 @@ bool identify(const char* image, Which& which) {
     if (law == std::string::npos || bytes.size() < 1000) continue;
     if (std::memcmp(bytes.data(), image, bytes.size() - 16) != 0) continue;
     const bool tangent = name.find("-tangent") != std::string::npos;
-    which = {static_cast<gmem::Law>(name[law + 4] - '0'), static_cast<gmem::Variant>(name[law + 5] - '0'),
+    which = {static_cast<gmem::Law>(name[law + 4] - '0'),         static_cast<gmem::Variant>(name[law + 5] - '0'),
              tangent ? gmem::Task::tangent : gmem::Task::forward, name.find("-periodic") != std::string::npos,
-             name.find("-unequal") != std::string::npos, name.find("-rubs") != std::string::npos};
+             name.find("-unequal") != std::string::npos,          name.find("-rubs") != std::string::npos};
     return true;
   }
   return false;
@@ -224,7 +232,8 @@ int cuCtxGetDevice(int* number) {
 }
 int cuDeviceGetAttribute(int* value, int attribute, int) {
   if (const int failed = called(__func__)) return failed;
-  return *value = attribute == kMajor ? architecture / 10 : architecture % 10, attribute == kMajor || attribute == kMinor ? kOk : kInvalidValue;
+  return *value = attribute == kMajor ? architecture / 10 : architecture % 10,
+         attribute == kMajor || attribute == kMinor ? kOk : kInvalidValue;
 }
 int cuThreadExchangeStreamCaptureMode(int* mode) {
   if (const int failed = called(__func__)) return failed;

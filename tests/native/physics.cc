@@ -20,8 +20,8 @@ V* touch(Law law, V apart, V* to) {
   const double numbers[kParameters] = {0.3, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.9, 0.06};
   for (int r = 0; r < kParameters; ++r) row[r] = splat<V>(numbers[r]);
   const auto vec = [](double x, double y, double z) { return Vec<V>{splat<V>(x), splat<V>(y), splat<V>(z)}; };
-  const ContactInput<V> meeting{apart * vec(0.6, 0.8, 0.0),   vec(0.5, 0.7, 0.1),   vec(-0.4, -0.6, 0.1),
-                         vec(2e-3, -1e-3, 3e-3),       vec(1e-3, 4e-3, 0.0), vec(0.0, -2e-3, 1e-3)};
+  const ContactInput<V> meeting{apart * vec(0.6, 0.8, 0.0), vec(0.5, 0.7, 0.1),   vec(-0.4, -0.6, 0.1),
+                                vec(2e-3, -1e-3, 3e-3),     vec(1e-3, 4e-3, 0.0), vec(0.0, -2e-3, 1e-3)};
   V history[10] = {splat<V>(2e-4), splat<V>(-1e-4), splat<V>(5e-4), splat<V>(0.03)};
   if (Law::kLayered) store_vec(history, vec(0.8, -0.6, 0.0)), history[kLastOverlap] = splat<V>(0.01);
   Contact<V> contact;
@@ -45,7 +45,8 @@ V* touch(Law law, V apart, V* to) {
   for (int q = 0; q < Law::kHistory; ++q) *to++ = history[q];
   if constexpr (Law::kLayered) {
     const V outer = Reach<V, Law::variant>(history[kLastOverlap], parameters, splat<V>(kPoints - 2.0)).outer;
-    segments.unload(load_layers(history + kLayers), outer, kPoints, [&](int, Flat<V> f) { *to++ = f.along, *to++ = f.across; });
+    segments.unload(load_layers(history + kLayers), outer, kPoints,
+                    [&](int, Flat<V> f) { *to++ = f.along, *to++ = f.across; });
   }
   return to;
 }
@@ -57,8 +58,8 @@ V* move(V shift, V* to) {
   const GrainParameters<V> p(row);
   const auto vec = [](double x, double y, double z) { return Vec<V>{splat<V>(x), splat<V>(y), splat<V>(z)}; };
   const Quaternion<V> q{splat<V>(0.8), vec(0.6, 0.0, 0.0)};
-  const Grain<V> grain{shift * vec(1.0, 2.0, 2.0), q, vec(0.01, 0.02, 0.0), vec(0.0, 0.01, 0.03),
-                       vec(1e-3, 0.0, 0.0),        vec(0.0, 0.0, 1e-3)};
+  const Grain<V> grain{shift * vec(1.0, 2.0, 2.0), q, vec(0.01, 0.02, 0.0), vec(0.0, 0.01, 0.03), vec(1e-3, 0.0, 0.0),
+                       vec(0.0, 0.0, 1e-3)};
   const HalfStep<V> m = begin_step(p, grain);
   const WallState<V> box{vec(0.0, 0.0, 0.0), vec(9.0, 9.0, 9.0), vec(1e-3, 0.0, 0.0), vec(0.0, 0.0, -1e-3)};
   const double offsets[6] = {0.5, 0.1, 0.0, -0.4, 0.0, 0.3};

@@ -54,12 +54,15 @@ template <class Law>
 void contact() {
   using Calculation = OneContact<Law>;
   Random random;
-  const double meeting[kInputs] = {1.17, 1.56, 0.1, 0.5, 0.7, 0.1, -0.4, -0.6, 0.1, 2e-3, -1e-3, 3e-3, 1e-3, 4e-3, 0.0, 0.0, -2e-3, 1e-3};
+  const double meeting[kInputs] = {1.17, 1.56,  0.1,  0.5,  0.7,  0.1, -0.4, -0.6,  0.1,
+                                   2e-3, -1e-3, 3e-3, 1e-3, 4e-3, 0.0, 0.0,  -2e-3, 1e-3};
   const double numbers[kParameters] = {0.3, 0.01, 1.5, 0.8, 1.0, 1.3, 0.47, 0.069, 0.66, 0.4, 0.145, 0.069, 0.9, 0.06};
   Real own[Calculation::kNumbers], result_bar[Calculation::kResults], parameter[kParameters], of_law[kLawNumbers];
-  for (int n = 0; n < kInputs; ++n) own[n] = splat<Real>(meeting[n]) * (splat<Real>(1.0) + splat<Real>(0.3) * random.lanes());
+  for (int n = 0; n < kInputs; ++n)
+    own[n] = splat<Real>(meeting[n]) * (splat<Real>(1.0) + splat<Real>(0.3) * random.lanes());
   for (int q = kInputs; q < Calculation::kNumbers; ++q) own[q] = splat<Real>(2e-3) * random.lanes();
-  for (int axis = 0; axis < 3; ++axis) {  // not too far into each other, and Mindlin's contacts in the same ring as before
+  for (int axis = 0; axis < 3;
+       ++axis) {  // not too far into each other, and Mindlin's contacts in the same ring as before
     const Real spread = Law::kLayered ? splat<Real>(0.002) * random.lanes() : splat<Real>(0.04) * random.lanes();
     own[axis] = splat<Real>(meeting[axis]) * (splat<Real>(1.0) + spread);
   }
@@ -116,7 +119,8 @@ void contact() {
 // A grain and constants, and what a program and the tape make of them.
 struct Motion {
   Random random;
-  Real numbers[kGrainNumbers], bar_of_numbers[kGrainNumbers] = {}, own[kTurned], own_bar[kTurned] = {}, result_bar[kTurned];
+  Real numbers[kGrainNumbers], bar_of_numbers[kGrainNumbers] = {}, own[kTurned], own_bar[kTurned] = {},
+                               result_bar[kTurned];
   Tape recorded;
   Recording recording{&recorded};
   int first = recorded.mark().slots;
@@ -163,7 +167,8 @@ template <bool near>
 void sphere() {
   Motion m;
   Real walls[kWalls], wall_bar[kWalls] = {};
-  for (int n = 0; n < kWalls; ++n) walls[n] = splat<Real>(n < 3 ? -1.5 : n < 6 ? 1.5 : 0.0) + splat<Real>(0.1) * m.random.lanes();
+  for (int n = 0; n < kWalls; ++n)
+    walls[n] = splat<Real>(n < 3 ? -1.5 : n < 6 ? 1.5 : 0.0) + splat<Real>(0.1) * m.random.lanes();
   const Real body[] = {splat<Real>(0.3), splat<Real>(-0.4), splat<Real>(0.2)};
   const Real* in[] = {m.own, m.numbers, body, walls};
   Real body_bar[3] = {};

@@ -72,7 +72,8 @@ void test_ways() {
       rings[l].reach(next < -1 ? -1 : next > kPoints - 2 ? kPoints - 2 : next);
       outer[l] = rings[l].outer;
     }
-    segment[kPoints - 1] = segment[kPoints] = {Flat<Real>{}, splat<Real>(7.0)};  // never used: there are as many segments as rings
+    segment[kPoints - 1] =
+        segment[kPoints] = {Flat<Real>{}, splat<Real>(7.0)};  // never used: there are as many segments as rings
     const Layers<Real> former = kept.layers;
     const int were = stored;
     reattach(kept.segments, kept.layers, before, outer, kLacking);

@@ -28,9 +28,10 @@ from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.grain import sphere
 from gmem_jax.physics.state import Box, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 from gmem_jax.simulation.loop import rollout_chunk
-from gmem_jax.simulation.protocol import Drive, Stage
+from gmem_jax.simulation.stage import Drive, Stage
 
 BUILT, REASON = native.available()
 pytestmark = [

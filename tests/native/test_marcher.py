@@ -20,7 +20,8 @@ from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of,
 from gmem_jax.native.primitives import Arrays, StepOutput
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.state import Box, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 
 BUILT, REASON = native.available()
 needs_library = pytest.mark.skipif(not BUILT, reason=REASON)

@@ -14,7 +14,8 @@ from gmem_jax.experiment.record import key_of_run, to_dict
 from gmem_jax.files.configuration import from_dict, named_experiment
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.state import State, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 
 BUILT, REASON = native.available()
 pytestmark = pytest.mark.skipif(not BUILT, reason=REASON)

@@ -30,7 +30,8 @@ from gmem_jax.native import build, cuda, library, primitives
 from gmem_jax.native.march import arrays_of, call_of, fixed_of
 from gmem_jax.native.primitives import Arrays, Call, Fixed
 from gmem_jax.physics.state import Box, replicate
-from gmem_jax.physics.step import System, start, wall_histories
+from gmem_jax.physics.step import start, wall_histories
+from gmem_jax.physics.system import System
 
 REPLICAS, STEPS = 3, 3
 QUICKLY = {"xla_backend_optimization_level": 0}  # for programs that run once

@@ -13,7 +13,8 @@ from gmem_jax import native
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.pytree import pytree
 from gmem_jax.physics.state import State, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 from gmem_jax.simulation.sample import Sample
 
 BUILT, REASON = native.available()

@@ -15,10 +15,11 @@ import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.state import State, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 from gmem_jax.simulation.loop import Simulation, rollout, rollout_chunk
-from gmem_jax.simulation.protocol import BINS, Drive, Stage
 from gmem_jax.simulation.sample import measure
+from gmem_jax.simulation.stage import BINS, Drive, Stage
 
 BUILT, REASON = native.available()
 # Without a C++ compiler there is no native backend to compare; plain JAX is then all there is.

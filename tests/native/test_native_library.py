@@ -17,7 +17,8 @@ from gmem_jax.native import build, cuda, library, primitives
 from gmem_jax.native.march import arrays_of, call_of, fixed_of
 from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics.state import replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 
 BUILT, REASON = native.available()
 needs_library = pytest.mark.skipif(not BUILT, reason=REASON)

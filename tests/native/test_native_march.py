@@ -21,7 +21,8 @@ from gmem_jax import native
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.pairs import listed_candidates, sphere_centres
 from gmem_jax.physics.state import Box, State, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 
 BUILT, REASON = native.available()
 # Without a C++ compiler there is no native backend to compare; plain JAX is then all there is.

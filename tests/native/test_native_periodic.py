@@ -16,7 +16,8 @@ import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.state import Box, State, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 
 pytestmark = pytest.mark.skipif(not native.available()[0], reason="the library was not built")
 

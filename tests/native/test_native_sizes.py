@@ -18,7 +18,8 @@ from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.grain import Clump, clump, sized, sphere
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, State, replicate, still_box
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 
 pytestmark = pytest.mark.skipif(not native.available()[0], reason="the library was not built")
 

@@ -14,10 +14,12 @@ from transposed import assert_transposed
 
 import gmem_jax as gm
 from gmem_jax import native
+from gmem_jax.physics import forces
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.wall import wall_forces
 from gmem_jax.physics.state import Box, State, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 
 pytestmark = pytest.mark.skipif(not native.available()[0], reason="the library was not built")
 
@@ -84,11 +86,11 @@ def test_values_at_walls_with_friction_are_those_of_the_definition(law: str, rep
 def test_walls_of_this_scene_are_stuck_to_and_slid_on() -> None:
     system, _, boxes = scene = thrown("M1", 5)
     grains, _, history, *_ = moved(native.march, *scene)
-    table, _ = dynamics.sphere_table(system.clump, grains)
+    table, _ = forces.sphere_table(system.clump, grains)
     box, solid = part(boxes, -1), (system.material.wall_stiffness, system.material.normal_damping)  # type: ignore[arg-type]
-    forces = wall_forces(table[:, :3], table[:, 3:6], box, *solid)
-    _, force, _, _ = dynamics.wall_loads(system, grains, box, *forces, history, jnp.asarray(0.3))
-    limit = np.asarray(system.wall_mu) * np.asarray(jnp.concatenate(forces, axis=1)).reshape(force.shape[0], 5)
+    normal = wall_forces(table[:, :3], table[:, 3:6], box, *solid)
+    _, force, _, _ = forces.wall_loads(system, grains, box, *normal, history, jnp.asarray(0.3))
+    limit = np.asarray(system.wall_mu) * np.asarray(jnp.concatenate(normal, axis=1)).reshape(force.shape[0], 5)
     used = np.linalg.norm(force, axis=1)[limit > 0.0] / limit[limit > 0.0]
     assert min(np.sum(used > 1.0 - 1e-9), np.sum(used < 0.9)) > 5
 

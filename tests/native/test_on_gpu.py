@@ -15,7 +15,8 @@ import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.native import march
 from gmem_jax.physics.state import Box, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 
 try:
     GPU = jax.devices("cuda")[0]

@@ -18,6 +18,7 @@ import scenes
 
 import gmem_jax as gm
 from gmem_jax.bench import lammps
+from gmem_jax.physics import forces
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.kinematics import kinematics
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
@@ -53,7 +54,7 @@ def surface_kinematics(separation, velocity, spin_sum, valid, dt, unequal=None):
 
 @pytest.fixture
 def lammps_kinematics(monkeypatch):
-    monkeypatch.setattr(dynamics, "kinematics", surface_kinematics)
+    monkeypatch.setattr(forces, "kinematics", surface_kinematics)
     jax.clear_caches()  # of what was traced with our own kinematics
     yield
     jax.clear_caches()
@@ -323,7 +324,7 @@ def untwisted(*of_walls):
 )
 @pytest.mark.usefixtures("lammps_kinematics")
 def test_a_sphere_on_a_wall_with_friction_moves_as_in_lammps(law, wall_mu, tmp_path, monkeypatch):
-    monkeypatch.setattr(dynamics, "wall_kinematics", untwisted)
+    monkeypatch.setattr(forces, "wall_kinematics", untwisted)
     lower = np.array([-np.inf, -np.inf, -1.0])
     for moves in (0.0, SPEED):  # LAMMPS has two fixes for that
         planes = replace(OPEN, lower=lower, lower_velocity=np.array([0.0, 0.0, moves]))
@@ -382,7 +383,7 @@ def test_a_dense_pack_under_strain_agrees_with_our_own_arms_within_their_differe
 
 def in_a_cell(system, grains, box, folder, dt, steps):
     """What LAMMPS makes of grains in a periodic box, which grows steadily if they are spheres; else they rest."""
-    table, _ = dynamics.sphere_table(system.clump, grains, box)
+    table, _ = forces.sphere_table(system.clump, grains, box)
     planes = [np.asarray(leaf)[:, 0] for leaf in (box.lower, box.upper, box.lower_velocity, box.upper_velocity)]
     spheres, velocity, spin = (np.asarray(table)[:, start : start + 3, 0] for start in (0, 3, 6))
     quaternion = np.asarray(grains.quaternion)[..., 0]
@@ -401,9 +402,9 @@ def forces_in_a_cell(system, grains, box, folder):
     """Forces on all spheres at the beginning, ours and theirs, [S, 3] each, in a periodic box that may grow."""
 
     def ours(grains):
-        table, _ = dynamics.sphere_table(system.clump, grains, box)
+        table, _ = forces.sphere_table(system.clump, grains, box)
         history = system.friction.init(system.pairs.capacity, 1, float)
-        return dynamics.contact_forces(system, table, history, jnp.zeros(()), jnp.asarray(True), box)[0]
+        return forces.contact_forces(system, table, history, jnp.zeros(()), jnp.asarray(True), box)[0]
 
     theirs = in_a_cell(system, grains, box, folder, 0.3, 1)  # in a run of no steps LAMMPS' cell has no rates
     return np.asarray(jax.jit(ours)(grains))[:, :3, 0], theirs.force[0]
@@ -451,7 +452,7 @@ def test_forces_in_a_bidisperse_pack_between_walls_are_those_of_lammps(tmp_path)
     system, grains = dynamics.System(made, HOOKE, pack.pairs), scenes.make_grains(pack.position, pack.quaternion)
     ours, theirs = forces_in_a_cell(system, grains, pack.box, tmp_path)
     radii, still = made.sphere_radii(len(ours)), jnp.zeros((len(ours), 3, 1))
-    places = dynamics.sphere_table(made, grains)[0][:, :3]
+    places = forces.sphere_table(made, grains)[0][:, :3]
     lower, upper = wall_forces(places, still, pack.box, MATERIAL.wall_stiffness, MATERIAL.normal_damping, radii)
     by_walls = np.asarray(lower - upper)[..., 0]
     assert min(np.abs(ours).max(), np.abs(by_walls).max()) > 1e-3

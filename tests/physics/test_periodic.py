@@ -16,8 +16,8 @@ from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, State, still_box
 from gmem_jax.simulation import observables
 from gmem_jax.simulation.loop import Simulation
-from gmem_jax.simulation.protocol import Bin
 from gmem_jax.simulation.sample import check, measure, overlaps
+from gmem_jax.simulation.stage import Bin
 from gmem_jax.simulation.strain import StrainPath
 
 PERIODIC = (True, True, True)

@@ -21,14 +21,16 @@ from scenes import (
 )
 
 import gmem_jax as gm
+from gmem_jax.physics import forces
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.wall import wall_forces
 from gmem_jax.physics.grain import sized
 from gmem_jax.physics.state import Box, State, Status, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 from gmem_jax.simulation import loop
-from gmem_jax.simulation.protocol import Bin
 from gmem_jax.simulation.stable_step import largest_stable_step
+from gmem_jax.simulation.stage import Bin
 
 quickly = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 MARCH = quickly(dynamics.march)
@@ -49,10 +51,10 @@ def standing(box: Box, steps: int) -> Box:
 @quickly
 def dragging(system: System, grains: Any, history: Any) -> Any:
     """Force, torque, new history and normal force of a sphere on the floor after a step of 1 t_c."""
-    table, _ = dynamics.sphere_table(system.clump, grains)
+    table, _ = forces.sphere_table(system.clump, grains)
     solid, radii = (system.material.wall_stiffness, system.material.normal_damping), system.clump.sphere_radii(1)
     lower, upper = wall_forces(table[:, :3], table[:, 3:6], FLOOR, *solid, radii)
-    loads = dynamics.wall_loads(system, grains, FLOOR, lower, upper, history, jnp.asarray(1.0))
+    loads = forces.wall_loads(system, grains, FLOOR, lower, upper, history, jnp.asarray(1.0))
     return (*(jnp.sum(load, axis=0)[:, 0] for load in loads[1:3]), loads[3], jnp.sum(lower))
 
 
@@ -161,13 +163,13 @@ def test_friction_of_walls_takes_the_energy_that_its_forces_do() -> None:
     state = dynamics.accelerate(system, replace(state, grains=grains), FLOOR)
 
     def stiffness(grains: Any) -> Any:
-        table, _ = dynamics.sphere_table(system.clump, grains)
+        table, _ = forces.sphere_table(system.clump, grains)
         return table, wall_forces(table[:, :3], table[:, 3:6], FLOOR, ELASTIC.wall_stiffness, 0.0)
 
     def one(state: State, _: Any) -> Any:
         state, _ = dynamics.step(system, state, FLOOR, jnp.asarray(dt), 0.0, state.status[0] >= 0)
-        table, forces = stiffness(state.grains)
-        kin, force, _, _ = dynamics.wall_loads(system, state.grains, FLOOR, *forces, state.wall_history, jnp.zeros(()))
+        table, normal = stiffness(state.grains)
+        kin, force, _, _ = forces.wall_loads(system, state.grains, FLOOR, *normal, state.wall_history, jnp.zeros(()))
         grains, deep = state.grains, jnp.maximum(1.0 - (table[:, 2] - FLOOR.lower[2]), 0.0)
         energy = 0.5 * system.clump.mass * jnp.sum(grains.velocity**2)
         energy += 0.5 * system.clump.inertia[0] * jnp.sum(grains.spin**2)

@@ -11,7 +11,8 @@ from scenes import ELASTIC, SPHERE, column, scene
 
 import gmem_jax as gm
 from gmem_jax.physics.state import still_box
-from gmem_jax.physics.step import System, march, start
+from gmem_jax.physics.step import march, start
+from gmem_jax.physics.system import System
 from gmem_jax.preparation.piston import Pressed, Servo, press
 from gmem_jax.preparation.preparation import _gas
 from gmem_jax.preparation.recipe import grain_steps, lattice, pressure_over_wanted, sites_of

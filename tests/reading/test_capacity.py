@@ -8,7 +8,7 @@ from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.signals import bin_average, words
 from gmem_jax.reading import capacity
 from gmem_jax.reading.readers import bit_errors, confusion, information
-from gmem_jax.simulation.protocol import BINS
+from gmem_jax.simulation.stage import BINS
 
 J = np.asarray(bin_average(words(5)))
 

@@ -71,7 +71,8 @@ struct Scene {
         list(i, j, true);
       }
     for (int g = 0; g < grains; ++g) sizes.push_back(1.0 + 0.03 * noise(g, 0, 12));
-    for (std::size_t row = 0; row < first.size(); ++row) images.insert(images.end(), {static_cast<int8_t>(row % 7 == 3), 0, 0});
+    for (std::size_t row = 0; row < first.size(); ++row)
+      images.insert(images.end(), {static_cast<int8_t>(row % 7 == 3), 0, 0});
   }
 
   void list(int i, int j, bool is_valid) { first.push_back(i), second.push_back(j), valid.push_back(is_valid); }
@@ -119,11 +120,13 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     slope.grains_in[f] = array(n * kSizes[f], false, small);
     lane.grains_out[f] = slope.grains_out[f] = array(n * kSizes[f], true, small);
   }
-  if (plant == "alignment") lane.grains_in[4] = reinterpret_cast<double*>(reinterpret_cast<char*>(array(n * 3 + 1, false, small)) + 1);
+  if (plant == "alignment")
+    lane.grains_in[4] = reinterpret_cast<double*>(reinterpret_cast<char*>(array(n * 3 + 1, false, small)) + 1);
   for (std::size_t leaf = 0; leaf < sizes.size(); ++leaf) {
     const int rows = sizes[leaf] * candidates;
     const bool overlap = sizes[leaf] == 1;
-    lane.history_in[leaf] = array(rows, false, [&](int row, int l) { return overlap ? positive(row, l) : small(row, l); });
+    lane.history_in[leaf] =
+        array(rows, false, [&](int row, int l) { return overlap ? positive(row, l) : small(row, l); });
     slope.history_in[leaf] = array(rows, false, small);
     lane.history_out[leaf] = slope.history_out[leaf] = array(rows, true, small);
   }
@@ -145,7 +148,8 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   if (back) slope.parameters_out = array(kRows, true, small), slope.walls_out = array(kSteps * kWalls, true, small);
   if (back) slope.offsets_out = array(kSpheres * 3, true, small);
 
-  const Problem problem{c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed, c.general ? c.rubs ? 3 : 7 : 0, c.rubs};
+  const Problem problem{
+      c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed, c.general ? c.rubs ? 3 : 7 : 0, c.rubs};
   const auto store = plan_for({n, kSpheres, candidates, scene.first.data(), scene.second.data(),
                                reinterpret_cast<const bool*>(scene.valid.data()), scene.reference.data(),
                                scene.smallest.data(), c.general ? scene.images.data() : nullptr,
@@ -163,7 +167,8 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     return of;
   };
   std::vector<Lane> lanes, slopes;
-  for (int l = 0; l < b; ++l) lanes.push_back(moved(lane, l)), slopes.push_back(moved(slope.parameters ? slope : lane, l));
+  for (int l = 0; l < b; ++l)
+    lanes.push_back(moved(lane, l)), slopes.push_back(moved(slope.parameters ? slope : lane, l));
   std::vector<Block> blocks;
   for (int l = 0; l < b;) {
     // Of two lanes the library has no use for this; here it is to be seen.
@@ -198,17 +203,26 @@ unsigned long long hash(const Numbers& numbers) {
 int main(int count, char** arguments) {
   const bool printed = count > 1 && std::string(arguments[1]) == "numbers";
   if (count > 1 && !printed) {
-    for (int repeat = 0; repeat < 50; ++repeat) run({Law::hooke, Variant::exact, Task::forward, 4, 4.5, 16}, 2, arguments[1]);
+    for (int repeat = 0; repeat < 50; ++repeat)
+      run({Law::hooke, Variant::exact, Task::forward, 4, 4.5, 16}, 2, arguments[1]);
     return 0;
   }
-  const struct { Law law; Variant variant; } laws[] = {
-      {Law::frictionless, Variant::exact}, {Law::hooke, Variant::exact},      {Law::mindlin_rescaled, Variant::exact},
-      {Law::mindlin, Variant::exact},      {Law::mindlin, Variant::averaged}, {Law::mindlin, Variant::paper}};
-  const struct { int edge; double reach; } packs[] = {{0, 0.0}, {0, 2.5}, {3, 0.0}, {3, 2.5}, {4, 4.5}};
+  const struct {
+    Law law;
+    Variant variant;
+  } laws[] = {{Law::frictionless, Variant::exact},     {Law::hooke, Variant::exact},
+              {Law::mindlin_rescaled, Variant::exact}, {Law::mindlin, Variant::exact},
+              {Law::mindlin, Variant::averaged},       {Law::mindlin, Variant::paper}};
+  const struct {
+    int edge;
+    double reach;
+  } packs[] = {{0, 0.0}, {0, 2.5}, {3, 0.0}, {3, 2.5}, {4, 4.5}};
   for (const auto& law : laws)
     for (const Task task : {Task::forward, Task::tangent, Task::adjoint})
       for (const auto& pack : packs) {
-        const auto with = [&](int replicas) { return Case{law.law, law.variant, task, pack.edge, pack.reach, replicas}; };
+        const auto with = [&](int replicas) {
+          return Case{law.law, law.variant, task, pack.edge, pack.reach, replicas};
+        };
         const Numbers alone = run(with(1), 1);
         for (const double number : alone) CHECK(std::isfinite(number));
         if (printed) {
@@ -239,7 +253,8 @@ int main(int count, char** arguments) {
     for (const Task task : {Task::forward, Task::tangent, Task::adjoint})
       for (const int kind : {0, 1, 2}) {
         const bool general = kind != 1, rubs = kind != 0;
-        const bool some = law.law == Law::hooke || law.variant == Variant::paper, has = general ? some : !some && law.law != Law::mindlin;
+        const bool some = law.law == Law::hooke || law.variant == Variant::paper,
+                   has = general ? some : !some && law.law != Law::mindlin;
         const auto with = [&](int edge, int replicas) {
           return Case{law.law, law.variant, task, edge, edge == 4 ? 4.5 : 2.5, replicas, false, general, rubs};
         };

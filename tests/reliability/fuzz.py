@@ -39,8 +39,9 @@ from gmem_jax.experiment.recall import Recall
 from gmem_jax.files.checkpoints import load_part, save_part
 from gmem_jax.files.seal import BLOCK, seal
 from gmem_jax.files.waveforms import load_target
-from gmem_jax.simulation.protocol import Drive, Protocol, Stage
+from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.sample import MEASURED, Sample
+from gmem_jax.simulation.stage import Drive, Stage
 from gmem_jax.sweeps.spec import read_spec
 
 MEMORY = 6 << 30  # bytes of address space that a child may add

@@ -18,7 +18,7 @@ from gmem_jax.physics.contact.path import led_contact
 from gmem_jax.reproduce import choices
 from gmem_jax.reproduce.choices import CHOICES, choice_points, effects
 from gmem_jax.reproduce.compare import write_csv
-from gmem_jax.simulation.protocol import Bin
+from gmem_jax.simulation.stage import Bin
 from gmem_jax.simulation.strain import StrainPath
 
 PACK = gm.load_pack(TETRA_27)

@@ -33,7 +33,7 @@ from gmem_jax.reproduce.dataset import COLLECTED
 from gmem_jax.reproduce.draw import power
 from gmem_jax.reproduce.figures import FIGURES, SCALES, PaperFigure, figure_spec, packs, scale_of
 from gmem_jax.reproduce.run import Reproduction
-from gmem_jax.show.tables import published
+from gmem_jax.show.numbers import published
 from gmem_jax.sweeps.executors import Executor
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import work

@@ -22,7 +22,8 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.physics.state import Box, replicate
-from gmem_jax.physics.step import System, mark_varying, start
+from gmem_jax.physics.step import mark_varying, start
+from gmem_jax.physics.system import System
 
 REPLICAS, STEPS, BINS = 8, 5, 2
 jax.config.update("jax_enable_x64", True)  # before the first array

@@ -12,7 +12,8 @@ import gmem_jax as gm
 from gmem_jax.experiment.protocols import memory_protocol
 from gmem_jax.experiment.signals import Bumps, six_signals
 from gmem_jax.experiment.stages import cycle
-from gmem_jax.simulation.protocol import Protocol, Stage, table
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import Stage, table
 
 LOWER = jnp.asarray([[1.0], [-2.0], [0.5]])
 UPPER = jnp.asarray([[9.0], [8.0], [12.5]])

@@ -11,12 +11,13 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
-from gmem_jax.experiment.recall import frame_schedule
+from gmem_jax.experiment.run import frame_schedule
 from gmem_jax.files.frames import load_frames, write_frames
 from gmem_jax.files.hdf5 import writing
 from gmem_jax.files.schemas import RECALL
+from gmem_jax.physics.forces import contact_forces, sphere_table
 from gmem_jax.physics.state import Grains, State
-from gmem_jax.physics.step import System, contact_forces, sphere_table
+from gmem_jax.physics.system import System
 from gmem_jax.preparation.preparation import preparation_frames as preparation_schedule
 from gmem_jax.simulation.frames import Frames, concatenate, configuration, places
 

@@ -21,7 +21,7 @@ from gmem_jax.physics.pairs import listed_candidates
 from gmem_jax.physics.pytree import pytree
 from gmem_jax.physics.rotation import matrix
 from gmem_jax.physics.state import Box, State, still_box
-from gmem_jax.physics.step import System
+from gmem_jax.physics.system import System
 from gmem_jax.show.recalls import recall_figure
 from gmem_jax.simulation import observables
 from gmem_jax.simulation.frames import sphere_places

@@ -15,7 +15,8 @@ from gmem_jax.experiment.stages import cycle
 from gmem_jax.physics.state import replicate, still_box
 from gmem_jax.physics.step import start
 from gmem_jax.simulation.loop import bin_step, walls
-from gmem_jax.simulation.protocol import Protocol, Stage, table
+from gmem_jax.simulation.protocol import Protocol
+from gmem_jax.simulation.stage import Stage, table
 
 PACK = gm.load_pack(TETRA_27)
 REST, HOLD, STORE = 0.1, 0.3, 0.7

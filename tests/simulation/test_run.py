@@ -14,14 +14,15 @@ from gmem_jax.experiment.recall import finish
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import State, Status, combined_status, replicate
-from gmem_jax.physics.step import System, start
+from gmem_jax.physics.step import start
+from gmem_jax.physics.system import System
 from gmem_jax.simulation import stability
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.observers import Chunk, Observer
 from gmem_jax.simulation.progress import work_of
-from gmem_jax.simulation.protocol import Stage
 from gmem_jax.simulation.runner import Runner
 from gmem_jax.simulation.sample import Sample, end_bin
+from gmem_jax.simulation.stage import Stage
 from gmem_jax.simulation.strain import StrainPath
 
 PACK = gm.load_pack(TETRA_27)

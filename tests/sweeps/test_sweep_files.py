@@ -14,11 +14,11 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
-from gmem_jax.experiment.experiment import value_at
-from gmem_jax.experiment.recall import OtherCompressionWarning, warn_of_another_compression
+from gmem_jax.experiment.changes import value_at
+from gmem_jax.experiment.run import OtherCompressionWarning, warn_of_another_compression
 from gmem_jax.files.atomic import atomic
+from gmem_jax.show.numbers import status_words
 from gmem_jax.show.sweeps import points_table
-from gmem_jax.show.tables import status_words
 from gmem_jax.simulation.progress import silent
 from gmem_jax.sweeps.executors import Executor, Submitted, executor
 from gmem_jax.sweeps.plan import plan, point

@@ -55,7 +55,20 @@ const Kernel& best_kernel(Task task, std::size_t replicas) {
   return of_task(baseline::kernel, baseline_derivatives::kernel);
 }
 
-enum Argument { kFirst = kFields, kSecond, kValid, kReference, kSmallest, kImages, kRadii, kSizes, kOffsets, kParameterRows, kWallRows, kHistoryIn };
+enum Argument {
+  kFirst = kFields,
+  kSecond,
+  kValid,
+  kReference,
+  kSmallest,
+  kImages,
+  kRadii,
+  kSizes,
+  kOffsets,
+  kParameterRows,
+  kWallRows,
+  kHistoryIn
+};
 constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
 
 struct Signature {
@@ -66,10 +79,14 @@ struct Signature {
 // results' or arguments' own; see `Task`.
 // gmem_jax/native/primitives.py: _library, _of_results, _of_arrays
 Signature signature(Task task, Law law, bool rubs) {
-  const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
-                      {"validities", "P", ffi::PRED},   {"reference centres", "S3"},
-                      {"smallest lengths", "3"},        {"images", "PI", ffi::S8},
-                      {"radii", "KU"},                  {"sizes", "NU"},
+  const Wants pack = {{"first spheres", "P", ffi::S32},
+                      {"second spheres", "P", ffi::S32},
+                      {"validities", "P", ffi::PRED},
+                      {"reference centres", "S3"},
+                      {"smallest lengths", "3"},
+                      {"images", "PI", ffi::S8},
+                      {"radii", "KU"},
+                      {"sizes", "NU"},
                       {"offsets", "K3"}};
   const Wants fields = fields_of_grains(), numbers = numbers_of_steps();
   const Wants walls = wall_histories(law, rubs), history = histories(law) + walls;
@@ -83,7 +100,8 @@ Signature signature(Task task, Law law, bool rubs) {
 }
 
 ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves,
-                int64_t mixed, int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+                int64_t mixed, int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args,
+                ffi::RemainingRets rets) {
   require_law(law, variant, points);
   require_axes(periodic);
   Problem problem{};
@@ -94,7 +112,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   problem.mixed = mixed != 0;
   problem.periodic = static_cast<int>(periodic);
   problem.rubs = rubs != 0;
-  require(!(periodic || unequal) || !problem.mixed, "in a periodic box, and of unequal spheres, there is no mixed precision");
+  require(!(periodic || unequal) || !problem.mixed,
+          "in a periodic box, and of unequal spheres, there is no mixed precision");
   require(!problem.mixed || (task == Task::forward && !is_layered(problem.law)),
           "there is no mixed precision for derivatives and the Mindlin law");
   require(!(rubs && problem.mixed), "at walls with friction there is no mixed precision");
@@ -129,7 +148,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   problem.stride = replicas;
   require(problem.grains > 0 && problem.spheres_per_grain > 0, "there is no grain");
   require(reader.size('S') == reader.size('N') * reader.size('K'), "there are not as many spheres as the grains have");
-  require(!rubs || leaves == 0 || reader.size('F') == kPlanes * reader.size('S'), "walls' histories are not those of all spheres");
+  require(!rubs || leaves == 0 || reader.size('F') == kPlanes * reader.size('S'),
+          "walls' histories are not those of all spheres");
   problem.history_aliased = task == Task::forward && leaves > 0;
   const int64_t all_leaves = rubs ? 2 * leaves : leaves;
   for (int64_t leaf = 0; leaf < all_leaves; ++leaf)
@@ -152,10 +172,11 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       const auto doubles = [&](Argument i) { return reinterpret_cast<const double*>(in[i].data) + key[i - kFirst]; };
       const auto integers = [&](Argument i) { return reinterpret_cast<const int32_t*>(in[i].data) + key[i - kFirst]; };
       const bool* valid = reinterpret_cast<const bool*>(in[kValid].data) + key[kValid - kFirst];
-      const int8_t* image = periodic ? reinterpret_cast<const int8_t*>(in[kImages].data) + key[kImages - kFirst] : nullptr;
+      const int8_t* image =
+          periodic ? reinterpret_cast<const int8_t*>(in[kImages].data) + key[kImages - kFirst] : nullptr;
       plans.push_back(plan_for({problem.grains, problem.spheres_per_grain, static_cast<int>(reader.size('P')),
-                                integers(kFirst), integers(kSecond), valid, doubles(kReference), doubles(kSmallest), image,
-                                unequal ? doubles(kRadii) : nullptr, unequal ? doubles(kSizes) : nullptr}));
+                                integers(kFirst), integers(kSecond), valid, doubles(kReference), doubles(kSmallest),
+                                image, unequal ? doubles(kRadii) : nullptr, unequal ? doubles(kSizes) : nullptr}));
       packs.emplace_back(new Pack{&plans.back()->plan, doubles(kOffsets), unequal ? doubles(kRadii) : nullptr});
       lanes.emplace_back();
       slopes.emplace_back();
@@ -196,7 +217,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       lanes[place.first->second].push_back(lane);
       slopes[place.first->second].push_back(slope);
     }
-    for (int axis = static_cast<int>(batch.size()) - 1; axis >= 0 && ++index[axis] == batch[axis]; --axis) index[axis] = 0;
+    for (int axis = static_cast<int>(batch.size()) - 1; axis >= 0 && ++index[axis] == batch[axis]; --axis)
+      index[axis] = 0;
   }
 
   std::size_t most = 0;

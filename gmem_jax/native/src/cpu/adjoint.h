@@ -169,8 +169,8 @@ struct Adjoint : AdjointLayout<Law> {
   V earlier_bar[kCellNumbers] = {};  // of the cell before the steps that were gone back through
 
   Adjoint(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
-      : forward(problem, block, team, rank, scratch), problem(problem), block(block), plan(*block.pack->plan), team(team),
-        rank(rank), steps(block.lanes[0].steps), adjacent(forward.mode.neighbours(block.slopes)),
+      : forward(problem, block, team, rank, scratch), problem(problem), block(block), plan(*block.pack->plan),
+        team(team), rank(rank), steps(block.lanes[0].steps), adjacent(forward.mode.neighbours(block.slopes)),
         general(Layout::is_general(problem, plan)) {
     Arena arena{static_cast<char*>(scratch)};
     this->place(problem, block, arena, rank == 0);  // `forward` has found the same at the beginning
@@ -211,8 +211,12 @@ struct Adjoint : AdjointLayout<Law> {
       for (int q = 0; q < kField[f].size; ++q) move(*s++, field_at(f, u, forward.hot, forward.cold)[q]);
   }
 
-  V* state_of(int step, int u) const { return of_grain(state + static_cast<std::size_t>(step) * problem.grains * kState, u, kState); }
-  V* total_of(int step, int u) const { return of_grain(total + static_cast<std::size_t>(step) * problem.grains * 6, u, 6); }
+  V* state_of(int step, int u) const {
+    return of_grain(state + static_cast<std::size_t>(step) * problem.grains * kState, u, kState);
+  }
+  V* total_of(int step, int u) const {
+    return of_grain(total + static_cast<std::size_t>(step) * problem.grains * 6, u, 6);
+  }
 
   // What sphere k of grain u remembers of plane w: its row, where it is among the histories of all that begin at `histories`,
   // and its bars.
@@ -496,10 +500,11 @@ struct Adjoint : AdjointLayout<Law> {
         const V power[] = {splat<V>(size.cube), splat<V>(size.inverse_cube), splat<V>(size.inverse_fifth)};
         V nothing[3] = {}, unused[3];
         const bool rubs = problem.rubs && problem.periodic;
-        const V* in[] = {mid, grain_numbers, cell_numbers, forward.parameter + kMass, power,
-                         rubs ? of_grain(forward.rubbed, u, 3) : nothing};
-        V* bar[] = {of_grain(mid_bar, u, kMid), of_chunk(chunk), cell_bar_of_chunk(chunk), of_chunk(chunk) + mass_row(problem),
-                    nullptr, rubs ? of_grain(rubbed_bar, u, 3) : unused};
+        const V* in[] = {mid,          grain_numbers,
+                         cell_numbers, forward.parameter + kMass,
+                         power,        rubs ? of_grain(forward.rubbed, u, 3) : nothing};
+        V* bar[] = {of_grain(mid_bar, u, kMid),          of_chunk(chunk), cell_bar_of_chunk(chunk),
+                    of_chunk(chunk) + mass_row(problem), nullptr,         rubs ? of_grain(rubbed_bar, u, 3) : unused};
         V result_bar[kState + 3];
         std::copy_n(of_grain(state_bar, u, kState), kState, result_bar);
         std::copy_n(faces_bar, 3, result_bar + kState);
@@ -611,7 +616,8 @@ struct Adjoint : AdjointLayout<Law> {
   void load_constants(std::size_t c, V* to) const {
     const Image image = plan.image ? plan.image[c] : Image{0, 0, 0};
     const Radii radii = plan.radii ? plan.radii[c] : Radii{2.0, 0.0, 1.0, 4.0};
-    const double constant[kContactConstants] = {1.0 * image.x, 1.0 * image.y, 1.0 * image.z, radii.reach, radii.lean, radii.root};
+    const double constant[kContactConstants] = {1.0 * image.x, 1.0 * image.y, 1.0 * image.z,
+                                                radii.reach,   radii.lean,    radii.root};
     for (int n = 0; n < kContactConstants; ++n) to[n] = splat<V>(constant[n]);
   }
 
@@ -668,7 +674,8 @@ struct Adjoint : AdjointLayout<Law> {
     Contact<Taped> contact;
     contact.history = memory;
     relative_motion(input, dot(input.separation, input.separation), contact);
-    general ? close<true>(&contact, 1, parameter.row, &unequal, [&](int) { return input; }) : close(&contact, 1, parameter.row);
+    general ? close<true>(&contact, 1, parameter.row, &unequal, [&](int) { return input; })
+            : close(&contact, 1, parameter.row);
     rub<Law>(&contact, 1, law, general ? &unequal : nullptr, [&](int) { return Segments{problem.points, &now}; });
 
     const ContactLoads<Taped> found = push(contact);
@@ -784,7 +791,8 @@ struct Adjoint : AdjointLayout<Law> {
           std::copy_n(of_spheres + 3 * k, 3, result_bar);
           std::copy_n(mid + kMidForce, 6, result_bar + 3);
           store_vec(result_bar + 9, on_wall), store_vec(result_bar + 12, on_wall);
-          plan.radii ? pull_back<OneSphere<true, true>>(in, result_bar, bar) : pull_back<OneSphere<true>>(in, result_bar, bar);
+          plan.radii ? pull_back<OneSphere<true, true>>(in, result_bar, bar)
+                     : pull_back<OneSphere<true>>(in, result_bar, bar);
         } else {
           plan.radii ? pull_back<OneSphere<false, true>>(in, of_spheres + 3 * k, bar)
                      : pull_back<OneSphere<false>>(in, of_spheres + 3 * k, bar);
@@ -813,11 +821,13 @@ struct Adjoint : AdjointLayout<Law> {
       store_vec(constants + kNormal, normal_of_plane<V>(w));
       V* const of = of_chunk(chunk);
       const V* in[] = {turned, grain_numbers, body, walls + w, constants, history, wall_law_numbers, &last_ring};
-      V* bar[] = {turned_bar, of, of + kGrainNumbers + 3 * k, of_walls + w, nullptr, history_bar, of + mass_row(problem) + 1};
+      V* bar[] = {turned_bar, of,          of + kGrainNumbers + 3 * k, of_walls + w,
+                  nullptr,    history_bar, of + mass_row(problem) + 1};
       if constexpr (Law::kLayered) {
         const std::size_t row = plane_row(u, k, w);
         const int before = wall_trace[step].segments[row];
-        if (before >= 0) return plane_rings_back(in, result_bar, bar, wall_trace[step].segment + row * problem.points, before);
+        if (before >= 0)
+          return plane_rings_back(in, result_bar, bar, wall_trace[step].segment + row * problem.points, before);
       }
       pull_back<OnePlane<Law>>(in, result_bar, bar);
     });
@@ -846,9 +856,9 @@ struct Adjoint : AdjointLayout<Law> {
     const int leaves = recorded.mark().slots;
     std::vector<Segment<Taped>> now = taped(seen, before);
     Contact<Taped> contact;
-    const auto on = rub_plane<Law>(half, rotation, size * body, radius, root(radius) * parameters.wall_stiffness,
-                                   parameters.normal_damping, at, moves_at, normal, walls, memory,
-                                   [&](int) { return Segments{problem.points, &now}; }, contact);
+    const auto on = rub_plane<Law>(
+        half, rotation, size * body, radius, root(radius) * parameters.wall_stiffness, parameters.normal_damping, at,
+        moves_at, normal, walls, memory, [&](int) { return Segments{problem.points, &now}; }, contact);
     const Bits moves = changes_ring(in[5][kLastOverlap], contact.overlap.value);
     V others[OnePlane<Law>::kResults], *const of_segments = bar[5] + Law::kHistory;
     for (int r = 0; r < OnePlane<Law>::kResults; ++r) others[r] = zero_unless(~moves, result_bar[r]);
@@ -897,7 +907,8 @@ struct Adjoint : AdjointLayout<Law> {
     if (general && rank == 0) cell_back(step, by_walls);
     for (int row = 0; rank == 0 && row < kWalls; ++row) {
       for (int chunk = 0; chunk < chunks(); ++chunk) by_walls[row] += wall_bar[chunk * kWalls + row];
-      write([](const Lane& lane) { return lane.walls_out; }, static_cast<std::ptrdiff_t>(step) * kWalls + row, by_walls[row]);
+      write([](const Lane& lane) { return lane.walls_out; }, static_cast<std::ptrdiff_t>(step) * kWalls + row,
+            by_walls[row]);
     }
   }
 

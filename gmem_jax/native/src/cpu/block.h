@@ -60,9 +60,9 @@ struct KnownPlanes {
 // What the histories of the contacts were when a step looked at them; kept where the step is to be gone through backwards.
 template <class V>
 struct Trace {
-  int* touching = nullptr;        // [candidates]: those of each domain that touch, in order, from its first candidate on
-  int* end = nullptr;             // [candidates]: where these end, at the first candidate of each domain
-  V* history = nullptr;           // [candidates, kHistory] of the law: theirs, in the places of `touching`
+  int* touching = nullptr;  // [candidates]: those of each domain that touch, in order, from its first candidate on
+  int* end = nullptr;       // [candidates]: where these end, at the first candidate of each domain
+  V* history = nullptr;     // [candidates, kHistory] of the law: theirs, in the places of `touching`
   Segment<V>* segment = nullptr;  // [candidates, Q], where a contact came to another ring
   int* segments = nullptr;        // [candidates]; -1 where it did not
 };
@@ -73,19 +73,19 @@ struct EngineLayout {
   using V = typename Mode::Number;
   static constexpr std::ptrdiff_t kNumber = sizeof(V) / sizeof(double);
 
-  V* hot;         // [units, kHot]
-  V* cold;        // [units, kCold]
-  V* offsets;     // of the pack, where they carry derivatives, [K, 3]
-  double* walls;  // partial sums, [chunks, 2, 3] in the mode's own layout
-  V* fastest;     // squares of the largest half-step velocity and spin, [chunks, 2]
-  double* sections;  // of periodic boxes, as `walls`: see `section`
-  V* through;        // ... and the forces through their faces, [domains, 3]
-  V* wall_history;   // of walls with friction, [units, wall_rows, Law::kHistory]
-  KnownPlanes* remembered;  // ... what of that is not 0, [units, spheres of a grain]
-  bool* remembers;          // ... whether anything is, [units]
-  Segment<V>* wall_segment;  // ... of the Mindlin law, [Q, units, wall_rows]
+  V* hot;                           // [units, kHot]
+  V* cold;                          // [units, kCold]
+  V* offsets;                       // of the pack, where they carry derivatives, [K, 3]
+  double* walls;                    // partial sums, [chunks, 2, 3] in the mode's own layout
+  V* fastest;                       // squares of the largest half-step velocity and spin, [chunks, 2]
+  double* sections;                 // of periodic boxes, as `walls`: see `section`
+  V* through;                       // ... and the forces through their faces, [domains, 3]
+  V* wall_history;                  // of walls with friction, [units, wall_rows, Law::kHistory]
+  KnownPlanes* remembered;          // ... what of that is not 0, [units, spheres of a grain]
+  bool* remembers;                  // ... whether anything is, [units]
+  Segment<V>* wall_segment;         // ... of the Mindlin law, [Q, units, wall_rows]
   int *wall_segments, *wall_rings;  // ... how many, and as in `Marks`, [units, wall_rows]
-  V* rubbed;                 // what their friction is of the force on a unit in a periodic box, [units, 3]
+  V* rubbed;                        // what their friction is of the force on a unit in a periodic box, [units, 3]
   typename Mode::Layout of_mode;
 
   void place(const Problem& p, const Block& block, Arena& arena) {
@@ -113,7 +113,8 @@ template <class Mode>
 struct Engine : EngineLayout<Mode> {
   using Layout = EngineLayout<Mode>;
   using V = typename Mode::Number;
-  using Layout::hot, Layout::cold, Layout::offsets, Layout::walls, Layout::fastest, Layout::sections, Layout::through, Layout::kNumber;
+  using Layout::hot, Layout::cold, Layout::offsets, Layout::walls, Layout::fastest, Layout::sections, Layout::through,
+      Layout::kNumber;
   using Layout::wall_history, Layout::remembered, Layout::remembers;
   using Layout::wall_segment, Layout::wall_segments, Layout::wall_rings, Layout::rubbed;
 
@@ -125,12 +126,12 @@ struct Engine : EngineLayout<Mode> {
   Mode mode;
   V parameter[kParameters];
   GrainParameters<V> constants;
-  WallLaw<V> wall_law;  // where walls have friction
-  double arm;           // of the outermost sphere of a grain, of the largest where they differ in size
-  double outer;         // radius about the centre of a grain of size 1 that holds it
+  WallLaw<V> wall_law;   // where walls have friction
+  double arm;            // of the outermost sphere of a grain, of the largest where they differ in size
+  double outer;          // radius about the centre of a grain of size 1 that holds it
   WallState<V> box_now;  // in the step under way, without walls along periodic axes
-  double travel = 0.0;  // how much closer any two spheres can have come since the call began
-  int current = 0;      // step under way
+  double travel = 0.0;   // how much closer any two spheres can have come since the call began
+  int current = 0;       // step under way
   bool deforms = false;  // whether the shape of a grain has a derivative
   Trace<V> trace;        // of contacts with walls: its segments alone, see `Replicas::trace`
 
@@ -187,8 +188,9 @@ struct Engine : EngineLayout<Mode> {
   Grain<V> still(int u) const {
     const V* h = hot + static_cast<std::size_t>(u) * kHot;
     const V* c = cold + static_cast<std::size_t>(u) * kCold;
-    return {load_vec(h + kPosition), {c[kQuaternion], load_vec(c + kQuaternion + 1)}, load_vec(h + kVelocity),
-            load_vec(h + kSpin),     load_vec(c + kAcceleration),                    load_vec(c + kSpinRate)};
+    return {load_vec(h + kPosition),     {c[kQuaternion], load_vec(c + kQuaternion + 1)},
+            load_vec(h + kVelocity),     load_vec(h + kSpin),
+            load_vec(c + kAcceleration), load_vec(c + kSpinRate)};
   }
 
   // First half of a step of unit u, midway, and wall forces.
@@ -208,10 +210,11 @@ struct Engine : EngineLayout<Mode> {
       WallForces<V> found{};
       near = unequal_spheres(u, found);
       if (near) on = found;
-    } else near = with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
-      return spheres_of(constants, m, offsets, problem.spheres_per_grain, arm, box, on,
-                        [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
-    });
+    } else
+      near = with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
+        return spheres_of(constants, m, offsets, problem.spheres_per_grain, arm, box, on,
+                          [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+      });
     WallFriction<V> friction{};
     if (problem.rubs && (near || remembers[u])) {
       friction = rub(u);
@@ -226,8 +229,9 @@ struct Engine : EngineLayout<Mode> {
   __attribute__((noinline)) bool unequal_spheres(int u, WallForces<V>& on) {
     const HalfStep<V> m = half_step_of(u);
     return with_offsets([&](const auto* offsets) __attribute__((always_inline)) {
-      return spheres_of(constants, m, offsets, block.pack->radii, problem.spheres_per_grain, mode.size_of(u, &Size::one), outer,
-                        box_now, on, [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
+      return spheres_of(constants, m, offsets, block.pack->radii, problem.spheres_per_grain,
+                        mode.size_of(u, &Size::one), outer, box_now, on,
+                        [&](int k, Vec<V> centre) { mode.put_sphere(u, k, centre); });
     });
   }
 
@@ -248,9 +252,9 @@ struct Engine : EngineLayout<Mode> {
         const Vec<V> lever = rotation * (plan.size ? size * body : body);
         const std::size_t first = wall_row(u, kPlanes * k);
         KnownPlanes& planes = remembered[first / kPlanes];
-        const unsigned now = rub_walls<Law>(own, wall_law, m.position + lever, lever, add_cross(m.velocity, m.spin, lever), m.spin,
-                                            box_now, radius, wall_history + first * Law::kHistory, planes.now,
-                                            [&](int w) { return wall_segments_of(first + w); }, on);
+        const unsigned now = rub_walls<Law>(
+            own, wall_law, m.position + lever, lever, add_cross(m.velocity, m.spin, lever), m.spin, box_now, radius,
+            wall_history + first * Law::kHistory, planes.now, [&](int w) { return wall_segments_of(first + w); }, on);
         planes = {static_cast<unsigned char>(now), static_cast<unsigned char>(planes.ever | now)};
         any |= now;
       }
@@ -320,7 +324,9 @@ struct Engine : EngineLayout<Mode> {
       if constexpr (Law::kLayered)
         unload_rings(problem, numbers, wall_segments_of(of_all), wall_outermost(of_all), wall_rings[of_all],
                      [&](int j, int axis, const V& number) {
-                       mode.wall_out(u, row, [&](std::ptrdiff_t at) { return ring_place(problem, at, j, axis); }, number, steps_done);
+                       mode.wall_out(
+                           u, row, [&](std::ptrdiff_t at) { return ring_place(problem, at, j, axis); }, number,
+                           steps_done);
                      });
     });
   }
@@ -378,7 +384,9 @@ struct Engine : EngineLayout<Mode> {
       for (int u = first; u < last && u < Mode::units(problem); ++u) {
         const Grain<V> grain = ends ? finish(u, periodic ? &ended : nullptr, of_sections) : still(u);
         if (!begins) keep(u, grain);
-        else begin(u, periodic ? begin_step(constants, grain, before, cell) : begin_step(constants, grain), box, sums, speeds);
+        else
+          begin(u, periodic ? begin_step(constants, grain, before, cell) : begin_step(constants, grain), box, sums,
+                speeds);
       }
     }
     team.barrier();
@@ -398,7 +406,8 @@ struct Engine : EngineLayout<Mode> {
     const V step = parameter[kDt] * fma(splat<V>(arm), root(spin), root(speed));
     travel += 2.0 * (1.0 + 1e-9) * largest(step);
     if (!problem.periodic) return;
-    const V strain = parameter[kDt] * (max(cell.rate.x, -cell.rate.x) + max(cell.rate.y, -cell.rate.y) + max(cell.rate.z, -cell.rate.z));
+    const V strain = parameter[kDt] *
+                     (max(cell.rate.x, -cell.rate.x) + max(cell.rate.y, -cell.rate.y) + max(cell.rate.z, -cell.rate.z));
     travel += (1.0 + 1e-9) * (plan.far + 2.0 * arm) * largest(strain);
   }
 
@@ -419,12 +428,14 @@ struct Engine : EngineLayout<Mode> {
 
   // p of the periodic axes in the step that has just ended.
   Vec<V> section_pressure_at(int step) const {
-    return section_pressure(problem.periodic, walls_at(step), cell_at(step), mode.sum_walls(sections, chunks(problem)), sum_through());
+    return section_pressure(problem.periodic, walls_at(step), cell_at(step), mode.sum_walls(sections, chunks(problem)),
+                            sum_through());
   }
 
   Vec<V> sum_through() const {
     Vec<V> sum{};
-    for (int domain = 0; domain < plan.domains; ++domain) sum = sum + load_vec(through + 3 * static_cast<std::size_t>(domain));
+    for (int domain = 0; domain < plan.domains; ++domain)
+      sum = sum + load_vec(through + 3 * static_cast<std::size_t>(domain));
     return sum;
   }
 

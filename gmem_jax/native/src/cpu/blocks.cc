@@ -106,7 +106,8 @@ void run_blocks(const Problem& problem, const Kernel& kernel, const std::vector<
     bytes = std::max(bytes, kernel.scratch_bytes(problem, block));
     domains = std::max(domains, block.pack->plan->domains);
   }
-  const int fit = static_cast<int>(std::min<std::size_t>(threads, kShare * cache_bytes() / std::max<std::size_t>(bytes, 1)));
+  const int fit =
+      static_cast<int>(std::min<std::size_t>(threads, kShare * cache_bytes() / std::max<std::size_t>(bytes, 1)));
   const int busy = (threads + domains - 1) / domains;
   const int teams = std::min(count, std::max({1, fit, busy}));
   for (int first = 0; first < count; first += teams)

@@ -12,11 +12,25 @@ namespace gmem {
 namespace GMEM_ISA {
 
 // Rows of what is kept, and of the bars, of one grain: at the beginning of a step, the fields in order ...
-enum StateRow { kStatePosition = 0, kStateQuaternion = 3, kStateVelocity = 7, kStateSpin = 10, kStateAcceleration = 13,
-                kStateSpinRate = 16, kState = 19 };
+enum StateRow {
+  kStatePosition = 0,
+  kStateQuaternion = 3,
+  kStateVelocity = 7,
+  kStateSpin = 10,
+  kStateAcceleration = 13,
+  kStateSpinRate = 16,
+  kState = 19
+};
 // ... and midway, with the force and torque found there ...
-enum MidRow { kMidPosition = 0, kMidQuaternion = 3, kMidVelocity = 7, kMidSpin = 10, kMidForce = 13, kMidTorque = 16,
-              kMid = 19 };
+enum MidRow {
+  kMidPosition = 0,
+  kMidQuaternion = 3,
+  kMidVelocity = 7,
+  kMidSpin = 10,
+  kMidForce = 13,
+  kMidTorque = 16,
+  kMid = 19
+};
 // ... or, instead of these, how it is turned.
 enum TurnedRow { kTurnedRotation = 13, kTurned = 22 };
 // Rows of a contact's input; its history follows.
@@ -31,7 +45,8 @@ constexpr int kLawNumbers = 5;
 
 template <class V, class Each>
 constexpr void for_numbers(GrainParameters<V>& p, const Each& each) {
-  each(p.dt), each(p.half_dt), each(p.drag), each(p.slowed), each(p.inverse_mass), each(p.wall_stiffness), each(p.normal_damping);
+  each(p.dt), each(p.half_dt), each(p.drag), each(p.slowed), each(p.inverse_mass), each(p.wall_stiffness),
+      each(p.normal_damping);
   each(p.gravity);
   for (int axis = 0; axis < 3; ++axis) each(p.inertia[axis]), each(p.inverse_inertia[axis]);
 }
@@ -143,7 +158,8 @@ struct OneContact {
       const auto cell = inputs<Cell<Symbol>>(program, 4, Bar::add);
       image = inputs<Vec<Symbol>>(program, 5, Bar::none, kImage);
       move_to_image(meeting, image, cell);
-      unequal = {input(program, 5, kReach, Bar::none), input(program, 5, kLean, Bar::none), input(program, 5, kRoot, Bar::none)};
+      unequal = {input(program, 5, kReach, Bar::none), input(program, 5, kLean, Bar::none),
+                 input(program, 5, kRoot, Bar::none)};
     }
     Contact<Symbol> contact{};
     contact.history = history;
@@ -243,9 +259,9 @@ struct OneSphere {
 // Friction of a plane of the walls on a sphere, as a force and a torque on its grain. `at` and `moves` are place and velocity
 // of the plane, `side` is -1 for a lower and 1 for an upper one, and `normal` leads to it.
 template <class Law, class V, class SegmentsOf>
-constexpr WallFriction<V> rub_plane(const HalfStep<V>& half, const Matrix<V>& rotation, Vec<V> body, V radius, V stiffness,
-                                    V damping_time, V at, V moves, Vec<V> normal, const WallLaw<V>& walls, V* history,
-                                    const SegmentsOf& segments_of, Contact<V>& contact) {
+constexpr WallFriction<V> rub_plane(const HalfStep<V>& half, const Matrix<V>& rotation, Vec<V> body, V radius,
+                                    V stiffness, V damping_time, V at, V moves, Vec<V> normal, const WallLaw<V>& walls,
+                                    V* history, const SegmentsOf& segments_of, Contact<V>& contact) {
   const Vec<V> lever = rotation * body;
   const Vec<V> velocity = add_cross(half.velocity, half.spin, lever);
   const V side = normal.x + (normal.y + normal.z);
@@ -280,8 +296,9 @@ struct OnePlane {
     SameRings rings{};
     if constexpr (Law::kLayered) rings.end = input(program, 7, 0, Bar::none);
     Contact<Symbol> contact{};
-    const auto on = rub_plane<Law>(half, rotation, body, radius, parameters.wall_stiffness, parameters.normal_damping, at, moves,
-                                   normal, walls, history, [&](int) { return rings; }, contact);
+    const auto on = rub_plane<Law>(
+        half, rotation, body, radius, parameters.wall_stiffness, parameters.normal_damping, at, moves, normal, walls,
+        history, [&](int) { return rings; }, contact);
     result(program, on.force), result(program, on.torque);
     for (int q = 0; q < Law::kHistory; ++q) result(program, history[q]);
     return program;

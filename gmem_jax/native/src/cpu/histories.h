@@ -79,11 +79,13 @@ void load_rings(V* history, Segments segments, Outer outer, bool apart, const Nu
 
 // ... and back, by `put(j, axis, number)`; `before` are the rings that there were at first.
 template <class V, class Segments, class Outer, class Put>
-void unload_rings(const Problem& p, const V* history, const Segments& segments, Outer outer, int before, const Put& put) {
-  segments.unload(load_layers(history + kLayers), outer, rings_to_write(p, before, outer), [&](int j, const auto& force) {
-    put(j, 0, force.along);
-    put(j, 1, force.across);
-  });
+void unload_rings(const Problem& p, const V* history, const Segments& segments, Outer outer, int before,
+                  const Put& put) {
+  segments.unload(load_layers(history + kLayers), outer, rings_to_write(p, before, outer),
+                  [&](int j, const auto& force) {
+                    put(j, 0, force.along);
+                    put(j, 1, force.across);
+                  });
 }
 
 // The history of candidate c, from the arrays of the call to where a mode keeps it.

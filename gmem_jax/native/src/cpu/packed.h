@@ -68,9 +68,11 @@ struct Packed : PackedLayout<Law> {
 
   void use(const Layout& layout, V* of_engine) { static_cast<Layout&>(*this) = layout, hot = of_engine; }
 
-  V per_lane(const double* Lane::*array, std::ptrdiff_t row) const { return splat<V>((lane.*array)[row * problem.stride]); }
+  V per_lane(const double* Lane::* array, std::ptrdiff_t row) const {
+    return splat<V>((lane.*array)[row * problem.stride]);
+  }
 
-  V size_of(int u, double Size::*power) const {
+  V size_of(int u, double Size::* power) const {
     V size;
     for (int l = 0; l < W; ++l) size[l] = plan.size[grain_in(u, l)].*power;
     return size;
@@ -217,9 +219,8 @@ struct Packed : PackedLayout<Law> {
     int count() const { return most; }
     Segment<V> get(int k) const {
       const Row none{0.0, 0.0, kNowhere};
-      const Rows rows = load_rows([&](int l) {
-        return k < *stored[l] ? reinterpret_cast<const Row*>(first[l] + k * stride) : &none;
-      });
+      const Rows rows = load_rows(
+          [&](int l) { return k < *stored[l] ? reinterpret_cast<const Row*>(first[l] + k * stride) : &none; });
       const Vec<V> segment = columns(rows);
       return {{segment.x, segment.y}, segment.z};
     }
@@ -314,7 +315,8 @@ struct Packed : PackedLayout<Law> {
       relative_motion(m, dot(m.separation, m.separation), contact[n]);
       if (plan.radii) unequal[n] = unequal_of(group[n]), spin[n] = m.spin_other - m.spin_one;
     }
-    plan.radii ? close<true>(contact, groups, parameter, unequal, [&](int n) { return spin[n]; }) : close(contact, groups, parameter);
+    plan.radii ? close<true>(contact, groups, parameter, unequal, [&](int n) { return spin[n]; })
+               : close(contact, groups, parameter);
     for (int n = 0; n < groups; ++n) forget_apart(group[n], contact[n].overlap);
     rub<Law>(contact, groups, law, plan.radii ? unequal : nullptr, [&](int n) { return segments_of(group[n]); });
     for (int n = 0; n < groups; ++n) {
@@ -324,8 +326,9 @@ struct Packed : PackedLayout<Law> {
       for (int l = 0; plan.image && l < group[n].count; ++l) {
         const Image& image = plan.image[group[n].c[l]];
         if (!image.any()) continue;
-        faces.through = faces.through - Vec<V>{splat<V>(image.x * found.force.x[l]), splat<V>(image.y * found.force.y[l]),
-                                               splat<V>(image.z * found.force.z[l])};
+        faces.through =
+            faces.through - Vec<V>{splat<V>(image.x * found.force.x[l]), splat<V>(image.y * found.force.y[l]),
+                                   splat<V>(image.z * found.force.z[l])};
       }
     }
   }
@@ -350,8 +353,12 @@ struct Packed : PackedLayout<Law> {
 
   // With images of the second spheres, of a periodic box.
   GMEM_INLINE ContactInput<V> contact_input(const Group& g, const Cell<V>* cell) const {
-    const auto one = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); }); };
-    const auto other = [&](Row GrainRows::*row) { return load_rows([&](int l) { return &(grain[g.pair[l].grain_other].*row); }); };
+    const auto one = [&](Row GrainRows::* row) {
+      return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); });
+    };
+    const auto other = [&](Row GrainRows::* row) {
+      return load_rows([&](int l) { return &(grain[g.pair[l].grain_other].*row); });
+    };
     const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l].one; });
     Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l].other; }), moved{};
     if (cell) {

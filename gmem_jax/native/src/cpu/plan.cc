@@ -75,7 +75,8 @@ void check(const List& list) {
   const int spheres = list.grains * list.spheres_per_grain;
   for (int row = 0; row < list.rows; ++row) {
     const int i = list.first[row], j = list.second[row];
-    if (!list.valid[row] || (0 <= i && i < j && j < spheres && i / list.spheres_per_grain != j / list.spheres_per_grain))
+    if (!list.valid[row] ||
+        (0 <= i && i < j && j < spheres && i / list.spheres_per_grain != j / list.spheres_per_grain))
       continue;
     throw std::invalid_argument("candidate " + std::to_string(row) + " joins spheres " + std::to_string(i) + " and " +
                                 std::to_string(j) + "; wanted are two of different grains, in order, from 0 to " +
@@ -191,7 +192,8 @@ struct Key {
   std::vector<char> bytes;
 
   explicit Key(const List& list)
-      : grains(list.grains), spheres_per_grain(list.spheres_per_grain), rows(list.rows), images(list.image), radii(list.radii) {
+      : grains(list.grains), spheres_per_grain(list.spheres_per_grain), rows(list.rows), images(list.image),
+        radii(list.radii) {
     visit(list, [this](const void* data, std::size_t size) {
       const char* begin = static_cast<const char*>(data);
       bytes.insert(bytes.end(), begin, begin + size);

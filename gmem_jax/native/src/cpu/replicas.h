@@ -124,7 +124,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     return a;
   }
 
-  V per_lane(const double* Lane::*array, std::ptrdiff_t row) const {
+  V per_lane(const double* Lane::* array, std::ptrdiff_t row) const {
     return of_lanes<V>(block, [&](const Lane* lanes, int first) {
       return gather(lanes, [array](const Lane& lane) { return lane.*array; }, row, first);
     });
@@ -132,10 +132,11 @@ struct Replicas : ReplicasLayout<Law, V, C> {
 
   // Number `row` of the pack's offsets, with its derivative.
   Dual<Real> offset(int row) const {
-    return {splat<Real>(block.pack->offsets[row]), gather(block.slopes, [](const Lane& lane) { return lane.offsets; }, row)};
+    return {splat<Real>(block.pack->offsets[row]),
+            gather(block.slopes, [](const Lane& lane) { return lane.offsets; }, row)};
   }
 
-  V size_of(int u, double Size::*power) const { return splat<V>(plan.size[u].*power); }
+  V size_of(int u, double Size::* power) const { return splat<V>(plan.size[u].*power); }
 
   // --- copying in and out
 
@@ -143,9 +144,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
 
   template <class Pointer>
   V read(const Pointer& pointer, std::ptrdiff_t row) const {
-    return of_lanes<V>(block, [&](const Lane* lanes, int first) {
-      return read_lanes(lanes, adjacent, pointer, row, first);
-    });
+    return of_lanes<V>(block,
+                       [&](const Lane* lanes, int first) { return read_lanes(lanes, adjacent, pointer, row, first); });
   }
 
   template <class Pointer>
@@ -187,7 +187,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     for (int f = 0; f < kFields; ++f)
       for (int q = 0; q < kField[f].size; ++q)
         write([f](const Lane& lane) { return lane.grains_out[f]; },
-              static_cast<std::ptrdiff_t>(plan.grain[u]) * kField[f].size + q, field_at(f, u, hot, cold)[q], steps_done);
+              static_cast<std::ptrdiff_t>(plan.grain[u]) * kField[f].size + q, field_at(f, u, hot, cold)[q],
+              steps_done);
   }
 
   StoredSegments<V> segments_of(std::size_t c) const {
@@ -291,7 +292,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
 
   // ... of spheres that `differ` in radius or do not.
   template <bool differ>
-  void contacts_of(int first, int end, const C* parameter, const LawParameters<C>& law, double travel, Faces<V>& faces) {
+  void contacts_of(int first, int end, const C* parameter, const LawParameters<C>& law, double travel,
+                   Faces<V>& faces) {
     constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether, kAhead = 6;
     const V contact_square = splat<V>(4.0);
     int near[kLook + 1], touching[kBatch];

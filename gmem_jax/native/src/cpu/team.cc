@@ -97,9 +97,9 @@ class Pool {
 
   std::mutex mutex_;
   std::condition_variable wake_, free_;
-  std::deque<Job*> jobs_;         // with ranks that have not begun
-  int workers_ = 0, ranks_ = 0;   // and how many of them are spoken for
-  int calls_ = 0, used_ = 0;      // calls in progress or waiting, and the threads they have
+  std::deque<Job*> jobs_;        // with ranks that have not begun
+  int workers_ = 0, ranks_ = 0;  // and how many of them are spoken for
+  int calls_ = 0, used_ = 0;     // calls in progress or waiting, and the threads they have
 };
 
 Pool& pool() { return of_process<Pool>(); }
@@ -181,7 +181,8 @@ int thread_count() {
   char* end = nullptr;
   const long wanted = std::strtol(text, &end, 10);
   if (*end || wanted < 1 || wanted > 4096)
-    throw std::invalid_argument("GMEM_THREADS should be a number of threads from 1 to 4096; it is \"" + std::string(text) + '"');
+    throw std::invalid_argument("GMEM_THREADS should be a number of threads from 1 to 4096; it is \"" +
+                                std::string(text) + '"');
   return static_cast<int>(wanted);
 }
 

@@ -10,11 +10,11 @@
 namespace gmem {
 namespace cuda {
 
-constexpr int kChunk = 64;   // numbers that one thread sums up
-constexpr int kItems = 32;   // grains that a block of `move` has
-constexpr int kWorkers = 4;  // threads that sum up the forces on one of them
-constexpr int kOfLayers = 6; // numbers of Mindlin's `Layers`
-constexpr int kLoad = 6;     // numbers of a contact: the force on its first sphere, and the point where it acts
+constexpr int kChunk = 64;    // numbers that one thread sums up
+constexpr int kItems = 32;    // grains that a block of `move` has
+constexpr int kWorkers = 4;   // threads that sum up the forces on one of them
+constexpr int kOfLayers = 6;  // numbers of Mindlin's `Layers`
+constexpr int kLoad = 6;      // numbers of a contact: the force on its first sphere, and the point where it acts
 
 // Where the numbers of each entry begin; the step is zero where all share them.
 template <class T>
@@ -66,28 +66,29 @@ struct Arguments {
   int grains, spheres, rows, columns, points, steps;  // N, K, P, C, Q, T
   int replicas, lanes;                                // B, L
   Divisor by_replicas, by_lanes, by_spheres;
-  int periodic;                                       // bit of each axis along which the box is
+  int periodic;  // bit of each axis along which the box is
   bool isotropic, tangent;
-  Entries<const int> first, second;    // spheres of a candidate, [P]
-  Entries<const unsigned char> valid;  // [P]
-  Entries<const Four> incidence;       // candidates of a sphere, plus P where it is the second one; [N K, C]
-  Entries<const signed char> image;    // by how many edges of a periodic box the second sphere is moved, [P, 3]
-  Entries<const double> offsets;       // sphere centres of a grain, [K, 3]
+  Entries<const int> first, second;     // spheres of a candidate, [P]
+  Entries<const unsigned char> valid;   // [P]
+  Entries<const Four> incidence;        // candidates of a sphere, plus P where it is the second one; [N K, C]
+  Entries<const signed char> image;     // by how many edges of a periodic box the second sphere is moved, [P, 3]
+  Entries<const double> offsets;        // sphere centres of a grain, [K, 3]
   Entries<const double> along_offsets;  // ... and their derivatives, where there are any, [K, 3, B]
-  Entries<const double> radii, sizes;  // where spheres differ in radius: of those of a grain of size 1, and of grains; [K], [N]
+  Entries<const double> radii,
+      sizes;  // where spheres differ in radius: of those of a grain of size 1, and of grains; [K], [N]
   Table parameters, walls, grains_in[kFields];
   Table grains_out[kFields], pressure_out;  // values, or derivatives where they are wanted
   Memories contacts, at_walls;              // of the candidates, P; and of every sphere at `kPlanes` planes
   // Between steps.
-  Table hot;                   // position, velocity, spin, [N, 9, L]
-  Table sphere;                // centres, [N K, 3, L]
-  Table cold;                  // orientation, [N, 4, L]
-  Table wall;                  // force of the walls, and their pressures summed over steps; if they have friction, its torque about
-                               // the sphere's centre and its force; [N K, of_wall, L]
-  int of_wall;                 // 6, or 12
-  Table load;                  // of candidates that touch, [P, kLoad, L]
-  unsigned char* touching;     // which candidates touch, and which spheres the walls (bits of planes that have friction),
-                               // [P + N K, L]
+  Table hot;     // position, velocity, spin, [N, 9, L]
+  Table sphere;  // centres, [N K, 3, L]
+  Table cold;    // orientation, [N, 4, L]
+  Table wall;    // force of the walls, and their pressures summed over steps; if they have friction, its torque about
+                 // the sphere's centre and its force; [N K, of_wall, L]
+  int of_wall;   // 6, or 12
+  Table load;    // of candidates that touch, [P, kLoad, L]
+  unsigned char* touching;  // which candidates touch, and which spheres the walls (bits of planes that have friction),
+                            // [P + N K, L]
 };
 
 enum class GpuKernel { enter, remember, touch, move, move_alone, collect, leave };

@@ -166,9 +166,13 @@ std::string compiled(const std::string& target, const Which& which, std::string*
   const std::string source = contents(paths().sources + "/cuda/kernel.cu");
   if (source.empty()) throw std::runtime_error("the sources of the GPU's kernels are not in " + paths().sources);
   std::vector<std::string> options = {
-      "--gpu-architecture=" + target, "--std=c++17", "--device-as-default-execution-space",
-      "--generate-line-info", "--fmad=false",  // as on CPUs: a fused multiply-add is where the sources say so
-      "-I" + paths().sources, "-DGMEM_ISA=gpu",
+      "--gpu-architecture=" + target,
+      "--std=c++17",
+      "--device-as-default-execution-space",
+      "--generate-line-info",
+      "--fmad=false",  // as on CPUs: a fused multiply-add is where the sources say so
+      "-I" + paths().sources,
+      "-DGMEM_ISA=gpu",
       "-DGMEM_LAW=" + law_as_type(which),
       "-DGMEM_PERIODIC=" + std::to_string(which.periodic),
       "-DGMEM_UNEQUAL=" + std::to_string(which.unequal),
@@ -232,9 +236,9 @@ std::string code_for(const std::string& architecture, const Which& which, bool a
   const std::string target = target_for(architecture), version = dotted(nvrtc().version);
   if (log && is_ptx(target)) throw std::runtime_error("NVRTC " + version + " does not know " + architecture);
   const std::string law = "-law" + std::to_string(static_cast<int>(which.law)) +
-                          std::to_string(static_cast<int>(which.variant)) +
-                          (which.periodic ? "-periodic" : "") + (which.unequal ? "-unequal" : "") +
-                          (which.rubs ? "-rubs" : "") + (which.task == Task::forward ? "" : "-tangent");
+                          std::to_string(static_cast<int>(which.variant)) + (which.periodic ? "-periodic" : "") +
+                          (which.unequal ? "-unequal" : "") + (which.rubs ? "-rubs" : "") +
+                          (which.task == Task::forward ? "" : "-tangent");
   const std::string path = paths().cache + "/" + GMEM_SOURCE_HASH + "-" + target + "-nvrtc" + version + law +
                            (is_ptx(target) ? ".ptx" : ".cubin");
   const bool keeps = !paths().cache.empty() && trial_options().empty();
@@ -271,7 +275,8 @@ extern "C" int gmem_cuda_compile(const char* architecture, int law, int variant,
   return gmem::cuda::in_one_line(said, size, [&] {
     std::string log;
     const auto task = tangent ? gmem::Task::tangent : gmem::Task::forward;
-    const gmem::cuda::Which which{static_cast<gmem::Law>(law), static_cast<gmem::Variant>(variant), task, false, false, false};
+    const gmem::cuda::Which which{
+        static_cast<gmem::Law>(law), static_cast<gmem::Variant>(variant), task, false, false, false};
     gmem::cuda::code_for(architecture, which, true, &log);
     return log;
   });

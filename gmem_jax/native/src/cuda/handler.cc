@@ -19,17 +19,24 @@ namespace {
 
 namespace ffi = xla::ffi;
 
-constexpr int kFew = 1 << 17;  // grains times lanes from which on one thread a grain keeps a GPU busy (an H200, measured)
+constexpr int kFew =
+    1 << 17;                // grains times lanes from which on one thread a grain keeps a GPU busy (an H200, measured)
 constexpr int kOfPack = 8;  // arguments that belong to a pack
 
 // Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain O,
 // of a load E, of a sphere at the walls X, of `Layers` Y, derivatives and values D, lanes L.
 // gmem_jax/native/cuda.py: call_kernels, between_steps
 Wants arguments_of(Task task, Law law, bool rubs) {
-  const Wants pack = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32}, {"validity", "P", ffi::PRED},
-                      {"incidence", "SC", ffi::S32},    {"images", "PI", ffi::S8},
-                      {"offsets", "K3"},                {"radii", "KU"},              {"sizes", "NU"}};
-  const Wants walls = wall_histories(law, rubs), all = fields_of_grains() + pack + numbers_of_steps() + histories(law) + walls;
+  const Wants pack = {{"first spheres", "P", ffi::S32},
+                      {"second spheres", "P", ffi::S32},
+                      {"validity", "P", ffi::PRED},
+                      {"incidence", "SC", ffi::S32},
+                      {"images", "PI", ffi::S8},
+                      {"offsets", "K3"},
+                      {"radii", "KU"},
+                      {"sizes", "NU"}};
+  const Wants walls = wall_histories(law, rubs),
+              all = fields_of_grains() + pack + numbers_of_steps() + histories(law) + walls;
   return task == Task::tangent ? all + arrays_of_steps(law) + walls : all;
 }
 
@@ -38,13 +45,14 @@ Wants results_of(Task task, Law law, bool rubs) {
   const Wants remembered = histories(law) + wall_histories(law, rubs);
   Wants all = fields_of_grains() + pressures() + remembered;
   all = all + Wants{{"hot", "DN9L"},   {"spheres", "DS3L"}, {"cold", "DNOL"},
-                    {"walls", "DSXL"}, {"loads", "DPEL"}, {"touching", "AL", ffi::U8}};
+                    {"walls", "DSXL"}, {"loads", "DPEL"},   {"touching", "AL", ffi::U8}};
   if (task == Task::tangent)
     for (const Wanted& leaf : remembered)
       if (leaf.axes.size() == 3) all.push_back({leaf.name, std::string("D") + leaf.axes.substr(0, 2) + "L"});
   if (!is_layered(law)) return all;
   all = all + Wants{{"layers", "DPYL"}, {"segments", "DPQ3L"}, {"stored", "PL", ffi::S32}};
-  if (rubs) all = all + Wants{{"walls' layers", "DFYL"}, {"walls' segments", "DFQ3L"}, {"walls' stored", "FL", ffi::S32}};
+  if (rubs)
+    all = all + Wants{{"walls' layers", "DFYL"}, {"walls' segments", "DFQ3L"}, {"walls' stored", "FL", ffi::S32}};
   return all;
 }
 
@@ -58,7 +66,8 @@ int threads_for(int64_t many) {
   return static_cast<int>(many);
 }
 
-Which which_of(Task task, int64_t law, int64_t variant, int64_t points, int64_t periodic, int64_t unequal, int64_t rubs) {
+Which which_of(Task task, int64_t law, int64_t variant, int64_t points, int64_t periodic, int64_t unequal,
+               int64_t rubs) {
   require_law(law, variant, points);
   require_axes(periodic);
   return {static_cast<Law>(law), static_cast<Variant>(variant), task, periodic != 0, unequal != 0, rubs != 0};
@@ -110,7 +119,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   a.tangent = task == Task::tangent;
   require(a.grains > 0 && a.spheres > 0, "there is no grain");
   require(a.lanes > 0, "there is no replica");
-  require(!rubs || leaves == 0 || reader.size('F') == kPlanes * reader.size('S'), "walls' histories are not those of all spheres");
+  require(!rubs || leaves == 0 || reader.size('F') == kPlanes * reader.size('S'),
+          "walls' histories are not those of all spheres");
   require(a.columns % 4 == 0, "columns of the incidence should come in fours");
   require(reader.size('S') == reader.size('N') * reader.size('K'), "spheres are not as many as grains have");
   a.by_replicas = Divisor(a.replicas), a.by_lanes = Divisor(a.lanes), a.by_spheres = Divisor(a.spheres);
@@ -188,8 +198,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 }
 
 template <Task task>
-ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t,
-                  int64_t mixed, int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
+ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t, int64_t mixed,
+                  int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
   return in_words([&] {
     require(mixed == 0, "there is no mixed precision on GPUs");
     return call(task, law, variant, points, isotropic, periodic, unequal, rubs, stream, args, rets);

@@ -28,12 +28,16 @@ constexpr bool kPlain = !__is_class(Number), kPeriodic = GMEM_PERIODIC, kUnequal
 
 GMEM_KERNEL(128, 2) enter(GMEM_GIVEN) { gmem::GMEM_ISA::enter<Number, kPeriodic, kUnequal>(a, thread()); }
 GMEM_KERNEL(128, 4) remember(GMEM_GIVEN) { gmem::GMEM_ISA::remember<Number, GMEM_LAW, kRubs>(a, thread()); }
-GMEM_KERNEL(128, GMEM_TOUCH) touch(GMEM_GIVEN) { gmem::GMEM_ISA::touch<Number, GMEM_LAW, kPeriodic, kUnequal, kRubs>(a, step, thread()); }
-GMEM_KERNEL(128, GMEM_MOVE) move_alone(GMEM_GIVEN) { gmem::GMEM_ISA::move_alone<Number, kPeriodic, kUnequal, kRubs>(a, step, thread()); }
+GMEM_KERNEL(128, GMEM_TOUCH) touch(GMEM_GIVEN) {
+  gmem::GMEM_ISA::touch<Number, GMEM_LAW, kPeriodic, kUnequal, kRubs>(a, step, thread());
+}
+GMEM_KERNEL(128, GMEM_MOVE) move_alone(GMEM_GIVEN) {
+  gmem::GMEM_ISA::move_alone<Number, kPeriodic, kUnequal, kRubs>(a, step, thread());
+}
 GMEM_KERNEL(128, 4) collect(GMEM_GIVEN) { gmem::GMEM_ISA::collect<Number>(a, step, thread()); }
 GMEM_KERNEL(128, 4) leave(GMEM_GIVEN) { gmem::GMEM_ISA::leave<Number, GMEM_LAW, kRubs>(a, thread()); }
 
-GMEM_KERNEL(kItems * kWorkers, 2) move(GMEM_GIVEN) {
+GMEM_KERNEL(kItems* kWorkers, 2) move(GMEM_GIVEN) {
   __shared__ Load<Number> part[kWorkers][kItems];
   const int slot = threadIdx.x % kItems, worker = threadIdx.x / kItems;
   const ReplicaView<Number> on(a, blockIdx.x * kItems + slot);

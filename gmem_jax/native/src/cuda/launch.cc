@@ -72,8 +72,8 @@ const Kernels* kernels_of(Handle context, const Which& which) {
   static std::mutex mutex;
   static std::map<std::tuple<Handle, Law, Variant, Task, bool, bool, bool, std::string>, Kernels> known;
   const std::lock_guard<std::mutex> lock(mutex);
-  const auto key = std::make_tuple(context, which.law, which.variant, which.task, which.periodic, which.unequal, which.rubs,
-                                   trial_options());
+  const auto key = std::make_tuple(context, which.law, which.variant, which.task, which.periodic, which.unequal,
+                                   which.rubs, trial_options());
   const auto found = known.find(key);
   if (found != known.end()) return &found->second;
   const Driver& d = driver();

@@ -173,7 +173,9 @@ Segments<V> segments_of(const ReplicaView<V>& on, const Memories& kept, int row)
 
 // Of the spheres of a pack in which they differ: the radius of one, and the size of a grain.
 template <class V>
-double size_of(const ReplicaView<V>& on, int grain) { return on.a.sizes.of(on.entry)[grain]; }
+double size_of(const ReplicaView<V>& on, int grain) {
+  return on.a.sizes.of(on.entry)[grain];
+}
 template <class V>
 double radius_of(const ReplicaView<V>& on, int sphere) {
   const int grain = on.a.by_spheres.of(sphere);
@@ -316,8 +318,9 @@ struct Memory {
 
 // Friction of the walls on a sphere; returns the planes that it touches. `known` are those that it remembers.
 template <class V, class Law>
-unsigned rub_planes(const ReplicaView<V>& on, const GrainParameters<V>& constants, const V* parameter, int number, Vec<V> centre,
-                   Vec<V> lever, Vec<V> velocity, Vec<V> spin, const WallState<V>& box, V radius, unsigned known) {
+unsigned rub_planes(const ReplicaView<V>& on, const GrainParameters<V>& constants, const V* parameter, int number,
+                    Vec<V> centre, Vec<V> lever, Vec<V> velocity, Vec<V> spin, const WallState<V>& box, V radius,
+                    unsigned known) {
   const Arguments& a = on.a;
   const int first = kPlanes * number, at = a.of_wall * number;
   V history[kPlanes * Law::kHistory + 1];
@@ -328,8 +331,9 @@ unsigned rub_planes(const ReplicaView<V>& on, const GrainParameters<V>& constant
   }
   const WallLaw<V> walls(parameter, on.in(a.parameters)[kWallMu]);
   WallFriction<V> found{};
-  const unsigned now = rub_walls<Law>(constants, walls, centre, lever, velocity, spin, box, radius, history, known,
-                                      [&](int w) { return segments_of(on, a.at_walls, first + w); }, found);
+  const unsigned now = rub_walls<Law>(
+      constants, walls, centre, lever, velocity, spin, box, radius, history, known,
+      [&](int w) { return segments_of(on, a.at_walls, first + w); }, found);
   for (int w = 0; w < kPlanes; ++w) {
     if (!((known | now) >> w & 1)) continue;
     Memory<V, Law> memory{on, a.at_walls, first + w, {}};
@@ -410,8 +414,8 @@ void touch(const Arguments& a, int step, int thread) {
   const Column<V> hot = on.in(a.hot), load = on.in(a.load);
   const int i = 9 * a.by_spheres.of(one), j = 9 * a.by_spheres.of(other);
   Vec<V> point = splat<V>(0.5) * (here + there);
-  ContactInput<V> input{gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3),
-                        hot.vec(i + 6), hot.vec(j + 6)};
+  ContactInput<V> input{
+      gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3), hot.vec(i + 6), hot.vec(j + 6)};
   if constexpr (periodic) to_image(input, shift, cell);
   memory.read();
   Contact<V> contact;
@@ -442,7 +446,9 @@ inline Load<V> operator+(const Load<V>& one, const Load<V>& other) {
 
 // A force that acts `lever` away from the grain's centre.
 template <class V>
-inline Load<V> at_lever(Vec<V> force, Vec<V> lever) { return {force, cross(lever, force), {}, {}}; }
+inline Load<V> at_lever(Vec<V> force, Vec<V> lever) {
+  return {force, cross(lever, force), {}, {}};
+}
 
 // The sum over the contacts of a sphere of a grain, walls included.
 template <class V, bool periodic, bool rubs>
@@ -504,7 +510,8 @@ GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
   V mass = parameter[kMass];
   if constexpr (unequal) {
     const double size = size_of(on, on.item), cube = size * size * size;
-    force = splat<V>(1.0 / cube) * force, torque = splat<V>(1.0 / (cube * size * size)) * torque, mass = splat<V>(cube) * mass;
+    force = splat<V>(1.0 / cube) * force, torque = splat<V>(1.0 / (cube * size * size)) * torque,
+    mass = splat<V>(cube) * mass;
   }
   Grain<V> after{};
   if constexpr (periodic) {

@@ -16,9 +16,7 @@ struct Dual {
   static Dual of(double a) { return {splat<R>(a), R{}}; }
   double operator[](int l) const { return value[l]; }
 
-  friend Dual select(Bits m, Dual a, Dual b) {
-    return {select(m, a.value, b.value), select(m, a.slope, b.slope)};
-  }
+  friend Dual select(Bits m, Dual a, Dual b) { return {select(m, a.value, b.value), select(m, a.slope, b.slope)}; }
   friend Dual zero_unless(Bits m, Dual a) { return select(m, a, Dual{}); }
 
   friend Dual operator+(Dual a, Dual b) { return {a.value + b.value, a.slope + b.slope}; }

@@ -17,8 +17,24 @@ namespace gmem {
 namespace GMEM_ISA {
 
 enum class Step : unsigned char {
-  input, constant, add, subtract, negate, multiply, divide, fma, fms, fnma, root, inverse_root, floor, select,
-  less, at_most, both, either  // these give masks
+  input,
+  constant,
+  add,
+  subtract,
+  negate,
+  multiply,
+  divide,
+  fma,
+  fms,
+  fnma,
+  root,
+  inverse_root,
+  floor,
+  select,
+  less,
+  at_most,
+  both,
+  either  // these give masks
 };
 
 // What becomes of the derivative ("bar") by an input: none is wanted, it is written, or it is added to what is there.
@@ -115,8 +131,8 @@ constexpr int record(Step step, Program* program, int a, int b = -1, int c = -1)
   node.step = step;
   node.a = static_cast<short>(a), node.b = static_cast<short>(b), node.c = static_cast<short>(c);
   const bool differentiable = step != Step::floor && step < Step::less;
-  node.active = differentiable && (program->node[a].active || (b >= 0 && program->node[b].active) ||
-                                   (c >= 0 && program->node[c].active));
+  node.active = differentiable &&
+                (program->node[a].active || (b >= 0 && program->node[b].active) || (c >= 0 && program->node[c].active));
   return program->push(node);
 }
 

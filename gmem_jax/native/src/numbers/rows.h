@@ -34,8 +34,7 @@ struct Rows {
 template <class Pointer>
 inline Rows load_rows(const Pointer& row) {
   Rows r;
-  for (int i = 0; i < 4; ++i)
-    r.part[i] = shuffle<0, 1, 2, 3, 4, 5, 6, 7>(*row(2 * i), *row(2 * i + 1));
+  for (int i = 0; i < 4; ++i) r.part[i] = shuffle<0, 1, 2, 3, 4, 5, 6, 7>(*row(2 * i), *row(2 * i + 1));
   return r;
 }
 
@@ -64,8 +63,7 @@ inline Rows rows_of(Vec<Real> a, Real spare = Real{}) {
 }
 
 inline Row row_of(const Rows& r, int l) {
-  return l % 2 ? shuffle<4, 5, 6, 7>(r.part[l / 2], r.part[l / 2])
-               : shuffle<0, 1, 2, 3>(r.part[l / 2], r.part[l / 2]);
+  return l % 2 ? shuffle<4, 5, 6, 7>(r.part[l / 2], r.part[l / 2]) : shuffle<0, 1, 2, 3>(r.part[l / 2], r.part[l / 2]);
 }
 
 #elif defined(__AVX__)
@@ -80,8 +78,7 @@ inline Vec<Real> columns(const Rows& r) {
   const Real q = shuffle<0, 4, 2, 6>(r.part[2], r.part[3]);
   const Real s = shuffle<1, 5, 3, 7>(r.part[0], r.part[1]);
   const Real t = shuffle<1, 5, 3, 7>(r.part[2], r.part[3]);
-  return {shuffle<0, 1, 4, 5>(p, q), shuffle<0, 1, 4, 5>(s, t),
-          shuffle<2, 3, 6, 7>(p, q)};
+  return {shuffle<0, 1, 4, 5>(p, q), shuffle<0, 1, 4, 5>(s, t), shuffle<2, 3, 6, 7>(p, q)};
 }
 
 inline Real spare_column(const Rows& r) {
@@ -95,8 +92,7 @@ inline Rows rows_of(Vec<Real> a, Real spare = Real{}) {
   const Real q = shuffle<1, 5, 3, 7>(a.x, a.y);
   const Real s = shuffle<0, 4, 2, 6>(a.z, spare);
   const Real t = shuffle<1, 5, 3, 7>(a.z, spare);
-  return {{shuffle<0, 1, 4, 5>(p, s), shuffle<0, 1, 4, 5>(q, t),
-           shuffle<2, 3, 6, 7>(p, s), shuffle<2, 3, 6, 7>(q, t)}};
+  return {{shuffle<0, 1, 4, 5>(p, s), shuffle<0, 1, 4, 5>(q, t), shuffle<2, 3, 6, 7>(p, s), shuffle<2, 3, 6, 7>(q, t)}};
 }
 
 inline Row row_of(const Rows& r, int l) { return r.part[l]; }
@@ -117,13 +113,10 @@ inline Vec<Real> columns(const Rows& r) {
 inline Real spare_column(const Rows& r) { return shuffle<1, 3>(r.part[1], r.part[3]); }
 
 inline Rows rows_of(Vec<Real> a, Real spare = Real{}) {
-  return {{shuffle<0, 2>(a.x, a.y), shuffle<0, 2>(a.z, spare),
-           shuffle<1, 3>(a.x, a.y), shuffle<1, 3>(a.z, spare)}};
+  return {{shuffle<0, 2>(a.x, a.y), shuffle<0, 2>(a.z, spare), shuffle<1, 3>(a.x, a.y), shuffle<1, 3>(a.z, spare)}};
 }
 
-inline Row row_of(const Rows& r, int l) {
-  return shuffle<0, 1, 2, 3>(r.part[2 * l], r.part[2 * l + 1]);
-}
+inline Row row_of(const Rows& r, int l) { return shuffle<0, 1, 2, 3>(r.part[2 * l], r.part[2 * l + 1]); }
 
 #endif
 

@@ -166,8 +166,8 @@ inline Real widen(Single<W> a) { return __builtin_convertvector((Halves)a.v, Rea
 
 inline Single<2 * W> narrow(Pair a) {
 #if defined(__AVX512F__)
-  return {(Single<2 * W>::Lanes)_mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps((__m512d)a.a)),
-                                                   _mm512_cvtpd_ps((__m512d)a.b), 1)};
+  return {(Single<2 * W>::Lanes) _mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps((__m512d)a.a)),
+                                                    _mm512_cvtpd_ps((__m512d)a.b), 1)};
 #else
   const Halves parts[2] = {narrow(a.a).v, narrow(a.b).v};
   Single<2 * W> both;
@@ -188,7 +188,9 @@ inline Pair widen(Single<2 * W> a) {
 }
 
 template <class V>
-GMEM_INLINE void put(V& to, V a) { to = a; }
+GMEM_INLINE void put(V& to, V a) {
+  to = a;
+}
 GMEM_INLINE void put(Single<W>& to, Real a) { to = narrow(a); }
 GMEM_INLINE void put(Single<2 * W>& to, Pair a) { to = narrow(a); }
 GMEM_INLINE void put(Real& to, Single<W> a) { to = widen(a); }
@@ -202,7 +204,9 @@ GMEM_INLINE To convert(From a) {
   return to;
 }
 template <class To, class From>
-GMEM_INLINE Vec<To> convert(Vec<From> a) { return {convert<To>(a.x), convert<To>(a.y), convert<To>(a.z)}; }
+GMEM_INLINE Vec<To> convert(Vec<From> a) {
+  return {convert<To>(a.x), convert<To>(a.y), convert<To>(a.z)};
+}
 
 }  // namespace GMEM_ISA
 }  // namespace gmem

@@ -15,7 +15,17 @@ namespace gmem {
 namespace GMEM_ISA {
 
 enum class Operation : std::int32_t {
-  add, subtract, negate, multiply, divide, fma, fms, fnma, root, inverse_root, select
+  add,
+  subtract,
+  negate,
+  multiply,
+  divide,
+  fma,
+  fms,
+  fnma,
+  root,
+  inverse_root,
+  select
 };
 
 // What was calculated, in order. A slot holds one number.
@@ -177,7 +187,9 @@ GMEM_INLINE Taped of_product(Operation operation, Real value, Taped a, Taped b, 
 GMEM_INLINE Taped operator*(Taped a, Taped b) {
   return of_product(Operation::multiply, a.value * b.value, a, b, Taped{});
 }
-GMEM_INLINE Taped operator/(Taped a, Taped b) { return of_product(Operation::divide, a.value / b.value, a, b, Taped{}); }
+GMEM_INLINE Taped operator/(Taped a, Taped b) {
+  return of_product(Operation::divide, a.value / b.value, a, b, Taped{});
+}
 GMEM_INLINE Taped fma(Taped a, Taped b, Taped c) {
   return of_product(Operation::fma, fma(a.value, b.value, c.value), a, b, c);
 }

@@ -25,7 +25,7 @@ struct Unequal {
 
 // From the second grain to its image in a periodic box (`Cell` of motion.h), which `shift` leads to. Levers already end
 // at the contact with that.
-// gmem_jax/physics/step.py: relative_motion
+// gmem_jax/physics/forces.py: relative_motion
 template <class V, class Cell>
 constexpr GMEM_INLINE void to_image(ContactInput<V>& m, Vec<V> shift, const Cell& cell) {
   m.lever_other = m.lever_other - shift;
@@ -63,7 +63,9 @@ constexpr GMEM_INLINE void relative_motion(const ContactInput<V>& m, V square, C
 
 // From the square of the distance and the inverse distance.
 template <class V>
-constexpr GMEM_INLINE V overlap_of(const Contact<V>& c) { return fnma(c.square, c.inverse, splat<V>(2.0)); }
+constexpr GMEM_INLINE V overlap_of(const Contact<V>& c) {
+  return fnma(c.square, c.inverse, splat<V>(2.0));
+}
 
 // From the motion of a contact halfway between the spheres to that of one that is not. Its normal is known, and `spin`, by how
 // much the second grain spins faster.
@@ -103,7 +105,7 @@ constexpr void close(Contact<V>* c, int count, const V* parameter, const Unequal
     if constexpr (differ) lean_over(motion_of(n), unequal[n].lean, c[n]);
     const V along = dot(c[n].sliding, normal);
     c[n].sliding = fnma(along, normal, c[n].sliding);
-    c[n].normal_force = -along;  // for now, the closing velocity
+    c[n].normal_force = -along;                             // for now, the closing velocity
     c[n].turned = quarter_dt * dot(c[n].spin_sum, normal);  // with the mean spin of the two grains
     if constexpr (differ) {
       c[n].overlap = fnma(c[n].square, c[n].inverse, unequal[n].reach);
@@ -137,7 +139,7 @@ constexpr GMEM_INLINE void rub(Contact<V>* c, int count, const LawParameters<V>&
 }
 
 // Force on i, and torques about the centres of both grains (j takes the opposite force).
-// gmem_jax/physics/step.py: contact_forces
+// gmem_jax/physics/forces.py: contact_forces
 template <class V>
 struct ContactLoads {
   Vec<V> force, torque_one, torque_other;

@@ -18,14 +18,14 @@ struct Contact {
   Vec<V> sliding;                 // relative velocity of the surfaces in the tangent plane; all of it at first
   Vec<V> lever_one, lever_other;  // from the grains' centres to the contact point
   Vec<V> spin_sum;
-  Vec<V> force;                   // tangential, on i
-  V overlap;                      // negative where apart
-  V root_overlap;                 // of 1 where apart
+  Vec<V> force;    // tangential, on i
+  V overlap;       // negative where apart
+  V root_overlap;  // of 1 where apart
   V normal_force;
-  V turned;                       // half the angle by which the contact turns about its normal in this step
-  V square;                       // of the length to be inverted next
+  V turned;  // half the angle by which the contact turns about its normal in this step
+  V square;  // of the length to be inverted next
   V inverse;
-  V before;                       // square of the force before it was flattened
+  V before;  // square of the force before it was flattened
   V* history;
 
   constexpr Mask<V> touching() const { return overlap > V{}; }
@@ -116,7 +116,9 @@ constexpr void carry(Contact<V>* c, int count, const From& from, const Then& the
 // The vector that a history begins with.
 struct Remembered {
   template <class V>
-  constexpr GMEM_INLINE Vec<V> operator()(const Contact<V>& c) const { return load_vec(c.history); }
+  constexpr GMEM_INLINE Vec<V> operator()(const Contact<V>& c) const {
+    return load_vec(c.history);
+  }
 };
 
 // By what a trial force is to be multiplied, of which `square` and `inverse` are the square and its inverse root.
@@ -164,7 +166,8 @@ constexpr GMEM_INLINE void friction(Rescaled, Contact<V>* c, int count, const La
   });
   coulomb(c, count, law.mu);
   for (int n = 0; n < count; ++n) {
-    store_vec(c[n].history, zero_unless(c[n].touching(), fnma(law.dashpot * c[n].root_overlap, c[n].sliding, c[n].force)));
+    store_vec(c[n].history,
+              zero_unless(c[n].touching(), fnma(law.dashpot * c[n].root_overlap, c[n].sliding, c[n].force)));
     c[n].history[kLastOverlap] = zero_unless(c[n].touching(), c[n].overlap);
   }
 }

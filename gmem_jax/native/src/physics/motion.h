@@ -15,7 +15,8 @@ struct WallState {
 
 // A box of which some axes are periodic: bit `axis` of `periodic`. Along the others there is nothing of it: rate and lower
 // are 0, lengths 1.
-// gmem_jax/physics/step.py: _carried, _strain_rate
+// gmem_jax/physics/step.py: _carried
+// gmem_jax/physics/forces.py: strain_rate
 template <class V>
 struct Cell {
   Vec<V> lower, lengths, rate;
@@ -73,8 +74,9 @@ struct GrainParameters {
 
   constexpr explicit GrainParameters(const V* parameter)
       : dt(parameter[kDt]), half_dt(splat<V>(0.5) * dt), drag(parameter[kDrag]),
-        slowed(splat<V>(1.0) / fma(half_dt, drag, splat<V>(1.0))), inverse_mass(splat<V>(1.0) / parameter[kMass]), wall_stiffness(parameter[kWallStiffness]),
-        normal_damping(parameter[kNormalDamping]), gravity(parameter[kGravity]) {
+        slowed(splat<V>(1.0) / fma(half_dt, drag, splat<V>(1.0))), inverse_mass(splat<V>(1.0) / parameter[kMass]),
+        wall_stiffness(parameter[kWallStiffness]), normal_damping(parameter[kNormalDamping]),
+        gravity(parameter[kGravity]) {
     for (int axis = 0; axis < 3; ++axis) {
       inertia[axis] = parameter[kInertia + axis];
       inverse_inertia[axis] = splat<V>(1.0) / inertia[axis];
@@ -114,7 +116,8 @@ constexpr Vec<V> angular_acceleration(const GrainParameters<V>& p, bool isotropi
   const Vec<V> body_spin = transposed(rotation, spin);
   const Vec<V> body_torque = transposed(rotation, torque);
   const auto rate = [&](Vec<V> spin) {
-    const Vec<V> left = body_torque - cross(spin, {p.inertia[0] * spin.x, p.inertia[1] * spin.y, p.inertia[2] * spin.z});
+    const Vec<V> left =
+        body_torque - cross(spin, {p.inertia[0] * spin.x, p.inertia[1] * spin.y, p.inertia[2] * spin.z});
     return Vec<V>{p.inverse_inertia[0] * left.x, p.inverse_inertia[1] * left.y, p.inverse_inertia[2] * left.z};
   };
   return rotation * rate(fma(p.half_dt, rate(body_spin), body_spin));
@@ -145,7 +148,8 @@ constexpr GMEM_INLINE Grain<V> end_step(const GrainParameters<V>& p, bool isotro
     const V slowing = p.drag + rate;
     return (fnma(slowing, velocity, p.inverse_mass * force) - gravity) / fma(p.half_dt, slowing, splat<V>(1.0));
   };
-  g.acceleration = {acceleration(m.velocity.x, force.x, cell.rate.x, V{}), acceleration(m.velocity.y, force.y, cell.rate.y, V{}),
+  g.acceleration = {acceleration(m.velocity.x, force.x, cell.rate.x, V{}),
+                    acceleration(m.velocity.y, force.y, cell.rate.y, V{}),
                     acceleration(m.velocity.z, force.z, cell.rate.z, p.gravity)};
   g.velocity = fma(p.half_dt, g.acceleration, m.velocity);
   return g;
@@ -178,10 +182,10 @@ constexpr Vec<V> wall_force(const GrainParameters<V>& parameters, Vec<V> overlap
 }
 
 // Adds to `on` the forces of the walls on one sphere of a grain, of a radius for which the walls have their stiffness.
-// gmem_jax/physics/step.py: _forces
+// gmem_jax/physics/forces.py: forces_on_grains
 template <class V>
 constexpr void touch_walls(const GrainParameters<V>& p, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
-                        const WallState<V>& box, WallForces<V>& on, V radius = splat<V>(1.0)) {
+                           const WallState<V>& box, WallForces<V>& on, V radius = splat<V>(1.0)) {
   const Vec<V> all{radius, radius, radius};
   if (!bits_less(V{}, deepest(radius, centre, box))) return;
   const Vec<V> lower = all - (centre - box.lower), upper = all - (box.upper - centre);
@@ -218,8 +222,8 @@ struct WallLaw {
 // A sphere's contact with a plane that is along `normal`, but for its friction and its history.
 // gmem_jax/physics/contact/wall.py: wall_kinematics
 template <class V>
-constexpr GMEM_INLINE void meet_plane(Vec<V> normal, const WallLaw<V>& walls, V damping_time, Vec<V> lever, Vec<V> velocity,
-                                      Vec<V> spin, V radius, V overlap, V closing, Contact<V>& now) {
+constexpr GMEM_INLINE void meet_plane(Vec<V> normal, const WallLaw<V>& walls, V damping_time, Vec<V> lever,
+                                      Vec<V> velocity, Vec<V> spin, V radius, V overlap, V closing, Contact<V>& now) {
   now.normal = normal;
   now.overlap = overlap;
   const Vec<V> arm = radius * now.normal;
@@ -243,9 +247,9 @@ constexpr Vec<V> normal_of_plane(int w) {
 // segments at plane w; is that anything but 0, the plane's bit of `remembered` is set. Returns these bits afterwards.
 // gmem_jax/physics/contact/wall.py: wall_friction
 template <class Law, class V, class SegmentsOf>
-GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls, Vec<V> centre, Vec<V> lever, Vec<V> velocity,
-                               Vec<V> spin, const WallState<V>& box, V radius, V* history, unsigned remembered,
-                               const SegmentsOf& segments_of, WallFriction<V>& on) {
+GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& walls, Vec<V> centre, Vec<V> lever,
+                               Vec<V> velocity, Vec<V> spin, const WallState<V>& box, V radius, V* history,
+                               unsigned remembered, const SegmentsOf& segments_of, WallFriction<V>& on) {
   if (!remembered && !bits_less(V{}, deepest(radius, centre, box))) return 0;
   const Vec<V> all{radius, radius, radius};
   const Vec<V> lower = all - (centre - box.lower), upper = all - (box.upper - centre);
@@ -268,7 +272,8 @@ GMEM_INLINE unsigned rub_walls(const GrainParameters<V>& p, const WallLaw<V>& wa
     touched |= 1u << w;
     c[count].history = own;
     stiffer[count].root = stiffer_by;
-    meet_plane(normal_of_plane<V>(w), walls, p.normal_damping, lever, velocity, spin, radius, overlap[w], closing[w], c[count]);
+    meet_plane(normal_of_plane<V>(w), walls, p.normal_damping, lever, velocity, spin, radius, overlap[w], closing[w],
+               c[count]);
     plane[count++] = w;
   }
   for (int done = 0; done < count; done += kTogether) {
@@ -303,7 +308,7 @@ constexpr GMEM_INLINE Vec<V> body_at(const Number* at) {
 }
 
 // Finds the spheres of a grain, handed to `put(k, centre)`, and what the walls do to them; whether they are near them.
-// gmem_jax/physics/step.py: sphere_table
+// gmem_jax/physics/forces.py: sphere_table
 template <class V, class Number, class Put>
 GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Number* offsets, int spheres,
                             double arm, const WallState<V>& box, WallForces<V>& on, const Put& put) {
@@ -317,8 +322,9 @@ GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, c
 
 // ... of a grain of some size, whose spheres have `radii` where it is 1 and are then within `outer` of its centre.
 template <class V, class Number, class Put>
-GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Number* offsets, const double* radii,
-                            int spheres, V size, double outer, const WallState<V>& box, WallForces<V>& on, const Put& put) {
+GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, const Number* offsets,
+                            const double* radii, int spheres, V size, double outer, const WallState<V>& box,
+                            WallForces<V>& on, const Put& put) {
   const Matrix<V> rotation = matrix(m.orientation);
   const bool near = bits_less(V{}, deepest(splat<V>(outer) * size, m.position, box)) != 0;
   for (int k = 0; k < spheres; ++k) {
@@ -336,13 +342,14 @@ GMEM_INLINE bool spheres_of(const GrainParameters<V>& p, const HalfStep<V>& m, c
 }
 
 // What a grain adds to L times the force across a section of a periodic box.
-// gmem_jax/physics/step.py: section_force
+// gmem_jax/physics/forces.py: section_force
 template <class V>
 constexpr Vec<V> section(const Cell<V>& cell, V mass, const HalfStep<V>& m, Vec<V> force) {
   const auto axis = [&](V at, V lower, V velocity, V force) {
     return fma(force, at - lower, mass * (velocity * velocity));
   };
-  return {axis(m.position.x, cell.lower.x, m.velocity.x, force.x), axis(m.position.y, cell.lower.y, m.velocity.y, force.y),
+  return {axis(m.position.x, cell.lower.x, m.velocity.x, force.x),
+          axis(m.position.y, cell.lower.y, m.velocity.y, force.y),
           axis(m.position.z, cell.lower.z, m.velocity.z, force.z)};
 }
 
@@ -358,11 +365,12 @@ constexpr Vec<V> pressure(const WallState<V>& box, Vec<V> force) {
 
 // Pressures along the periodic axes: of what the grains of a box add, and of the forces through its faces.
 template <class V>
-constexpr Vec<V> section_pressure(int periodic, const WallState<V>& box, const Cell<V>& cell, Vec<V> sections, Vec<V> through) {
+constexpr Vec<V> section_pressure(int periodic, const WallState<V>& box, const Cell<V>& cell, Vec<V> sections,
+                                  Vec<V> through) {
   const V two = splat<V>(2.0);
-  const Vec<V> p = pressure(box, {two * (through.x + sections.x / cell.lengths.x),
-                                  two * (through.y + sections.y / cell.lengths.y),
-                                  two * (through.z + sections.z / cell.lengths.z)});
+  const Vec<V> p =
+      pressure(box, {two * (through.x + sections.x / cell.lengths.x), two * (through.y + sections.y / cell.lengths.y),
+                     two * (through.z + sections.z / cell.lengths.z)});
   return {periodic & 1 ? p.x : V{}, periodic & 2 ? p.y : V{}, periodic & 4 ? p.z : V{}};
 }
 

@@ -31,10 +31,14 @@ struct Matrix {
 };
 
 template <class V>
-constexpr Vec<V> operator*(const Matrix<V>& m, Vec<V> a) { return {dot(m.row[0], a), dot(m.row[1], a), dot(m.row[2], a)}; }
+constexpr Vec<V> operator*(const Matrix<V>& m, Vec<V> a) {
+  return {dot(m.row[0], a), dot(m.row[1], a), dot(m.row[2], a)};
+}
 
 template <class V>
-constexpr Vec<V> transposed(const Matrix<V>& m, Vec<V> a) { return fma(a.z, m.row[2], fma(a.y, m.row[1], a.x * m.row[0])); }
+constexpr Vec<V> transposed(const Matrix<V>& m, Vec<V> a) {
+  return fma(a.z, m.row[2], fma(a.y, m.row[1], a.x * m.row[0]));
+}
 
 // Lab components of body vectors.
 // gmem_jax/physics/rotation.py: matrix
@@ -45,7 +49,8 @@ constexpr Matrix<V> matrix(Quaternion<V> q) {
   const V xx = x * q.v.x, yy = y * q.v.y, zz = z * q.v.z;
   const V xy = x * q.v.y, xz = x * q.v.z, yz = y * q.v.z;
   const V wx = q.w * x, wy = q.w * y, wz = q.w * z;
-  return {{{one - (yy + zz), xy - wz, xz + wy}, {xy + wz, one - (xx + zz), yz - wx}, {xz - wy, yz + wx, one - (xx + yy)}}};
+  return {
+      {{one - (yy + zz), xy - wz, xz + wy}, {xy + wz, one - (xx + zz), yz - wx}, {xz - wy, yz + wx, one - (xx + yy)}}};
 }
 
 }  // namespace GMEM_ISA

@@ -21,7 +21,9 @@ struct Segment {
 constexpr double kNowhere = 1e9;
 
 template <class V>
-constexpr Segment<V> no_segment() { return {Flat<V>{}, splat<V>(kNowhere)}; }
+constexpr Segment<V> no_segment() {
+  return {Flat<V>{}, splat<V>(kNowhere)};
+}
 
 template <class V>
 inline void copy_lane(Segment<V>& to, int l, const Segment<V>& from) {
@@ -39,7 +41,9 @@ struct Layers {
 };
 
 template <class V>
-constexpr Layers<V> load_layers(const V* p) { return {{p[0], p[1]}, {p[2], p[3]}, {p[4], p[5]}}; }
+constexpr Layers<V> load_layers(const V* p) {
+  return {{p[0], p[1]}, {p[2], p[3]}, {p[4], p[5]}};
+}
 template <class V>
 constexpr void store_layers(V* p, const Layers<V>& a) {
   p[0] = a.common.along, p[1] = a.common.across;
@@ -61,7 +65,8 @@ void reattach(Segments& segments, Layers<V>& layers, V before, V outer, double l
   for (int k = 0; k < stored + 2; ++k) {
     Segment<V> segment = k < stored ? segments.get(k) : no_segment<V>();
     segment.force = segment.force + common;
-    const Mask<V> stays = segment.start < outer, reaches = segment.start <= outer, begins = grows & (outer <= segment.start);
+    const Mask<V> stays = segment.start < outer, reaches = segment.start <= outer,
+                  begins = grows & (outer <= segment.start);
     rim = select(shrinks & reaches, segment.force, rim);
     // First the ring that was the outermost, then those that were passed in this step.
     const Mask<V> former = begins & (last < before);

@@ -1,0 +1,102 @@
+"""What of an experiment and of a running state is differentiated by."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import fields
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gmem_jax.experiment.arguments import require_several
+from gmem_jax.experiment.changes import replace as with_values
+from gmem_jax.experiment.changes import value_at
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.physics.state import State
+from gmem_jax.simulation.loop import Simulation
+from gmem_jax.simulation.progress import work_of
+from gmem_jax.simulation.runner import Runner
+
+STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
+LENGTHS = ("pack.clump.radii", "pack.clump.sizes")  # of spheres that are not all alike
+
+Moving = tuple[Any, ...]  # grains, histories, held walls and periodic cell: what of a state can be differentiated
+
+
+def fixed_by(names: Iterable[str]) -> tuple[str, ...]:
+    """Parts of a simulation that are not differentiated by: the list, the mark, and lengths that no name has.
+
+    The library has no derivatives by these lengths: where one is wanted, all are those of plain JAX.
+    """
+    lengths = [length for length in LENGTHS if not any(f"{length}.".startswith(f"{name}.") for name in names)]
+    return (".system.pairs", ".mark", *(length.replace("pack", ".system") for length in lengths))
+
+
+def _is_moving(path: Any, leaf: Any, fixed: tuple[str, ...]) -> bool:
+    """Whether a number of a simulation is differentiated by."""
+    floats = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+    return floats and not jax.tree_util.keystr(path).startswith(fixed)
+
+
+def numbers_of(simulation: Simulation, fixed: tuple[str, ...]) -> list[jax.Array]:
+    """The numbers of a simulation that are differentiated by."""
+    leaves = jax.tree_util.tree_leaves_with_path(simulation)
+    return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf, fixed)]
+
+
+def with_numbers(simulation: Simulation, numbers: Sequence[jax.Array], fixed: tuple[str, ...]) -> Simulation:
+    """The simulation with other numbers in the place of `numbers_of`."""
+    left = iter(numbers)
+    leaves, structure = jax.tree_util.tree_flatten_with_path(simulation)
+    filled: Simulation = jax.tree.unflatten(
+        structure, [next(left) if _is_moving(path, leaf, fixed) else leaf for path, leaf in leaves]
+    )
+    return filled
+
+
+def moving_of(state: State) -> Moving:
+    """What of a state can be differentiated."""
+    return state.grains, state.history, state.servo, state.cell, state.wall_history
+
+
+def state_of(moving: Moving, status: jax.Array) -> State:
+    """The state that has these numbers."""
+    return State(moving[0], moving[1], status, *moving[2:])
+
+
+def theta_of(experiment: Experiment, names: Any) -> dict[str, Any]:
+    """What stands at names, as arrays.
+
+    Raises:
+        ValueError: if there is no such name, it holds what has no derivative, or it is within another.
+    """
+    require_several(names, "by")
+    found = {name: value_at(experiment, name) for name in names}
+    for name, tree in found.items():
+        if inside := next((other for other in found if name.startswith(f"{other}.")), ""):
+            raise ValueError(f"{name} is part of {inside}; name one of them")
+        if name in STATIC_FIELDS or tree is None or not all(map(_is_number, jax.tree.leaves(tree))):
+            raise ValueError(
+                f"{name} is fixed when a program is compiled and has no derivative; "
+                "numbers like gamma0, friction.mu, signals.amplitudes and pack.position have"
+            )
+    theta = {name: jax.tree.map(jnp.asarray, tree) for name, tree in found.items()}
+    for name, tree in theta.items():
+        if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
+            raise ValueError(f"{name} holds more than floats; name what to differentiate by, like pack.position")
+    return theta
+
+
+def _is_number(leaf: Any) -> bool:
+    return isinstance(leaf, float | int | np.ndarray | jax.Array)
+
+
+def at_values(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
+    """From values by name to the experiment that has them."""
+    return lambda theta: with_values(experiment, theta)
+
+
+def whole_work(experiment: Experiment, on: Runner) -> float:
+    """Work of all stages, of a runner at their beginning."""
+    common, own = experiment.phases
+    return work_of(common, on.state.replicas) + work_of(own, experiment.replicas)

@@ -1,0 +1,93 @@
+"""An experiment with other numbers: its fields by dotted names."""
+
+import copy
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from gmem_jax.experiment.arguments import require_kind, require_once
+from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.signals import SignalSets, part, sets_of
+from gmem_jax.physics.pytree import traced
+from gmem_jax.physics.rules import usual_rules
+from gmem_jax.simulation.protocol import Protocol
+
+
+@usual_rules()
+def replace(experiment: Experiment, values: Mapping[str, Any] | None = None, /, **changes: Any) -> Experiment:
+    """The same experiment with other fields.
+
+    A traced t0 keeps the number of steps that the experiment has; a concrete one has it chosen anew unless it was
+    given.
+
+    Args:
+        experiment: the experiment; it stays as it is.
+        values: what changes by dotted name, like {"friction.mu": 0.5}.
+        changes: what changes by field.
+
+    Raises:
+        ValueError: if there is no such field, it is given twice, or the new experiment is impossible.
+    """
+    require_kind("replace", experiment, Experiment)
+    found: dict[str, Any] = dict(changes)
+    require_once(values or {}, changes)
+    for path, value in (values or {}).items():
+        name, *deeper = path.split(".")
+        _require_field(experiment, name)
+        before = found.get(name, getattr(experiment, name))
+        found[name] = _with(before, deeper, value)
+    for name in found:
+        _require_field(experiment, name)
+    if traced(found.get("t0")):
+        found.setdefault("steps", experiment.steps_per_bin)
+    if experiment.is_paper:  # it is made anew of the new numbers and sets
+        found.setdefault("protocol", None)
+    return dataclasses.replace(experiment, **found)
+
+
+def with_part(experiment: Experiment, first: int, last: int) -> Experiment:
+    """The same experiment with waveforms number `first` to `last` - 1 alone, be they silent: the whole set is not."""
+    few = copy.copy(experiment)
+    object.__setattr__(few, "signals", part(experiment.signals, first, last))
+    return few
+
+
+def _with(tree: Any, path: list[str], value: Any) -> Any:
+    if not path:
+        return value
+    if isinstance(tree, Protocol):
+        return tree.with_value(".".join(path), value)
+    if isinstance(tree, SignalSets) and path[0] in tree.names:
+        sets = [_with(one, path[1:], value) if name == path[0] else one for name, one in sets_of(tree).items()]
+        return SignalSets(tuple(sets), tree.names)
+    _require_field(tree, path[0])
+    return dataclasses.replace(tree, **{path[0]: _with(getattr(tree, path[0]), path[1:], value)})
+
+
+def value_at(experiment: Experiment, path: str) -> Any:
+    """What stands at a dotted name, like "friction.mu"; defaults resolved.
+
+    Raises:
+        ValueError: if there is no such field.
+    """
+    resolved: dict[str, Any] = {"delta0": experiment.compression, "hold_drag": experiment.drag}
+    if path in resolved:
+        return resolved[path]
+    found: Any = experiment
+    for name in path.split("."):
+        if isinstance(found, SignalSets) and name in found.names:
+            found = sets_of(found)[name]
+            continue
+        _require_field(found, name)
+        found = getattr(found, name)
+    return found
+
+
+def _require_field(tree: Any, name: str) -> None:
+    names = [field.name for field in fields(tree)] if is_dataclass(tree) else []
+    if name not in names:
+        parts = [part for part in names if is_dataclass(getattr(tree, part))]
+        near = [f"{part}.{name}" for part in parts if any(one.name == name for one in fields(getattr(tree, part)))]
+        meant = f" (meant is {' or '.join(near)}?)" if near else ""
+        raise ValueError(f"{type(tree).__name__} has no field {name!r}{meant}; it has {', '.join(names) or 'none'}")

@@ -1,0 +1,289 @@
+"""A stage of a protocol as data, and the table of bins that stages make up."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import numpy as np
+
+from gmem_jax.physics.pytree import static_record
+from gmem_jax.simulation.channels import CHANNELS
+
+BINS = 256  # bins of a stage of length t0, as in the paper: the resolution of every recorded quantity
+SINE = "sine:"  # begins the name of a drive of whole sine periods
+
+Numbers = float | np.ndarray | jax.Array
+"""A number, or a column of a table."""
+
+Role = Literal["condition", "write", "hold", "read"]
+"""What a stage is for: to strain the pack without a waveform, to apply one, to wait, or to measure what it recalls."""
+Along = Literal["u", "time"]
+"""What a waveform is a function of: the compression u, or the time since the stage began, over its length."""
+
+
+class Bin(NamedTuple):
+    """One bin of t0 / 256 as numbers, or a table of them with a leading axis on each.
+
+    Attributes:
+        start: u at the beginning of its stage.
+        stop: u at the end of its stage.
+        bins: length of its stage.
+        number: its place in the stage, from 0.
+        timed: whether waveforms are functions of time.
+        still: whether the drag of the simulation acts.
+        amplitudes: of each of `Columns.lanes`; 0 where it is not applied.
+        drag: of the stage, in the place of the simulation's, 1 / t_c; None where no stage has one.
+        friction: 1, or 0 where the stage switches friction off; None where no stage does.
+        pressure: that the walls of each axis are held at, in E, 0 for walls that are not; None where no stage has one.
+    """
+
+    start: Numbers
+    stop: Numbers
+    bins: Numbers
+    number: Numbers
+    timed: Numbers
+    still: Numbers
+    amplitudes: tuple[Numbers, ...] = ()
+    drag: Numbers | None = None
+    friction: Numbers | None = None
+    pressure: tuple[Numbers, Numbers, Numbers] | None = None
+
+    @property
+    def u(self) -> Any:
+        """The compression variable at the end of the bin."""
+        return self.start + (self.stop - self.start) * ((self.number + 1) / self.bins)
+
+
+@static_record
+@dataclass(frozen=True)
+class Drive:
+    """A waveform on a channel.
+
+    Attributes:
+        channel: one of `CHANNELS`; "" for the channel that is called like the waveforms.
+        waveform: the name of a set of waveforms, of which each replica has its own; "" for all sets that are called
+            like a channel. Or one for all replicas, the zero signal's too: its samples at k / (n + 1), k = 1..n, or
+            "sine:n", n whole periods.
+        amplitude: what it is multiplied with, beside gamma0.
+
+    Raises:
+        ValueError: for an unknown channel, or what makes no waveform.
+    """
+
+    channel: str = ""
+    waveform: str | tuple[float, ...] = ""
+    amplitude: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.channel and self.channel not in CHANNELS:
+            raise ValueError(f"a channel must be one of {', '.join(CHANNELS)}; got {self.channel!r}")
+        if not isinstance(self.waveform, str):
+            object.__setattr__(self, "waveform", tuple(map(float, self.waveform)))
+            if len(self.waveform) < 2 or not all(map(math.isfinite, self.waveform)):
+                raise ValueError(
+                    "a fixed waveform is made of 2 or more finite samples between its ends, which are zero"
+                )
+        elif self.waveform.startswith(SINE) and self.periods < 1:
+            raise ValueError(f"a sine has whole periods, as in 'sine:4'; got {self.waveform!r}")
+        if self.fixed and not self.channel:
+            raise ValueError("a fixed waveform needs a channel, as in channel='xy'")
+        if isinstance(self.amplitude, bool) or not math.isfinite(self.amplitude):
+            raise ValueError(f"the amplitude of a drive must be a finite number, got {self.amplitude!r}")
+        object.__setattr__(self, "amplitude", float(self.amplitude))
+
+    @property
+    def fixed(self) -> bool:
+        """Whether it is the same for all replicas."""
+        return not isinstance(self.waveform, str) or self.waveform.startswith(SINE)
+
+    @property
+    def periods(self) -> int:
+        """Of a sine; 0 of what is none."""
+        count = self.waveform.removeprefix(SINE) if isinstance(self.waveform, str) else ""
+        return int(count) if count.isdecimal() else 0
+
+    @property
+    def lane(self) -> "Lane":
+        """What of it does not change from bin to bin."""
+        return Lane(self.channel, self.waveform)
+
+
+class Lane(NamedTuple):
+    """A waveform on a channel, whatever its amplitude: a column of a table of bins. See `Drive`."""
+
+    channel: str
+    waveform: str | tuple[float, ...]
+
+
+OWN = (Drive(),)
+"""Each set of waveforms on the channel of its name."""
+
+
+class Columns(NamedTuple):
+    """What some stages make use of: programs are compiled for it.
+
+    Attributes:
+        lanes: waveforms by channel.
+        drag: whether any stage has a drag of its own.
+        friction: whether any switches friction off.
+        pressure: whether any holds walls at a pressure.
+    """
+
+    lanes: tuple[Lane, ...] = ()
+    drag: bool = False
+    friction: bool = False
+    pressure: bool = False
+
+
+@static_record
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a protocol.
+
+    Attributes:
+        name: for people; nothing follows from it.
+        start: u at its beginning; None for where the stage before ends.
+        stop: u at its end; None for where it begins.
+        length: duration in units of t0.
+        role: what it is for.
+        drives: the waveforms that are applied.
+        along: what they are a function of; default u, or time where u stands still.
+        drag: viscous drag, 1 / t_c; default the experiment's where the walls stand still, else none.
+        friction: whether grains rub.
+        pressure: at which the walls of x, y, z are held by a servo, in E; None for walls that follow u. They stay where
+            the stage leaves them: what follows strains the box from there.
+        of: of a stage that reads, the stage whose waveforms its recall is compared with; default the last that wrote on
+            each channel.
+        mark: whether observers compare with the beginning of this stage (`gmem_jax.simulation.observables`).
+        recorded: whether its samples are kept.
+
+    Raises:
+        ValueError: for what no stage can be.
+    """
+
+    name: str
+    start: float | None = None
+    stop: float | None = None
+    length: float = 1.0
+    role: Role = "condition"
+    drives: tuple[Drive, ...] = ()
+    along: Along | None = None
+    drag: float | None = None
+    friction: bool = True
+    pressure: tuple[float | None, float | None, float | None] | None = None
+    of: str | None = None
+    mark: bool = False
+    recorded: bool = True
+
+    def __post_init__(self) -> None:
+        def refuse(problem: str) -> None:
+            raise ValueError(f"stage {self.name!r}: {problem}")
+
+        object.__setattr__(self, "drives", tuple(self.drives))
+        if not isinstance(self.name, str) or not self.name.isprintable() or not self.name or "/" in self.name:
+            raise ValueError(f"a stage has a name of printable letters without '/', got {self.name!r}")
+        if self.role not in get_args(Role):
+            refuse(f"its role must be one of {', '.join(get_args(Role))}; got {self.role!r}")
+        if self.along not in (None, *get_args(Along)):
+            refuse(f"along must be one of {', '.join(get_args(Along))}; got {self.along!r}")
+        for name in ("start", "stop"):
+            u = getattr(self, name)
+            if u is not None and not 0.0 <= u <= 1.0:
+                refuse(f"u must be in [0, 1], and its {name} is {u}")
+        if not 0.0 <= self.length < math.inf:
+            refuse(f"its length must be in [0, inf), got {self.length}")
+        if self.drag is not None and not 0.0 <= self.drag < math.inf:
+            refuse(f"its drag must be in [0, inf), got {self.drag}")
+        if self.role == "write" and not self.drives:
+            refuse("it writes no waveform; give it drives, or another role")
+        if self.of is not None and self.role != "read":
+            refuse("only a stage that reads is compared with another")
+        if self.role == "read" and not self.recorded:
+            refuse("what is read is recorded")
+        if self.pressure is not None:
+            object.__setattr__(self, "pressure", tuple(self.pressure))
+            if len(self.pressure) != 3 or not all(p is None or 0.0 < p < math.inf for p in self.pressure):
+                refuse(f"its pressure is three numbers above 0 or none, for x, y and z; got {self.pressure}")
+
+    @property
+    def bins(self) -> int:
+        """Length in bins of t0 / 256; a hold is rounded up to whole bins."""
+        return max(1, math.ceil(self.length * BINS - 1e-9))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """u at its beginning and at its end, of a stage of a protocol."""
+        return self.start or 0.0, self.stop or 0.0
+
+    @property
+    def moves(self) -> bool:
+        """Whether u changes."""
+        return self.start != self.stop
+
+    @property
+    def timed(self) -> bool:
+        """Whether waveforms are functions of time."""
+        return self.along == "time" or not self.moves
+
+    @property
+    def sheared(self) -> bool:
+        """Whether a waveform is applied."""
+        return bool(self.drives)
+
+    @property
+    def own(self) -> tuple[Drive, ...]:
+        """The drives of which each replica has its own waveform."""
+        return tuple(drive for drive in self.drives if not drive.fixed)
+
+    def rows(self, first: Any, count: int | None = None, columns: Columns | None = None) -> Bin:
+        """The bin of number `first`, or `count` bins from there on, as columns [count].
+
+        Args:
+            first: number of the bin, from 0.
+            count: how many; None for one bin, of numbers.
+            columns: which columns the table has; default those that this stage needs.
+        """
+        columns = columns_of((self,)) if columns is None else columns
+        held = None if self.pressure is None else tuple(p or 0.0 for p in self.pressure)
+        amplitudes = Counter[Lane]()
+        for drive in self.drives:
+            amplitudes[drive.lane] += drive.amplitude  # type: ignore[assignment]
+        row = Bin(
+            *self.ends,
+            self.bins,
+            first if count is None else first + np.arange(count),
+            self.timed,
+            not (self.moves or self.drives) and self.drag is None,
+            tuple(float(amplitudes[lane]) for lane in columns.lanes),
+            (self.drag or 0.0) if columns.drag else None,
+            float(self.friction) if columns.friction else None,
+            (held or (0.0, 0.0, 0.0)) if columns.pressure else None,  # type: ignore[arg-type]
+        )
+        if count is None:
+            return row
+        table_: Bin = jax.tree.map(lambda column: np.broadcast_to(column, count), row)
+        return table_
+
+
+def columns_of(stages: Iterable[Stage]) -> Columns:
+    """The columns that some stages need."""
+    stages = tuple(stages)
+    lanes = dict.fromkeys(drive.lane for stage in stages for drive in stage.drives)
+    return Columns(
+        tuple(lanes),
+        any(stage.drag is not None for stage in stages),
+        not all(stage.friction for stage in stages),
+        any(stage.pressure is not None for stage in stages),
+    )
+
+
+def table(stages: Iterable[Stage], columns: Columns | None = None) -> Bin:
+    """All bins of some stages, one after the other; [rows] each."""
+    stages = tuple(stages)
+    columns = columns_of(stages) if columns is None else columns
+    parts = [stage.rows(0, stage.bins, columns) for stage in stages]
+    joined: Bin = jax.tree.map(lambda *column: np.concatenate(column), *parts)
+    return joined
