@@ -108,8 +108,8 @@ def prepare_command(
     clump = grain_of(shape, overlap)
     if standard is not None:
         own = ("output", "shape", "overlap", "name", *(entry.name for entry in fields(Recipe)))
-        refuse_idle(f"beside {standard}: the name of a standard pack says all about it", *own)
         recipe, name, output = standard_recipe(standard), standard, kept_pack(standard)
+        refuse_idle(f"beside {standard}: the name of a standard pack says all about it", *own)
         if output is None:
             raise InputError(f"{standard}: there is no home folder to keep it in; set XDG_CACHE_HOME")
         try:

@@ -115,7 +115,7 @@ class Recipe:
                 kind = "a whole number" if entry.type is int else "a number"
                 raise ValueError(f"{entry.name} must be {kind} in {within.words}, got {given!r}") from None
             if entry.name == "grains" and value < FEWEST_GRAINS:
-                raise ValueError(f"grains must be at least {FEWEST_GRAINS} to jam between six walls, got {given}")
+                raise ValueError(f"grains must be at least {FEWEST_GRAINS} to jam, got {given}")
             if not within.holds(value):
                 raise ValueError(f"{entry.name} must be in {within.words}{unit and ' ' + unit}, got {given}")
             object.__setattr__(self, entry.name, value)

@@ -216,7 +216,8 @@ BAD = [
         ["prepare", "--shape", "cube", "-o", "{out}"],
         "must be tetra or sphere, or a file of spheres, got 'cube'",
     ),
-    (["prepare", "--grains", "0", "-o", "{out}"], "grains must be at least 12 to jam between six walls, got 0"),
+    (["prepare", "p", "--grains", "27"], "p: a standard pack is called tetra-N-x, N grains and a letter for the seed"),
+    (["prepare", "--grains", "0", "-o", "{out}"], "grains must be at least 12 to jam, got 0"),
     (["prepare", "--overlap", "1.0", "-o", "{out}"], "overlap must be in [0, 1), got 1"),
     (
         ["prepare", "--shape", "sphere", "--overlap", "0.3", "-o", "{out}"],
