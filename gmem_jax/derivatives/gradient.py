@@ -18,7 +18,6 @@ from jax import lax
 
 from gmem_jax.derivatives.moving import (
     Moving,
-    at_values,
     fixed_by,
     moving_of,
     numbers_of,
@@ -28,6 +27,7 @@ from gmem_jax.derivatives.moving import (
     with_numbers,
 )
 from gmem_jax.experiment.arguments import require_kind
+from gmem_jax.experiment.changes import replace as with_values
 from gmem_jax.experiment.experiment import Experiment, acts_on_prefix
 from gmem_jax.experiment.run import apply_waveforms, runner_of
 from gmem_jax.physics.pytree import comparable, short_repr
@@ -201,7 +201,7 @@ def value_and_grad(
     """
     require_kind("value_and_grad", experiment, Experiment)
     tell = callback(progress)
-    theta, along = theta_of(experiment, by), at_values(experiment)
+    theta, along = theta_of(experiment, by), functools.partial(with_values, experiment)
     common, own = experiment.phases
     on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))
     on.total_work = whole_work(experiment, on)

@@ -1,6 +1,6 @@
 """What of an experiment and of a running state is differentiated by."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_several
-from gmem_jax.experiment.changes import replace as with_values
 from gmem_jax.experiment.changes import value_at
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.physics.state import State
@@ -89,11 +88,6 @@ def theta_of(experiment: Experiment, names: Any) -> dict[str, Any]:
 
 def _is_number(leaf: Any) -> bool:
     return isinstance(leaf, float | int | np.ndarray | jax.Array)
-
-
-def at_values(experiment: Experiment) -> Callable[[dict[str, Any]], Experiment]:
-    """From values by name to the experiment that has them."""
-    return lambda theta: with_values(experiment, theta)
 
 
 def whole_work(experiment: Experiment, on: Runner) -> float:

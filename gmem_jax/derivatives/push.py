@@ -10,7 +10,6 @@ import numpy as np
 
 from gmem_jax.derivatives.moving import (
     Moving,
-    at_values,
     fixed_by,
     moving_of,
     numbers_of,
@@ -125,14 +124,13 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
         RunFailedError: if the simulation broke down.
     """
     theta, tangent = theta_of(experiment, direction), jax.tree.map(jnp.asarray, dict(direction))
-    along = at_values(experiment)
     common, own = experiment.phases
     on = runner_of(experiment, progress=progress)
     on.total_work = whole_work(experiment, on)
     wide = on.state.replicas > 1
     slope: Moving | None = None
     if any(map(acts_on_prefix, theta)):
-        slope = jax.jvp(lambda theta: moving_of(along(theta).begin()), (theta,), (tangent,))[1]
+        slope = jax.jvp(lambda theta: moving_of(with_values(experiment, theta).begin()), (theta,), (tangent,))[1]
     fixed = fixed_by(theta)
     pushing = _Pushing(fixed, _number_slope(experiment, theta, tangent, fixed, sheared=False), slope)
     on.observers = (pushing,)

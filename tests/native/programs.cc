@@ -61,8 +61,8 @@ void contact() {
   for (int n = 0; n < kInputs; ++n)
     own[n] = splat<Real>(meeting[n]) * (splat<Real>(1.0) + splat<Real>(0.3) * random.lanes());
   for (int q = kInputs; q < Calculation::kNumbers; ++q) own[q] = splat<Real>(2e-3) * random.lanes();
-  for (int axis = 0; axis < 3;
-       ++axis) {  // not too far into each other, and Mindlin's contacts in the same ring as before
+  // Not too far into each other, and Mindlin's contacts in the same ring as before.
+  for (int axis = 0; axis < 3; ++axis) {
     const Real spread = Law::kLayered ? splat<Real>(0.002) * random.lanes() : splat<Real>(0.04) * random.lanes();
     own[axis] = splat<Real>(meeting[axis]) * (splat<Real>(1.0) + spread);
   }

@@ -71,8 +71,8 @@ class Reader {
   }
 
  private:
-  static constexpr int64_t kLargest = int64_t{1}
-                                      << 27;  // numbers of rows, times those in a row, are integers of 32 bits
+  // Numbers of rows, times those in a row, are integers of 32 bits.
+  static constexpr int64_t kLargest = int64_t{1} << 27;
 
   static std::string shown(xla::ffi::AnyBuffer::Dimensions dims) {
     std::string text;

@@ -674,7 +674,7 @@ struct Adjoint : AdjointLayout<Law> {
     Contact<Taped> contact;
     contact.history = memory;
     relative_motion(input, dot(input.separation, input.separation), contact);
-    general ? close<true>(&contact, 1, parameter.row, &unequal, [&](int) { return input; })
+    general ? close<true>(&contact, 1, parameter.row, &unequal, [&](int) { return input.spin_other - input.spin_one; })
             : close(&contact, 1, parameter.row);
     rub<Law>(&contact, 1, law, general ? &unequal : nullptr, [&](int) { return Segments{problem.points, &now}; });
 

@@ -164,7 +164,8 @@ struct OneContact {
     Contact<Symbol> contact{};
     contact.history = history;
     relative_motion(meeting, dot(meeting.separation, meeting.separation), contact);
-    if constexpr (general) close<true>(&contact, 1, parameter, &unequal, [&](int) { return meeting; });
+    if constexpr (general)
+      close<true>(&contact, 1, parameter, &unequal, [&](int) { return meeting.spin_other - meeting.spin_one; });
     else close(&contact, 1, parameter);
     SameRings rings{};
     if constexpr (Law::kLayered) rings.end = input(program, 3, 0, Bar::none);

@@ -74,8 +74,8 @@ struct Arguments {
   Entries<const signed char> image;     // by how many edges of a periodic box the second sphere is moved, [P, 3]
   Entries<const double> offsets;        // sphere centres of a grain, [K, 3]
   Entries<const double> along_offsets;  // ... and their derivatives, where there are any, [K, 3, B]
-  Entries<const double> radii,
-      sizes;  // where spheres differ in radius: of those of a grain of size 1, and of grains; [K], [N]
+  // Where spheres differ in radius: of those of a grain of size 1, and of grains; [K], [N].
+  Entries<const double> radii, sizes;
   Table parameters, walls, grains_in[kFields];
   Table grains_out[kFields], pressure_out;  // values, or derivatives where they are wanted
   Memories contacts, at_walls;              // of the candidates, P; and of every sphere at `kPlanes` planes

@@ -19,8 +19,8 @@ namespace {
 
 namespace ffi = xla::ffi;
 
-constexpr int kFew =
-    1 << 17;                // grains times lanes from which on one thread a grain keeps a GPU busy (an H200, measured)
+// Grains times lanes from which on one thread a grain keeps a GPU busy (an H200, measured).
+constexpr int kFew = 1 << 17;
 constexpr int kOfPack = 8;  // arguments that belong to a pack
 
 // Beside the letters of call/signature.h: columns of the incidence C, candidates and spheres A, numbers of a cold grain O,

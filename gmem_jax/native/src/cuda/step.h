@@ -421,7 +421,8 @@ void touch(const Arguments& a, int step, int thread) {
   Contact<V> contact;
   relative_motion(input, square, contact);
   contact.history = memory.number;
-  if constexpr (unequal) close<true>(&contact, 1, parameter, &differing, [&](int) { return input; });
+  if constexpr (unequal)
+    close<true>(&contact, 1, parameter, &differing, [&](int) { return input.spin_other - input.spin_one; });
   else close(&contact, 1, parameter);
   rub<Law>(&contact, 1, law, unequal ? &differing : nullptr, [&](int) { return segments_of(on, a.contacts, row); });
   if constexpr (unequal) point = point + differing.lean * contact.normal;

@@ -16,6 +16,7 @@
 namespace gmem {
 namespace GMEM_ISA {
 
+// The last four give masks.
 enum class Step : unsigned char {
   input,
   constant,
@@ -34,7 +35,7 @@ enum class Step : unsigned char {
   less,
   at_most,
   both,
-  either  // these give masks
+  either
 };
 
 // What becomes of the derivative ("bar") by an input: none is wanted, it is written, or it is added to what is there.
