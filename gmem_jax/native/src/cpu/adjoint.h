@@ -614,10 +614,9 @@ struct Adjoint : AdjointLayout<Law> {
 
   // What is constant of a contact; see `ContactConstant`.
   void load_constants(std::size_t c, V* to) const {
-    const Image image = plan.image ? plan.image[c] : Image{0, 0, 0};
+    const Image image = plan.image ? plan.image_of(c) : Image{0.0, 0.0, 0.0};
     const Radii radii = plan.radii ? plan.radii[c] : Radii{2.0, 0.0, 1.0, 4.0};
-    const double constant[kContactConstants] = {1.0 * image.x, 1.0 * image.y, 1.0 * image.z,
-                                                radii.reach,   radii.lean,    radii.root};
+    const double constant[kContactConstants] = {image.x, image.y, image.z, radii.reach, radii.lean, radii.root};
     for (int n = 0; n < kContactConstants; ++n) to[n] = splat<V>(constant[n]);
   }
 

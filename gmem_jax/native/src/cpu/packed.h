@@ -269,17 +269,14 @@ struct Packed : PackedLayout<Law> {
     compute(touching, count, parameter, law, faces);
   }
 
-  // By what the second sphere of a candidate is moved in a periodic box.
-  Row shift(const Cell<V>& cell, std::size_t c) const {
-    if (c >= static_cast<std::size_t>(plan.candidates)) return Row{};
-    const Image& image = plan.image[c];
-    return Row{image.x * cell.lengths.x[0], image.y * cell.lengths.y[0], image.z * cell.lengths.z[0]};
-  }
+  // By how many edges of a periodic box the second sphere of a candidate is moved, and how long these are.
+  const Row& image_of(std::size_t c) const { return reinterpret_cast<const Row&>(plan.image_of(c)); }
+  static Row edges(const Cell<V>& cell) { return Row{cell.lengths.x[0], cell.lengths.y[0], cell.lengths.z[0]}; }
 
   // Whether a candidate that did not touch at the last step does now, by the same arithmetic as in vectors.
   bool touches(std::size_t c, double travel, const Cell<V>& cell) {
     const Row other = sphere[plan.candidate[c].other];
-    const Row d = (plan.image ? other + shift(cell, c) : other) - sphere[plan.candidate[c].one];
+    const Row d = (plan.image ? other + image_of(c) * edges(cell) : other) - sphere[plan.candidate[c].one];
     const double square = fma(d[2], d[2], fma(d[1], d[1], d[0] * d[0]));
     const Radii radii = plan.radii ? plan.radii[c] : Radii{2.0, 0.0, 1.0, 4.0};
     if (square < radii.square) return marks.touched[c] = true;
@@ -300,6 +297,14 @@ struct Packed : PackedLayout<Law> {
   }
 
   void compute(const int* touching, int count, const V* parameter, const LawParameters<V>& law, Faces<V>& faces) {
+    plan.image ? compute_in<true>(touching, count, parameter, law, faces)
+               : compute_in<false>(touching, count, parameter, law, faces);
+  }
+
+  // ... in a box that has periodic axes or has not: GCC makes faster code of the two apart.
+  template <bool periodic>
+  __attribute__((noinline)) void compute_in(const int* touching, int count, const V* parameter,
+                                            const LawParameters<V>& law, Faces<V>& faces) {
     constexpr int kGroups = kTogether;
     Group group[kGroups];
     Contact<V> contact[kGroups];
@@ -311,7 +316,7 @@ struct Packed : PackedLayout<Law> {
       group[n] = group_of(touching + n * W, count - n * W);
       contact[n].history = memory[n];
       read_history(group[n], memory[n]);
-      const ContactInput<V> m = contact_input(group[n], plan.image ? &faces.cell : nullptr);
+      const ContactInput<V> m = contact_input<periodic>(group[n], faces.cell);
       relative_motion(m, dot(m.separation, m.separation), contact[n]);
       if (plan.radii) unequal[n] = unequal_of(group[n]), spin[n] = m.spin_other - m.spin_one;
     }
@@ -323,14 +328,22 @@ struct Packed : PackedLayout<Law> {
       write_history(group[n], memory[n]);
       const ContactLoads<V> found = push(contact[n]);
       add(group[n], found);
-      for (int l = 0; plan.image && l < group[n].count; ++l) {
-        const Image& image = plan.image[group[n].c[l]];
-        if (!image.any()) continue;
-        faces.through =
-            faces.through - Vec<V>{splat<V>(image.x * found.force.x[l]), splat<V>(image.y * found.force.y[l]),
-                                   splat<V>(image.z * found.force.z[l])};
-      }
+      if (periodic && any_image(group[n])) add_through(group[n], found.force, faces.through);
     }
+  }
+
+  bool any_image(const Group& g) const {
+    int32_t any = 0;
+    for (int l = 0; l < W; ++l) any |= plan.image[g.c[l]];
+    return any != 0;
+  }
+
+  // All lanes of `through` are the same.
+  GMEM_INLINE void add_through(const Group& g, Vec<V> force, Vec<V>& through) const {
+    const Rows forces = rows_of(force);
+    Row sum{through.x[0], through.y[0], through.z[0]};
+    for (int l = 0; l < W; ++l) sum -= image_of(g.c[l]) * row_of(forces, l);
+    through = {splat<V>(sum[0]), splat<V>(sum[1]), splat<V>(sum[2])};
   }
 
   // Contacts that have come apart in this step: the laws give them no force and a blank history.
@@ -351,8 +364,9 @@ struct Packed : PackedLayout<Law> {
     return g;
   }
 
-  // With images of the second spheres, of a periodic box.
-  GMEM_INLINE ContactInput<V> contact_input(const Group& g, const Cell<V>* cell) const {
+  // Of the images of the second grains, in a periodic box.
+  template <bool periodic>
+  GMEM_INLINE ContactInput<V> contact_input(const Group& g, const Cell<V>& cell) const {
     const auto one = [&](Row GrainRows::* row) {
       return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); });
     };
@@ -361,20 +375,21 @@ struct Packed : PackedLayout<Law> {
     };
     const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l].one; });
     Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l].other; }), moved{};
-    if (cell) {
-      Row each[W];
-      for (int l = 0; l < W; ++l) each[l] = shift(*cell, static_cast<std::size_t>(g.c[l]));
-      moved = load_rows([&](int l) { return each + l; });
+    if constexpr (periodic) {
+      const Row edge = edges(cell);
+      const Rows images = load_rows([&](int l) { return &image_of(g.c[l]); });
+      moved = images * load_rows([&](int) { return &edge; });
       centre_other = centre_other + moved;
     }
     const Rows point = splat<V>(0.5) * (centre_one + centre_other);
+    const Rows lever_one = point - one(&GrainRows::position), lever_other = point - other(&GrainRows::position);
     ContactInput<V> input{columns(centre_other - centre_one),
-                          columns(point - one(&GrainRows::position)),
-                          columns(point - other(&GrainRows::position)),
+                          columns(lever_one),
+                          columns(periodic ? lever_other - moved : lever_other),
                           columns(other(&GrainRows::velocity) - one(&GrainRows::velocity)),
                           columns(one(&GrainRows::spin)),
                           columns(other(&GrainRows::spin))};
-    if (cell) to_image(input, columns(moved), *cell);
+    if constexpr (periodic) drift(input, cell);
     return input;
   }
 

@@ -1,9 +1,11 @@
 #include "cpu/plan.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstring>
 #include <deque>
+#include <map>
 #include <mutex>
 #include <numeric>
 #include <stdexcept>
@@ -95,6 +97,19 @@ void sort_by(std::vector<Candidate>& candidates, int end, const Number& number) 
   candidates.swap(sorted);
 }
 
+// There are at most 27 images in boxes that are large enough, so that one replica finds them as rows in the cache.
+void number_images(const List& list, PlanStore& store) {
+  std::map<std::array<int8_t, 3>, int32_t> number{{{0, 0, 0}, 0}};
+  store.images.push_back({0.0, 0.0, 0.0});
+  for (const Candidate& c : store.candidate) {
+    const int8_t* of = list.image + 3 * static_cast<std::size_t>(c.row);
+    const auto [found, is_new] = number.insert({{of[0], of[1], of[2]}, static_cast<int32_t>(number.size())});
+    if (is_new) store.images.push_back({1.0 * of[0], 1.0 * of[1], 1.0 * of[2]});
+    store.image.push_back(found->second);
+  }
+  store.image.push_back(0);
+}
+
 std::shared_ptr<const PlanStore> make_plan(const List& list) {
   check(list);
   auto store = std::make_shared<PlanStore>();
@@ -145,11 +160,7 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
     store->remote_sphere[c.remote] = away(c) == c.grain_one ? c.one : c.other;
   }
 
-  for (const Candidate& c : candidates) {
-    if (!list.image) break;
-    const int8_t* of = list.image + 3 * static_cast<std::size_t>(c.row);
-    store->image.push_back({of[0], of[1], of[2]});
-  }
+  if (list.image) number_images(list, *store);
 
   double largest = 1.0, widest = 1.0;
   if (list.radii) {
@@ -174,6 +185,7 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
                  store->grain.data(),
                  candidates.data(),
                  list.image ? store->image.data() : nullptr,
+                 list.image ? store->images.data() : nullptr,
                  list.radii ? store->radii.data() : nullptr,
                  list.radii ? store->size.data() : nullptr,
                  largest,

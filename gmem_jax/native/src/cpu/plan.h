@@ -33,7 +33,8 @@ struct PlanStore {
   Plan plan;
   std::vector<int32_t> grain, domain_candidate, remote_start, remote_sphere, padding_row;
   std::vector<Candidate> candidate;
-  std::vector<Image> image;
+  std::vector<int32_t> image;
+  std::vector<Image> images;
   std::vector<Radii> radii;
   std::vector<Size> size;
 };

@@ -59,10 +59,8 @@ struct Candidate {
 };
 
 // By how many edges of a periodic box the second sphere of a candidate is moved along each axis.
-struct Image {
-  int8_t x, y, z;
-
-  bool any() const { return x || y || z; }
+struct alignas(32) Image {
+  double x, y, z, unused = 0.0;
 };
 
 // Of a candidate between spheres i and j, where spheres differ in radius R.
@@ -86,7 +84,8 @@ struct Plan {
   int padding;                      // rows of the list without a candidate
   const int32_t* grain;             // number in the call of each grain, [N]
   const Candidate* candidate;       // by domain
-  const Image* image;               // of each, or null without periodic axes
+  const int32_t* image;             // which of `images` belongs to each and to a dummy, or null without periodic axes
+  const Image* images;              // those that there are; the first moves nothing
   const Radii* radii;               // of each and of a dummy, or null where all radii are 1
   const Size* size;                 // of each grain, or null where all radii are 1, [N]
   double largest;                   // of the sizes
@@ -95,6 +94,8 @@ struct Plan {
   const int32_t* remote_start;      // the remotes of each grain: remote_start[g] to remote_start[g + 1], [N + 1]
   const int32_t* remote_sphere;     // that each remote acts on, [remotes]
   const int32_t* padding_row;       // [padding]
+
+  const Image& image_of(std::size_t c) const { return images[image[c]]; }
 };
 
 struct Pack {

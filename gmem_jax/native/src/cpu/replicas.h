@@ -356,7 +356,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   }
 
   Vec<V> shift(const Cell<V>& cell, std::size_t c) const {
-    const Image& image = plan.image[c];
+    const Image& image = plan.image_of(c);
     return cell.shift(image.x, image.y, image.z);
   }
 
@@ -379,8 +379,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     for (int n = 0; n < count; ++n) {
       const ContactLoads<C> found = push(contact[n]);
       add(plan.candidate[touching[n]], found);
-      if (!plan.image || !plan.image[touching[n]].any()) continue;
-      const Image& image = plan.image[touching[n]];
+      if (!plan.image || plan.image[touching[n]] == 0) continue;
+      const Image& image = plan.image_of(touching[n]);
       const Vec<V> force = convert<V>(found.force);
       faces.through = faces.through + through_faces({splat<V>(image.x), splat<V>(image.y), splat<V>(image.z)}, force);
     }

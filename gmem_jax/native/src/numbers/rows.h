@@ -132,6 +132,12 @@ inline Rows operator-(const Rows& a, const Rows& b) {
   return r;
 }
 
+inline Rows operator*(const Rows& a, const Rows& b) {
+  Rows r;
+  for (int i = 0; i < 4; ++i) r.part[i] = a.part[i] * b.part[i];
+  return r;
+}
+
 inline Rows operator*(Real s, const Rows& a) {
   Rows r;
   for (int i = 0; i < 4; ++i) r.part[i] = s * a.part[i];

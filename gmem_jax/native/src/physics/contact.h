@@ -23,13 +23,20 @@ struct Unequal {
   V reach, lean, root;  // as of `Radii` in cpu/problem.h
 };
 
+// What the strain of a periodic box (`Cell` of motion.h) adds to the velocity of the second grain, or of its image. Levers are
+// those of that one.
+template <class V, class Cell>
+constexpr GMEM_INLINE void drift(ContactInput<V>& m, const Cell& cell) {
+  m.velocity = m.velocity + cell.flow(m.lever_one - m.lever_other);
+}
+
 // From the second grain to its image in a periodic box (`Cell` of motion.h), which `shift` leads to. Levers already end
 // at the contact with that.
 // gmem_jax/physics/forces.py: relative_motion
 template <class V, class Cell>
 constexpr GMEM_INLINE void to_image(ContactInput<V>& m, Vec<V> shift, const Cell& cell) {
   m.lever_other = m.lever_other - shift;
-  m.velocity = m.velocity + cell.flow(m.lever_one - m.lever_other);
+  drift(m, cell);
 }
 
 // ... of a contact whose separation and levers are still those of the second grain itself; `image` is how many edges lead to
