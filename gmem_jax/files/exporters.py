@@ -97,7 +97,7 @@ def write_gsd(path: Path, frames: Frames, mass: float, material: Material) -> No
                 "time": frames.time[[number]],
                 "u": frames.u[[number]],
                 "pressure_tensor": pressure_tensor(frames, number, walls).ravel(),
-                "particles/wall_force": walls,
+                "particles/wall_force": walls.sum(axis=1),
                 "bonds/normal_force": frames.normal_force[own],
                 "bonds/friction_force": frames.friction_force[own],
             }
@@ -221,7 +221,7 @@ def write_pvd(path: Path, frames: Frames, mass: float, material: Material) -> No
 def _points(frames: Frames, number: int, material: Material) -> Any:
     grain, walls = _grain_numbers(frames), frame_wall_forces(frames, number, material)
     mesh = optional("pyvista", "vtk").PolyData(frames.centres(number))
-    mesh["radius"], mesh["grain"], mesh["wall_force"] = frames.sphere_radii, grain, walls
+    mesh["radius"], mesh["grain"], mesh["wall_force"] = frames.sphere_radii, grain, walls.sum(axis=1)
     facts = {
         "lower": frames.lower[number],
         "upper": frames.upper[number],

@@ -10,12 +10,13 @@ import h5py
 import numpy as np
 
 from gmem_jax.files.hdf5 import Content, reading, stored_axes, write_arrays
-from gmem_jax.files.schemas import FRAMES, UNEQUAL
+from gmem_jax.files.schemas import FRAMES, RUBBED, UNEQUAL
 from gmem_jax.files.validation import Array, fit, refusing, require, require_finite, require_sizes, title, whole
 from gmem_jax.physics.boundary import boundary_of
 from gmem_jax.simulation.frames import Frames
 
 GROUP = "frames"
+_SOME = UNEQUAL | RUBBED  # what not all frames have
 
 
 def write_frames(file: h5py.File, frames: Frames) -> None:
@@ -30,7 +31,7 @@ def write_frames(file: h5py.File, frames: Frames) -> None:
 
 def _declared(found: Mapping[str, Any]) -> dict[str, Array]:
     """The arrays that frames of such fields have."""
-    return {**FRAMES, **{name: array for name, array in UNEQUAL.items() if found.get(name) is not None}}
+    return FRAMES | {name: array for name, array in _SOME.items() if found.get(name) is not None}
 
 
 def read_frames(content: Content) -> Frames | None:
@@ -41,7 +42,7 @@ def read_frames(content: Content) -> Frames | None:
     """
     if GROUP not in content.attributes:
         return None
-    declared = _declared({name: content.datasets.get(f"{GROUP}/{name}") for name in UNEQUAL})
+    declared = _declared({name: content.datasets.get(f"{GROUP}/{name}") for name in _SOME})
     found = content.arrays({f"{GROUP}/{name}": array for name, array in declared.items()})
     stages, signal = json.loads(content.text("stages", GROUP)), content.attributes[GROUP].get("signal")
     require(isinstance(stages, list), "the stages of its frames are no names")
@@ -62,9 +63,11 @@ def check_frames(frames: Frames) -> None:
     fit(_declared(vars(frames)), vars(frames))
     require(all(map(title, frames.stages)), "the stages of its frames are no names")
     require_finite({f"frames/{entry.name}": getattr(frames, entry.name) for entry in fields(frames)[:11]})
-    start, spheres = frames.start, frames.spheres
+    start, spheres, rubbed = frames.start, frames.spheres, frames.wall_friction
     count, per_grain = frames.position.shape[1] * len(frames.offsets), len(frames.offsets)
     require_sizes(frames.radii, frames.sizes)
+    require_finite({"frames/wall_friction": np.zeros(0) if rubbed is None else rubbed})
+    require(rubbed is None or rubbed.shape[1] == count, "the friction of its walls is not of all spheres")
     require(len(frames.time) == frames.count > 0, "its frames and their stages are not of one number")
     require(count > 0, "its frames hold no spheres")
     require(frames.lower < frames.upper, "a frame has a lower wall that is not below the upper one")

@@ -2,27 +2,34 @@
 
 import numpy as np
 
+from gmem_jax.physics.contact.wall import PLANES
 from gmem_jax.physics.material import Material
 from gmem_jax.simulation.frames import Frames, images_met
 
 
 def frame_wall_forces(frames: Frames, number: int, material: Material) -> np.ndarray:
-    """The elastic forces of the walls on every sphere of a frame, [N K, 3], in E R^2.
+    """The forces of the planes on every sphere of a frame, [N K, 6, 3], in E R^2: elastic forces and friction.
 
-    What damping adds depends on speeds, which frames do not keep: it is left out.
+    Planes are the lower ones of x, y and z, then the upper ones. What damping adds depends on speeds, which frames do
+    not keep: it is left out.
     """
     centres, radii = frames.centres(number), frames.sphere_radii[:, None]
-    overlaps = (radii - (centres - frames.lower[number]), radii - (frames.upper[number] - centres))
-    lower, upper = (np.sqrt(radii) * np.maximum(overlap, 0.0) ** 1.5 for overlap in overlaps)
-    return np.asarray(np.where(frames.periodic, 0.0, float(material.wall_stiffness) * (lower - upper)))
+    forces = np.zeros((len(centres), PLANES, 3))
+    for first, overlap, sign in (
+        (0, radii - (centres - frames.lower[number]), 1.0),
+        (3, radii - (frames.upper[number] - centres), -1.0),
+    ):
+        elastic = float(material.wall_stiffness) * np.sqrt(radii) * np.maximum(overlap, 0.0) ** 1.5
+        forces[:, range(first, first + 3), range(3)] = sign * np.where(frames.periodic, 0.0, elastic)
+    return forces if frames.wall_friction is None else forces + frames.wall_friction[number]
 
 
 def pressure_tensor(frames: Frames, number: int, walls: np.ndarray) -> np.ndarray:
     """The mean stress in a frame, [3, 3], in E, compression positive: the sum of f_a l_b over the box's volume.
 
     A contact counts with the force on its second grain and the line from the first grain's centre to the second's, a
-    wall with its force and the line from where it is touched to the grain's centre (Love and Weber). So at rest the
-    diagonal is what the walls measure.
+    wall with its force and the line from where it is touched to the grain's centre (Love and Weber). So at rest between
+    smooth walls the diagonal is what they measure.
 
     Args:
         frames: the configurations.
@@ -37,7 +44,7 @@ def pressure_tensor(frames: Frames, number: int, walls: np.ndarray) -> np.ndarra
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     force = frames.normal_force[own, None] * normal - frames.friction_force[own]
     total = force.T @ (position[other // each] - position[one // each] + image)
-    planes = np.where(walls > 0.0, frames.lower[number], frames.upper[number])
-    total += walls.T @ (np.repeat(position, each, axis=0) - centres)
-    total += np.diag(np.sum(walls * (centres - planes), axis=0))
+    touched = np.repeat(centres[:, None], PLANES, axis=1)
+    touched[:, range(PLANES), [0, 1, 2] * 2] = np.concatenate([frames.lower[number], frames.upper[number]])
+    total += np.einsum("nwa,nwb->ab", walls, np.repeat(position, each, axis=0)[:, None] - touched)
     return np.asarray(total / np.prod(frames.upper[number] - frames.lower[number]))

@@ -12,6 +12,7 @@ DIMENSIONS = {  # names of lengths, and what the scales of those say that no arr
     "component": "w, x, y, z of a quaternion",
     "side": "the two spheres of a candidate contact",
     "grain": "number of the grain",
+    "plane": "lower planes of x, y, z, then the upper ones",
     "sphere": "number of the sphere: grain K + place in the grain",
     "part": "place of the sphere in its grain",
     "candidate": "number of the candidate contact",
@@ -65,6 +66,15 @@ STAGE = {  # of a recall or a preparation, in stages/NAME; `common` is the last 
 UNEQUAL = {  # of spheres that are not all of radius 1; else they are missing
     "radii": Array("real", ("part",), "R", "radii of the spheres of a grain"),
     "sizes": Array("real", ("grain",), "1", "sizes of the grains: factors on their lengths"),
+}
+
+RUBBED = {  # of frames between walls with friction; else it is missing
+    "wall_friction": Array(
+        "real",
+        ("frame", "sphere", "plane", "axis"),
+        "E R^2",
+        "tangential forces of the lower planes of x, y and z on the spheres, then of the upper ones",
+    ),
 }
 
 FRAMES = {  # configurations along the run that made a recall or a pack, in frames
@@ -347,7 +357,7 @@ def _section(schema: Schema) -> str:
         lines += ["", "In `stages/NAME`, in the order of the attribute `order` (in packs where they were kept):", ""]
         lines += _table(STAGE)
         lines += ["", "In `frames`, where they were asked for (`--frames`), whose attribute `stages` names theirs:", ""]
-        lines += _table(FRAMES)
+        lines += _table(FRAMES | RUBBED)
     if schema is PACK:
         lines += ["", _SIZES, ""]
         lines += _table(schema.unequal)

@@ -20,7 +20,8 @@ from gmem_jax.physics.rules import require_started
 from gmem_jax.simulation.stage import BINS
 
 DTYPES = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or no": ("bool",), "text": ("bytes",)}
-FIXED_LENGTHS = {"u": BINS, "axis": 3, "component": 4, "side": 2}  # dimensions that have one length in every file
+# Dimensions that have one length in every file.
+FIXED_LENGTHS = {"u": BINS, "axis": 3, "component": 4, "side": 2, "plane": 6}
 MOST_DIGITS = 18  # digits of a whole number: no count or seed has more
 NAME = 200  # characters of what is printed
 PATH = 4096  # of a path

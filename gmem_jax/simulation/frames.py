@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
-from gmem_jax.physics.forces import contact_loads, relative_motion, sphere_table
+from gmem_jax.physics.contact.wall import PLANES, wall_forces
+from gmem_jax.physics.forces import contact_loads, relative_motion, sphere_table, wall_loads
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.numbers import require_numbers
 from gmem_jax.physics.pytree import pytree, short_repr, static
-from gmem_jax.physics.state import State
+from gmem_jax.physics.state import State, still_box
 from gmem_jax.physics.system import System
 from gmem_jax.simulation.observers import Chunk, Observer
 from gmem_jax.simulation.sample import Sample
@@ -41,6 +42,7 @@ class Frame:
     spheres: np.ndarray
     normal_force: np.ndarray
     friction_force: np.ndarray
+    wall_friction: np.ndarray | None = None
 
 
 @pytree
@@ -69,6 +71,8 @@ class Frames:
         periodic: the periodic axes of the box; grains may have left it through these faces.
         radii: of the spheres of a grain of size 1, [K], in R; None where all are 1.
         sizes: of the grains, factors on their lengths, [N]; None where all are 1.
+        wall_friction: tangential forces of the planes on every sphere, the lower planes of x, y and z, then the upper
+            ones, [F, N K, 6, 3], in E R^2; None between smooth walls.
     """
 
     time: np.ndarray
@@ -87,6 +91,7 @@ class Frames:
     periodic: PeriodicAxes = static(WALLS)
     radii: np.ndarray | None = None
     sizes: np.ndarray | None = None
+    wall_friction: np.ndarray | None = None
 
     __repr__ = short_repr
 
@@ -211,16 +216,16 @@ class FrameRecorder(Observer):
         """
         name, simulation, replicas = chunk.stage.name, chunk.simulation, state.replicas
         one = self.schedule.replica if replicas > 1 else 0
-        friction, dt = jax.tree.map(
+        friction, wall_mu, dt = jax.tree.map(
             lambda leaf: to_host(leaf)[one : one + 1] if np.shape(leaf) == (replicas,) else to_host(leaf),
-            (simulation.system.friction, simulation.dt),
+            (simulation.system.friction, simulation.system.wall_mu, simulation.dt),
         )
         state, lower, upper = jax.tree.map(
             lambda leaf: leaf[..., one : one + 1] if np.shape(leaf)[-1] > 1 else leaf,
             (chunk.gather(state), lower, upper),
         )
         time = (chunk.time + later) * float(np.max(dt)) / float(np.max(to_host(simulation.dt)))
-        system = replace(jax.tree.map(to_host, simulation.system), friction=friction)
+        system = replace(jax.tree.map(to_host, simulation.system), friction=friction, wall_mu=wall_mu)
         frame = configuration(system, state, lower[:, 0], upper[:, 0], time, u)
         self.recorded = OrderedDict({**self.recorded, name: (*self.recorded.get(name, ()), frame)})
 
@@ -304,6 +309,18 @@ def _contacts(system: System, state: State) -> tuple[jax.Array, jax.Array, jax.A
     return kin.touching, normal, friction
 
 
+@jax.jit
+def _rubbing(system: System, state: State, lower: jax.Array, upper: jax.Array) -> jax.Array:
+    """Tangential forces of the planes on every sphere, [S, 6, 3, B]; the normal ones that limit them are elastic."""
+    cell = state.cell
+    box = still_box(lower, upper) if cell is None else replace(cell, lower=lower, upper=upper)
+    table, _ = sphere_table(system.clump, state.grains, cell)
+    radii = system.clump.sphere_radii(len(table))
+    normal = wall_forces(table[:, :3], table[:, 3:6], box, system.material.wall_stiffness, 0.0, radii)
+    _, force, _, _ = wall_loads(system, state.grains, box, *normal, state.wall_history, jnp.zeros(()))
+    return force.reshape(-1, PLANES, *force.shape[1:])
+
+
 def configuration(system: System, state: State, lower: np.ndarray, upper: np.ndarray, time: float, u: float) -> Frame:
     """The configuration that a state of one replica is in.
 
@@ -319,6 +336,7 @@ def configuration(system: System, state: State, lower: np.ndarray, upper: np.nda
     listed = np.flatnonzero(touching[:, 0])
     spheres = np.stack([np.asarray(system.pairs.first), np.asarray(system.pairs.second)], axis=1)
     position, quaternion = np.asarray(state.grains.position), np.asarray(state.grains.quaternion)
+    planes = (jnp.asarray(lower)[:, None], jnp.asarray(upper)[:, None])
     return Frame(
         time=np.asarray(time, float),
         u=np.asarray(u, float),
@@ -329,6 +347,7 @@ def configuration(system: System, state: State, lower: np.ndarray, upper: np.nda
         spheres=spheres[listed],
         normal_force=normal[listed, 0],
         friction_force=friction[listed],
+        wall_friction=None if system.wall_mu is None else np.asarray(_rubbing(system, state, *planes))[..., 0],
     )
 
 
@@ -357,6 +376,7 @@ def concatenate(
         name: np.concatenate([getattr(frame, name) for frame in every])
         for name in ("spheres", "normal_force", "friction_force")
     }
+    rubbed = [frame.wall_friction for frame in every]
     return Frames(
         **stacked,
         **moved,
@@ -368,4 +388,5 @@ def concatenate(
         periodic=periodic,
         radii=None if clump.radii is None else np.asarray(clump.radii),
         sizes=None if clump.sizes is None else np.asarray(clump.sizes),
+        wall_friction=None if any(one is None for one in rubbed) else np.stack(rubbed),  # type: ignore[arg-type]
     )

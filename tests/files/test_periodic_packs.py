@@ -15,8 +15,10 @@ from gmem_jax import native
 from gmem_jax.experiment.pack import stack
 from gmem_jax.experiment.record import pack_fingerprint
 from gmem_jax.files.exporters import EXPORT_FORMATS, format_of, frames_of_pack
+from gmem_jax.files.frames import load_frames
 from gmem_jax.files.loads import frame_wall_forces, pressure_tensor
 from gmem_jax.files.seal import seal
+from gmem_jax.simulation import observables
 from gmem_jax.simulation.loop import at_rest
 
 PACK = gm.load_pack(PERIODIC_27)
@@ -179,3 +181,21 @@ def test_the_gradient_through_a_recall_of_a_periodic_pack_is_its_differences() -
     for name, at, by, within in (("gamma0", 1e-3, 1e-8, 1e-5), ("friction.stiffness", 0.13, 1e-6, 1e-4)):
         difference = (value(**{name: at + by}) - value(**{name: at - by})) / (2.0 * by)
         assert float(found[name]) == pytest.approx(difference, rel=within)
+
+
+@pytest.mark.parametrize("source", [TETRA_27, PERIODIC_XY_27], ids=["walls", "both"])
+def test_stress_in_frames_has_the_friction_of_walls_in_it(source: Path, tmp_path: Path) -> None:
+    """As the observers' of the same moment, but for the damping of walls, of which frames know nothing."""
+    short = {"rest": 0.05, "hold": 0.05, "store": 0.5}
+    experiment = gm.Experiment(gm.load_pack(source), gm.words(1), t0=300.0, gamma0=5e-3, wall_mu=1.0, **short)
+    recall = gm.run(replace(experiment, observe={"stress": observables.stress()}), frames=5, frames_at=(0.0, 1.0))
+    frames, number = recall.frames, recall.frames.stages.index("store")  # its end, where grains have come to rest
+    gm.save_recall(tmp_path / "rough.h5", recall)
+    np.testing.assert_array_equal(load_frames(tmp_path / "rough.h5").wall_friction, frames.wall_friction)
+    stress = recall.stages["store"].observed["stress"][-1, ..., frames.signal]
+    walls = frame_wall_forces(frames, number, experiment.material)
+    tensor = pressure_tensor(frames, number, walls)
+    smooth = pressure_tensor(frames, number, walls - frames.wall_friction[number])
+    off = ~np.eye(3, dtype=bool)
+    assert np.abs((smooth - stress)[off]).max() > 1e-3 * stress.max()
+    np.testing.assert_allclose(tensor, stress, atol=1e-6 * stress.max())

@@ -81,7 +81,7 @@ def one_after_the_other(*some: Frames) -> Frames:
     parts = {
         name: np.concatenate([getattr(one, name) for one in some])
         for name in vars(some[0])
-        if name not in ("offsets", "stages", "start", "signal", "radii", "sizes")
+        if name not in ("offsets", "stages", "start", "signal", "radii", "sizes", "wall_friction")
     }
     return Frames(**parts, **alike)
 
