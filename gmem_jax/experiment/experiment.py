@@ -275,6 +275,9 @@ class Experiment:
                 f"an experiment has one pack: positions [N, 3], got {jnp.shape(self.pack.position)}; put a stack of "
                 "packs into jax.vmap"
             )
+        for name, value in vars(self.material).items():
+            if jnp.shape(value) != ():
+                raise ValueError(f"material.{name} must be one number, of all replicas; got shape {jnp.shape(value)}")
         for name, value in replica_parameters(self).items():
             if jnp.shape(value) not in ((), (self.replicas,)):
                 raise ValueError(

@@ -96,6 +96,7 @@ def write_gsd(path: Path, frames: Frames, mass: float, material: Material) -> No
             frame.log = {
                 "time": frames.time[[number]],
                 "u": frames.u[[number]],
+                "periodic": np.asarray(frames.periodic, np.uint8),
                 "pressure_tensor": pressure_tensor(frames, number, walls).ravel(),
                 "particles/wall_force": walls.sum(axis=1),
                 "bonds/normal_force": frames.normal_force[own],

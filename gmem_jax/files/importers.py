@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.files.lammpsdata import SAME, Read, density_of, read_lammps
+from gmem_jax.files.lammpsdata import PERIODIC, SAME, Read, density_of, read_lammps
 from gmem_jax.files.validation import optional, refusing, require, require_finite
 from gmem_jax.physics.grain import require_radii
 
@@ -109,6 +109,7 @@ def _gsd(path: Path, radius: float) -> Read:
     body, kind = np.asarray(own.body, np.int64), np.asarray(own.typeid)
     lengths, tilts = np.asarray(frame.configuration.box[:3], float), frame.configuration.box[3:]
     require(np.asarray(tilts) == 0.0, "its box is not rectangular")
+    require(np.asarray(frame.log.get("periodic", 0)) == 0, PERIODIC)  # by our own exports: GSD has no place for it
     free = body < 0
     grain = np.where(free, len(body) + np.arange(len(body)), body)
     # HOOMD marks each rigid body by a particle of a type of its own, which has the body's number, as others have

@@ -22,6 +22,8 @@ _STYLES = {  # of atoms: columns
 }
 _HYBRID = ("hybrid sphere molecular", "hybrid molecular sphere")  # LAMMPS itself writes no more than "hybrid"
 _READ = ("Atoms", "Molecules", "Masses", "Atom Type Labels")
+PERIODIC = "its box is periodic: a pack to be imported lies within walls"
+_PERIODIC = re.compile(r"^gmem: .*, boundary [fp ]*p")
 _ATOMS = re.compile(r"\s*\S+\s+atoms\s*(#.*)?")
 _WHOLE = re.compile(r"[+-]?[0-9]{1,15}")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -85,6 +87,7 @@ def read_lammps(path: Path, radius: float) -> Read:
     with path.open(encoding="utf-8", errors="backslashreplace") as file:  # a title may be in any encoding
         lines = file.read().split("\n")
     require(any(map(_ATOMS.fullmatch, lines)), "it is no LAMMPS data file, which has a line 'N atoms', and no GSD file")
+    require(not _PERIODIC.search(lines[0]), PERIODIC)  # by our own exports: such files do not say it elsewhere
     head, sections = _parts(lines)
     box = _box(head)
     atoms = sections.get("Atoms", _Section("", []))

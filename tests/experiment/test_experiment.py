@@ -44,6 +44,10 @@ def make(**changes: Any) -> gm.Experiment:
         ({"steps": 0}, "steps must be a whole number from 1, got 0"),
         ({"t0": 1.8e3, "steps": 2}, "give more steps, or none"),
         ({"gamma0": jnp.full(5, 1e-3)}, r"gamma0 must be one number or one for each replica, .*= \[2\].* shape \(5,\)"),
+        (
+            {"material": gm.Material(poisson=jnp.full(2, 0.2))},
+            r"material.poisson must be one number, .*; got shape \(2,\)",
+        ),
     ],
 )
 def test_impossible_numbers_are_refused_with_what_would_be_right(bad: dict, words: str) -> None:

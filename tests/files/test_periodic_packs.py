@@ -16,6 +16,7 @@ from gmem_jax.experiment.pack import stack
 from gmem_jax.experiment.record import pack_fingerprint
 from gmem_jax.files.exporters import EXPORT_FORMATS, format_of, frames_of_pack
 from gmem_jax.files.frames import load_frames
+from gmem_jax.files.importers import load_spheres
 from gmem_jax.files.loads import frame_wall_forces, pressure_tensor
 from gmem_jax.files.seal import seal
 from gmem_jax.simulation import observables
@@ -199,3 +200,14 @@ def test_stress_in_frames_has_the_friction_of_walls_in_it(source: Path, tmp_path
     off = ~np.eye(3, dtype=bool)
     assert np.abs((smooth - stress)[off]).max() > 1e-3 * stress.max()
     np.testing.assert_allclose(tensor, stress, atol=1e-6 * stress.max())
+
+
+@pytest.mark.parametrize("name", ["gsd", "lammps"])
+def test_an_export_of_a_periodic_box_is_not_taken_for_a_pack_between_walls(name: str, tmp_path: Path) -> None:
+    """Also where no sphere has crossed a face, so that no image tells of it."""
+    inside = replace(frames_of_pack(PACK), position=0.5 * np.asarray(PACK.position)[None])
+    form = format_of(name, several=False)
+    path = tmp_path / f"a{form.suffix}"
+    form.write(path, inside, 1.0, gm.Material())
+    with pytest.raises(gm.FileFormatError, match="its box is periodic"):
+        load_spheres(path)
