@@ -24,6 +24,7 @@ from gmem_jax.show.numbers import published
 
 HERE = Path(__file__).parents[1] / "results"
 OWN = HERE / "points.csv"
+BEGINS, ENDS = "<!-- made by docs/make/points.py -->", "<!-- end -->"  # of what is made in the page
 USUAL = {"mu": 1.0, "delta0": 0.05, "gamma0": 1e-3, "overlap": 0.6, "law": "H"}
 GRAINS = 10_240  # of figures
 Measured = tuple[Conditions, str]
@@ -179,4 +180,7 @@ def words() -> list[str]:
 
 if __name__ == "__main__":
     figures()
-    print("\n".join([*every_point(), "", *words()]))
+    page = HERE / "points.md"
+    before = page.read_text(encoding="utf-8").split(BEGINS)[0]
+    made = "\n".join([*every_point(), "", *words()])
+    page.write_text(f"{before}{BEGINS}\n\n{made}\n\n{ENDS}\n", encoding="utf-8")
