@@ -723,7 +723,7 @@ MUTATIONS = (
     mutation(
         "native-image-unseen",
         "cpu/packed.h",
-        "(plan.image ? other + shift(cell, c) : other)",
+        "(plan.image ? other + image_of(c) * edges(cell) : other)",
         "other",
         "test_values_are_those_of_the_definition[H-1]",
     ),
