@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import gmem_jax as gm
+from gmem_jax.bench.table import into
 from gmem_jax.derivatives.push import push
 from gmem_jax.experiment.changes import value_at
 from gmem_jax.experiment.experiment import acts_on_prefix
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "derivatives.md"
-BEGIN, END = "<!-- made by docs/make/derivatives_page.py -->", "<!-- end -->"
 STEP = 1e-7  # of a difference, over the size of a number: contacts of 27 grains hardly change within it
 DIRECTIONS = 5  # the median over these is not that of a step in which a contact began to slide
 LARGEST_ERROR = 2e-2  # as in tests/derivatives/test_gradient.py
@@ -129,5 +129,5 @@ def rows() -> list[str]:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    before, _, rest = PAGE.read_text().partition(BEGIN)
-    PAGE.write_text(f"{before}{BEGIN}\n\n" + "\n".join(rows()) + f"\n\n{END}{rest.partition(END)[2]}")
+    made = "\n".join(["", *rows(), "", ""])
+    PAGE.write_text(into(PAGE.read_text(), made, "docs/make/derivatives_page.py"))

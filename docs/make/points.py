@@ -17,6 +17,7 @@ from typing import Any
 
 from drawn_words import over_packs, read_rows
 
+from gmem_jax.bench.table import into
 from gmem_jax.reproduce import draw
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, compared, comparison_rows, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES
@@ -24,7 +25,6 @@ from gmem_jax.show.numbers import published
 
 HERE = Path(__file__).parents[1] / "results"
 OWN = HERE / "points.csv"
-BEGINS, ENDS = "<!-- made by docs/make/points.py -->", "<!-- end -->"  # of what is made in the page
 USUAL = {"mu": 1.0, "delta0": 0.05, "gamma0": 1e-3, "overlap": 0.6, "law": "H"}
 GRAINS = 10_240  # of figures
 Measured = tuple[Conditions, str]
@@ -181,6 +181,5 @@ def words() -> list[str]:
 if __name__ == "__main__":
     figures()
     page = HERE / "points.md"
-    before = page.read_text(encoding="utf-8").split(BEGINS)[0]
-    made = "\n".join([*every_point(), "", *words()])
-    page.write_text(f"{before}{BEGINS}\n\n{made}\n\n{ENDS}\n", encoding="utf-8")
+    made = ["", *every_point(), "", *words(), "", ""]
+    page.write_text(into(page.read_text(), "\n".join(made), "docs/make/points.py"))

@@ -1,4 +1,4 @@
-"""The tables of docs/results/figures.md and points.md, and of docs/remember_more.md, of words.
+"""The tables of docs/results/figures.md, and of docs/remember_more.md, of words.
 
 PYTHONPATH=experiments python docs/make/results_page.py [--redraw]
 
@@ -18,6 +18,7 @@ import jax
 import points
 from packs import over_packs
 
+from gmem_jax.bench.table import into
 from gmem_jax.reproduce import choices as weighed
 from gmem_jax.reproduce import draw
 from gmem_jax.reproduce.compare import comparison_rows, read_csv, write_csv
@@ -35,7 +36,6 @@ JOINED = {  # figures that no one command makes
 }
 TITLES = {"fig03": "packs at rest, by size and by shape", "choices": "what the paper leaves open, each tried otherwise"}
 RATES = {"fig12b-paper": "1,800 to 18,000"}  # of figures whose points are of several
-BEGIN, END = "<!-- made by docs/make/results_page.py -->", "<!-- end -->"
 
 
 def table(path: Path) -> list[str]:
@@ -109,8 +109,7 @@ def _with(mean: str, deviation: str) -> str:
 
 def put(lines: list[str], page: Path) -> None:
     """Write lines between the marks of a page."""
-    before, _, rest = page.read_text().partition(BEGIN)
-    page.write_text(f"{before}{BEGIN}\n\n" + "\n".join(lines) + f"{END}{rest.partition(END)[2]}")
+    page.write_text(into(page.read_text(), "\n".join(["", *lines]), "docs/make/results_page.py"))
 
 
 def heading(name: str, scale: str) -> list[str]:
@@ -192,7 +191,6 @@ def main() -> None:
     for (_, name, _, scale), path in sorted(shown):
         lines += [*heading(name, scale), *([*verdicts(path), ""] if name == "claims" else figure(path))]
     put(lines, HERE / "figures.md")
-    put([*points.every_point(), "", *points.words(), "", ""], HERE / "points.md")
     put([*designed_words(HERE / "designed_words.csv"), "", ""], HERE.parent / "remember_more.md")
 
 

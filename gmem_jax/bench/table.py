@@ -7,8 +7,6 @@ from typing import Any
 
 from gmem_jax.files.atomic import atomic
 
-BEGIN, END = "<!-- made by benchmarks/short_table.py -->", "<!-- end -->"
-
 
 def _find(rows: Sequence[dict[str, Any]], **wanted: Any) -> dict[str, Any] | None:
     return next((row for row in rows if all(row[key] == value for key, value in wanted.items())), None)
@@ -103,17 +101,18 @@ def short(result: dict[str, Any], law: str = "H") -> str:
     )
 
 
-def into(text: str, table: str) -> str:
-    """A page with the table between its marks in the place of what is there.
+def into(text: str, made: str, by: str = "benchmarks/short_table.py") -> str:
+    """A page with what a program has made, in the place of what is there between the marks of that program.
 
     Raises:
         ValueError: if the page has no marks.
     """
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
+    first, last = f"<!-- made by {by} -->", "<!-- end -->"
+    before, begin, rest = text.partition(first)
+    _, end, after = rest.partition(last)
     if not (begin and end):
-        raise ValueError(f"no place for a table: {BEGIN} ... {END}")
-    return f"{before}{BEGIN}\n{table}{END}{after}"
+        raise ValueError(f"no place between {first} and {last}")
+    return f"{before}{begin}\n{made}{end}{after}"
 
 
 def save_benchmark(folder: Path, result: dict[str, Any], text: str) -> None:

@@ -66,8 +66,9 @@ def check_frames(frames: Frames) -> None:
     start, spheres, rubbed = frames.start, frames.spheres, frames.wall_friction
     count, per_grain = frames.position.shape[1] * len(frames.offsets), len(frames.offsets)
     require_sizes(frames.radii, frames.sizes)
-    require_finite({"frames/wall_friction": np.zeros(0) if rubbed is None else rubbed})
-    require(rubbed is None or rubbed.shape[1] == count, "the friction of its walls is not of all spheres")
+    if rubbed is not None:
+        require_finite({"frames/wall_friction": rubbed})
+        require(rubbed.shape[1] == count, "the friction of its walls is not of all spheres")
     require(len(frames.time) == frames.count > 0, "its frames and their stages are not of one number")
     require(count > 0, "its frames hold no spheres")
     require(frames.lower < frames.upper, "a frame has a lower wall that is not below the upper one")

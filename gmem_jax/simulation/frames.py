@@ -336,7 +336,7 @@ def configuration(system: System, state: State, lower: np.ndarray, upper: np.nda
     listed = np.flatnonzero(touching[:, 0])
     spheres = np.stack([np.asarray(system.pairs.first), np.asarray(system.pairs.second)], axis=1)
     position, quaternion = np.asarray(state.grains.position), np.asarray(state.grains.quaternion)
-    planes = (jnp.asarray(lower)[:, None], jnp.asarray(upper)[:, None])
+    planes = lower[:, None], upper[:, None]
     return Frame(
         time=np.asarray(time, float),
         u=np.asarray(u, float),
@@ -376,7 +376,7 @@ def concatenate(
         name: np.concatenate([getattr(frame, name) for frame in every])
         for name in ("spheres", "normal_force", "friction_force")
     }
-    rubbed = [frame.wall_friction for frame in every]
+    rubbed = [frame.wall_friction for frame in every if frame.wall_friction is not None]
     return Frames(
         **stacked,
         **moved,
@@ -388,5 +388,5 @@ def concatenate(
         periodic=periodic,
         radii=None if clump.radii is None else np.asarray(clump.radii),
         sizes=None if clump.sizes is None else np.asarray(clump.sizes),
-        wall_friction=None if any(one is None for one in rubbed) else np.stack(rubbed),  # type: ignore[arg-type]
+        wall_friction=np.stack(rubbed) if rubbed else None,
     )

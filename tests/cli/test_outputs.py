@@ -301,7 +301,7 @@ def test_the_demo_stores_in_the_pack_of_the_middle_and_says_what_packs_differ_by
     assert f'gm.load_pack("{recalls.TYPICAL}")' in readme
     gains = [float(value) for value in row.split("|")[2].split("/")]
     place = "abcde".index(recalls.TYPICAL[-1])
-    assert f"G = {gains[place]:.3f}: how large it is; F = {fidelities[place]:.3f}: how close its shape" in readme
+    assert f"G = {gains[place]:.3f}: how large it is; F = {fidelities[place]:.3f}: how well its shape fits" in readme
 
 
 def test_what_cannot_fit_is_refused_before_it_begins(
