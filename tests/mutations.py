@@ -667,7 +667,7 @@ MUTATIONS = (
     mutation(
         "adjoint-of-the-common-part",
         "adjoint.h",
-        "+= bar, layers[axis][l] += bar;",
+        "+= bar, at(kLayers + axis)[l] += bar;",
         "+= bar;",
         f"{ACROSS}[M2]",
     ),

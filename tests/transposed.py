@@ -13,10 +13,15 @@ from gmem_jax.physics.system import System
 
 # Round-off of a sum of a thousand numbers; more where steps magnify it, as 3e-12 in a periodic box with law M2.
 TOLERANCE = 1e-10
+# Second derivatives by differences. Forces go as a power 1.5 of overlaps that have just begun, and histories bend: in
+# these scenes steps of 1e-9 are too long. Over 1e-10 round-off leaves 4e-6 of the largest.
+STEP, BY_DIFFERENCES = 1e-10, 1e-4
 
 
 def assert_transposed(system: System, state: State, boxes: Box, dt: float = 0.3, drag: float = 0.01) -> Any:
     """The library's adjoint is the transpose of its tangent: w . (J d) = (J^T w) . d, for every argument of a call.
+
+    And the derivative of the adjoint is one.
 
     J is the derivative of the steps, w weights of all that they give, d a direction along one argument, or along one
     row of the parameters.
@@ -43,7 +48,62 @@ def assert_transposed(system: System, state: State, boxes: Box, dt: float = 0.3,
         forwards_by = np.concatenate([np.ravel(term) for term in _products(weights, push(along))])
         backwards_by = np.concatenate([np.ravel(term) for term in _products(bars, along)])
         assert abs(backwards_by.sum() - forwards_by.sum()) <= TOLERANCE * np.linalg.norm(forwards_by), name
+    _assert_derivative_of_the_adjoint(call, definition, fixed, arrays, weights, draws)
     return bars
+
+
+def _assert_derivative_of_the_adjoint(
+    call: primitives.Call,
+    definition: PlainDefinition,
+    fixed: Any,
+    arrays: Any,
+    weights: Any,
+    draws: np.random.Generator,
+) -> None:
+    """Of J^T w along a direction of the arguments and one of w: it is that of differences, and symmetric.
+
+    With w held, d . D(J^T w)[e] = e . D(J^T w)[d] for any two directions.
+    """
+
+    def adjoint(arrays: Any, weights: Any) -> Any:
+        return jax.vjp(lambda arrays: primitives.advance(call, definition, fixed, arrays), arrays)[1](weights)[0]
+
+    def random(tree: Any) -> Any:
+        drawn = jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), tree)
+        if isinstance(tree, primitives.Arrays):
+            # Offsets are alike in all replicas. Histories that are zero stay so: magnitudes have a bend there.
+            known = [jnp.where(leaf != 0.0, way, 0.0) for leaf, way in zip(tree.history, drawn.history, strict=True)]
+            alike = jnp.broadcast_to(drawn.offsets[..., :1], drawn.offsets.shape)
+            drawn = drawn._replace(offsets=alike, history=known)
+        return drawn
+
+    first = jax.jit(adjoint)
+    second = jax.jit(lambda along, change: jax.jvp(adjoint, (arrays, weights), (along, change))[1])
+    one, other, change = random(arrays), random(arrays), random(weights)
+    assert "@gmem_second_adjoint" in second.lower(one, change).as_text()
+    found = second(one, change)
+    up, down = (
+        first(
+            *(jax.tree.map(lambda at, way, by=by: at + by * way, *pair) for pair in ((arrays, one), (weights, change)))
+        )
+        for by in (STEP, -STEP)
+    )
+    for (path, slope), high, low in zip(
+        jax.tree_util.tree_flatten_with_path(found)[0], jax.tree.leaves(up), jax.tree.leaves(down), strict=True
+    ):
+        # Parameters differ in their units, row by row.
+        rows = np.asarray(slope) if "parameters" in jax.tree_util.keystr(path) else np.asarray(slope)[None]
+        for row, difference in zip(rows, np.reshape((high - low) / (2.0 * STEP), rows.shape), strict=True):
+            if row.size:
+                apart = np.abs(row - difference).max()
+                assert apart <= BY_DIFFERENCES * np.abs(row).max(), (
+                    jax.tree_util.keystr(path),
+                    apart / np.abs(row).max(),
+                )
+    still = jax.tree.map(jnp.zeros_like, change)
+    ahead, back = (_products(a, second(b, still)) for a, b in ((other, one), (one, other)))
+    ahead, back = (np.concatenate([np.ravel(term) for term in terms]) for terms in (ahead, back))
+    assert abs(ahead.sum() - back.sum()) <= TOLERANCE * np.linalg.norm(ahead)
 
 
 def _products(one: Any, other: Any) -> list[np.ndarray]:

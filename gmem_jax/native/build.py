@@ -2,9 +2,9 @@
 
 With ``--if-stale`` it is compiled only if it is not there, or not made of the sources beside it.
 
-The library has no Python in it: one shared object whose symbols `gmem_jax.native` registers with XLA. The time step and
-its derivatives are compiled once per instruction set, and the best one that the CPU has is chosen when it runs. Only
-the standard library is imported here, because setup.py loads this file before the package exists.
+The library has no Python in it: one shared object whose symbols `gmem_jax.native` registers with XLA. The time step,
+its derivatives and theirs are compiled once per instruction set, and the best one that the CPU has is chosen when it
+runs. Only the standard library is imported here, because setup.py loads this file before the package exists.
 """
 
 import ctypes
@@ -30,6 +30,15 @@ INSTRUCTION_SETS = {
     "avx2": ("-mavx2", "-mfma"),
     "avx512": ("-mavx512f", "-mavx512dq", "-mavx512bw", "-mavx512vl", "-mfma", "-mprefer-vector-width=512"),
 }
+
+# What is compiled of cpu/kernel.cc, each by itself.
+KERNELS = {
+    "steps": (),
+    "derivatives": ("-DGMEM_DERIVATIVES", "-O2"),
+    "second_derivatives": ("-DGMEM_SECOND_DERIVATIVES", "-O2"),
+}
+# Numbers are pairs of vectors there: eight lanes take longer to compile than they would save.
+NOT_COMPILED = {("avx512", "second_derivatives")}
 
 
 class BuildError(RuntimeError):
@@ -108,9 +117,10 @@ def build(target: Path) -> None:
     jobs += [(f"cuda/{name}.cc", f"gpu_{name}.o", (stamp,)) for name in ("compile", "launch")]
     # From the lowest instruction set up: the linker keeps the first copy of what they share, of the standard library.
     for name, flags in sets.items():
-        jobs.append(("cpu/kernel.cc", f"{name}.o", (f"-DGMEM_ISA={name}", *flags)))
-        derivatives = (f"-DGMEM_ISA={name}_derivatives", "-DGMEM_DERIVATIVES", "-O2", *flags)
-        jobs.append(("cpu/kernel.cc", f"{name}_derivatives.o", derivatives))
+        for kernel, more in KERNELS.items():
+            space = name if kernel == "steps" else f"{name}_{kernel}"
+            if (name, kernel) not in NOT_COMPILED:
+                jobs.append(("cpu/kernel.cc", f"{space}.o", (f"-DGMEM_ISA={space}", *more, *flags)))
 
     def run(command: list[str]) -> None:
         try:

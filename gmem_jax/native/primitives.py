@@ -3,6 +3,7 @@
 The tangent is a primitive of JAX with a rule for its transpose, so that `jax.jvp`, `jax.linearize`, `jax.grad` and
 their compositions with `jax.vmap` and `jax.checkpoint` all come out of the two calls. Forward mode runs the steps in
 numbers that carry a derivative; reverse mode redoes them, remembers each step, and goes back (src/cpu/adjoint.h).
+Second derivatives are the derivative of the adjoint along a direction: reverse mode in numbers that carry one.
 
 Which code runs is settled when a program is lowered: the library on CPUs and, forwards, on CUDA GPUs (see `cuda`); the
 definition in plain JAX elsewhere.
@@ -27,7 +28,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from gmem_jax.native import cuda
 from gmem_jax.physics.step import mark_varying
 
-TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint")
+TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint", "gmem_second_adjoint")
 
 
 class Call(NamedTuple):
@@ -242,6 +243,23 @@ def _over(function: Callable[..., Any], leading: tuple[int, ...]) -> Callable[..
     return each
 
 
+def _plain_second_adjoint(
+    definition: Definition, fixed: Fixed, arrays: Arrays, along: Arrays, slopes: StepOutput, changes: StepOutput
+) -> Arrays:
+    def adjoint(arrays: Arrays, slopes: StepOutput) -> Arrays:
+        return _plain_adjoint(definition, fixed, arrays, slopes)
+
+    found: Arrays = jax.jvp(adjoint, (arrays, slopes), (along, changes))[1]
+    return found
+
+
+def _no_second_tangent(*_: Any) -> StepOutput:
+    raise NotImplementedError(
+        "the native backend has second derivatives by jax.jvp of jax.grad, but not forward over forward, and no third "
+        "ones; use backend='jax'"
+    )
+
+
 # The primitives.
 
 
@@ -327,6 +345,9 @@ def _primitive(
     primitive.def_impl(alone)
     primitive.def_abstract_eval(abstract)
     batching.primitive_batchers[primitive] = batch
+    if target not in TARGETS:
+        mlir.register_lowering(primitive, in_plain_jax)
+        return primitive
     mlir.register_lowering(primitive, library, platform="cpu")
     mlir.register_lowering(primitive, on_cuda, platform="cuda")
     mlir.register_lowering(primitive, on_others)
@@ -369,33 +390,124 @@ _tangent_p = _primitive("gmem_tangent", _of_results, _plain_tangent)
 _adjoint_p = _primitive("gmem_adjoint", _of_arrays, _plain_adjoint)
 
 
-def _transpose(slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition) -> list[Any]:
-    """From derivatives by the results to derivatives by what the tangent was linear in."""
-    fixed, arrays, _ = jax.tree.unflatten(tree, arguments)
-    known = len(jax.tree.leaves((fixed, arrays)))
-    on_results = _results(arrays, [ad.instantiate_zeros(slope) for slope in slopes])
-    found = _bind(_adjoint_p, call, definition, fixed, arrays, on_results)
+_second_adjoint_p = _primitive("gmem_second_adjoint", _of_arrays, _plain_second_adjoint)
+_second_tangent_p = _primitive("gmem_second_tangent", _of_results, _no_second_tangent)
+
+
+def _sums(found: Sequence[jax.Array], places: Sequence[Any]) -> list[jax.Array | None]:
+    """Derivatives by those arguments that are wanted, summed over leading axes that one did not have."""
 
     def fitted(slope: jax.Array, place: Any) -> jax.Array | None:
-        """Summed over leading axes that an argument did not have."""
         if not ad.is_undefined_primal(place):
             return None
         shape = place.aval.shape
         repeated = [axis for axis, size in enumerate(shape) if size != slope.shape[axis]]
         return jnp.sum(slope, axis=repeated, keepdims=True) if repeated else slope
 
-    return [None] * known + [fitted(slope, place) for slope, place in zip(found, arguments[known:], strict=True)]
+    return [fitted(slope, place) for slope, place in zip(found, places, strict=True)]
 
 
-ad.primitive_transposes[_tangent_p] = _transpose
+def _whole_slopes(slopes: Sequence[Any]) -> list[jax.Array]:
+    return [ad.instantiate_zeros(slope) for slope in slopes]
 
 
-# The library has the derivative of the steps and not that of the derivative, which plain JAX has.
-def _no_second(primals: Any, tangents: Any, **_: Any) -> Any:
-    raise NotImplementedError(
-        "second derivatives are not in the native backend; use backend='jax' (what they cost: docs/howto/gradients.md)"
-    )
+def _transpose_tangent(
+    slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition
+) -> list[Any]:
+    """From derivatives by the results to derivatives by what the tangent was linear in."""
+    fixed, arrays, _ = jax.tree.unflatten(tree, arguments)
+    known = len(jax.tree.leaves((fixed, arrays)))
+    on_results = _results(arrays, _whole_slopes(slopes))
+    found = _bind(_adjoint_p, call, definition, fixed, arrays, on_results)
+    return [None] * known + _sums(found, arguments[known:])
 
 
-for _primitive_p in (_forward_p, _tangent_p, _adjoint_p):
-    ad.primitive_jvps[_primitive_p] = _no_second
+def _transpose_second_tangent(
+    slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition
+) -> list[Any]:
+    """Of what is linear and symmetric in two directions, of which one is known."""
+    fixed, arrays, *directions = jax.tree.unflatten(tree, arguments)
+    known = len(jax.tree.leaves((fixed, arrays)))
+    on_results = _results(arrays, _whole_slopes(slopes))
+    way = next(one for one in directions if not any(map(_is_open, jax.tree.leaves(one, is_leaf=_is_open))))
+    found = _bind(_second_adjoint_p, call, definition, fixed, arrays, way, on_results, _still(on_results))
+    return [None] * known + _sums([*found, *found], arguments[known:])
+
+
+def _transpose_second_adjoint(
+    slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition
+) -> list[Any]:
+    """Of what is linear in `along`, by which it is its own transpose, and in `changes`."""
+    fixed, arrays, _, on_results, _ = jax.tree.unflatten(tree, arguments)
+    known = len(jax.tree.leaves((fixed, arrays)))
+    way = jax.tree.unflatten(jax.tree.structure(arrays), _whole_slopes(slopes))
+    by_along = _bind(_second_adjoint_p, call, definition, fixed, arrays, way, on_results, _still(on_results))
+    by_changes = _bind(_tangent_p, call, definition, fixed, arrays, way)
+    found = [*by_along, *jax.tree.leaves(on_results), *by_changes]
+    return [None] * known + _sums(found, arguments[known:])
+
+
+def _still(tree: Any) -> Any:
+    return jax.tree.map(jnp.zeros_like, tree)
+
+
+def _is_open(leaf: Any) -> bool:
+    return isinstance(leaf, ad.UndefinedPrimal)
+
+
+ad.primitive_transposes[_tangent_p] = _transpose_tangent
+ad.primitive_transposes[_second_tangent_p] = _transpose_second_tangent
+ad.primitive_transposes[_second_adjoint_p] = _transpose_second_adjoint
+
+
+def _directions(tree: Any, leaves: Sequence[Any], slopes: Sequence[Any]) -> tuple[Any, bool]:
+    """Tangents of the arguments after the first, and whether those of the arrays are all zero.
+
+    Raises:
+        NotImplementedError: if there are any of sizes or radii of spheres.
+    """
+    fixed, arrays, *_ = jax.tree.unflatten(tree, range(len(leaves)))
+    if any(type(slopes[place]) is not ad.Zero for place in (fixed.radii, fixed.sizes)):
+        raise NotImplementedError("the native backend has no second derivatives by sizes and radii; use backend='jax'")
+    first = len(fixed)  # lists of contacts have no derivatives
+    whole = [None] * first + _whole_slopes(slopes[first:])
+    still = all(type(slopes[place]) is ad.Zero for place in jax.tree.leaves(arrays))
+    return jax.tree.unflatten(tree, whole)[1:], still
+
+
+# `march._bin` has a rule of its own, which JAX leaves out where it takes a derivative apart (`jax.grad` of a scan).
+def _jvp_forward(leaves: Any, tangents: Any, *, tree: Any, call: Call, definition: Definition) -> Any:
+    fixed, arrays = jax.tree.unflatten(tree, leaves)
+    (along,), _ = _directions(tree, leaves, tangents)
+    found = _bind(_forward_p, call, definition, fixed, arrays)
+    return found, _bind(_tangent_p, call, definition, fixed, arrays, along)
+
+
+def _jvp_adjoint(leaves: Any, tangents: Any, *, tree: Any, call: Call, definition: Definition) -> Any:
+    fixed, arrays, slopes = jax.tree.unflatten(tree, leaves)
+    (along, changes), still = _directions(tree, leaves, tangents)
+    found = _bind(_adjoint_p, call, definition, fixed, arrays, slopes)
+    if still:
+        return found, _bind(_adjoint_p, call, definition, fixed, arrays, changes)
+    return found, _bind(_second_adjoint_p, call, definition, fixed, arrays, along, slopes, changes)
+
+
+def _jvp_tangent(leaves: Any, tangents: Any, *, tree: Any, call: Call, definition: Definition) -> Any:
+    fixed, arrays, along = jax.tree.unflatten(tree, leaves)
+    (other, change), still = _directions(tree, leaves, tangents)
+    found = _bind(_tangent_p, call, definition, fixed, arrays, along)
+    turned = _bind(_tangent_p, call, definition, fixed, arrays, change)
+    if still:
+        return found, turned
+    bent = _bind(_second_tangent_p, call, definition, fixed, arrays, along, other)
+    return found, [one + more for one, more in zip(turned, bent, strict=True)]
+
+
+def _no_third(*_: Any, **__: Any) -> Any:
+    raise NotImplementedError("the native backend has no third derivatives; use backend='jax'")
+
+
+ad.primitive_jvps[_forward_p] = _jvp_forward
+ad.primitive_jvps[_adjoint_p] = _jvp_adjoint
+ad.primitive_jvps[_tangent_p] = _jvp_tangent
+ad.primitive_jvps[_second_adjoint_p] = ad.primitive_jvps[_second_tangent_p] = _no_third

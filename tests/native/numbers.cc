@@ -105,14 +105,14 @@ void slopes_are_those_of_differences() {
 }
 
 void a_tape_read_backwards_has_the_same_slopes() {
-  Tape recorded;
-  const Recording recording(&recorded);
+  Tape<Real> recorded;
+  const Recording<Real> recording(&recorded);
   const Point p = point();
   for (int again = 0; again < 2; ++again) {  // the second time in memory that is there already
     recorded.clear();
     const auto mark = recorded.mark();
-    const Vec<Taped> a = leaf(p.a), b = leaf(p.b);
-    const Taped result = everything(a, b, leaf(p.s));
+    const Vec<Taped<Real>> a = leaf(p.a), b = leaf(p.b);
+    const Taped<Real> result = everything(a, b, leaf(p.s));
     recorded.bar(result.slot) += splat<Real>(1.0);
     recorded.reverse(mark);
     for (int which = 0; which < 7; ++which)

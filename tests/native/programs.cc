@@ -26,14 +26,14 @@ struct Random {
 template <class T>
 T leaves(const Real* from) {
   T a{};
-  for_numbers(a, [&](Taped& number) { number = leaf(*from++); });
+  for_numbers(a, [&](Taped<Real>& number) { number = leaf(*from++); });
   return a;
 }
 
 template <class T>
 void seed(T a, const Real*& bar) {
-  for_numbers(a, [&](Taped number) {
-    if (number.slot) tape->bar(number.slot) += *bar;
+  for_numbers(a, [&](Taped<Real> number) {
+    if (number.slot) tape<Real>->bar(number.slot) += *bar;
     ++bar;
   });
 }
@@ -43,7 +43,7 @@ bool same(int first, const Real* found, int count) {
   bool any = false;
   for (int n = 0; n < count; ++n)
     for (int l = 0; l < W; ++l) {
-      CHECK(close_to(found[n][l], tape->bar(first + n)[l], 1e-11));
+      CHECK(close_to(found[n][l], tape<Real>->bar(first + n)[l], 1e-11));
       any |= found[n][l] != 0.0;
     }
   return any;
@@ -80,22 +80,22 @@ void contact() {
   Real* bar[] = {own_bar, parameter_bar, law_bar};
   pull_back<Calculation>(in, result_bar, bar);
 
-  Tape recorded;
-  const Recording recording(&recorded);
+  Tape<Real> recorded;
+  const Recording<Real> recording(&recorded);
   const int first = recorded.mark().slots;
-  const auto input = leaves<ContactInput<Taped>>(own);
-  Taped memory[Law::kHistory + 1], row[kParameters];
+  const auto input = leaves<ContactInput<Taped<Real>>>(own);
+  Taped<Real> memory[Law::kHistory + 1], row[kParameters];
   for (int q = 0; q < Law::kHistory; ++q) memory[q] = leaf(own[kInputs + q]);
   for (int r = 0; r < kParameters; ++r) row[r] = leaf(parameter[r]);
-  const auto law = leaves<LawParameters<Taped>>(of_law);
-  Contact<Taped> now;
+  const auto law = leaves<LawParameters<Taped<Real>>>(of_law);
+  Contact<Taped<Real>> now;
   now.history = memory;
   relative_motion(input, dot(input.separation, input.separation), now);
   close(&now, 1, row);
-  Segment<Taped> segment[kRings] = {};
+  Segment<Taped<Real>> segment[kRings] = {};
   int stored = 1;
   bool looked = false;  // whether the rings were looked at, for which there is no program
-  struct Watched : StoredSegments<Taped> {
+  struct Watched : StoredSegments<Taped<Real>> {
     bool* looked;
     void remember() const { *looked = true; }
   };
@@ -105,7 +105,7 @@ void contact() {
     friction(Law{}, &now, 1, law);
   }
   CHECK(!looked);
-  const ContactLoads<Taped> found = push(now);
+  const ContactLoads<Taped<Real>> found = push(now);
   const Real* seeds = result_bar;
   seed(found.force, seeds), seed(found.torque_one, seeds), seed(found.torque_other, seeds);
   for (int q = 0; q < Law::kHistory; ++q, ++seeds)
@@ -121,8 +121,8 @@ struct Motion {
   Random random;
   Real numbers[kGrainNumbers], bar_of_numbers[kGrainNumbers] = {}, own[kTurned], own_bar[kTurned] = {},
                                result_bar[kTurned];
-  Tape recorded;
-  Recording recording{&recorded};
+  Tape<Real> recorded;
+  const Recording<Real> recording{&recorded};
   int first = recorded.mark().slots;
 
   Motion() {
@@ -143,8 +143,8 @@ void begin() {
   const Real* in[] = {m.own, m.numbers};
   Real* bar[] = {m.own_bar, m.bar_of_numbers};
   pull_back<StepBegin<>>(in, m.result_bar, bar);
-  const auto grain = leaves<Grain<Taped>>(m.own);
-  const HalfStep<Taped> half = begin_step(leaves<GrainParameters<Taped>>(m.numbers), grain);
+  const auto grain = leaves<Grain<Taped<Real>>>(m.own);
+  const HalfStep<Taped<Real>> half = begin_step(leaves<GrainParameters<Taped<Real>>>(m.numbers), grain);
   const Real* seeds = m.result_bar;
   seed(half, seeds), seed(matrix(half.orientation), seeds);
   m.compare(kState);
@@ -156,10 +156,10 @@ void end() {
   const Real* in[] = {m.own, m.numbers};
   Real* bar[] = {m.own_bar, m.bar_of_numbers};
   pull_back<StepEnd<isotropic>>(in, m.result_bar, bar);
-  const auto half = leaves<HalfStep<Taped>>(m.own);
-  const auto force = leaves<Vec<Taped>>(m.own + kMidForce), torque = leaves<Vec<Taped>>(m.own + kMidTorque);
+  const auto half = leaves<HalfStep<Taped<Real>>>(m.own);
+  const auto force = leaves<Vec<Taped<Real>>>(m.own + kMidForce), torque = leaves<Vec<Taped<Real>>>(m.own + kMidTorque);
   const Real* seeds = m.result_bar;
-  seed(end_step(leaves<GrainParameters<Taped>>(m.numbers), isotropic, half, force, torque), seeds);
+  seed(end_step(leaves<GrainParameters<Taped<Real>>>(m.numbers), isotropic, half, force, torque), seeds);
   m.compare(kMid);
 }
 
@@ -174,17 +174,17 @@ void sphere() {
   Real body_bar[3] = {};
   Real* bar[] = {m.own_bar, m.bar_of_numbers, body_bar, wall_bar};
   pull_back<OneSphere<near>>(in, m.result_bar, bar);
-  const auto half = leaves<HalfStep<Taped>>(m.own);
-  const auto rotation = leaves<Matrix<Taped>>(m.own + kTurnedRotation);
-  const auto parameters = leaves<GrainParameters<Taped>>(m.numbers);
+  const auto half = leaves<HalfStep<Taped<Real>>>(m.own);
+  const auto rotation = leaves<Matrix<Taped<Real>>>(m.own + kTurnedRotation);
+  const auto parameters = leaves<GrainParameters<Taped<Real>>>(m.numbers);
   const int first_body = m.recorded.mark().slots;
-  const auto offset = leaves<Vec<Taped>>(body);
+  const auto offset = leaves<Vec<Taped<Real>>>(body);
   const int first_wall = m.recorded.mark().slots;
-  const auto box = leaves<WallState<Taped>>(walls);
-  WallForces<Taped> on{};
-  const Vec<Taped> centre = sphere_of(parameters, half, rotation, offset, near, box, on);
+  const auto box = leaves<WallState<Taped<Real>>>(walls);
+  WallForces<Taped<Real>> on{};
+  const Vec<Taped<Real>> centre = sphere_of(parameters, half, rotation, offset, near, box, on);
   const Real* seeds = m.result_bar;
-  for (const Vec<Taped>& part : {centre, on.force, on.torque, on.lower, on.upper}) seed(part, seeds);
+  for (const Vec<Taped<Real>>& part : {centre, on.force, on.torque, on.lower, on.upper}) seed(part, seeds);
   m.recorded.reverse({});
   CHECK(same(m.first, m.own_bar, kTurned));
   CHECK(same(m.first + kTurned, m.bar_of_numbers, kGrainNumbers) == near);

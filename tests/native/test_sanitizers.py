@@ -38,9 +38,9 @@ def compiler(sanitizers: str, folder: Path) -> list[str]:
 def compiled(sanitizers: str, folder: Path) -> Path:
     command = compiler(sanitizers, folder)
     cpu, objects = build.SOURCES / "cpu", []
-    for name, flags in {"steps": ("-DGMEM_DOUBLE_ONLY",), "derivatives": ("-DGMEM_DERIVATIVES",)}.items():
+    for name, flags in build.KERNELS.items():
         objects.append(str(folder / f"{name}.o"))
-        kernel = ["-c", str(cpu / "kernel.cc"), f"-DGMEM_ISA={name}", *flags]
+        kernel = ["-c", str(cpu / "kernel.cc"), f"-DGMEM_ISA={name}", "-DGMEM_DOUBLE_ONLY", *flags, "-O0"]
         subprocess.run([*command, *kernel, "-o", objects[-1]], check=True)
     sources = [str(DRIVER), *(str(cpu / f"{name}.cc") for name in ("team", "cache", "plan", "blocks"))]
     subprocess.run([*command, *sources, *objects, "-o", str(folder / "drive")], check=True)

@@ -130,7 +130,7 @@ void a_failed_block_fails_the_call_and_not_the_next() {
   for (const int threads : {1, 2, 4})
     for (int repeat = 0; repeat < 20; ++repeat) {
       std::vector<Block> blocks;
-      for (int n = 1; n <= 5; ++n) blocks.push_back({&pack, nullptr, nullptr, n, false});
+      for (int n = 1; n <= 5; ++n) blocks.push_back({&pack, nullptr, nullptr, nullptr, nullptr, n, false});
       const Threads held(threads);
       CHECK(held.count == threads);
       CHECK(!thrown<std::bad_alloc>([&] { run_blocks(Problem{}, kernel, blocks, held.count); }).empty());
@@ -188,7 +188,8 @@ std::vector<int> teams_of(int kilobytes, int count, int domains) {
   const Pack pack{&plan, nullptr};
   for (auto& size : done) size = 0;
   setenv("GMEM_CACHE", "1", 1);
-  run_blocks(Problem{}, kernel, std::vector<Block>(count, {&pack, nullptr, nullptr, kilobytes, false}), 4);
+  run_blocks(Problem{}, kernel,
+             std::vector<Block>(count, {&pack, nullptr, nullptr, nullptr, nullptr, kilobytes, false}), 4);
   unsetenv("GMEM_CACHE");
   return {done[1], done[2], done[3], done[4]};
 }

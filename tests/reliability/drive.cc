@@ -19,6 +19,7 @@
 namespace gmem {
 namespace steps { extern const Kernel kernel; }
 namespace derivatives { extern const Kernel kernel; }
+namespace second_derivatives { extern const Kernel kernel; }
 }  // namespace gmem
 
 using namespace gmem;
@@ -78,6 +79,8 @@ struct Scene {
   void list(int i, int j, bool is_valid) { first.push_back(i), second.push_back(j), valid.push_back(is_valid); }
 };
 
+constexpr Task kTasks[] = {Task::forward, Task::tangent, Task::adjoint, Task::second_adjoint};
+
 // Runs one call; the results of the first replica. `plant` is the defect.
 Numbers run(const Case& c, int threads, const std::string& plant = "") {
   const Scene scene(c);
@@ -111,14 +114,14 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
                                  : c.law == Law::hooke      ? std::vector<int>{3}
                                  : c.law == Law::mindlin    ? std::vector<int>{2 * points, 3, 1}
                                                             : std::vector<int>{3, 1};
-  const bool forward = c.task == Task::forward, back = c.task == Task::adjoint;
+  const bool forward = c.task == Task::forward, second = c.task == Task::second_adjoint;
+  const bool back = second || c.task == Task::adjoint;
 
-  Lane lane{}, slope{};
-  lane.steps = slope.steps = kSteps;
+  Lane lane{};
+  lane.steps = kSteps;
   for (int f = 0; f < kFields; ++f) {
     lane.grains_in[f] = array(n * kSizes[f] - (plant == "bounds" && f == 5), false, field(f));
-    slope.grains_in[f] = array(n * kSizes[f], false, small);
-    lane.grains_out[f] = slope.grains_out[f] = array(n * kSizes[f], true, small);
+    lane.grains_out[f] = array(n * kSizes[f], true, small);
   }
   if (plant == "alignment")
     lane.grains_in[4] = reinterpret_cast<double*>(reinterpret_cast<char*>(array(n * 3 + 1, false, small)) + 1);
@@ -127,8 +130,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     const bool overlap = sizes[leaf] == 1;
     lane.history_in[leaf] =
         array(rows, false, [&](int row, int l) { return overlap ? positive(row, l) : small(row, l); });
-    slope.history_in[leaf] = array(rows, false, small);
-    lane.history_out[leaf] = slope.history_out[leaf] = array(rows, true, small);
+    lane.history_out[leaf] = array(rows, true, small);
   }
   for (std::size_t leaf = 0; c.rubs && leaf < sizes.size(); ++leaf) {
     const int rows = sizes[leaf] * kPlanes * n * kSpheres;
@@ -136,17 +138,29 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     lane.wall_history_in[leaf] = array(rows, false, [&](int row, int l) {
       return row % 5 == 0 ? 0.0 : overlap ? positive(row, l) : small(row, l);
     });
-    slope.wall_history_in[leaf] = array(rows, false, small);
-    lane.wall_history_out[leaf] = slope.wall_history_out[leaf] = array(rows, true, small);
+    lane.wall_history_out[leaf] = array(rows, true, small);
   }
   lane.parameters = array(kRows, false, parameter);
   lane.walls = array(kSteps * kWalls, false, wall);
-  slope.parameters = array(kRows, false, small);
-  slope.walls = array(kSteps * kWalls, false, small);
-  lane.offsets = slope.offsets = array(kSpheres * 3, false, small);
-  lane.pressure = slope.pressure = array(3, !back, small);
-  if (back) slope.parameters_out = array(kRows, true, small), slope.walls_out = array(kSteps * kWalls, true, small);
-  if (back) slope.offsets_out = array(kSpheres * 3, true, small);
+  lane.offsets = array(kSpheres * 3, false, small);
+  lane.pressure = array(3, !back, small);
+  if (back) lane.parameters_out = array(kRows, true, small), lane.walls_out = array(kSteps * kWalls, true, small);
+  if (back) lane.offsets_out = array(kSpheres * 3, true, small);
+  // The same with arguments of their own: slopes, or bars.
+  const auto other = [&] {
+    Lane of = lane;
+    for (int f = 0; f < kFields; ++f) of.grains_in[f] = array(n * kSizes[f], false, small);
+    for (std::size_t leaf = 0; leaf < sizes.size(); ++leaf) {
+      of.history_in[leaf] = array(sizes[leaf] * candidates, false, small);
+      if (c.rubs) of.wall_history_in[leaf] = array(sizes[leaf] * kPlanes * n * kSpheres, false, small);
+    }
+    of.parameters = array(kRows, false, small);
+    of.walls = array(kSteps * kWalls, false, small);
+    of.offsets = array(kSpheres * 3, false, small);
+    if (back) of.pressure = array(3, false, small);
+    return of;
+  };
+  const Lane slope = other(), bar = other(), bar_slope = other();
 
   const Problem problem{
       c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed, c.general ? c.rubs ? 3 : 7 : 0, c.rubs};
@@ -155,7 +169,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
                                scene.smallest.data(), c.general ? scene.images.data() : nullptr,
                                c.general ? scene.radii.data() : nullptr, c.general ? scene.sizes.data() : nullptr});
   const Pack pack{&store->plan, scene.offsets.data(), c.general ? scene.radii.data() : nullptr};
-  const Kernel& kernel = forward ? steps::kernel : derivatives::kernel;
+  const Kernel& kernel = forward ? steps::kernel : second ? second_derivatives::kernel : derivatives::kernel;
   const auto moved = [](Lane of, std::ptrdiff_t l) {
     for (int f = 0; f < kFields; ++f) of.grains_in[f] += l, of.grains_out[f] += l;
     for (int leaf = 0; leaf < kMaxHistory; ++leaf)
@@ -166,15 +180,17 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     if (of.parameters_out) of.parameters_out += l, of.walls_out += l, of.offsets_out += l;
     return of;
   };
-  std::vector<Lane> lanes, slopes;
-  for (int l = 0; l < b; ++l)
-    lanes.push_back(moved(lane, l)), slopes.push_back(moved(slope.parameters ? slope : lane, l));
+  std::vector<Lane> lanes, slopes, bars, bar_slopes;
+  for (int l = 0; l < b; ++l) {
+    lanes.push_back(moved(lane, l)), slopes.push_back(moved(slope, l));
+    bars.push_back(moved(bar, l)), bar_slopes.push_back(moved(bar_slope, l));
+  }
   std::vector<Block> blocks;
   for (int l = 0; l < b;) {
     // Of two lanes the library has no use for this; here it is to be seen.
     const bool packed = forward && (2 * (b - l) < kernel.width || b == 1);
     const int count = packed ? 1 : b - l < kernel.width ? b - l : kernel.width;
-    blocks.push_back({&pack, &lanes[l], &slopes[l], count, packed});
+    blocks.push_back({&pack, &lanes[l], &slopes[l], &bars[l], &bar_slopes[l], count, packed});
     l += count;
   }
   if (plant == "race") blocks = {blocks[0], blocks[0]};  // two threads write the same results
@@ -218,7 +234,7 @@ int main(int count, char** arguments) {
     double reach;
   } packs[] = {{0, 0.0}, {0, 2.5}, {3, 0.0}, {3, 2.5}, {4, 4.5}};
   for (const auto& law : laws)
-    for (const Task task : {Task::forward, Task::tangent, Task::adjoint})
+    for (const Task task : kTasks)
       for (const auto& pack : packs) {
         const auto with = [&](int replicas) {
           return Case{law.law, law.variant, task, pack.edge, pack.reach, replicas};
@@ -250,7 +266,7 @@ int main(int count, char** arguments) {
       }
   // Periodic boxes of unequal spheres, rough walls, and both.
   for (const auto& law : laws)
-    for (const Task task : {Task::forward, Task::tangent, Task::adjoint})
+    for (const Task task : kTasks)
       for (const int kind : {0, 1, 2}) {
         const bool general = kind != 1, rubs = kind != 0;
         const bool some = law.law == Law::hooke || law.variant == Variant::paper,

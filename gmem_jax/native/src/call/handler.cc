@@ -23,23 +23,29 @@
 
 namespace gmem {
 
-#define GMEM_DECLARE(name)                        \
-  namespace name { extern const Kernel kernel; } \
-  namespace name##_derivatives { extern const Kernel kernel; }
+// gmem_jax/native/build.py: KERNELS
+#define GMEM_DECLARE(name) \
+  namespace name { extern const Kernel kernel; }
 #if defined(__x86_64__)
 GMEM_DECLARE(avx512)
+GMEM_DECLARE(avx512_derivatives)
 GMEM_DECLARE(avx2)
+GMEM_DECLARE(avx2_derivatives)
+GMEM_DECLARE(avx2_second_derivatives)
 #endif
 GMEM_DECLARE(baseline)
+GMEM_DECLARE(baseline_derivatives)
+GMEM_DECLARE(baseline_second_derivatives)
 
 namespace {
 
 namespace ffi = xla::ffi;
 
-// The lanes of derivatives are replicas: few of them are done sooner in narrow vectors.
+// The lanes of derivatives are replicas: few of them are done sooner in narrow vectors. Second derivatives always are:
+// native/build.py says why.
 const Kernel& best_kernel(Task task, std::size_t replicas) {
-  const auto of_task = [task](const Kernel& steps, const Kernel& derivatives) -> const Kernel& {
-    return task == Task::forward ? steps : derivatives;
+  const auto of_task = [task](const Kernel& steps, const Kernel& derivatives, const Kernel& second) -> const Kernel& {
+    return task == Task::forward ? steps : task == Task::second_adjoint ? second : derivatives;
   };
   const char* wanted = std::getenv("GMEM_ISA");  // for tests: a lower instruction set than the best
   const std::string limit = wanted ? wanted : "";
@@ -49,10 +55,11 @@ const Kernel& best_kernel(Task task, std::size_t replicas) {
                       __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl");
   const bool narrow = task != Task::forward && replicas <= static_cast<std::size_t>(avx2::kernel.width);
   if (avx512 && !narrow && limit != "avx2" && limit != "baseline")
-    return of_task(avx512::kernel, avx512_derivatives::kernel);
-  if (avx2 && limit != "baseline") return of_task(avx2::kernel, avx2_derivatives::kernel);
+    return of_task(avx512::kernel, avx512_derivatives::kernel, avx2_second_derivatives::kernel);
+  if (avx2 && limit != "baseline")
+    return of_task(avx2::kernel, avx2_derivatives::kernel, avx2_second_derivatives::kernel);
 #endif
-  return of_task(baseline::kernel, baseline_derivatives::kernel);
+  return of_task(baseline::kernel, baseline_derivatives::kernel, baseline_second_derivatives::kernel);
 }
 
 enum Argument {
@@ -75,8 +82,8 @@ struct Signature {
   Wants arguments, results;
 };
 
-// Arguments of the three tasks are those of the steps themselves, then, for derivatives, a number for each of the
-// results' or arguments' own; see `Task`.
+// Arguments of all tasks are those of the steps themselves; then, for derivatives, a number for each of the arguments', or
+// of the results, that there are: see `Task`.
 // gmem_jax/native/primitives.py: _library, _of_results, _of_arrays
 Signature signature(Task task, Law law, bool rubs) {
   const Wants pack = {{"first spheres", "P", ffi::S32},
@@ -95,6 +102,7 @@ Signature signature(Task task, Law law, bool rubs) {
   switch (task) {
     case Task::tangent: return {arguments + arrays, moved};
     case Task::adjoint: return {arguments + moved, arrays};
+    case Task::second_adjoint: return {arguments + arrays + moved + moved, arrays};
     default: return {arguments, moved};
   }
 }
@@ -152,6 +160,8 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
           "walls' histories are not those of all spheres");
   problem.history_aliased = task == Task::forward && leaves > 0;
   const int64_t all_leaves = rubs ? 2 * leaves : leaves;
+  const bool of_results = task == Task::forward || task == Task::tangent;  // what is wanted is
+  const bool has_slopes = task == Task::tangent || task == Task::second_adjoint;
   for (int64_t leaf = 0; leaf < all_leaves; ++leaf)
     problem.history_aliased &= in[kHistoryIn + leaf].data == out[kHistoryOut + leaf].data;
 
@@ -160,7 +170,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   std::map<std::array<int64_t, kOfPack>, std::size_t> known;
   std::vector<std::shared_ptr<const PlanStore>> plans;
   std::vector<std::unique_ptr<Pack>> packs;
-  std::vector<std::vector<Lane>> lanes, slopes;
+  std::vector<std::vector<Lane>> lanes, slopes, bars, bar_slopes;
   std::vector<int64_t> index(batch.size(), 0);
   int64_t entries = 1;
   for (const int64_t n : batch) entries *= n;
@@ -178,8 +188,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
                                 integers(kFirst), integers(kSecond), valid, doubles(kReference), doubles(kSmallest),
                                 image, unequal ? doubles(kRadii) : nullptr, unequal ? doubles(kSizes) : nullptr}));
       packs.emplace_back(new Pack{&plans.back()->plan, doubles(kOffsets), unequal ? doubles(kRadii) : nullptr});
-      lanes.emplace_back();
-      slopes.emplace_back();
+      for (auto* all : {&lanes, &slopes, &bars, &bar_slopes}) all->emplace_back();
     }
     for (int64_t b = 0; b < replicas; ++b) {
       // Pointers to this replica in the next array of arguments, and of results.
@@ -187,35 +196,43 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       const auto source = [&](const Array& a) { return reinterpret_cast<double*>(a.data) + a.at(index) + b; };
       const auto next_argument = [&] { return source(in[argument++]); };
       const auto next_result = [&] { return source(out[result++]); };
+      const auto read_grains = [&](Lane& lane) {
+        for (int f = 0; f < kFields; ++f) lane.grains_in[f] = next_argument();
+      };
+      const auto read_histories = [&](Lane& lane) {
+        for (int64_t leaf = 0; leaf < leaves; ++leaf) lane.history_in[leaf] = next_argument();
+        for (int64_t leaf = leaves; leaf < all_leaves; ++leaf) lane.wall_history_in[leaf - leaves] = next_argument();
+      };
       Lane lane{};
-      for (int f = 0; f < kFields; ++f) lane.grains_in[f] = next_argument(), lane.grains_out[f] = next_result();
+      read_grains(lane);
       lane.parameters = source(in[kParameterRows]);
       lane.walls = source(in[kWallRows]);
       lane.steps = static_cast<int>(rows);
       argument = kHistoryIn;
-      for (int64_t leaf = 0; leaf < leaves; ++leaf) lane.history_in[leaf] = next_argument();
-      for (int64_t leaf = leaves; leaf < all_leaves; ++leaf) lane.wall_history_in[leaf - leaves] = next_argument();
-      Lane slope = lane;
-      if (task != Task::forward)
-        for (int f = 0; f < kFields; ++f) slope.grains_in[f] = next_argument();
-      if (task == Task::tangent)
+      read_histories(lane);
+      for (int f = 0; f < kFields; ++f) lane.grains_out[f] = next_result();
+      if (of_results) lane.pressure = next_result();
+      else lane.parameters_out = next_result(), lane.walls_out = next_result(), lane.offsets_out = next_result();
+      for (int64_t leaf = 0; leaf < leaves; ++leaf) lane.history_out[leaf] = next_result();
+      for (int64_t leaf = leaves; leaf < all_leaves; ++leaf) lane.wall_history_out[leaf - leaves] = next_result();
+      const auto read_slope = [&] {
+        Lane slope = lane;
+        read_grains(slope);
         slope.parameters = next_argument(), slope.walls = next_argument(), slope.offsets = next_argument();
-      if (task == Task::adjoint) {
-        slope.pressure = next_argument();
-        slope.parameters_out = next_result(), slope.walls_out = next_result(), slope.offsets_out = next_result();
-      } else {
-        lane.pressure = slope.pressure = next_result();
-      }
-      for (int64_t leaf = 0; leaf < leaves; ++leaf) {
-        lane.history_out[leaf] = slope.history_out[leaf] = next_result();
-        if (task != Task::forward) slope.history_in[leaf] = next_argument();
-      }
-      for (int64_t leaf = 0; leaf < all_leaves - leaves; ++leaf) {
-        lane.wall_history_out[leaf] = slope.wall_history_out[leaf] = next_result();
-        if (task != Task::forward) slope.wall_history_in[leaf] = next_argument();
-      }
+        read_histories(slope);
+        return slope;
+      };
+      const auto read_bar = [&] {
+        Lane bar = lane;
+        read_grains(bar);
+        bar.pressure = next_argument();
+        read_histories(bar);
+        return bar;
+      };
       lanes[place.first->second].push_back(lane);
-      slopes[place.first->second].push_back(slope);
+      if (has_slopes) slopes[place.first->second].push_back(read_slope());
+      if (!of_results) bars[place.first->second].push_back(read_bar());
+      if (!of_results && has_slopes) bar_slopes[place.first->second].push_back(read_bar());
     }
     for (int axis = static_cast<int>(batch.size()) - 1; axis >= 0 && ++index[axis] == batch[axis]; --axis)
       index[axis] = 0;
@@ -228,13 +245,23 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   for (std::size_t i = 0; i < packs.size(); ++i) {
     const int count = static_cast<int>(lanes[i].size());
     int done = 0;
+    const auto block_of = [&](int width, bool packed, bool wide = false) {
+      const auto from = [&](const std::vector<Lane>& all) { return all.empty() ? nullptr : &all[done]; };
+      return Block{packs[i].get(),
+                   &lanes[i][done],
+                   from(slopes[i]),
+                   from(bars[i]),
+                   from(bar_slopes[i]),
+                   std::min(width, count - done),
+                   packed,
+                   wide};
+    };
     // Replicas side by side share much work: a vector that is half full is cheaper than they are one by one.
     for (; problem.mixed && done < count; done += 2 * kernel.width)
-      whole.push_back({packs[i].get(), &lanes[i][done], nullptr, std::min(2 * kernel.width, count - done), false,
-                       count - done > kernel.width});
+      whole.push_back(block_of(2 * kernel.width, false, count - done > kernel.width));
     for (; 2 * (count - done) >= kernel.width || (task != Task::forward && done < count); done += kernel.width)
-      whole.push_back({packs[i].get(), &lanes[i][done], &slopes[i][done], std::min(kernel.width, count - done), false});
-    for (; done < count; ++done) packed.push_back({packs[i].get(), &lanes[i][done], nullptr, 1, true});
+      whole.push_back(block_of(kernel.width, false));
+    for (; done < count; ++done) packed.push_back(block_of(1, true));
   }
   const Threads threads(thread_count());
   run_blocks(problem, kernel, whole, threads.count);
@@ -257,6 +284,7 @@ auto binding() { return with_arguments(ffi::Ffi::Bind()); }
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_advance, gmem::handle<gmem::Task::forward>, gmem::binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_tangent, gmem::handle<gmem::Task::tangent>, gmem::binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_adjoint, gmem::handle<gmem::Task::adjoint>, gmem::binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_second_adjoint, gmem::handle<gmem::Task::second_adjoint>, gmem::binding());
 
 // Of the sources and flags that this library was compiled from; see native/build.py.
 extern "C" const char* gmem_source_hash() { return GMEM_SOURCE_HASH; }

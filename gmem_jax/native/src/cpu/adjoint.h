@@ -3,6 +3,8 @@
 // here stands only who gets which derivative.
 // "Bar" x is the derivative of the final result by x.
 //
+// In numbers that carry a derivative (`Dual`) the same gives the derivative of these derivatives along a direction.
+//
 // Grains and contacts are shared among the threads of a team as in the forward steps, and sums are taken in the same
 // fixed order.
 
@@ -11,6 +13,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstring>
+#include <type_traits>
 #include <vector>
 
 #include "cpu/calculations.h"
@@ -23,46 +26,53 @@ namespace GMEM_ISA {
 // What a contact adds to the bars of a grain of another domain.
 enum RemoteRow { kRemoteCentre = 0, kRemotePosition = 3, kRemoteVelocity = 6, kRemoteSpin = 9, kRemote = 12 };
 
-inline void add_vec(Real* to, Vec<Real> a) { store_vec(to, load_vec(to) + a); }
-
-inline Vec<Real> bars(int slot) { return load_vec(&tape->bar(slot)); }
-inline void seed(Taped a, Real bar) {
-  if (a.slot) tape->bar(a.slot) += bar;
+template <class V>
+inline void add_vec(V* to, Vec<V> a) {
+  store_vec(to, load_vec(to) + a);
 }
-inline void seed(Vec<Taped> a, Vec<Real> bar) { seed(a.x, bar.x), seed(a.y, bar.y), seed(a.z, bar.z); }
 
+template <class V>
+inline void seed(Taped<V> a, V bar) {
+  if (a.slot) tape<V>->bar(a.slot) += bar;
+}
+template <class V>
+inline void seed(Vec<Taped<V>> a, Vec<V> bar) {
+  seed(a.x, bar.x), seed(a.y, bar.y), seed(a.z, bar.z);
+}
+
+template <class V>
 struct TapedWalls {
   int first;
-  WallState<Taped> box;
+  WallState<Taped<V>> box;
 
-  explicit TapedWalls(const WallState<Real>& w)
-      : first(tape->mark().slots), box{leaf(w.lower), leaf(w.upper), leaf(w.lower_velocity), leaf(w.upper_velocity)} {}
+  explicit TapedWalls(const WallState<V>& w)
+      : first(tape<V>->mark().slots),
+        box{leaf(w.lower), leaf(w.upper), leaf(w.lower_velocity), leaf(w.upper_velocity)} {}
 
-  void add_bars(Real* to) const {
-    for (int row = 0; row < kWalls; ++row) to[row] += tape->bar(first + row);
+  void add_bars(V* to) const {
+    for (int row = 0; row < kWalls; ++row) to[row] += tape<V>->bar(first + row);
   }
 };
 
+template <class V>
 struct TapedParameters {
   int first;
-  Taped row[kParameters];
+  Taped<V> row[kParameters];
 
-  explicit TapedParameters(const Real* parameter) : first(tape->mark().slots) {
+  explicit TapedParameters(const V* parameter) : first(tape<V>->mark().slots) {
     for (int r = 0; r < kParameters; ++r) row[r] = leaf(parameter[r]);
   }
 
-  void add_bars(Real* to) const {
-    for (int r = 0; r < kParameters; ++r) to[r] += tape->bar(first + r);
+  void add_bars(V* to) const {
+    for (int r = 0; r < kParameters; ++r) to[r] += tape<V>->bar(first + r);
   }
 };
 
 // The memory of an `Adjoint`. What is kept of every step is given room for all candidates; memory that contacts apart
 // leave untouched is not used.
-template <class Law>
+template <class Law, class V>
 struct AdjointLayout {
-  using V = Real;
-
-  EngineLayout<Replicas<Law, Real>> of_forward;
+  EngineLayout<Replicas<Law, V>> of_forward;
   V* state;         // [steps, N, kState]: at the beginning of each step
   V* total;         // [steps, N, 6]: force and torque in it
   Trace<V>* trace;  // [steps]
@@ -141,16 +151,18 @@ struct AdjointLayout {
   }
 };
 
-template <class Law>
-struct Adjoint : AdjointLayout<Law> {
-  using Layout = AdjointLayout<Law>;
+template <class Law, class V>
+struct Adjoint : AdjointLayout<Law, V> {
+  using Layout = AdjointLayout<Law, V>;
   using Layout::state, Layout::total, Layout::trace, Layout::state_bar, Layout::mid_bar, Layout::sphere_bar;
   using Layout::remote_bar, Layout::history_bar, Layout::has_bar, Layout::domain_bar;
   using Layout::chunk_bar, Layout::wall_bar, Layout::faces, Layout::domain_cell_bar, Layout::chunk_cell_bar;
   using Layout::wall_history, Layout::planes, Layout::wall_history_bar, Layout::rubbed_bar, Layout::wall_trace;
   using Layout::remembered, Layout::chunk_rows, Layout::mass_row;
-  using V = Real;
-  using Forward = Engine<Replicas<Law, Real>>;
+  using Forward = Engine<Replicas<Law, V>>;
+  using Taped = GMEM_ISA::Taped<V>;
+  static constexpr bool kDual = std::is_same<V, Dual<Real>>::value;
+  static constexpr int kParts = sizeof(V) / sizeof(Real);  // vectors of lanes in a number
   static constexpr int kNumbers = OneContact<Law, true>::kNumbers, kResults = OneContact<Law, true>::kResults;
 
   Forward forward;
@@ -161,7 +173,7 @@ struct Adjoint : AdjointLayout<Law> {
   const int rank, steps;
   const bool adjacent;  // the lanes are neighbours in every array of bars
   const bool general;
-  Tape recorded;
+  Tape<V> recorded;
   V law_numbers[kLawNumbers], grain_numbers[kGrainNumbers], wall_law_numbers[kWallLawNumbers], last_ring;
   // Of the step that is gone back through: the cell in it and before it, their numbers, and the bars of what is on `faces`.
   Cell<V> cell;
@@ -170,7 +182,7 @@ struct Adjoint : AdjointLayout<Law> {
 
   Adjoint(const Problem& problem, const Block& block, Team& team, int rank, void* scratch)
       : forward(problem, block, team, rank, scratch), problem(problem), block(block), plan(*block.pack->plan),
-        team(team), rank(rank), steps(block.lanes[0].steps), adjacent(forward.mode.neighbours(block.slopes)),
+        team(team), rank(rank), steps(block.lanes[0].steps), adjacent(all_adjacent()),
         general(Layout::is_general(problem, plan)) {
     Arena arena{static_cast<char*>(scratch)};
     this->place(problem, block, arena, rank == 0);  // `forward` has found the same at the beginning
@@ -179,6 +191,12 @@ struct Adjoint : AdjointLayout<Law> {
     store_numbers(grain_numbers, forward.constants);
     if (problem.rubs) store_numbers(wall_law_numbers, forward.wall_law);
     last_ring = splat<V>(problem.points - 2.0);
+  }
+
+  // Of sphere k in a grain.
+  Vec<V> offset_of(int k) const {
+    if constexpr (kDual) return load_vec(forward.offsets + 3 * k);
+    else return body_at<V>(block.pack->offsets + 3 * k);
   }
 
   V* history_of(std::size_t c) const { return history_bar + c * remembered(problem); }
@@ -309,11 +327,23 @@ struct Adjoint : AdjointLayout<Law> {
 
   // --- bars in and out
 
+  bool all_adjacent() const {
+    return forward.mode.neighbours(block.bars) && (!kDual || forward.mode.neighbours(block.bar_slopes));
+  }
+
   template <class Pointer>
-  void write(const Pointer& pointer, std::ptrdiff_t row, V a) const {
-    double* const to = pointer(block.slopes[0]) + row * problem.stride;
+  V read(const Pointer& pointer, std::ptrdiff_t row) const {
+    const auto of = [&](const Lane* lanes) { return forward.mode.read_lanes(lanes, adjacent, pointer, row); };
+    if constexpr (kDual) return {of(block.bars), of(block.bar_slopes)};
+    else return of(block.bars);
+  }
+
+  template <class Pointer>
+  void write(const Pointer& pointer, std::ptrdiff_t row, V bar) const {
+    const Real a = result(bar);
+    double* const to = pointer(block.bars[0]) + row * problem.stride;
     if (adjacent) return block.count < W ? store(to, a, block.count) : store(to, a);
-    for (int l = 0; l < block.count; ++l) pointer(block.slopes[l])[row * problem.stride] = a[l];
+    for (int l = 0; l < block.count; ++l) pointer(block.bars[l])[row * problem.stride] = a[l];
   }
 
   // Calls `each(field, row in the arrays of the call, row of the state)` for the numbers of grain u.
@@ -347,8 +377,7 @@ struct Adjoint : AdjointLayout<Law> {
   void load_bars() {
     for_grains([&](int u) {
       for_wall_history(u, [&](int leaf, std::ptrdiff_t row, V& bar) {
-        const auto array = [leaf](const Lane& lane) { return lane.wall_history_in[leaf]; };
-        bar = forward.mode.read_lanes(block.slopes, adjacent, array, row);
+        bar = read([leaf](const Lane& lane) { return lane.wall_history_in[leaf]; }, row);
       });
       if constexpr (Law::kLayered)
         for_planes(u, [&](int k, int w, const KnownPlanes&) {
@@ -356,14 +385,12 @@ struct Adjoint : AdjointLayout<Law> {
           to_layers(bar_at_plane(u, k, w), forward.wall_segments_of(row), forward.wall_outermost(row));
         });
       for_fields(u, [&](int f, std::ptrdiff_t row, int number) {
-        of_grain(state_bar, u, kState)[number] =
-            forward.mode.read_lanes(block.slopes, adjacent, [f](const Lane& lane) { return lane.grains_in[f]; }, row);
+        of_grain(state_bar, u, kState)[number] = read([f](const Lane& lane) { return lane.grains_in[f]; }, row);
       });
     });
     for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
       for_history(plan.candidate[c].row, [&](int leaf, std::ptrdiff_t row, int q) {
-        const auto array = [leaf](const Lane& lane) { return lane.history_in[leaf]; };
-        history_of(c)[q] = forward.mode.read_lanes(block.slopes, adjacent, array, row);
+        history_of(c)[q] = read([leaf](const Lane& lane) { return lane.history_in[leaf]; }, row);
       });
     const int first = forward.share_begin(plan.candidates);
     std::fill_n(has_bar + first, forward.share_begin(plan.candidates, 1) - first, true);
@@ -381,18 +408,21 @@ struct Adjoint : AdjointLayout<Law> {
 
   // From the bars of rings to those of the layers and segments that they are in at the end, in the bars of one history.
   void to_layers(V* history, const StoredSegments<V>& segments, V outer) {
-    V *layers = history + kLayers, *ring = history + Law::kHistory;
     for (int q = kLayers; q < Law::kHistory; ++q) history[q] = V{};
-    for (int l = 0; l < W; ++l)
-      for (int k = 0, j = 0; j < problem.points; ++j) {
-        if (k + 1 < segments.count() && segments.get(k + 1).start[l] <= j) ++k;
-        for (int axis = 0; axis < 2; ++axis) {
-          const double bar = ring[2 * j + axis][l];
-          ring[2 * j + axis][l] = 0.0;
-          if (j < outer[l]) ring[2 * k + axis][l] += bar, layers[axis][l] += bar;
-          if (j == outer[l]) layers[4 + axis][l] = bar;
+    for (int part = 0; part < kParts; ++part) {
+      const auto at = [&](int q) -> Real& { return reinterpret_cast<Real*>(history + q)[part]; };
+      const auto ring = [&](int j, int axis) -> Real& { return at(Law::kHistory + 2 * j + axis); };
+      for (int l = 0; l < W; ++l)
+        for (int k = 0, j = 0; j < problem.points; ++j) {
+          if (k + 1 < segments.count() && segments.get(k + 1).start[l] <= j) ++k;
+          for (int axis = 0; axis < 2; ++axis) {
+            const double bar = ring(j, axis)[l];
+            ring(j, axis)[l] = 0.0;
+            if (j < outer[l]) ring(k, axis)[l] += bar, at(kLayers + axis)[l] += bar;
+            if (j == outer[l]) at(kLayers + 4 + axis)[l] = bar;
+          }
         }
-      }
+    }
   }
 
   // From the bars of layers and segments at the beginning, when each ring is a segment, to those of the rings; of the history in
@@ -779,7 +809,7 @@ struct Adjoint : AdjointLayout<Law> {
       std::copy_n(mid, kMidForce, turned_bar);
       for (int k = 0; k < spheres; ++k) {
         V body[3];
-        store_vec(body, body_at<V>(block.pack->offsets + 3 * k));
+        store_vec(body, offset_of(k));
         V constants[kSphereConstants];
         load_constants(u, k, constants);
         const V* in[] = {turned, grain_numbers, body, walls, constants};
@@ -811,7 +841,7 @@ struct Adjoint : AdjointLayout<Law> {
       V* const history_bar = bar_at_plane(u, k, w);
       if (!(known.now >> w & 1)) return void(std::fill_n(history_bar, remembered(problem), V{}));
       V body[3], history[Law::kHistory + 1] = {}, result_bar[OnePlane<Law>::kResults], constants[kPlaneConstants];
-      store_vec(body, body_at<V>(block.pack->offsets + 3 * k));
+      store_vec(body, offset_of(k));
       if (planes_of(step, u, k) >> w & 1) std::copy_n(at_plane(wall_history_at(step), u, k, w), Law::kHistory, history);
       std::copy_n(of_grain(mid_bar, u, kMid) + kMidForce, 6, result_bar);
       if (problem.periodic) add_vec(result_bar, load_vec(of_grain(rubbed_bar, u, 3)));
@@ -933,7 +963,7 @@ struct Adjoint : AdjointLayout<Law> {
     recorded.reverse({});
     for (int row = 0; row < 6; ++row) faces_bar[row] = problem.periodic ? recorded.bar(on_faces + row) : V{};
     walls.add_bars(by_walls);
-    return bars(first);
+    return load_vec(&recorded.bar(first));
   }
 
   // The bars of the cell of a step, of which all have told theirs.
@@ -957,7 +987,7 @@ struct Adjoint : AdjointLayout<Law> {
     load_bars();
     V pressure_bar[3];
     for (int axis = 0; axis < 3; ++axis)
-      pressure_bar[axis] = forward.mode.gather(block.slopes, [](const Lane& lane) { return lane.pressure; }, axis);
+      pressure_bar[axis] = read([](const Lane& lane) { return lane.pressure; }, axis);
     for (int step = steps - 1; step >= 0; --step) step_back(step, load_vec(pressure_bar));
     unload_bars();
   }

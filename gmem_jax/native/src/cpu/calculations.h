@@ -97,14 +97,14 @@ constexpr void for_numbers(Cell<V>& a, const Each& each) {
 constexpr int kCellNumbers = 9;
 
 // To and from arrays of them.
-template <class T>
-inline void store_numbers(Real* to, T a) {
-  for_numbers(a, [&](Real number) { *to++ = number; });
+template <class V, class T>
+inline void store_numbers(V* to, T a) {
+  for_numbers(a, [&](V number) { *to++ = number; });
 }
-template <class T>
-inline T load_numbers(const Real* from) {
+template <class T, class V>
+inline T load_numbers(const V* from) {
   T a;
-  for_numbers(a, [&](Real& number) { number = *from++; });
+  for_numbers(a, [&](V& number) { number = *from++; });
   return a;
 }
 

@@ -1,10 +1,10 @@
 // The time step for one instruction set; compiled once for each, with GMEM_ISA the name of its namespace and the
-// compiler's flags, and once more with GMEM_DERIVATIVES for its derivatives.
+// compiler's flags, and again with GMEM_DERIVATIVES for its derivatives and with GMEM_SECOND_DERIVATIVES for theirs.
 
 #include <cstdint>
 #include <cstdlib>
 
-#ifdef GMEM_DERIVATIVES
+#if defined(GMEM_DERIVATIVES) || defined(GMEM_SECOND_DERIVATIVES)
 #include "cpu/adjoint.h"
 #else
 #include "cpu/packed.h"
@@ -25,7 +25,10 @@ auto with_worker(const Problem& problem, [[maybe_unused]] const Block& block, co
   return with_law(problem.law, problem.variant, [&](auto law) {
     using L = decltype(law);
 #ifdef GMEM_DERIVATIVES
-    return problem.task == Task::tangent ? function(As<Engine<Replicas<L, Dual<Real>>>>{}) : function(As<Adjoint<L>>{});
+    return problem.task == Task::tangent ? function(As<Engine<Replicas<L, Dual<Real>>>>{})
+                                         : function(As<Adjoint<L, Real>>{});
+#elif defined(GMEM_SECOND_DERIVATIVES)
+    return function(As<Adjoint<L, Dual<Real>>>{});
 #else
 #ifndef GMEM_DOUBLE_ONLY  // for sanitizers, under which these take many minutes to compile
     if constexpr (!L::kLayered) {

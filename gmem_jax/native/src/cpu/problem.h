@@ -116,8 +116,8 @@ struct Lane {
   const double* walls;
   double* pressure;
   int steps;
-  const double* offsets;  // only among the slopes of the tangent, [K, 3]
-  // Only among the slopes of the adjoint, where "in" is by the results and "out" by the arguments:
+  const double* offsets;  // only among slopes, [K, 3]
+  // Only among bars, where "in" is by the results and "out" by the arguments:
   double* parameters_out;
   double* walls_out;
   double* offsets_out;
@@ -126,10 +126,12 @@ struct Lane {
 struct Block {
   const Pack* pack;
   const Lane* lanes;
-  const Lane* slopes;  // the derivatives, where they are wanted
-  int count;           // 1 to W, or to 2 W where it is wide
-  bool packed;         // the lanes of the CPU are grains and contacts of one replica
-  bool wide = false;   // in mixed precision: two vectors of doubles to one of floats
+  const Lane* slopes;      // derivatives of the arguments along a direction; with the results where these are tangents
+  const Lane* bars;        // in reverse mode, derivatives by the results and by the arguments
+  const Lane* bar_slopes;  // derivatives of the former along the direction
+  int count;               // 1 to W, or to 2 W where it is wide
+  bool packed;             // the lanes of the CPU are grains and contacts of one replica
+  bool wide = false;       // in mixed precision: two vectors of doubles to one of floats
 };
 
 // The threads that share one block; see team.h.

@@ -22,6 +22,8 @@ struct Dual {
   friend Dual operator+(Dual a, Dual b) { return {a.value + b.value, a.slope + b.slope}; }
   friend Dual operator-(Dual a, Dual b) { return {a.value - b.value, a.slope - b.slope}; }
   friend Dual operator-(Dual a) { return {-a.value, -a.slope}; }
+  Dual& operator+=(Dual a) { return *this = *this + a; }
+  Dual& operator-=(Dual a) { return *this = *this - a; }
   friend Dual operator*(Dual a, Dual b) { return {a.value * b.value, fma(a.slope, b.value, a.value * b.slope)}; }
   friend Dual operator/(Dual a, Dual b) {
     const R quotient = a.value / b.value;

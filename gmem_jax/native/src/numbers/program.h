@@ -190,12 +190,12 @@ template <class Calculation>
 constexpr Reached reached_in{program_of<Calculation>};
 
 // One node of a calculation's program, forwards: its number goes to `value`, or its mask to `mask`.
-template <class Calculation, int n>
-GMEM_INLINE void evaluate(const Real* const* in, Real* value, Bits* mask) {
+template <class Calculation, int n, class V>
+GMEM_INLINE void evaluate(const V* const* in, V* value, Mask<V>* mask) {
   constexpr Program::Node now = program_of<Calculation>.node[n];
   constexpr Step step = now.step;
   if constexpr (step == Step::input) value[n] = in[now.a][now.b];
-  if constexpr (step == Step::constant) value[n] = splat<Real>(now.constant);
+  if constexpr (step == Step::constant) value[n] = splat<V>(now.constant);
   if constexpr (step == Step::add) value[n] = value[now.a] + value[now.b];
   if constexpr (step == Step::subtract) value[n] = value[now.a] - value[now.b];
   if constexpr (step == Step::negate) value[n] = -value[now.a];
@@ -215,8 +215,8 @@ GMEM_INLINE void evaluate(const Real* const* in, Real* value, Bits* mask) {
 }
 
 // ... and backwards: from its bar to those of its operands.
-template <class Calculation, int n>
-GMEM_INLINE void reverse(const Real* value, const Bits* mask, Real* bar) {
+template <class Calculation, int n, class V>
+GMEM_INLINE void reverse(const V* value, const Mask<V>* mask, V* bar) {
   constexpr Program::Node now = program_of<Calculation>.node[n];
   constexpr Step step = now.step;
   if constexpr (now.active && step != Step::input && reached_in<Calculation>.node[n]) {
@@ -224,14 +224,14 @@ GMEM_INLINE void reverse(const Real* value, const Bits* mask, Real* bar) {
     constexpr bool a_wanted = wanted(now.a), b_wanted = wanted(now.b), c_wanted = wanted(now.c);
     constexpr bool a_there = reached_in<Calculation>.operand[n][0], b_there = reached_in<Calculation>.operand[n][1];
     constexpr bool c_there = reached_in<Calculation>.operand[n][2];
-    const Real g = bar[n];
-    const auto to_a = [&](Real more) {
+    const V g = bar[n];
+    const auto to_a = [&](V more) {
       if constexpr (a_wanted) bar[now.a] = a_there ? bar[now.a] + more : more;
     };
-    const auto to_b = [&](Real more) {
+    const auto to_b = [&](V more) {
       if constexpr (b_wanted) bar[now.b] = b_there ? bar[now.b] + more : more;
     };
-    const auto to_c = [&](Real more) {
+    const auto to_c = [&](V more) {
       if constexpr (c_wanted) bar[now.c] = c_there ? bar[now.c] + more : more;
     };
     if constexpr (step == Step::add) to_a(g), to_b(g);
@@ -249,40 +249,40 @@ GMEM_INLINE void reverse(const Real* value, const Bits* mask, Real* bar) {
       to_c(g);
     }
     if constexpr (step == Step::divide) {
-      const Real by_a = g / value[now.b];
+      const V by_a = g / value[now.b];
       to_a(by_a);
       if constexpr (b_wanted) bar[now.b] = b_there ? fnma(by_a, value[n], bar[now.b]) : -(by_a * value[n]);
     }
     if constexpr (step == Step::root)  // at zero, where it has no derivative, zero
-      to_a(zero_unless(value[n] > Real{}, splat<Real>(0.5) * g / value[n]));
+      to_a(zero_unless(value[n] > V{}, splat<V>(0.5) * g / value[n]));
     if constexpr (step == Step::inverse_root)  // what is not wanted stays zero, even where its slope is infinite
-      to_a(zero_unless(g != Real{}, splat<Real>(-0.5) * (((g * value[n]) * value[n]) * value[n])));
+      to_a(zero_unless(differ(g, V{}), splat<V>(-0.5) * (((g * value[n]) * value[n]) * value[n])));
     if constexpr (step == Step::select) to_a(zero_unless(mask[now.c], g)), to_b(zero_unless(~mask[now.c], g));
   }
 }
 
-template <class Calculation, int n>
-GMEM_INLINE void put_bar(const Real* bar, Real* const* in_bar) {
+template <class Calculation, int n, class V>
+GMEM_INLINE void put_bar(const V* bar, V* const* in_bar) {
   constexpr Program::Node now = program_of<Calculation>.node[n];
   if constexpr (now.step == Step::input && now.active) {
-    Real& to = in_bar[now.a][now.b];
-    if constexpr (now.bar == Bar::set) to = reached_in<Calculation>.node[n] ? bar[n] : Real{};
+    V& to = in_bar[now.a][now.b];
+    if constexpr (now.bar == Bar::set) to = reached_in<Calculation>.node[n] ? bar[n] : V{};
     if constexpr (now.bar == Bar::add && reached_in<Calculation>.node[n]) to += bar[n];
   }
 }
 
-template <class Calculation, int r>
-GMEM_INLINE void seed_bar(Real* bar, const Real* result_bar) {
+template <class Calculation, int r, class V>
+GMEM_INLINE void seed_bar(V* bar, const V* result_bar) {
   constexpr int n = program_of<Calculation>.result[r];
   if constexpr (program_of<Calculation>.node[n].active)
     bar[n] = reached_in<Calculation>.seeded[r] ? bar[n] + result_bar[r] : result_bar[r];
 }
 
-template <class Calculation, int... n, int... r>
-GMEM_INLINE void pull_back_by(std::integer_sequence<int, n...>, std::integer_sequence<int, r...>, const Real* const* in,
-                              const Real* result_bar, Real* const* in_bar) {
-  Real value[sizeof...(n)], bar[sizeof...(n)];
-  Bits mask[sizeof...(n)];
+template <class Calculation, class V, int... n, int... r>
+GMEM_INLINE void pull_back_by(std::integer_sequence<int, n...>, std::integer_sequence<int, r...>, const V* const* in,
+                              const V* result_bar, V* const* in_bar) {
+  V value[sizeof...(n)], bar[sizeof...(n)];
+  Mask<V> mask[sizeof...(n)];
   using InOrder = int[];
   (void)InOrder{(evaluate<Calculation, n>(in, value, mask), 0)...};
   (void)InOrder{(seed_bar<Calculation, r>(bar, result_bar), 0)...};
@@ -291,8 +291,8 @@ GMEM_INLINE void pull_back_by(std::integer_sequence<int, n...>, std::integer_seq
 }
 
 // From the bars of a calculation's results to those of its inputs, array by array.
-template <class Calculation>
-__attribute__((noinline)) void pull_back(const Real* const* in, const Real* result_bar, Real* const* in_bar) {
+template <class Calculation, class V>
+__attribute__((noinline)) void pull_back(const V* const* in, const V* result_bar, V* const* in_bar) {
   pull_back_by<Calculation>(std::make_integer_sequence<int, program_of<Calculation>.nodes>{},
                             std::make_integer_sequence<int, program_of<Calculation>.results>{}, in, result_bar, in_bar);
 }

@@ -7,7 +7,9 @@
 #include <cstdlib>
 #include <cstring>
 #include <new>
+#include <type_traits>
 
+#include "numbers/dual.h"
 #include "numbers/simd.h"
 #include "numbers/vectors.h"
 
@@ -28,14 +30,24 @@ enum class Operation : std::int32_t {
   select
 };
 
+// A mask where a number is kept.
+template <class R>
+inline R of_mask(Bits m) {
+  if constexpr (std::is_same<R, Real>::value) return (Real)m;
+  else return {(Real)m, Real{}};
+}
+inline Bits mask_in(Real a) { return (Bits)a; }
+inline Bits mask_in(Dual<Real> a) { return (Bits)a.value; }
+
 // What was calculated, in order. A slot holds one number.
+template <class R>
 class Tape {
  public:
   struct Mark {
     int nodes, slots;
   };
 
-  Tape() { slot(Real{}); }  // for all constants; its bar is of no interest
+  Tape() { slot(R{}); }  // for all constants; its bar is of no interest
   ~Tape() { std::free(node_), std::free(value_), std::free(bar_); }
   Tape(const Tape&) = delete;
   Tape& operator=(const Tape&) = delete;
@@ -43,16 +55,16 @@ class Tape {
   Mark mark() const { return {nodes_, slots_}; }
   void rewind(Mark mark) { nodes_ = mark.nodes, slots_ = mark.slots; }
   void clear() { rewind({0, 1}); }
-  Real& bar(int slot) { return bar_[slot]; }
+  R& bar(int slot) { return bar_[slot]; }
 
-  GMEM_INLINE int slot(Real value) {
+  GMEM_INLINE int slot(R value) {
     if (__builtin_expect(slots_ == slot_capacity_, 0)) grow_slots();
     value_[slots_] = value;
-    bar_[slots_] = Real{};
+    bar_[slots_] = R{};
     return slots_++;
   }
 
-  GMEM_INLINE int push(Operation operation, Real value, int a, int b = 0, int c = 0) {
+  GMEM_INLINE int push(Operation operation, R value, int a, int b = 0, int c = 0) {
     if (__builtin_expect(nodes_ == node_capacity_, 0)) grow_nodes();
     const int result = slot(value);
     node_[nodes_++] = {operation, result, a, b, c};
@@ -63,11 +75,11 @@ class Tape {
   void reverse(Mark first) {
     for (int n = nodes_ - 1; n >= first.nodes; --n) {
       const Node node = node_[n];
-      const Real g = bar_[node.result];
-      Real* const a = bar_ + node.a;
-      Real* const b = bar_ + node.b;
-      Real* const c = bar_ + node.c;
-      const Real* const result = value_ + node.result;
+      const R g = bar_[node.result];
+      R* const a = bar_ + node.a;
+      R* const b = bar_ + node.b;
+      R* const c = bar_ + node.c;
+      const R* const result = value_ + node.result;
       switch (node.operation) {
         case Operation::add: *a += g, *b += g; break;
         case Operation::subtract: *a += g, *b -= g; break;
@@ -77,21 +89,21 @@ class Tape {
         case Operation::fms: product(node, g), *c -= g; break;
         case Operation::fnma: product(node, -g), *c += g; break;
         case Operation::divide: {
-          const Real by_a = g / value_[node.b];
+          const R by_a = g / value_[node.b];
           *a += by_a;
           *b = fnma(by_a, *result, *b);
           break;
         }
         case Operation::root:  // at zero, where it has no derivative, zero
-          *a += zero_unless(*result > Real{}, splat<Real>(0.5) * g / *result);
+          *a += zero_unless(*result > R{}, splat<R>(0.5) * g / *result);
           break;
         case Operation::inverse_root: {  // what is not wanted stays zero, even where its slope is infinite
-          const Real y = *result;
-          *a += zero_unless(g != Real{}, splat<Real>(-0.5) * (((g * y) * y) * y));
+          const R y = *result;
+          *a += zero_unless(differ(g, R{}), splat<R>(-0.5) * (((g * y) * y) * y));
           break;
         }
         case Operation::select: {
-          const Bits m = (Bits)value_[node.c];
+          const Bits m = mask_in(value_[node.c]);
           *a += zero_unless(m, g);
           *b += zero_unless(~m, g);
           break;
@@ -106,7 +118,7 @@ class Tape {
     int result, a, b, c;
   };
 
-  void product(const Node& node, Real g) {
+  void product(const Node& node, R g) {
     bar_[node.a] = fma(g, value_[node.b], bar_[node.a]);
     bar_[node.b] = fma(g, value_[node.a], bar_[node.b]);
   }
@@ -133,17 +145,19 @@ class Tape {
 
   int nodes_ = 0, slots_ = 0, node_capacity_ = 0, slot_capacity_ = 0;
   Node* node_ = nullptr;
-  Real* value_ = nullptr;
-  Real* bar_ = nullptr;
+  R* value_ = nullptr;
+  R* bar_ = nullptr;
 };
 
 // The tape on which this thread records.
-static thread_local Tape* tape __attribute__((tls_model("initial-exec"))) = nullptr;
+template <class R>
+static thread_local Tape<R>* tape __attribute__((tls_model("initial-exec"))) = nullptr;
 
 // Makes it that tape for as long as this lives.
+template <class R>
 struct Recording {
-  explicit Recording(Tape* on) { tape = on; }
-  ~Recording() { tape = nullptr; }
+  explicit Recording(Tape<R>* on) { tape<R> = on; }
+  ~Recording() { tape<R> = nullptr; }
   Recording(const Recording&) = delete;
   Recording& operator=(const Recording&) = delete;
 };
@@ -151,71 +165,80 @@ struct Recording {
 // --- numbers
 
 // A number in a slot, or a constant (slot 0).
+template <class R>
 struct Taped {
-  Real value;
+  R value;
   int slot;
 
-  static Taped of(double a) { return {splat<Real>(a), 0}; }
+  static Taped of(double a) { return {splat<R>(a), 0}; }
   double operator[](int l) const { return value[l]; }
+
+  friend GMEM_INLINE Taped select(Bits m, Taped a, Taped b) {
+    const R value = select(m, a.value, b.value);
+    if (!a.slot && !b.slot) return {value, 0};
+    return {value, tape<R>->push(Operation::select, value, a.slot, b.slot, tape<R>->slot(of_mask<R>(m)))};
+  }
+  friend GMEM_INLINE Taped zero_unless(Bits m, Taped a) { return select(m, a, Taped{}); }
+
+  friend GMEM_INLINE Taped operator+(Taped a, Taped b) { return of_sum(Operation::add, a.value + b.value, a, b); }
+  friend GMEM_INLINE Taped operator-(Taped a, Taped b) { return of_sum(Operation::subtract, a.value - b.value, a, b); }
+  friend GMEM_INLINE Taped operator-(Taped a) { return of_sum(Operation::negate, -a.value, a, Taped{}); }
+  friend GMEM_INLINE Taped operator*(Taped a, Taped b) {
+    return of_product(Operation::multiply, a.value * b.value, a, b, Taped{});
+  }
+  friend GMEM_INLINE Taped operator/(Taped a, Taped b) {
+    return of_product(Operation::divide, a.value / b.value, a, b, Taped{});
+  }
+  friend GMEM_INLINE Taped fma(Taped a, Taped b, Taped c) {
+    return of_product(Operation::fma, fma(a.value, b.value, c.value), a, b, c);
+  }
+  friend GMEM_INLINE Taped fms(Taped a, Taped b, Taped c) {
+    return of_product(Operation::fms, fms(a.value, b.value, c.value), a, b, c);
+  }
+  friend GMEM_INLINE Taped fnma(Taped a, Taped b, Taped c) {
+    return of_product(Operation::fnma, fnma(a.value, b.value, c.value), a, b, c);
+  }
+  friend GMEM_INLINE Taped root(Taped a) { return of_root(Operation::root, root(a.value), a); }
+  friend GMEM_INLINE Taped inverse_root(Taped a) { return of_root(Operation::inverse_root, inverse_root(a.value), a); }
+
+  friend Bits operator<(Taped a, Taped b) { return a.value < b.value; }
+  friend Bits operator>(Taped a, Taped b) { return a.value > b.value; }
+  friend Bits operator<=(Taped a, Taped b) { return a.value <= b.value; }
+  friend unsigned bits_less(Taped a, Taped b) { return bits_less(a.value, b.value); }
+  friend Taped max(Taped a, Taped b) { return {max(a.value, b.value), 0}; }  // only ever asked who is near
+  friend double largest(Taped a) { return largest(a.value); }
+  friend double smallest(Taped a) { return smallest(a.value); }
+  friend Taped floor_of(Taped a) { return {floor_of(a.value), 0}; }
+
+ private:
+  // Of constants alone nothing is remembered.
+  static GMEM_INLINE Taped of_sum(Operation operation, R value, Taped a, Taped b) {
+    return {value, a.slot || b.slot ? tape<R>->push(operation, value, a.slot, b.slot) : 0};
+  }
+  static GMEM_INLINE Taped of_product(Operation operation, R value, Taped a, Taped b, Taped c) {
+    if (!a.slot && !b.slot && !c.slot) return {value, 0};
+    const int one = a.kept(), other = b.kept();
+    return {value, tape<R>->push(operation, value, one, other, c.slot)};
+  }
+  static GMEM_INLINE Taped of_root(Operation operation, R value, Taped a) {
+    return {value, a.slot ? tape<R>->push(operation, value, a.slot) : 0};
+  }
+  // The slot of an operand whose value will be wanted.
+  GMEM_INLINE int kept() const { return slot ? slot : tape<R>->slot(value); }
 };
 
-inline Taped leaf(Real value) { return {value, tape->slot(value)}; }
-// The slot of an operand whose value will be wanted.
-GMEM_INLINE int kept(Taped a) { return a.slot ? a.slot : tape->slot(a.value); }
-
-inline Taped constant(Real a) { return {a, 0}; }
-
-GMEM_INLINE Taped select(Bits m, Taped a, Taped b) {
-  const Real value = m ? a.value : b.value;
-  if (!a.slot && !b.slot) return constant(value);
-  return {value, tape->push(Operation::select, value, a.slot, b.slot, tape->slot((Real)m))};
+template <class R>
+inline Taped<R> constant(R a) {
+  return {a, 0};
 }
-GMEM_INLINE Taped zero_unless(Bits m, Taped a) { return select(m, a, Taped{}); }
-
-GMEM_INLINE Taped of_sum(Operation operation, Real value, Taped a, Taped b) {
-  return a.slot || b.slot ? Taped{value, tape->push(operation, value, a.slot, b.slot)} : constant(value);
+template <class R>
+inline Taped<R> leaf(R value) {
+  return {value, tape<R>->slot(value)};
 }
-GMEM_INLINE Taped operator+(Taped a, Taped b) { return of_sum(Operation::add, a.value + b.value, a, b); }
-GMEM_INLINE Taped operator-(Taped a, Taped b) { return of_sum(Operation::subtract, a.value - b.value, a, b); }
-GMEM_INLINE Taped operator-(Taped a) { return of_sum(Operation::negate, -a.value, a, Taped{}); }
-
-GMEM_INLINE Taped of_product(Operation operation, Real value, Taped a, Taped b, Taped c) {
-  if (!a.slot && !b.slot && !c.slot) return constant(value);
-  const int one = kept(a), other = kept(b);
-  return {value, tape->push(operation, value, one, other, c.slot)};
+template <class R>
+inline Vec<Taped<R>> leaf(Vec<R> a) {
+  return {leaf(a.x), leaf(a.y), leaf(a.z)};
 }
-GMEM_INLINE Taped operator*(Taped a, Taped b) {
-  return of_product(Operation::multiply, a.value * b.value, a, b, Taped{});
-}
-GMEM_INLINE Taped operator/(Taped a, Taped b) {
-  return of_product(Operation::divide, a.value / b.value, a, b, Taped{});
-}
-GMEM_INLINE Taped fma(Taped a, Taped b, Taped c) {
-  return of_product(Operation::fma, fma(a.value, b.value, c.value), a, b, c);
-}
-GMEM_INLINE Taped fms(Taped a, Taped b, Taped c) {
-  return of_product(Operation::fms, fms(a.value, b.value, c.value), a, b, c);
-}
-GMEM_INLINE Taped fnma(Taped a, Taped b, Taped c) {
-  return of_product(Operation::fnma, fnma(a.value, b.value, c.value), a, b, c);
-}
-
-GMEM_INLINE Taped of_root(Operation operation, Real value, Taped a) {
-  return a.slot ? Taped{value, tape->push(operation, value, a.slot)} : constant(value);
-}
-GMEM_INLINE Taped root(Taped a) { return of_root(Operation::root, root(a.value), a); }
-GMEM_INLINE Taped inverse_root(Taped a) { return of_root(Operation::inverse_root, inverse_root(a.value), a); }
-
-inline Bits operator<(Taped a, Taped b) { return a.value < b.value; }
-inline Bits operator>(Taped a, Taped b) { return a.value > b.value; }
-inline Bits operator<=(Taped a, Taped b) { return a.value <= b.value; }
-inline unsigned bits_less(Taped a, Taped b) { return bits_less(a.value, b.value); }
-inline Taped max(Taped a, Taped b) { return constant(max(a.value, b.value)); }  // only ever asked who is near
-inline double largest(Taped a) { return largest(a.value); }
-inline double smallest(Taped a) { return smallest(a.value); }
-inline Taped floor_of(Taped a) { return constant(floor_of(a.value)); }
-
-inline Vec<Taped> leaf(Vec<Real> a) { return {leaf(a.x), leaf(a.y), leaf(a.z)}; }
 
 }  // namespace GMEM_ISA
 }  // namespace gmem

@@ -9,9 +9,9 @@ constexpr int kWalls = 12;  // lower, upper, lower velocity, upper velocity
 constexpr int kMaxHistory = 3;
 constexpr int kPlanes = 6;  // that a sphere may touch: the lower walls of x, y and z, then the upper ones
 
-// What is wanted: all steps; their derivative along a direction; or, back from derivatives by all results, those by all
-// arguments.
-enum class Task { forward, tangent, adjoint };
+// What is wanted: all steps; their derivative along a direction; back from derivatives by all results, those by all
+// arguments; or the derivative of these along a direction.
+enum class Task { forward, tangent, adjoint, second_adjoint };
 
 // In the order of
 // gmem_jax/physics/contact/laws.py: LAWS
