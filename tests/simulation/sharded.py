@@ -118,6 +118,22 @@ def replicas_forwards(runs: Runs, tolerance: float) -> None:
     assert not sent, sent
 
 
+def replicas_twice(runs: Runs, tolerance: float) -> None:
+    """Second derivatives, of split arrays and within a map."""
+
+    def bend(loss: Callable[..., Any]) -> Callable[..., Any]:
+        slope = jax.grad(lambda mu, rates: jnp.sum(loss(mu, rates) ** 2), argnums=(0, 1))
+        return lambda mu, rates: jax.jvp(slope, (mu, rates), (jnp.ones_like(mu), jnp.sin(rates)))[1]
+
+    alone, shared = (jnp.asarray(0.5), RATES), (jnp.asarray(0.5), split(RATES, "a"))
+    (_, by_rates), sent = compare(bend(runs.loss), alone, shared, tolerance)
+    assert by_rates.sharding.shard_shape(by_rates.shape) == (1,), by_rates.sharding
+    assert sent == {"all-reduce"}, sent
+    mesh, each = Mesh(np.array(jax.devices()), ("a",)), PartitionSpec("a")
+    mapped = jax.shard_map(runs.loss, mesh=mesh, in_specs=(PartitionSpec(), each), out_specs=each)
+    compare(bend(runs.loss), alone, alone, tolerance, bend(mapped))
+
+
 def in_types(runs: Runs, tolerance: float) -> None:
     """The mesh is part of types, as `jax.make_mesh` has it; a loop's first state must be split as the next ones are."""
     rates, placed = split(RATES, "a", kind=AxisType.Explicit), Runs(runs.backend)
@@ -221,6 +237,7 @@ CHECKS: dict[str, tuple[Callable[[Runs, float], None], ...]] = {
     "native": (
         *ALWAYS,
         replicas_forwards,
+        replicas_twice,
         in_types,
         sweep_backwards,
         sweep_of_split_replicas,
