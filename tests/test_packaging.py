@@ -69,8 +69,9 @@ def test_a_wheel_serves_every_python_of_one_platform(built: Built) -> None:
 def test_the_wheel_is_small(built: Built) -> None:
     library = ROOT / "gmem_jax" / "native" / build.LIBRARY
     size = built.wheel.stat().st_size + (len(zlib.compress(library.read_bytes())) if library.exists() else 0)
-    # 16.4 MB: 12.7 of packs, and 2.9 of the library, which has each law's derivatives for three instruction sets.
-    assert size < 17e6, f"{size / 1e6:.1f} MB with the library"
+    # 17.9 MB: 12.7 of packs, and 4.4 of the library, which has each law's derivatives for three instruction sets and
+    # second ones for two.
+    assert size < 18.5e6, f"{size / 1e6:.1f} MB with the library"
 
 
 def test_without_a_compiler_it_is_built_and_says_so(built: Built) -> None:

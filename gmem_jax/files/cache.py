@@ -7,8 +7,9 @@ from pathlib import Path
 
 def kept() -> Path | None:
     """The package's folder in the user's cache, which need not exist; None for a user without a home."""
-    if chosen := os.environ.get("XDG_CACHE_HOME"):
-        return Path(chosen) / "gmem_jax"
+    chosen = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if chosen.is_absolute():  # others are to be ignored, the XDG Base Directory Specification says
+        return chosen / "gmem_jax"
     try:
         return Path.home() / ".cache" / "gmem_jax"
     except RuntimeError:

@@ -71,7 +71,8 @@ def _cache() -> str:
     if chosen:
         return str(Path(chosen) / "kernels")
     try:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        home = Path(os.environ.get("XDG_CACHE_HOME", ""))
+        home = home if home.is_absolute() else Path.home() / ".cache"
     except RuntimeError:  # a user without a home
         return ""
     return str(home / "gmem_jax" / "kernels")

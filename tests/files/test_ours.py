@@ -17,9 +17,11 @@ import gmem_jax as gm
 from gmem_jax.command import app as cli
 from gmem_jax.command.console import check_output
 from gmem_jax.files.atomic import atomic
+from gmem_jax.files.cache import kept
 from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import Folder, remove_leftovers, temporary
 from gmem_jax.files.packs import load_pack
+from gmem_jax.native.cuda import _cache
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.spec import spec_of
 from gmem_jax.sweeps.store import Store
@@ -419,3 +421,13 @@ def test_a_pack_under_another_s_name_is_refused(tmp_path: Path, monkeypatch: pyt
     made.store.pack_at(job["name"]).write_bytes(PACK.read_bytes())
     with pytest.raises(gm.FileFormatError, match="files were exchanged"):
         made.pack_of({"mu": 0.1, "prepare.grains": 16})
+
+
+def test_a_cache_of_a_relative_path_is_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would be another one in every folder; the XDG Base Directory Specification says so."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("GMEM_COMPILE_CACHE")
+    for chosen, folder in {"here": tmp_path / ".cache", "": tmp_path / ".cache", "/some": Path("/some")}.items():
+        monkeypatch.setenv("XDG_CACHE_HOME", chosen)
+        assert kept() == folder / "gmem_jax"
+        assert Path(_cache()) == folder / "gmem_jax" / "kernels"

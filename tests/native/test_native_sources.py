@@ -67,7 +67,7 @@ def test_unit_tests_in_cpp(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", AT_HAND.values())
 def test_every_compiler_at_hand_takes_the_sources(name: str) -> None:
     x86 = platform.machine().lower() in ("x86_64", "amd64")
-    for flags in (build.INSTRUCTION_SETS["avx512"] if x86 else (), ("-DGMEM_DERIVATIVES",)):
+    for flags in (build.INSTRUCTION_SETS["avx512"] if x86 else (), *build.KERNELS.values()):
         compiled([name], "-fsyntax-only", "-DGMEM_ISA=some", *flags, str(build.SOURCES / "cpu" / "kernel.cc"))
     gpu = [*map(str, sorted((build.SOURCES / "cuda").glob("*.cc"))), str(HERE / "emulated.cc")]
     compiled([name], "-fsyntax-only", '-DGMEM_SOURCE_HASH="some"', *gpu)
