@@ -282,7 +282,7 @@ def loss_of(system: System, state: State) -> Callable[..., jax.Array]:
 
 # Plain JAX compiles them for ten seconds; differences say the same of every law more quickly (`assert_transposed`).
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", ["H", "M1", "M2-paper"])
 def test_second_derivatives_are_those_of_plain_jax(name: str) -> None:
     system, state = squeezed(LAWS[name])
     loss, theta = loss_of(system, state), arguments(system, state)
