@@ -13,6 +13,7 @@ import gmem_jax
 ROOT = Path(gmem_jax.__file__).parent
 FLOORS = (
     "errors",
+    "home",
     "physics",
     "native",
     "simulation",

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.native import primitives
+from gmem_jax.native import calls, primitives
 from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of
 from gmem_jax.physics.state import Box, State
 from gmem_jax.physics.system import System
@@ -27,7 +27,7 @@ def assert_transposed(system: System, state: State, boxes: Box, dt: float = 0.3,
     row of the parameters.
 
     Returns:
-        J^T w, `primitives.Arrays`.
+        J^T w, `calls.Arrays`.
     """
     boxes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*leaf.shape[:-1], state.replicas)), boxes)
     numbers = jnp.asarray(dt), jnp.asarray(drag)
@@ -53,7 +53,7 @@ def assert_transposed(system: System, state: State, boxes: Box, dt: float = 0.3,
 
 
 def _assert_derivative_of_the_adjoint(
-    call: primitives.Call,
+    call: calls.Call,
     definition: PlainDefinition,
     fixed: Any,
     arrays: Any,
@@ -70,7 +70,7 @@ def _assert_derivative_of_the_adjoint(
 
     def random(tree: Any) -> Any:
         drawn = jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), tree)
-        if isinstance(tree, primitives.Arrays):
+        if isinstance(tree, calls.Arrays):
             # Offsets are alike in all replicas. Histories that are zero stay so: magnitudes have a bend there.
             known = [jnp.where(leaf != 0.0, way, 0.0) for leaf, way in zip(tree.history, drawn.history, strict=True)]
             alike = jnp.broadcast_to(drawn.offsets[..., :1], drawn.offsets.shape)
@@ -111,7 +111,7 @@ def _products(one: Any, other: Any) -> list[np.ndarray]:
     return [np.asarray(a * b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)]
 
 
-def _directions(arrays: primitives.Arrays, draws: np.random.Generator) -> Any:
+def _directions(arrays: calls.Arrays, draws: np.random.Generator) -> Any:
     """Directions along one array each, or one row of the parameters, and what they are called."""
     leaves, structure = jax.tree.flatten(arrays)
     for place, (path, leaf) in enumerate(jax.tree_util.tree_flatten_with_path(arrays)[0]):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from gmem_jax.files.cache import kept
+from gmem_jax.home import cache_folder
 
 SWITCH = "GMEM_COMPILE_CACHE"  # another folder, or "off"
 
@@ -34,7 +34,7 @@ def keep_programs() -> None:
         return
     if chosen:
         folder = Path(chosen)
-    elif home := kept():
+    elif home := cache_folder():
         folder = home / f"jax-{jax.__version__}-{_processor()}"
     else:
         return

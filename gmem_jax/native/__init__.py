@@ -3,8 +3,9 @@
 One call into the library runs all steps of one bin for all replicas; walls, checks and samples are computed in JAX.
 It works under `jax.jit`, `jax.vmap`, `jax.shard_map`, on sharded arrays, and in both modes of differentiation, whose
 derivatives are computed in the library too. The rooms: `backend` decides which code does the steps, `march` puts a
-state into the arrays of a call, `primitives` makes the calls operations of JAX, `library` loads what `build` compiled,
-`cuda` has what GPUs need beside that, and `search` looks for candidate contacts.
+state into the arrays of a call, `calls` makes a call an operation of JAX, `primitives` says how the calls are
+differentiated, `library` loads what `build` compiled, `cuda` has what GPUs need beside that, and `search` looks for
+candidate contacts.
 
 On CUDA GPUs the same C++ runs as kernels; see `gmem_jax.native.cuda` and docs/gpu.md. What follows is said of CPUs.
 
@@ -30,9 +31,9 @@ from gmem_jax.native.backend import (
     resolve,
     supports,
 )
+from gmem_jax.native.calls import TARGETS
 from gmem_jax.native.library import available, needs, require_threads
 from gmem_jax.native.march import March, march
-from gmem_jax.native.primitives import TARGETS
 from gmem_jax.native.search import search
 
 __all__ = [

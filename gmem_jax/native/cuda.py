@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gmem_jax.home import cache_folder
+
 CUDA_TARGETS = {"gmem_advance": "gmem_cuda_advance", "gmem_tangent": "gmem_cuda_tangent"}
 """Symbols of the library by the names of calls; reverse mode is in plain JAX."""
 
@@ -70,12 +72,8 @@ def _cache() -> str:
         return ""
     if chosen:
         return str(Path(chosen) / "kernels")
-    try:
-        home = Path(os.environ.get("XDG_CACHE_HOME", ""))
-        home = home if home.is_absolute() else Path.home() / ".cache"
-    except RuntimeError:  # a user without a home
-        return ""
-    return str(home / "gmem_jax" / "kernels")
+    folder = cache_folder()
+    return str(folder / "kernels") if folder else ""
 
 
 def initializing(symbol: str) -> str:
@@ -112,7 +110,7 @@ def kernel_needs(
 
     Args:
         library: the native library.
-        law: its number, as of `gmem_jax.native.primitives.Call`.
+        law: its number, as of `gmem_jax.native.calls.Call`.
         variant: alike.
         architecture: as "sm_90".
         tangent: of numbers that carry derivatives.
@@ -156,7 +154,7 @@ def between_steps(fixed: Any, history: Sequence[Any], grains: int, call: Any, ki
         fixed: of the call.
         history: of the call, leaves [1, P, ..., B], and [1, 6 S, ..., B] where walls have friction.
         grains: N.
-        call: its attributes, `gmem_jax.native.primitives.Call`.
+        call: its attributes, `gmem_jax.native.calls.Call`.
         kinds: one for values, two for values and derivatives.
         lanes: replicas of all entries, L.
     """
@@ -180,9 +178,9 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
 
     Args:
         target: what XLA knows it by.
-        call: its attributes, `gmem_jax.native.primitives.Call`.
+        call: its attributes, `gmem_jax.native.calls.Call`.
         in_place: whether histories may take the place of those that were given.
-        parts: `Fixed` and `Arrays` of `gmem_jax.native.primitives`, and the tangent's `Arrays`.
+        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`, and the tangent's `Arrays`.
         shapes: of the results.
     """
     outer = shapes[0].shape[:-3]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 
-from gmem_jax.native import cuda, primitives
+from gmem_jax.native import calls, cuda
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import Entry, entry_of
 
@@ -34,7 +34,7 @@ def load_library() -> tuple[str, str]:
         library = ctypes.CDLL(str(file))
         if is_stale(library):
             return "", "its library is older than its sources; rebuild it: python -m gmem_jax.native.build"
-        for target in primitives.TARGETS:
+        for target in calls.TARGETS:
             jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
         cuda.register(library, SOURCES)
         library.gmem_instruction_set.restype = ctypes.c_char_p

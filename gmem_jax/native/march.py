@@ -1,7 +1,7 @@
 """The steps of a bin by the library, with the signature of `gmem_jax.physics.step.march`; their tangents and adjoints.
 
 Here a system and a state become the arrays and numbers of a call, and its results a state again. How a call is made is
-in `gmem_jax.native.primitives`.
+in `gmem_jax.native.calls` and `gmem_jax.native.primitives`.
 """
 
 import functools
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.extend.backend import get_backend
 
 from gmem_jax.native import library, primitives
-from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
+from gmem_jax.native.calls import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -203,12 +203,12 @@ class _Solid(NamedTuple):
 
 @dataclass(frozen=True)
 class PlainDefinition:
-    """`_plain` on the arguments of a call, `gmem_jax.native.primitives.Definition`.
+    """`_plain` on the arguments of a call, `gmem_jax.native.calls.Definition`.
 
     Attributes:
         system: structure of the `System`.
         history: structure of the histories, of the candidates and of walls with friction.
-        anywhere: see `gmem_jax.native.primitives.Definition`.
+        anywhere: see `gmem_jax.native.calls.Definition`.
         periodic: the periodic axes of the box.
     """
 

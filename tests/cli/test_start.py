@@ -16,7 +16,8 @@ from test_cli import PACK, SHORT, gmem
 
 import gmem_jax as gm
 from gmem_jax.errors import FileFormatError
-from gmem_jax.files.cache import kept, kept_pack
+from gmem_jax.files.cache import kept_pack
+from gmem_jax.home import cache_folder
 from gmem_jax.physics.rules import StartError
 from gmem_jax.show import summaries
 from gmem_jax.show.figure import Curve, Figure, Panel
@@ -140,7 +141,7 @@ def test_a_user_without_a_home_keeps_nothing_and_is_told_where_a_home_is_needed(
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.delenv("GMEM_COMPILE_CACHE")
     monkeypatch.setattr(Path, "home", no_home)
-    assert kept() is None
+    assert cache_folder() is None
     assert kept_pack("tetra-31680-a") is None
     assert gmem(monkeypatch, "--help") == 0
     assert gmem(monkeypatch, "show", "tetra-325-a") == 0

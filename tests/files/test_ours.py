@@ -17,10 +17,10 @@ import gmem_jax as gm
 from gmem_jax.command import app as cli
 from gmem_jax.command.console import check_output
 from gmem_jax.files.atomic import atomic
-from gmem_jax.files.cache import kept
 from gmem_jax.files.checkpoints import Checkpoints, locked
 from gmem_jax.files.ours import Folder, remove_leftovers, temporary
 from gmem_jax.files.packs import load_pack
+from gmem_jax.home import cache_folder
 from gmem_jax.native.cuda import _cache
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.spec import spec_of
@@ -429,5 +429,5 @@ def test_a_cache_of_a_relative_path_is_ignored(tmp_path: Path, monkeypatch: pyte
     monkeypatch.delenv("GMEM_COMPILE_CACHE")
     for chosen, folder in {"here": tmp_path / ".cache", "": tmp_path / ".cache", "/some": Path("/some")}.items():
         monkeypatch.setenv("XDG_CACHE_HOME", chosen)
-        assert kept() == folder / "gmem_jax"
+        assert cache_folder() == folder / "gmem_jax"
         assert Path(_cache()) == folder / "gmem_jax" / "kernels"

@@ -22,9 +22,9 @@ from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, assert_close, scene
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import build, cuda, library, primitives
+from gmem_jax.native import build, calls, cuda, library
+from gmem_jax.native.calls import Arrays, Call, Fixed, StepOutput
 from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of
-from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
 from gmem_jax.physics.grain import sphere
 from gmem_jax.physics.state import Box, replicate
@@ -143,16 +143,16 @@ def spheres() -> Scene:
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
 def emulate(call: Call, fixed: Fixed, arrays: Arrays) -> StepOutput:
     """What a GPU would give."""
-    shapes = primitives._of_results((fixed, arrays))
+    shapes = calls.of_results((fixed, arrays))
     found = cuda.call_kernels("gmem_emulated_advance", call, True, (fixed, arrays), shapes)
-    return primitives._results(arrays, found[: len(shapes)])
+    return calls.results_of(arrays, found[: len(shapes)])
 
 
 @functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
 def emulate_tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> StepOutput:
-    shapes = primitives._of_results((fixed, arrays))
+    shapes = calls.of_results((fixed, arrays))
     found = cuda.call_kernels("gmem_emulated_tangent", call, False, (fixed, arrays, along), shapes)
-    return primitives._results(arrays, found[: len(shapes)])
+    return calls.results_of(arrays, found[: len(shapes)])
 
 
 def few(law: str, file: Path, wall_mu: float | None = None) -> Scene:

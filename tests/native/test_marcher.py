@@ -15,9 +15,9 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import cuda, library, primitives
+from gmem_jax.native import calls, cuda, library, primitives
+from gmem_jax.native.calls import Arrays, StepOutput
 from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of, warn_no_library
-from gmem_jax.native.primitives import Arrays, StepOutput
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import start
@@ -73,7 +73,7 @@ def no_library(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     warn_no_library.cache_clear()
 
 
-CALLS_ALLOWED = [export.DisabledSafetyCheck.custom_call(target) for target in primitives.TARGETS]
+CALLS_ALLOWED = [export.DisabledSafetyCheck.custom_call(target) for target in calls.TARGETS]
 
 
 def lowered(march: native.March, platform: str) -> str:
@@ -87,7 +87,7 @@ def test_auto_is_the_library_where_it_runs_and_the_definition_elsewhere(monkeypa
     monkeypatch.setattr(cuda, "missing", lambda: "")
     auto = native.marcher("auto")
     found = {
-        platform: {target for target in primitives.TARGETS if f"custom_call @{target}" in lowered(auto, platform)}
+        platform: {target for target in calls.TARGETS if f"custom_call @{target}" in lowered(auto, platform)}
         for platform in ("cpu", "cuda", "tpu")
     }
     # Reverse mode on GPUs is that of the definition.
@@ -175,13 +175,9 @@ def test_other_platforms_have_the_derivatives_of_a_sweep() -> None:
 
     along = known(jax.tree.map(jnp.ones_like, values))
     found = primitives.tangent(call, definition, outer(fixed), values, along)
-    plain = primitives._over(functools.partial(primitives._plain_tangent, definition), (2,))(
-        outer(fixed), values, along
-    )
-    back = primitives._bind(primitives._adjoint_p, call, definition, outer(fixed), values, found)
-    plain_back = primitives._over(functools.partial(primitives._plain_adjoint, definition), (2,))(
-        outer(fixed), values, found
-    )
+    plain = calls.over(functools.partial(primitives._plain_tangent, definition), (2,))(outer(fixed), values, along)
+    back = calls.bind(primitives._adjoint_p, call, definition, outer(fixed), values, found)
+    plain_back = calls.over(functools.partial(primitives._plain_adjoint, definition), (2,))(outer(fixed), values, found)
     ours, theirs = (found, known(jax.tree.unflatten(jax.tree.structure(plain_back), back))), (plain, known(plain_back))
     for one, other in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         assert one.shape == other.shape

@@ -26,9 +26,9 @@ from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import build, cuda, library, primitives
+from gmem_jax.native import build, calls, cuda, library
+from gmem_jax.native.calls import Arrays, Call, Fixed
 from gmem_jax.native.march import arrays_of, call_of, fixed_of
-from gmem_jax.native.primitives import Arrays, Call, Fixed
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import start, wall_histories
 from gmem_jax.physics.system import System
@@ -121,7 +121,7 @@ def parts_of(name: str) -> Parts:
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICKLY)
 def called(target: str, in_place: bool, call: Call, *parts: Any) -> list[jax.Array]:
-    shapes = primitives._of_results(parts[:2])
+    shapes = calls.of_results(parts[:2])
     return list(cuda.call_kernels(target, call, in_place, parts, shapes)[: len(shapes)])
 
 

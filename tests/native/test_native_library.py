@@ -13,9 +13,9 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import build, cuda, library, primitives
+from gmem_jax.native import build, calls, cuda, library
+from gmem_jax.native.calls import Arrays, Call, Fixed, StepOutput
 from gmem_jax.native.march import arrays_of, call_of, fixed_of
-from gmem_jax.native.primitives import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics.state import replicate
 from gmem_jax.physics.step import start
 from gmem_jax.physics.system import System
@@ -47,9 +47,7 @@ def parts(given: Arguments) -> tuple[Call, Fixed, Arrays]:
 def run(given: Arguments) -> Any:
     """Past JAX's own look at the shapes: the library must not depend on it."""
     call, fixed, arrays = parts(given)
-    return jax.block_until_ready(
-        primitives._library("gmem_advance", primitives._of_results, call, False, (fixed, arrays))
-    )
+    return jax.block_until_ready(calls.call_library("gmem_advance", calls.of_results, call, False, (fixed, arrays)))
 
 
 def changed(name: str, change: Callable[[Any], Any]) -> Callable[[Arguments], Arguments]:
@@ -126,9 +124,7 @@ def test_want_of_memory_is_an_error_and_leaves_the_library_working() -> None:
     call, fixed, arrays = parts({**called(points=points)(given), **alone})
     bars = StepOutput(arrays.fields, jnp.zeros((3, 1)), arrays.history)
     with pytest.raises(jax.errors.JaxRuntimeError, match="gmem_jax native: out of memory"):
-        jax.block_until_ready(
-            primitives._library("gmem_adjoint", primitives._of_arrays, call, False, (fixed, arrays, bars))
-        )
+        jax.block_until_ready(calls.call_library("gmem_adjoint", calls.of_arrays, call, False, (fixed, arrays, bars)))
     run(given)
 
 

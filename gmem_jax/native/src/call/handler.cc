@@ -84,7 +84,7 @@ struct Signature {
 
 // Arguments of all tasks are those of the steps themselves; then, for derivatives, a number for each of the arguments', or
 // of the results, that there are: see `Task`.
-// gmem_jax/native/primitives.py: _library, _of_results, _of_arrays
+// gmem_jax/native/calls.py: call_library, of_results, of_arrays
 Signature signature(Task task, Law law, bool rubs) {
   const Wants pack = {{"first spheres", "P", ffi::S32},
                       {"second spheres", "P", ffi::S32},
