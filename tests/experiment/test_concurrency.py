@@ -33,7 +33,7 @@ def traced(gamma0: float) -> np.ndarray:
     return np.asarray(compiled(jnp.asarray(gamma0)))
 
 
-@pytest.mark.parametrize(("recalled", "repeats"), [(on_the_host, 5), pytest.param(traced, 20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("recalled", "repeats"), [(on_the_host, 2), pytest.param(traced, 20, marks=pytest.mark.slow)])
 def test_eight_threads_at_once_give_the_bits_of_one_after_the_other(
     recalled: Callable[[float], np.ndarray], repeats: int
 ) -> None:
