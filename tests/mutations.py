@@ -1383,7 +1383,7 @@ MUTATIONS = (
     ),
     mutation(
         "adjoint-of-unequal-spheres-on-walls",
-        "cpu/calculations.h",
+        "physics/calculations.h",
         "parameters.wall_stiffness = root(radius) * parameters.wall_stiffness;",
         "",
         "test_the_adjoint_of_unequal_spheres_is_the_transpose_of_their_tangent[H-spheres]",

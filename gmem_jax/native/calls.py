@@ -1,7 +1,7 @@
 """A call into the library as an operation of JAX: its arguments, their shapes, and what does it where.
 
-Which code runs is settled when a program is lowered: the library on CPUs and, forwards, on CUDA GPUs (see `cuda`); the
-definition in plain JAX elsewhere.
+Which code runs is settled when a program is lowered: the library on CPUs and, where it serves the call (see `cuda`), on
+CUDA GPUs; the definition in plain JAX elsewhere.
 Replicas know nothing of each other, so a call on arrays that are sharded by replicas runs on each device by itself.
 """
 
@@ -278,11 +278,12 @@ def make_primitive(
     def on_cuda(context: mlir.LoweringRuleContext, *values: Any, definition: Definition, **static: Any) -> Any:
         if static["call"].mixed:
             raise NotImplementedError("precision='mixed' is a mode of CPUs so far; use 'double' on a GPU")
-        if target in cuda.CUDA_TARGETS and not cuda.missing():
+        serves = cuda.serves(target, static["call"])
+        if serves and not cuda.missing():
             return library(context, *values, on_gpu=True, **static)
-        if target in cuda.CUDA_TARGETS and not definition.anywhere:
+        if serves and not definition.anywhere:
             raise NotImplementedError(f"the native backend does not run on this GPU: {cuda.missing()}")
-        if target in cuda.CUDA_TARGETS:
+        if serves:
             cuda.warn_no_nvrtc(cuda.missing())
         return in_plain_jax(context, *values, definition=definition, **static)
 

@@ -1,8 +1,8 @@
 """The native backend on CUDA GPUs: which arrays a call has there, and whether it can be made at all.
 
 The kernels (src/cuda) are the physics of the CPU's library, compiled where they run by NVRTC. A step is two launches: a
-thread is a candidate of a replica in the first, and a grain in the second. What is needed from one step to the next are
-further results of the call, so that XLA manages all memory.
+thread is a candidate of a replica in the first, and a grain in the second. What is needed from one step to the next, and
+what reverse mode keeps of every step, are further results of the call, so that XLA manages all memory.
 """
 
 import ctypes
@@ -21,8 +21,12 @@ import jax.numpy as jnp
 
 from gmem_jax.home import cache_folder
 
-CUDA_TARGETS = {"gmem_advance": "gmem_cuda_advance", "gmem_tangent": "gmem_cuda_tangent"}
-"""Symbols of the library by the names of calls; reverse mode is in plain JAX."""
+CUDA_TARGETS = {
+    "gmem_advance": "gmem_cuda_advance",
+    "gmem_tangent": "gmem_cuda_tangent",
+    "gmem_adjoint": "gmem_cuda_adjoint",
+}
+"""Symbols of the library by the names of calls; see `serves`."""
 
 _NAMES = ("libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so")
 _registered: list[ctypes.CDLL] = []  # the library, once it is loaded
@@ -65,6 +69,19 @@ def warn_no_nvrtc(reason: str) -> None:
     warnings.warn(f"plain JAX runs on the GPU, and slowly: {reason}", stacklevel=2)
 
 
+def serves(target: str, call: Any) -> bool:
+    """Whether there are kernels for a call; if not, GPUs have it in plain JAX.
+
+    Reverse mode is of equal spheres between smooth walls, with any law but Mindlin's; second derivatives there are none.
+
+    Args:
+        target: what XLA knows the call by.
+        call: its attributes, `gmem_jax.native.calls.Call`.
+    """
+    beyond = call.points or call.periodic or call.unequal or call.rubs
+    return target in CUDA_TARGETS and not (target == "gmem_adjoint" and beyond)
+
+
 def _cache() -> str:
     """The folder for compiled kernels; "" where nothing is to be kept."""
     chosen = os.environ.get("GMEM_COMPILE_CACHE", "")
@@ -104,7 +121,7 @@ class Needs(NamedTuple):
 
 
 def kernel_needs(
-    library: ctypes.CDLL, law: int, variant: int, architecture: str, *, tangent: bool = False
+    library: ctypes.CDLL, law: int, variant: int, architecture: str, *, tangent: bool = False, adjoint: bool = False
 ) -> dict[str, Needs]:
     """The kernels, compiled for an architecture without a GPU, by their names.
 
@@ -114,12 +131,14 @@ def kernel_needs(
         variant: alike.
         architecture: as "sm_90".
         tangent: of numbers that carry derivatives.
+        adjoint: of reverse mode instead, for a law that has it there.
 
     Raises:
         RuntimeError: if there is no NVRTC, or it fails.
     """
     said = ctypes.create_string_buffer(1 << 16)
-    failed = library.gmem_cuda_compile(architecture.encode(), law, variant, int(tangent), said, len(said))
+    task = 2 if adjoint else int(tangent)  # src/physics/parameters.h: Task
+    failed = library.gmem_cuda_compile(architecture.encode(), law, variant, task, said, len(said))
     text = said.value.decode()
     if failed:
         raise RuntimeError(text)
@@ -147,7 +166,9 @@ def is_sound(pairs: Any) -> jax.Array:
     return count & jnp.all(real | (rows == 2 * capacity))
 
 
-def between_steps(fixed: Any, history: Sequence[Any], grains: int, call: Any, kinds: int, lanes: int) -> list[Any]:
+def between_steps(
+    fixed: Any, history: Sequence[Any], grains: int, call: Any, kinds: int, lanes: int, kept: int | None = None
+) -> list[Any]:
     """Shapes of what the kernels need from one step to the next; see src/cuda/arguments.h.
 
     Args:
@@ -157,6 +178,7 @@ def between_steps(fixed: Any, history: Sequence[Any], grains: int, call: Any, ki
         call: its attributes, `gmem_jax.native.calls.Call`.
         kinds: one for values, two for values and derivatives.
         lanes: replicas of all entries, L.
+        kept: steps that reverse mode keeps, T; None forwards.
     """
     spheres, rows = fixed.incidence.shape[1], fixed.first.shape[1]
 
@@ -164,23 +186,28 @@ def between_steps(fixed: Any, history: Sequence[Any], grains: int, call: Any, ki
         return jax.ShapeDtypeStruct((1, *shape, lanes), dtype)
 
     found = [array(kinds, grains, 9), array(kinds, spheres, 3), array(kinds, grains, 4)]
-    found += [array(kinds, spheres, 12 if call.rubs else 6), array(kinds, rows, 6)]
+    found += [array(kinds, spheres, 12 if call.rubs else 6), array(kinds, rows, 6 if kept is None else 18)]
     found += [array(rows + spheres, dtype=jnp.uint8)]
-    if kinds == 2:  # where there are values alone, histories are in the results
+    if kinds == 2 or kept is not None:  # forwards, of values alone, histories are in the results
         found += [array(kinds, *leaf.shape[1:3]) for leaf in history if leaf.ndim == 4]
     for count in (rows, 6 * spheres)[: 1 + call.rubs if call.points else 0]:
         found += [array(kinds, count, 6), array(kinds, count, call.points, 3), array(count, dtype=jnp.int32)]
-    return found
+    if kept is None:
+        return found
+    remembered, chunks = sum(leaf.shape[2] for leaf in history), -(-grains // 64)
+    found += [array(kept, grains, 19), array(kept, grains, 6), array(kept, rows, remembered)]
+    found += [array(grains, 19), array(grains, 12), array(grains, 14 + 3 * (spheres // grains))]
+    return [*found, array(rows, 7), array(kept, chunks, 12)]
 
 
 def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Sequence[Any]) -> Sequence[jax.Array]:
     """A call of the library, with results of the given shapes, and what was needed between its steps.
 
     Args:
-        target: what XLA knows it by.
+        target: what XLA knows it by; if it ends in "adjoint" it is of reverse mode.
         call: its attributes, `gmem_jax.native.calls.Call`.
         in_place: whether histories may take the place of those that were given.
-        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`, and the tangent's `Arrays`.
+        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`, and the tangent's `Arrays` or the adjoint's `StepOutput`.
         shapes: of the results.
     """
     outer = shapes[0].shape[:-3]
@@ -213,8 +240,14 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
                 aliases[argument] = result
     _, grains, _, replicas = arrays.fields[0].shape
     lanes = entries * replicas
-    between = between_steps(fixed, arrays.history, grains, call, 2 if slopes else 1, lanes)
+    kept = arrays.walls.shape[1] if target.endswith("adjoint") else None
+    kinds = 2 if slopes and kept is None else 1
+    between = between_steps(fixed, arrays.history, grains, call, kinds, lanes, kept)
     ffi = jax.ffi.ffi_call(target, [*results, *between], input_output_aliases=aliases)
-    found = ffi(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict())
+    found = list(ffi(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict()))
+    if kept is not None:  # where nothing touches, not all derivatives ask for the parameters
+        for number in range(len(arrays.fields) + 3):
+            whole = jnp.expand_dims(sound, tuple(range(1, found[number].ndim)))
+            found[number] = jnp.where(whole, found[number], jnp.nan)
     moved = [leaf.reshape(shape.shape) for leaf, shape in zip(found, shapes, strict=False)]
     return [*moved, *found[len(shapes) :]]

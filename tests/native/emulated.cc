@@ -1,7 +1,7 @@
 // The GPU's half of the library on a CPU: the same handler and the same kernels, a launch being a loop over threads.
 
+#include "cuda/back.h"
 #include "cuda/handler.cc"
-#include "cuda/step.h"
 
 namespace gmem {
 namespace cuda {
@@ -20,14 +20,38 @@ void run(GpuKernel kernel, const Arguments& a, int step, int thread) {
     case GpuKernel::move_alone: return k::move_alone<V, periodic, unequal, rubs>(a, step, thread);
     case GpuKernel::collect: return k::collect<V>(a, step, thread);
     case GpuKernel::leave: return k::leave<V, Law, rubs>(a, thread);
+    default: return;  // of reverse mode
+  }
+}
+
+// The same of reverse mode.
+template <class Law>
+void run_back(GpuKernel kernel, const Arguments& a, int step, int thread) {
+  namespace k = gmem::GMEM_ISA;
+  using V = double;
+  switch (kernel) {
+    case GpuKernel::enter: return k::enter<V, false, false, true>(a, thread);
+    case GpuKernel::remember: return k::remember<V, Law, false>(a, thread);
+    case GpuKernel::touch: return k::touch<V, Law, false, false, false, true>(a, step, thread);
+    case GpuKernel::move:
+    case GpuKernel::move_alone: return k::move_alone<V, false, false, false, true>(a, step, thread);
+    case GpuKernel::take: return k::take<Law>(a, thread);
+    case GpuKernel::touch_back: return k::touch_back<Law>(a, step, thread);
+    case GpuKernel::move_back: return k::move_back(a, step, thread);
+    case GpuKernel::collect_walls: return k::collect_walls(a, step, thread);
+    case GpuKernel::sum_up: return k::sum_up(a, step, thread);
+    case GpuKernel::leave_back: return k::leave_back(a, thread);
+    default: return;  // of the steps alone
   }
 }
 
 // ... of some kernels.
 using Run = void (*)(GpuKernel, const Arguments&, int step, int thread);
 Run run_of(const Which& which) {
-  return with_law(which.law, which.variant, [&](auto law) {
+  return with_law(which.law, which.variant, [&](auto law) -> Run {
     using L = decltype(law);
+    if constexpr (!L::kLayered)
+      if (which.task == Task::adjoint) return Run{run_back<L>};
     const auto of_numbers = [&](auto number) -> Run {
       using V = decltype(number);
       if (which.unequal) return which.periodic || which.rubs ? nullptr : run<V, L, false, true, false>;  // not tested
@@ -66,4 +90,6 @@ void Launcher::operator()(GpuKernel kernel, int items, const Arguments& a, int s
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_emulated_advance, gmem::cuda::emulate<gmem::Task::forward>,
                               gmem::cuda::without_stream());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_emulated_tangent, gmem::cuda::emulate<gmem::Task::tangent>,
+                              gmem::cuda::without_stream());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_emulated_adjoint, gmem::cuda::emulate<gmem::Task::adjoint>,
                               gmem::cuda::without_stream());

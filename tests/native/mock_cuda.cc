@@ -1,6 +1,7 @@
 // A driver without a GPU: the functions that cuda/launch.cc calls. It keeps the protocol of contexts, streams, capture and
 // arguments, reads from each module what its kernels are given, and runs their CPU build (emulated.cc) on bytes that it
-// copied at the launch. `gmem_mock_advance` and `gmem_mock_tangent` give calls of XLA's CPU a stream of this driver.
+// copied at the launch. `gmem_mock_advance`, `gmem_mock_tangent` and `gmem_mock_adjoint` give calls of XLA's CPU a stream of
+// this driver.
 
 #include <elf.h>
 
@@ -30,7 +31,6 @@ enum {
   kCaptureUnsupported = 900
 };
 enum { kRelaxed = 2, kMostThreads = 0, kMajor = 75, kMinor = 76 };
-constexpr const char* kKernels[] = {"enter", "remember", "touch", "move", "move_alone", "collect", "leave"};
 
 struct Context {
   int device;
@@ -133,10 +133,15 @@ bool identify(const char* image, Which& which) {
     const std::size_t law = name.find("-law");
     if (law == std::string::npos || bytes.size() < 1000) continue;
     if (std::memcmp(bytes.data(), image, bytes.size() - 16) != 0) continue;
-    const bool tangent = name.find("-tangent") != std::string::npos;
-    which = {static_cast<gmem::Law>(name[law + 4] - '0'),         static_cast<gmem::Variant>(name[law + 5] - '0'),
-             tangent ? gmem::Task::tangent : gmem::Task::forward, name.find("-periodic") != std::string::npos,
-             name.find("-unequal") != std::string::npos,          name.find("-rubs") != std::string::npos};
+    const auto says = [&](const char* word) { return name.find(word) != std::string::npos; };
+    which = {static_cast<gmem::Law>(name[law + 4] - '0'),
+             static_cast<gmem::Variant>(name[law + 5] - '0'),
+             says("-tangent")   ? gmem::Task::tangent
+             : says("-adjoint") ? gmem::Task::adjoint
+                                : gmem::Task::forward,
+             says("-periodic"),
+             says("-unequal"),
+             says("-rubs")};
     return true;
   }
   return false;
@@ -205,7 +210,7 @@ XLA_FFI_Error* call(XLA_FFI_CallFrame* frame, const Handlers& handlers) {
   return error;
 }
 
-Handlers advance, tangent;
+Handlers advance, tangent, adjoint;
 
 }  // namespace
 
@@ -249,8 +254,10 @@ int cuModuleLoadData(Module** module, const void* code) {
   const bool is_cubin = std::memcmp(image, ELFMAG, SELFMAG) == 0;
   if (is_cubin && architecture_of(image) != architecture) return kNoBinary;
   *module = new Module(is_cubin ? kernels_of(image) : kernels_of_text(image));
-  for (std::size_t n = 0; n < std::size(kKernels); ++n) {
-    Function& kernel = (**module)[kKernels[n]];
+  for (std::size_t n = 0; n < std::size(gmem::cuda::kKernelNames); ++n) {
+    const auto found = (*module)->find(gmem::cuda::kKernelNames[n]);
+    if (found == (*module)->end()) continue;
+    Function& kernel = found->second;
     kernel.context = stack.back(), kernel.which = which, kernel.kernel = static_cast<GpuKernel>(n);
   }
   return kOk;
@@ -292,8 +299,9 @@ int cuGetErrorString(int code, const char** text) {
 
 // For the test. The library's handlers, and the folder of compiled kernels.
 void mock_handlers(Handler load_advance, Handler run_advance, Handler load_tangent, Handler run_tangent,
-                   const char* kept) {
-  advance = {load_advance, run_advance}, tangent = {load_tangent, run_tangent}, folder = kept;
+                   Handler load_adjoint, Handler run_adjoint, const char* kept) {
+  advance = {load_advance, run_advance}, tangent = {load_tangent, run_tangent}, adjoint = {load_adjoint, run_adjoint};
+  folder = kept;
 }
 // Calls run on this device from now on, captured and then replayed so often, or (0) at once; and before that they are
 // initialized, or not. Counts begin anew.
@@ -310,5 +318,6 @@ const char* mock_complaints() { return complaints.c_str(); }
 
 XLA_FFI_Error* gmem_mock_advance(XLA_FFI_CallFrame* frame) { return call(frame, advance); }
 XLA_FFI_Error* gmem_mock_tangent(XLA_FFI_CallFrame* frame) { return call(frame, tangent); }
+XLA_FFI_Error* gmem_mock_adjoint(XLA_FFI_CallFrame* frame) { return call(frame, adjoint); }
 
 }  // extern "C"

@@ -2,7 +2,7 @@
 // runs: of a contact of each law, of the two halves of a step, and of a sphere at the walls.
 
 #include "check.h"
-#include "cpu/calculations.h"
+#include "physics/calculations.h"
 #include "numbers/tape.h"
 
 namespace gmem {

@@ -22,7 +22,7 @@ from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, assert_close, scene
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import build, calls, cuda, library
+from gmem_jax.native import build, calls, cuda, library, primitives
 from gmem_jax.native.calls import Arrays, Call, Fixed, StepOutput
 from gmem_jax.native.march import PlainDefinition, arrays_of, call_of, fixed_of
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
@@ -53,7 +53,7 @@ Scene = tuple[Call, Fixed, Arrays, Callable[..., Any]]
 
 @pytest.fixture(scope="module", autouse=True)
 def emulated(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """The kernels as calls of the CPU: gmem_emulated_advance and gmem_emulated_tangent."""
+    """The kernels as calls of the CPU: gmem_emulated_advance, gmem_emulated_tangent and gmem_emulated_adjoint."""
     library = tmp_path_factory.mktemp("emulated") / "libemulated.so"
     flags = ["-std=c++17", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-Wno-psabi", "-DGMEM_ISA=emulated"]
     include = ["-I", str(build.SOURCES), "-isystem", str(build.headers())]
@@ -63,7 +63,7 @@ def emulated(tmp_path_factory: pytest.TempPathFactory) -> None:
     )
     assert done.returncode == 0, done.stderr[:4000]
     functions = ctypes.CDLL(str(library))
-    for target in ("gmem_emulated_advance", "gmem_emulated_tangent"):
+    for target in ("gmem_emulated_advance", "gmem_emulated_tangent", "gmem_emulated_adjoint"):
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(functions, target)), platform="cpu")
 
 
@@ -155,6 +155,19 @@ def emulate_tangent(call: Call, fixed: Fixed, arrays: Arrays, along: Arrays) -> 
     return calls.results_of(arrays, found[: len(shapes)])
 
 
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
+def emulate_adjoint(call: Call, fixed: Fixed, arrays: Arrays, bars: StepOutput) -> Arrays:
+    shapes = calls.of_arrays((fixed, arrays))
+    found = cuda.call_kernels("gmem_emulated_adjoint", call, False, (fixed, arrays, bars), shapes)
+    return jax.tree.unflatten(jax.tree.structure(arrays), found[: len(shapes)])
+
+
+@functools.partial(jax.jit, static_argnums=0, compiler_options=QUICKLY)
+def adjoint_of_the_cpu(call: Call, fixed: Fixed, arrays: Arrays, bars: StepOutput) -> Arrays:
+    found = calls.call_library("gmem_adjoint", calls.of_arrays, call, False, (fixed, arrays, bars))
+    return jax.tree.unflatten(jax.tree.structure(arrays), list(found))
+
+
 def few(law: str, file: Path, wall_mu: float | None = None) -> Scene:
     """27 grains of a file; where they differ in size, their spheres do so, too."""
     pack = gm.load_pack(file)
@@ -194,6 +207,93 @@ def test_the_kernels_give_the_values_and_tangents_of_the_definition(name: str) -
     # ... and in the derivative once more where the normal part of a carried force nearly cancels: see
     # test_native_derivatives.py.
     assert_close(emulate_tangent(call, fixed, arrays, along), slope, 1e-9)
+
+
+def weights_of(fixed: Fixed, arrays: Arrays) -> StepOutput:
+    """Random derivatives by all results."""
+    draws = np.random.default_rng(2)
+    shapes = calls.results_of(arrays, calls.of_results((fixed, arrays)))
+    return jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), shapes)
+
+
+def assert_alike(found: Arrays, expected: Arrays) -> None:
+    """Sums are taken in another order; parameters differ in their units."""
+    assert_close(found._replace(parameters=()), expected._replace(parameters=()), 1e-11)
+    for one, other in zip(found.parameters, expected.parameters, strict=True):
+        assert_close(one, other, 1e-11)
+
+
+REVERSED = {name: SCENES[name] for name in ("frictionless", "H", "M1", "gyroscopic", "spheres")}
+
+
+@pytest.mark.parametrize("name", REVERSED)
+def test_the_adjoint_of_the_kernels_is_that_of_the_cpu_and_the_transpose_of_their_tangent(name: str) -> None:
+    call, fixed, arrays, _ = REVERSED[name]()
+    weights = weights_of(fixed, arrays)
+    bars = emulate_adjoint(call, fixed, arrays, weights)
+    assert_alike(bars, adjoint_of_the_cpu(call, fixed, arrays, weights))  # seen: 6e-13
+    assert all(np.any(np.asarray(row) != 0.0) for row in (bars.walls, bars.offsets, bars.parameters[6], *bars.history))
+    draws = np.random.default_rng(3)
+    along = jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), arrays)
+    along = along._replace(
+        offsets=jnp.broadcast_to(along.offsets[..., :1], along.offsets.shape)
+    )  # alike in all replicas
+    ahead, back = (
+        np.concatenate([np.ravel(one * other) for one, other in zip(*map(jax.tree.leaves, pair), strict=True)])
+        for pair in ((weights, emulate_tangent(call, fixed, arrays, along)), (bars, along))
+    )
+    assert abs(ahead.sum() - back.sum()) <= 1e-11 * np.linalg.norm(ahead)
+
+
+def test_contacts_and_walls_come_and_go_while_the_adjoint_is_taken() -> None:
+    """What the cases above are about, in the scene of law M1."""
+    call, fixed, arrays, _ = packed("M1")
+    ends = emulate(call, fixed, arrays)
+    before, after = (np.asarray(one.history[1]) > 0.0 for one in (arrays, ends))
+    assert np.sum(before & after) > 500
+    assert np.sum(before & ~after) > 10
+    assert np.sum(after & ~before) > 10
+    assert np.all(np.asarray(ends.pressure) > 0.0)
+    slides = np.linalg.norm(ends.history[0], axis=1) > 0.0
+    assert np.sum(slides) > 500
+
+
+def test_the_adjoint_of_a_replica_has_the_same_bits_alone_in_a_batch_and_in_a_sweep() -> None:
+    call, fixed, arrays, _ = packed("M1")
+    weights = weights_of(fixed, arrays)
+    everyone = emulate_adjoint(call, fixed, arrays, weights)
+    for lane in range(REPLICAS):
+        one = jax.tree.map(lambda leaf, lane=lane: leaf[..., lane : lane + 1], (arrays, weights))
+        for few, many in zip(*map(jax.tree.leaves, (emulate_adjoint(call, fixed, *one), everyone)), strict=True):
+            np.testing.assert_array_equal(few[..., 0], many[..., lane])
+    # Two leading axes: what points share is given once, the rest for each.
+    several = jax.tree.map(lambda leaf: leaf[None, None], (fixed, arrays, weights))
+    numbers = jnp.stack([arrays.parameters.at[9].multiply(factor) for factor in (1.0, 0.5)])
+    bars = jnp.stack([weights.pressure, -weights.pressure])
+    swept = emulate_adjoint(
+        call,
+        several[0],
+        several[1]._replace(parameters=numbers[None]),
+        several[2]._replace(pressure=bars[None]),
+    )
+    for point in range(2):
+        alone = emulate_adjoint(
+            call, fixed, arrays._replace(parameters=numbers[point]), weights._replace(pressure=bars[point])
+        )
+        for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(swept), strict=True):
+            np.testing.assert_array_equal(one, other[0, point])
+
+
+def test_the_adjoint_of_no_step_is_what_was_given() -> None:
+    call, fixed, arrays, _ = packed("H")
+    weights = weights_of(fixed, arrays)
+    arrays = arrays._replace(walls=arrays.walls[:0])
+    found = emulate_adjoint(call, fixed, arrays, weights)
+    for one, other in zip(
+        *map(jax.tree.leaves, (found, adjoint_of_the_cpu(call, fixed, arrays, weights))), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(found.fields[0], weights.fields[0])
 
 
 def test_a_replica_has_the_same_bits_alone_in_a_batch_and_in_a_sweep() -> None:
@@ -240,6 +340,8 @@ def test_a_broken_list_gives_no_numbers(how: str) -> None:
     call, fixed, arrays, _ = packed("H")
     found = emulate(call, BROKEN[how](fixed), arrays)
     assert np.all(np.isnan(np.asarray(found.fields[0])))
+    bars = emulate_adjoint(call, BROKEN[how](fixed), arrays, weights_of(fixed, arrays))
+    assert all(np.all(np.isnan(leaf)) for leaf in (*bars.fields, bars.parameters, bars.walls, bars.offsets))
 
 
 def test_arrays_that_do_not_fit_are_refused() -> None:
@@ -248,6 +350,8 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         jax.block_until_ready(emulate(call, fixed, arrays._replace(walls=arrays.walls[:, :6])))
     with pytest.raises(Exception, match="no friction law has number 9"):
         jax.block_until_ready(emulate(call._replace(law=9), fixed, arrays))
+    with pytest.raises(Exception, match="reverse mode on GPUs is for equal spheres between smooth walls"):
+        jax.block_until_ready(emulate_adjoint(call._replace(rubs=1), fixed, arrays, weights_of(fixed, arrays)))
 
 
 @needs_nvrtc
@@ -267,6 +371,17 @@ def test_plain_numbers_fit_into_the_registers(architecture: str, law: str) -> No
 @pytest.mark.parametrize("law", ["H", "M2-averaged"])
 def test_numbers_with_derivatives_fit_too(law: str) -> None:
     assert all(kernel.spilt == 0 for kernel in native.needs(LAWS[law], "sm_90", tangent=True).values())
+
+
+@needs_nvrtc
+@pytest.mark.parametrize("law", ["frictionless", "H", "M1"])
+@pytest.mark.parametrize("architecture", ["sm_80", "sm_90"])
+def test_the_kernels_of_reverse_mode_compile(architecture: str, law: str) -> None:
+    kernels = native.needs(LAWS[law], architecture, adjoint=True)
+    steps = {"enter", "remember", "touch", "move", "move_alone"}
+    assert set(kernels) == steps | {"take", "touch_back", "move_back", "collect_walls", "sum_up", "leave_back"}
+    assert kernels["touch_back"].spilt == 0
+    assert kernels["move_back"].spilt <= 1000  # it goes through two halves of a step; seen: 710
 
 
 ALONE = """
@@ -395,3 +510,22 @@ def test_a_bin_of_an_experiment_on_a_gpu_is_one_call_and_waits_for_nothing(monke
     text = export.export(program, platforms=["cuda"], disabled_checks=allowed)(simulation, state, row, 4).mlir_module()
     assert text.count("custom_call @gmem_advance") == 1
     assert "stablehlo.case" not in text  # the host would wait for its condition
+
+
+@pytest.mark.parametrize(
+    ("name", "serves"),
+    [("H", True), ("M1", True), ("M2-exact", False), ("periodic-H", False), ("spread-H", False), ("rough-M1", False)],
+)
+def test_reverse_mode_is_the_library_s_where_it_has_kernels_for_it(
+    name: str, serves: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cuda, "missing", lambda: "")
+    call, fixed, arrays, definition = SCENES[name]()
+
+    def back(arrays: Arrays, weights: StepOutput) -> Arrays:
+        return jax.vjp(lambda arrays: primitives.advance(call, definition, fixed, arrays), arrays)[1](weights)[0]
+
+    allowed = [export.DisabledSafetyCheck.custom_call(target) for target in cuda.CUDA_TARGETS]
+    lowered = export.export(jax.jit(back), platforms=["cuda"], disabled_checks=allowed)
+    text = lowered(arrays, weights_of(fixed, arrays)).mlir_module()
+    assert text.count("custom_call @gmem_adjoint") == int(serves)

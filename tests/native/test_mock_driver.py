@@ -61,7 +61,7 @@ class Driver:
         symbols = [ctypes.cast(getattr(handlers, name), ctypes.c_void_p) for name in names]
         kept = str(Path(os.environ["GMEM_COMPILE_CACHE"]) / "kernels").encode()
         self._library.mock_handlers(*symbols, kept)
-        for kind in ("advance", "tangent"):
+        for kind in ("advance", "tangent", "adjoint"):
             for made in ("mock", "emulated"):
                 function = getattr(self._library, f"gmem_{made}_{kind}")
                 jax.ffi.register_ffi_target(f"gmem_{made}_{kind}", jax.ffi.pycapsule(function), platform="cpu")
@@ -121,7 +121,7 @@ def parts_of(name: str) -> Parts:
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=QUICKLY)
 def called(target: str, in_place: bool, call: Call, *parts: Any) -> list[jax.Array]:
-    shapes = calls.of_results(parts[:2])
+    shapes = (calls.of_arrays if target.endswith("adjoint") else calls.of_results)(parts[:2])
     return list(cuda.call_kernels(target, call, in_place, parts, shapes)[: len(shapes)])
 
 
@@ -133,6 +133,14 @@ def values(made: str, law: str, in_place: bool = False) -> list[np.ndarray]:
 def tangents(made: str, law: str) -> list[np.ndarray]:
     call, fixed, arrays, along = parts_of(law)
     return [np.asarray(leaf) for leaf in called(f"gmem_{made}_tangent", False, call, fixed, arrays, along)]
+
+
+def adjoints(made: str, law: str) -> list[np.ndarray]:
+    call, fixed, arrays, _ = parts_of(law)
+    draws = np.random.default_rng(1)
+    shapes = calls.results_of(arrays, calls.of_results((fixed, arrays)))
+    bars = jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), shapes)
+    return [np.asarray(leaf) for leaf in called(f"gmem_{made}_adjoint", False, call, fixed, arrays, bars)]
 
 
 def assert_same(found: list[Any], expected: list[Any]) -> None:
@@ -160,6 +168,19 @@ def numbers_of_a_law(driver: Driver, law: str) -> None:
     assert driver.count("cuLaunchKernel") == 5 + 2 * STEPS
     assert_same(tangents("mock", law), tangents("emulated", law))
     assert driver.count("cuModuleLoadData") == 2
+
+
+def reverse_mode(driver: Driver) -> None:
+    """At once, and captured and replayed."""
+    driver.begin()
+    expected = adjoints("emulated", "H")
+    assert all(np.abs(leaf).max() > 1e-6 for leaf in expected)
+    assert_same(adjoints("mock", "H"), expected)
+    assert driver.count("cuModuleLoadData") == 1
+    assert driver.count("cuLaunchKernel") == 7 + 5 * STEPS
+    driver.begin(replays=2)
+    assert_same(adjoints("mock", "H"), expected)
+    assert driver.count("cuModuleLoadData") == 0
 
 
 def many_replicas(driver: Driver) -> None:
@@ -271,6 +292,7 @@ def failures(driver: Driver) -> None:
 
 CASES: dict[str, Callable[[Driver], None]] = {
     **{f"the numbers of {law}": functools.partial(numbers_of_a_law, law=law) for law in LAWS},
+    "reverse mode": reverse_mode,
     "many replicas": many_replicas,
     "launches that are captured and replayed": captured,
     "two devices": two_devices,

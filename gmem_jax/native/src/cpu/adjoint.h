@@ -16,9 +16,9 @@
 #include <type_traits>
 #include <vector>
 
-#include "cpu/calculations.h"
 #include "cpu/replicas.h"
 #include "numbers/tape.h"
+#include "physics/calculations.h"
 
 namespace gmem {
 namespace GMEM_ISA {

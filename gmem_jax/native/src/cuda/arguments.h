@@ -15,6 +15,9 @@ constexpr int kItems = 32;    // grains that a block of `move` has
 constexpr int kWorkers = 4;   // threads that sum up the forces on one of them
 constexpr int kOfLayers = 6;  // numbers of Mindlin's `Layers`
 constexpr int kLoad = 6;      // numbers of a contact: the force on its first sphere, and the point where it acts
+// Of reverse mode (cuda/back.h): numbers of a grain at the beginning of a step, and midway; of `ContactInput`; those that
+// every grain has of `GrainParameters`; and the parameters that contacts have derivatives by.
+constexpr int kOfGrain = 19, kOfInput = 18, kOfConstants = 14, kOfContact = 7;
 
 // Where the numbers of each entry begin; the step is zero where all share them.
 template <class T>
@@ -62,6 +65,25 @@ struct Memories {
   int* stored;                 // ... how many, [rows, L]
 };
 
+// What reverse mode has beside what the steps have. "Bar" x is the derivative of the final results by x.
+struct Backwards {
+  // Bars of the results, and of the arguments but for fields and histories, which take the place of these in `Arguments`.
+  Table fields_in[kFields], pressure_in, history_in[kMaxHistory];
+  Table parameters_out, walls_out, offsets_out;
+  // Kept of every step:
+  double* state;    // of the grains at its beginning, the fields in order, [T, N, kOfGrain, L]
+  double* total;    // force and torque on them, [T, N, 6, L]
+  double* history;  // of candidates that touch in it, at its beginning, [T, P, numbers of the law, L]
+  // Of the step that is gone back through:
+  double* middle;   // bars of the grains midway, with those of force and torque, [N, kOfGrain, L]
+  double* input;    // bars of what contacts are found from, if they touch, [P, kOfInput, L]; forwards `load` lies here
+  double* at_wall;  // bars of the walls by grains that touch them, [N, kWalls, L]
+  // Sums over steps, in the end over all grains or candidates:
+  double* of_grains;    // bars of their constants and of the spheres' places in them, [N, kOfConstants + 3 K, L]
+  double* of_contacts;  // bars of parameters, [P, kOfContact, L]
+  double* of_walls;     // bars of the walls by chunks of grains, [T, chunks, kWalls, L]
+};
+
 struct Arguments {
   int grains, spheres, rows, columns, points, steps;  // N, K, P, C, Q, T
   int replicas, lanes;                                // B, L
@@ -89,9 +111,36 @@ struct Arguments {
   Table load;    // of candidates that touch, [P, kLoad, L]
   unsigned char* touching;  // which candidates touch, and which spheres the walls (bits of planes that have friction),
                             // [P + N K, L]
+  Backwards back;           // where that is wanted
+
+  // Of `many`, each of kChunk.
+  static int chunks(int many) { return (many + kChunk - 1) / kChunk; }
 };
 
-enum class GpuKernel { enter, remember, touch, move, move_alone, collect, leave };
+// Those from `take` on are of reverse mode, which has neither `collect` nor `leave`.
+enum class GpuKernel {
+  enter,
+  remember,
+  touch,
+  move,
+  move_alone,
+  collect,
+  leave,
+  take,
+  touch_back,
+  move_back,
+  collect_walls,
+  sum_up,
+  leave_back
+};
+constexpr int kKernels = 13;
+constexpr const char* kKernelNames[kKernels] = {"enter",         "remember", "touch",     "move",       "move_alone",
+                                                "collect",       "leave",    "take",      "touch_back", "move_back",
+                                                "collect_walls", "sum_up",   "leave_back"};
+constexpr bool is_kernel_of(Task task, GpuKernel kernel) {
+  if (task != Task::adjoint) return kernel < GpuKernel::take;
+  return kernel != GpuKernel::collect && kernel != GpuKernel::leave;
+}
 
 }  // namespace cuda
 }  // namespace gmem

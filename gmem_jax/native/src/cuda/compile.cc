@@ -177,7 +177,8 @@ std::string compiled(const std::string& target, const Which& which, std::string*
       "-DGMEM_PERIODIC=" + std::to_string(which.periodic),
       "-DGMEM_UNEQUAL=" + std::to_string(which.unequal),
       "-DGMEM_RUBS=" + std::to_string(which.rubs),
-      std::string("-DGMEM_NUMBER=") + (which.task == Task::forward ? "double" : "Dual<double>")};
+      std::string("-DGMEM_NUMBER=") + (which.task == Task::tangent ? "Dual<double>" : "double"),
+      std::string("-DGMEM_BACK=") + (which.task == Task::adjoint ? "1" : "0")};
   if (log) options.emplace_back("--ptxas-options=-v");
   std::istringstream more(trial_options());
   for (std::string option; more >> option;) options.push_back(option);
@@ -238,7 +239,9 @@ std::string code_for(const std::string& architecture, const Which& which, bool a
   const std::string law = "-law" + std::to_string(static_cast<int>(which.law)) +
                           std::to_string(static_cast<int>(which.variant)) + (which.periodic ? "-periodic" : "") +
                           (which.unequal ? "-unequal" : "") + (which.rubs ? "-rubs" : "") +
-                          (which.task == Task::forward ? "" : "-tangent");
+                          (which.task == Task::forward   ? ""
+                           : which.task == Task::tangent ? "-tangent"
+                                                         : "-adjoint");
   const std::string path = paths().cache + "/" + GMEM_SOURCE_HASH + "-" + target + "-nvrtc" + version + law +
                            (is_ptx(target) ? ".ptx" : ".cubin");
   const bool keeps = !paths().cache.empty() && trial_options().empty();
@@ -270,13 +273,16 @@ extern "C" int gmem_cuda_missing(const char* architecture, char* said, int size)
   });
 }
 
-// For a test: 0 if the kernels compile; what the assembler says of them, or why they do not, in `said`.
-extern "C" int gmem_cuda_compile(const char* architecture, int law, int variant, int tangent, char* said, int size) {
+// For a test: 0 if the kernels of a `gmem::Task` compile; what the assembler says of them, or why they do not, in `said`.
+extern "C" int gmem_cuda_compile(const char* architecture, int law, int variant, int task, char* said, int size) {
   return gmem::cuda::in_one_line(said, size, [&] {
     std::string log;
-    const auto task = tangent ? gmem::Task::tangent : gmem::Task::forward;
-    const gmem::cuda::Which which{
-        static_cast<gmem::Law>(law), static_cast<gmem::Variant>(variant), task, false, false, false};
+    const gmem::cuda::Which which{static_cast<gmem::Law>(law),
+                                  static_cast<gmem::Variant>(variant),
+                                  static_cast<gmem::Task>(task),
+                                  false,
+                                  false,
+                                  false};
     gmem::cuda::code_for(architecture, which, true, &log);
     return log;
   });

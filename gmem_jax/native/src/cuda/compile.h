@@ -9,7 +9,7 @@
 namespace gmem {
 namespace cuda {
 
-// Which kernels: of one law, in plain numbers or (for the tangent) in those that carry a derivative.
+// Which kernels: of one law, in plain numbers or (for the tangent) in those that carry a derivative; or of reverse mode.
 struct Which {
   Law law;
   Variant variant;

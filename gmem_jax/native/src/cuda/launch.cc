@@ -17,14 +17,13 @@ namespace cuda {
 namespace {
 
 using Handle = void*;  // the driver's contexts, modules, functions and streams
-constexpr const char* kNames[] = {"enter", "remember", "touch", "move", "move_alone", "collect", "leave"};
 constexpr int kRelaxed = 2, kMajor = 75, kMinor = 76, kMostThreads = 0;  // of cuda.h
 
 struct Kernel {
   Handle function;
   int block;  // threads that it was compiled for
 };
-using Kernels = std::array<Kernel, 7>;
+using Kernels = std::array<Kernel, kKernels>;
 
 struct Driver {
   int (*context_of)(Handle, Handle*);
@@ -91,7 +90,8 @@ const Kernels* kernels_of(Handle context, const Which& which) {
     Handle module = nullptr;
     int failed = d.load(&module, code.data());
     for (std::size_t i = 0; i < kernels.size() && failed == 0; ++i) {
-      failed = d.function(&kernels[i].function, module, kNames[i]);
+      if (!is_kernel_of(which.task, static_cast<GpuKernel>(i))) continue;
+      failed = d.function(&kernels[i].function, module, kKernelNames[i]);
       if (failed == 0) failed = d.needs(&kernels[i].block, kMostThreads, kernels[i].function);
     }
     d.exchange_mode(&mode);

@@ -73,6 +73,8 @@ struct ReplicaView {
     return {t.value.of(entry) + replica, __is_class(V) ? t.slope.of(entry) + replica : nullptr, 8 * t.stride};
   }
   Column<double> out(const Table& t) const { return {t.value.of(entry) + replica, nullptr, 8 * t.stride}; }
+  // This lane of an array of doubles, [..., L].
+  Column<double> lane_of(double* array) const { return {array + lane, nullptr, 8 * a.lanes}; }
   // Number of this lane in an array [..., L].
   long long of_lane(int row) const { return static_cast<long long>(row) * a.lanes + lane; }
 
@@ -204,6 +206,15 @@ GMEM_INLINE void begin(const ReplicaView<V>& on, int step, const GrainParameters
   }
 }
 
+// Keeps a grain at the beginning of a step, for the way back.
+inline void keep(const ReplicaView<double>& on, int step, const Grain<double>& g) {
+  const Column<double> state = on.lane_of(on.a.back.state);
+  const int at = cuda::kOfGrain * (step * on.a.grains + on.item);
+  state.put(at, g.position), state.put(at + 3, g.orientation.w), state.put(at + 4, g.orientation.v);
+  state.put(at + 7, g.velocity), state.put(at + 10, g.spin);
+  state.put(at + 13, g.acceleration), state.put(at + 16, g.spin_rate);
+}
+
 template <class V>
 inline void deliver(const ReplicaView<V>& on, const Grain<V>& g) {
   const V number[kFields][4] = {{g.position.x, g.position.y, g.position.z},
@@ -268,7 +279,7 @@ void remember(const Arguments& a, int thread) {
 }
 
 // Grains, from the arrays of the call. Thread of grain and lane.
-template <class V, bool periodic, bool unequal>
+template <class V, bool periodic, bool unequal, bool keeps = false>
 void enter(const Arguments& a, int thread) {
   const ReplicaView<V> on(a, thread);
   const int grain = on.item;
@@ -282,7 +293,12 @@ void enter(const Arguments& a, int thread) {
     on.in(a.wall).put(a.of_wall * (grain * a.spheres + k) + 3, Vec<V>{});
     a.touching[on.of_lane(a.rows + grain * a.spheres + k)] = 0;
   }
-  if (a.steps == 0) return deliver(on, from);
+  if constexpr (keeps) {
+    if (a.steps == 0) return;
+    keep(on, 0, from);
+  } else {
+    if (a.steps == 0) return deliver(on, from);
+  }
   begin<V, periodic, unequal>(on, 0, constants, from);
 }
 
@@ -374,8 +390,14 @@ void touch_walls(const ReplicaView<V>& on, int step, int number) {
         rub_planes<V, Law>(on, constants, parameter, number, centre, lever, velocity, spin, box, radius, touching));
 }
 
+// What a contact at a point is found from; the numbers of its grains begin in rows i and j.
+template <class V>
+GMEM_INLINE ContactInput<V> meeting(const Column<V>& hot, int i, int j, Vec<V> gap, Vec<V> point) {
+  return {gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3), hot.vec(i + 6), hot.vec(j + 6)};
+}
+
 // The forces between the spheres of a candidate, or of the walls on a sphere. Thread of candidate or sphere, and lane.
-template <class V, class Law, bool periodic, bool unequal, bool rubs>
+template <class V, class Law, bool periodic, bool unequal, bool rubs, bool keeps = false>
 void touch(const Arguments& a, int step, int thread) {
   const ReplicaView<V> on(a, thread);
   const int row = on.item;
@@ -414,10 +436,13 @@ void touch(const Arguments& a, int step, int thread) {
   const Column<V> hot = on.in(a.hot), load = on.in(a.load);
   const int i = 9 * a.by_spheres.of(one), j = 9 * a.by_spheres.of(other);
   Vec<V> point = splat<V>(0.5) * (here + there);
-  ContactInput<V> input{
-      gap, point - hot.vec(i), point - hot.vec(j), hot.vec(j + 3) - hot.vec(i + 3), hot.vec(i + 6), hot.vec(j + 6)};
+  ContactInput<V> input = meeting(hot, i, j, gap, point);
   if constexpr (periodic) to_image(input, shift, cell);
   memory.read();
+  if constexpr (keeps) {
+    const int first = Law::kHistory * (step * a.rows + row);
+    for (int n = 0; n < Law::kHistory; ++n) on.lane_of(a.back.history).put(first + n, memory.number[n]);
+  }
   Contact<V> contact;
   relative_motion(input, square, contact);
   contact.history = memory.number;
@@ -451,23 +476,12 @@ inline Load<V> at_lever(Vec<V> force, Vec<V> lever) {
   return {force, cross(lever, force), {}, {}};
 }
 
-// The sum over the contacts of a sphere of a grain, walls included.
-template <class V, bool periodic, bool rubs>
-GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int step, int sphere) {
+// Calls `each(row, is_second)` for the candidates of a sphere that touch, in the order of the list.
+template <class V, class Each>
+GMEM_INLINE void for_touching(const ReplicaView<V>& on, int number, const Each& each) {
   const Arguments& a = on.a;
-  Load<V> sum{};
-  if (on.item >= a.grains || sphere >= a.spheres) return sum;
-  const int fours = a.columns / 4, rows = a.rows, number = on.item * a.spheres + sphere;
+  const int fours = a.columns / 4, rows = a.rows;
   const Four* listed = a.incidence.of(on.entry) + static_cast<long long>(number) * fours;
-  const Column<V> load = on.in(a.load);
-  const Vec<V> position = on.in(a.hot).vec(9 * on.item);
-  if (a.touching[on.of_lane(rows + number)]) {
-    const Column<V> wall = on.in(a.wall);
-    const int at = a.of_wall * number;
-    sum = at_lever(wall.vec(at), on.in(a.sphere).vec(3 * number) - position);
-    if constexpr (rubs) sum.torque = sum.torque + wall.vec(at + 6);
-    if constexpr (rubs && periodic) sum.rubbed = wall.vec(at + 9);
-  }
   Four next = listed[0];
   for (int n = 1; n <= fours; ++n) {
     const Four now = next;
@@ -479,26 +493,45 @@ GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int step, int sphere) {
       row[q] = second[q] ? now.of[q] - rows : now.of[q];
       touching[q] = static_cast<unsigned>(row[q]) < static_cast<unsigned>(rows) && a.touching[on.of_lane(row[q])];
     }
-    for (int q = 0; q < 4; ++q) {
-      if (!touching[q]) continue;
-      const int at = kLoad * row[q];
-      const Vec<V> force = load.vec(at);
-      Vec<V> lever = load.vec(at + 3) - position;
-      if constexpr (periodic) {
-        const signed char* image = a.image.of(on.entry) + 3ll * row[q];
-        const Vec<V> moved{splat<V>(image[0]), splat<V>(image[1]), splat<V>(image[2])};
-        if (second[q]) lever = lever - on.cell(step).shift(image[0], image[1], image[2]);
-        else sum.through = sum.through + through_faces(moved, force);
-      }
-      sum = sum + at_lever(second[q] ? -force : force, lever);
-    }
+    for (int q = 0; q < 4; ++q)
+      if (touching[q]) each(row[q], second[q]);
     if (static_cast<unsigned>(now.of[3]) >= 2u * rows) break;  // those that follow are blank, too
   }
+}
+
+// The sum over the contacts of a sphere of a grain, walls included.
+template <class V, bool periodic, bool rubs>
+GMEM_INLINE Load<V> loads_of(const ReplicaView<V>& on, int step, int sphere) {
+  const Arguments& a = on.a;
+  Load<V> sum{};
+  if (on.item >= a.grains || sphere >= a.spheres) return sum;
+  const int number = on.item * a.spheres + sphere;
+  const Column<V> load = on.in(a.load);
+  const Vec<V> position = on.in(a.hot).vec(9 * on.item);
+  if (a.touching[on.of_lane(a.rows + number)]) {
+    const Column<V> wall = on.in(a.wall);
+    const int at = a.of_wall * number;
+    sum = at_lever(wall.vec(at), on.in(a.sphere).vec(3 * number) - position);
+    if constexpr (rubs) sum.torque = sum.torque + wall.vec(at + 6);
+    if constexpr (rubs && periodic) sum.rubbed = wall.vec(at + 9);
+  }
+  for_touching(on, number, [&](int row, bool second) {
+    const int at = kLoad * row;
+    const Vec<V> force = load.vec(at);
+    Vec<V> lever = load.vec(at + 3) - position;
+    if constexpr (periodic) {
+      const signed char* image = a.image.of(on.entry) + 3ll * row;
+      const Vec<V> moved{splat<V>(image[0]), splat<V>(image[1]), splat<V>(image[2])};
+      if (second) lever = lever - on.cell(step).shift(image[0], image[1], image[2]);
+      else sum.through = sum.through + through_faces(moved, force);
+    }
+    sum = sum + at_lever(second ? -force : force, lever);
+  });
   return sum;
 }
 
 // The end of a step, and the beginning of the next, of a grain in a lane.
-template <class V, bool periodic, bool unequal>
+template <class V, bool periodic, bool unequal, bool keeps = false>
 GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
   const Arguments& a = on.a;
   if (on.item >= a.grains) return;
@@ -526,17 +559,25 @@ GMEM_INLINE void move(const ReplicaView<V>& on, int step, const Load<V>& load) {
   } else {
     after = end_step(constants, a.isotropic, half, force, torque);
   }
-  if (step + 1 == a.steps) return deliver(on, after);
+  if constexpr (keeps) {
+    const Column<double> total = on.lane_of(a.back.total);
+    const int at = 6 * (step * a.grains + on.item);
+    total.put(at, force), total.put(at + 3, torque);
+    if (step + 1 == a.steps) return;
+    keep(on, step + 1, after);
+  } else {
+    if (step + 1 == a.steps) return deliver(on, after);
+  }
   begin<V, periodic, unequal>(on, step + 1, constants, after);
 }
 
 // One thread for all spheres of a grain.
-template <class V, bool periodic, bool unequal, bool rubs>
+template <class V, bool periodic, bool unequal, bool rubs, bool keeps = false>
 void move_alone(const Arguments& a, int step, int thread) {
   const ReplicaView<V> on(a, thread);
   Load<V> sum{};
   for (int k = 0; k < a.spheres; ++k) sum = sum + loads_of<V, periodic, rubs>(on, step, k);
-  move<V, periodic, unequal>(on, step, sum);
+  move<V, periodic, unequal, keeps>(on, step, sum);
 }
 
 // Sums of pressures over a chunk of spheres that are `stride` apart, in the place of its first. Thread of chunk and axis,

@@ -8,8 +8,6 @@
 
 #pragma once
 
-#include <utility>
-
 #include "numbers/number.h"
 #include "numbers/vectors.h"
 
@@ -189,6 +187,14 @@ constexpr Program program_of = Calculation::record();
 template <class Calculation>
 constexpr Reached reached_in{program_of<Calculation>};
 
+// A double's inverse root is infinite at zero, as that of a CPU's vectors is not. A `select` drops what comes of it, but on
+// the way back zero would be multiplied by it.
+template <class V>
+GMEM_INLINE V finite_inverse_root(V a) {
+  return inverse_root(a);
+}
+GMEM_INLINE double finite_inverse_root(double a) { return zero_unless(a > 0.0, inverse_root(a)); }
+
 // One node of a calculation's program, forwards: its number goes to `value`, or its mask to `mask`.
 template <class Calculation, int n, class V>
 GMEM_INLINE void evaluate(const V* const* in, V* value, Mask<V>* mask) {
@@ -205,7 +211,7 @@ GMEM_INLINE void evaluate(const V* const* in, V* value, Mask<V>* mask) {
   if constexpr (step == Step::fms) value[n] = fms(value[now.a], value[now.b], value[now.c]);
   if constexpr (step == Step::fnma) value[n] = fnma(value[now.a], value[now.b], value[now.c]);
   if constexpr (step == Step::root) value[n] = root(value[now.a]);
-  if constexpr (step == Step::inverse_root) value[n] = inverse_root(value[now.a]);
+  if constexpr (step == Step::inverse_root) value[n] = finite_inverse_root(value[now.a]);
   if constexpr (step == Step::floor) value[n] = floor_of(value[now.a]);
   if constexpr (step == Step::select) value[n] = select(mask[now.c], value[now.a], value[now.b]);
   if constexpr (step == Step::less) mask[n] = value[now.a] < value[now.b];
@@ -257,7 +263,7 @@ GMEM_INLINE void reverse(const V* value, const Mask<V>* mask, V* bar) {
       to_a(zero_unless(value[n] > V{}, splat<V>(0.5) * g / value[n]));
     if constexpr (step == Step::inverse_root)  // what is not wanted stays zero, even where its slope is infinite
       to_a(zero_unless(differ(g, V{}), splat<V>(-0.5) * (((g * value[n]) * value[n]) * value[n])));
-    if constexpr (step == Step::select) to_a(zero_unless(mask[now.c], g)), to_b(zero_unless(~mask[now.c], g));
+    if constexpr (step == Step::select) to_a(zero_unless(mask[now.c], g)), to_b(select(mask[now.c], V{}, g));
   }
 }
 
@@ -278,9 +284,26 @@ GMEM_INLINE void seed_bar(V* bar, const V* result_bar) {
     bar[n] = reached_in<Calculation>.seeded[r] ? bar[n] + result_bar[r] : result_bar[r];
 }
 
+// The numbers from 0 to `count` - 1, as of std::make_integer_sequence: NVRTC has no standard library.
+template <int... n>
+struct Sequence {
+  using Twice = Sequence<n..., (static_cast<int>(sizeof...(n)) + n)...>;
+  using AndOne = Sequence<n..., static_cast<int>(sizeof...(n))>;
+};
+template <int count>
+constexpr auto up_to() {
+  if constexpr (count == 0) {
+    return Sequence<>{};
+  } else if constexpr (count % 2 == 0) {
+    return typename decltype(up_to<count / 2>())::Twice{};
+  } else {
+    return typename decltype(up_to<count - 1>())::AndOne{};
+  }
+}
+
 template <class Calculation, class V, int... n, int... r>
-GMEM_INLINE void pull_back_by(std::integer_sequence<int, n...>, std::integer_sequence<int, r...>, const V* const* in,
-                              const V* result_bar, V* const* in_bar) {
+GMEM_INLINE void pull_back_by(Sequence<n...>, Sequence<r...>, const V* const* in, const V* result_bar,
+                              V* const* in_bar) {
   V value[sizeof...(n)], bar[sizeof...(n)];
   Mask<V> mask[sizeof...(n)];
   using InOrder = int[];
@@ -292,9 +315,9 @@ GMEM_INLINE void pull_back_by(std::integer_sequence<int, n...>, std::integer_seq
 
 // From the bars of a calculation's results to those of its inputs, array by array.
 template <class Calculation, class V>
-__attribute__((noinline)) void pull_back(const V* const* in, const V* result_bar, V* const* in_bar) {
-  pull_back_by<Calculation>(std::make_integer_sequence<int, program_of<Calculation>.nodes>{},
-                            std::make_integer_sequence<int, program_of<Calculation>.results>{}, in, result_bar, in_bar);
+GMEM_APART void pull_back(const V* const* in, const V* result_bar, V* const* in_bar) {
+  pull_back_by<Calculation>(up_to<program_of<Calculation>.nodes>(), up_to<program_of<Calculation>.results>(), in,
+                            result_bar, in_bar);
 }
 
 }  // namespace GMEM_ISA

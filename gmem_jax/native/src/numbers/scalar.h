@@ -16,6 +16,12 @@
 #endif
 
 #define GMEM_INLINE inline __attribute__((always_inline))
+// Of long functions that are called in several places; on a GPU, where what they are given stays in registers, in one.
+#if defined(__CUDACC_RTC__)
+#define GMEM_APART GMEM_INLINE
+#else
+#define GMEM_APART __attribute__((noinline))
+#endif
 
 namespace gmem {
 namespace GMEM_ISA {

@@ -3,7 +3,6 @@
 
 #pragma once
 
-#include "cpu/problem.h"
 #include "numbers/program.h"
 #include "physics/contact.h"
 #include "physics/motion.h"
@@ -253,6 +252,28 @@ struct OneSphere {
     result(program, sphere_of(parameters, half, rotation, body, near, box, on, radius));
     if (!near) return program;
     result(program, on.force), result(program, on.torque), result(program, on.lower), result(program, on.upper);
+    return program;
+  }
+};
+
+// Arrays: the walls; the sum of the forces on the two of each axis. Results: the pressures.
+struct WallPressure {
+  static constexpr Program record() {
+    Program program;
+    const auto box = inputs<WallState<Symbol>>(program, 0, Bar::add);
+    result(program, pressure(box, inputs<Vec<Symbol>>(program, 1, Bar::set)));
+    return program;
+  }
+};
+
+// Arrays: the parameters. Results: the numbers of `LawParameters`, then those of `GrainParameters`.
+struct ParameterNumbers {
+  static constexpr Program record() {
+    Program program;
+    Symbol parameter[kParameters] = {};
+    for (int r = 0; r < kParameters; ++r) parameter[r] = input(program, 0, r, Bar::set);
+    results(program, LawParameters<Symbol>(parameter + kLaw, parameter[kDt]));
+    results(program, GrainParameters<Symbol>(parameter));
     return program;
   }
 };
