@@ -63,6 +63,7 @@ AT_ROUGH_WALLS = "test_the_adjoint_at_walls_with_friction_is_the_transpose_of_th
 IN_A_PERIODIC_BOX = "test_the_adjoint_in_a_periodic_box_is_the_transpose_of_the_tangent"
 UNEQUAL = "test_values_of_unequal_spheres_are_those_of_the_definition"
 KERNELS = "test_the_kernels_give_the_values_and_tangents_of_the_definition"
+BACK = "test_the_adjoint_of_the_kernels_is_that_of_the_cpu_and_the_transpose_of_their_tangent"
 AFAR = "test_grains_that_come_from_afar_meet_when_they_should"
 GAS = "test_the_gas_has_the_speeds_and_spins_of_the_recipe_each_at_random"
 MEAN = "test_a_running_mean_is_the_mean_over_the_part_of_its_window_that_is_inside"
@@ -864,7 +865,7 @@ MUTATIONS = (
     mutation(
         "gpu-force-on-the-other-with-its-sign",
         "cuda/step.h",
-        "at_lever(second[q] ? -force : force, lever)",
+        "at_lever(second ? -force : force, lever)",
         "at_lever(force, lever)",
         KERNELS + "[H]",
     ),
@@ -899,7 +900,7 @@ MUTATIONS = (
     mutation(
         "gpu-image-of-the-lever",
         "cuda/step.h",
-        "if (second[q]) lever = lever - on.cell(step)",
+        "if (second) lever = lever - on.cell(step)",
         "if (false) lever = lever - on.cell(step)",
         KERNELS + "[periodic-H]",
     ),
@@ -909,6 +910,48 @@ MUTATIONS = (
         "stride < spheres; stride *= kChunk",
         "stride < 2; stride *= kChunk",
         KERNELS + "[H]",
+    ),
+    mutation(
+        "gpu-adjoint-history-bar-outlives-the-contact",
+        "cuda/back.h",
+        "return bars.put(at, 0.0);",
+        "return bars.put(at, bars[at]);",
+        BACK + "[H]",
+    ),
+    mutation(
+        "gpu-adjoint-of-the-other-force-lost",
+        "cuda/back.h",
+        "on_grain(i, kMidForce) - on_grain(j, kMidForce)",
+        "on_grain(i, kMidForce)",
+        BACK + "[H]",
+    ),
+    mutation(
+        "gpu-adjoint-of-the-lever-at-the-centre-lost",
+        "cuda/back.h",
+        "second ? point + separation : point - separation",
+        "second ? separation : -separation",
+        BACK + "[H]",
+    ),
+    mutation(
+        "gpu-adjoint-of-pressures-lost",
+        "cuda/back.h",
+        "pull_back<WallPressure>(of_pressure, pressure_bar, pressure_gives);",
+        "store_vec(force_bar, Vec<double>{});",
+        BACK + "[M1]",
+    ),
+    mutation(
+        "gpu-adjoint-sums-the-first-chunk",
+        "cuda/handler.cc",
+        "stride < most; stride *= kChunk",
+        "stride < 2; stride *= kChunk",
+        BACK + "[H]",
+    ),
+    mutation(
+        "gpu-adjoint-of-a-double-divides-by-zero",
+        "program.h",
+        "zero_unless(a > 0.0, inverse_root(a))",
+        "inverse_root(a)",
+        BACK + "[H]",
     ),
     mutation(
         "gpu-list-taken-on-trust",

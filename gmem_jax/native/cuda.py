@@ -1,8 +1,9 @@
 """The native backend on CUDA GPUs: which arrays a call has there, and whether it can be made at all.
 
 The kernels (src/cuda) are the physics of the CPU's library, compiled where they run by NVRTC. A step is two launches: a
-thread is a candidate of a replica in the first, and a grain in the second. What is needed from one step to the next, and
-what reverse mode keeps of every step, are further results of the call, so that XLA manages all memory.
+thread is a candidate of a replica in the first, and a grain in the second. Reverse mode goes through the steps and keeps
+what it needs of each, and then goes back through them (src/cuda/back.h). What is kept, or needed from one step to the
+next, are further results of the call, so that XLA manages all memory.
 """
 
 import ctypes
@@ -72,7 +73,7 @@ def warn_no_nvrtc(reason: str) -> None:
 def serves(target: str, call: Any) -> bool:
     """Whether there are kernels for a call; if not, GPUs have it in plain JAX.
 
-    Reverse mode is of equal spheres between smooth walls, with any law but Mindlin's; second derivatives there are none.
+    Reverse mode is of equal spheres between smooth walls, with any law but Mindlin's. There are no second derivatives.
 
     Args:
         target: what XLA knows the call by.
@@ -207,7 +208,7 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
         target: what XLA knows it by; if it ends in "adjoint" it is of reverse mode.
         call: its attributes, `gmem_jax.native.calls.Call`.
         in_place: whether histories may take the place of those that were given.
-        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`, and the tangent's `Arrays` or the adjoint's `StepOutput`.
+        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`; and the tangent's `Arrays` or the adjoint's `StepOutput`.
         shapes: of the results.
     """
     outer = shapes[0].shape[:-3]
@@ -244,10 +245,10 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
     kinds = 2 if slopes and kept is None else 1
     between = between_steps(fixed, arrays.history, grains, call, kinds, lanes, kept)
     ffi = jax.ffi.ffi_call(target, [*results, *between], input_output_aliases=aliases)
-    found = list(ffi(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict()))
+    found: list[jax.Array] = list(ffi(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict()))
     if kept is not None:  # where nothing touches, not all derivatives ask for the parameters
-        for number in range(len(arrays.fields) + 3):
-            whole = jnp.expand_dims(sound, tuple(range(1, found[number].ndim)))
-            found[number] = jnp.where(whole, found[number], jnp.nan)
+        for number, bar in enumerate(found[: len(arrays.fields) + 3]):
+            known = jnp.expand_dims(sound, tuple(range(1, bar.ndim)))
+            found[number] = jnp.where(known, bar, jnp.full_like(bar, jnp.nan))
     moved = [leaf.reshape(shape.shape) for leaf, shape in zip(found, shapes, strict=False)]
     return [*moved, *found[len(shapes) :]]

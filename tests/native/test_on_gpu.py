@@ -58,6 +58,28 @@ def slopes(system: System, state: Any, boxes: Box, along: jax.Array) -> Any:
     return jax.jvp(lambda upper: moved(system, state, replace(boxes, upper=upper)), (boxes.upper,), (along,))[1]
 
 
+@jax.jit
+def gradient(system: System, state: Any, boxes: Box, weights: Any) -> Any:
+    """The derivative of a weighted sum of `moved` by the walls' positions, and by the grains' positions and velocities."""
+
+    def total(upper: jax.Array, lower: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
+        grains = replace(state.grains, position=position, velocity=velocity)
+        found = moved(system, replace(state, grains=grains), replace(boxes, upper=upper, lower=lower))
+        products = jax.tree.map(lambda weight, leaf: jnp.sum(weight * leaf), weights, found)
+        return jax.tree.reduce(jnp.add, products)
+
+    by = boxes.upper, boxes.lower, state.grains.position, state.grains.velocity
+    return jax.grad(total, argnums=(0, 1, 2, 3))(*by)
+
+
+def weighted(law: str, replicas: int, isotropic: bool = True) -> tuple[Any, ...]:
+    """`thrown`, and random weights of all that it gives."""
+    parts = thrown(law, replicas, isotropic)
+    draws = np.random.default_rng(2)
+    shapes = jax.eval_shape(moved, *parts)
+    return (*parts, jax.tree.map(lambda leaf: jnp.asarray(draws.normal(size=leaf.shape)), shapes))
+
+
 def on_both(function: Any, make: Any) -> tuple[Any, Any]:
     """What a function of arguments that are made on the CPU gives on the GPU, and on the CPU."""
     with jax.default_device(jax.devices("cpu")[0]):
@@ -72,6 +94,22 @@ def test_values_and_tangents_are_those_of_the_cpu(law: str) -> None:
     assert_close(*on_both(moved, lambda: thrown(law, 5)), 1e-10)
     along = jnp.asarray(np.random.default_rng(1).normal(size=(STEPS, 3, 5)))
     assert_close(*on_both(slopes, lambda: (*thrown(law, 5), along)), 1e-9)
+
+
+@pytest.mark.parametrize(("law", "isotropic"), [("frictionless", True), ("H", True), ("M1", True), ("H", False)])
+def test_gradients_are_those_of_the_cpu(law: str, isotropic: bool) -> None:
+    with jax.default_device(GPU):
+        assert "@gmem_adjoint" in gradient.lower(*weighted(law, 2, isotropic)).as_text()  # not plain JAX
+    assert_close(*on_both(gradient, lambda: weighted(law, 5, isotropic)), 1e-9)
+
+
+def test_the_gradient_of_a_replica_has_the_same_bits_alone_and_among_many() -> None:
+    system, state, boxes, weights = weighted("M1", 512)
+    many = gradient(system, state, boxes, weights)
+    first = functools.partial(jax.tree.map, lambda leaf: leaf[..., :1])
+    alone = gradient(system, *map(first, (state, boxes, weights)))
+    for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(many), strict=True):
+        np.testing.assert_array_equal(one[..., 0], other[..., 0])
 
 
 def test_grains_with_unequal_moments_of_inertia() -> None:

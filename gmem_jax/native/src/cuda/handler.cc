@@ -253,6 +253,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   else go_forward(launch, a, rubs != 0, layered);
   return ffi::Error::Success();
 }
+
 template <Task task>
 ffi::Error handle(void* stream, int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t, int64_t mixed,
                   int64_t periodic, int64_t unequal, int64_t rubs, ffi::RemainingArgs args, ffi::RemainingRets rets) {
