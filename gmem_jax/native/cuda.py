@@ -1,9 +1,9 @@
 """The native backend on CUDA GPUs: which arrays a call has there, and whether it can be made at all.
 
 The kernels (src/cuda) are the physics of the CPU's library, compiled where they run by NVRTC. A step is two launches: a
-thread is a candidate of a replica in the first, and a grain in the second. Reverse mode goes through the steps and keeps
-what it needs of each, and then goes back through them (src/cuda/back.h). What is kept, or needed from one step to the
-next, are further results of the call, so that XLA manages all memory.
+thread is a candidate of a replica in the first, and a grain in the second. Reverse mode keeps what it needs of each
+step, and then goes back through them (src/cuda/back.h). What is kept, or needed from one step to the next, are further
+results of the call, so that XLA manages all memory.
 """
 
 import ctypes
@@ -187,7 +187,8 @@ def between_steps(
         return jax.ShapeDtypeStruct((1, *shape, lanes), dtype)
 
     found = [array(kinds, grains, 9), array(kinds, spheres, 3), array(kinds, grains, 4)]
-    found += [array(kinds, spheres, 12 if call.rubs else 6), array(kinds, rows, 6 if kept is None else 18)]
+    found += [array(kinds, spheres, 12 if call.rubs or kept is not None else 6)]
+    found += [array(kinds, rows, 6 if kept is None else 18)]
     found += [array(rows + spheres, dtype=jnp.uint8)]
     if kinds == 2 or kept is not None:  # forwards, of values alone, histories are in the results
         found += [array(kinds, *leaf.shape[1:3]) for leaf in history if leaf.ndim == 4]
@@ -208,7 +209,7 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
         target: what XLA knows it by; if it ends in "adjoint" it is of reverse mode.
         call: its attributes, `gmem_jax.native.calls.Call`.
         in_place: whether histories may take the place of those that were given.
-        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`; and the tangent's `Arrays` or the adjoint's `StepOutput`.
+        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`; also the tangent's `Arrays`, the adjoint's `StepOutput`.
         shapes: of the results.
     """
     outer = shapes[0].shape[:-3]

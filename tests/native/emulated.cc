@@ -37,6 +37,7 @@ void run_back(GpuKernel kernel, const Arguments& a, int step, int thread) {
     case GpuKernel::move_alone: return k::move_alone<V, false, false, false, true>(a, step, thread);
     case GpuKernel::take: return k::take<Law>(a, thread);
     case GpuKernel::touch_back: return k::touch_back<Law>(a, step, thread);
+    case GpuKernel::gather_back: return k::gather_back(a, thread);
     case GpuKernel::move_back: return k::move_back(a, step, thread);
     case GpuKernel::collect_walls: return k::collect_walls(a, step, thread);
     case GpuKernel::sum_up: return k::sum_up(a, step, thread);

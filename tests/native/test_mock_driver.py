@@ -177,7 +177,7 @@ def reverse_mode(driver: Driver) -> None:
     assert all(np.abs(leaf).max() > 1e-6 for leaf in expected)
     assert_same(adjoints("mock", "H"), expected)
     assert driver.count("cuModuleLoadData") == 1
-    assert driver.count("cuLaunchKernel") == 7 + 5 * STEPS
+    assert driver.count("cuLaunchKernel") == 7 + 6 * STEPS
     driver.begin(replays=2)
     assert_same(adjoints("mock", "H"), expected)
     assert driver.count("cuModuleLoadData") == 0

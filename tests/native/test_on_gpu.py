@@ -60,7 +60,7 @@ def slopes(system: System, state: Any, boxes: Box, along: jax.Array) -> Any:
 
 @jax.jit
 def gradient(system: System, state: Any, boxes: Box, weights: Any) -> Any:
-    """The derivative of a weighted sum of `moved` by the walls' positions, and by the grains' positions and velocities."""
+    """The derivative of a weighted sum of `moved` by where walls and grains are, and by the grains' velocities."""
 
     def total(upper: jax.Array, lower: jax.Array, position: jax.Array, velocity: jax.Array) -> jax.Array:
         grains = replace(state.grains, position=position, velocity=velocity)

@@ -17,7 +17,8 @@ constexpr int kOfLayers = 6;  // numbers of Mindlin's `Layers`
 constexpr int kLoad = 6;      // numbers of a contact: the force on its first sphere, and the point where it acts
 // Of reverse mode (cuda/back.h): numbers of a grain at the beginning of a step, and midway; of `ContactInput`; those that
 // every grain has of `GrainParameters`; and the parameters that contacts have derivatives by.
-constexpr int kOfGrain = 19, kOfInput = 18, kOfConstants = 14, kOfContact = 7;
+// At last, those that the contacts of a sphere give to it.
+constexpr int kOfGrain = 19, kOfInput = 18, kOfConstants = 14, kOfContact = 7, kOfSphere = 12;
 
 // Where the numbers of each entry begin; the step is zero where all share them.
 template <class T>
@@ -107,7 +108,7 @@ struct Arguments {
   Table cold;    // orientation, [N, 4, L]
   Table wall;    // force of the walls, and their pressures summed over steps; if they have friction, its torque about
                  // the sphere's centre and its force; [N K, of_wall, L]
-  int of_wall;   // 6, or 12
+  int of_wall;   // 6; 12 if they have friction, or in reverse mode, which puts `Given` here on the way back
   Table load;    // of candidates that touch, [P, kLoad, L]
   unsigned char* touching;  // which candidates touch, and which spheres the walls (bits of planes that have friction),
                             // [P + N K, L]
@@ -128,15 +129,16 @@ enum class GpuKernel {
   leave,
   take,
   touch_back,
+  gather_back,
   move_back,
   collect_walls,
   sum_up,
   leave_back
 };
-constexpr int kKernels = 13;
-constexpr const char* kKernelNames[kKernels] = {"enter",         "remember", "touch",     "move",       "move_alone",
-                                                "collect",       "leave",    "take",      "touch_back", "move_back",
-                                                "collect_walls", "sum_up",   "leave_back"};
+constexpr int kKernels = 14;
+constexpr const char* kKernelNames[kKernels] = {"enter",     "remember",      "touch",  "move",       "move_alone",
+                                                "collect",   "leave",         "take",   "touch_back", "gather_back",
+                                                "move_back", "collect_walls", "sum_up", "leave_back"};
 constexpr bool is_kernel_of(Task task, GpuKernel kernel) {
   if (task != Task::adjoint) return kernel < GpuKernel::take;
   return kernel != GpuKernel::collect && kernel != GpuKernel::leave;

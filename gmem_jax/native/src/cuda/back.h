@@ -1,7 +1,7 @@
 // Reverse mode on a GPU. The steps go forwards and keep what the way back needs (`keeps` in step.h); then each step is gone
-// back through in two launches. In `touch_back` a thread is one candidate of one lane, in `move_back` one grain of one lane:
-// it gathers what its contacts found, goes back through the first half of the step, and through the second half of the step
-// before. The calculations are those of the CPU, as programs (physics/calculations.h); here stands only who gets which
+// back through in three launches. In `touch_back` a thread is one candidate of one lane; in `gather_back` one sphere, which
+// sums up what its contacts found; in `move_back` one grain, which goes back through the first half of the step, and through
+// the second half of the step before. The calculations are those of the CPU, as programs (physics/calculations.h); here stands only who gets which
 // derivative. "Bar" x is the derivative of the final results by x.
 //
 // Bars of grains and histories lie where the results of the call are. Those of what all share - parameters, places of
@@ -124,24 +124,29 @@ void touch_back(const Arguments& a, int step, int thread) {
   for (const int of : kLawRowOfContact) add(sums, sum++, law_bar[of]);
 }
 
-// What the contacts of a sphere give to it and to its grain.
-struct Given {
-  Vec<double> centre, position, velocity, spin;
-};
+// What the contacts of a sphere give to it and to its grain, summed in the order of its list.
+enum Given { kGivenCentre = 0, kGivenPosition = 3, kGivenVelocity = 6, kGivenSpin = 9 };
+static_assert(cuda::kOfSphere == kGivenSpin + 3, "spheres are given other numbers");
 
-inline Given given_to(const ReplicaView<double>& on, int sphere) {
-  const Column<double> input = on.lane_of(on.a.back.input);
-  Given sum{};
-  for_touching(on, sphere, [&](int row, bool second) {
+// Thread of sphere and lane.
+inline void gather_back(const Arguments& a, int thread) {
+  const ReplicaView<double> on(a, thread);
+  if (on.item >= a.grains * a.spheres) return;
+  const Column<double> input = on.lane_of(a.back.input);
+  Vec<double> centre{}, position{}, velocity{}, spin{};
+  for_touching(on, on.item, [&](int row, bool second) {
     const auto part = [&](int number) { return input.vec(kInputs * row + number); };  // see `ContactInput`
-    const Vec<double> separation = part(0), lever_one = part(3), lever_other = part(6), velocity = part(9);
+    const Vec<double> separation = part(0), lever_one = part(3), lever_other = part(6), closing = part(9);
     const Vec<double> point = 0.5 * (lever_one + lever_other);
-    sum.centre = sum.centre + (second ? point + separation : point - separation);
-    sum.position = sum.position - (second ? lever_other : lever_one);
-    sum.velocity = second ? sum.velocity + velocity : sum.velocity - velocity;
-    sum.spin = sum.spin + part(second ? 15 : 12);
+    centre = centre + (second ? point + separation : point - separation);
+    position = position - (second ? lever_other : lever_one);
+    velocity = second ? velocity + closing : velocity - closing;
+    spin = spin + part(second ? 15 : 12);
   });
-  return sum;
+  const Column<double> given = on.in(a.wall);
+  const int at = a.of_wall * on.item;
+  given.put(at + kGivenCentre, centre), given.put(at + kGivenPosition, position);
+  given.put(at + kGivenVelocity, velocity), given.put(at + kGivenSpin, spin);
 }
 
 inline Grain<double> kept_grain(const ReplicaView<double>& on, int step) {
@@ -205,15 +210,16 @@ GMEM_INLINE void begin_back(const ReplicaView<double>& on, int step, Constants& 
   bool touches = false;
   for (int k = 0; k < a.spheres; ++k) {
     const int sphere = on.item * a.spheres + k;
-    const Given given = given_to(on, sphere);
+    const auto given = [&](int number) { return on.in(a.wall).vec(a.of_wall * sphere + number); };
     const auto take_in = [&](int number, Vec<double> more) {
       store_vec(turned_bar + number, load_vec(turned_bar + number) + more);
     };
-    take_in(kMidPosition, given.position), take_in(kMidVelocity, given.velocity), take_in(kMidSpin, given.spin);
+    take_in(kMidPosition, given(kGivenPosition)), take_in(kMidVelocity, given(kGivenVelocity));
+    take_in(kMidSpin, given(kGivenSpin));
     const double body[] = {on.offset(3 * k), on.offset(3 * k + 1), on.offset(3 * k + 2)};
     double body_bar[3] = {};
-    touches |=
-        sphere_back(on, sphere, half, box, turned, body, given.centre, constants, turned_bar, body_bar, walls_bar);
+    touches |= sphere_back(on, sphere, half, box, turned, body, given(kGivenCentre), constants, turned_bar, body_bar,
+                           walls_bar);
     for (int q = 0; q < 3; ++q) add(sums, of_grain(a) * on.item + kOfConstants + 3 * k + q, body_bar[q]);
   }
   // The byte of its first sphere, which nothing else asks for on the way back, says whether there are bars of the walls.

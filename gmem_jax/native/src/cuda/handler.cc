@@ -111,6 +111,7 @@ void go_back(const Launcher& launch, const Arguments& a) {
   launch(GpuKernel::move_back, a.grains, a, a.steps);
   for (int step = a.steps - 1; step >= 0; --step) {
     launch(GpuKernel::touch_back, a.rows, a, step);
+    launch(GpuKernel::gather_back, a.grains * a.spheres, a, step);
     launch(GpuKernel::move_back, a.grains, a, step);
     launch(GpuKernel::collect_walls, Arguments::chunks(a.grains) * kWalls, a, step);
   }
@@ -138,7 +139,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   reader.size('Q') = points;
   reader.size('O') = 4;
   reader.size('E') = task == Task::adjoint ? kOfInput : kLoad;
-  reader.size('X') = rubs ? 12 : 6;
+  reader.size('X') = rubs || task == Task::adjoint ? kOfSphere : 6;
   reader.size('Y') = kOfLayers;
   reader.size('D') = task == Task::tangent ? 2 : 1;
   reader.size('M') = kOfGrain;

@@ -43,6 +43,7 @@ GMEM_KERNEL(128, GMEM_MOVE) move_alone(GMEM_GIVEN) {
 #if GMEM_BACK
 GMEM_KERNEL(128, 4) take(GMEM_GIVEN) { gmem::GMEM_ISA::take<GMEM_LAW>(a, thread()); }
 GMEM_KERNEL(128, 2) touch_back(GMEM_GIVEN) { gmem::GMEM_ISA::touch_back<GMEM_LAW>(a, step, thread()); }
+GMEM_KERNEL(128, 6) gather_back(GMEM_GIVEN) { gmem::GMEM_ISA::gather_back(a, thread()); }
 GMEM_KERNEL(128, 2) move_back(GMEM_GIVEN) { gmem::GMEM_ISA::move_back(a, step, thread()); }
 GMEM_KERNEL(128, 4) collect_walls(GMEM_GIVEN) { gmem::GMEM_ISA::collect_walls(a, step, thread()); }
 GMEM_KERNEL(128, 4) sum_up(GMEM_GIVEN) { gmem::GMEM_ISA::sum_up(a, step, thread()); }
