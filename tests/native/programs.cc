@@ -1,9 +1,11 @@
 // Derivatives by programs that the compiler recorded are those of the tape, on which the same physics is recorded when it
 // runs: of a contact of each law, of the two halves of a step, and of a sphere at the walls.
 
+#include <initializer_list>
+
 #include "check.h"
-#include "physics/calculations.h"
 #include "numbers/tape.h"
+#include "physics/calculations.h"
 
 namespace gmem {
 namespace GMEM_ISA {
