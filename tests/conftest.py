@@ -16,8 +16,8 @@ if "GMEM_COMPILE_CACHE" not in os.environ:
 
 # Much of the time of all tests is the compiler's, which makes programs fast that are small and run once. The slow tests
 # have programs as a user's are: there XLA_FLAGS is set (Makefile). The emitters of fusions, which XLA can do without up
-# to jaxlib 0.9, take half of the time that is left; an unknown flag ends the process. A program in one piece compiles in
-# four fifths of the time that several take side by side, where workers have all cores already.
+# to jaxlib 0.9, take half of the time that is left; an unknown flag ends the process. A program in one piece compiles
+# in four fifths of the time that several take side by side, where workers have all cores already.
 if "XLA_FLAGS" not in os.environ:
     os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
     if version("jaxlib").startswith("0.9."):

@@ -53,12 +53,18 @@ WHICH: dict[str, Callable[[Compared], bool]] = {
 
 WITHIN = 2.0  # combined errors that count as agreement
 REASONS: tuple[tuple[Callable[[Mapping[str, Any]], bool], str], ...] = (
-    (lambda at: at["delta0"] <= 0.02 or SHEARED < at["gamma0"] / at["delta0"] < LARGE / 0.05, "[thin compression](differences.md#thin-compression)"),
+    (
+        lambda at: at["delta0"] <= 0.02 or SHEARED < at["gamma0"] / at["delta0"] < LARGE / 0.05,
+        "[thin compression](differences.md#thin-compression)",
+    ),
     (lambda at: at["mu"] < 0.7, "[small friction](differences.md#g-at-small-friction)"),
     (lambda at: at["gamma0"] > LARGE, "[large shear](differences.md#large-shear)"),
     (lambda at: at["n_grains"] > 20_000, "[large packs](differences.md#g-of-31680-and-100450-grains)"),
     (lambda at: at["shape"] == "sphere", "[spheres](differences.md#spheres)"),
-    (lambda at: at["n_grains"] == GRAINS and at["delta0"] >= 0.05, "[the rate and F](differences.md#f-and-the-rate-of-the-drive)"),
+    (
+        lambda at: at["n_grains"] == GRAINS and at["delta0"] >= 0.05,
+        "[the rate and F](differences.md#f-and-the-rate-of-the-drive)",
+    ),
 )
 
 

@@ -375,7 +375,7 @@ def test_numbers_with_derivatives_fit_too(law: str) -> None:
 
 @needs_nvrtc
 @pytest.mark.parametrize("law", ["frictionless", "H", "M1"])
-@pytest.mark.parametrize("architecture", ["sm_80", "sm_90"])
+@pytest.mark.parametrize("architecture", [pytest.param("sm_80", marks=pytest.mark.slow), "sm_90"])
 def test_the_kernels_of_reverse_mode_compile(architecture: str, law: str) -> None:
     kernels = native.needs(LAWS[law], architecture, adjoint=True)
     steps = {"enter", "remember", "touch", "move", "move_alone"}

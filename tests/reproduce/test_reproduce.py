@@ -350,7 +350,10 @@ def test_pictures_of_recalls_and_words(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 @pytest.mark.parametrize(
     ("t0", "stored"),
-    [(450.0, (0.293218, 0.637052, 0.680709)), pytest.param(1.8e3, (0.261092, 0.657701, 0.659159), marks=pytest.mark.slow)],
+    [
+        (450.0, (0.293218, 0.637052, 0.680709)),
+        pytest.param(1.8e3, (0.261092, 0.657701, 0.659159), marks=pytest.mark.slow),
+    ],
 )
 def test_the_physics_gives_the_stored_numbers(t0: float, stored: tuple[float, ...]) -> None:
     """Compilers and instruction sets move p_sig by 1e-9 of itself."""
