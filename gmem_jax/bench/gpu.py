@@ -88,12 +88,12 @@ def registers() -> dict[str, dict[str, tuple[Needs, Needs]]]:
     if cuda.missing() or not native.available()[0]:
         return {}
 
-    def of(law: FrictionLaw, tangent: bool) -> dict[str, tuple[Needs, Needs]]:
-        found = {name: native.needs(law, name, tangent=tangent) for name in ARCHITECTURES}
+    def of(law: FrictionLaw, task: cuda.Task) -> dict[str, tuple[Needs, Needs]]:
+        found = {name: native.needs(law, name, task) for name in ARCHITECTURES}
         return {name: (kernels["touch"], kernels["move_alone"]) for name, kernels in found.items()}
 
-    plain = {name: of(law, tangent=False) for name, law in GPU_LAWS.items()}
-    return {**plain, **{f"{name}, with derivatives": of(GPU_LAWS[name], tangent=True) for name in ("H", "M2")}}
+    plain = {name: of(law, "forward") for name, law in GPU_LAWS.items()}
+    return {**plain, **{f"{name}, with derivatives": of(GPU_LAWS[name], "tangent") for name in ("H", "M2")}}
 
 
 def timed(load: Callable[[str], Pack], say: measure.Say = lambda what, fraction: None) -> dict[str, Any]:

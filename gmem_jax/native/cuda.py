@@ -15,7 +15,7 @@ import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,9 @@ CUDA_TARGETS = {
     "gmem_adjoint": "gmem_cuda_adjoint",
 }
 """Symbols of the library by the names of calls; see `serves`."""
+
+Task = Literal["forward", "tangent", "adjoint"]
+"""What kernels are compiled for, in the order of src/physics/parameters.h."""
 
 _NAMES = ("libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so")
 _registered: list[ctypes.CDLL] = []  # the library, once it is loaded
@@ -122,7 +125,7 @@ class Needs(NamedTuple):
 
 
 def kernel_needs(
-    library: ctypes.CDLL, law: int, variant: int, architecture: str, *, tangent: bool = False, adjoint: bool = False
+    library: ctypes.CDLL, law: int, variant: int, architecture: str, task: Task = "forward"
 ) -> dict[str, Needs]:
     """The kernels, compiled for an architecture without a GPU, by their names.
 
@@ -131,15 +134,13 @@ def kernel_needs(
         law: its number, as of `gmem_jax.native.calls.Call`.
         variant: alike.
         architecture: as "sm_90".
-        tangent: of numbers that carry derivatives.
-        adjoint: of reverse mode instead, for a law that has it there.
+        task: what the kernels are for; "adjoint" for a law that has reverse mode there.
 
     Raises:
         RuntimeError: if there is no NVRTC, or it fails.
     """
     said = ctypes.create_string_buffer(1 << 16)
-    task = 2 if adjoint else int(tangent)  # src/physics/parameters.h: Task
-    failed = library.gmem_cuda_compile(architecture.encode(), law, variant, task, said, len(said))
+    failed = library.gmem_cuda_compile(architecture.encode(), law, variant, get_args(Task).index(task), said, len(said))
     text = said.value.decode()
     if failed:
         raise RuntimeError(text)
@@ -198,18 +199,19 @@ def between_steps(
         return found
     remembered, chunks = sum(leaf.shape[2] for leaf in history), -(-grains // 64)
     found += [array(kept, grains, 19), array(kept, grains, 6), array(kept, rows, remembered)]
-    found += [array(grains, 19), array(grains, 12), array(grains, 14 + 3 * (spheres // grains))]
-    return [*found, array(rows, 7), array(kept, chunks, 12)]
+    found += [array(grains, 19), array(grains, 12)]  # of the step that is gone back through; then sums
+    return [*found, array(grains, 14 + 3 * (spheres // grains)), array(rows, 7), array(kept, chunks, 12)]
 
 
 def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Sequence[Any]) -> Sequence[jax.Array]:
     """A call of the library, with results of the given shapes, and what was needed between its steps.
 
     Args:
-        target: what XLA knows it by; if it ends in "adjoint" it is of reverse mode.
+        target: what XLA knows it by.
         call: its attributes, `gmem_jax.native.calls.Call`.
         in_place: whether histories may take the place of those that were given.
-        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`; also the tangent's `Arrays`, the adjoint's `StepOutput`.
+        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`; then the tangent's `Arrays` or, for reverse mode, a
+            `StepOutput`.
         shapes: of the results.
     """
     outer = shapes[0].shape[:-3]
@@ -242,8 +244,9 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
                 aliases[argument] = result
     _, grains, _, replicas = arrays.fields[0].shape
     lanes = entries * replicas
-    kept = arrays.walls.shape[1] if target.endswith("adjoint") else None
-    kinds = 2 if slopes and kept is None else 1
+    along = [type(one) is type(arrays) for one in slopes]  # or derivatives by the results: reverse mode
+    kept = None if all(along) else arrays.walls.shape[1]
+    kinds = 2 if any(along) else 1
     between = between_steps(fixed, arrays.history, grains, call, kinds, lanes, kept)
     ffi = jax.ffi.ffi_call(target, [*results, *between], input_output_aliases=aliases)
     found: list[jax.Array] = list(ffi(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict()))

@@ -83,16 +83,13 @@ def entry(law: FrictionLaw) -> Entry:
     return found
 
 
-def needs(
-    law: FrictionLaw, architecture: str, *, tangent: bool = False, adjoint: bool = False
-) -> dict[str, cuda.Needs]:
+def needs(law: FrictionLaw, architecture: str, task: cuda.Task = "forward") -> dict[str, cuda.Needs]:
     """What the kernels of a law take of a GPU, compiled for its architecture ("sm_90") on this machine.
 
     Args:
         law: one that the library knows.
         architecture: as NVRTC calls it.
-        tangent: of numbers that carry derivatives.
-        adjoint: of reverse mode instead, for a law that has it on GPUs.
+        task: what the kernels are for; "adjoint" for a law that has reverse mode on GPUs.
 
     Raises:
         RuntimeError: if there is no NVRTC, or it does not know the architecture.
@@ -100,5 +97,4 @@ def needs(
     """
     require_library()
     row = entry(law)
-    library = ctypes.CDLL(str(path()))
-    return cuda.kernel_needs(library, row.native, row.variant(law), architecture, tangent=tangent, adjoint=adjoint)
+    return cuda.kernel_needs(ctypes.CDLL(str(path())), row.native, row.variant(law), architecture, task)

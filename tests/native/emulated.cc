@@ -8,33 +8,11 @@ namespace cuda {
 
 namespace {
 
-// Of one thread.
-template <class V, class Law, bool periodic, bool unequal, bool rubs>
-void run(GpuKernel kernel, const Arguments& a, int step, int thread) {
-  namespace k = gmem::GMEM_ISA;
-  switch (kernel) {
-    case GpuKernel::enter: return k::enter<V, periodic, unequal>(a, thread);
-    case GpuKernel::remember: return k::remember<V, Law, rubs>(a, thread);
-    case GpuKernel::touch: return k::touch<V, Law, periodic, unequal, rubs>(a, step, thread);
-    case GpuKernel::move:  // in the order of its sum it is the same
-    case GpuKernel::move_alone: return k::move_alone<V, periodic, unequal, rubs>(a, step, thread);
-    case GpuKernel::collect: return k::collect<V>(a, step, thread);
-    case GpuKernel::leave: return k::leave<V, Law, rubs>(a, thread);
-    default: return;  // of reverse mode
-  }
-}
-
-// The same of reverse mode.
+// Of one thread on the way back.
 template <class Law>
 void run_back(GpuKernel kernel, const Arguments& a, int step, int thread) {
   namespace k = gmem::GMEM_ISA;
-  using V = double;
   switch (kernel) {
-    case GpuKernel::enter: return k::enter<V, false, false, true>(a, thread);
-    case GpuKernel::remember: return k::remember<V, Law, false>(a, thread);
-    case GpuKernel::touch: return k::touch<V, Law, false, false, false, true>(a, step, thread);
-    case GpuKernel::move:
-    case GpuKernel::move_alone: return k::move_alone<V, false, false, false, true>(a, step, thread);
     case GpuKernel::take: return k::take<Law>(a, thread);
     case GpuKernel::touch_back: return k::touch_back<Law>(a, step, thread);
     case GpuKernel::gather_back: return k::gather_back(a, thread);
@@ -42,7 +20,24 @@ void run_back(GpuKernel kernel, const Arguments& a, int step, int thread) {
     case GpuKernel::collect_walls: return k::collect_walls(a, step, thread);
     case GpuKernel::sum_up: return k::sum_up(a, step, thread);
     case GpuKernel::leave_back: return k::leave_back(a, thread);
-    default: return;  // of the steps alone
+    default: return;
+  }
+}
+
+// Of one thread.
+template <class V, class Law, bool periodic, bool unequal, bool rubs, bool keeps = false>
+void run(GpuKernel kernel, const Arguments& a, int step, int thread) {
+  namespace k = gmem::GMEM_ISA;
+  switch (kernel) {
+    case GpuKernel::enter: return k::enter<V, periodic, unequal, keeps>(a, thread);
+    case GpuKernel::remember: return k::remember<V, Law, rubs>(a, thread);
+    case GpuKernel::touch: return k::touch<V, Law, periodic, unequal, rubs, keeps>(a, step, thread);
+    case GpuKernel::move:  // in the order of its sum it is the same
+    case GpuKernel::move_alone: return k::move_alone<V, periodic, unequal, rubs, keeps>(a, step, thread);
+    case GpuKernel::collect: return k::collect<V>(a, step, thread);
+    case GpuKernel::leave: return k::leave<V, Law, rubs>(a, thread);
+    default:
+      if constexpr (keeps) run_back<Law>(kernel, a, step, thread);
   }
 }
 
@@ -52,7 +47,7 @@ Run run_of(const Which& which) {
   return with_law(which.law, which.variant, [&](auto law) -> Run {
     using L = decltype(law);
     if constexpr (!L::kLayered)
-      if (which.task == Task::adjoint) return Run{run_back<L>};
+      if (which.task == Task::adjoint) return run<double, L, false, false, false, true>;
     const auto of_numbers = [&](auto number) -> Run {
       using V = decltype(number);
       if (which.unequal) return which.periodic || which.rubs ? nullptr : run<V, L, false, true, false>;  // not tested

@@ -370,14 +370,14 @@ def test_plain_numbers_fit_into_the_registers(architecture: str, law: str) -> No
 @needs_nvrtc
 @pytest.mark.parametrize("law", ["H", "M2-averaged"])
 def test_numbers_with_derivatives_fit_too(law: str) -> None:
-    assert all(kernel.spilt == 0 for kernel in native.needs(LAWS[law], "sm_90", tangent=True).values())
+    assert all(kernel.spilt == 0 for kernel in native.needs(LAWS[law], "sm_90", "tangent").values())
 
 
 @needs_nvrtc
 @pytest.mark.parametrize("law", ["frictionless", "H", "M1"])
 @pytest.mark.parametrize("architecture", [pytest.param("sm_80", marks=pytest.mark.slow), "sm_90"])
 def test_the_kernels_of_reverse_mode_compile(architecture: str, law: str) -> None:
-    kernels = native.needs(LAWS[law], architecture, adjoint=True)
+    kernels = native.needs(LAWS[law], architecture, "adjoint")
     steps = {"enter", "remember", "touch", "move", "move_alone"}
     back = {"take", "touch_back", "gather_back", "move_back", "collect_walls", "sum_up", "leave_back"}
     assert set(kernels) == steps | back

@@ -56,7 +56,8 @@ def test_unit_tests_in_cpp(name: str, tmp_path: Path) -> None:
     more = [str(build.SOURCES / source) for source in THREADS] if name == "threads" else []
     sets = {"baseline": ()} if name == "threads" else instruction_sets()
     if name == "programs":  # takes its time, and knows of vectors only how long they are
-        sets = dict([list(sets.items())[-1]])
+        best = list(sets)[-1]
+        sets = {best: sets[best]}
     for instructions, flags in sets.items():
         program = tmp_path / instructions
         level = "-O0" if name == "programs" else "-O1"  # where g++ 12 stops with an error of its own
