@@ -2,6 +2,7 @@
 
 import atexit
 import os
+import signal
 import tempfile
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -26,6 +27,10 @@ if "XLA_FLAGS" not in os.environ:
 # Threads of the library wait for each other in loops, and workers side by side have no core to spare for that.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("GMEM_THREADS", "1")
+
+# Shells let what they start in the background ignore Ctrl-C, and the programs that tests stop by it would, too.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import jax
 import pytest
