@@ -1,5 +1,7 @@
 // The GPU's half of the library on a CPU: the same handler and the same kernels, a launch being a loop over threads.
 
+#include "emulated.h"
+
 #include "cuda/back.h"
 #include "cuda/handler.cc"
 
@@ -41,8 +43,8 @@ void run(GpuKernel kernel, const Arguments& a, int step, int thread) {
   }
 }
 
-// ... of some kernels.
-using Run = void (*)(GpuKernel, const Arguments&, int step, int thread);
+}  // namespace
+
 Run run_of(const Which& which) {
   return with_law(which.law, which.variant, [&](auto law) -> Run {
     using L = decltype(law);
@@ -57,6 +59,8 @@ Run run_of(const Which& which) {
     return which.task == Task::forward ? of_numbers(double{}) : of_numbers(gmem::GMEM_ISA::Dual<double>{});
   });
 }
+
+namespace {
 
 template <Task task>
 xla::ffi::Error emulate(int64_t law, int64_t variant, int64_t points, int64_t isotropic, int64_t leaves, int64_t mixed,

@@ -11,8 +11,11 @@
 #include <iterator>
 #include <map>
 #include <mutex>
+#include <string>
+#include <vector>
 
-#include "emulated.cc"
+#include "emulated.h"
+#include "xla/ffi/api/c_api.h"
 
 namespace {
 

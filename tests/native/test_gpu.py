@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from emulation import linked
 from jax import export
 from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, assert_close, scene
 
@@ -55,13 +56,7 @@ Scene = tuple[Call, Fixed, Arrays, Callable[..., Any]]
 def emulated(tmp_path_factory: pytest.TempPathFactory) -> None:
     """The kernels as calls of the CPU: gmem_emulated_advance, gmem_emulated_tangent and gmem_emulated_adjoint."""
     library = tmp_path_factory.mktemp("emulated") / "libemulated.so"
-    flags = ["-std=c++17", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-Wno-psabi", "-DGMEM_ISA=emulated"]
-    include = ["-I", str(build.SOURCES), "-isystem", str(build.headers())]
-    source = Path(__file__).parent / "emulated.cc"
-    done = subprocess.run(
-        [*build.compiler(), *flags, *include, str(source), "-o", str(library)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr[:4000]
+    linked(library)
     functions = ctypes.CDLL(str(library))
     for target in ("gmem_emulated_advance", "gmem_emulated_tangent", "gmem_emulated_adjoint"):
         jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(functions, target)), platform="cpu")

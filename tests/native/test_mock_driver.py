@@ -22,11 +22,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from emulation import linked
 from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native
-from gmem_jax.native import build, calls, cuda, library
+from gmem_jax.native import calls, cuda, library
 from gmem_jax.native.calls import Arrays, Call, Fixed
 from gmem_jax.native.march import arrays_of, call_of, fixed_of
 from gmem_jax.physics.state import Box, replicate
@@ -308,12 +309,7 @@ SLOW = {"reverse mode", *(f"the numbers of {law}" for law in LAWS if law != "H")
 def driver_of(folder: Path) -> Path:
     """The mock driver, compiled."""
     path = folder / "libcuda.so.1"
-    flags = ["-std=c++17", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-Wno-psabi", "-DGMEM_ISA=emulated"]
-    include = ["-I", str(build.SOURCES), "-isystem", str(build.headers()), f"-Wl,-soname,{path.name}"]
-    source = Path(__file__).parent / "mock_cuda.cc"
-    command = [*build.compiler(), *flags, *include, str(source), "-o", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[:4000]
+    linked(path, f"-Wl,-soname,{path.name}", str(Path(__file__).parent / "mock_cuda.cc"))
     return path
 
 
