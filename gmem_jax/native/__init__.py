@@ -32,7 +32,7 @@ from gmem_jax.native.backend import (
     supports,
 )
 from gmem_jax.native.calls import TARGETS
-from gmem_jax.native.library import available, needs, require_threads
+from gmem_jax.native.library import available, cpus, needs, require_threads
 from gmem_jax.native.march import March, march
 from gmem_jax.native.search import search
 
@@ -45,6 +45,7 @@ __all__ = [
     "Precision",
     "ResolvedBackend",
     "available",
+    "cpus",
     "march",
     "marcher",
     "name",

@@ -49,6 +49,14 @@ def available() -> tuple[bool, str]:
     return not reason, reason or instructions
 
 
+def cpus() -> int | None:
+    """How many CPUs this process may keep busy: fewer than it may run on where its container has a quota of their time.
+
+    None if the library is not available.
+    """
+    return int(ctypes.CDLL(str(path())).gmem_cpus()) if available()[0] else None
+
+
 def require_library() -> None:
     """Refuse to go on without the library.
 

@@ -99,8 +99,9 @@ class Executor(ABC):
 
 
 def cores() -> list[int]:
-    """The CPUs that this process may use."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    """The CPUs that this process may use, or as many of them as the quota of its container keeps busy."""
+    own = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    return sorted(own)[: native.cpus()]
 
 
 def threads(cpus: int) -> str:

@@ -7,6 +7,9 @@
 #include <atomic>
 #include <chrono>
 #include <cstdlib>
+#include <filesystem>
+#include <fstream>
+#include <limits>
 #include <new>
 #include <stdexcept>
 #include <string>
@@ -43,6 +46,32 @@ void a_failed_rank_is_thrown_when_all_have_ended() {
     CHECK(what == "rank " + std::to_string(failing));
     CHECK(ended == 3);
   }
+}
+
+void a_container_s_quota_is_found() {
+  char folder[] = "/tmp/gmem-quota-XXXXXX";
+  CHECK(mkdtemp(folder) != nullptr);
+  const std::string root = folder, groups = root + "/groups";
+  const auto write = [](const std::string& path, const char* text) {
+    std::filesystem::create_directories(std::filesystem::path(path).parent_path());
+    std::ofstream(path) << text;
+  };
+  const int none = std::numeric_limits<int>::max();
+  CHECK(quota_of(groups, root) == none);  // no such file
+  write(groups, "0::/pod/box\n");
+  write(root + "/pod/box/cpu.max", "max 100000\n");
+  CHECK(quota_of(groups, root) == none);
+  write(root + "/pod/cpu.max", "250000 100000\n");  // a group above
+  CHECK(quota_of(groups, root) == 3);
+  write(root + "/pod/box/cpu.max", "50000 100000\n");
+  CHECK(quota_of(groups, root) == 1);
+  write(groups, "5:devices:/pod\n4:cpu,cpuacct:/elsewhere/box\n0::/\n");  // version 1; its path is the host's
+  write(root + "/cpu/cpu.cfs_period_us", "100000\n");
+  write(root + "/cpu/cpu.cfs_quota_us", "-1\n");
+  CHECK(quota_of(groups, root) == none);
+  write(root + "/cpu/cpu.cfs_quota_us", "200000\n");
+  CHECK(quota_of(groups, root) == 2);
+  std::filesystem::remove_all(root);
 }
 
 void a_team_does_not_wait_for_one_that_failed() {
@@ -123,7 +152,7 @@ void fail(const Problem&, const Block& block, Team& team, int rank, void*) {
 }
 
 void a_failed_block_fails_the_call_and_not_the_next() {
-  const Kernel kernel{"test", 1, no_scratch, fail};
+  const InstructionSet kernel{"test", 1, no_scratch, fail};
   Plan plan{};
   plan.domains = 64;
   const Pack pack{&plan, nullptr};
@@ -182,7 +211,7 @@ void note(const Problem&, const Block&, Team& team, int rank, void*) {
 
 // How many of `count` blocks of so many kB were done by teams of 1, 2, 3 and 4 of four threads, with 1 MB of cache.
 std::vector<int> teams_of(int kilobytes, int count, int domains) {
-  const Kernel kernel{"test", 1, own_kilobytes, note};
+  const InstructionSet kernel{"test", 1, own_kilobytes, note};
   Plan plan{};
   plan.domains = domains;
   const Pack pack{&plan, nullptr};
@@ -253,6 +282,7 @@ int main() {
   a_bad_number_of_threads_is_refused();
   calls_at_once_share_out_the_cpus();
   a_failed_rank_is_thrown_when_all_have_ended();
+  a_container_s_quota_is_found();
   a_team_does_not_wait_for_one_that_failed();
   every_chunk_of_a_phase_is_done_once();
   plans_keep_neighbours_together_and_padding_apart();

@@ -17,9 +17,9 @@
 #include "cpu/team.h"
 
 namespace gmem {
-namespace steps { extern const Kernel kernel; }
-namespace derivatives { extern const Kernel kernel; }
-namespace second_derivatives { extern const Kernel kernel; }
+namespace steps { extern const InstructionSet kernel; }
+namespace derivatives { extern const InstructionSet kernel; }
+namespace second_derivatives { extern const InstructionSet kernel; }
 }  // namespace gmem
 
 using namespace gmem;
@@ -117,7 +117,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   const bool forward = c.task == Task::forward, second = c.task == Task::second_adjoint;
   const bool back = second || c.task == Task::adjoint;
 
-  Lane lane{};
+  ReplicaArrays lane{};
   lane.steps = kSteps;
   for (int f = 0; f < kFields; ++f) {
     lane.grains_in[f] = array(n * kSizes[f] - (plant == "bounds" && f == 5), false, field(f));
@@ -148,7 +148,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   if (back) lane.offsets_out = array(kSpheres * 3, true, small);
   // The same with arguments of their own: slopes, or bars.
   const auto other = [&] {
-    Lane of = lane;
+    ReplicaArrays of = lane;
     for (int f = 0; f < kFields; ++f) of.grains_in[f] = array(n * kSizes[f], false, small);
     for (std::size_t leaf = 0; leaf < sizes.size(); ++leaf) {
       of.history_in[leaf] = array(sizes[leaf] * candidates, false, small);
@@ -160,7 +160,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     if (back) of.pressure = array(3, false, small);
     return of;
   };
-  const Lane slope = other(), bar = other(), bar_slope = other();
+  const ReplicaArrays slope = other(), bar = other(), bar_slope = other();
 
   const Problem problem{
       c.task, c.law, c.variant, false, false, points, n, kSpheres, b, c.mixed, c.general ? c.rubs ? 3 : 7 : 0, c.rubs};
@@ -169,8 +169,8 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
                                scene.smallest.data(), c.general ? scene.images.data() : nullptr,
                                c.general ? scene.radii.data() : nullptr, c.general ? scene.sizes.data() : nullptr});
   const Pack pack{&store->plan, scene.offsets.data(), c.general ? scene.radii.data() : nullptr};
-  const Kernel& kernel = forward ? steps::kernel : second ? second_derivatives::kernel : derivatives::kernel;
-  const auto moved = [](Lane of, std::ptrdiff_t l) {
+  const InstructionSet& kernel = forward ? steps::kernel : second ? second_derivatives::kernel : derivatives::kernel;
+  const auto moved = [](ReplicaArrays of, std::ptrdiff_t l) {
     for (int f = 0; f < kFields; ++f) of.grains_in[f] += l, of.grains_out[f] += l;
     for (int leaf = 0; leaf < kMaxHistory; ++leaf)
       if (of.history_in[leaf]) of.history_in[leaf] += l, of.history_out[leaf] += l;
@@ -180,7 +180,7 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     if (of.parameters_out) of.parameters_out += l, of.walls_out += l, of.offsets_out += l;
     return of;
   };
-  std::vector<Lane> lanes, slopes, bars, bar_slopes;
+  std::vector<ReplicaArrays> lanes, slopes, bars, bar_slopes;
   for (int l = 0; l < b; ++l) {
     lanes.push_back(moved(lane, l)), slopes.push_back(moved(slope, l));
     bars.push_back(moved(bar, l)), bar_slopes.push_back(moved(bar_slope, l));

@@ -25,7 +25,7 @@ namespace gmem {
 
 // gmem_jax/native/build.py: KERNELS
 #define GMEM_DECLARE(name) \
-  namespace name { extern const Kernel kernel; }
+  namespace name { extern const InstructionSet kernel; }
 #if defined(__x86_64__)
 GMEM_DECLARE(avx512)
 GMEM_DECLARE(avx512_derivatives)
@@ -43,8 +43,9 @@ namespace ffi = xla::ffi;
 
 // The lanes of derivatives are replicas: few of them are done sooner in narrow vectors. Second derivatives always are:
 // native/build.py says why.
-const Kernel& best_kernel(Task task, std::size_t replicas) {
-  const auto of_task = [task](const Kernel& steps, const Kernel& derivatives, const Kernel& second) -> const Kernel& {
+const InstructionSet& best_kernel(Task task, std::size_t replicas) {
+  const auto of_task = [task](const InstructionSet& steps, const InstructionSet& derivatives,
+                              const InstructionSet& second) -> const InstructionSet& {
     return task == Task::forward ? steps : task == Task::second_adjoint ? second : derivatives;
   };
   const char* wanted = std::getenv("GMEM_ISA");  // for tests: a lower instruction set than the best
@@ -170,7 +171,7 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
   std::map<std::array<int64_t, kOfPack>, std::size_t> known;
   std::vector<std::shared_ptr<const PlanStore>> plans;
   std::vector<std::unique_ptr<Pack>> packs;
-  std::vector<std::vector<Lane>> lanes, slopes, bars, bar_slopes;
+  std::vector<std::vector<ReplicaArrays>> lanes, slopes, bars, bar_slopes;
   std::vector<int64_t> index(batch.size(), 0);
   int64_t entries = 1;
   for (const int64_t n : batch) entries *= n;
@@ -196,14 +197,14 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       const auto source = [&](const Array& a) { return reinterpret_cast<double*>(a.data) + a.at(index) + b; };
       const auto next_argument = [&] { return source(in[argument++]); };
       const auto next_result = [&] { return source(out[result++]); };
-      const auto read_grains = [&](Lane& lane) {
+      const auto read_grains = [&](ReplicaArrays& lane) {
         for (int f = 0; f < kFields; ++f) lane.grains_in[f] = next_argument();
       };
-      const auto read_histories = [&](Lane& lane) {
+      const auto read_histories = [&](ReplicaArrays& lane) {
         for (int64_t leaf = 0; leaf < leaves; ++leaf) lane.history_in[leaf] = next_argument();
         for (int64_t leaf = leaves; leaf < all_leaves; ++leaf) lane.wall_history_in[leaf - leaves] = next_argument();
       };
-      Lane lane{};
+      ReplicaArrays lane{};
       read_grains(lane);
       lane.parameters = source(in[kParameterRows]);
       lane.walls = source(in[kWallRows]);
@@ -216,14 +217,14 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
       for (int64_t leaf = 0; leaf < leaves; ++leaf) lane.history_out[leaf] = next_result();
       for (int64_t leaf = leaves; leaf < all_leaves; ++leaf) lane.wall_history_out[leaf - leaves] = next_result();
       const auto read_slope = [&] {
-        Lane slope = lane;
+        ReplicaArrays slope = lane;
         read_grains(slope);
         slope.parameters = next_argument(), slope.walls = next_argument(), slope.offsets = next_argument();
         read_histories(slope);
         return slope;
       };
       const auto read_bar = [&] {
-        Lane bar = lane;
+        ReplicaArrays bar = lane;
         read_grains(bar);
         bar.pressure = next_argument();
         read_histories(bar);
@@ -240,13 +241,13 @@ ffi::Error call(Task task, int64_t law, int64_t variant, int64_t points, int64_t
 
   std::size_t most = 0;
   for (const auto& of_pack : lanes) most = std::max(most, of_pack.size());
-  const Kernel& kernel = best_kernel(task, most);
+  const InstructionSet& kernel = best_kernel(task, most);
   std::vector<Block> whole, packed;
   for (std::size_t i = 0; i < packs.size(); ++i) {
     const int count = static_cast<int>(lanes[i].size());
     int done = 0;
     const auto block_of = [&](int width, bool packed, bool wide = false) {
-      const auto from = [&](const std::vector<Lane>& all) { return all.empty() ? nullptr : &all[done]; };
+      const auto from = [&](const std::vector<ReplicaArrays>& all) { return all.empty() ? nullptr : &all[done]; };
       return Block{packs[i].get(),
                    &lanes[i][done],
                    from(slopes[i]),
@@ -288,6 +289,9 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(gmem_second_adjoint, gmem::handle<gmem::Task::seco
 
 // Of the sources and flags that this library was compiled from; see native/build.py.
 extern "C" const char* gmem_source_hash() { return GMEM_SOURCE_HASH; }
+
+// CPUs that this process may keep busy.
+extern "C" int gmem_cpus() { return gmem::cpus(); }
 
 // Name of the instruction set in use.
 extern "C" const char* gmem_instruction_set() { return gmem::best_kernel(gmem::Task::forward, 1).name; }

@@ -79,7 +79,7 @@ struct AdjointLayout {
   V* state_bar;     // [N, kState]
   V* mid_bar;       // [N, kMid]
   V* sphere_bar;    // [S, 3]
-  V* remote_bar;    // [remotes, kRemote]
+  V* remote_bar;    // [remote_contacts, kRemote]
   V* history_bar;   // [candidates, kHistory and the forces of Mindlin's segments, 2 Q]
   bool* has_bar;    // [candidates]: whether their bars, and those of their remotes, may be other than zero
   V* domain_bar;    // [domains, kParameters + kLawNumbers]
@@ -126,7 +126,7 @@ struct AdjointLayout {
     state_bar = arena.take<V>(grains * kState);
     mid_bar = arena.take<V>(grains * kMid);
     sphere_bar = arena.take<V>(static_cast<std::size_t>(p.spheres()) * 3);
-    remote_bar = arena.take<V>(static_cast<std::size_t>(plan.remotes) * kRemote);
+    remote_bar = arena.take<V>(static_cast<std::size_t>(plan.remote_contacts) * kRemote);
     history_bar = arena.take<V>(candidates * remembered(p));
     has_bar = arena.take<bool>(candidates);
     domain_bar = arena.take<V>(static_cast<std::size_t>(plan.domains) * (kParameters + kLawNumbers));
@@ -333,7 +333,7 @@ struct Adjoint : AdjointLayout<Law, V> {
 
   template <class Pointer>
   V read(const Pointer& pointer, std::ptrdiff_t row) const {
-    const auto of = [&](const Lane* lanes) { return forward.mode.read_lanes(lanes, adjacent, pointer, row); };
+    const auto of = [&](const ReplicaArrays* lanes) { return forward.mode.read_lanes(lanes, adjacent, pointer, row); };
     if constexpr (kDual) return {of(block.bars), of(block.bar_slopes)};
     else return of(block.bars);
   }
@@ -377,7 +377,7 @@ struct Adjoint : AdjointLayout<Law, V> {
   void load_bars() {
     for_grains([&](int u) {
       for_wall_history(u, [&](int leaf, std::ptrdiff_t row, V& bar) {
-        bar = read([leaf](const Lane& lane) { return lane.wall_history_in[leaf]; }, row);
+        bar = read([leaf](const ReplicaArrays& lane) { return lane.wall_history_in[leaf]; }, row);
       });
       if constexpr (Law::kLayered)
         for_planes(u, [&](int k, int w, const KnownPlanes&) {
@@ -385,12 +385,13 @@ struct Adjoint : AdjointLayout<Law, V> {
           to_layers(bar_at_plane(u, k, w), forward.wall_segments_of(row), forward.wall_outermost(row));
         });
       for_fields(u, [&](int f, std::ptrdiff_t row, int number) {
-        of_grain(state_bar, u, kState)[number] = read([f](const Lane& lane) { return lane.grains_in[f]; }, row);
+        of_grain(state_bar, u, kState)[number] =
+            read([f](const ReplicaArrays& lane) { return lane.grains_in[f]; }, row);
       });
     });
     for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
       for_history(plan.candidate[c].row, [&](int leaf, std::ptrdiff_t row, int q) {
-        history_of(c)[q] = read([leaf](const Lane& lane) { return lane.history_in[leaf]; }, row);
+        history_of(c)[q] = read([leaf](const ReplicaArrays& lane) { return lane.history_in[leaf]; }, row);
       });
     const int first = forward.share_begin(plan.candidates);
     std::fill_n(has_bar + first, forward.share_begin(plan.candidates, 1) - first, true);
@@ -427,10 +428,11 @@ struct Adjoint : AdjointLayout<Law, V> {
 
   // From the bars of layers and segments at the beginning, when each ring is a segment, to those of the rings; of the history in
   // `row`, of contacts between grains or with walls.
-  void to_rings(V* history, std::ptrdiff_t row, const double* const (Lane::*histories)[kMaxHistory]) {
+  void to_rings(V* history, std::ptrdiff_t row, const double* const (ReplicaArrays::*histories)[kMaxHistory]) {
     const LawParameters<V> law(forward.parameter + kLaw, forward.parameter[kDt]);
     const Place place = place_of<Law>(row, kLastOverlap);
-    const V overlap = forward.mode.read([&](const Lane& lane) { return (lane.*histories)[place.leaf]; }, place.row);
+    const V overlap =
+        forward.mode.read([&](const ReplicaArrays& lane) { return (lane.*histories)[place.leaf]; }, place.row);
     const V outer = Reach<V, Law::variant>(overlap, law, last_ring).outer;
     const V* layers = history + kLayers;
     V* ring = history + Law::kHistory;
@@ -447,25 +449,26 @@ struct Adjoint : AdjointLayout<Law, V> {
     for_grains([&](int u) {
       if constexpr (Law::kLayered)
         for_planes(u, [&](int k, int w, const KnownPlanes&) {
-          to_rings(bar_at_plane(u, k, w), forward.mode.wall_row(u, kPlanes * k + w), &Lane::wall_history_in);
+          to_rings(bar_at_plane(u, k, w), forward.mode.wall_row(u, kPlanes * k + w), &ReplicaArrays::wall_history_in);
         });
       for_wall_history(u, [&](int leaf, std::ptrdiff_t row, V bar) {
-        write([leaf](const Lane& lane) { return lane.wall_history_out[leaf]; }, row, bar);
+        write([leaf](const ReplicaArrays& lane) { return lane.wall_history_out[leaf]; }, row, bar);
       });
       for_fields(u, [&](int f, std::ptrdiff_t row, int number) {
-        write([f](const Lane& lane) { return lane.grains_out[f]; }, row, of_grain(state_bar, u, kState)[number]);
+        write([f](const ReplicaArrays& lane) { return lane.grains_out[f]; }, row,
+              of_grain(state_bar, u, kState)[number]);
       });
     });
     if constexpr (Law::kLayered)
       for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
-        to_rings(history_of(c), plan.candidate[c].row, &Lane::history_in);
+        to_rings(history_of(c), plan.candidate[c].row, &ReplicaArrays::history_in);
     for (int c = forward.share_begin(plan.candidates); c < forward.share_begin(plan.candidates, 1); ++c)
       for_history(plan.candidate[c].row, [&](int leaf, std::ptrdiff_t row, int q) {
-        write([leaf](const Lane& lane) { return lane.history_out[leaf]; }, row, history_of(c)[q]);
+        write([leaf](const ReplicaArrays& lane) { return lane.history_out[leaf]; }, row, history_of(c)[q]);
       });
     for (int n = forward.share_begin(plan.padding); n < forward.share_begin(plan.padding, 1); ++n)
       for_history(plan.padding_row[n], [&](int leaf, std::ptrdiff_t row, int) {
-        write([leaf](const Lane& lane) { return lane.history_out[leaf]; }, row, V{});
+        write([leaf](const ReplicaArrays& lane) { return lane.history_out[leaf]; }, row, V{});
       });
     if (rank == 0) unload_parameter_bars();
     team.barrier();
@@ -497,11 +500,11 @@ struct Adjoint : AdjointLayout<Law, V> {
     if (problem.periodic) add_cell_bars(forward.cell_edges(-1), earlier_bar, edges);
     sum[kWallMu] = mu_bar;
     std::copy_n(edges, 6, sum + kCell);
-    for (int r = 0; r < kRows; ++r) write([](const Lane& lane) { return lane.parameters_out; }, r, sum[r]);
+    for (int r = 0; r < kRows; ++r) write([](const ReplicaArrays& lane) { return lane.parameters_out; }, r, sum[r]);
     for (int row = 0; row < 3 * problem.spheres_per_grain; ++row) {
       V of_offset{};
       for (int chunk = 0; chunk < chunks(); ++chunk) of_offset += of_chunk(chunk)[kGrainNumbers + row];
-      write([](const Lane& lane) { return lane.offsets_out; }, row, of_offset);
+      write([](const ReplicaArrays& lane) { return lane.offsets_out; }, row, of_offset);
     }
   }
 
@@ -608,7 +611,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     if (!has_bar[c]) return;
     has_bar[c] = false;
     for (int q = 0; q < remembered(problem); ++q) history_of(c)[q] = V{};
-    const int remote = plan.candidate[c].remote;
+    const int remote = plan.candidate[c].remote_contact;
     if (remote >= 0)
       for (int q = 0; q < kRemote; ++q) of_grain(remote_bar, remote, kRemote)[q] = V{};
   }
@@ -782,7 +785,7 @@ struct Adjoint : AdjointLayout<Law, V> {
       add_vec(to + kMidVelocity, bar.velocity);
       add_vec(to + kMidSpin, bar.spin);
     } else {
-      V* to = of_grain(remote_bar, pair.remote, kRemote);
+      V* to = of_grain(remote_bar, pair.remote_contact, kRemote);
       store_vec(to + kRemoteCentre, bar.centre);
       store_vec(to + kRemotePosition, bar.position);
       store_vec(to + kRemoteVelocity, bar.velocity);
@@ -910,9 +913,9 @@ struct Adjoint : AdjointLayout<Law, V> {
   }
 
   void take_remotes(int u, V* bar) {
-    for (int n = plan.remote_start[u]; n < plan.remote_start[u + 1]; ++n) {
+    for (int n = plan.remote_contact_start[u]; n < plan.remote_contact_start[u + 1]; ++n) {
       const V* from = of_grain(remote_bar, n, kRemote);
-      add_vec(sphere_bar + 3 * static_cast<std::size_t>(plan.remote_sphere[n]), load_vec(from + kRemoteCentre));
+      add_vec(sphere_bar + 3 * static_cast<std::size_t>(plan.remote_contact_sphere[n]), load_vec(from + kRemoteCentre));
       add_vec(bar + kMidPosition, load_vec(from + kRemotePosition));
       add_vec(bar + kMidVelocity, load_vec(from + kRemoteVelocity));
       add_vec(bar + kMidSpin, load_vec(from + kRemoteSpin));
@@ -936,7 +939,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     if (general && rank == 0) cell_back(step, by_walls);
     for (int row = 0; rank == 0 && row < kWalls; ++row) {
       for (int chunk = 0; chunk < chunks(); ++chunk) by_walls[row] += wall_bar[chunk * kWalls + row];
-      write([](const Lane& lane) { return lane.walls_out; }, static_cast<std::ptrdiff_t>(step) * kWalls + row,
+      write([](const ReplicaArrays& lane) { return lane.walls_out; }, static_cast<std::ptrdiff_t>(step) * kWalls + row,
             by_walls[row]);
     }
   }
@@ -987,7 +990,7 @@ struct Adjoint : AdjointLayout<Law, V> {
     load_bars();
     V pressure_bar[3];
     for (int axis = 0; axis < 3; ++axis)
-      pressure_bar[axis] = read([](const Lane& lane) { return lane.pressure; }, axis);
+      pressure_bar[axis] = read([](const ReplicaArrays& lane) { return lane.pressure; }, axis);
     for (int step = steps - 1; step >= 0; --step) step_back(step, load_vec(pressure_bar));
     unload_bars();
   }

@@ -140,9 +140,9 @@ struct Engine : EngineLayout<Mode> {
     Arena arena{static_cast<char*>(scratch)};
     this->place(problem, block, arena);
     mode.use(this->of_mode, hot);
-    for (int row = 0; row < kParameters; ++row) parameter[row] = mode.per_lane(&Lane::parameters, row);
+    for (int row = 0; row < kParameters; ++row) parameter[row] = mode.per_lane(&ReplicaArrays::parameters, row);
     constants = GrainParameters<V>(parameter);
-    if (problem.rubs) wall_law = WallLaw<V>(parameter, mode.per_lane(&Lane::parameters, kWallMu));
+    if (problem.rubs) wall_law = WallLaw<V>(parameter, mode.per_lane(&ReplicaArrays::parameters, kWallMu));
     arm = outer = 0.0;
     for (int k = 0; k < problem.spheres_per_grain; ++k) {
       const double* body = block.pack->offsets + 3 * k;
@@ -167,7 +167,7 @@ struct Engine : EngineLayout<Mode> {
 
   WallState<V> walls_at(int step) const {
     V w[kWalls];
-    for (int row = 0; row < kWalls; ++row) w[row] = mode.per_lane(&Lane::walls, step * kWalls + row);
+    for (int row = 0; row < kWalls; ++row) w[row] = mode.per_lane(&ReplicaArrays::walls, step * kWalls + row);
     return {load_vec(w), load_vec(w + 3), load_vec(w + 6), load_vec(w + 9)};
   }
 
@@ -175,7 +175,7 @@ struct Engine : EngineLayout<Mode> {
   WallState<V> cell_edges(int step) const {
     if (step >= 0) return walls_at(step);
     V edge[6];
-    for (int row = 0; row < 6; ++row) edge[row] = mode.per_lane(&Lane::parameters, kCell + row);
+    for (int row = 0; row < 6; ++row) edge[row] = mode.per_lane(&ReplicaArrays::parameters, kCell + row);
     WallState<V> box{};
     box.lower = load_vec(edge), box.upper = load_vec(edge + 3);
     return box;

@@ -75,8 +75,8 @@ class ScratchPool {
 ScratchPool& scratch_pool() { return of_process<ScratchPool>(); }
 
 // Some blocks at once, each by a team; `threads` are shared out to them, to each at most one per domain.
-void run_teams(const Problem& problem, const Kernel& kernel, const Block* blocks, int count, int threads, int domains,
-               std::size_t bytes) {
+void run_teams(const Problem& problem, const InstructionSet& kernel, const Block* blocks, int count, int threads,
+               int domains, std::size_t bytes) {
   std::vector<std::unique_ptr<Team>> team;
   std::vector<ScratchPool::Piece> scratch;
   std::vector<std::pair<int, int>> place;  // team, and rank in it, of each thread
@@ -97,7 +97,7 @@ void run_teams(const Problem& problem, const Kernel& kernel, const Block* blocks
 
 // As many blocks at once as fit into the cache, each by a team: side by side they would push each other out. More where
 // threads would have nothing to do otherwise.
-void run_blocks(const Problem& problem, const Kernel& kernel, const std::vector<Block>& blocks, int threads) {
+void run_blocks(const Problem& problem, const InstructionSet& kernel, const std::vector<Block>& blocks, int threads) {
   const int count = static_cast<int>(blocks.size());
   if (count == 0) return;
   std::size_t bytes = 0;

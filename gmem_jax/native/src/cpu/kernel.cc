@@ -77,8 +77,8 @@ void run(const Problem& problem, const Block& block, Team& team, int rank, void*
 
 #define GMEM_STRING2(name) #name
 #define GMEM_STRING(name) GMEM_STRING2(name)
-extern const Kernel kernel;
-const Kernel kernel = {GMEM_STRING(GMEM_ISA), W, scratch_bytes, run};
+extern const InstructionSet kernel;
+const InstructionSet kernel = {GMEM_STRING(GMEM_ISA), W, scratch_bytes, run};
 
 }  // namespace GMEM_ISA
 }  // namespace gmem

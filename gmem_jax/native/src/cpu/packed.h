@@ -3,6 +3,7 @@
 
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 
 #include "cpu/block.h"
@@ -25,7 +26,7 @@ struct PackedLayout {
 
   Row* sphere;            // [S + 2]: centres; the last two are far apart and fill up vectors
   GrainRows* grain;       // [N + 1]
-  Row* remote;            // [remotes, 2]: force and torque
+  Row* remote;            // [remotes, 2]: sums of forces and torques
   Row* history;           // [candidates + 1, kHistoryRows]
   RowOfSegment* segment;  // [Q, candidates + 1] of the Mindlin law: those that are few lie together
   Marks<Law> marks;
@@ -57,7 +58,7 @@ struct Packed : PackedLayout<Law> {
   const Problem& problem;
   const Block& block;
   const Plan& plan;
-  const Lane& lane;
+  const ReplicaArrays& lane;
   V* hot;  // the engine's
 
   Packed(const Problem& problem, const Block& block)
@@ -68,7 +69,7 @@ struct Packed : PackedLayout<Law> {
 
   void use(const Layout& layout, V* of_engine) { static_cast<Layout&>(*this) = layout, hot = of_engine; }
 
-  V per_lane(const double* Lane::* array, std::ptrdiff_t row) const {
+  V per_lane(const double* ReplicaArrays::* array, std::ptrdiff_t row) const {
     return splat<V>((lane.*array)[row * problem.stride]);
   }
 
@@ -173,6 +174,9 @@ struct Packed : PackedLayout<Law> {
     store_rows(&first->spin, stride, spin);
     store_rows(&first->force, stride, force);
     store_rows(&first->torque, stride, torque);
+    const int begin = u * W, end = begin + W < problem.grains ? begin + W : problem.grains;
+    std::fill(remote + 2 * static_cast<std::size_t>(plan.remote_start[begin]),
+              remote + 2 * static_cast<std::size_t>(plan.remote_start[end]), Row{});
   }
 
   void total_force(int u, Vec<V>& force, Vec<V>& torque) const {
@@ -280,7 +284,7 @@ struct Packed : PackedLayout<Law> {
     const double square = fma(d[2], d[2], fma(d[1], d[1], d[0] * d[0]));
     const Radii radii = plan.radii ? plan.radii[c] : Radii{2.0, 0.0, 1.0, 4.0};
     if (square < radii.square) return marks.touched[c] = true;
-    if (marks.next_check[c] < 0.0) blank(c);
+    if (marks.next_check[c] < 0.0) forget(c);
     marks.next_check[c] = next_check(travel, square, radii.reach, plan.far);
     return false;
   }
@@ -288,12 +292,6 @@ struct Packed : PackedLayout<Law> {
   void forget(std::size_t c) {
     for (int r = 0; r < kHistoryRows; ++r) history[c * kHistoryRows + r] = Row{};
     if constexpr (Law::kLayered) marks.segments[c] = 0;
-  }
-
-  void blank(std::size_t c) {
-    forget(c);
-    const int n = plan.candidate[c].remote;
-    if (n >= 0) remote[2 * static_cast<std::size_t>(n)] = remote[2 * static_cast<std::size_t>(n) + 1] = Row{};
   }
 
   void compute(const int* touching, int count, const V* parameter, const LawParameters<V>& law, Faces<V>& faces) {
@@ -444,8 +442,8 @@ struct Packed : PackedLayout<Law> {
     if (pair.remote < 0 || away_is_one) other.force -= force, other.torque += torque_other;
     if (pair.remote >= 0) {
       Row* to = remote + 2 * static_cast<std::size_t>(pair.remote);
-      to[0] = away_is_one ? force : -force;
-      to[1] = away_is_one ? torque_one : torque_other;
+      to[0] += away_is_one ? force : -force;
+      to[1] += away_is_one ? torque_one : torque_other;
     }
   }
 };

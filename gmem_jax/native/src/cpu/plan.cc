@@ -97,6 +97,33 @@ void sort_by(std::vector<Candidate>& candidates, int end, const Number& number) 
   candidates.swap(sorted);
 }
 
+// Numbers the sums of remote forces by the grain that they act on, so that it finds them together, and then by domain;
+// likewise the contacts of these sums, which are sorted by their domains.
+void number_remotes(const std::vector<int32_t>& domain_of, PlanStore& store) {
+  const std::size_t grains = domain_of.size();
+  const auto home = [](const Candidate& c) { return std::min(c.grain_one, c.grain_other); };
+  const auto away = [](const Candidate& c) { return std::max(c.grain_one, c.grain_other); };
+  std::vector<std::vector<int32_t>> of_grain(grains);
+  for (std::size_t n = 0; n < store.candidate.size(); ++n)
+    if (domain_of[home(store.candidate[n])] != domain_of[away(store.candidate[n])])
+      of_grain[away(store.candidate[n])].push_back(static_cast<int32_t>(n));
+  store.remote_start.push_back(0);
+  store.remote_contact_start.push_back(0);
+  int32_t remotes = 0;
+  for (const auto& contacts : of_grain) {
+    int32_t domain = -1;
+    for (const int32_t n : contacts) {
+      Candidate& c = store.candidate[n];
+      if (domain_of[home(c)] != domain) domain = domain_of[home(c)], ++remotes;
+      c.remote = remotes - 1;
+      c.remote_contact = static_cast<int32_t>(store.remote_contact_sphere.size());
+      store.remote_contact_sphere.push_back(c.away_is_one() ? c.one : c.other);
+    }
+    store.remote_start.push_back(remotes);
+    store.remote_contact_start.push_back(static_cast<int32_t>(store.remote_contact_sphere.size()));
+  }
+}
+
 // There are at most 27 images in boxes that are large enough, so that one replica finds them as rows in the cache.
 void number_images(const List& list, PlanStore& store) {
   std::map<std::array<int8_t, 3>, int32_t> number{{{0, 0, 0}, 0}};
@@ -126,7 +153,8 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
     }
     const int i = list.first[row], j = list.second[row];
     const int grain_i = place[i / spheres], grain_j = place[j / spheres];
-    candidates.push_back({grain_i * spheres + i % spheres, grain_j * spheres + j % spheres, grain_i, grain_j, -1, row});
+    candidates.push_back(
+        {grain_i * spheres + i % spheres, grain_j * spheres + j % spheres, grain_i, grain_j, -1, -1, row});
   }
   const auto home = [](const Candidate& c) { return std::min(c.grain_one, c.grain_other); };
   const auto away = [](const Candidate& c) { return std::max(c.grain_one, c.grain_other); };
@@ -147,19 +175,7 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
   }
   store->domain_candidate.push_back(count);
 
-  // Guests, numbered by the grain they act on so that it finds them together.
-  std::vector<int32_t> visits(list.grains + 1, 0);
-  const auto remote = [&](const Candidate& c) { return domain_of[home(c)] != domain_of[away(c)]; };
-  for (const Candidate& c : candidates) visits[away(c) + 1] += remote(c);
-  std::partial_sum(visits.begin(), visits.end(), visits.begin());
-  store->remote_start = visits;
-  store->remote_sphere.resize(store->remote_start.back());
-  for (Candidate& c : candidates) {
-    if (!remote(c)) continue;
-    c.remote = visits[away(c)]++;
-    store->remote_sphere[c.remote] = away(c) == c.grain_one ? c.one : c.other;
-  }
-
+  number_remotes(domain_of, *store);
   if (list.image) number_images(list, *store);
 
   double largest = 1.0, widest = 1.0;
@@ -181,6 +197,7 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
   store->plan = {count,
                  static_cast<int>(store->domain_candidate.size()) - 1,
                  store->remote_start.back(),
+                 store->remote_contact_start.back(),
                  static_cast<int>(store->padding_row.size()),
                  store->grain.data(),
                  candidates.data(),
@@ -192,7 +209,8 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
                  4.0 * widest,
                  store->domain_candidate.data(),
                  store->remote_start.data(),
-                 store->remote_sphere.data(),
+                 store->remote_contact_start.data(),
+                 store->remote_contact_sphere.data(),
                  store->padding_row.data()};
   return store;
 }

@@ -3,8 +3,8 @@
 //
 // Grains are renumbered so that neighbours in space are neighbours in memory. They are divided into domains of about
 // equal numbers of candidates. A candidate belongs to the domain of its lower-numbered grain; one thread computes a
-// domain's contacts in order and adds the forces to that domain's grains at once. Forces on grains of other domains
-// ("remote" forces) are stored, and added when the grain is moved.
+// domain's contacts in order and adds the forces to that domain's grains at once. Its forces on a grain of another domain
+// ("remote" forces) are summed up apart, and added when that grain is moved.
 
 #pragma once
 
@@ -31,7 +31,8 @@ struct List {
 // A plan and the memory it points to.
 struct PlanStore {
   Plan plan;
-  std::vector<int32_t> grain, domain_candidate, remote_start, remote_sphere, padding_row;
+  std::vector<int32_t> grain, domain_candidate, padding_row;
+  std::vector<int32_t> remote_start, remote_contact_start, remote_contact_sphere;
   std::vector<Candidate> candidate;
   std::vector<int32_t> image;
   std::vector<Image> images;

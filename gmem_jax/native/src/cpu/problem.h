@@ -4,13 +4,13 @@
 //
 //   pack    a candidate list (as a plan) and the shape of a grain, which replicas may share.
 //   plan    the candidates sorted for memory and threads, with grains and spheres numbered anew (plan.h).
-//   lane    one of the W doubles of a vector of the CPU; and the replica that is computed in it, `Lane`.
+//   lane    one of the W doubles of a vector of the CPU; and the replica that is computed in it, `ReplicaArrays`.
 //   block   what a team of threads computes at once: W replicas of one pack, each in a lane (replicas.h), or one replica
 //           whose grains and contacts fill the lanes (packed.h). These two are the modes of an `Engine` (block.h).
 //   unit    the grains of one vector: one grain of W replicas, or W grains of one replica.
 //   chunk   16 grains: what a thread takes at once, and of which wall forces are summed before they are added up.
 //   domain  the contacts that a thread takes at once: those whose lower-numbered grain is in one part of the pack.
-//   remote  a force on a grain of another domain, which waits until that grain is moved.
+//   remote  the forces of a domain's contacts on a grain of another domain; their sum waits until that grain is moved.
 //
 // Most candidates are apart for many steps. `Engine::travel` is how much closer any two spheres can have come since the
 // call began: twice what the fastest grain can have moved and turned, summed over the steps. When a candidate is found
@@ -51,7 +51,8 @@ struct Problem {
 struct Candidate {
   int32_t one, other;              // spheres
   int32_t grain_one, grain_other;  // their grains
-  int32_t remote;                  // where the force on the grain of another domain waits, or -1
+  int32_t remote;                  // where its domain sums up the forces on the grain of another domain, or -1
+  int32_t remote_contact;          // its number among the contacts that have such a sum, or -1
   int32_t row;                     // in the arrays of the call
 
   // Of two grains in different domains that of the lower number is at home, the other away.
@@ -81,6 +82,7 @@ struct Plan {
   int candidates;
   int domains;
   int remotes;
+  int remote_contacts;
   int padding;                      // rows of the list without a candidate
   const int32_t* grain;             // number in the call of each grain, [N]
   const Candidate* candidate;       // by domain
@@ -92,8 +94,10 @@ struct Plan {
   double far;                       // distance from which on spheres are spoken of as nearer: see `Engine::add_travel`
   const int32_t* domain_candidate;  // first candidate of each domain, [domains + 1]
   const int32_t* remote_start;      // the remotes of each grain: remote_start[g] to remote_start[g + 1], [N + 1]
-  const int32_t* remote_sphere;     // that each remote acts on, [remotes]
-  const int32_t* padding_row;       // [padding]
+  // The contacts of these sums likewise, by the grain that they act on; and the sphere of it, [remote_contacts].
+  const int32_t* remote_contact_start;
+  const int32_t* remote_contact_sphere;
+  const int32_t* padding_row;  // [padding]
 
   const Image& image_of(std::size_t c) const { return images[image[c]]; }
 };
@@ -105,7 +109,7 @@ struct Pack {
 };
 
 // One replica: pointers to its first element; rows are `stride` apart.
-struct Lane {
+struct ReplicaArrays {
   const double* grains_in[kFields];
   double* grains_out[kFields];
   const double* history_in[kMaxHistory];
@@ -125,13 +129,14 @@ struct Lane {
 
 struct Block {
   const Pack* pack;
-  const Lane* lanes;
-  const Lane* slopes;      // derivatives of the arguments along a direction; with the results where these are tangents
-  const Lane* bars;        // in reverse mode, derivatives by the results and by the arguments
-  const Lane* bar_slopes;  // derivatives of the former along the direction
-  int count;               // 1 to W, or to 2 W where it is wide
-  bool packed;             // the lanes of the CPU are grains and contacts of one replica
-  bool wide = false;       // in mixed precision: two vectors of doubles to one of floats
+  const ReplicaArrays* lanes;
+  const ReplicaArrays*
+      slopes;  // derivatives of the arguments along a direction; with the results where these are tangents
+  const ReplicaArrays* bars;        // in reverse mode, derivatives by the results and by the arguments
+  const ReplicaArrays* bar_slopes;  // derivatives of the former along the direction
+  int count;                        // 1 to W, or to 2 W where it is wide
+  bool packed;                      // the lanes of the CPU are grains and contacts of one replica
+  bool wide = false;                // in mixed precision: two vectors of doubles to one of floats
 };
 
 // The threads that share one block; see team.h.
@@ -152,7 +157,7 @@ struct Arena {
 };
 
 // A compiled instruction set.
-struct Kernel {
+struct InstructionSet {
   const char* name;
   int width;
   std::size_t (*scratch_bytes)(const Problem&, const Block&);

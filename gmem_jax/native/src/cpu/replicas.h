@@ -3,6 +3,7 @@
 
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <type_traits>
 
@@ -50,7 +51,7 @@ template <class Law, class V, class C>
 struct ReplicasLayout {
   V* sphere;               // [S, 3]: centres
   GrainMotion<C>* motion;  // [N], in mixed precision; in the other, `hot` has all
-  C* remote;               // [remotes, 6]: force and torque
+  C* remote;               // [remotes, 6]: sums of forces and torques
   C* history;              // [candidates, Law::kHistory]
   Segment<C>* segment;     // [Q, candidates] of the Mindlin law: those that are few lie together
   Marks<Law> marks;
@@ -92,11 +93,11 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   }
 
   // Whether the lanes are neighbours in every array.
-  bool neighbours(const Lane* lanes) const {
+  bool neighbours(const ReplicaArrays* lanes) const {
     bool found = true;
-    const Lane& a = lanes[0];
+    const ReplicaArrays& a = lanes[0];
     for (int l = 1; l < block.count; ++l) {
-      const Lane& b = lanes[l];
+      const ReplicaArrays& b = lanes[l];
       for (int f = 0; f < kFields; ++f)
         found &= b.grains_in[f] == a.grains_in[f] + l && b.grains_out[f] == a.grains_out[f] + l;
       for (int leaf = 0; leaf < kMaxHistory; ++leaf)
@@ -117,39 +118,40 @@ struct Replicas : ReplicasLayout<Law, V, C> {
 
   // Number `row` of an array in every lane; a short block repeats its last replica.
   template <class Pointer>
-  Real gather(const Lane* lanes, const Pointer& pointer, std::ptrdiff_t row, int first = 0) const {
+  Real gather(const ReplicaArrays* lanes, const Pointer& pointer, std::ptrdiff_t row, int first = 0) const {
     Real a{};
     for (int l = 0; l < W; ++l)
       a[l] = pointer(lanes[first + l < block.count ? first + l : block.count - 1])[row * problem.stride];
     return a;
   }
 
-  V per_lane(const double* Lane::* array, std::ptrdiff_t row) const {
-    return of_lanes<V>(block, [&](const Lane* lanes, int first) {
-      return gather(lanes, [array](const Lane& lane) { return lane.*array; }, row, first);
+  V per_lane(const double* ReplicaArrays::* array, std::ptrdiff_t row) const {
+    return of_lanes<V>(block, [&](const ReplicaArrays* lanes, int first) {
+      return gather(lanes, [array](const ReplicaArrays& lane) { return lane.*array; }, row, first);
     });
   }
 
   // Number `row` of the pack's offsets, with its derivative.
   Dual<Real> offset(int row) const {
     return {splat<Real>(block.pack->offsets[row]),
-            gather(block.slopes, [](const Lane& lane) { return lane.offsets; }, row)};
+            gather(block.slopes, [](const ReplicaArrays& lane) { return lane.offsets; }, row)};
   }
 
   V size_of(int u, double Size::* power) const { return splat<V>(plan.size[u].*power); }
 
   // --- copying in and out
 
-  const Lane* results() const { return problem.task == Task::forward ? block.lanes : block.slopes; }
+  const ReplicaArrays* results() const { return problem.task == Task::forward ? block.lanes : block.slopes; }
 
   template <class Pointer>
   V read(const Pointer& pointer, std::ptrdiff_t row) const {
-    return of_lanes<V>(block,
-                       [&](const Lane* lanes, int first) { return read_lanes(lanes, adjacent, pointer, row, first); });
+    return of_lanes<V>(
+        block, [&](const ReplicaArrays* lanes, int first) { return read_lanes(lanes, adjacent, pointer, row, first); });
   }
 
   template <class Pointer>
-  Real read_lanes(const Lane* lanes, bool adjacent, const Pointer& pointer, std::ptrdiff_t row, int first = 0) const {
+  Real read_lanes(const ReplicaArrays* lanes, bool adjacent, const Pointer& pointer, std::ptrdiff_t row,
+                  int first = 0) const {
     const int count = block.count - first;
     if (!adjacent || count < 1) return gather(lanes, pointer, row, first);
     const double* from = pointer(lanes[first]) + row * problem.stride;
@@ -160,7 +162,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   template <class Pointer>
   void write(const Pointer& pointer, std::ptrdiff_t row, V number, int steps_done) const {
     const auto a = result(number);
-    const Lane* lanes = results();
+    const ReplicaArrays* lanes = results();
     if (adjacent && together) {
       double* to = pointer(lanes[0]) + row * problem.stride;
       return block.count < kReplicas<V> ? store(to, a, block.count) : store(to, a);
@@ -179,14 +181,14 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   void load_unit(int u, V* hot, V* cold) const {
     for (int f = 0; f < kFields; ++f)
       for (int q = 0; q < kField[f].size; ++q)
-        field_at(f, u, hot, cold)[q] = read([f](const Lane& lane) { return lane.grains_in[f]; },
+        field_at(f, u, hot, cold)[q] = read([f](const ReplicaArrays& lane) { return lane.grains_in[f]; },
                                             static_cast<std::ptrdiff_t>(plan.grain[u]) * kField[f].size + q);
   }
 
   void unload_unit(int u, const V* hot, const V* cold, int steps_done) const {
     for (int f = 0; f < kFields; ++f)
       for (int q = 0; q < kField[f].size; ++q)
-        write([f](const Lane& lane) { return lane.grains_out[f]; },
+        write([f](const ReplicaArrays& lane) { return lane.grains_out[f]; },
               static_cast<std::ptrdiff_t>(plan.grain[u]) * kField[f].size + q, field_at(f, u, hot, cold)[q],
               steps_done);
   }
@@ -205,10 +207,10 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   C& remembered(std::size_t c, int q) const { return history[c * Law::kHistory + q]; }
 
   C history_in(Place place) const {
-    return convert<C>(read([place](const Lane& lane) { return lane.history_in[place.leaf]; }, place.row));
+    return convert<C>(read([place](const ReplicaArrays& lane) { return lane.history_in[place.leaf]; }, place.row));
   }
   void history_out(Place place, C number, int steps_done) const {
-    const auto out = [place](const Lane& lane) { return lane.history_out[place.leaf]; };
+    const auto out = [place](const ReplicaArrays& lane) { return lane.history_out[place.leaf]; };
     write(out, place.row, convert<V>(number), steps_done);
   }
 
@@ -217,12 +219,13 @@ struct Replicas : ReplicasLayout<Law, V, C> {
   template <class PlaceAt>
   V wall_in(int u, int row, const PlaceAt& place_at) const {
     const Place place = place_at(wall_row(u, row));
-    return read([place](const Lane& lane) { return lane.wall_history_in[place.leaf]; }, place.row);
+    return read([place](const ReplicaArrays& lane) { return lane.wall_history_in[place.leaf]; }, place.row);
   }
   template <class PlaceAt>
   void wall_out(int u, int row, const PlaceAt& place_at, V number, int steps_done) const {
     const Place place = place_at(wall_row(u, row));
-    write([place](const Lane& lane) { return lane.wall_history_out[place.leaf]; }, place.row, number, steps_done);
+    write([place](const ReplicaArrays& lane) { return lane.wall_history_out[place.leaf]; }, place.row, number,
+          steps_done);
   }
   std::ptrdiff_t wall_row(int u, int row) const {
     return static_cast<std::ptrdiff_t>(plan.grain[u]) * problem.wall_rows() + row;
@@ -249,6 +252,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     }
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kForce, force);
     store_vec(hot + static_cast<std::size_t>(u) * kHot + kTorque, torque);
+    std::fill(remote + 6 * static_cast<std::size_t>(plan.remote_start[u]),
+              remote + 6 * static_cast<std::size_t>(plan.remote_start[u + 1]), C{});
   }
 
   void total_force(int u, Vec<V>& force, Vec<V>& torque) const {
@@ -322,7 +327,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
         const V square = dot(other - one, other - one);
         const Radii* const radii = differ ? plan.radii + c : nullptr;
         if (!bits_less(square, differ ? splat<V>(radii->square) : contact_square)) {
-          if (marks.touched[c]) forget(c, pair);
+          if (marks.touched[c]) forget(c);
           marks.next_check[c] = differ ? next_check(travel, smallest(square), radii->reach, plan.far)
                                        : next_check(travel, smallest(square));
           continue;
@@ -386,12 +391,10 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     }
   }
 
-  void forget(std::size_t c, const Candidate& pair) {
+  void forget(std::size_t c) {
     marks.touched[c] = false;
     for (int q = 0; q < Law::kHistory; ++q) history[c * Law::kHistory + q] = C{};
     if constexpr (Law::kLayered) marks.segments[c] = 0;
-    if (pair.remote >= 0)
-      for (int q = 0; q < 6; ++q) remote[6 * static_cast<std::size_t>(pair.remote) + q] = C{};
   }
 
   GMEM_INLINE ContactInput<C> contact_input(const Candidate& pair, Vec<V> centre_one, Vec<V> centre_other) const {
@@ -431,8 +434,8 @@ struct Replicas : ReplicasLayout<Law, V, C> {
     }
     if (pair.remote >= 0) {
       C* to = remote + 6 * static_cast<std::size_t>(pair.remote);
-      store_vec(to, away_is_one ? push.force : -push.force);
-      store_vec(to + 3, away_is_one ? push.torque_one : push.torque_other);
+      store_vec(to, away_is_one ? load_vec(to) + push.force : load_vec(to) - push.force);
+      store_vec(to + 3, load_vec(to + 3) + (away_is_one ? push.torque_one : push.torque_other));
     }
   }
 };

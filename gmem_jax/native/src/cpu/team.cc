@@ -1,10 +1,13 @@
 #include "cpu/team.h"
 
 #include <algorithm>
+#include <cmath>
 #include <condition_variable>
 #include <cstdlib>
 #include <deque>
 #include <exception>
+#include <fstream>
+#include <limits>
 #include <mutex>
 #include <stdexcept>
 #include <string>
@@ -28,13 +31,13 @@ inline void pause() {
 #endif
 }
 
-int cpus() {
-#if defined(__linux__)
-  cpu_set_t set;
-  if (sched_getaffinity(0, sizeof set, &set) == 0) return CPU_COUNT(&set);
-#endif
-  const unsigned count = std::thread::hardware_concurrency();
-  return count ? static_cast<int>(count) : 1;
+// Quota over period of a folder of either version of control groups, as files have them; infinite where they have none.
+double share_in(const std::string& folder) {
+  double quota = 0.0, period = 0.0;
+  std::ifstream both(folder + "/cpu.max"), first(folder + "/cpu.cfs_quota_us"), second(folder + "/cpu.cfs_period_us");
+  if (both >> quota >> period || (first >> quota && second >> period))
+    if (quota > 0.0 && period > 0.0) return quota / period;
+  return std::numeric_limits<double>::infinity();
 }
 
 // Workers live until the process ends; they sleep between jobs.
@@ -105,6 +108,33 @@ class Pool {
 Pool& pool() { return of_process<Pool>(); }
 
 }  // namespace
+
+int quota_of(const std::string& groups, const std::string& root) {
+  double least = std::numeric_limits<int>::max();
+  std::ifstream file(groups);
+  for (std::string line; std::getline(file, line);) {  // number:controllers:path, and no controllers in version 2
+    const std::size_t first = line.find(':'), second = line.find(':', first + 1);
+    if (first == std::string::npos || second == std::string::npos) continue;
+    const std::string controllers = "," + line.substr(first + 1, second - first - 1) + ",";
+    if (controllers != ",," && controllers.find(",cpu,") == std::string::npos) continue;
+    std::string path = line.substr(second + 1);
+    for (bool more = true; more;) {  // a group has no more than those above it
+      least = std::min(least, share_in(root + (controllers == ",," ? "" : "/cpu") + path));
+      more = !path.empty();
+      path.resize(path.find_last_of('/') == std::string::npos ? 0 : path.find_last_of('/'));
+    }
+  }
+  return std::max(1, static_cast<int>(std::ceil(least)));
+}
+
+int cpus() {
+  static const int quota = quota_of("/proc/self/cgroup", "/sys/fs/cgroup");
+#if defined(__linux__)
+  cpu_set_t set;
+  if (sched_getaffinity(0, sizeof set, &set) == 0) return std::min(CPU_COUNT(&set), quota);
+#endif
+  return std::min(std::max(1, static_cast<int>(std::thread::hardware_concurrency())), quota);
+}
 
 void Team::barrier() {
   constexpr int kSpins = 200, kYields = 50;

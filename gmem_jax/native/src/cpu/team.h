@@ -7,6 +7,7 @@
 #include <cstdint>
 #include <functional>
 #include <mutex>
+#include <string>
 
 namespace gmem {
 
@@ -76,7 +77,14 @@ class Threads {
 // fail threw.
 void run_ranks(int threads, const std::function<void(int)>& work);
 
-// Threads to use: the environment's GMEM_THREADS, or the CPUs this process may run on. Throws std::invalid_argument if
+// CPUs that this process may keep busy: those it may run on, or fewer where its control group has a quota of their time.
+int cpus();
+
+// The least quota of CPU time of the control groups that are listed in the file `groups` (/proc/self/cgroup) and lie in the
+// folder `root` (/sys/fs/cgroup), in CPUs, rounded up; the largest number where there is none.
+int quota_of(const std::string& groups, const std::string& root);
+
+// Threads to use: the environment's GMEM_THREADS, or `cpus`. Throws std::invalid_argument if
 // GMEM_THREADS is no number of threads.
 int thread_count();
 

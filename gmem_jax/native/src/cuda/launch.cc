@@ -19,11 +19,11 @@ namespace {
 using Handle = void*;  // the driver's contexts, modules, functions and streams
 constexpr int kRelaxed = 2, kMajor = 75, kMinor = 76, kMostThreads = 0;  // of cuda.h
 
-struct Kernel {
+struct Loaded {
   Handle function;
   int block;  // threads that it was compiled for
 };
-using Kernels = std::array<Kernel, kKernels>;
+using Kernels = std::array<Loaded, kKernels>;
 
 struct Driver {
   int (*context_of)(Handle, Handle*);
@@ -126,7 +126,7 @@ void Launcher::operator()(GpuKernel kernel, int items, const Arguments& argument
   if (items == 0) return;
   const Driver& d = driver();
   void* parameters[] = {const_cast<Arguments*>(&arguments), &step};
-  const Kernel& found = (*static_cast<const Kernels*>(kernels_))[static_cast<std::size_t>(kernel)];
+  const Loaded& found = (*static_cast<const Kernels*>(kernels_))[static_cast<std::size_t>(kernel)];
   const unsigned block = static_cast<unsigned>(found.block), each = kernel == GpuKernel::move ? kItems : block;
   const unsigned blocks = (static_cast<unsigned>(items) * static_cast<unsigned>(arguments.lanes) + each - 1) / each;
   d.must(d.launch(found.function, blocks, 1, 1, block, 1, 1, 0, stream_, parameters, nullptr), "launch");

@@ -121,20 +121,24 @@ struct Remembered {
   }
 };
 
-// By what a trial force is to be multiplied, of which `square` and `inverse` are the square and its inverse root.
+// By what a trial force is to be multiplied, of which `square` is the square. Most contacts stick, and need no root; a GPU,
+// which takes one contact at a time, has too few registers for the question.
 // gmem_jax/physics/contact/friction.py: coulomb
 template <class V>
-constexpr GMEM_INLINE V limited(const Contact<V>& c, V mu) {
-  const V limit = mu * c.normal_force;
-  return select(c.square > limit * limit, limit * c.inverse, splat<V>(1.0));
+constexpr GMEM_INLINE V limited(Contact<V>& c, V mu) {
+  const V limit = mu * c.normal_force, one = splat<V>(1.0);
+  if (kTogether > 1 && !bits_less(limit * limit, c.square)) return one;
+  invert_roots(&c, 1);
+  return select(c.square > limit * limit, limit * c.inverse, one);
 }
 
 // Take the trial forces of a batch back to the friction limit.
 template <class V>
 constexpr void coulomb(Contact<V>* c, int count, V mu) {
-  for (int n = 0; n < count; ++n) c[n].square = dot(c[n].force, c[n].force);
-  invert_roots(c, count);
-  for (int n = 0; n < count; ++n) c[n].force = zero_unless(c[n].touching(), limited(c[n], mu) * c[n].force);
+  for (int n = 0; n < count; ++n) {
+    c[n].square = dot(c[n].force, c[n].force);
+    c[n].force = zero_unless(c[n].touching(), limited(c[n], mu) * c[n].force);
+  }
 }
 
 // gmem_jax/physics/contact/frictionless.py: Frictionless.__call__
@@ -241,7 +245,6 @@ constexpr GMEM_INLINE void friction(Layered<variant>, Contact<V>* c, int count, 
     trial[n] = fma(pushed, sliding[n], law.spacing * fma(rim, layers.rim, layers.inside));
     c[n].square = dot(trial[n], trial[n]);
   }
-  invert_roots(c, count);
   for (int n = 0; n < count; ++n) {
     const V scale = limited(c[n], law.mu);
     const Mask<V> touching = c[n].touching();
