@@ -1,6 +1,7 @@
 """The written form of an experiment: what files and keys say of it, down to where and by which code it was run."""
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -8,8 +9,7 @@ import jax
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_kind
-from gmem_jax.experiment.changes import value_at
-from gmem_jax.experiment.experiment import NUMBERS, Experiment
+from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance, sources
 from gmem_jax.experiment.signals import (
@@ -150,6 +150,8 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
 def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
     """All that is to be known of a result: the experiment as written, what its defaults came to, and where it ran.
 
+    `values_of` reads it.
+
     Args:
         experiment: what was run.
         seconds: wall time that the run took; 0 where nobody measured it.
@@ -176,10 +178,16 @@ def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
         },
         "friction": entry.name if entry else type(law).__name__,
         "mu": plain(law.mu) if isinstance(law, CoulombLaw) else 0.0,
-        **{name: plain(value_at(experiment, name)) for name in NUMBERS},
+        "delta0": plain(experiment.compression),
+        "hold_drag": plain(experiment.drag),
         "dt": plain(dt),
         "steps": steps,
         "seconds": seconds,
         **provenance(),
         "backend": experiment.runs_on,
     }
+
+
+def values_of(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """What a configuration says by name: what a value came to, and else as the experiment has it."""
+    return {**configuration.get("experiment", {}), **configuration}

@@ -9,6 +9,7 @@ import numpy as np
 
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import values_of
 from gmem_jax.files.hdf5 import OBSERVED, observed_array
 from gmem_jax.files.measures import of_each
 from gmem_jax.files.schemas import RECALL, STAGE, declared_of_recall
@@ -69,7 +70,8 @@ def to_xarray(recall: Recall) -> Any:
         "stage": ("time", joined["stage"]),
     }
     told = ("pack", "grains", "friction", "background", "mu", "gamma0", "delta0", "t0")
-    facts = {name: configuration[name] for name in told if name in configuration}
+    known = values_of(configuration)
+    facts = {name: known[name] for name in told if name in known}
     about = {"schema": RECALL.name, "units": "R = E = rho = 1", **facts, "configuration": json.dumps(configuration)}
     return xarray.Dataset(data, coordinates, about)
 

@@ -10,6 +10,7 @@ import numpy as np
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.readings import placed
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import values_of
 from gmem_jax.simulation.channels import CHANNELS
 
 EACH = ("signal_gain", "signal_fidelity", "signal_windowed_fidelity", "signal_correlation")
@@ -17,7 +18,7 @@ EACH = ("signal_gain", "signal_fidelity", "signal_windowed_fidelity", "signal_co
 
 def relative_scale(configuration: Mapping[str, Any]) -> jax.Array:
     """delta0 gamma0, what gains are measured in; scalar, or [S, 1] where it differs between signals; NaN if unknown."""
-    numbers = np.multiply(*(configuration.get(name, np.nan) for name in ("delta0", "gamma0")))
+    numbers = np.multiply(*(values_of(configuration).get(name, np.nan) for name in ("delta0", "gamma0")))
     return jnp.asarray(numbers if np.ndim(numbers) == 0 else numbers[1:, None])
 
 
@@ -32,8 +33,8 @@ def of_each(recall: Recall) -> dict[str, np.ndarray]:
 
     Arrays [S], or [R, C, S] as in the recall.
     """
-    configuration, shape = recall.configuration, np.shape(recall.J)[:-1]
-    scale, window = relative_scale(configuration), recall.window / np.max(configuration.get("t0", np.nan))
+    known, shape = values_of(recall.configuration), np.shape(recall.J)[:-1]
+    scale, window = relative_scale(known), recall.window / np.max(known.get("t0", np.nan))
     curves = [jnp.asarray(each).reshape(-1, *np.shape(each)[-2:]) for each in (recall.p_sig, recall.J)]
     found: dict[str, list[Any]] = {name: [] for name in EACH}
     for p_sig, integral in zip(*curves, strict=True):

@@ -10,6 +10,7 @@ import numpy as np
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import values_of
 from gmem_jax.files.frames import read_frames, write_frames
 from gmem_jax.files.hdf5 import Content, reading, write_arrays, write_samples, writing
 from gmem_jax.files.measures import EACH, of_each
@@ -114,10 +115,10 @@ def _check_configuration(configuration: dict[str, Any]) -> None:
     """What tables and figures rely on."""
     kinds = {"pack": source, "friction": title, "background": title, "grains": whole, "steps": whole}
     amounts = dict.fromkeys(("mu", "delta0", "gamma0", "t0", "hold_drag", "dt"), numbers)
-    require_fields(configuration, "configuration", **kinds, **amounts, seconds=is_number)
-    require_fields(configuration.get("grain"), "configuration's grain", shape=title, mass=is_number, diameter=is_number)
     experiment = configuration.get("experiment", {})
     require(isinstance(experiment, dict), "its configuration has an impossible 'experiment'")
+    require_fields(values_of(configuration), "configuration", **kinds, **amounts, seconds=is_number)
+    require_fields(configuration.get("grain"), "configuration's grain", shape=title, mass=is_number, diameter=is_number)
     signals, form = configuration.get("signals", []), experiment.get("signals", {})
     require(isinstance(signals, list) and isinstance(form, dict), "its configuration has impossible 'signals'")
     require(isinstance(configuration.get("warnings", []), list), "its configuration has impossible 'warnings'")

@@ -55,7 +55,7 @@ class Schema(NamedTuple):
 
 
 _CONFIGURATION = {
-    "configuration": "JSON: every parameter of the experiment, what its defaults came to, versions, commit, device"
+    "configuration": "JSON: `experiment`, all its parameters; beside it what defaults came to, versions, commit, device"
 }
 
 STAGE = {  # of a recall or a preparation, in stages/NAME; `common` is the last dimension where there is one run for all

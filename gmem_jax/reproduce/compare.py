@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
 from gmem_jax.experiment.analysis import spread
+from gmem_jax.experiment.record import values_of
 from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.contact.laws import LAWS
 from gmem_jax.physics.state import combined_status
@@ -102,8 +103,8 @@ class Compared(NamedTuple):
 
 def conditions_of(configuration: dict[str, Any]) -> Conditions:
     """What a recall was measured at, from its configuration."""
-    law = configuration["experiment"]["friction"]
-    entry = next(entry for entry in LAWS if entry.name == configuration["friction"])
+    law, known = configuration["experiment"]["friction"], values_of(configuration)
+    entry = next(entry for entry in LAWS if entry.name == known["friction"])
     variant = law.get("variant", "averaged")
     shape, _, overlap = configuration["grain"]["shape"].partition("(")
     shape += "".join(f", {words}" for words in (configuration["grain"].get("sizes"),) if words)
@@ -113,11 +114,11 @@ def conditions_of(configuration: dict[str, Any]) -> Conditions:
         shape=shape,
         overlap=float(overlap.rstrip(")")) if overlap else 1.0,
         grains=configuration["grains"],
-        mu=float(configuration["mu"]),
-        delta0=round(float(configuration["delta0"]), 12),
-        gamma0=float(configuration["gamma0"]),
+        mu=float(known["mu"]),
+        delta0=round(float(known["delta0"]), 12),
+        gamma0=float(known["gamma0"]),
         bits=signals.get("bits", 0) if signals["kind"] == "words" else 0,
-        background=configuration["background"],
+        background=known["background"],
         boundary=configuration["pack_record"].get("recipe", {}).get("boundary", "walls"),
     )
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gmem_jax.experiment.provenance import versions
+from gmem_jax.experiment.record import values_of
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.datasets import plain_cell
 from gmem_jax.files.schemas import RECALL
@@ -88,7 +89,7 @@ def _row(store: Store, point: ComputedPoint, gain: str, fidelity: str) -> dict[s
         "sha256": hashlib.sha256(store.at(point.key).read_bytes()).hexdigest(),
         **asdict(point.conditions),
         "pack": configuration["pack"],
-        "t0": configuration["t0"],
+        "t0": values_of(configuration)["t0"],
         "G": point.numbers[gain],
         "F": point.numbers[fidelity],
         "status": point.numbers["status"],

@@ -11,6 +11,7 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import BACKGROUNDS
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import values_of
 from gmem_jax.experiment.signals import Bumps, six_signals, words
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.numbers import plural
@@ -341,16 +342,14 @@ def waveforms(path: Path, bits: int = 5) -> None:
     save_picture(path, figure, also=VECTOR, caption=caption)
 
 
-def words_figure(
-    path: Path, recalls: Sequence[tuple[Recall, dict[str, Any]]], shown: Sequence[Sequence[int]], title: str
-) -> None:
+def words_figure(path: Path, recalls: Sequence[Recall], shown: Sequence[Sequence[int]], title: str) -> None:
     """Recalled words (SUB2-BL) beside their scaled integrals, a line of panels for each length, like Fig. 13.
 
     Where the drive rings, what counts is drawn over it: the running mean over the ringing period.
 
     Args:
         path: file to write.
-        recalls: of all words of a length, with their configurations.
+        recalls: of all words of a length.
         shown: which words of each to draw.
         title: over the picture.
 
@@ -367,12 +366,13 @@ def words_figure(
         sharey=True,
         squeeze=False,
     )
-    unit = Material().modulus
-    for line, (recall, configuration), chosen in zip(axes, recalls, shown, strict=True):
-        stored = stored_words(recall)
-        gain, fidelity = (float(getattr(recall, name)) for name in counted(configuration["t0"]))
-        scale = unit * gain * configuration["delta0"] * configuration["gamma0"]
-        smooth = mean_over_ringing(recall, np.asarray(stored.signals), configuration["t0"])
+    unit, ringing = Material().modulus, False
+    for line, recall, chosen in zip(axes, recalls, shown, strict=True):
+        stored, known = stored_words(recall), values_of(recall.configuration)
+        gain, fidelity = (float(getattr(recall, name)) for name in counted(known["t0"]))
+        scale = unit * gain * known["delta0"] * known["gamma0"]
+        smooth = mean_over_ringing(recall, np.asarray(stored.signals), known["t0"])
+        ringing |= smooth is not None
         for axis, word in zip(line, chosen, strict=False):
             axis.axhline(0.0, color="0.8", linewidth=0.8)
             strong = stored.signals if smooth is None else smooth
@@ -390,9 +390,6 @@ def words_figure(
         lowest.tick_params(labelbottom=True)
         lowest.set_xlabel("u")
     figure.suptitle(title, fontsize=10)
-    ringing = any(
-        mean_over_ringing(recall, np.asarray(recall.p_sig), known["t0"]) is not None for recall, known in recalls
-    )
     drawn = f"Pale: recalled, SUB2-BL; blue: {MEAN}" if ringing else "Blue: recalled, SUB2-BL"
     caption = rf"{drawn}; red: $G E \delta_0 \gamma_0 J$. All panels have one scale."
     save_picture(path, figure, also=VECTOR, caption=caption)

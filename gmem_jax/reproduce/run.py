@@ -302,18 +302,17 @@ def _draw(
         draw.draw_comparison(target, rows, figure.across, title)
         return
     recall = store.load(points[0].key)
-    configuration = recall.configuration
     if name == "fig04":
         draw.through_time(target, recall, 5, title)
     elif name == "fig06":
-        drawn = to_matplotlib(recall_figure(recall, "signals", configuration))
+        drawn = to_matplotlib(recall_figure(recall, "signals"))
         for suffix in (".png", ".svg"):
             drawn.save(target.with_suffix(suffix))
     else:
         kept = [store.load(point.key) for point in points]
         draw.words_figure(
             target,
-            [(recall, recall.configuration) for recall in kept],
+            kept,
             [_shown(point.conditions.bits) for point in points],
             title,
         )

@@ -10,6 +10,7 @@ import numpy as np
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import values_of
 from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.measures import of_each, read_stress, relative_scale
 from gmem_jax.files.waveforms import signals_from_dict
@@ -160,7 +161,7 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
     first, second = (read_stress(recall, name) for name in recall.protocol.reads)
     scale = relative_scale(configuration)
     rows: dict[str, dict[str, float]] = {name: {} for name in analysis.BACKGROUNDS}
-    for prefix, window in (("", None), ("windowed_", recall.window / np.max(configuration["t0"]))):
+    for prefix, window in (("", None), ("windowed_", recall.window / np.max(values_of(configuration)["t0"]))):
         for name, match in analysis.backgrounds(first, second, recall.J, scale, window).items():
             rows[name] |= {f"{prefix}gain": float(match.gain), f"{prefix}fidelity": float(match.fidelity)}
     correlation, left = (spread(values) for values in analysis.remembered_after(second, recall.J, scale))

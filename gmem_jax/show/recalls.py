@@ -11,7 +11,7 @@ from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.experiment import PAPER_T0, Experiment
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.record import describe
+from gmem_jax.experiment.record import describe, values_of
 from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.validation import is_number
 from gmem_jax.physics.material import Material
@@ -91,7 +91,7 @@ def recall_figure(
             f"{what!r} against {against!r}: pictures of a recall are {', '.join(pictures)}, against time or u"
         )
     _refuse_unknown(signals, len(names), lowest=0 if found in quantities else 1)
-    t0 = known.get("t0")
+    t0 = values_of(known).get("t0")
     if found in quantities:
         chosen = {names[number - 1] if number else ZERO: number for number in signals}
         return stages_figure(recall.stages, quantities[found], title, against=against, t0=t0, chosen=chosen)

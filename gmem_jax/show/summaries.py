@@ -15,7 +15,7 @@ from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.record import pack_fingerprint
+from gmem_jax.experiment.record import pack_fingerprint, values_of
 from gmem_jax.experiment.signals import bin_average, waveform
 from gmem_jax.files.datasets import to_csv
 from gmem_jax.files.frames import load_frames
@@ -176,7 +176,7 @@ def of_recall(
 
 def _parts_of_recall(recall: Recall, row: dict[str, Any]) -> Iterator[Part]:
     configuration = recall.configuration
-    names, t0 = recall.names, configuration["t0"]
+    names, t0 = recall.names, values_of(configuration)["t0"]
     yield Part(tables.errors_table(recall))
     if tables.signals_told(row) > tables.FEW:
         yield Part(tables.signals_table(row), f"each of {plural(len(names), 'signal')}", folded=True)
@@ -273,7 +273,8 @@ def of_kernel(
     }
 
     def parts() -> Iterator[Part]:
-        bumps = {**configuration, "signals": (), "experiment": {}}  # no signals were stored
+        written = {**configuration.get("experiment", {}), "signals": {}}  # no signals were stored
+        bumps = {**configuration, "signals": (), "experiment": written}
         yield Part(tables.heading(bumps))
         yield Part(drawn["kernel"]())
 

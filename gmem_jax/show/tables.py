@@ -14,6 +14,7 @@ from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import NUMBERS, Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
+from gmem_jax.experiment.record import values_of
 from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.printing import printable
 from gmem_jax.physics.boundary import boundary_of
@@ -66,7 +67,7 @@ def errors_table(recall: Recall) -> Table:
     """G and F with their standard errors over signals, as they are and averaged over the ringing period."""
     configuration, window = recall.configuration, float(recall.window)
     scale = np.asarray(relative_scale(configuration))
-    bins = window * BINS / float(np.max(configuration["t0"]))
+    bins = window * BINS / float(np.max(values_of(configuration)["t0"]))
     told = "G: gain; F: fidelity, 1 if what is recalled is the integral of what was stored; errors: standard errors "
     parts = [*recall.each()]
     where = _where(parts)
@@ -236,21 +237,22 @@ def conditions(configuration: dict[str, Any]) -> str:
 
     Of another protocol than the paper's its stages, too; and what the paper has not, if it was given.
     """
-    known = ", ".join(f"{name} = {_amount(configuration[name])}" for name in ("mu", "gamma0", "delta0", "t0"))
+    known = values_of(configuration)
+    first = ", ".join(f"{name} = {_amount(known[name])}" for name in ("mu", "gamma0", "delta0", "t0"))
     more = (
-        f"{name} = {_amount(configuration[name])} {NUMBERS[name].metadata['unit']}".strip()
+        f"{name} = {_amount(known[name])} {NUMBERS[name].metadata['unit']}".strip()
         for name in NOT_OF_PAPER
-        if configuration.get(name) is not None
+        if known.get(name) is not None
     )
     form = configuration.get("experiment", {}).get("signals", {})
     count = len(configuration.get("signals", ()))
     named = {"six": "the six signals", "words": f"all {count} words of {plural(form.get('bits'), 'bit')}"}
     named["sets"] = f"{len(form) - 1} sets of {plural(count, 'signal')}"
     stored = named.get(str(form.get("kind")), plural(count, "signal") if count else "")
-    background = configuration.get("background", "sub0")
+    background = known.get("background", "sub0")
     subtracted = "" if background == "sub0" else background.upper()
     stages = _stages(configuration.get("experiment", {}).get("protocol"))
-    return ", ".join(filter(None, (configuration["friction"], f"{known} t_c", *more, stored, subtracted, stages)))
+    return ", ".join(filter(None, (configuration["friction"], f"{first} t_c", *more, stored, subtracted, stages)))
 
 
 def _stages(protocol: Any) -> str:
@@ -272,15 +274,15 @@ def _comparable(configuration: dict[str, Any]) -> list[dict[str, Any]]:
 
     What the paper leaves open may be chosen otherwise: to see what it does to the agreement is why one would.
     """
-    written = configuration.get("experiment", {})
-    if written.get("signals") != {"kind": "six"} or configuration.get("background") != "sub0":
+    written, known = configuration.get("experiment", {}), values_of(configuration)
+    if written.get("signals") != {"kind": "six"} or known.get("background") != "sub0":
         return []
-    if configuration["friction"] != "hooke" or not np.min(configuration["t0"]) >= SLOW_ENOUGH:
+    if known["friction"] != "hooke" or not np.min(known["t0"]) >= SLOW_ENOUGH:
         return []
     as_published = ("shear", "store", "hold", "protocol", *NOT_OF_PAPER)
     if any(written.get(name) != getattr(Experiment, name) for name in as_published):
         return []
-    same = {key: configuration[key] for key in ("mu", "delta0", "gamma0")}
+    same = {key: known[key] for key in ("mu", "delta0", "gamma0")}
     boundary = configuration["pack_record"].get("recipe", {}).get("boundary", "walls")
     if "sizes" in configuration["grain"] or boundary != "walls":
         return []

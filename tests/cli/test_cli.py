@@ -93,7 +93,7 @@ def test_a_recall_writes_data_and_picture_and_prints_json(
     recall = gm.load_recall(target)
     configuration = recall.configuration
     assert float(recall.fidelity) == said["fidelity"]
-    assert configuration["t0"] == 75.0
+    assert configuration["experiment"]["t0"] == 75.0
     assert configuration["backend"] in ("jax", "native")
     assert configuration["pack_record"]["recipe"]["seed"] == 1
     with h5py.File(target) as file:

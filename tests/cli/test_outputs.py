@@ -135,7 +135,7 @@ def test_names_of_the_paper_are_accepted_in_any_case(
     assert gmem(monkeypatch, "recall", PACK, *options, *SHORT) == 0
     capsys.readouterr()
     configuration = gm.load_recall(tmp_path / "out.h5").configuration
-    assert (configuration["friction"], configuration["background"]) == ("m1", "sub2")
+    assert (configuration["friction"], configuration["experiment"]["background"]) == ("m1", "sub2")
     again = gm.from_dict(configuration["experiment"])
     assert isinstance(again.friction, gm.MindlinRescaled)
 

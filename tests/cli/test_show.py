@@ -266,7 +266,7 @@ def test_where_a_drive_rings_the_mean_over_the_ringing_is_drawn(recalled: tuple[
     experiment, recall = recalled
     labels = [text.get_text() for text in gm.plot(recall, "signals", experiment).figure.legends[0].get_texts()]
     assert recalls.MEAN in labels
-    slow = dict(gm.describe(experiment, 0.0), t0=1.8e4)
+    slow = gm.describe(gm.replace(experiment, t0=1.8e4))
     labels = [
         text.get_text()
         for text in to_matplotlib(recalls.recall_figure(recall, "signals", slow)).figure.legends[0].get_texts()

@@ -15,6 +15,8 @@ from scenes import TETRA_27
 import gmem_jax as gm
 from gmem_jax.experiment import recall as recalls
 from gmem_jax.experiment.changes import value_at
+from gmem_jax.experiment.experiment import NUMBERS
+from gmem_jax.experiment.record import values_of
 from gmem_jax.physics.rotation import unit
 
 PACK = gm.load_pack(TETRA_27)
@@ -266,6 +268,19 @@ def test_a_written_form_of_another_pack_is_refused() -> None:
         gm.from_dict({**form, "gama0": 1.0}, PACK)
     with pytest.raises(gm.FileFormatError, match="'t0' is missing"):
         gm.from_dict({name: value for name, value in form.items() if name != "t0"}, PACK)
+
+
+def test_a_configuration_says_twice_only_what_came_to_something_else() -> None:
+    experiment = make(gamma0=2e-3, creep=1e-6)
+    found = json.loads(json.dumps(gm.describe(experiment)))
+    again = {"pack", "signals", "friction", "delta0", "hold_drag", "dt", "steps", "backend"}
+    assert set(found) & set(found["experiment"]) == again
+    values = values_of(found)
+    assert {name: values[name] for name in {*NUMBERS} - again} == {
+        name: value_at(experiment, name) for name in {*NUMBERS} - again
+    }
+    assert (values["delta0"], values["hold_drag"]) == (float(PACK.delta0), 0.05)
+    assert (values["dt"], values["steps"]) == experiment.timing
 
 
 def test_replace_knows_every_field_by_keyword_and_by_name() -> None:

@@ -326,7 +326,7 @@ def test_recalled_words_have_one_scale(monkeypatch: pytest.MonkeyPatch, tmp_path
     pack, both = gm.load_pack(PACK), []
     for bits in (1, 2):
         experiment = gm.Experiment(pack, gm.words(bits), t0=75.0, store=0.1, rest=0.1, hold=0.1, background="sub2-bl")
-        both.append((gm.run(experiment), gm.describe(experiment, 1.0)))
+        both.append(gm.run(experiment))
     draw.words_figure(tmp_path / "fig13.png", both, [[0, 1], [0, 1, 2]], "title")
     figure, caption = drawn[0]
     assert len({axis.get_ylim() for axis in figure.axes}) == 1
