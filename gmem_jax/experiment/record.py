@@ -1,7 +1,8 @@
 """The written form of an experiment: what files and keys say of it, down to where and by which code it was run."""
 
 import hashlib
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -12,18 +13,7 @@ from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance, sources
-from gmem_jax.experiment.signals import (
-    LONGEST_WORD,
-    Bumps,
-    Signals,
-    SignalSets,
-    Spline,
-    bit_width,
-    sets_of,
-    six_signals,
-    word_bits,
-    words,
-)
+from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, sets_of, six_signals, word_bits, words
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of
 from gmem_jax.physics.grain import words_of_sizes
@@ -31,10 +21,10 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.observables import Observable
 
+NAMED: dict[str, Callable[..., Bumps]] = {"six": six_signals, "words": words}
 SIGNALS = {"bumps": Bumps, "spline": Spline}
 PARTS = ("pack", "signals", "friction", "material", "protocol", "observe")
 """Fields of an experiment that are no numbers. What observes it is no part of its written form: it changes nothing."""
-DIGITS = 9  # of the pad and width of words
 
 
 def fingerprint(tree: Any) -> str:
@@ -59,42 +49,20 @@ def plain(value: Any) -> Any:
     return value if isinstance(value, float | int | str | None) else np.asarray(value).tolist()
 
 
-def _equal(one: Signals, other: Signals) -> bool:
-    return fingerprint(one) == fingerprint(other) if type(one) is type(other) else False
-
-
 def signals_to_dict(signals: Signals | SignalSets) -> dict[str, Any]:
-    """Waveforms as JSON: by name where they have one, else by their numbers."""
+    """Waveforms as JSON: by what made them where they are still that, else by their numbers."""
     if isinstance(signals, SignalSets):
         return {"kind": "sets", **{name: signals_to_dict(one) for name, one in sets_of(signals).items()}}
-    if _equal(signals, six_signals()):
-        return {"kind": "six"}
-    if form := _as_words(signals):
-        return {"kind": "words", **form}
+    if isinstance(signals, Bumps) and signals.form:
+        form: dict[str, Any] = json.loads(signals.form)
+        named = NAMED[form["kind"]](**{name: value for name, value in form.items() if name != "kind"})
+        if fingerprint(signals) == fingerprint(named):
+            return form
     for kind, known in SIGNALS.items():
         if isinstance(signals, known):
-            return {"kind": kind, **{entry.name: plain(getattr(signals, entry.name)) for entry in fields(known)}}
+            numbers = (entry.name for entry in fields(known) if entry.init)
+            return {"kind": kind, **{name: plain(getattr(signals, name)) for name in numbers}}
     return {"kind": type(signals).__name__, "sha256": fingerprint(signals)}
-
-
-def _as_words(signals: Signals) -> dict[str, Any]:
-    """The arguments of `words` that give these waveforms; {} if none do."""
-    bits = signals.count.bit_length() - 1
-    if not isinstance(signals, Bumps) or signals.count != 1 << bits or not 1 <= bits <= LONGEST_WORD:
-        return {}
-    first = float(signals.centres[0, 0])  # pad / (bits + 2 pad)
-    if np.ndim(signals.width) != 0 or not 0.0 < first < 0.5:
-        return {}
-    pad = round(bits * first / (1.0 - 2.0 * first), DIGITS)
-    form: dict[str, Any] = {
-        "bits": bits,
-        "pad": pad,
-        "width": round(float(signals.width) / bit_width(bits, pad), DIGITS),
-    }
-    try:
-        return form if _equal(signals, words(**form)) else {}
-    except ValueError:
-        return {}
 
 
 def names_of(signals: Signals | SignalSets) -> list[str]:

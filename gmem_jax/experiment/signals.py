@@ -5,9 +5,10 @@ All waveforms vanish at u = 0 and u = 1, so that the box is unsheared outside th
 """
 
 import functools
+import json
 import math
 from dataclasses import dataclass
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 
 from gmem_jax.experiment.html import line
 from gmem_jax.physics.numbers import is_real, plural, require_numbers, said
-from gmem_jax.physics.pytree import Scalar, pytree, static, traced
+from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.stage import BINS
 
@@ -125,11 +126,14 @@ class Bumps:
         amplitudes: a_b, [S, b]; zero entries pad signals with fewer bumps.
         centres: c_b, [S, b].
         width: du, scalar or [S, 1].
+        form: what made them, as JSON of their written form; "" for those of one's own. A label: with other numbers it
+            is another set's.
     """
 
     amplitudes: jax.Array
     centres: jax.Array
     width: Scalar
+    form: str = label("", given=False)
 
     def __post_init__(self) -> None:
         _require_arrays(self)
@@ -227,7 +231,12 @@ def six_signals() -> Bumps:
     for row, (places, heights) in enumerate(bumps):
         centres[row, : len(places)] = places
         amplitudes[row, : len(heights)] = heights
-    return Bumps(amplitudes=jnp.asarray(amplitudes), centres=jnp.asarray(centres), width=0.2)
+    return _made_as(Bumps(jnp.asarray(amplitudes), jnp.asarray(centres), 0.2), kind="six")
+
+
+def _made_as(made: Bumps, **form: Any) -> Bumps:
+    object.__setattr__(made, "form", json.dumps(form))
+    return made
 
 
 def word_bits(bits: int) -> np.ndarray:
@@ -266,7 +275,8 @@ def words(bits: int, pad: float = PAD, width: float = WIDTH) -> Bumps:
     level = np.pad(value - 0.5, ((0, 0), (1, 1)))  # a word begins and ends half-way between its two plateaus
     amplitudes = np.diff(level, axis=1)
     centres = np.tile((pad + np.arange(bits + 1)) * bit, (len(value), 1))
-    return Bumps(amplitudes=jnp.asarray(amplitudes), centres=jnp.asarray(centres), width=width * bit)
+    made = Bumps(jnp.asarray(amplitudes), jnp.asarray(centres), width * bit)
+    return _made_as(made, kind="words", bits=int(bits), pad=float(pad), width=float(width))
 
 
 def bit_width(bits: int, pad: float = PAD) -> float:

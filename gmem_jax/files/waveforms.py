@@ -3,7 +3,7 @@
 import codecs
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,10 @@ import numpy as np
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.arguments import require_kind
-from gmem_jax.experiment.record import SIGNALS, signals_to_dict
+from gmem_jax.experiment.record import NAMED, SIGNALS, signals_to_dict
 from gmem_jax.experiment.samples import Told, require_gentle, untold, waveform_from
 from gmem_jax.experiment.signals import (
     LONGEST_WORD,
-    PAD,
-    WIDTH,
     Signals,
     SignalSets,
     Spline,
@@ -181,17 +179,13 @@ def signals_from_dict(written: Mapping[str, Any]) -> Signals:
     """
     require_kinds(written)
     kind = written["kind"]
-    if kind == "six":
-        return six_signals()
-    if kind == "words":
-        return words(written["bits"], written.get("pad", PAD), written.get("width", WIDTH))
-    if kind not in SIGNALS:
+    makers: dict[str, Callable[..., Signals]] = {**NAMED, **SIGNALS}
+    if kind not in makers:
         raise ValueError(f"signals of kind {kind!r} cannot be read back")
     numbers = {name: value for name, value in written.items() if name != "kind"}
-    made: Signals = SIGNALS[kind](
+    return makers[kind](
         **{name: jnp.asarray(value, float) if isinstance(value, list) else value for name, value in numbers.items()}
     )
-    return made
 
 
 Sets = tuple[tuple[str, str], ...]

@@ -61,9 +61,14 @@ def static(default: Any = MISSING, words: str = "", unit: str = "", **more: bool
     return field(default=default, metadata={"static": True, "words": words, "unit": unit, **more})
 
 
-def label(default: str) -> Any:
-    """A text that programs are not compiled for: what comes out of a transformation may carry another's."""
-    return field(default=default, metadata={"label": True})
+def label(default: str, *, given: bool = True) -> Any:
+    """A text that programs are not compiled for: what comes out of a transformation may carry another's.
+
+    Args:
+        default: its default.
+        given: whether who makes the object gives it, and `==` compares it.
+    """
+    return field(default=default, metadata={"label": True}, init=given, compare=given)
 
 
 RECORDS: dict[str, type] = {}
@@ -104,10 +109,11 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def _equal(self: Any, other: Any) -> Any:
-    """Whether all fields are equal, arrays in shape and in every number."""
+    """Whether all fields that are compared are equal, arrays in shape and in every number."""
     if type(other) is not type(self):
         return NotImplemented
-    return all(_alike(getattr(self, entry.name), getattr(other, entry.name)) for entry in fields(self))
+    compared = (entry.name for entry in fields(self) if entry.compare)
+    return all(_alike(getattr(self, name), getattr(other, name)) for name in compared)
 
 
 def _short(value: Any) -> str:

@@ -1,11 +1,14 @@
 """Waveforms and their integrals: the paper's table, closed forms, and curves through given samples."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gmem_jax.experiment.signals import Bumps, bin_average, bit_width, six_signals, waveform, word_bits, words
+from gmem_jax.experiment.record import names_of, signals_to_dict
+from gmem_jax.experiment.signals import Bumps, bin_average, bit_width, part, six_signals, waveform, word_bits, words
 
 SIX = six_signals()
 SHEAR = jax.jit(lambda signals, u: signals.shear(u))
@@ -225,3 +228,25 @@ def test_a_word_and_its_complement_are_opposite_waveforms():
 def test_words_of_no_length_or_too_long_are_refused(bits):
     with pytest.raises(ValueError, match="a word has 1 to 12 bits"):
         words(bits)
+
+
+@pytest.mark.parametrize(
+    ("made", "form"),
+    [(SIX, {"kind": "six"}), (words(3, 1.5, 0.75), {"kind": "words", "bits": 3, "pad": 1.5, "width": 0.75})],
+)
+def test_waveforms_are_written_by_what_made_them_while_they_are_that(made, form):
+    assert signals_to_dict(made) == signals_to_dict(jax.tree.map(jnp.asarray, part(made, 0, made.count))) == form
+    others = part(made, 0, 2), dataclasses.replace(made, width=0.1), jax.tree.map(lambda leaf: 0.5 * leaf, made)
+    for other in others:
+        assert set(signals_to_dict(other)) == {"kind", "amplitudes", "centres", "width"}
+        assert names_of(other)[0] == "signal 1"
+
+
+def test_what_made_waveforms_is_no_part_of_what_programs_are_compiled_for():
+    own = Bumps(SIX.amplitudes, SIX.centres, SIX.width)
+    assert own == SIX
+    assert signals_to_dict(own)["kind"] == "bumps"
+    seen = []
+    program = jax.jit(lambda signals: seen.append(signals) or signals.shear(FINE[:3]))
+    np.testing.assert_array_equal(program(own), program(SIX))
+    assert len(seen) == 1
