@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import pkgutil
 import re
+import runpy
 import shlex
 from pathlib import Path
 from types import SimpleNamespace
@@ -145,6 +146,11 @@ def test_a_page_can_be_done_word_for_word_with_no_output_in_the_way_of_another(p
     outputs = [str(output) for output in given if output and Path(output).suffix]
     written = re.findall(r"""save\w*\("([^"]+)""", "".join(blocks(page, "python")))
     assert sorted({*outputs, *written}) == sorted([*outputs, *set(written)])
+
+
+def test_the_options_of_an_experiment_on_the_page_are_those_of_today() -> None:
+    page = runpy.run_path(str(DOCS / "make" / "options_page.py"))["page"]()
+    assert page == (DOCS / "howto" / "command_line.md").read_text(), "python docs/make/options_page.py"
 
 
 def test_a_command_that_is_not_there_is_noticed() -> None:

@@ -137,11 +137,16 @@ class ExperimentOptions:
         return named_signals(*waveforms_of(self._values), told=log)
 
 
-def with_experiment(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command all options of an experiment; it gets what they chose as `chosen`."""
+def experiment_options() -> _Options:
+    """All options of an experiment."""
     of_law = _options(OF_LAW, **{**dict.fromkeys(OF_LAW), "mu": Hooke().mu})  # what is not given is the law's
     of_material = _options(OF_MATERIAL, **dict.fromkeys(OF_MATERIAL))
-    return _with(command, "chosen", ExperimentOptions, {**_OTHERS, **of_law, **of_material, **_options(NUMBERS)})
+    return {**_OTHERS, **of_law, **of_material, **_options(NUMBERS)}
+
+
+def with_experiment(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command all options of an experiment; it gets what they chose as `chosen`."""
+    return _with(command, "chosen", ExperimentOptions, experiment_options())
 
 
 def with_recipe(command: Callable[..., None]) -> Callable[..., None]:
