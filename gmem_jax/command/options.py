@@ -11,9 +11,9 @@ import typer
 
 from gmem_jax.command.console import check_output, log, refuse_idle
 from gmem_jax.errors import FileFormatError
-from gmem_jax.experiment.experiment import NUMBERS, Experiment
+from gmem_jax.experiment.experiment import NUMBERS, OF_PAPER, Experiment
 from gmem_jax.experiment.signals import Signals, SignalSets
-from gmem_jax.files.configuration import OF_LAW, OF_MATERIAL, OF_PAPER, named_experiment
+from gmem_jax.files.configuration import OF_LAW, OF_MATERIAL, named_experiment
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.protocols import named_protocol, ready_protocols
 from gmem_jax.files.waveforms import OF_SAMPLES, OF_WORDS, load_target, named_signals, sets_named, waveforms_of

@@ -54,6 +54,8 @@ MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
 LEAST_STEP = 1e-100  # t_c; its square is a number still
 USUAL_STEP = 0.6  # t_c; less than a third of what is stable under the default law
 LARGEST_STEP = 2.0  # t_c; `stable_step` says what a pack allows: this and more under the default law
+OF_PAPER = ("rest", "hold", "store", "shear")  # make the paper's protocol; another one says it in its stages
+NOT_OF_PAPER = ("creep", "creep_fades", "gravity", "wall_mu")  # None: what they stand for is not there, as in the paper
 
 
 class Timing(NamedTuple):
@@ -216,7 +218,7 @@ class Experiment:
                 f"like a channel, {', '.join(CHANNELS)}: give a protocol that says what is written when"
             )
         if protocol != paper:
-            odd = [name for name in _OF_PAPER if getattr(self, name) != _DEFAULTS[name]]
+            odd = [name for name in OF_PAPER if getattr(self, name) != _DEFAULTS[name]]
             if odd:
                 raise ValueError(
                     f"{odd[0]} makes the paper's protocol, and another one was given: say it in a stage of that"
@@ -442,7 +444,6 @@ class Experiment:
 
 
 _OPEN = 1e-9  # of a waveform where it should vanish
-_OF_PAPER = ("rest", "hold", "store", "shear")
 _DEFAULTS = {entry.name: entry.default for entry in fields(Experiment)}
 
 

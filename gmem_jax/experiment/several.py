@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.experiment.changes import replace, value_at
-from gmem_jax.experiment.experiment import Experiment, acts_on_prefix, replica_parameters
+from gmem_jax.experiment.experiment import NOT_OF_PAPER, Experiment, acts_on_prefix, replica_parameters
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.run import PREFIX, finished, runner_of, warn_of_another_compression
@@ -70,10 +70,7 @@ def match(one: Experiment, other: Experiment) -> bool:
     scalars = all(jnp.ndim(value) == 0 for each in (one, other) for value in replica_parameters(each).values())
     slips = [float(np.min(getattr(each.friction, "mu", 1.0))) == 0.0 for each in (one, other)]
     same = slips[0] == slips[1] and all(getattr(one, name) == getattr(other, name) for name in alike)
-    kinds = [
-        [getattr(each, name) is None for name in ("creep", "creep_fades", "gravity", "wall_mu")]
-        for each in (one, other)
-    ]
+    kinds = [[getattr(each, name) is None for name in NOT_OF_PAPER] for each in (one, other)]
     same = same and kinds[0] == kinds[1]
     alone = not any(isinstance(each.signals, SignalSets) or each.observe for each in (one, other))
     return alone and scalars and same and one.pack is other.pack and laws[0] == laws[1]

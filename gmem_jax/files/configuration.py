@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.changes import replace
-from gmem_jax.experiment.experiment import NUMBERS, Experiment
+from gmem_jax.experiment.experiment import NUMBERS, OF_PAPER, Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.record import PARTS, pack_fingerprint
 from gmem_jax.experiment.signals import Signals, SignalSets, signals
@@ -27,7 +27,6 @@ from gmem_jax.simulation.protocol import Protocol
 
 OF_LAW = {entry.name: entry for law in reversed(LAWS) for entry in fields(law.kind)}
 OF_MATERIAL = {entry.name: entry for entry in fields(Material) if entry.metadata.get("option")}
-OF_PAPER = ("rest", "hold", "store", "shear")  # of the paper's protocol; another one says it in its stages
 NAMES = ("signals", *OF_WORDS, *OF_SAMPLES, "protocol", "friction", *OF_LAW, *OF_MATERIAL, *NUMBERS)
 STAGES = "protocol."  # begins the name of a value of a stage, as "protocol.store.length"
 

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import spread
-from gmem_jax.experiment.experiment import NUMBERS, Experiment
+from gmem_jax.experiment.experiment import NOT_OF_PAPER, NUMBERS, Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import values_of
@@ -226,10 +226,6 @@ def cell(value: Any) -> str:
     """A value as a table shows it; of a file, its name."""
     text = f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
     return Path(text).stem if text.endswith(".h5") else text
-
-
-NOT_OF_PAPER = ("creep", "creep_fades", "gravity", "wall_mu")
-"""Numbers of an experiment without which, as in the paper, what they stand for is not there."""
 
 
 def conditions(configuration: dict[str, Any]) -> str:
