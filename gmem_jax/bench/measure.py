@@ -225,13 +225,13 @@ def _peak_bytes() -> int:
     return unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def memory(load: Callable[[str], Pack], name: str, grains: int, backend: str, law: str, replicas: int = 32) -> float:
-    """Bytes per grain and replica: growth of the peak from half to all of the replicas, each in its own process."""
+def memory(load: Callable[[str], Pack], name: str, grains: int, backend: str, law: str) -> float:
+    """Bytes per grain and replica: growth of the peak from 16 to 32 replicas, each in its own process."""
     peaks = []
-    for count in (replicas // 2, replicas):
+    for count in (16, 32):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             peaks.append(pool.submit(_peak_memory, load, name, backend, law, count).result())
-    return (peaks[1] - peaks[0]) / (grains * (replicas - replicas // 2))
+    return (peaks[1] - peaks[0]) / (grains * 16)
 
 
 def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int, t0: float) -> dict[str, float]:
@@ -369,12 +369,12 @@ def run_benchmark(
     return result
 
 
-def fits(pack: Pack, law: str, replicas: int, share: float = 0.25) -> bool:
-    """Whether the contact histories of a case fit into `share` of the memory (Mindlin's are dense in XLA)."""
+def fits(pack: Pack, law: str, replicas: int) -> bool:
+    """Whether the contact histories of a case fit into a quarter of the memory (Mindlin's are dense in XLA)."""
     friction = TIMED_LAWS[law]
     points = friction.points if isinstance(friction, Mindlin) else 1
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return 2 * 8 * points * pack.pairs.capacity * replicas * 3 < share * total
+    return 2 * 8 * points * pack.pairs.capacity * replicas * 3 < 0.25 * total
 
 
 def _worth(pack: Pack, first: Pack, backend: str, law: str) -> bool:

@@ -20,7 +20,7 @@ from gmem_jax.experiment.run import run
 from gmem_jax.experiment.signals import Bumps
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
-from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, silent, within
+from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
 
 LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
 SHARE = 0.7  # of the time that all derivatives take, those by the drive
@@ -118,7 +118,7 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
     return Jacobian(tuple(names), np.asarray(values), np.concatenate(p_sig), np.concatenate(p_xy))
 
 
-def differences(experiment: Experiment, relative: float, *, progress: Progress = silent) -> Jacobian:
+def differences(experiment: Experiment, relative: float) -> Jacobian:
     """Central differences with steps of `relative` times each parameter (amplitudes: times 1), as replicas.
 
     Raises:
@@ -131,7 +131,7 @@ def differences(experiment: Experiment, relative: float, *, progress: Progress =
     gamma0 = np.full(2 * n + 3, float(experiment.gamma0))
     gamma0[-2:] *= [1.0 + relative, 1.0 - relative]
     drive = replace(experiment, signals=_copies(bumps, jnp.asarray(row + steps)), gamma0=jnp.asarray(gamma0))
-    found = run(drive, progress=progress)
+    found = run(drive, progress=False)
     recalled, p_xy = np.asarray(found.p_sig), _p_xy(experiment, _pressures(found))[1:]
     widths = np.full((n + 1, 1), 2.0 * relative)
     widths[n] *= float(experiment.gamma0)
@@ -147,7 +147,7 @@ def differences(experiment: Experiment, relative: float, *, progress: Progress =
     }
     rows = jnp.asarray(np.concatenate([np.zeros((3, n)), np.repeat(row, 4, axis=0)]))
     other = replace(experiment, {**shifted, "signals": _copies(bumps, rows)})
-    pressure = _pressures(run(other, progress=progress))
+    pressure = _pressures(run(other, progress=False))
     change = np.asarray(analysis.recalled(jnp.asarray(pressure[experiment.protocol.reads[0]])))
     signal = -(change[4:] - change[:4])
     p_xy = _p_xy(experiment, pressure)[4:]

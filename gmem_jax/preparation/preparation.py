@@ -131,7 +131,6 @@ class _Preparation:
         state = start(system, at, grains.quaternion, self.box)
         state = accelerate(system, replace(state, grains=grains), self.box)
         expected = bins_outside(recipe, clump) * work_of_bin(1) + work_of(cycles_of(recipe), 1)
-        self.march = native.marcher(native.name(backend, system.friction))
         simulation = Simulation(system, self._path(), self.dt, recipe.drag, steps=steps, backend=backend)
         self.runner = Runner(
             simulation, state, finder=finder, progress=progress, total_work=expected, observers=(self.frames,)
@@ -173,8 +172,8 @@ class _Preparation:
             return {"runner": runner.snapshot(), "pressed": pressed, "left": np.asarray(left)}
 
         while left > 0:
-            system = runner.simulation.system
-            pressed = _press(system, pressed, servo, self.dt, drag, blocks=min(CALL, left), march=self.march)
+            system, march = runner.simulation.system, runner.simulation.resolved.march
+            pressed = _press(system, pressed, servo, self.dt, drag, blocks=min(CALL, left), march=march)
             raise_if_fatal(status_of(pressed.state), name)
             runner.state, self.box = pressed.state, pressed.box
             done = int(pressed.blocks)
