@@ -122,7 +122,8 @@ def recall_command(
     if accuracy is not None:
         refuse_idle("with --accuracy, which chooses t0 and dt", "t0", "dt")
         experiment = at_accuracy(experiment, accuracy)
-        log(f"t0 = {float(np.max(experiment.t0)):.5g} t_c, dt = {float(np.max(experiment.timing.dt)):.3g} t_c")
+        said = f"t0 = {float(np.max(experiment.t0)):.5g} t_c, dt = {float(np.max(experiment.timing.dt)):.3g} t_c"
+        log(f"{said}; up to {stable_step(experiment):.3g} t_c are stable")
     target = chosen.target(experiment.signals.count)
     at = _compressions(frames_at)
     if not frames and not at:

@@ -5,12 +5,13 @@ contact is looked at, of an overlap as in a pack: what exceeds these bounds is a
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from gmem_jax.physics.contact.laws import entry_of
+from gmem_jax.physics.contact.mindlin import Mindlin
+from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.sharding import to_host
 
@@ -23,16 +24,21 @@ _USUAL = {  # what stands for a number that is asked whether it is the cause
 }
 
 
-def longest_step(mass: float, plane_stiffness: float, numbers: Mapping[str, float]) -> float:
+def longest_step(simulation: Simulation, stiffer: float = 1.0, **changed: float) -> float:
     """The longest stable step for a grain on a wall and two grains with friction, in t_c.
 
     Args:
-        mass: of the smallest grain.
-        plane_stiffness: of its material.
-        numbers: those in `_USUAL`.
+        simulation: gives the smallest grain, the material and the law; of replicas the largest numbers count.
+        stiffer: factor of every spring and dashpot.
+        changed: numbers in `_USUAL` that stand for those of the simulation.
     """
+    system = simulation.system
+    numbers = {**_USUAL, **_numbers(simulation), **changed}
     rigidity, damping, spring, tangential_damping = (numbers[name] for name in _USUAL)
-    stiffness = plane_stiffness * math.sqrt(OVERLAP) * max(rigidity, 2.0**-0.5)  # or of two grains, of mass m / 2
+    mass = _most(system.clump.mass) * float(system.clump.smallest) ** 3 / stiffer
+    root = math.sqrt(OVERLAP)
+    stiffness = _most(system.material.plane_stiffness) * root * max(rigidity, 2.0**-0.5)  # or of two, of mass m / 2
+    spring *= root if isinstance(system.friction, MindlinRescaled | Mindlin) else 1.0
     rates = (
         0.5 * math.sqrt(1.5 * stiffness / mass),
         0.5 * stiffness * damping / mass,
@@ -42,25 +48,25 @@ def longest_step(mass: float, plane_stiffness: float, numbers: Mapping[str, floa
     return float(1.0 / max(rates))
 
 
-def cause(simulation: Simulation) -> str:
-    """The number that made a run unstable, as far as can be said; "" if none is beyond its bound."""
+def _numbers(simulation: Simulation) -> dict[str, float]:
+    """Those in `_USUAL` that are known: of the material, and of a law that has a name."""
     material, law = simulation.system.material, simulation.system.friction
     of_material = ("wall_rigidity", "normal_damping")
     known: dict[str, Any] = {f"material.{name}": getattr(material, name) for name in of_material}
     if entry_of(law):
         known |= {f"friction.{name}": getattr(law, name, 0.0) for name in ("stiffness", "damping_time")}
-    numbers = {**_USUAL, **{name: _most(value) for name, value in known.items()}}
-    clump, plane, dt = simulation.system.clump, _most(material.plane_stiffness), _most(simulation.dt)
-    mass = _most(clump.mass) * float(clump.smallest) ** 3
+    return {name: _most(value) for name, value in known.items()}
 
-    def longest(**changed: float) -> float:
-        return longest_step(mass, plane, {**numbers, **changed})
 
-    name = max(known, key=lambda one: longest(**{one: _USUAL[one]}))
-    if longest() >= dt or longest(**{name: _USUAL[name]}) <= longest():
+def cause(simulation: Simulation) -> str:
+    """The number that made a run unstable, as far as can be said; "" if none is beyond its bound."""
+    numbers, longest, dt = _numbers(simulation), longest_step(simulation), _most(simulation.dt)
+    without = {name: longest_step(simulation, **{name: _USUAL[name]}) for name in numbers}
+    name = max(without, key=without.__getitem__)
+    if longest >= dt or without[name] <= longest:
         return ""
     return (
-        f"{name} = {numbers[name]:g} makes steps beyond {longest():.2g} t_c unstable, and dt is {dt:.2g}; "
+        f"{name} = {numbers[name]:g} makes steps beyond {longest:.2g} t_c unstable, and dt is {dt:.2g}; "
         f"use a smaller {name}"
     )
 

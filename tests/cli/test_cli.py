@@ -249,6 +249,7 @@ BAD = [
         ["recall", "{pack}", "--dt", "0.9", "--stiffness", "0.93", "-o", "{out}"],
         "t_c exceeds the largest stable step of this pack, law and",
     ),
+    (["recall", "{pack}", "--stiffness", "2", "-o", "{out}"], "dt = 0.586 t_c exceeds the largest stable step"),
     (["recall", "{pack}", "--dt", "2.2", "-o", "{out}"], "dt must be in (0, 2.0], got 2.2"),
     (["recall", "{pack}", "--signals", "seven", "-o", "{out}"], "--signals"),
     (["recall", "{pack}", "--signals", "{nan.csv}", "-o", "{out}"], "sample 2 of signal 1 is not a finite number"),

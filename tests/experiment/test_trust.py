@@ -15,6 +15,7 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment import validity as limits
+from gmem_jax.experiment.stepping import require_stable
 from gmem_jax.experiment.validity import compression_speed, validity
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -116,8 +117,11 @@ def test_grains_without_friction_may_turn_freely() -> None:
     assert judged(speed=[10.0] * 3, friction=gm.Frictionless()) == [0, 0, 0]
 
 
-def test_a_dashpot_that_its_steps_cannot_follow_is_told_and_one_that_they_can_is_not() -> None:
+def test_a_dashpot_that_its_steps_cannot_follow_is_told_and_one_that_they_can_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """What the bound says is what happens: above it p_sig is large and means nothing."""
+    monkeypatch.setattr("gmem_jax.experiment.run.require_stable", lambda _: None)
     found = [
         gm.run(gm.Experiment(PACK, two_bumps(1.0, -0.6), gm.Hooke(damping_time=time), t0=450.0, store=0.2))
         for time in (3.0, 1e9)
@@ -176,7 +180,7 @@ def bits_of(t0: float = 450.0, **changes: object) -> Status:
     ("changes", "bit"),
     [
         ({"friction.mu": 1e6}, Status.LARGE_FRICTION),
-        ({"friction.stiffness": 2.0}, Status.LARGE_STIFFNESS),
+        ({"friction.stiffness": 1.0}, Status.LARGE_STIFFNESS),
         ({"gamma0": 0.02}, Status.SHEAR_BEYOND_COMPRESSION),
         ({"delta0": 0.1, "t0": 150.0}, Status.DEEP_OVERLAP),
         ({"t0": 120.0}, Status.NOT_QUASI_STATIC),
@@ -203,8 +207,22 @@ def test_steps_that_are_not_stable_are_refused_with_both_numbers(monkeypatch: py
     experiment = gm.Experiment(PACK, two_bumps(1.0, -0.6), gm.Hooke(stiffness=0.93), t0=225.0, steps=1)
     with pytest.raises(ValueError, match=r"dt = 0\.879 t_c exceeds the largest stable step .*, 0\.8[0-3]\d? t_c"):
         gm.run(experiment)
+    with pytest.raises(ValueError, match=r"dt = 0\.586 t_c exceeds .*, 0\.5[3-6]\d? t_c; use a smaller dt"):
+        gm.run(gm.replace(experiment, {"friction.stiffness": 2.0, "t0": 150.0}))
+    with pytest.raises(ValueError, match=r"exceeds .*, below 0\.1 t_c; friction\.stiffness = 1e\+09 makes"):
+        gm.run(gm.replace(experiment, {"friction.stiffness": 1e9}))
+
+
+@pytest.mark.parametrize("law", [gm.Hooke(), gm.MindlinRescaled(), gm.Mindlin(), gm.Frictionless()])
+def test_nothing_is_estimated_for_default_numbers_in_default_steps(
+    law: FrictionLaw, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("gmem_jax.experiment.stepping.stable_step", lambda _: 0.0)
-    gm.run(gm.replace(experiment, t0=75.0, steps=None, store=0.1))  # at the default step nothing is estimated
+    experiment = gm.Experiment(PACK, two_bumps(1.0, -0.6), law)
+    for one in (experiment, gm.replace(experiment, wall_mu=None if law == gm.Frictionless() else 1.0)):
+        require_stable(one)
+    with pytest.raises(ValueError, match="exceeds the largest stable step"):
+        require_stable(gm.replace(experiment, dt=0.7))
 
 
 def test_the_smallest_stable_step_is_that_of_the_stiffest_replica_and_of_either_end() -> None:
@@ -216,6 +234,13 @@ def test_the_smallest_stable_step_is_that_of_the_stiffest_replica_and_of_either_
     assert gm.stable_step(gm.Experiment(PACK, bumps, gm.Hooke(mu=0.0))) == 2.0
     deep = gm.Experiment(PACK, bumps, gm.MindlinRescaled(), delta0=0.2)  # whose springs stiffen with the overlap
     assert gm.stable_step(deep) < gm.stable_step(gm.replace(deep, delta0=0.01))
+
+
+@pytest.mark.parametrize("name", ["spread-27", "periodic-27"])
+@pytest.mark.parametrize("law", [gm.Hooke(), gm.MindlinRescaled()], ids=["H", "M1"])
+def test_default_steps_are_stable_for_sizes_that_differ_and_without_walls(name: str, law: FrictionLaw) -> None:
+    pack = gm.load_pack(TETRA_27.parent / f"{name}.h5")
+    require_stable(gm.Experiment(pack, two_bumps(1.0, -0.6), law))
 
 
 def test_round_off_is_as_large_as_the_recall_says() -> None:

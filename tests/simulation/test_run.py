@@ -139,10 +139,16 @@ FAST = {"t0": 60.0, "rest": 0.02, "hold": 0.02, "store": 0.02}
 
 
 @pytest.mark.parametrize("name", UNSTABLE)
-def test_a_run_that_broke_names_the_number_that_made_its_steps_unstable(name: str) -> None:
+def test_a_run_that_broke_names_the_number_that_made_its_steps_unstable(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    experiment = gm.Experiment(PACK, gm.words(1), **FAST, **UNSTABLE[name])
+    with pytest.raises(ValueError, match=rf"below 0\.1 t_c; {name} = 1e\+09 makes steps beyond .* unstable"):
+        gm.run(experiment)
+    monkeypatch.setattr("gmem_jax.experiment.run.require_stable", lambda _: None)
     words = rf"rest: grains moved by most of R within one bin: {name} = 1e\+09 makes steps beyond .* unstable"
     with pytest.raises(gm.RunFailedError, match=words):
-        gm.run(gm.Experiment(PACK, gm.words(1), **FAST, **UNSTABLE[name]))
+        gm.run(experiment)
 
 
 SOFTER = {  # other numbers, other laws, and one replica alone
@@ -161,7 +167,8 @@ def test_the_number_that_makes_steps_unstable_is_found_by_any_law_and_in_any_rep
     assert re.match(rf"{name} = [\d.]+ makes steps beyond 0\.\d+ t_c unstable, and dt is 0\.\d+; use a smaller", told)
 
 
-def test_a_run_that_broke_for_no_number_that_is_known_says_what_to_try() -> None:
+def test_a_run_that_broke_for_no_number_that_is_known_says_what_to_try(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gmem_jax.experiment.run.require_stable", lambda _: None)
     stiff = gm.Experiment(PACK, gm.words(1), material=gm.Material(poisson=-0.9999), **FAST)
     with pytest.raises(gm.RunFailedError, match="one bin: the steps are unstable; use a smaller dt, or check pack"):
         gm.run(stiff)
