@@ -42,24 +42,49 @@ def modules() -> dict[str, Path]:
 
 
 MODULES = modules()
-LATE = ("import_module", "__import__")  # imports by a string
+LATE = ("import_module", "__import__", "optional")  # imports by a string; the last is that of files.validation
+COMPUTED = {  # modules that import by a name that they compute
+    "gmem_jax": "public names, by its table",
+    "gmem_jax.files.validation": "`optional`, whose calls are looked at",
+}
 
 
-def imports(name: str) -> set[str]:
+def late_names(tree: ast.AST) -> set[str]:
+    """What a module calls the functions that import by a string."""
+    names = set(LATE)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            names |= {alias.asname for alias in node.names if alias.asname and alias.name in LATE}
+        elif isinstance(node, ast.Assign) and ast.unparse(node.value).rpartition(".")[2] in LATE:
+            names |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+    return names
+
+
+def named(argument: ast.expr | None) -> str | None:
+    """The module that a string names, or an f-string the package of; None for what is computed."""
+    if isinstance(argument, ast.JoinedStr) and isinstance(argument.values[0], ast.Constant):
+        return str(argument.values[0].value).rpartition(".")[0] or None
+    whole = isinstance(argument, ast.Constant) and not str(argument.value).startswith(".")
+    return str(argument.value) if whole else None  # type: ignore[union-attr]
+
+
+def imports(name: str, source: str | None = None) -> set[str]:
     """The modules of this package that a module imports anywhere in it: late, for types, and by strings too."""
     found = set()
-    for node in ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
+    tree = ast.parse(MODULES[name].read_text(encoding="utf-8") if source is None else source)
+    late = late_names(tree)
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{name}: relative import in line {node.lineno}"
             below = {f"{node.module}.{alias.name}" for alias in node.names}
             found |= {one if one in MODULES else str(node.module) for one in below}
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in (
-            "import_module",
-            "__import__",
-        ):
-            found |= {one.value for one in node.args[:1] if isinstance(one, ast.Constant)}
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in late:
+            given = [*node.args[:1], *(word.value for word in node.keywords if word.arg == "name")]
+            module = named(given[0] if given else None)
+            assert module or name in COMPUTED, f"{name}: import of a computed name in line {node.lineno}"
+            found.add(module or "")
     return {one for one in found if one.split(".")[0] == ROOT.name}
 
 
@@ -77,6 +102,32 @@ def test_imports_point_downwards(name: str) -> None:
     above = [one for one in imports(name) if one == ROOT.name or floor(one) > floor(name)]
     assert not above, f"{name} imports {', '.join(sorted(above))}"
     assert all(one in MODULES for one in imports(name))
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        "importlib.import_module('gmem_jax.command.app')",
+        "__import__('gmem_jax.command.app')",
+        "optional(name='gmem_jax.command.app', extra='')",
+        "from importlib import import_module as load\nload('gmem_jax.command.app')",
+        "load = importlib.import_module\nload('gmem_jax.command.app')",
+        "import_module(f'gmem_jax.command.{name}')",
+        "import_module(f'gmem_jax.{name}')",
+    ],
+)
+def test_an_import_upwards_by_a_string_is_noticed(planted: str) -> None:
+    (found,) = imports("gmem_jax.physics.state", planted)
+    assert found == ROOT.name or floor(found) > floor("gmem_jax.physics.state")
+
+
+@pytest.mark.parametrize("planted", ["import_module(name)", "__import__(f'{name}')", "import_module('.app', package)"])
+def test_an_import_by_a_computed_name_is_noticed(planted: str) -> None:
+    with pytest.raises(AssertionError, match="computed name in line 1"):
+        imports("gmem_jax.physics.state", planted)
+    for name in COMPUTED:  # none of them is listed in vain
+        with pytest.raises(AssertionError, match="computed name"):
+            imports("gmem_jax.physics.state", MODULES[name].read_text(encoding="utf-8"))
 
 
 def test_no_import_goes_in_a_circle() -> None:
