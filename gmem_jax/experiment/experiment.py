@@ -79,19 +79,20 @@ class Experiment:
         friction: the friction law.
         material: the elastic solid.
         gamma0: shear amplitude.
-        shear_share: of it on each axis: L_x shrinks and L_y grows by this part of gamma; see
+        shear_share: the part of gamma by which L_x shrinks and L_y grows; see
             `gmem_jax.simulation.strain.StrainPath`.
         delta0: areal compression; default the pack's own. Another value makes `run` warn.
         t0: duration of one compression, in t_c. The paper's is 1.8e4.
         hold_drag: viscous drag while the walls stand still, 1 / t_c; default 0.05 for t0 below the paper's, else 0.
-        creep: rate at which elastic tangential forces relax, 1 / t_c; default never. A twentieth of a bin's at most.
-        creep_fades: time in a stage after which that rate falls as 1 / t, in t_c; default it stays.
+        creep: rate at which elastic tangential forces relax, 1 / t_c; default: they never relax. In one bin at most a
+            twentieth of a force may relax.
+        creep_fades: time in a stage after which that rate falls as 1 / t, in t_c; default: the rate stays constant.
         gravity: its acceleration along -z, in R / t_c^2, that is E / (rho R); default none. It acts from the start on.
         wall_mu: friction coefficient of the walls, whose contacts take the friction law with it; default smooth walls.
             Like mu it acts from the start on, and a stage without friction has none.
         dt: largest time step, in t_c.
         steps: steps in a bin of t0 / 256; default the fewest that `dt` allows. Needed where t0 is a tracer.
-        steps_per_bin: what follows from that.
+        steps_per_bin: the number of steps in a bin that follows from `dt` or `steps`.
         rest: rests at u = 0, in t0.
         hold: holds at u = 1, in t0.
         store: storage, in t0.

@@ -130,7 +130,7 @@ def run(
         batch: signals that run together; default all of them. Each batch has a zero signal of its own.
         devices: that share out the replicas; default all that JAX sees, also those of other processes.
         frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
-        frames_of: the signal whose they are, from 1; 0 for the zero signal.
+        frames_of: the signal whose replica is recorded, from 1; 0 for the zero signal.
         frames_at: compressions u, 0 to 1, at which more are kept, each time that the run passes them, to the next of
             256 bins: u = 0.5 gives one of every compression and decompression.
         cache: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).

@@ -47,9 +47,9 @@ def plot(
         recall: the recall.
         what: "signals", recalled; "waveforms", stored; "all", an image of all; or a quantity of the stages, like
             "pressure", "p_xy", "Z" or "phi"; or what an observer gave, like "observed:sliding".
-        experiment: that it is of, for names, conditions and t0, if the recall does not say them itself.
+        experiment: the one that was recalled, for names, conditions and t0; default what the recall says of itself.
         against: "time" or "u", for the stages.
-        signals: numbers of those to draw, from 1; of the stages also 0, the zero signal. Default all.
+        signals: the numbers of the signals to draw, from 1; of the stages also 0, the zero signal. Default all.
 
     Raises:
         ValueError: if there is no such picture, or no such signal; it names those that there are.
