@@ -1504,6 +1504,13 @@ MUTATIONS = (
         "test_all_ways_to_a_second_derivative_agree",
     ),
     mutation(
+        "walls-of-pieces-as-they-are-gone-back-through",
+        "native/primitives.py",
+        "jnp.concatenate(walls[::-1], axis=-3)",
+        "jnp.concatenate(walls, axis=-3)",
+        "test_the_adjoint_is_the_transpose_of_the_tangent[H-True]",
+    ),
+    mutation(
         "adjoint-of-rings-in-periodic-boxes",
         "cpu/adjoint.h",
         "if (general) move_to_image(input, taped_image, taped_cell);",

@@ -3,10 +3,12 @@
 The tangent is a primitive of JAX with a rule for its transpose, so that `jax.jvp`, `jax.linearize`, `jax.grad` and
 their compositions with `jax.vmap` and `jax.checkpoint` all come out of the two calls. Forward mode runs the steps in
 numbers that carry a derivative; reverse mode redoes them, remembers each step, and goes back (src/cpu/adjoint.h).
+Where it would remember too much at once, it goes back through one piece of the steps after the other.
 Second derivatives are the derivative of the adjoint along a direction: reverse mode in numbers that carry one.
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,6 +28,10 @@ from gmem_jax.native.calls import (
     of_results,
     results_of,
 )
+
+# Bytes for what reverse mode keeps of the steps of a call. The usual 12 steps of 10,240 grains keep 0.7 GB with law H;
+# to go back in pieces costs one more way forward, which only longer bins of large packs are to pay.
+STEPS_ROOM = 2**30
 
 
 def advance(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays) -> StepOutput:
@@ -99,6 +105,46 @@ def _whole_slopes(slopes: Sequence[Any]) -> list[jax.Array]:
     return [ad.instantiate_zeros(slope) for slope in slopes]
 
 
+def piece_count(call: Call, arrays: Arrays) -> int:
+    """How many pieces reverse mode cuts the steps of a call into.
+
+    T steps that keep more than `STEPS_ROOM` are cut into about sqrt(T), into fewer where a state, kept before each
+    piece, takes more than a step keeps (Mindlin's rings). What steps keep is counted as room for the replicas that a
+    CPU takes side by side: 25 numbers of a grain (19 of its state, force and torque) and the histories, of rings six
+    numbers a contact. In periodic boxes, where pieces would begin with edges of their own, the steps are one piece.
+    """
+    steps, _, replicas = arrays.walls.shape[-3:]
+    inner = [leaf.shape[arrays.walls.ndim - 3 : -1] for leaf in arrays.history]  # [P, h], or [P, Q, 2] of rings
+    remembered = sum(shape[0] * (shape[1] if len(shape) == 2 else 6) for shape in inner)
+    kept = 8 * (4 if replicas <= 4 else 8) * steps * (25 * arrays.fields[0].shape[-3] + remembered)
+    if kept <= STEPS_ROOM or call.periodic:
+        return 1
+    state = 8 * sum(leaf.size for leaf in (*arrays.fields, *arrays.history))
+    return max(1, round(math.sqrt(min(steps, kept / state))))
+
+
+def _adjoint(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, slopes: StepOutput) -> list[jax.Array]:
+    """The leaves of derivatives by `arrays`, from those by the results of the steps.
+
+    The state before each piece of the steps is kept; what a piece keeps, while it is gone back through.
+    """
+    pieces = jnp.array_split(arrays.walls, piece_count(call, arrays), axis=-3)
+    before = [arrays._replace(walls=pieces[0])]
+    for piece in pieces[1:]:
+        moved = results_of(arrays, bind(_forward_p, call, definition, fixed, before[-1]))
+        before.append(arrays._replace(fields=moved.fields, walls=piece, history=moved.history))
+    own = []
+    while before:
+        leaves = bind(_adjoint_p, call, definition, fixed, before.pop(), slopes)
+        bars: Arrays = jax.tree.unflatten(jax.tree.structure(arrays), leaves)
+        slopes = slopes._replace(fields=bars.fields, history=bars.history)
+        own.append((bars.parameters, bars.offsets, bars.walls))
+    parameters, offsets, walls = zip(*own, strict=True)
+    parameters, offsets = (functools.reduce(jnp.add, some) for some in (parameters, offsets))
+    whole = jnp.concatenate(walls[::-1], axis=-3)
+    return jax.tree.leaves(bars._replace(parameters=parameters, walls=whole, offsets=offsets))
+
+
 def _transpose_tangent(
     slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition
 ) -> list[Any]:
@@ -106,7 +152,7 @@ def _transpose_tangent(
     fixed, arrays, _ = jax.tree.unflatten(tree, arguments)
     known = len(jax.tree.leaves((fixed, arrays)))
     on_results = results_of(arrays, _whole_slopes(slopes))
-    found = bind(_adjoint_p, call, definition, fixed, arrays, on_results)
+    found = _adjoint(call, definition, fixed, arrays, on_results)
     return [None] * known + _sums(found, arguments[known:])
 
 

@@ -14,6 +14,7 @@ from transposed import assert_transposed
 
 import gmem_jax as gm
 from gmem_jax import native
+from gmem_jax.native import calls, primitives
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.state import State, replicate
 from gmem_jax.physics.step import start
@@ -114,6 +115,30 @@ def test_the_adjoint_is_the_transpose_of_the_tangent(name: str, isotropic: bool)
     steps = (motion().box_at(180.0 + 0.3 * (step + 1)) for step in range(20))
     boxes = jax.tree.map(lambda *leaves: jnp.stack(leaves), *steps)
     assert_transposed(replace(turning(system, isotropic), gravity=jnp.asarray(1e-3)), state, boxes)
+
+
+@pytest.mark.parametrize(
+    ("grains", "contacts", "steps", "replicas", "rings", "pieces"),
+    [
+        (10_240, 215_000, 12, 8, 0, 1),
+        (10_240, 215_000, 235, 8, 0, 15),
+        (10_240, 215_000, 235, 1, 0, 15),
+        (3_267, 61_440, 60, 6, 32, 4),  # a state with rings takes more than a step keeps ...
+        (3_267, 61_440, 60, 6, 1000, 1),  # ... or than all steps
+    ],
+)
+def test_long_bins_of_large_packs_are_gone_back_through_in_pieces(
+    grains: int, contacts: int, steps: int, replicas: int, rings: int, pieces: int
+) -> None:
+    def array(*shape: int) -> Any:
+        return jax.ShapeDtypeStruct((*shape, replicas), jnp.float64)
+
+    fields = [array(grains, rows) for rows in (3, 4, 3, 3)]
+    history = [array(contacts, 3)] if rings == 0 else [array(contacts, *rows) for rows in ((rings, 2), (3,), (1,))]
+    arrays = calls.Arrays(fields, array(22), array(steps, 12), array(4, 3), history)
+    call = calls.Call(law=1, variant=0, points=rings, isotropic=1, leaves=len(history))
+    assert primitives.piece_count(call, arrays) == pieces
+    assert primitives.piece_count(call._replace(periodic=1), arrays) == 1
 
 
 @pytest.mark.parametrize(("name", "isotropic", "backwards"), [("H", True, True), *ALIKE])
