@@ -682,8 +682,8 @@ MUTATIONS = (
     mutation(
         "adjoint-remote-of-the-other-sphere",
         "plan.cc",
-        "away(c) == c.grain_one ? c.one : c.other",
-        "away(c) == c.grain_one ? c.other : c.one",
+        "c.away_is_one() ? c.one : c.other",
+        "c.away_is_one() ? c.other : c.one",
         f"{ACROSS}[H]",
     ),
     mutation(
