@@ -3,7 +3,9 @@
 python docs/make/options_page.py
 """
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from gmem_jax.bench.table import into
 from gmem_jax.command.options import experiment_options
@@ -15,7 +17,9 @@ PAGE = Path(__file__).parents[1] / "howto" / "command_line.md"
 
 def page() -> str:
     """The page with a table of today's options."""
-    known = {name: entry.metadata for name, entry in {**OF_LAW, **OF_MATERIAL, **NUMBERS}.items()}
+    known: dict[str, Mapping[str, Any]] = {
+        name: entry.metadata for name, entry in {**OF_LAW, **OF_MATERIAL, **NUMBERS}.items()
+    }
     lines = ["| option | | unit | in | default |", "|---|---|---|---|---|"]
     for name, (default, _, words, _) in experiment_options().items():
         entry = known.get(name, {"words": words.rstrip("."), "unit": ""})
