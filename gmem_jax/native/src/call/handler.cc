@@ -77,7 +77,7 @@ enum Argument {
   kWallRows,
   kHistoryIn
 };
-constexpr int kPressure = kFields, kHistoryOut = kFields + 1;  // results
+constexpr int kHistoryOut = kFields + 1;  // results: after the pressure
 
 struct Signature {
   Wants arguments, results;

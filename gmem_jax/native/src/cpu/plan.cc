@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstring>
 #include <deque>
+#include <functional>
 #include <map>
 #include <mutex>
 #include <numeric>
@@ -66,7 +67,7 @@ std::vector<int32_t> spatial_order(const List& list) {
 }
 
 // A power of two, to end where the bisection did: 4 for a pack of 325 grains, 32 for 31,680. More would occupy more
-// threads, but every force between two domains is written to memory and read again.
+// threads, but their sums of forces on each other's grains are written to memory and read again.
 int domains_for(int candidates) {
   const double logarithm = 0.5 * std::log2(std::max(1.0, candidates / 330.0));
   return 1 << static_cast<int>(std::lround(logarithm));
@@ -101,12 +102,10 @@ void sort_by(std::vector<Candidate>& candidates, int end, const Number& number) 
 // likewise the contacts of these sums, which are sorted by their domains.
 void number_remotes(const std::vector<int32_t>& domain_of, PlanStore& store) {
   const std::size_t grains = domain_of.size();
-  const auto home = [](const Candidate& c) { return std::min(c.grain_one, c.grain_other); };
-  const auto away = [](const Candidate& c) { return std::max(c.grain_one, c.grain_other); };
   std::vector<std::vector<int32_t>> of_grain(grains);
   for (std::size_t n = 0; n < store.candidate.size(); ++n)
-    if (domain_of[home(store.candidate[n])] != domain_of[away(store.candidate[n])])
-      of_grain[away(store.candidate[n])].push_back(static_cast<int32_t>(n));
+    if (const Candidate& c = store.candidate[n]; domain_of[c.home()] != domain_of[c.away()])
+      of_grain[c.away()].push_back(static_cast<int32_t>(n));
   store.remote_start.push_back(0);
   store.remote_contact_start.push_back(0);
   int32_t remotes = 0;
@@ -114,7 +113,7 @@ void number_remotes(const std::vector<int32_t>& domain_of, PlanStore& store) {
     int32_t domain = -1;
     for (const int32_t n : contacts) {
       Candidate& c = store.candidate[n];
-      if (domain_of[home(c)] != domain) domain = domain_of[home(c)], ++remotes;
+      if (domain_of[c.home()] != domain) domain = domain_of[c.home()], ++remotes;
       c.remote = remotes - 1;
       c.remote_contact = static_cast<int32_t>(store.remote_contact_sphere.size());
       store.remote_contact_sphere.push_back(c.away_is_one() ? c.one : c.other);
@@ -156,10 +155,8 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
     candidates.push_back(
         {grain_i * spheres + i % spheres, grain_j * spheres + j % spheres, grain_i, grain_j, -1, -1, row});
   }
-  const auto home = [](const Candidate& c) { return std::min(c.grain_one, c.grain_other); };
-  const auto away = [](const Candidate& c) { return std::max(c.grain_one, c.grain_other); };
-  sort_by(candidates, list.grains, away);  // by rows they are
-  sort_by(candidates, list.grains, home);
+  sort_by(candidates, list.grains, std::mem_fn(&Candidate::away));  // by rows they are
+  sort_by(candidates, list.grains, std::mem_fn(&Candidate::home));
 
   // Domains end between grains.
   const int count = static_cast<int>(candidates.size());
@@ -169,7 +166,7 @@ std::shared_ptr<const PlanStore> make_plan(const List& list) {
   int next = 0;
   for (int g = 0; g < list.grains; ++g) {
     domain_of[g] = static_cast<int>(store->domain_candidate.size()) - 1;
-    while (next < count && home(candidates[next]) == g) ++next;
+    while (next < count && candidates[next].home() == g) ++next;
     const int64_t ended = static_cast<int>(store->domain_candidate.size());
     if (ended < wanted && next >= ended * count / wanted) store->domain_candidate.push_back(next);
   }

@@ -4,7 +4,7 @@
 //
 //   pack    a candidate list (as a plan) and the shape of a grain, which replicas may share.
 //   plan    the candidates sorted for memory and threads, with grains and spheres numbered anew (plan.h).
-//   lane    one of the W doubles of a vector of the CPU; and the replica that is computed in it, `ReplicaArrays`.
+//   lane    one of the W doubles of a vector of the CPU. In most blocks it has a replica, whose arrays are `ReplicaArrays`.
 //   block   what a team of threads computes at once: W replicas of one pack, each in a lane (replicas.h), or one replica
 //           whose grains and contacts fill the lanes (packed.h). These two are the modes of an `Engine` (block.h).
 //   unit    the grains of one vector: one grain of W replicas, or W grains of one replica.
@@ -57,6 +57,8 @@ struct Candidate {
 
   // Of two grains in different domains that of the lower number is at home, the other away.
   bool away_is_one() const { return grain_one > grain_other; }
+  int32_t home() const { return away_is_one() ? grain_other : grain_one; }
+  int32_t away() const { return away_is_one() ? grain_one : grain_other; }
 };
 
 // By how many edges of a periodic box the second sphere of a candidate is moved along each axis.
@@ -130,8 +132,7 @@ struct ReplicaArrays {
 struct Block {
   const Pack* pack;
   const ReplicaArrays* lanes;
-  const ReplicaArrays*
-      slopes;  // derivatives of the arguments along a direction; with the results where these are tangents
+  const ReplicaArrays* slopes;      // derivatives of the arguments along a direction, and of results that are tangents
   const ReplicaArrays* bars;        // in reverse mode, derivatives by the results and by the arguments
   const ReplicaArrays* bar_slopes;  // derivatives of the former along the direction
   int count;                        // 1 to W, or to 2 W where it is wide
