@@ -1,6 +1,6 @@
 """Figures of recalled signals, and `gm.plot`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import running_mean
 from gmem_jax.experiment.arguments import require_kind, require_several
-from gmem_jax.experiment.experiment import PAPER_T0, Experiment
+from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.record import describe, values_of
+from gmem_jax.experiment.record import values_of
 from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.validation import is_number
 from gmem_jax.physics.material import Material
@@ -34,7 +34,6 @@ PICTURES = (*OF_SIGNALS, *QUANTITIES)
 def plot(
     recall: Recall,
     what: str = "signals",
-    experiment: Experiment | None = None,
     *,
     against: str = "time",
     signals: Sequence[int] = (),
@@ -47,7 +46,6 @@ def plot(
         recall: the recall.
         what: "signals", recalled; "waveforms", stored; "all", an image of all; or a quantity of the stages, like
             "pressure", "p_xy", "Z" or "phi"; or what an observer gave, like "observed:sliding".
-        experiment: the one that was recalled, for names, conditions and t0; default what the recall says of itself.
         against: "time" or "u", for the stages.
         signals: the numbers of the signals to draw, from 1; of the stages also 0, the zero signal. Default all.
 
@@ -56,14 +54,12 @@ def plot(
     """
     require_kind("plot", recall, Recall)
     require_several(signals, "signals")
-    known = None if experiment is None else describe(experiment, 0.0)
-    return to_matplotlib(recall_figure(recall, what, known, against=against, signals=signals))
+    return to_matplotlib(recall_figure(recall, what, against=against, signals=signals))
 
 
 def recall_figure(
     recall: Recall,
     what: str = "signals",
-    configuration: Mapping[str, Any] | None = None,
     *,
     against: str = "time",
     signals: Sequence[int] = (),
@@ -73,15 +69,13 @@ def recall_figure(
     Args:
         recall: the recall.
         what: one of `PICTURES`, or "observed:NAME".
-        configuration: for names, conditions and t0; default the recall's own.
         against: "time" or "u", for the stages.
         signals: numbers of those to draw.
 
     Raises:
         ValueError: if there is no such picture, or no such signal.
     """
-    known = dict(configuration or recall.configuration)
-    names = recall.described(known).names
+    known, names = recall.configuration, recall.names
     title = tables.heading(known) if known else "recall"
     quantities = QUANTITIES | observed_quantities(recall.stages, known.get("observed", {}))
     pictures = dict.fromkeys((*PICTURES, *quantities))

@@ -155,10 +155,10 @@ def of_recall(
     configuration, row = recall.configuration, summary(recall)
     choice: dict[str, Any] = {"against": against, "signals": signals}
     pictures = (*PICTURES, *observed_quantities(recall.stages, configuration.get("observed", {})))
-    drawn: dict[str, Draw] = {what: partial(recall_figure, recall, what, configuration, **choice) for what in pictures}
+    drawn: dict[str, Draw] = {what: partial(recall_figure, recall, what, **choice) for what in pictures}
     if row.get("each"):
         drawn |= {
-            f"{what}/{one.reads[0]}/{one.channels[0]}": partial(recall_figure, one, what, configuration, **choice)
+            f"{what}/{one.reads[0]}/{one.channels[0]}": partial(recall_figure, one, what, **choice)
             for one in recall.each()
             for what in OF_SIGNALS
         }

@@ -225,12 +225,12 @@ def test_frames_at_chosen_compressions_are_kept(monkeypatch: pytest.MonkeyPatch,
 
 
 def test_chosen_signals_are_the_columns_of_their_replicas(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
-    experiment, recall = recalled
-    (axis,) = gm.plot(recall, "p_xy", experiment, signals=[2]).figure.axes
+    recall = recalled[1]
+    (axis,) = gm.plot(recall, "p_xy", signals=[2]).figure.axes
     pressure = np.asarray(recall.stages["readout"].pressure)[:, :, 2]
     lines = [line for line in axis.lines if len(line.get_xdata()) > 2]
     np.testing.assert_allclose(lines[-1].get_ydata() / (pressure[:, 0] - pressure[:, 1]), gm.Material().modulus)
-    figure = gm.plot(recall, "signals", experiment, signals=[2]).figure
+    figure = gm.plot(recall, "signals", signals=[2]).figure
     assert [axis.get_title() for axis in figure.axes if axis.get_title()] == ["1"]
     np.testing.assert_allclose(figure.axes[0].lines[1].get_ydata(), gm.Material().modulus * recall.p_sig[1])
     assert "of all 2 signals" in " ".join(figure._suptitle.get_text().split())
@@ -264,13 +264,10 @@ def test_a_choice_of_signals_that_cannot_be_is_refused_in_a_line(
 
 def test_where_a_drive_rings_the_mean_over_the_ringing_is_drawn(recalled: tuple[gm.Experiment, gm.Recall]) -> None:
     experiment, recall = recalled
-    labels = [text.get_text() for text in gm.plot(recall, "signals", experiment).figure.legends[0].get_texts()]
+    labels = [text.get_text() for text in gm.plot(recall).figure.legends[0].get_texts()]
     assert recalls.MEAN in labels
-    slow = gm.describe(gm.replace(experiment, t0=1.8e4))
-    labels = [
-        text.get_text()
-        for text in to_matplotlib(recalls.recall_figure(recall, "signals", slow)).figure.legends[0].get_texts()
-    ]
+    slow = recall.described(gm.describe(gm.replace(experiment, t0=1.8e4)))
+    labels = [text.get_text() for text in gm.plot(slow).figure.legends[0].get_texts()]
     assert recalls.MEAN not in labels
 
 

@@ -61,13 +61,12 @@ def test_what_is_recorded_stands_in_files_and_can_be_drawn(recalled: tuple[gm.Ex
         assert any(curve.y.shape == (count,) and np.array_equal(curve.y, first) for curve in panel.curves), name
 
 
-def test_a_recall_without_its_configuration_is_drawn_with_the_names_of_an_experiment(
+def test_a_recall_is_drawn_with_the_names_of_its_configuration(
     recalled: tuple[gm.Experiment, gm.Recall],
 ) -> None:
     experiment, recall = recalled
-    bare = recall.described({})
-    for known, names in ((None, ["signal 1", "signal 2"]), (experiment, ["0", "1"])):
-        drawn = gm.plot(bare, "signals", known)
+    for known, names in (({}, ["signal 1", "signal 2"]), (gm.describe(experiment), ["0", "1"])):
+        drawn = gm.plot(recall.described(known))
         assert [axis.get_title() for axis in drawn.figure.axes[:2]] == names
 
 

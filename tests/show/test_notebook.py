@@ -86,14 +86,14 @@ def test_a_long_table_says_how_much_is_left_out_and_names_cannot_break_it() -> N
 
 def test_a_recall_draws_itself(recalled: tuple[gm.Experiment, gm.Recall], tmp_path: Path) -> None:
     experiment, recall = recalled
-    drawn = gm.plot(recall, "signals", experiment)
+    drawn = gm.plot(recall, "signals")
     assert drawn._repr_png_().startswith(b"\x89PNG")
     title = " ".join(drawn.figure._suptitle.get_text().split())
     assert all(word in title for word in ("mu = 1", "gamma0 = 0.001", "t0 = 75 t_c", "all 2 words"))
     stress, wave = drawn.figure.axes[0], drawn.figure.axes[2]
     assert (stress.get_title(), wave.get_ylabel(), stress.get_ylabel()) == ("0", "", "stress (Pa)")
     np.testing.assert_allclose(stress.lines[1].get_ydata() * 1e-10, 0.0, atol=1e-3)
-    (axis,) = gm.plot(recall, "z", experiment).figure.axes
+    (axis,) = gm.plot(recall, "z").figure.axes
     assert (axis.get_xlabel(), axis.get_ylabel()) == ("time ($t_c$)", "coordination Z")
     total = sum(len(line.get_xdata()) for line in axis.lines if len(line.get_xdata()) > 2)
     assert total == experiment.protocol.bins
