@@ -16,10 +16,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import TETRA_27
+from scenes import TETRA_27, gmem
 
 import gmem_jax as gm
-from gmem_jax.command import app
 from gmem_jax.experiment import analysis
 from gmem_jax.show import render_plotly
 from gmem_jax.show.recalls import signals_figure
@@ -274,13 +273,6 @@ def test_a_view_of_a_notebook_is_a_page_in_a_frame() -> None:
     shown = gm.view(PACK)._repr_html_()
     assert shown.startswith("<iframe srcdoc=")
     assert shown.count("<") == 2  # its own tags; all of the page is escaped
-
-
-def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        app.main()
-    return int(stop.value.code or 0)
 
 
 def test_the_command_writes_a_page_and_says_where(
