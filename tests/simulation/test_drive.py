@@ -142,7 +142,7 @@ def test_the_protocol_is_continuous_in_u_and_takes_6_6_t0():
 
 def test_a_preparation_cycle_has_no_shear_and_returns_to_the_start():
     stages = cycle(rest=0.1, hold=0.3)
-    assert not any(stage.sheared for stage in stages)
+    assert not any(stage.drives for stage in stages)
     assert [stage.length for stage in stages] == [0.1, 1.0, 0.3, 1.0]
     assert [stage.start == stage.stop for stage in stages] == [True, False, True, False]
     assert stages[-1].stop == stages[0].start

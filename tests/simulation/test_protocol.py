@@ -37,7 +37,7 @@ def test_rests_holds_and_storage_have_lengths_of_their_own() -> None:
 
 def test_only_the_encoding_is_sheared_and_all_before_it_is_common() -> None:
     stages = memory_protocol(REST, HOLD, STORE, second_readout=True)
-    assert [stage.name for stage in stages if stage.sheared] == ["encode"]
+    assert [stage.name for stage in stages if stage.drives] == ["encode"]
     common, own = stages.phases
     assert written(common + own) == FIRST + AGAIN
     assert own[0].name == "encode"
@@ -46,7 +46,7 @@ def test_only_the_encoding_is_sheared_and_all_before_it_is_common() -> None:
 def test_a_pulse_before_the_compression_takes_the_shear_from_it() -> None:
     protocol = memory_protocol(REST, HOLD, STORE, second_readout=False, shear="before")
     stages = protocol.stages
-    assert [stage.name for stage in stages if stage.sheared] == ["pulse"]
+    assert [stage.name for stage in stages if stage.drives] == ["pulse"]
     assert [stage.name for stage in stages][4:7] == ["rest-2", "pulse", "encode"]
     assert (stages[5].start, stages[5].stop, stages[5].bins) == (0.0, 0.0, 256)
     _, own = protocol.phases
@@ -79,7 +79,7 @@ def test_the_table_counts_the_bins_of_every_stage_from_zero() -> None:
         np.testing.assert_array_equal(rows.number[here], np.arange(stage.bins))
         assert {*np.asarray(rows.bins)[here]} == {stage.bins}
         assert {*np.asarray(rows.start)[here], *np.asarray(rows.stop)[here]} == {stage.start, stage.stop}
-        assert {*np.asarray(rows.amplitudes[0])[here]} == {float(stage.sheared)}
+        assert {*np.asarray(rows.amplitudes[0])[here]} == {float(bool(stage.drives))}
         place += stage.bins
     assert place == len(rows.number) == 26 + 256 + 77 + 256 + 26 + 256 + 180 + 256 + 26 + 256 + 77 + 256
 
