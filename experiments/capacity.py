@@ -9,16 +9,15 @@ was killed; some 2.5e10 grain-steps in all. What stands in the table is drawn to
 """
 
 import argparse
-import csv
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import jax
-import matplotlib
 import numpy as np
 from console import say
 from packs import over_packs
+from rows import done, note
 
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import KERNEL_BUMP_WIDTH, KERNEL_BUMPS
@@ -28,6 +27,7 @@ from gmem_jax.experiment.run import LARGEST_BATCH
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.physics.material import Material
 from gmem_jax.reading.capacity import candidates, channels, decoded_bits, greedy_alphabet, smallest_distance
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
 ROUND_OFF = 1e-9  # of p_sig: what another order of grains, skin or instruction set changes (docs/trust.md)
 TIME_STEP = 2e-3  # of p_sig: what a time step four times shorter changes (docs/trust.md)
@@ -84,7 +84,7 @@ class Table:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.rows: list[Row] = list(csv.DictReader(path.open())) if path.exists() else []
+        self.rows: list[Row] = done(path)
 
     def note(self, case: Case, study: str, found: Iterable[Found]) -> None:
         """Add what a study finds, unless it is there already."""
@@ -93,12 +93,7 @@ class Table:
             return
         key |= {"N": str(case.experiment.pack.grains)}
         rows = [key | {name: _text(value) for name, value in each.items()} for each in found]
-        new = not self.path.exists()
-        with self.path.open("a") as file:
-            writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
-            if new:
-                writer.writeheader()
-            writer.writerows(rows)
+        note(self.path, COLUMNS, rows)
         self.rows += [dict.fromkeys(COLUMNS, "") | row for row in rows]
         for row in rows:
             print(*(row[name] for name in COLUMNS if name in row), flush=True)
@@ -211,10 +206,7 @@ STYLES = {
 
 def draw(table: Table, path: Path) -> None:
     """Bounds against N and against gamma0, and distances against the size of an alphabet."""
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(15, 4.8))
+    figure, axes = pyplot().subplots(1, 3, figsize=(15, 4.8))
     usual, small = f"{USUAL:g}", min((row["N"] for row in table.rows), key=int)
     names = list(dict.fromkeys(row["noise"] for row in table.pick(study="channels")))
     for axis, by, kept in ((axes[0], "N", {"gamma0": usual}), (axes[1], "gamma0", {"N": small})):
@@ -249,9 +241,7 @@ def draw(table: Table, path: Path) -> None:
     axes[2].set_ylim(top=3.0 * axes[2].get_ylim()[1])  # room for the legend
     axes[2].set_title("predicted; full: simulated", fontsize=9)
     axes[2].legend(fontsize=7, frameon=False)
-    figure.tight_layout()
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    save_picture(path, figure)
 
 
 def points(rows: list[Row]) -> tuple[list[int], list[float]]:

@@ -11,7 +11,6 @@ at t0 = 1,800 takes some 1e10 grain-steps.
 """
 
 import argparse
-import csv
 import sys
 import time
 from dataclasses import replace
@@ -22,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from console import say
 from packs import over_packs
+from rows import done, note
 
 import gmem_jax as gm
 from gmem_jax.design.by_kernel import KERNEL_BUMP_WIDTH, KERNEL_BUMPS
@@ -68,7 +68,7 @@ def main() -> None:
             number = drawn(2**bits, arguments.drawn)
             row = design(folder, any_words, kernel, bits, number, net, arguments.iterations)
             print(row, flush=True)
-            append(folder / TABLE, row)
+            note(folder / TABLE, list(row), [row])
             draw(folder / TABLE, folder / "words.png")
 
 
@@ -116,27 +116,17 @@ def design(
 
 def there(table: Path, pack: str, bits: int, t0: float, iterations: int) -> bool:
     """Whether the table has these words; what is drawn of it is of one rate and one effort."""
-    rows = list(csv.DictReader(table.open())) if table.exists() else []
+    rows = done(table)
     for row in rows:
         if (float(row["t0"]), int(row["iterations"])) != (t0, iterations):
             sys.exit(f"{table}: has words of t0 = {row['t0']}, {row['iterations']} iterations; name another folder")
     return any((row["pack"], row["bits"]) == (pack, str(bits)) for row in rows)
 
 
-def append(table: Path, row: Row) -> None:
-    """A row more."""
-    new = not table.exists()
-    with table.open("a") as file:
-        writer = csv.DictWriter(file, row)
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
-
-
 def draw(table: Path, path: Path) -> None:
     """F and what the net reads against L: as they come and designed, mean and SD over packs; and the published."""
     figure, axes = pyplot().subplots(1, 2, figsize=(10, 4.2))
-    rows = list(csv.DictReader(table.open()))
+    rows = done(table)
     sizes = sorted({gm.load_pack(row["pack"]).grains for row in rows})
     for axis, column, theirs in ((axes[0], "F", "fidelity_sub0"), (axes[1], "net", "classifier_accuracy")):
         place = 0

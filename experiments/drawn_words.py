@@ -31,6 +31,7 @@ from gmem_jax.reading import training
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.net import Net, accuracy
 from gmem_jax.reading.readers import nearest_template
+from gmem_jax.reproduce.compare import write_csv
 from gmem_jax.reproduce.draw import OURS, THEIRS
 from gmem_jax.reproduce.figures import SHOWN_WORD
 from gmem_jax.show.numbers import published
@@ -72,7 +73,7 @@ def main() -> None:
         row = {"pack": pack.name, "t0": arguments.t0, **read(experiment, recall, bits, number, net)}
         print(row, flush=True)
         rows = sorted([row, *(other for other in rows if other["bits"] != bits)], key=lambda one: int(one["bits"]))
-        write(table, rows)
+        write_csv(table, rows)
         draw(rows, table.with_suffix(".png"))
 
 
@@ -111,17 +112,9 @@ def read(experiment: gm.Experiment, recall: gm.Recall, bits: int, number: np.nda
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows that `write` wrote."""
+    """The rows of a table."""
     with path.open() as file:
         return [{**row, "bits": int(row["bits"])} for row in csv.DictReader(file)]
-
-
-def write(path: Path, rows: list[Row]) -> None:
-    """A table of rows."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def over_packs(rows: list[Row]) -> list[Row]:

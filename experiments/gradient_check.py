@@ -14,7 +14,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 from console import say
 
@@ -22,6 +21,7 @@ import gmem_jax as gm
 from gmem_jax.derivatives import jacobian
 from gmem_jax.derivatives.push import push
 from gmem_jax.experiment.changes import value_at
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
 AMPLITUDES = 16
 STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -104,10 +104,7 @@ def draw(
     steps: int,
 ) -> None:
     """Error against step size and against horizon."""
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(14, 3.9))
+    figure, (left, middle, right) = pyplot().subplots(1, 3, figsize=(14, 3.9))
     for group in next(iter(table.values())):
         left.loglog(list(table), [row[group] for row in table.values()], "o-", markersize=4, label=group)
     left.axhline(0.01, color="0.7", linewidth=0.8)
@@ -123,8 +120,7 @@ def draw(
         axis.set(xlabel=f"steps since {since} began", ylabel=f"error of {what}")
     middle.set_xscale("log")
     middle.legend(fontsize=7, frameon=False)
-    figure.tight_layout()
-    figure.savefig(path, dpi=150)
+    save_picture(path, figure)
 
 
 def main() -> None:

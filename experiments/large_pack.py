@@ -10,14 +10,15 @@ added to a table; packs and recalls are kept and not made again, and what was in
 """
 
 import argparse
-import csv
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 from console import say
 from drawn_words import run
+from rows import done
 
 import gmem_jax as gm
 from gmem_jax.experiment import analysis
@@ -25,6 +26,7 @@ from gmem_jax.experiment.provenance import sources
 from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.physics.state import combined_status
 from gmem_jax.preparation.recipe import Recipe
+from gmem_jax.reproduce.compare import write_csv
 
 STANDARD = Recipe()
 SHORT = Recipe(piston_gain=0.01, settled_speed=3e-3, quiet=2e-4)
@@ -90,17 +92,10 @@ def measured(
     return {**dict(zip(MEASURES, (round(value, 6) for value in values), strict=True)), "status": status}
 
 
-def add(path: Path, rows: list[dict[str, object]]) -> None:
+def add(path: Path, rows: list[dict[str, Any]]) -> None:
     """Put rows into a table, in the place of older ones of the same conditions."""
-    old: list[dict[str, object]] = []
-    if path.exists():
-        with path.open() as file:
-            old = list(csv.DictReader(file))
-    new = {tuple(str(row[name]) for name in CONDITIONS): row for row in [*old, *rows]}
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(new.values())
+    new = {tuple(str(row[name]) for name in CONDITIONS): row for row in [*done(path), *rows]}
+    write_csv(path, list(new.values()))
     for row in rows[:1]:
         print(row, flush=True)
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import matplotlib
 import numpy as np
 
 import gmem_jax as gm
@@ -21,6 +20,7 @@ from gmem_jax import classify
 from gmem_jax.experiment.run import Prefix, prefix_of, run
 from gmem_jax.experiment.signals import bit_width
 from gmem_jax.physics.material import Material
+from gmem_jax.show.render_matplotlib import pyplot, save_picture
 
 GAMMAS = (1e-4, 3e-4, 1e-3, 3e-3)
 BITS = (3, 4, 5)
@@ -55,10 +55,7 @@ def of_words(bits: int) -> tuple[int, float]:
 
 def draw(path: Path, rows: list[list[Any]], six: dict[str, Any], title: str) -> None:
     """The six recalls beside their predictions, and errors against gamma0 and against the number of bits."""
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, 4, figsize=(14, 6))
+    figure, axes = pyplot().subplots(2, 4, figsize=(14, 6))
     pascal, u = Material().modulus, (np.arange(256) + 0.5) / 256
     for number, axis in enumerate((*axes[0, :3], *axes[1, :3])):
         axis.plot(u, pascal * six["simulated"][number], color="C0", label="simulated")
@@ -79,8 +76,7 @@ def draw(path: Path, rows: list[list[Any]], six: dict[str, Any], title: str) -> 
     axes[1, 3].set(xlabel="bits of the words", ylabel="error of superposition")
     axes[1, 3].legend(fontsize=7, frameon=False)
     figure.suptitle(title, fontsize=10)
-    figure.tight_layout()
-    figure.savefig(path, dpi=130)
+    save_picture(path, figure)
 
 
 def main() -> None:

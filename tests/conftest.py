@@ -66,3 +66,9 @@ def recalled() -> tuple[gm.Experiment, gm.Recall]:
     pack = gm.load_pack(Path(__file__).parent / "data" / "tetra-27.h5")
     experiment = gm.Experiment(pack, gm.words(1), t0=75.0, store=0.1, rest=0.1, hold=0.1)
     return experiment, gm.run(experiment)
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Packs are imported without the run that measures the ringing period."""
+    monkeypatch.setattr("gmem_jax.preparation.imported.ringing_period", lambda *_: 20.0)

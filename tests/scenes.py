@@ -1,6 +1,7 @@
 """Small deterministic scenes, and compiled runs of them, shared by the tests of the core; where files of tests are."""
 
 import functools
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,10 +9,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import Signals
 from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
@@ -36,10 +39,26 @@ PERIODIC_XY_27 = TESTS / "data" / "periodic-xy-27.h5"  # between walls along z
 ELASTIC = Material(normal_damping=0.0)
 SPHERE = sphere()
 THREE_LAWS: dict[str, Any] = {"H": Hooke(mu=0.3), "M1": MindlinRescaled(mu=0.3), "M2": Mindlin(mu=0.3, points=8)}
+EVERY_LAW: dict[str, Any] = {
+    "frictionless": Frictionless(),
+    "H": Hooke(mu=0.3),
+    "M1": MindlinRescaled(mu=0.3),
+    **{f"M2-{variant}": Mindlin(mu=0.3, points=8, variant=variant) for variant in ("exact", "averaged", "paper")},
+}
 FREE = still_box(jnp.full((3, 1), -15.0), jnp.full((3, 1), 15.0))  # walls out of everybody's way
 
 cached_tetra = functools.lru_cache(tetra)
 accelerate = jax.jit(dynamics.accelerate)
+
+
+def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Run the command in this process; its exit code."""
+    from gmem_jax.command import app
+
+    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        app.main()
+    return int(stop.value.code or 0)
 
 
 def assert_close(found: Any, expected: Any, tolerance: float) -> None:
@@ -49,6 +68,12 @@ def assert_close(found: Any, expected: Any, tolerance: float) -> None:
     ):
         scale = float(np.abs(np.asarray(other)).max()) if other.size else 0.0
         np.testing.assert_allclose(one, other, rtol=0.0, atol=tolerance * scale, err_msg=jax.tree_util.keystr(path))
+
+
+def random_like(tree: Any, seed: int = 3) -> Any:
+    """Normal numbers in the place of every number."""
+    generator = np.random.default_rng(seed)
+    return jax.tree.map(lambda leaf: jnp.asarray(generator.normal(size=jnp.shape(leaf))), tree)
 
 
 def column(values) -> jax.Array:
@@ -201,6 +226,11 @@ def record(system, state, motion, dt, *, count):
 def still(box: Box) -> Motion:
     """Walls that do not move."""
     return Motion(box.lower, box.upper, 0.0, 0.0, 0.0, 1.0)
+
+
+def standing(box: Box, steps: int) -> Box:
+    """Walls that stand still for some steps."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), box)
 
 
 CLUSTER_EDGE = 7.6  # of the box of the 27 grains: 2e-3 E and overlaps of 0.1 R, as in a pack at u = 0

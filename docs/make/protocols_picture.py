@@ -3,7 +3,6 @@
 python docs/make/protocols_picture.py
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import matplotlib
@@ -14,24 +13,11 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from gmem_jax.experiment import protocols
+from gmem_jax.files.protocols import ready_protocols
 from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.stage import Drive
 
 OUTPUT = Path(__file__).parents[1] / "protocols.png"
-SHELF: tuple[Callable[[], Protocol], ...] = (
-    protocols.paper,
-    protocols.paper_twice_read,
-    protocols.write_read_write_read,
-    protocols.partial_readout,
-    protocols.two_channels,
-    protocols.two_channels_in_turn,
-    protocols.amplitude_training,
-    protocols.several_amplitudes,
-    protocols.erasure_by_shear,
-    protocols.erasure_by_vibration,
-    protocols.long_storage,
-    protocols.read_by_shear,
-)
 SETS = {"first": 0.35, "second": 0.65, "xy": 0.35, "z": 0.65}  # where the bump of a set is
 COLOURS = {"xy": "C3", "z": "C0"}
 ROLES = {"write": "C3", "read": "C0"}
@@ -75,7 +61,7 @@ def draw(axis: Axes, name: str, protocol: Protocol) -> None:
 def main() -> None:
     """Draw it."""
     figure, axes = plt.subplots(4, 3, figsize=(10.5, 9.0))
-    for axis, build in zip(axes.flat, SHELF, strict=True):
+    for axis, build in zip(axes.flat, ready_protocols().values(), strict=True):
         named = ("first", "second") if build is protocols.write_read_write_read else ("xy",)
         if build in (protocols.two_channels, protocols.two_channels_in_turn):
             named = ("xy", "z")

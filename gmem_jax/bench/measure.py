@@ -29,7 +29,7 @@ from gmem_jax.bench.race import REPEATS, Candidate, Row, interleave
 from gmem_jax.derivatives.gradient import value_and_grad
 from gmem_jax.design.kernel import bumps
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.pack import Pack
+from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
 from gmem_jax.experiment.run import run
 from gmem_jax.experiment.signals import Bumps
@@ -39,14 +39,12 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.rotation import matrix
-from gmem_jax.physics.state import Grains, State, Status, explain, replicate, still_box
+from gmem_jax.physics.state import State, Status, explain, replicate, still_box
 from gmem_jax.physics.system import System
 from gmem_jax.simulation.loop import Simulation
-from gmem_jax.simulation.neighbors import SKIN, pair_finder
 from gmem_jax.simulation.observers import forward, told_of
 from gmem_jax.simulation.runner import status_of
 from gmem_jax.simulation.stage import Drive, Stage
-from gmem_jax.simulation.strain import smallest_box
 from gmem_jax.sweeps.executors import cores
 
 TIMED_LAWS = {entry.paper: entry.kind() for entry in laws.LAWS if entry.kind is not Frictionless}
@@ -187,19 +185,14 @@ def tile(pack: Pack, times: tuple[int, int, int]) -> Pack:
     quaternion = Rotation.from_matrix(np.concatenate(rotations)).as_quat(scalar_first=True)
     upper = lengths * np.asarray(times)
     box = still_box(jnp.zeros((3, 1)), jnp.asarray(upper)[:, None])
-    at = jnp.asarray(np.concatenate(places))[..., None]
-    still = jnp.zeros_like(at)
-    grains = Grains(at, jnp.asarray(quaternion)[..., None], still, still, still, still)
-    pairs = pair_finder(pack.clump, upper, SKIN)(
-        grains, pack.clump, box, smallest_box(np.zeros(3), upper, float(pack.delta0))
-    )
+    at = np.concatenate(places)
     return replace(
         pack,
-        position=at[..., 0],
+        position=jnp.asarray(at),
         quaternion=jnp.asarray(quaternion),
         lower=jnp.zeros(3),
         upper=jnp.asarray(upper),
-        pairs=pairs,
+        pairs=find_pairs(pack.clump, at, quaternion, box, float(pack.delta0)),
         name=f"{pack.name} x {math.prod(times)}",
     )
 

@@ -1,7 +1,7 @@
 """What may stand where a pack, waveforms, a law or names belong: refused in one line that says what is right."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
@@ -89,17 +89,6 @@ def require_several(values: Any, argument: str) -> None:
         one = json.dumps(values) if isinstance(values, str | int | float) else ""
         right = f"write [{one}] for {one}" if one else f"got {_said(values)}"
         raise ValueError(f"{argument} takes several, in a list: {right}")
-
-
-def require_values(vary: Mapping[str, Sequence[Any]]) -> None:
-    """Refuse one value in the place of several.
-
-    Raises:
-        ValueError: saying how to write it.
-    """
-    for name, values in vary.items():
-        if isinstance(values, str) or not isinstance(values, Iterable):
-            raise ValueError(f"{name} varies over a list of values: write [{values!r}] for {values!r}")
 
 
 def require_once(values: Mapping[str, Any], changes: Mapping[str, Any]) -> None:

@@ -181,7 +181,7 @@ def run(
             apply_waveforms(on, few)
             on.place_on(placement_of(few.replicas, devices))
             samples = on.run_stages(*own, checkpoint=checkpoint)
-            return (samples, on.status()), recorder.saved()
+            return (samples, on.gather(on.state.status)), recorder.saved()
 
         found_part, seen = cache(f"batch-{number:04d}", run_batch)
         parts.append(found_part)

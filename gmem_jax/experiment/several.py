@@ -157,7 +157,7 @@ def run_several(
         on.state = jax.tree.map(lambda leaf: jnp.asarray(leaf)[..., place], on.state)
         on.place_on(placement_of(len(owners)))
         samples = on.run_stages(*own, checkpoint=checkpoint)
-        return samples, on.status()
+        return samples, on.gather(on.state.status)
 
     before = on.run_cached(PREFIX, cache, *common)
     on = on.fork()

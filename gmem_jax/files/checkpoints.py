@@ -27,6 +27,7 @@ from gmem_jax.files.atomic import atomic
 from gmem_jax.files.ours import Folder, release, remove_leftovers
 from gmem_jax.files.seal import BLOCK, PART, require_sealed, seal
 from gmem_jax.files.validation import json_of, read_npy, refusing, require
+from gmem_jax.physics.numbers import said
 from gmem_jax.physics.pytree import REGISTERED
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 
@@ -117,7 +118,7 @@ def load_part(path: Path, of: str = "") -> Any:
             raise FileFormatError(f"{path}: schema is {head.get('schema')!r}, expected {PART_SCHEMA!r}")
         if head.get("of") != of:
             raise FileFormatError(
-                f"{path}: says that it is {_short(head.get('of'))}, not {_short(of)}: files were exchanged"
+                f"{path}: says that it is {said(head.get('of'))}, not {said(of)}: files were exchanged"
             )
         return _put_together(head["form"], [found[name] for name in sorted(found)])
 
@@ -217,7 +218,7 @@ class Checkpoints(ResultCache):
         if not found or found == wanted:
             return ""
         name, there, now = _difference(found, wanted)
-        return f"holds parts of an interrupted run with another {name} ({_short(there)}, now {_short(now)})"
+        return f"holds parts of an interrupted run with another {name} ({said(there)}, now {said(now)})"
 
     @staticmethod
     def key_of(folder: Path) -> dict[str, Any]:
@@ -268,11 +269,6 @@ def _difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any]:
         return name, one, other
     differs = next(own for own in {**one, **other} if one.get(own) != other.get(own))
     return _difference(one.get(differs), other.get(differs), f"{name}.{differs}" if name else differs)
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 @contextlib.contextmanager

@@ -3,7 +3,7 @@
 import math
 import operator
 from collections.abc import Mapping
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import Field, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from gmem_jax.files.validation import is_number
 from gmem_jax.physics.boundary import boundary_of, periodic_axes, require_room
 from gmem_jax.physics.grain import Clump, sized
 from gmem_jax.physics.numbers import is_real, said
-from gmem_jax.physics.pytree import interval
+from gmem_jax.physics.pytree import parameter, static
 from gmem_jax.preparation.grading import LARGEST_SPREAD, lognormal, mixture
 from gmem_jax.simulation.stage import BINS, Stage
 from gmem_jax.simulation.strain import COMPRESSIONS
@@ -27,11 +27,6 @@ SLOWEST_BINS = 1.8e3  # t_c: t0 whose bins and steps a preparation has outside i
 # costs would grow as t0 falls otherwise: a bin is t0 / 256, a step no longer than that
 STEP_OVERHEAD = 200.0  # grain-steps that a step costs beside its grains: calls and lists (N = 16 to 250, native)
 BIN_OVERHEAD = 4000.0  # and that a bin of a cycle costs beside its steps
-
-
-def _number(default: float, within: str, words: str, unit: str = "") -> Any:
-    """A field of a recipe: its default, the interval it must be in, its meaning, and its unit."""
-    return field(default=default, metadata={"interval": interval(within), "help": words, "unit": unit})
 
 
 @dataclass(frozen=True)
@@ -70,36 +65,34 @@ class Recipe:
             compressed as one between walls is, and its grains are carried along.
     """
 
-    grains: int = _number(325, "[12, inf)", "Number of grains N")
-    seed: int = _number(1, "[0, 9007199254740991]", "Random seed, a number that JSON holds exactly")
-    delta0: float = _number(0.05, COMPRESSIONS, "Areal compression of the cycles and of the experiment")
-    t0: float = _number(1.8e3, "(0, inf)", "Duration of one compression", "t_c")
-    dt: float = _number(0.3, "(0, 0.5]", "Largest time step", "t_c")
-    filling: float = _number(0.30, "(0, 0.6)", "Of the lattice that the gas starts from; less for long grains")
-    gas_speed: float = _number(0.02, "(0, inf)", "Rms velocity, and spin times R, of the gas", "R/t_c")
-    gas_time: float = _number(6.0e3, "(0, inf)", "Duration of the gas", "t_c")
-    pressure: float = _number(
+    grains: int = parameter(325, "[12, inf)", "Number of grains N")
+    seed: int = parameter(1, "[0, 9007199254740991]", "Random seed, a number that JSON holds exactly")
+    delta0: float = parameter(0.05, COMPRESSIONS, "Areal compression of the cycles and of the experiment")
+    t0: float = parameter(1.8e3, "(0, inf)", "Duration of one compression", "t_c")
+    dt: float = parameter(0.3, "(0, 0.5]", "Largest time step", "t_c")
+    filling: float = parameter(0.30, "(0, 0.6)", "Of the lattice that the gas starts from; less for long grains")
+    gas_speed: float = parameter(0.02, "(0, inf)", "Rms velocity, and spin times R, of the gas", "R/t_c")
+    gas_time: float = parameter(6.0e3, "(0, inf)", "Duration of the gas", "t_c")
+    pressure: float = parameter(
         2.0e-3, "(0, inf)", "p_z before the cycles (law H: k_H follows it, see docs/howto/grain.md)", "E"
     )
-    piston_speed: float = _number(0.02, "(0, inf)", "Largest speed of the upper wall", "R/t_c")
-    piston_gain: float = _number(0.005, "(0, inf)", "Its speed per relative error of p_z", "R/t_c")
-    cycles: int = _number(2, "[0, 1000]", "Compress/decompress cycles")
-    rest: float = _number(0.2, "[0, inf)", "Rests at u = 0", "t0")
-    hold: float = _number(0.2, "[0, inf)", "Holds at u = 1", "t0")
-    drag: float = _number(0.01, "[0, inf)", "Viscous drag while walls stand still", "1/t_c")
-    settled_speed: float = _number(1.0e-5, "(0, inf)", "Largest grain speed at which the piston is fixed", "R/t_c")
-    quiet: float = _number(1.0e-6, "(0, inf)", "Largest grain speed of the finished pack", "R/t_c")
-    pressure_error: float = _number(0.01, "(0, inf)", "Relative error of p_z at which the piston is fixed")
-    patience: float = _number(2.0e5, "(0, inf)", "Longest time spent on coming to rest", "t_c")
-    gravity: float = _number(0.0, "[0, 0.01]", "Acceleration of gravity along -z", "R/t_c^2")
-    size_spread: float = _number(
+    piston_speed: float = parameter(0.02, "(0, inf)", "Largest speed of the upper wall", "R/t_c")
+    piston_gain: float = parameter(0.005, "(0, inf)", "Its speed per relative error of p_z", "R/t_c")
+    cycles: int = parameter(2, "[0, 1000]", "Compress/decompress cycles")
+    rest: float = parameter(0.2, "[0, inf)", "Rests at u = 0", "t0")
+    hold: float = parameter(0.2, "[0, inf)", "Holds at u = 1", "t0")
+    drag: float = parameter(0.01, "[0, inf)", "Viscous drag while walls stand still", "1/t_c")
+    settled_speed: float = parameter(1.0e-5, "(0, inf)", "Largest grain speed at which the piston is fixed", "R/t_c")
+    quiet: float = parameter(1.0e-6, "(0, inf)", "Largest grain speed of the finished pack", "R/t_c")
+    pressure_error: float = parameter(0.01, "(0, inf)", "Relative error of p_z at which the piston is fixed")
+    patience: float = parameter(2.0e5, "(0, inf)", "Longest time spent on coming to rest", "t_c")
+    gravity: float = parameter(0.0, "[0, 0.01]", "Acceleration of gravity along -z", "R/t_c^2")
+    size_spread: float = parameter(
         0.0, f"[0, {LARGEST_SPREAD:g}]", "SD of the sizes of grains over their mean, lognormal, cut at 3 SD"
     )
-    sizes: str = field(default="", metadata={"help": "Sizes of the grains of a mixture, like 1,1.4"})
-    shares: str = field(default="", metadata={"help": "Their shares of all grains, like 0.5,0.5; default equal ones"})
-    boundary: str = field(
-        default="walls", metadata={"help": "walls, periodic, or one for each axis: periodic,periodic,walls"}
-    )
+    sizes: str = static("", "Sizes of the grains of a mixture, like 1,1.4")
+    shares: str = static("", "Their shares of all grains, like 0.5,0.5; default equal ones")
+    boundary: str = static("walls", "walls, periodic, or one for each axis: periodic,periodic,walls")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "boundary", boundary_of(periodic_axes(self.boundary)))
@@ -173,9 +166,9 @@ def _plain(kind: Any, given: Any) -> float | int:
 def words_of(entry: Field[Any]) -> str:
     """What a field of a recipe means, in which unit, and where it must lie."""
     if "interval" not in entry.metadata:
-        return f"{entry.metadata['help']}."
+        return f"{entry.metadata['words']}."
     unit = entry.metadata["unit"]
-    return f"{entry.metadata['help']}{unit and ', ' + unit}; in {entry.metadata['interval'].words}."
+    return f"{entry.metadata['words']}{unit and ', ' + unit}; in {entry.metadata['interval'].words}."
 
 
 def pressure_over_wanted(record: Mapping[str, Any]) -> float | None:

@@ -16,9 +16,8 @@ from gmem_jax.experiment.run import apply_waveforms, runner_of
 from gmem_jax.experiment.signals import six_signals
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
-from gmem_jax.physics.pairs import sphere_centres
-from gmem_jax.physics.state import State
 from gmem_jax.reproduce.figures import Values, crossed
+from gmem_jax.simulation.sample import overlaps
 from gmem_jax.simulation.stage import BINS
 
 STORES = (0.5, 2.0, 8.0)  # t0
@@ -128,12 +127,6 @@ def proportional(recalls: dict[float, Recall]) -> Verdict:
     return Verdict("p_sig is proportional to gamma0", wide < 0.1, f"G = {said}", {"G": gains, "spread": wide})
 
 
-def non_affine(before: State, after: State) -> float:
-    """Root mean square displacement of grains between two states in one box, of one replica, in R."""
-    moved = np.asarray(after.grains.position - before.grains.position)[..., 0]
-    return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-
-
 def rearrangement(pack: Pack, friction: Any, t0: float) -> float:
     """How far grains are from where they were after one cycle without shear, in R; root mean square."""
     experiment = Experiment(pack, six_signals(), friction, t0=t0)
@@ -141,7 +134,8 @@ def rearrangement(pack: Pack, friction: Any, t0: float) -> float:
     before = on.state
     common, _ = experiment.phases
     on.run_stages(*common[:4])
-    return non_affine(before, on.state)
+    moved = np.asarray(on.state.grains.position - before.grains.position)[..., 0]
+    return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
 
 def rearranges(packs: dict[str, Pack], t0: float) -> Verdict:
@@ -158,46 +152,32 @@ def rearranges(packs: dict[str, Pack], t0: float) -> Verdict:
     )
 
 
-def normal_force_spread(experiment: Experiment, state: State) -> np.ndarray:
-    """Overlaps to the power 3/2 of all sphere contacts, to which Hertz' forces are proportional, [P, B]; 0 apart."""
-    centres = np.asarray(sphere_centres(state.grains, experiment.pack.clump))
-    pairs = experiment.pack.pairs
-    valid = np.asarray(pairs.valid)
-    first, second = (np.asarray(index)[valid] for index in (pairs.first, pairs.second))
-    overlap = 2.0 - np.linalg.norm(centres[first] - centres[second], axis=1)
-    forces: np.ndarray = np.maximum(overlap, 0.0) ** 1.5
-    return forces
-
-
 def forces_tell_nothing(experiment: Experiment) -> Verdict:
     """The distribution of contact forces at u = 1 does not tell signals from none.
 
     Kolmogorov's distance between the distributions with and without a signal, beside that of two halves of one pack's
     contacts, which is what chance makes.
     """
+    from scipy.stats import ks_2samp
+
     on = runner_of(experiment)
     common, own = experiment.phases
     on.run_stages(*common)
     apply_waveforms(on, experiment)
     on.run_stages(own[0])
-    forces = normal_force_spread(experiment, on.state)
+    # Hertz' forces are proportional to overlaps to the power 3/2.
+    forces = np.maximum(np.asarray(overlaps(on.simulation.system, on.state)), 0.0) ** 1.5
     samples = [np.sort(column[column > 0.0]) for column in forces.T]
     scaled = [sample / sample.mean() for sample in samples]
-    distance = max(_kolmogorov(scaled[0], other) for other in scaled[1:])
+    distance = max(float(ks_2samp(scaled[0], other, method="asymp").statistic) for other in scaled[1:])
     halves = np.random.default_rng(0).permutation(scaled[0])
-    chance = _kolmogorov(np.sort(halves[::2]), np.sort(halves[1::2]))
+    chance = float(ks_2samp(halves[::2], halves[1::2], method="asymp").statistic)
     return Verdict(
         "contact-force distributions carry no trace of the signal",
         distance < chance,
         f"largest distance to that without signal {distance:.4f}, between halves of one {chance:.4f} (Kolmogorov)",
         {"distance": distance, "chance": chance},
     )
-
-
-def _kolmogorov(one: np.ndarray, other: np.ndarray) -> float:
-    every = np.concatenate([one, other])
-    ranks = (np.searchsorted(sample, every, side="right") / len(sample) for sample in (one, other))
-    return float(np.max(np.abs(np.subtract(*ranks))))
 
 
 def claim_points(packs: Sequence[Values]) -> list[Values]:

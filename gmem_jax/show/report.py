@@ -39,11 +39,6 @@ def _cells(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = ""
     return {"head": head, "rows": cells, "right": right, "caption": caption}
 
 
-def html_table(head: Sequence[str], rows: Sequence[Sequence[Any]], caption: str = "") -> str:
-    """A table as HTML."""
-    return str(_template().module.table(**_cells(head, rows, caption)))
-
-
 def _of_rich(drawn: Table) -> Shown:
     """A table of the terminal."""
     head = [str(column.header) for column in drawn.columns] if drawn.show_header else [""] * len(drawn.columns)

@@ -167,14 +167,6 @@ class FrameSchedule:
     wanted: Mapping[str, Sequence[int]] = field(default_factory=dict)
     replica: int = 0
 
-    def between(self, stage: str, first: int, last: int) -> list[int]:
-        """The wanted numbers of finished bins above `first` and up to `last`."""
-        return [bins for bins in self.wanted.get(stage, ()) if first < bins <= last]
-
-    def begins(self, stage: str) -> bool:
-        """Whether one is wanted before a stage begins."""
-        return 0 in self.wanted.get(stage, ())
-
 
 class FrameRecorder(Observer):
     """Records configurations, each as it was seen: those within a chunk are run up to once more."""
@@ -186,13 +178,15 @@ class FrameRecorder(Observer):
     def step(self, chunk: Chunk) -> None:
         """Record the configuration before the first bin of a stage, if it is wanted."""
         name, path = chunk.stage.name, chunk.simulation.path
-        if chunk.first == 0 and self.schedule.begins(name) and name not in self.recorded:
+        if chunk.first == 0 and 0 in self.schedule.wanted.get(name, ()) and name not in self.recorded:
             self.record(chunk, chunk.state, np.asarray(path.lower), np.asarray(path.upper), chunk.stage.ends[0])
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
         """Record what is wanted of a chunk."""
-        for done in self.schedule.between(chunk.stage.name, chunk.first, chunk.first + chunk.count):
+        for done in self.schedule.wanted.get(chunk.stage.name, ()):
             bins = done - chunk.first
+            if not 0 < bins <= chunk.count:
+                continue
             then, then_sample = (state, sample) if bins == chunk.count else chunk.run(bins)
             half = 0.5 * chunk.gather(then_sample.lengths)[bins - 1]
             path, stage = chunk.simulation.path, chunk.stage

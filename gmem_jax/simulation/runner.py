@@ -175,11 +175,6 @@ class Runner:
         found: OrderedDict[str, Sample] = samples
         return found
 
-    def status(self) -> np.ndarray:
-        """The status of every replica, [B]."""
-        found: np.ndarray = self.gather(self.state.status)
-        return found
-
     def _run_chunk(self, stage: Stage, done: int, observers: tuple[Observer, ...], last: Observer) -> None:
         """Run the next bins of a stage, of which some are done; or build the list anew for them.
 

@@ -229,11 +229,6 @@ class Stage:
         return self.along == "time" or not self.moves
 
     @property
-    def sheared(self) -> bool:
-        """Whether a waveform is applied."""
-        return bool(self.drives)
-
-    @property
     def own(self) -> tuple[Drive, ...]:
         """The drives of which each replica has its own waveform."""
         return tuple(drive for drive in self.drives if not drive.fixed)

@@ -15,7 +15,7 @@ import numpy as np
 import psutil
 
 from gmem_jax.errors import FileFormatError, RunFailedError
-from gmem_jax.experiment.arguments import require_kind, require_values
+from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.changes import replace as with_values
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.html import listing
@@ -101,7 +101,8 @@ def sweep(
     """
     require_kind("sweep", experiment, Experiment)
     tell = callback(progress)
-    require_values(vary)
+    for name, several in vary.items():
+        require_several(several, name)
     packs = functools.cache(load_pack)  # points on one pack object can run side by side
     points = []
     for row in itertools.product(*vary.values()):

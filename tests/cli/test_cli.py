@@ -12,24 +12,15 @@ import h5py
 import jax
 import numpy as np
 import pytest
-from scenes import TETRA_27
+from scenes import TETRA_27, gmem
 
 import gmem_jax as gm
-from gmem_jax.command import app as cli
 from gmem_jax.command import recalls
 from gmem_jax.experiment.analysis import MEASURES
 from gmem_jax.files.hdf5 import writing
 
 PACK = TETRA_27
 SHORT = ["--t0", "75", "--store", "0.1", "--rest", "0.1", "--hold", "0.1"]
-
-
-def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Run the command in this process; its exit code."""
-    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    return int(stop.value.code or 0)
 
 
 def test_help_and_info_work(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

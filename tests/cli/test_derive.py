@@ -6,7 +6,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from test_cli import PACK, SHORT, gmem
+from scenes import gmem
+from test_cli import PACK, SHORT
 
 import gmem_jax as gm
 from gmem_jax.files.schemas import KERNEL

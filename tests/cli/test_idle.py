@@ -3,7 +3,8 @@
 from pathlib import Path
 
 import pytest
-from test_cli import PACK, SHORT, gmem
+from scenes import gmem
+from test_cli import PACK, SHORT
 
 import gmem_jax as gm
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import PERIODIC_27, ROOT, SPREAD_27
-from test_cli import PACK, SHORT, gmem
+from scenes import PERIODIC_27, ROOT, SPREAD_27, gmem
+from test_cli import PACK, SHORT
 
 import gmem_jax as gm
 from gmem_jax import native

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from scenes import TETRA_27
-from test_cli import gmem
+from scenes import TETRA_27, gmem
 
 from gmem_jax.command import recalls
 from gmem_jax.files import checkpoints

@@ -8,7 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_cli import PACK, gmem
+from scenes import gmem
+from test_cli import PACK
 
 import gmem_jax as gm
 from gmem_jax.experiment import analysis

@@ -7,7 +7,7 @@ import h5py
 import matplotlib as mpl
 import numpy as np
 import pytest
-from test_cli import gmem
+from scenes import gmem
 
 import gmem_jax as gm
 from gmem_jax.design.kernel import MemoryKernel

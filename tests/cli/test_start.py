@@ -11,8 +11,8 @@ import jax
 import matplotlib
 import numpy as np
 import pytest
-from scenes import ROOT
-from test_cli import PACK, SHORT, gmem
+from scenes import ROOT, gmem
+from test_cli import PACK, SHORT
 
 import gmem_jax as gm
 from gmem_jax.errors import FileFormatError

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from scenes import TETRA_27
-from test_cli import gmem
+from scenes import TETRA_27, gmem
 
 import gmem_jax as gm
 

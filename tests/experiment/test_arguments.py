@@ -72,8 +72,8 @@ def test_names_values_and_batches_in_the_wrong_form_are_refused_with_the_right_o
             lambda: gm.replace(EXPERIMENT, {"friction.mu": 0.5, "friction": gm.Hooke()}),
             "friction is given twice; leave one away",
         ),
-        (lambda: gm.sweep(EXPERIMENT, {"gamma0": 1e-3}), r"gamma0 varies over a list of values: write \[0.001\]"),
-        (lambda: gm.sweep(EXPERIMENT, {"pack": "tetra-325-a"}), r"write \['tetra-325-a'\] for 'tetra-325-a'"),
+        (lambda: gm.sweep(EXPERIMENT, {"gamma0": 1e-3}), r"gamma0 takes several, in a list: write \[0.001\]"),
+        (lambda: gm.sweep(EXPERIMENT, {"pack": "tetra-325-a"}), r'write \["tetra-325-a"\] for "tetra-325-a"'),
     ]
     for make, words in wrong:
         with pytest.raises(ValueError, match=words) as refused:

@@ -1,7 +1,6 @@
 """Packs and frames in the formats of others: read back by their own programs, and made packs of again."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -9,11 +8,10 @@ from xml.etree import ElementTree
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import TETRA_27, orientations
+from scenes import TETRA_27, gmem, orientations
 
 import gmem_jax as gm
 from gmem_jax.bench import lammps
-from gmem_jax.command import app as cli
 from gmem_jax.files import exporters
 from gmem_jax.files.exporters import format_of, frames_of_pack
 from gmem_jax.files.importers import load_spheres
@@ -229,12 +227,6 @@ def test_lammps_reads_what_was_written(pack_frames: Frames, run_frames: Frames, 
 # ---------------------------------------------------------------- import
 
 
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the run that measures the ringing period."""
-    monkeypatch.setattr(imported, "ringing_period", lambda *_: 20.0)
-
-
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize(("name", "within"), [("lammps", 1e-13), ("gsd", SINGLE)])
 def test_a_pack_comes_back(pack_frames: Frames, tmp_path: Path, name: str, within: float) -> None:
@@ -313,13 +305,6 @@ def test_a_heap_is_refused(pack_frames: Frames, tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- command line
-
-
-def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    return int(stop.value.code or 0)
 
 
 def test_a_folder_beside_a_series_is_filled_by_force_only(

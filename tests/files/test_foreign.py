@@ -1,16 +1,14 @@
 """Files of other programs: what a number in them means is honoured, or refused in one line that names its line."""
 
 import gzip
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import TETRA_27
+from scenes import TETRA_27, gmem
 
 import gmem_jax as gm
 from gmem_jax.bench import lammps
-from gmem_jax.command import app as cli
 from gmem_jax.files.exporters import format_of, frames_of_pack
 from gmem_jax.files.importers import load_spheres
 from gmem_jax.preparation import imported
@@ -31,19 +29,6 @@ def put(folder: Path, content: str | bytes, name: str = "a.data") -> Path:
     path = folder / name
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
-
-
-def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    return int(stop.value.code or 0)
-
-
-@pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the run that measures the ringing period."""
-    monkeypatch.setattr(imported, "ringing_period", lambda *_: 20.0)
 
 
 # ---------------------------------------------------------------- read

@@ -5,16 +5,14 @@ import contextlib
 import os
 import re
 import stat
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from scenes import TETRA_27
+from scenes import TETRA_27, gmem
 
 import gmem_jax as gm
-from gmem_jax.command import app as cli
 from gmem_jax.command.console import check_output
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.checkpoints import Checkpoints, locked
@@ -32,14 +30,6 @@ PACK = TETRA_27
 ROOT = Path(gm.__file__).parent
 REMOVING = {"unlink", "rmtree", "rmdir", "rename", "renames", "removedirs", "replace", "remove", "move"}
 OF_OTHERS = {"native/build.py"}  # it compiles before anything can be imported, and replaces its own library
-
-
-def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """Run the command in this process; its exit code."""
-    monkeypatch.setattr(sys, "argv", ["gmem", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    return int(stop.value.code or 0)
 
 
 def tree(folder: Path) -> dict[str, bytes | None]:

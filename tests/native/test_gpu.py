@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from emulation import linked
 from jax import export
-from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, assert_close, scene
+from scenes import EVERY_LAW, PERIODIC_XY_27, SPREAD_27, TETRA_27, assert_close, scene
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -41,12 +41,6 @@ pytestmark = [
 needs_nvrtc = pytest.mark.skipif(bool(cuda.missing()), reason=cuda.missing())
 
 PACK = gm.load_pack("tetra-325-a")
-LAWS: dict[str, Any] = {
-    "frictionless": gm.Frictionless(),
-    "H": gm.Hooke(mu=0.3),
-    "M1": gm.MindlinRescaled(mu=0.3),
-    **{f"M2-{variant}": gm.Mindlin(mu=0.3, points=8, variant=variant) for variant in ("exact", "averaged", "paper")},
-}
 REPLICAS = 3
 QUICKLY = {"xla_backend_optimization_level": 0}  # for programs that run once
 Scene = tuple[Call, Fixed, Arrays, Callable[..., Any]]
@@ -109,7 +103,7 @@ def thrown(
 @functools.cache
 def at_rest() -> Any:
     """The pack's state before it was thrown; blank histories of any law give the same."""
-    system = System(PACK.clump, LAWS["H"], PACK.pairs)
+    system = System(PACK.clump, EVERY_LAW["H"], PACK.pairs)
     return jax.jit(start, compiler_options=QUICKLY)(
         system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box
     )
@@ -120,7 +114,7 @@ def packed(law: str, isotropic: bool = True) -> Scene:
     """A pack of 325 grains, whose list is padded."""
     moments = PACK.clump.inertia * (1.0 if isotropic else jnp.asarray([0.8, 1.0, 1.3]))
     clump = replace(PACK.clump, isotropic=isotropic, inertia=moments)
-    system = System(clump, LAWS[law], PACK.pairs)
+    system = System(clump, EVERY_LAW[law], PACK.pairs)
     history = system.friction.init(PACK.pairs.capacity, 1, np.dtype(float))
     return thrown(system, replace(at_rest(), history=history), PACK.lower, PACK.upper)
 
@@ -131,7 +125,7 @@ def spheres() -> Scene:
     edges = jnp.zeros(3), jnp.full(3, 7.75)
     still = jnp.zeros((3, 1))
     box = Box(edges[0][:, None], edges[1][:, None], still, still)
-    system, state, _ = scene(sphere(), lattice, friction=LAWS["H"], box=box)
+    system, state, _ = scene(sphere(), lattice, friction=EVERY_LAW["H"], box=box)
     return thrown(system, state, *edges, speed=-1.1e-2, ago=10)
 
 
@@ -167,12 +161,12 @@ def few(law: str, file: Path, wall_mu: float | None = None) -> Scene:
     """27 grains of a file; where they differ in size, their spheres do so, too."""
     pack = gm.load_pack(file)
     clump = pack.clump if pack.clump.equal else replace(pack.clump, radii=jnp.asarray([1.0, 0.98, 0.96, 1.0]))
-    system = System(clump, LAWS[law], pack.pairs, wall_mu=wall_mu)
+    system = System(clump, EVERY_LAW[law], pack.pairs, wall_mu=wall_mu)
     state = start(system, pack.position[..., None], pack.quaternion[..., None], pack.box)
     return thrown(system, state, pack.lower, pack.upper, periodic=pack.box.periodic)
 
 
-SCENES = {**{law: functools.partial(packed, law) for law in LAWS}, "gyroscopic": lambda: packed("H", False)}
+SCENES = {**{law: functools.partial(packed, law) for law in EVERY_LAW}, "gyroscopic": lambda: packed("H", False)}
 SCENES |= {"spheres": spheres}
 # Grains between walls along z alone, whose contacts go through the faces of the box; and grains of many sizes.
 SCENES |= {f"periodic-{law}": functools.partial(few, law, PERIODIC_XY_27) for law in ("H", "M1")}
@@ -350,10 +344,10 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
 
 
 @needs_nvrtc
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", EVERY_LAW)
 @pytest.mark.parametrize("architecture", ["sm_80", "sm_90", "sm_100", "sm_120"])
 def test_plain_numbers_fit_into_the_registers(architecture: str, law: str) -> None:
-    kernels = native.needs(LAWS[law], architecture)
+    kernels = native.needs(EVERY_LAW[law], architecture)
     assert set(kernels) == {"enter", "remember", "touch", "move", "move_alone", "collect", "leave"}
     for name, kernel in kernels.items():
         assert kernel.registers < 255
@@ -365,14 +359,14 @@ def test_plain_numbers_fit_into_the_registers(architecture: str, law: str) -> No
 @needs_nvrtc
 @pytest.mark.parametrize("law", ["H", "M2-averaged"])
 def test_numbers_with_derivatives_fit_too(law: str) -> None:
-    assert all(kernel.spilt == 0 for kernel in native.needs(LAWS[law], "sm_90", "tangent").values())
+    assert all(kernel.spilt == 0 for kernel in native.needs(EVERY_LAW[law], "sm_90", "tangent").values())
 
 
 @needs_nvrtc
 @pytest.mark.parametrize("law", ["frictionless", "H", "M1"])
 @pytest.mark.parametrize("architecture", [pytest.param("sm_80", marks=pytest.mark.slow), "sm_90"])
 def test_the_kernels_of_reverse_mode_compile(architecture: str, law: str) -> None:
-    kernels = native.needs(LAWS[law], architecture, "adjoint")
+    kernels = native.needs(EVERY_LAW[law], architecture, "adjoint")
     steps = {"enter", "remember", "touch", "move", "move_alone"}
     back = {"take", "touch_back", "gather_back", "move_back", "collect_walls", "sum_up", "leave_back"}
     assert set(kernels) == steps | back
@@ -498,7 +492,7 @@ def test_a_gpu_that_is_too_old_is_known_before_a_program_runs(monkeypatch: pytes
 def test_a_bin_of_an_experiment_on_a_gpu_is_one_call_and_waits_for_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "missing", lambda: "")
     signals = gm.Bumps(jnp.asarray([[1.0], [-1.0]]), jnp.full((2, 1), 0.5), 0.8)
-    experiment = gm.Experiment(PACK, signals, LAWS["H"], t0=300.0)
+    experiment = gm.Experiment(PACK, signals, EVERY_LAW["H"], t0=300.0)
     simulation, state = experiment.simulation(sheared=True), replicate(experiment.begin(), REPLICAS)
     program = jax.jit(functools.partial(rollout_chunk, most=4))
     allowed = [export.DisabledSafetyCheck.custom_call(target) for target in cuda.CUDA_TARGETS]

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from emulation import linked
-from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27
+from scenes import EVERY_LAW, PERIODIC_XY_27, SPREAD_27, TETRA_27
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -36,12 +36,7 @@ from gmem_jax.physics.system import System
 
 REPLICAS, STEPS = 3, 3
 QUICKLY = {"xla_backend_optimization_level": 0}  # for programs that run once
-LAWS: dict[str, Any] = {
-    "frictionless": gm.Frictionless(),
-    "H": gm.Hooke(mu=0.3),
-    "M1": gm.MindlinRescaled(mu=0.3),
-    **{f"M2-{variant}": gm.Mindlin(mu=0.3, points=8, variant=variant) for variant in ("exact", "averaged", "paper")},
-}
+LAWS: dict[str, Any] = dict(EVERY_LAW)
 PERIODIC = "H in a box that is periodic along two axes"
 SPREAD = "H between grains of many sizes"
 FILES = {PERIODIC: PERIODIC_XY_27, SPREAD: SPREAD_27}

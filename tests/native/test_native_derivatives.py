@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import SPREAD_27, TETRA_27, Motion, advance_by, strain_path
+from scenes import SPREAD_27, TETRA_27, Motion, advance_by, random_like, strain_path
 from transposed import assert_transposed
 
 import gmem_jax as gm
@@ -90,11 +90,6 @@ def arguments(system: System, state: State) -> dict[str, Any]:
         "dt": jnp.asarray(0.3),
         "drag": jnp.asarray(0.01),
     }
-
-
-def random_like(tree: Any, seed: int) -> Any:
-    generator = np.random.default_rng(seed)
-    return jax.tree.map(lambda leaf: jnp.asarray(generator.normal(size=jnp.shape(leaf))), tree)
 
 
 def assert_close(one: Any, other: Any) -> None:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import THREE_LAWS, assert_close, scene
+from scenes import THREE_LAWS, assert_close, random_like, scene
 from transposed import assert_transposed
 
 import gmem_jax as gm
@@ -104,11 +104,6 @@ def end(march: Any, system: System, state: State, theta: dict[str, Any]) -> Any:
     system = replace(system, friction=law, clump=clump)
     after, pressure = march(system, state, theta["boxes"], theta["dt"], theta["drag"])
     return after.grains, after.history, pressure
-
-
-def random_like(tree: Any, seed: int) -> Any:
-    generator = np.random.default_rng(seed)
-    return jax.tree.map(lambda leaf: jnp.asarray(generator.normal(size=jnp.shape(leaf))), tree)
 
 
 # One history of each kind, and new runs of several rings; what crosses is the same for all.

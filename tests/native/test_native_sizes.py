@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import PERIODIC_27, SPREAD_27, TETRA_27, assert_close, make_grains, scene
+from scenes import EVERY_LAW, PERIODIC_27, SPREAD_27, TETRA_27, assert_close, make_grains, scene
 from transposed import assert_transposed
 
 import gmem_jax as gm
@@ -23,12 +23,6 @@ from gmem_jax.physics.system import System
 
 pytestmark = pytest.mark.skipif(not native.available()[0], reason="the library was not built")
 
-LAWS: dict[str, Any] = {
-    "frictionless": gm.Frictionless(),
-    "H": gm.Hooke(mu=0.3),
-    "M1": gm.MindlinRescaled(mu=0.3),
-    **{f"M2-{variant}": gm.Mindlin(mu=0.3, points=8, variant=variant) for variant in ("exact", "averaged", "paper")},
-}
 STEPS, REPLICAS = 20, 5  # of a bin
 QUICKLY = {"xla_backend_optimization_level": 0}
 Scene = tuple[System, State, Box]
@@ -67,7 +61,7 @@ def thrown(law: str, of: str = "clumps", replicas: int = REPLICAS) -> Scene:
     grain, position, quaternion, box = SCENES[of]()
     grains = make_grains(position, quaternion)
     finder = PairFinder(grain, np.asarray(box.lengths)[:, 0], 0.5, search=native.search())
-    system = System(grain, LAWS[law], finder(grains, grain, box))
+    system = System(grain, EVERY_LAW[law], finder(grains, grain, box))
     begin = jax.jit(start, compiler_options=QUICKLY)
     state = replicate(begin(system, grains.position, grains.quaternion, box), replicas)
     draws = 5e-3 * np.random.default_rng(0).normal(size=(2, len(position), 3, replicas))
@@ -97,7 +91,7 @@ def moved(march: native.March, system: System, state: State, boxes: Box) -> Any:
 
 def slow(*names: str) -> list[Any]:
     """The laws, these among the slow tests."""
-    return [pytest.param(law, marks=[pytest.mark.slow] * (law in names)) for law in LAWS]
+    return [pytest.param(law, marks=[pytest.mark.slow] * (law in names)) for law in EVERY_LAW]
 
 
 @pytest.mark.parametrize("law", slow("M2-exact"))
@@ -118,7 +112,7 @@ def test_values_of_bidisperse_spheres_and_in_periodic_boxes_are_those_of_the_def
     assert of == "spheres" or np.any(np.asarray(given[0].pairs.image)[touching] != 0)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", EVERY_LAW)
 def test_a_replica_of_unequal_spheres_has_the_same_bits_alone(law: str) -> None:
     # One replica is computed contact by contact, five side by side.
     system, state, boxes = thrown(law)
@@ -149,7 +143,8 @@ def test_tangents_of_unequal_spheres_are_those_of_the_definition(law: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("law", "of"), [*((law, "clumps") for law in LAWS), ("H", "spheres"), ("H", "periodic"), ("M2-paper", "periodic")]
+    ("law", "of"),
+    [*((law, "clumps") for law in EVERY_LAW), ("H", "spheres"), ("H", "periodic"), ("M2-paper", "periodic")],
 )
 def test_the_adjoint_of_unequal_spheres_is_the_transpose_of_their_tangent(law: str, of: str) -> None:
     system, state, boxes = thrown(law, of, 2)

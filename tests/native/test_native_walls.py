@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, THREE_LAWS, assert_close
+from scenes import PERIODIC_XY_27, SPREAD_27, TETRA_27, THREE_LAWS, assert_close, random_like
 from transposed import assert_transposed
 
 import gmem_jax as gm
@@ -142,11 +142,6 @@ def slopes(march: Callable[..., Any], scene: Scene, steps: int) -> tuple[Callabl
         return after.grains, after.history, after.wall_history, pressure
 
     return end, theta
-
-
-def random_like(tree: Any) -> Any:
-    generator = np.random.default_rng(3)
-    return jax.tree.map(lambda leaf: jnp.asarray(generator.normal(size=jnp.shape(leaf))), tree)
 
 
 def rubbed(law: str, file: Any) -> Scene:

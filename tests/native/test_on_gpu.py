@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import assert_close
-from test_gpu import LAWS, PACK
+from scenes import EVERY_LAW, assert_close
+from test_gpu import PACK
 
 import gmem_jax as gm
 from gmem_jax import native
@@ -34,7 +34,7 @@ def thrown(law: str, replicas: int, isotropic: bool = True, wall_mu: float | Non
     clump = replace(PACK.clump, isotropic=isotropic)
     if not isotropic:
         clump = replace(clump, inertia=clump.inertia * jnp.asarray([0.8, 1.0, 1.3]))
-    system = System(clump, LAWS[law], PACK.pairs, wall_mu=wall_mu)
+    system = System(clump, EVERY_LAW[law], PACK.pairs, wall_mu=wall_mu)
     state = start(system, PACK.position[..., None], PACK.quaternion[..., None], PACK.box)
     draws = 5e-3 * np.random.default_rng(0).normal(size=(2, PACK.grains, 3, 1)) * np.linspace(1.0, 0.5, replicas)
     state = replicate(state, replicas)
@@ -88,7 +88,7 @@ def on_both(function: Any, make: Any) -> tuple[Any, Any]:
     return function(*jax.device_put(arguments, GPU)), expected
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", EVERY_LAW)
 def test_values_and_tangents_are_those_of_the_cpu(law: str) -> None:
     # Sums are taken in another order. Seen: 1e-13, and 1e-11 for M2-paper; tangents 5e-11, and 2e-10.
     assert_close(*on_both(moved, lambda: thrown(law, 5)), 1e-10)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scenes import PERIODIC_27, SPHERE, TETRA_27, scene
+from scenes import PERIODIC_27, SPHERE, TETRA_27, scene, standing
 
 import gmem_jax as gm
 from gmem_jax.physics import step as dynamics
@@ -14,11 +14,6 @@ from gmem_jax.physics.state import Box, replicate
 
 MARCH = jax.jit(dynamics.march)
 G = 1e-4
-
-
-def standing(box: Box, steps: int) -> Box:
-    """Walls that stand still for some steps."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), box)
 
 
 def falling(place: list[float], gravity: object = G, **more: object) -> tuple:

@@ -18,6 +18,7 @@ from scenes import (
     cached_tetra,
     make_grains,
     squeeze,
+    standing,
 )
 
 import gmem_jax as gm
@@ -41,11 +42,6 @@ LAWS = {
     "M1": gm.MindlinRescaled(damping_time=0.0),
     "M2": gm.Mindlin(damping_time=0.0, points=20),
 }
-
-
-def standing(box: Box, steps: int) -> Box:
-    """Walls that stand still for some steps."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), box)
 
 
 @quickly

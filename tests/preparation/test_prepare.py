@@ -271,7 +271,7 @@ def test_a_boundary_is_walls_or_periodic(wrong: object) -> None:
 def test_every_number_of_a_recipe_says_what_it_means_and_where_it_must_lie() -> None:
     for entry in fields(gm.Recipe):
         assert entry.name in ("sizes", "shares", "boundary") or entry.metadata["interval"].holds(entry.default)
-        assert entry.metadata["help"]
+        assert entry.metadata["words"]
         assert f"        {entry.name}: " in str(gm.Recipe.__doc__)
 
 

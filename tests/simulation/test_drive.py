@@ -12,7 +12,6 @@ import gmem_jax as gm
 from gmem_jax.experiment.protocols import memory_protocol
 from gmem_jax.experiment.signals import Bumps, six_signals
 from gmem_jax.experiment.stages import cycle
-from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.stage import Stage, table
 
 LOWER = jnp.asarray([[1.0], [-2.0], [0.5]])
@@ -136,67 +135,17 @@ def memory(rest=0.2, hold=0.2, store=2.0, second_readout=False) -> tuple[Stage, 
 def test_the_protocol_is_continuous_in_u_and_takes_6_6_t0():
     stages = memory()
     assert sum(stage.length for stage in stages) == pytest.approx(6.6, rel=1e-14)
+    assert sum(stage.length for stage in memory(second_readout=True)) == pytest.approx(9.0, rel=1e-14)
     assert all(one.stop == other.start for one, other in itertools.pairwise(stages))
     assert (stages[0].start, stages[-1].stop) == (0.0, 0.0)
 
 
-def test_only_encoding_moves_the_walls_with_shear():
-    moving = [stage.name for stage in memory() if stage.sheared and stage.start != stage.stop]
-    assert moving == ["encode"]
-
-
 def test_a_preparation_cycle_has_no_shear_and_returns_to_the_start():
     stages = cycle(rest=0.1, hold=0.3)
-    assert not any(stage.sheared for stage in stages)
+    assert not any(stage.drives for stage in stages)
     assert [stage.length for stage in stages] == [0.1, 1.0, 0.3, 1.0]
     assert [stage.start == stage.stop for stage in stages] == [True, False, True, False]
     assert stages[-1].stop == stages[0].start
-
-
-def test_rest_hold_and_storage_have_lengths_of_their_own():
-    stages = memory(rest=0.1, hold=0.3, store=0.7, second_readout=True)
-    assert [(stage.name, stage.start, stage.stop, stage.length) for stage in stages] == [
-        ("rest", 0.0, 0.0, 0.1),
-        ("compress", 0.0, 1.0, 1.0),
-        ("hold", 1.0, 1.0, 0.3),
-        ("decompress", 1.0, 0.0, 1.0),
-        ("rest-2", 0.0, 0.0, 0.1),
-        ("encode", 0.0, 1.0, 1.0),
-        ("store", 1.0, 1.0, 0.7),
-        ("readout", 1.0, 0.0, 1.0),
-        ("rest-3", 0.0, 0.0, 0.1),
-        ("compress-3", 0.0, 1.0, 1.0),
-        ("hold-3", 1.0, 1.0, 0.3),
-        ("readout-2", 1.0, 0.0, 1.0),
-    ]
-    assert stages[:8] == memory(rest=0.1, hold=0.3, store=0.7)
-    assert sum(stage.length for stage in memory(second_readout=True)) == pytest.approx(9.0, rel=1e-14)
-
-
-def test_the_stages_are_split_before_the_first_shear():
-    common, own = Protocol(memory(second_readout=True)).phases
-    assert (common[-1].name, own[0].name) == ("rest-2", "encode")
-    assert (*common, *own) == memory(second_readout=True)
-
-
-@pytest.mark.parametrize(("length", "bins"), [(0.2, 52), (0.05, 13), (0.5, 128), (1.0, 256), (1e-6, 1), (0.0, 1)])
-def test_a_hold_is_rounded_up_to_whole_bins(length, bins):
-    assert Stage("hold", 1.0, 1.0, length).bins == bins
-
-
-def test_the_table_lists_the_bins_of_all_stages_in_order():
-    stages = memory(rest=0.05, hold=0.1, store=0.3)
-    lengths = [13, 256, 26, 256, 13, 256, 77, 256]
-    rows = table(stages)
-    assert [stage.bins for stage in stages] == lengths
-    for column, values in (
-        (rows.start, [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0]),
-        (rows.stop, [0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0, 0.0]),
-        (rows.bins, lengths),
-        (rows.amplitudes[0], [False] * 5 + [True] + [False] * 2),
-    ):
-        np.testing.assert_array_equal(column, np.repeat(values, lengths))
-    np.testing.assert_array_equal(rows.number, np.concatenate([np.arange(length) for length in lengths]))
 
 
 def test_rows_are_part_of_the_table_of_their_stage():

@@ -37,7 +37,7 @@ def test_rests_holds_and_storage_have_lengths_of_their_own() -> None:
 
 def test_only_the_encoding_is_sheared_and_all_before_it_is_common() -> None:
     stages = memory_protocol(REST, HOLD, STORE, second_readout=True)
-    assert [stage.name for stage in stages if stage.sheared] == ["encode"]
+    assert [stage.name for stage in stages if stage.drives] == ["encode"]
     common, own = stages.phases
     assert written(common + own) == FIRST + AGAIN
     assert own[0].name == "encode"
@@ -46,17 +46,18 @@ def test_only_the_encoding_is_sheared_and_all_before_it_is_common() -> None:
 def test_a_pulse_before_the_compression_takes_the_shear_from_it() -> None:
     protocol = memory_protocol(REST, HOLD, STORE, second_readout=False, shear="before")
     stages = protocol.stages
-    assert [stage.name for stage in stages if stage.sheared] == ["pulse"]
+    assert [stage.name for stage in stages if stage.drives] == ["pulse"]
     assert [stage.name for stage in stages][4:7] == ["rest-2", "pulse", "encode"]
     assert (stages[5].start, stages[5].stop, stages[5].bins) == (0.0, 0.0, 256)
     _, own = protocol.phases
     assert own[0].name == "pulse"
 
 
-@pytest.mark.parametrize(
-    ("length", "bins"),
-    [(0.0, 1), (0.001, 1), (1 / 256, 1), (0.1, 26), (0.2, 52), (0.25, 64), (0.3, 77), (1.0, 256), (2.0, 512)],
-)
+WHOLE_BINS = [(0.0, 1), (1e-6, 1), (0.001, 1), (1 / 256, 1), (0.05, 13), (0.1, 26), (0.2, 52), (0.25, 64)]
+WHOLE_BINS += [(0.3, 77), (0.5, 128), (1.0, 256), (2.0, 512)]
+
+
+@pytest.mark.parametrize(("length", "bins"), WHOLE_BINS)
 def test_a_hold_that_is_not_whole_bins_is_rounded_up_to_them(length: float, bins: int) -> None:
     assert Stage("hold", 1.0, 1.0, length).bins == bins
 
@@ -78,7 +79,7 @@ def test_the_table_counts_the_bins_of_every_stage_from_zero() -> None:
         np.testing.assert_array_equal(rows.number[here], np.arange(stage.bins))
         assert {*np.asarray(rows.bins)[here]} == {stage.bins}
         assert {*np.asarray(rows.start)[here], *np.asarray(rows.stop)[here]} == {stage.start, stage.stop}
-        assert {*np.asarray(rows.amplitudes[0])[here]} == {float(stage.sheared)}
+        assert {*np.asarray(rows.amplitudes[0])[here]} == {float(bool(stage.drives))}
         place += stage.bins
     assert place == len(rows.number) == 26 + 256 + 77 + 256 + 26 + 256 + 180 + 256 + 26 + 256 + 77 + 256
 
@@ -136,18 +137,6 @@ def test_what_is_asked_of_a_protocol_follows_from_roles_and_not_from_names() -> 
     assert renamed.first_memory == ("part 5", "part 6", "part 7")
     assert [len(phase) for phase in renamed.phases] == [5, 7]
     assert Protocol.from_list(json.loads(json.dumps(renamed.to_list()))) == renamed
-
-
-@pytest.mark.parametrize(
-    ("stages", "reason"),
-    [
-        ((), "at least one stage"),
-        ((Stage("a", 0.0, 0.5, 1.0), Stage("b", 0.6, 1.0, 1.0)), "the walls would jump: stage 'a' ends at u = 0.5"),
-    ],
-)
-def test_stages_that_make_no_protocol_are_refused(stages: tuple[Stage, ...], reason: str) -> None:
-    with pytest.raises(ValueError, match=reason):
-        Protocol(stages)
 
 
 def test_a_stage_has_a_role_and_a_length() -> None:

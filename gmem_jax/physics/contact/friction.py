@@ -7,16 +7,32 @@ A law is called once in a step, with positions at its end and velocities of its 
 `kin.sliding` times `kin.dt`.
 """
 
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 
 from gmem_jax.physics.contact.kinematics import Kinematics
-from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.pytree import Scalar, parameter, validate
 from gmem_jax.physics.rotation import dot
 
 TANGENTIAL_DAMPING = 0.069  # gamma / k of a tangential spring, in t_c; the paper's, of every law
+
+
+@dataclass(frozen=True)
+class Sprung:
+    """The numbers of a law with a tangential spring and dashpot, which each law describes; the stiffness is H's."""
+
+    mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")
+    stiffness: Scalar = parameter(0.13, "(0, inf)", "k_H in E R, or k_M in E R^0.5; default the law's")
+    damping_time: Scalar = parameter(
+        TANGENTIAL_DAMPING, "[0, inf)", "Tangential damping over stiffness; default the law's", "t_c"
+    )
+    spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
+
+    def __post_init__(self) -> None:
+        validate(self)
 
 
 @runtime_checkable

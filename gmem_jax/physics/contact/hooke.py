@@ -6,14 +6,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.physics.contact.friction import TANGENTIAL_DAMPING, coulomb
+from gmem_jax.physics.contact.friction import Sprung, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
-from gmem_jax.physics.pytree import Scalar, parameter, pytree, validate
+from gmem_jax.physics.pytree import pytree
 
 
 @pytree
 @dataclass(frozen=True)
-class Hooke:
+class Hooke(Sprung):
     """df_e = k dsigma, f_d = damping_time k dsigma/dt, |f_e + f_d| <= mu f_n (paper, Sec. II).
 
     The stiffness is one for all contacts, whatever the radii of the spheres.
@@ -27,16 +27,6 @@ class Hooke:
         spinning: 1 where the history turns with a contact about its normal, 0 where it does not (as in LAMMPS, which
             only tumbles it); scalar or [B].
     """
-
-    mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")
-    stiffness: Scalar = parameter(0.13, "(0, inf)", "k_H in E R, or k_M in E R^0.5; default the law's")
-    damping_time: Scalar = parameter(
-        TANGENTIAL_DAMPING, "[0, inf)", "Tangential damping over stiffness; default the law's", "t_c"
-    )
-    spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
-
-    def __post_init__(self) -> None:
-        validate(self)
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> jax.Array:
         """No elastic force yet: zeros, [contacts, 3, replicas]."""

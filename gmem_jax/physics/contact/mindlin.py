@@ -6,11 +6,11 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.physics.contact.friction import TANGENTIAL_DAMPING, coulomb
+from gmem_jax.physics.contact.friction import Sprung, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.numbers import require_whole
-from gmem_jax.physics.pytree import Scalar, parameter, pytree, static, validate
+from gmem_jax.physics.pytree import Scalar, parameter, pytree, static
 from gmem_jax.physics.rotation import cross, dot
 
 MOST_POINTS = 10_000  # of a history; the paper has 100
@@ -40,7 +40,7 @@ def any_tangent(normal: jax.Array) -> jax.Array:
 
 @pytree
 @dataclass(frozen=True)
-class Mindlin:
+class Mindlin(Sprung):
     """f_e is the integral of f(q) over 0 < q < sqrt(p), where df = k dsigma; f beyond is forgotten (App. D.2).
 
     f(q) is the elastic force per unit of q in the ring of contact area that was attached when sqrt(p) passed q. It is
@@ -77,18 +77,13 @@ class Mindlin:
         ValueError: if `points` or `variant` is none of these.
     """
 
-    mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")
     stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)", "k_M", "E R^0.5")
-    damping_time: Scalar = parameter(
-        TANGENTIAL_DAMPING, "[0, inf)", "Tangential damping over stiffness; default the law's", "t_c"
-    )
-    spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
     p_max: Scalar = parameter(0.2, "(0, inf)", "m2: largest overlap of its history", "R")
     points: int = static(100, "m2: points of its history")
     variant: Literal["averaged", "exact", "paper"] = static("averaged", "m2: averaged, exact or paper")
 
     def __post_init__(self) -> None:
-        validate(self)
+        super().__post_init__()
         object.__setattr__(self, "points", require_whole("Mindlin.points", self.points))
         if not 2 <= self.points <= MOST_POINTS:
             raise ValueError(f"Mindlin.points must be 2 to {MOST_POINTS}, got {self.points}")

@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.physics.contact.friction import TANGENTIAL_DAMPING, coulomb
+from gmem_jax.physics.contact.friction import Sprung, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pytree import Scalar, parameter, pytree, validate
+from gmem_jax.physics.pytree import Scalar, parameter, pytree
 
 
 @pytree
@@ -28,7 +28,7 @@ class RescaledHistory:
 
 @pytree
 @dataclass(frozen=True)
-class MindlinRescaled:
+class MindlinRescaled(Sprung):
     """f_e *= sqrt(p / p_old) on unloading, then df_e = k p^0.5 dsigma, f_d = damping_time k p^0.5 dsigma/dt (Sec. II).
 
     The Coulomb limit |f_e + f_d| <= mu f_n applies as in the other laws. Between spheres of other radii than 1, k is
@@ -41,15 +41,7 @@ class MindlinRescaled:
         spinning: see `gmem_jax.physics.contact.hooke.Hooke`.
     """
 
-    mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")
     stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)", "k_M", "E R^0.5")
-    damping_time: Scalar = parameter(
-        TANGENTIAL_DAMPING, "[0, inf)", "Tangential damping over stiffness; default the law's", "t_c"
-    )
-    spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
-
-    def __post_init__(self) -> None:
-        validate(self)
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> RescaledHistory:
         """No elastic force and no overlap yet."""
