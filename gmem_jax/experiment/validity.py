@@ -15,7 +15,7 @@ from jax import lax
 
 from gmem_jax.experiment.analysis import compare
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.physics.contact.friction import CoulombLaw, Sprung
+from gmem_jax.physics.contact.friction import CoulombLaw, SpringLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.state import Status
@@ -62,7 +62,7 @@ def validity(
     of_walls = jnp.asarray(0.0 if experiment.wall_mu is None else experiment.wall_mu)
     rubs = friction > 0.0 if isinstance(law, CoulombLaw) else not isinstance(law, Frictionless)
     least = -_most([-(sample.pressure[:, 0] + sample.pressure[:, 1]) for sample in stages.values()])
-    stiffness = jnp.asarray(law.stiffness if isinstance(law, Sprung) else 0.0)
+    stiffness = jnp.asarray(law.stiffness if isinstance(law, SpringLaw) else 0.0)
     found = {
         Status.DEEP_OVERLAP: deepest > DEEPEST,
         Status.NOT_QUASI_STATIC: fastest > FASTEST,
@@ -116,7 +116,7 @@ def _dashpots(experiment: Experiment, stages: Mapping[str, Sample], deepest: jax
     along two of three axes, and turns a grain by the arm of its outer radius.
     """
     law: Any = experiment.friction
-    if not isinstance(law, Sprung):
+    if not isinstance(law, SpringLaw):
         return jnp.zeros(1)
     clump, contacts = experiment.pack.clump, _most([sample.contacts for sample in stages.values()])
     spring = law.stiffness * (1.0 if isinstance(law, Hooke) else jnp.sqrt(jnp.maximum(deepest, 0.0)))

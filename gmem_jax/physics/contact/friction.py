@@ -21,7 +21,7 @@ TANGENTIAL_DAMPING = 0.069  # gamma / k of a tangential spring, in t_c; the pape
 
 
 @dataclass(frozen=True)
-class Sprung:
+class SpringLaw:
     """The numbers of a law with a tangential spring and dashpot, which each law describes; the stiffness is H's."""
 
     mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")

@@ -6,14 +6,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.physics.contact.friction import Sprung, coulomb
+from gmem_jax.physics.contact.friction import SpringLaw, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.pytree import pytree
 
 
 @pytree
 @dataclass(frozen=True)
-class Hooke(Sprung):
+class Hooke(SpringLaw):
     """df_e = k dsigma, f_d = damping_time k dsigma/dt, |f_e + f_d| <= mu f_n (paper, Sec. II).
 
     The stiffness is one for all contacts, whatever the radii of the spheres.

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.physics.contact.friction import Sprung, coulomb
+from gmem_jax.physics.contact.friction import SpringLaw, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.numbers import require_whole
@@ -40,7 +40,7 @@ def any_tangent(normal: jax.Array) -> jax.Array:
 
 @pytree
 @dataclass(frozen=True)
-class Mindlin(Sprung):
+class Mindlin(SpringLaw):
     """f_e is the integral of f(q) over 0 < q < sqrt(p), where df = k dsigma; f beyond is forgotten (App. D.2).
 
     f(q) is the elastic force per unit of q in the ring of contact area that was attached when sqrt(p) passed q. It is

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gmem_jax.physics.contact.friction import Sprung, coulomb
+from gmem_jax.physics.contact.friction import SpringLaw, coulomb
 from gmem_jax.physics.contact.kinematics import Kinematics, transport
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar, parameter, pytree
@@ -28,7 +28,7 @@ class RescaledHistory:
 
 @pytree
 @dataclass(frozen=True)
-class MindlinRescaled(Sprung):
+class MindlinRescaled(SpringLaw):
     """f_e *= sqrt(p / p_old) on unloading, then df_e = k p^0.5 dsigma, f_d = damping_time k p^0.5 dsigma/dt (Sec. II).
 
     The Coulomb limit |f_e + f_d| <= mu f_n applies as in the other laws. Between spheres of other radii than 1, k is
