@@ -5,6 +5,7 @@ volume, mass and inertia; they are computed by summing exact one-dimensional sec
 of lines.
 """
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -112,12 +113,15 @@ def words_of_sizes(clump: Clump) -> str:
     return "; ".join(found)
 
 
-def _sections(offsets: np.ndarray, radii: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Volume, first moment [3] and second moment [3, 3] of a union of spheres at [K, 3] of radii [K].
+@functools.lru_cache(maxsize=64)
+def _sections(spheres: tuple[tuple[float, ...], ...]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Volume, first moment [3] and second moment [3, 3] of a union of spheres, each given as x, y, z and radius.
 
     Along each line parallel to z the union is a set of intervals whose ends are known exactly; only the two
-    transverse directions are discretised (midpoint rule).
+    transverse directions are discretised (midpoint rule). That takes 0.3 s, and sweeps ask for one grain many times.
     """
+    table = np.asarray(spheres)
+    offsets, radii = table[:, :3], table[:, 3]
     low, high = (offsets[:, :2] - radii[:, None]).min(axis=0), (offsets[:, :2] + radii[:, None]).max(axis=0)
     step = (high - low) / _LINES
     x = low[0] + step[0] * (np.arange(_LINES) + 0.5)
@@ -174,7 +178,7 @@ def clump(
         raise ValueError(f"clump offsets must be a finite [K, 3] array, got shape {centres.shape}")
     own = _lengths("clump radii", np.ones(len(centres)) if radii is None else radii, len(centres))
     require_radii(own)
-    volume, first, second = _sections(centres, own)
+    volume, first, second = _sections(tuple(map(tuple, np.column_stack([centres, own]).tolist())))
     centre = first / volume
     second = second - volume * np.outer(centre, centre)
     inertia = np.trace(second) * np.eye(3) - second
