@@ -50,7 +50,7 @@ from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache
 from gmem_jax.simulation.observers import CHUNK
 from gmem_jax.simulation.progress import within
 
-GRADIENT_COST = 5.0  # of a gradient through the prefix too, in runs (docs/speed.md)
+GRADIENT_COST = 5.5  # of a gradient through the prefix too, in runs (docs/speed.md)
 MANY = 16  # signals above which one kernel serves all rather than a Jacobian each
 
 
