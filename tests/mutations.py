@@ -221,8 +221,8 @@ MUTATIONS = (
     mutation(
         "coordination-of-spheres",
         "simulation/sample.py",
-        "jax.ops.segment_max(touching",
-        "jax.ops.segment_sum(touching",
+        "jnp.sum(touching > 0, axis=0)",
+        "jnp.sum(touching, axis=0)",
         "test_observables_are_those_counted_by_hand",
     ),
     mutation(

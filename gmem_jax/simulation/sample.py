@@ -169,9 +169,9 @@ def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scal
     grains, clump, pairs = state.grains, system.clump, system.pairs
     spheres = sphere_centres(grains, clump)
     overlap = overlaps(system, state)
-    touching = (overlap > 0.0).astype(jnp.int32)
     count = grains.position.shape[0]
-    touching_pairs = jax.ops.segment_max(touching, pairs.grain_pair, num_segments=pairs.capacity)
+    # Contacts of each pair of grains; both means below follow from it, so that overlaps are looked through once less.
+    touching = jax.ops.segment_sum((overlap > 0.0).astype(jnp.int32), pairs.grain_pair, num_segments=pairs.capacity)
     body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)
     inertia = clump.scaled(clump.inertia[:, None], 5)
     energy = jnp.sum(inertia * body_spin**2, axis=1, keepdims=True)
@@ -192,7 +192,7 @@ def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scal
         lengths=lengths,
         kinetic_energy=0.5 * jnp.sum(energy, axis=(0, 1)),
         largest_speed=jnp.sqrt(jnp.max(jnp.sum(lax.stop_gradient(grains.velocity) ** 2, axis=1), axis=0)),
-        coordination=2.0 * jnp.sum(jnp.maximum(touching_pairs, 0), axis=0) / count,
+        coordination=2.0 * jnp.sum(touching > 0, axis=0) / count,
         contacts=2.0 * jnp.sum(touching, axis=0) / count,
         wall_contacts=jnp.sum(at_walls, axis=(0, 1)) / count,
         filling=clump.volume(count) / jnp.prod(lengths, axis=0),
