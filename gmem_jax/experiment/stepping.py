@@ -17,9 +17,10 @@ from gmem_jax.physics.contact.laws import entry_of
 from gmem_jax.physics.numbers import is_real, said
 from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
-from gmem_jax.physics.state import still_box
+from gmem_jax.physics.state import Box, still_box
+from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.stability import cause, longest_step
-from gmem_jax.simulation.stable_step import SHORTEST_STEP, largest_stable_step
+from gmem_jax.simulation.stable_step import GROWTH, SHORTEST_STEP, growth, largest_stable_step
 
 RINGING_PERIODS = 9.6  # of a compression for an error of 1 in G, which falls as 1 / t0^2: at most 0.9 % at 96 of them
 ACCURACIES = 0.002, 0.1
@@ -27,7 +28,8 @@ LONG_STEP, LONG_DRIVE = 1.0, 1.8e3  # t_c; such steps change G by less than 1e-3
 ENOUGH_RINGS = 10  # rings of a history: their number hardly matters to its stiffness, and 100 take minutes
 MUCH_STIFFER = 144.0  # than one contact; packs at rest, whose grains have many, were 9 to 41 times as stiff
 
-_known: dict[tuple[str, ...], float] = {}
+_known: dict[tuple[str, ...], float] = {}  # stable steps that were found
+_borne: dict[tuple[str, ...], float] = {}  # the longest steps that were found to be stable
 
 
 @usual_rules()
@@ -44,20 +46,42 @@ def stable_step(experiment: Experiment) -> float:
         At most 2.
     """
     require_kind("stable_step", experiment, Experiment)
+    key, law = _case(experiment)
+    if key not in _known:
+        _known[key] = largest_stable_step(*_at_rest(experiment, law))
+    return _known[key]
+
+
+def is_stable(experiment: Experiment, dt: float) -> bool:
+    """Whether steps of `dt` are stable: `stable_step` without looking for the longest one, a tenth of the work."""
+    key, law = _case(experiment)
+    if key in _known:
+        return dt <= _known[key]
+    if dt > _borne.get(key, 0.0):
+        if not growth(*_at_rest(experiment, law), dt) <= GROWTH:
+            return False
+        _borne[key] = dt
+    return True
+
+
+def _case(experiment: Experiment) -> tuple[tuple[str, ...], Any]:
+    """What the stable step depends on, and the law that stands for the experiment's."""
     law: Any = experiment.friction
     if isinstance(law, CoulombLaw) and not np.any(law.mu):
         law = Frictionless()
     if (row := entry_of(law)) and row.layered:
         law = replace(law, points=min(law.points, ENOUGH_RINGS))
     parts = (law, experiment.material, experiment.compression, experiment.wall_mu)
-    key = (pack_fingerprint(experiment.pack), fingerprint(parts), str(jax.tree.structure(law)), experiment.backend)
-    if key not in _known:
-        _known[key] = _found(experiment, law)
-    return _known[key]
+    return (
+        pack_fingerprint(experiment.pack),
+        fingerprint(parts),
+        str(jax.tree.structure(law)),
+        experiment.backend,
+    ), law
 
 
-def _found(experiment: Experiment, law: Any) -> float:
-    """`stable_step` under a law: every replica at u = 0, and every one at u = 1."""
+def _at_rest(experiment: Experiment, law: Any) -> tuple[Simulation, jax.Array, jax.Array, Box]:
+    """The arguments of `largest_stable_step` under a law: every replica at u = 0, and every one at u = 1."""
     pack, single = experiment.pack, max(map(jnp.size, jax.tree.leaves((law, experiment.compression))))
     law = jax.tree.map(lambda leaf: jnp.tile(leaf, 2) if jnp.ndim(leaf) else leaf, law)
     compression, replicas = jnp.broadcast_to(experiment.compression, (single,)), 2 * single
@@ -69,8 +93,7 @@ def _found(experiment: Experiment, law: Any) -> float:
     simulation = experiment.simulation(sheared=False)
     system = replace(simulation.system, friction=law)
     simulation = replace(simulation, system=system, dt=1.0, drag=0.0, steps=1, precision="double")
-    box = still_box(centre - scale * half, centre + scale * half, pack.periodic)
-    return largest_stable_step(simulation, position, quaternion, box)
+    return simulation, position, quaternion, still_box(centre - scale * half, centre + scale * half, pack.periodic)
 
 
 def require_stable(experiment: Experiment) -> None:
@@ -83,7 +106,7 @@ def require_stable(experiment: Experiment) -> None:
         ValueError: saying both numbers, and which number of the experiment is the cause if one is by itself.
     """
     dt, simulation = float(np.max(np.asarray(experiment.timing.dt))), experiment.simulation(sheared=False)
-    if dt <= max(SHORTEST_STEP, min(USUAL_STEP, longest_step(simulation, MUCH_STIFFER))):
+    if dt <= max(SHORTEST_STEP, min(USUAL_STEP, longest_step(simulation, MUCH_STIFFER))) or is_stable(experiment, dt):
         return
     if dt > (stable := stable_step(experiment)):
         limit = f"{stable:.3g}" if stable else f"below {SHORTEST_STEP}"

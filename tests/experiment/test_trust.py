@@ -217,6 +217,7 @@ def test_steps_that_are_not_stable_are_refused_with_both_numbers(monkeypatch: py
 def test_nothing_is_estimated_for_default_numbers_in_default_steps(
     law: FrictionLaw, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("gmem_jax.experiment.stepping.is_stable", lambda *_: False)
     monkeypatch.setattr("gmem_jax.experiment.stepping.stable_step", lambda _: 0.0)
     experiment = gm.Experiment(PACK, two_bumps(1.0, -0.6), law)
     for one in (experiment, gm.replace(experiment, wall_mu=None if law == gm.Frictionless() else 1.0)):
