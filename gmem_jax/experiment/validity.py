@@ -23,8 +23,8 @@ from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.stage import BINS
 
 DEEPEST = 0.2  # R; there a contact's radius is 0.32 R, which Hertz takes for small. delta0 = 0.05 makes 0.14 to 0.17
-FASTEST = 5e-3  # inertial number; at 6e-3 (t0 = 180) F is 0.25 to 0.29 on packs that have 0.68 to 0.87 when not hurried
-RINGING = 0.03  # what averaging over T_1 may add to F: at N = 325 up to 0.005 at t0 = 1.8e3, 0.04 to 0.08 at 360
+FASTEST = 5e-3  # inertial number; at 7e-3 (t0 = 180) F is 0.20 to 0.33 on packs that have 0.66 to 0.88 when not hurried
+RINGING = 0.03  # what averaging over T_1 may add to F: at N = 325 up to 0.005 at t0 = 1.8e3, 0.06 to 0.15 at 360
 LARGEST_SHEAR = 0.25  # of delta0; gains are 1.3 to 1.7 times as large at 0.2, 2.0 to 2.5 at 0.3
 LARGEST_WAVEFORM = 2.0  # |I|; the paper's signals have 1 at most, and gains are per gamma0
 LARGEST_FRICTION = 10.0  # no pair of materials has it; beyond it G changes by 4 % up to 1e6: hardly a contact slides

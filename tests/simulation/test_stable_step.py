@@ -9,6 +9,7 @@ import pytest
 from scenes import TETRA_27
 
 import gmem_jax as gm
+from gmem_jax.experiment import stepping
 from gmem_jax.simulation.stable_step import CLOSE, GROWTH, LONGEST_STEP, SHORTEST_STEP, largest_without
 
 EXPERIMENT = gm.Experiment(gm.load_pack(TETRA_27), gm.words(1), gm.Hooke(stiffness=0.5), delta0=1e-4)
@@ -36,6 +37,17 @@ def test_a_kick_dies_out_in_stable_steps_and_grows_beyond_them() -> None:
     assert 0.8 < stable < 1.2  # 2 under the default law, and there it ends
     assert growth(0.98 * stable) < 0.0
     assert growth(1.03 * stable) > GROWTH
+
+
+def test_whether_a_step_is_stable_is_known_without_the_longest_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    stable = gm.stable_step(EXPERIMENT)
+    monkeypatch.setattr(stepping, "_known", {})
+    monkeypatch.setattr(stepping, "_borne", {})
+    monkeypatch.setattr(stepping, "largest_stable_step", None)
+    assert stepping.is_stable(EXPERIMENT, 0.98 * stable)
+    assert not stepping.is_stable(EXPERIMENT, CLOSE**2 * stable)
+    monkeypatch.setattr(stepping, "growth", None)  # asked once
+    assert stepping.is_stable(EXPERIMENT, 0.9 * stable)
 
 
 def test_the_step_is_the_longest_without_growth() -> None:
