@@ -24,7 +24,8 @@ from gmem_jax.simulation.stable_step import GROWTH, SHORTEST_STEP, growth, large
 
 RINGING_PERIODS = 9.6  # of a compression for an error of 1 in G, which falls as 1 / t0^2: at most 0.9 % at 96 of them
 ACCURACIES = 0.002, 0.1
-LONG_STEP, LONG_DRIVE = 1.0, 1.8e3  # t_c; such steps change G by less than 1e-3 where t0 is at least so long
+PART = 0.6  # of the stable step that is taken, and
+LONG_STEP, LONG_DRIVE = 1.2, 1.8e3  # t_c; such steps change G by 1.5e-3 at most where t0 is at least so long
 ENOUGH_RINGS = 10  # rings of a history: their number hardly matters to its stiffness, and 100 take minutes
 MUCH_STIFFER = 144.0  # than one contact; packs at rest, whose grains have many, were 9 to 41 times as stiff
 
@@ -53,7 +54,7 @@ def stable_step(experiment: Experiment) -> float:
 
 
 def is_stable(experiment: Experiment, dt: float) -> bool:
-    """Whether steps of `dt` are stable: `stable_step` without looking for the longest one, a tenth of the work."""
+    """Whether steps of `dt` are stable: `stable_step` without looking for the longest one, a quarter of the work."""
     key, law = _case(experiment)
     if key in _known:
         return dt <= _known[key]
@@ -128,7 +129,7 @@ def at_accuracy(experiment: Experiment, accuracy: float) -> Experiment:
         accuracy: error of G, relative, 0.002 to 0.1.
 
     Returns:
-        t0 is 9.6 T1 / accuracy^0.5, and dt half of the stable step, but at most 1 t_c, or 0.6 where t0 is below 1,800.
+        t0 is 9.6 T1 / accuracy^0.5, and dt 0.6 of the stable step, but at most 1.2 t_c, or 0.6 where t0 is below 1,800.
 
     Raises:
         ValueError: if the accuracy is outside of this.
@@ -139,4 +140,4 @@ def at_accuracy(experiment: Experiment, accuracy: float) -> Experiment:
         raise ValueError(f"accuracy must be a number from {least} to {most}, got {said(accuracy)}")
     t0 = float(RINGING_PERIODS * np.max(np.asarray(experiment.pack.ringing_period)) / accuracy**0.5)
     longest = LONG_STEP if t0 >= LONG_DRIVE else USUAL_STEP
-    return with_changes(experiment, t0=t0, dt=min(longest, 0.5 * stable_step(experiment)), steps=None)
+    return with_changes(experiment, t0=t0, dt=min(longest, PART * stable_step(experiment)), steps=None)

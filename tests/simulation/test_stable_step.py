@@ -54,6 +54,18 @@ def test_the_step_is_the_longest_without_growth() -> None:
     assert 0.7 / CLOSE < largest_without(lambda dt: dt - 0.7) < 0.7 + GROWTH
 
 
+@pytest.mark.parametrize("frequency", [1.02, 2.0, 7.0])
+def test_the_step_of_one_undamped_mode_is_found_in_four_questions(frequency: float) -> None:
+    asked = []
+
+    def growth(dt: float) -> float:
+        asked.append(dt)
+        return float(np.arccosh(max(1.0, 0.5 * (frequency * dt) ** 2 - 1.0)))  # z + 1 / z = 2 - (w dt)^2
+
+    assert 2.0 / CLOSE < frequency * largest_without(growth) <= 2.0
+    assert len(asked) <= 4
+
+
 @pytest.mark.parametrize(("found", "expected"), [(-1.0, LONGEST_STEP), (1.0, 0.0), (np.nan, 0.0)])
 def test_steps_that_are_all_stable_or_not_have_no_root(found: float, expected: float) -> None:
     assert largest_without(lambda _: found) == expected
