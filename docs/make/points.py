@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from drawn_words import over_packs, read_rows
+from scipy.special import stdtr
 
 from gmem_jax.bench.table import into
 from gmem_jax.reproduce import draw
@@ -126,6 +127,14 @@ def ours() -> dict[Measured, Compared]:
     return best
 
 
+def by_chance(row: Compared) -> float:
+    """The probability that a measure lies beyond `WITHIN` although nothing differs: Student's t, degrees by Welch."""
+    parts = [one for one in (row.ours, row.theirs) if one is not None and one.packs > 1]
+    squares = [one.error**2 for one in parts]
+    degrees = sum(squares) ** 2 / sum(square**2 / (one.packs - 1) for one, square in zip(parts, squares, strict=True))
+    return 2.0 * float(stdtr(degrees, -WITHIN))
+
+
 def _said(one: Estimate) -> str:
     error = "" if math.isnan(one.error) else f" ± {one.error:.3f}"
     return f"{one.mean:.3f}{error} ({one.packs})"
@@ -145,14 +154,16 @@ def every_point() -> list[str]:
     head = [*names, "G", "published", "apart", "F", "published", "apart", "beyond 2: see"]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     apart: list[float] = []
-    missing = 0
+    missing, chance = 0, 0.0
     for at in _published():
         grain, box = (at["shape"], at["overlap"], int(at["n_grains"])), (at["mu"], at["delta0"], at["gamma0"])
         conditions = Conditions(at["law"], *grain, *box, 0, "sub0")
         rows = [best.get((conditions, measure)) for measure in "GF"]
         missing += rows[1] is None
-        own = [row.errors_apart for row in rows if row is not None and not math.isnan(row.errors_apart)]
+        told_apart = [row for row in rows if row is not None and not math.isnan(row.errors_apart)]
+        own = [row.errors_apart for row in told_apart]
         apart += own
+        chance += sum(map(by_chance, told_apart))
         reasons = [words for holds, words in REASONS if holds(at)][:1] if any(abs(x) > WITHIN for x in own) else []
         shown = [at["law"], f"{at['overlap']:g}", f"{at['mu']:g}", f"{conditions.grains:,}"]
         shown += [f"{at['delta0']:g}", f"{at['gamma0']:g}", *_beside(rows[0]), *_beside(rows[1]), *(reasons or [""])]
@@ -160,7 +171,8 @@ def every_point() -> list[str]:
     within = sum(abs(one) <= WITHIN for one in apart)
     total = len(lines) - 2
     told = f"{total - missing} of {total} published points have one of ours of the same N. "
-    return [f"{told}Of {len(apart)} measures {within} lie within two combined errors.", "", *lines]
+    told += f"Of {len(apart)} measures {within} lie within two combined errors, and {len(apart) - within} beyond. "
+    return [f"{told}Chance alone would put {chance:.0f} beyond, so few are the packs (Student's t).", "", *lines]
 
 
 def _published() -> Iterable[dict[str, Any]]:
