@@ -24,7 +24,7 @@ from gmem_jax.simulation.stable_step import GROWTH, SHORTEST_STEP, growth, large
 
 RINGING_PERIODS = 9.6  # of a compression for an error of 1 in G, which falls as 1 / t0^2: at most 0.9 % at 96 of them
 ACCURACIES = 0.002, 0.1
-PART = 0.6  # of the stable step that is taken, and
+STEP_PART = 0.6  # of the stable step that is taken, and
 LONG_STEP, LONG_DRIVE = 1.2, 1.8e3  # t_c; such steps change G by 1.5e-3 at most where t0 is at least so long
 ENOUGH_RINGS = 10  # rings of a history: their number hardly matters to its stiffness, and 100 take minutes
 MUCH_STIFFER = 144.0  # than one contact; packs at rest, whose grains have many, were 9 to 41 times as stiff
@@ -140,4 +140,4 @@ def at_accuracy(experiment: Experiment, accuracy: float) -> Experiment:
         raise ValueError(f"accuracy must be a number from {least} to {most}, got {said(accuracy)}")
     t0 = float(RINGING_PERIODS * np.max(np.asarray(experiment.pack.ringing_period)) / accuracy**0.5)
     longest = LONG_STEP if t0 >= LONG_DRIVE else USUAL_STEP
-    return with_changes(experiment, t0=t0, dt=min(longest, PART * stable_step(experiment)), steps=None)
+    return with_changes(experiment, t0=t0, dt=min(longest, STEP_PART * stable_step(experiment)), steps=None)
