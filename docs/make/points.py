@@ -160,10 +160,10 @@ def every_point() -> list[str]:
         conditions = Conditions(at["law"], *grain, *box, 0, "sub0")
         rows = [best.get((conditions, measure)) for measure in "GF"]
         missing += rows[1] is None
-        told_apart = [row for row in rows if row is not None and not math.isnan(row.errors_apart)]
-        own = [row.errors_apart for row in told_apart]
+        found = [row for row in rows if row is not None and not math.isnan(row.errors_apart)]
+        own = [row.errors_apart for row in found]
         apart += own
-        chance += sum(map(by_chance, told_apart))
+        chance += sum(map(by_chance, found))
         reasons = [words for holds, words in REASONS if holds(at)][:1] if any(abs(x) > WITHIN for x in own) else []
         shown = [at["law"], f"{at['overlap']:g}", f"{at['mu']:g}", f"{conditions.grains:,}"]
         shown += [f"{at['delta0']:g}", f"{at['gamma0']:g}", *_beside(rows[0]), *_beside(rows[1]), *(reasons or [""])]
