@@ -1,6 +1,7 @@
 """How the house is built: imports point downwards only, and importing it starts and loads nothing heavy."""
 
 import ast
+import os
 import subprocess
 import sys
 from graphlib import TopologicalSorter
@@ -193,9 +194,11 @@ except SystemExit:
 """
 
 
-@pytest.mark.parametrize(("arguments", "loaded"), [("--help", ""), ("--version", ""), ("info", "jax numpy")])
+@pytest.mark.parametrize(("arguments", "loaded"), [("--help", ""), ("--version", ""), ("info", "")])
 def test_what_is_told_at_once_loads_no_more_than_it_needs(arguments: str, loaded: str) -> None:
-    done = subprocess.run([sys.executable, "-c", STARTING, arguments], capture_output=True, text=True, check=True)
+    quiet = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "PJRT_", "XLA_"))}
+    told = [sys.executable, "-c", STARTING, arguments]
+    done = subprocess.run(told, env=quiet, capture_output=True, text=True, check=True)
     assert done.stdout
     assert done.stderr == loaded
 

@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import native
 from gmem_jax.bench import measure
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance
-from gmem_jax.native import cuda
+from gmem_jax.native import cuda, library
 from gmem_jax.native.cuda import Needs
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -47,7 +46,7 @@ def device() -> Any:
     except RuntimeError as error:
         hint = "pip install 'gmem-jax[cuda13]', or [cuda12] for drivers of CUDA 12"
         raise ValueError(f"JAX sees no CUDA GPU here (with one: {hint})") from error
-    if reason := (native.available()[1] if not native.available()[0] else cuda.missing()):
+    if reason := (library.available()[1] if not library.available()[0] else cuda.missing()):
         raise ValueError(f"the native backend cannot use the GPU: {reason}")
     return found
 
@@ -85,11 +84,11 @@ def bytes_per_grain_step(pack: Pack) -> dict[str, float]:
 
 def registers() -> dict[str, dict[str, tuple[Needs, Needs]]]:
     """What the kernels `touch` and `move_alone` take, by law and architecture; empty without NVRTC or library."""
-    if cuda.missing() or not native.available()[0]:
+    if cuda.missing() or not library.available()[0]:
         return {}
 
     def of(law: FrictionLaw, task: cuda.Task) -> dict[str, tuple[Needs, Needs]]:
-        found = {name: native.needs(law, name, task) for name in ARCHITECTURES}
+        found = {name: library.needs(law, name, task) for name in ARCHITECTURES}
         return {name: (kernels["touch"], kernels["move_alone"]) for name, kernels in found.items()}
 
     plain = {name: of(law, "forward") for name, law in GPU_LAWS.items()}

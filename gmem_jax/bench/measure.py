@@ -23,7 +23,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import native
 from gmem_jax.bench import lammps
 from gmem_jax.bench.race import REPEATS, Candidate, Row, interleave
 from gmem_jax.derivatives.gradient import value_and_grad
@@ -33,6 +32,8 @@ from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
 from gmem_jax.experiment.run import run
 from gmem_jax.experiment.signals import Bumps
+from gmem_jax.native.backend import backend_name
+from gmem_jax.native.library import available
 from gmem_jax.physics.contact import laws
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -70,7 +71,7 @@ def encode(pack: Pack, law: FrictionLaw, replicas: int, backend: str, t0: float 
     """The start of an encode stage: what a rollout needs."""
     heights = jnp.linspace(-1.0, 1.0, max(1, replicas - 1))[:, None]
     signals = Bumps(heights, jnp.full_like(heights, 0.1), 0.2)
-    experiment = Experiment(pack, signals, law, t0=t0, backend=native.name(backend, law))
+    experiment = Experiment(pack, signals, law, t0=t0, backend=backend_name(backend, law))
     simulation = experiment.simulation(sheared=replicas > 1)
     return simulation, replicate(experiment.begin(), replicas)
 
@@ -230,7 +231,7 @@ def memory(load: Callable[[str], Pack], name: str, grains: int, backend: str, la
 def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int, t0: float) -> dict[str, float]:
     jax.config.update("jax_enable_x64", True)
     amplitudes = np.random.default_rng(0).normal(scale=0.2, size=(6, values))
-    experiment = Experiment(load(name), bumps(amplitudes, 0.2), t0=t0, backend=native.name(backend, Hooke()))
+    experiment = Experiment(load(name), bumps(amplitudes, 0.2), t0=t0, backend=backend_name(backend, Hooke()))
 
     def seconds(timed: Callable[[], Any]) -> float:
         taken = []
@@ -309,14 +310,14 @@ def run_benchmark(
     """
     loaded = {name: load(name) for name in packs}
     first = loaded[packs[0]]
-    fastest = "native" if native.available()[0] else "jax"
+    fastest = "native" if available()[0] else "jax"
     backends = [fastest, "jax"] if with_jax and fastest != "jax" else [fastest]
     absent = lammps.missing_lammps() if with_lammps else "not asked for"
     result: dict[str, Any] = {
         **provenance(),
         "processor": processor(),
         "lammps": absent or lammps.version(),
-        "instruction_set": native.available()[1],
+        "instruction_set": available()[1],
         "repeats": REPEATS,
         "t0": t0,
         "rows": [],

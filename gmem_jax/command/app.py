@@ -4,7 +4,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -91,7 +91,8 @@ class _Command(TyperCommand):
         typed = [one for one in self.params if "COMMANDLINE" in str(ctx.get_parameter_source(str(one.name)))]
         GIVEN.set({str(one.name): "/".join(_longest(one.opts) + _longest(one.secondary_opts)) for one in typed})
         gmem_start.imported()
-        with _rules_of_commands():
+        # The rules are JAX's: a command that does without it is told sooner.
+        with _rules_of_commands() if "jax" in sys.modules else nullcontext():
             return super().invoke(ctx)
 
 

@@ -246,7 +246,7 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
     import psutil
 
     from gmem_jax.files.sizes import in_bytes, in_time
-    from gmem_jax.native import require_threads
+    from gmem_jax.native.library import require_threads
 
     if backend == "native":
         require_threads()

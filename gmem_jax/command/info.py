@@ -2,21 +2,22 @@
 
 from typing import Any
 
-import jax
-
-from gmem_jax import native
 from gmem_jax.command.console import AsJson, print_result
-from gmem_jax.experiment.provenance import provenance
+from gmem_jax.experiment.provenance import devices, is_one_cpu, provenance
 from gmem_jax.files.cache import list_packs
+from gmem_jax.native import build
+
+if not is_one_cpu():
+    import jax  # noqa: F401  under the rules that commands have for it
 
 
 def info(as_json: AsJson = False) -> None:
     """Versions, devices, backend and shipped packs."""
-    built, why = native.available()
+    library, why = build.opened(build.HERE / build.LIBRARY)
     facts: dict[str, Any] = {
         **provenance(),
-        "devices": [f"{d.platform}: {d.device_kind}" for d in jax.devices()],
-        "backend": f"native ({why})" if built else f"jax (no native backend: {why})",
+        "devices": devices(),
+        "backend": f"native ({build.instruction_set(library)})" if library else f"jax (no native backend: {why})",
         "packs": list_packs(),
     }
     lines = [f"{key}: {value}" for key, value in facts["versions"].items()]

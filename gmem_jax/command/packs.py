@@ -7,7 +7,6 @@ from typing import Annotated, Any
 
 import typer
 
-from gmem_jax import native
 from gmem_jax.command.console import (
     AsJson,
     DryRun,
@@ -32,6 +31,7 @@ from gmem_jax.files.cache import kept_pack, list_packs
 from gmem_jax.files.packs import STANDARD_NAME, save_pack
 from gmem_jax.files.sizes import pack_bytes
 from gmem_jax.files.spheres import load_clump
+from gmem_jax.native.backend import backend_name
 from gmem_jax.physics import grain
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.grain import Clump
@@ -124,7 +124,7 @@ def prepare_command(
     preparation_frames(recipe, frames)  # refuses what cannot be before anything is begun
     check_output(output, ".h5", force=force)
     made = graded(recipe, clump)
-    backend = native.name(backend, Frictionless())
+    backend = backend_name(backend, Frictionless())
     cost = announce(f"{recipe.grains} grains", grain_steps(recipe, made), PREPARATION_BYTES * recipe.grains, backend)
     key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
     if dry_run:

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import native
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
 from gmem_jax.experiment.arguments import named_observers, require_parts
@@ -29,7 +28,7 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.protocols import Shear, memory_protocol
 from gmem_jax.experiment.readings import Readings
 from gmem_jax.experiment.signals import Signals, SignalSets, bin_average, sets_of, waveform
-from gmem_jax.native import Backend, Precision
+from gmem_jax.native.backend import BACKENDS, Backend, Precision, backend_name, require_precision, supports
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
@@ -161,10 +160,10 @@ class Experiment:
         if self.shear not in ("during", "before"):
             raise ValueError(f"shear must be during or before, got {self.shear!r}")
         self._set_protocol()
-        if self.backend not in native.BACKENDS:
-            raise ValueError(f"backend must be one of {', '.join(native.BACKENDS)}; got {self.backend!r}")
+        if self.backend not in BACKENDS:
+            raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
         of_pack = self.pack.periodic, self.pack.clump.equal, self.wall_mu is None
-        native.require_precision(self.precision, self.backend, self.friction, *of_pack)
+        require_precision(self.precision, self.backend, self.friction, *of_pack)
         require_walls(self.pack.periodic, self.material, self.wall_mu)
         if self.gravity is not None and self.pack.periodic[2]:
             raise ValueError("gravity acts along z, and a box that is periodic there has no floor: leave gravity out")
@@ -176,7 +175,7 @@ class Experiment:
         self._check_shapes()
         if jax.config.read("jax_enable_x64"):
             require_double(pack=self.pack, signals=self.signals)
-        if not native.supports(self.friction) and not traced(self.friction):
+        if not supports(self.friction) and not traced(self.friction):
             require_law(self.friction, self.replicas)
         self._check_waveforms()
         require_slippery(self.friction, self.wall_mu)
@@ -328,9 +327,9 @@ class Experiment:
         return jnp.where(self.t0 < 0.999 * PAPER_T0, HOLD_DRAG, 0.0)
 
     @property
-    def runs_on(self) -> native.Backend:
+    def runs_on(self) -> Backend:
         """What `backend` means for this law and these walls on JAX's default device."""
-        return native.name(self.backend, self.friction)
+        return backend_name(self.backend, self.friction)
 
     @property
     def timing(self) -> Timing:

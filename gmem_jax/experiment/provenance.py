@@ -2,8 +2,11 @@
 
 import functools
 import hashlib
+import os
 import platform
+import sys
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +59,28 @@ def sources() -> dict[str, Any]:
     return {"sources": digest.hexdigest(), "versions": {name: versions()[name] for name in own}}
 
 
+_ASKED_BY = ("JAX_", "PJRT_", "XLA_")  # what variables begin with that tell JAX which devices there are
+
+
+def is_one_cpu() -> bool:
+    """Whether JAX has one device, a CPU, told without its import, which takes half a second.
+
+    False where it may have others: it was imported, a variable of the environment speaks to it, or a plugin for other
+    devices is installed.
+    """
+    told = "jax" in sys.modules or any(name.startswith(_ASKED_BY) for name in os.environ)
+    return not (told or metadata.entry_points(group="jax_plugins") or find_spec("jax_plugins") or find_spec("libtpu"))
+
+
+def devices() -> list[str]:
+    """The devices of JAX, like "cpu: cpu"."""
+    if is_one_cpu():
+        return ["cpu: cpu"]
+    import jax
+
+    return [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+
+
 def provenance() -> dict[str, Any]:
     """Versions, git commit and device."""
-    import jax  # here: the version is told without it
-
-    device = jax.devices()[0]
-    return {**code(), "device": f"{device.platform}: {device.device_kind}"}
+    return {**code(), "device": devices()[0]}

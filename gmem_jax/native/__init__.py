@@ -17,24 +17,35 @@ when it is not right about how many blocks of replicas fit into them. JAX does n
 """
 
 import sys
+from typing import TYPE_CHECKING
 
-from gmem_jax.native import library
-from gmem_jax.native.backend import (
-    BACKENDS,
-    PRECISIONS,
-    Backend,
-    Precision,
-    ResolvedBackend,
-    marcher,
-    name,
-    require_precision,
-    resolve,
-    supports,
-)
-from gmem_jax.native.calls import TARGETS
-from gmem_jax.native.library import available, cpus, needs, require_threads
-from gmem_jax.native.march import March, march
-from gmem_jax.native.search import search
+import gmem_start
+
+# In a process of the command a module loads what it needs, as in `gmem_jax`.
+if TYPE_CHECKING or not gmem_start.alone:
+    from gmem_jax.native import library
+    from gmem_jax.native.backend import (
+        BACKENDS,
+        PRECISIONS,
+        Backend,
+        Precision,
+        ResolvedBackend,
+        backend_name,
+        marcher,
+        require_precision,
+        resolve,
+        supports,
+    )
+    from gmem_jax.native.calls import TARGETS
+    from gmem_jax.native.library import available, cpus, needs, require_threads
+    from gmem_jax.native.march import March, march
+    from gmem_jax.native.search import search
+
+    # Now, and not when a march is first asked for: a program that `jax.export` wrote calls the library by name, in a
+    # process that may have imported the package and no more. It starts no backend. While Python looks for the module
+    # of ``python -m gmem_jax.native.build``, which compiles the library, it must not be imported yet.
+    if getattr(sys, "argv", [""])[:1] != ["-m"]:
+        library.load_library()
 
 __all__ = [
     "BACKENDS",
@@ -45,10 +56,10 @@ __all__ = [
     "Precision",
     "ResolvedBackend",
     "available",
+    "backend_name",
     "cpus",
     "march",
     "marcher",
-    "name",
     "needs",
     "require_precision",
     "require_threads",
@@ -56,9 +67,3 @@ __all__ = [
     "search",
     "supports",
 ]
-
-# Now, and not when a march is first asked for: a program that `jax.export` wrote calls the library by name, in a
-# process that may have imported the package and no more. It starts no backend. While Python looks for the module of
-# ``python -m gmem_jax.native.build``, which compiles the library, it must not be imported yet.
-if getattr(sys, "argv", [""])[:1] != ["-m"]:
-    library.load_library()

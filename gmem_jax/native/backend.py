@@ -76,7 +76,7 @@ def _why_not(lacks: str, built: bool, said: str) -> str:
     return "" if client.platform == "cpu" else f"the native backend does not run on {client.platform}"
 
 
-def name(backend: str, law: FrictionLaw) -> Backend:
+def backend_name(backend: str, law: FrictionLaw) -> Backend:
     """What "auto" means on JAX's default device, "jax" or "native"; others are themselves.
 
     Args:
@@ -122,7 +122,7 @@ def require_precision(
         raise ValueError(f"precision must be one of {', '.join(PRECISIONS)}; got {precision!r}")
     if precision == "double":
         return
-    if name(backend, law) != "native":
+    if backend_name(backend, law) != "native":
         built, said = library.available()
         why = "" if backend == "jax" or built else f", which is not available: {said}"
         raise ValueError(f"precision='mixed' is a mode of the native backend{why}; here plain JAX would run")

@@ -93,6 +93,26 @@ def is_stale(library: ctypes.CDLL) -> bool:
     return source_hash() not in ("", compiled)
 
 
+def opened(target: Path) -> tuple[ctypes.CDLL | None, str]:
+    """The library at `target`; None, and why, if it cannot be used."""
+    if not target.exists():
+        return None, "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
+    try:
+        library = ctypes.CDLL(str(target))
+    except OSError as error:
+        return None, f"its library could not be loaded: {error}"
+    if is_stale(library):
+        return None, "its library is older than its sources; rebuild it: python -m gmem_jax.native.build"
+    return library, ""
+
+
+def instruction_set(library: ctypes.CDLL) -> str:
+    """What the steps of a library are done with on this machine: "avx512", "avx2" or "baseline"."""
+    library.gmem_instruction_set.restype = ctypes.c_char_p
+    name: str = library.gmem_instruction_set().decode()
+    return name
+
+
 def is_current(target: Path) -> bool:
     """Whether the library at `target` is made of the sources beside this file."""
     try:

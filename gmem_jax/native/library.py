@@ -25,20 +25,16 @@ def path() -> Path:
 @functools.cache
 def load_library() -> tuple[str, str]:
     """Load and register the library, once; returns its instruction set, and why that failed ("" if it did not)."""
-    from gmem_jax.native.build import SOURCES, is_stale  # here, as in `path`
+    from gmem_jax.native.build import SOURCES, instruction_set, opened  # here, as in `path`
 
-    file = path()
-    if not file.exists():
-        return "", "it was not built (no C++ compiler when gmem_jax was installed?); python -m gmem_jax.native.build"
+    library, reason = opened(path())
+    if library is None:
+        return "", reason
     try:
-        library = ctypes.CDLL(str(file))
-        if is_stale(library):
-            return "", "its library is older than its sources; rebuild it: python -m gmem_jax.native.build"
         for target in calls.TARGETS:
             jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
         cuda.register(library, SOURCES)
-        library.gmem_instruction_set.restype = ctypes.c_char_p
-        return library.gmem_instruction_set().decode(), ""
+        return instruction_set(library), ""
     except (OSError, AttributeError) as error:
         return "", f"its library could not be loaded: {error}"
 

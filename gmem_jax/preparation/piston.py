@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gmem_jax.native import March
+from gmem_jax.native.march import March
 from gmem_jax.physics.pairs import slack, sphere_centres
 from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.state import Box, State

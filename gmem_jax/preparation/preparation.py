@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax import native
 from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.asked import require_walls
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
+from gmem_jax.native.backend import backend_name
 from gmem_jax.physics import chance, rotation
 from gmem_jax.physics.boundary import periodic_axes
 from gmem_jax.physics.contact.friction import FrictionLaw
@@ -351,7 +351,7 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
         "simulated_time": runner.time,
         "at_rest": asdict(last),
         **provenance(),
-        "backend": native.name(runner.simulation.backend, Frictionless()),
+        "backend": backend_name(runner.simulation.backend, Frictionless()),
     }
     return Pack(
         clump=clump,

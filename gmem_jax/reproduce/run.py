@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmem_jax import native
 from gmem_jax.bench.measure import rival
 from gmem_jax.errors import RunFailedError
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.cache import list_packs
 from gmem_jax.files.packs import load_pack
+from gmem_jax.native.backend import backend_name
 from gmem_jax.physics.contact.laws import entry_of, law_named
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.readers import stored_words
@@ -274,7 +274,7 @@ def quick_cost(points: Sequence[Values]) -> float:
         grains = int(values.get(f"{PREPARE}grains", 0)) or load_pack(values["pack"]).grains
         near = min(list_packs(), key=lambda name: abs(math.log(int(name.split("-")[1]) / grains)))
         work[law.paper, near] = work.get((law.paper, near), 0.0) + grains
-    backend = native.name("auto", Experiment.friction)
+    backend = backend_name("auto", Experiment.friction)
     timed = {(law, near): rival(load_pack(near), backend, law, SIDE_BY_SIDE, seconds=1.0).once() for law, near in work}
     return 1e-6 * sum(timed[case] * weight for case, weight in work.items()) / sum(work.values())
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from gmem_jax import native
+from gmem_jax.native.backend import ResolvedBackend, resolve
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.creep import RelaxingLaw, relaxation
 from gmem_jax.physics.contact.friction import CoulombLaw
@@ -51,7 +51,7 @@ class Simulation:
         dt: time step, in t_c; scalar or [B].
         drag: viscous drag while the walls stand still, 1 / t_c; scalar or [B].
         steps: steps in a bin.
-        backend: who does them; see `native.resolve`.
+        backend: who does them; see `gmem_jax.native.resolve`.
         precision: of contacts, likewise.
         creep: rate at which elastic tangential forces relax, 1 / t_c; scalar or [B], None for never.
         creep_fades: time in a stage after which that rate falls, in t_c; see `relaxation`.
@@ -80,9 +80,9 @@ class Simulation:
     sample: Sample | None = None
 
     @property
-    def resolved(self) -> native.ResolvedBackend:
+    def resolved(self) -> ResolvedBackend:
         """What does the steps; the same object for all simulations that ask for the same."""
-        return native.resolve(self.backend, self.precision, self.system.friction)
+        return resolve(self.backend, self.precision, self.system.friction)
 
     def marked(self, state: State, stage: Stage) -> "Simulation":
         """The same, whose observers compare with a state at the beginning of a stage."""

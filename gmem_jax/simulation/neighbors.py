@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gmem_jax import native
+from gmem_jax.native.search import search as native_search
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.pairs import slack, sphere_centres
 from gmem_jax.physics.search import PairFinder
@@ -20,7 +20,7 @@ LARGEST_SKIN = 2.0  # skin beyond which a list that goes stale within a bin is a
 
 def pair_finder(clump: Clump, extent: np.ndarray, skin: float, **sizes: Any) -> PairFinder:
     """A `PairFinder` that searches in the library where there is one."""
-    return PairFinder(clump, extent, skin, search=native.search(), **sizes)
+    return PairFinder(clump, extent, skin, search=native_search(), **sizes)
 
 
 def skin_left(system: System, state: State, box: Box) -> jax.Array:

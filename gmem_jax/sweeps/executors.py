@@ -13,9 +13,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gmem_jax import native
 from gmem_jax.errors import RunFailedError
 from gmem_jax.files.validation import optional
+from gmem_jax.native.library import cpus, require_threads
 from gmem_jax.sweeps import slurm, work
 from gmem_jax.sweeps.processes import EXIT_TIMEOUT, RUNNER, job_name, known_by, python, safe_path, stderr_into
 from gmem_jax.sweeps.store import Store
@@ -101,7 +101,7 @@ class Executor(ABC):
 def cores() -> list[int]:
     """The CPUs that this process may use, or as many of them as the quota of its container keeps busy."""
     own = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
-    return sorted(own)[: native.cpus()]
+    return sorted(own)[: cpus()]
 
 
 def threads(cpus: int) -> str:
@@ -269,7 +269,7 @@ def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executo
     Raises:
         ValueError: if there is none of that name, it cannot be had here, or GMEM_THREADS is no number of threads.
     """
-    native.require_threads()
+    require_threads()
     require_options(kind, options)
     if kind == "processes":
         return Processes(workers)

@@ -50,6 +50,16 @@ def test_a_setting_that_jax_refuses_when_it_is_imported_is_told_in_one_line() ->
     assert line.count("\n") == 1
 
 
+def test_the_devices_are_told_without_jax_where_it_could_have_no_others() -> None:
+    told = [sys.executable, "-c", "import sys; from gmem_jax.experiment.provenance import devices; print(devices())"]
+    quiet = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "PJRT_", "XLA_"))}
+    own = f"import gmem_start; gmem_start.alone = True; {told[-1]}; print('jax' in sys.modules)"
+    asked = {**quiet, "JAX_NUM_CPU_DEVICES": "2"}
+    for environment, loaded, count in ((quiet, False, 1), (asked, True, 2)):
+        done = subprocess.run([*told[:-1], own], env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout.split("\n")[:2] == [str(["cpu: cpu"] * count), str(loaded)]
+
+
 def test_flags_of_jax_do_not_stop_a_command_and_one_that_slows_it_is_told(tmp_path: Path) -> None:
     strict = {"JAX_TRANSFER_GUARD": "disallow", "JAX_NUMPY_RANK_PROMOTION": "raise"}
     said("show", PACK, "--plot", "grains", "-o", tmp_path / "x.png", code=0, **strict)
@@ -91,12 +101,15 @@ sys.meta_path.insert(0, Slow)
 
 @pytest.mark.parametrize("entry", [["-c", "from gmem_start import main; main()"], ["-m", "gmem_jax"]])
 def test_ctrl_c_while_it_is_imported_is_one_line(tmp_path: Path, entry: list[str]) -> None:
-    # Imports as slow as on a cold disk, so that the signal comes while they run.
+    # Imports as slow as on a cold disk, so that the signal comes while they run; the setting is one of JAX's.
     (tmp_path / "sitecustomize.py").write_text(SLOW)
     paths = os.pathsep.join([str(tmp_path), str(ROOT)])
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(
-        [sys.executable, *entry, "info"], **pipes, text=True, env={**os.environ, "PYTHONPATH": paths}
+        [sys.executable, *entry, "info"],
+        **pipes,
+        text=True,
+        env={**os.environ, "PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"},
     ) as process:
         process.stdout.readline()
         process.send_signal(signal.SIGINT)
@@ -115,7 +128,8 @@ def test_ctrl_c_at_either_end_of_a_command_leaves_no_traceback(moment: str) -> N
     }[moment]
     modules = "from gmem_jax.command import app; from gmem_jax.files import compilation_cache"
     code = f"import atexit, os, signal, gmem_start; {modules}; {where}; gmem_start.main()"
-    done = subprocess.run([sys.executable, "-c", code, "info"], capture_output=True, text=True, timeout=60)
+    own = {**os.environ, "JAX_PLATFORMS": "cpu"}  # a setting of JAX's, so that it is imported
+    done = subprocess.run([sys.executable, "-c", code, "info"], env=own, capture_output=True, text=True, timeout=60)
     assert done.returncode == 130
     assert "Traceback" not in done.stderr
     assert len(done.stderr.splitlines()) <= 1

@@ -203,7 +203,7 @@ def test_without_the_library_auto_says_so_once_and_runs_in_plain_jax(no_library:
         warnings.simplefilter("error")
         jax.eval_shape(functools.partial(loss, march), 0.6, RATES)
     assert found.shape == ()
-    assert native.name("auto", gm.Hooke()) == "jax"
+    assert native.backend_name("auto", gm.Hooke()) == "jax"
     with pytest.raises(ValueError, match="not available: it was not built"):
         native.marcher("native")
 
@@ -211,7 +211,7 @@ def test_without_the_library_auto_says_so_once_and_runs_in_plain_jax(no_library:
 def test_a_law_of_ones_own_runs_in_plain_jax_without_a_word(no_library: None) -> None:
     own = replace(SYSTEM, friction=Own())
     jax.eval_shape(functools.partial(loss, native.marcher("auto"), system=own), 0.5, RATES)
-    assert native.name("auto", Own()) == "jax"
+    assert native.backend_name("auto", Own()) == "jax"
 
 
 def test_backends_have_names() -> None:
