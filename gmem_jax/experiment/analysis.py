@@ -59,6 +59,7 @@ class Match(NamedTuple):
     fidelity: jax.Array
 
 
+@jax.jit
 def compare(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None) -> Match:
     """Gain and fidelity of a set of signals (paper, Sec. II).
 
@@ -103,6 +104,7 @@ def compare_channels(signal: jax.Array, integral: jax.Array, scale: Scalar, wind
     return Match(jnp.where(silent, jnp.nan, gain), jnp.where(silent, jnp.nan, 1.0 - jnp.sqrt(miss)))
 
 
+@jax.jit
 def each(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None) -> Match:
     """Gain and fidelity of each signal by itself, [S]: each has a gain of its own. NaN where p_sig or J is zero.
 
@@ -157,6 +159,7 @@ def backgrounds(
     return {name: compare(subtract(name, first, second), integral, scale, window) for name in BACKGROUNDS}
 
 
+@jax.jit
 def correlation(signal: jax.Array, integral: jax.Array) -> jax.Array:
     """Correlation A.B / (|A| |B|) of each signal with its J, [S]; the inner product is that of gain and fidelity.
 
@@ -185,6 +188,7 @@ def remembered_after(second: jax.Array, integral: jax.Array, scale: Scalar) -> t
 
 
 @usual_rules()
+@jax.jit
 def running_mean(series: jax.Array, width: Scalar) -> jax.Array:
     """Mean over a window of `width` bins (need not be whole) along the last axis, [..., bins].
 

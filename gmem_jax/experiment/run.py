@@ -36,7 +36,7 @@ GRAIN_BYTES = 800  # of a grain's own numbers and its spheres'
 PREFIX = "prefix"  # name of the part of a run that is common to all waveforms
 LARGEST_BATCH = 63  # signals; with the zero signal they fill whole vectors of every CPU
 
-_begin = Experiment.begin
+_begin = Compiled(Experiment.begin, quick=True)
 _fan_out = Compiled(Experiment.fan_out)
 _compare = Compiled(unjudged)
 _judge = Compiled(judged, quick=True)
