@@ -3,8 +3,8 @@
 PYTHONPATH=experiments python docs/make/points.py
 
 `docs/results/points.csv` has a row for each pack and condition, as `gmem sweep export` gave them: sweeps over delta0,
-gamma0, mu and the seed of `prepare`, with t0 = 5,400 and dt = 1.2. Of a pack that ran at several rates the slowest
-counts. Means over packs become the tables and pictures of figs. 8, 9, 11 and 12a, by the names of their scale; and
+gamma0, mu and the seed of `prepare`, with t0 = 5,400 and dt = 1.2. Of a point that ran at several rates the one of most
+packs counts, the slower of two alike: a mean over packs mixes no rates. Means over packs become the tables and pictures of figs. 8, 9, 11 and 12a, by the names of their scale; and
 docs/results/points.md is written anew. Packs of 3,267 grains in the table are others than those of the figures.
 """
 
@@ -73,14 +73,14 @@ def of_packs(path: Path = OWN) -> list[Compared]:
     """Means over the packs of a table, where G and F are those over the ringing period."""
     with path.open(newline="", encoding="utf-8") as file:
         lines = list(csv.DictReader(file))
-    groups: dict[Conditions, dict[str, dict[str, str]]] = {}
-    for line in sorted(lines, key=lambda line: float(line["t0"])):
+    groups: dict[Conditions, dict[float, list[dict[str, str]]]] = {}
+    for line in lines:
         overlap, mu, delta0, gamma0 = (float(line[name]) for name in ("overlap", "mu", "delta0", "gamma0"))
         at = Conditions(line["law"], line["shape"], overlap, int(line["grains"]), mu, delta0, gamma0, 0, "sub0")
-        groups.setdefault(at, {})[line["pack"]] = line
+        groups.setdefault(at, {}).setdefault(float(line["t0"]), []).append(line)
     found = []
-    for at, packs in groups.items():
-        status, members = 0, packs.values()
+    for at, rates in groups.items():
+        status, members = 0, max(rates.items(), key=lambda rate: (len(rate[1]), rate[0]))[1]
         for member in members:
             status |= int(member["status"])
         for measure in "FG":
@@ -186,7 +186,8 @@ def _published() -> Iterable[dict[str, Any]]:
 
 def _words_of(row: Mapping[str, Any]) -> str:
     packs = len(row["pack"].split())
-    return f"{row['words']} drawn" + (f", {packs} packs" if packs > 1 else "")
+    told = "all" if int(row["words"]) == 2 ** int(row["bits"]) else f"{row['words']} drawn"
+    return told + (f", {packs} packs" if packs > 1 else "")
 
 
 def words() -> list[str]:
