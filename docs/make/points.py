@@ -4,8 +4,9 @@ PYTHONPATH=experiments python docs/make/points.py
 
 `docs/results/points.csv` has a row for each pack and condition, as `gmem sweep export` gave them: sweeps over delta0,
 gamma0, mu and the seed of `prepare`, with t0 = 5,400 and dt = 1.2. Of a point that ran at several rates the one of most
-packs counts, the slower of two alike: a mean over packs mixes no rates. Means over packs become the tables and pictures of figs. 8, 9, 11 and 12a, by the names of their scale; and
-docs/results/points.md is written anew. Packs of 3,267 grains in the table are others than those of the figures.
+packs counts, the slower of two alike: a mean over packs mixes no rates. Means over packs become the tables and pictures
+of figs. 8, 9, 11 and 12a, by the names of their scale; and docs/results/points.md is written anew. Packs of 3,267
+grains in the table are others than those of the figures.
 """
 
 import csv

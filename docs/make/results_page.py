@@ -29,7 +29,8 @@ from gmem_jax.show.numbers import published
 HERE = Path(__file__).parents[1] / "results"
 JOINED = {  # figures that no one command makes
     "fig12b-paper": "Fig. 6 of this scale, figs. 8 and 12b of smaller ones, "
-    "`--scale workstation,sizes=31680,few=1` and `experiments/large_pack.py`, put together by `experiments/joined.py`",
+    "`--scale workstation,sizes=31680,few=1` and `experiments/large_pack.py`, put together by `experiments/joined.py`. "
+    "The point of 31,680 grains is one pack at t0 = 5,400; two packs at 18,000 agree ([every point](points.md))",
     **dict.fromkeys(
         points.WHICH, "Sweeps of single packs ([table](points.csv), [how](runs.md#points-of-10240-grains))"
     ),
