@@ -79,7 +79,10 @@ class MemoryKernel:
         return values
 
     def _match(self) -> analysis.Match:
-        return analysis.compare(jnp.asarray(self.odd), bin_average(self.basis), self.delta0 * self.gamma0)
+        match: analysis.Match = analysis.compare(
+            jnp.asarray(self.odd), bin_average(self.basis), self.delta0 * self.gamma0
+        )
+        return match
 
     @usual_rules()
     def gain(self) -> float:

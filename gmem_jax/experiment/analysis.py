@@ -116,7 +116,8 @@ def each(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar |
     """
 
     def alone(p_sig: jax.Array, own: jax.Array, scale: jax.Array) -> Match:
-        return compare(p_sig[None], own[None], scale, window)
+        match: Match = compare(p_sig[None], own[None], scale, window)
+        return match
 
     return jax.vmap(alone)(signal, integral, jnp.broadcast_to(scale, (len(signal), 1)))
 

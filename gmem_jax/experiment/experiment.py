@@ -454,7 +454,7 @@ def _ends(signals: Signals) -> jax.Array:
 @jax.jit
 def _probe(signals: Signals) -> tuple[jax.Array, jax.Array]:
     """The waveforms at both ends, and in between."""
-    return _ends(signals), signals.shear((np.arange(BINS) + 0.5) / BINS)
+    return _ends(signals), signals.shear(jnp.asarray((np.arange(BINS) + 0.5) / BINS))
 
 
 NUMBERS = {entry.name: entry for entry in fields(Experiment) if entry.metadata.get("words")}

@@ -91,9 +91,9 @@ class Readings(NamedTuple):
         channels = len(self.channels)
 
         def of_read(signal: jax.Array, integral: jax.Array) -> analysis.Match:
-            if channels == 1:
-                return analysis.compare(signal, integral, scale, window)
-            return analysis.compare_channels(signal, integral, scale, window)
+            compare = analysis.compare if channels == 1 else analysis.compare_channels
+            match: analysis.Match = compare(signal, integral, scale, window)
+            return match
 
         if len(self.reads) == 1:
             return of_read(signal, integral)
