@@ -36,7 +36,7 @@ Measured = tuple[Conditions, str]
 def _only(row: Compared, *free: str) -> bool:
     at = asdict(row.conditions)
     usual = all(at[name] == value for name, value in USUAL.items() if name not in free)
-    return usual and row.grains == row.conditions.grains == GRAINS
+    return usual and row.conditions.grains == GRAINS and row.grains in (GRAINS, 0)  # 0: nothing was published
 
 
 SHOWN = (0.01, 0.02, 0.05, 0.08)  # delta0 of the curves of fig. 11: with all eight, points would lie under one another
