@@ -27,7 +27,7 @@ class BuildWithNative(build_py):
         builder = load_builder()
         root = SOURCE.parent.parent.parent if self.editable_mode else Path(self.build_lib)
         library = root / "gmem_jax" / "native" / builder.LIBRARY
-        if self.editable_mode and builder.is_current(library):
+        if self.editable_mode and builder.opened(library)[0]:
             return  # a second environment of the same folder
         try:
             builder.build(library)

@@ -1,6 +1,7 @@
 """Small deterministic scenes, and compiled runs of them, shared by the tests of the core; where files of tests are."""
 
 import functools
+import os
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -49,6 +50,11 @@ FREE = still_box(jnp.full((3, 1), -15.0), jnp.full((3, 1), 15.0))  # walls out o
 
 cached_tetra = functools.lru_cache(tetra)
 accelerate = jax.jit(dynamics.accelerate)
+
+
+def without_settings_of_jax() -> dict[str, str]:
+    """The environment, less all that tells JAX of devices and the like."""
+    return {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "PJRT_", "XLA_"))}
 
 
 def gmem(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:

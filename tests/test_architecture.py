@@ -1,13 +1,13 @@
 """How the house is built: imports point downwards only, and importing it starts and loads nothing heavy."""
 
 import ast
-import os
 import subprocess
 import sys
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from scenes import without_settings_of_jax
 
 import gmem_jax
 
@@ -196,9 +196,8 @@ except SystemExit:
 
 @pytest.mark.parametrize(("arguments", "loaded"), [("--help", ""), ("--version", ""), ("info", "")])
 def test_what_is_told_at_once_loads_no_more_than_it_needs(arguments: str, loaded: str) -> None:
-    quiet = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "PJRT_", "XLA_"))}
-    told = [sys.executable, "-c", STARTING, arguments]
-    done = subprocess.run(told, env=quiet, capture_output=True, text=True, check=True)
+    told, own = [sys.executable, "-c", STARTING, arguments], without_settings_of_jax()
+    done = subprocess.run(told, env=own, capture_output=True, text=True, check=True)
     assert done.stdout
     assert done.stderr == loaded
 

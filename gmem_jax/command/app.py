@@ -91,7 +91,7 @@ class _Command(TyperCommand):
         typed = [one for one in self.params if "COMMANDLINE" in str(ctx.get_parameter_source(str(one.name)))]
         GIVEN.set({str(one.name): "/".join(_longest(one.opts) + _longest(one.secondary_opts)) for one in typed})
         gmem_start.imported()
-        # The rules are JAX's: a command that does without it is told sooner.
+        # The rules are JAX's: a command that has not imported it needs none, and answers sooner.
         with _rules_of_commands() if "jax" in sys.modules else nullcontext():
             return super().invoke(ctx)
 

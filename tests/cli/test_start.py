@@ -11,7 +11,7 @@ import jax
 import matplotlib
 import numpy as np
 import pytest
-from scenes import ROOT, gmem
+from scenes import ROOT, gmem, without_settings_of_jax
 from test_cli import PACK, SHORT
 
 import gmem_jax as gm
@@ -51,12 +51,11 @@ def test_a_setting_that_jax_refuses_when_it_is_imported_is_told_in_one_line() ->
 
 
 def test_the_devices_are_told_without_jax_where_it_could_have_no_others() -> None:
-    told = [sys.executable, "-c", "import sys; from gmem_jax.experiment.provenance import devices; print(devices())"]
-    quiet = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "PJRT_", "XLA_"))}
-    own = f"import gmem_start; gmem_start.alone = True; {told[-1]}; print('jax' in sys.modules)"
-    asked = {**quiet, "JAX_NUM_CPU_DEVICES": "2"}
-    for environment, loaded, count in ((quiet, False, 1), (asked, True, 2)):
-        done = subprocess.run([*told[:-1], own], env=environment, capture_output=True, text=True, check=True)
+    code = "import sys, gmem_start; gmem_start.alone = True; from gmem_jax.experiment.provenance import devices"
+    told = [sys.executable, "-c", f"{code}; print(devices()); print('jax' in sys.modules)"]
+    quiet = without_settings_of_jax()
+    for environment, loaded, count in ((quiet, False, 1), ({**quiet, "JAX_NUM_CPU_DEVICES": "2"}, True, 2)):
+        done = subprocess.run(told, env=environment, capture_output=True, text=True, check=True)
         assert done.stdout.split("\n")[:2] == [str(["cpu: cpu"] * count), str(loaded)]
 
 
