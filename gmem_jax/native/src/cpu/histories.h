@@ -4,6 +4,7 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 
 #include "cpu/problem.h"
 #include "physics/laws.h"
@@ -37,12 +38,19 @@ struct Marks {
   static constexpr int kLook = 256;  // candidates looked at at once
 
   // Of these, from `first` on and before `end`, those that may touch go to `near`; returns how many.
-  GMEM_INLINE int find_near(int first, int end, double travel, int (&near)[kLook + 1]) const {
+  GMEM_INLINE int find_near(int first, int end, double travel, int (&near)[kLook]) const {
+    constexpr int kWord = 64;
     const int look_end = first + kLook < end ? first + kLook : end;
+    const Real now = splat<Real>(travel);
     int found = 0;
-    for (int c = first; c < look_end; ++c) {
-      near[found] = c;
-      found += !(next_check[c] > travel);  // also where it is not a number
+    for (int c = first; c < look_end; c += kWord) {
+      const int count = look_end - c < kWord ? look_end - c : kWord;
+      uint64_t later = 0;  // a bit for each; none where `next_check` is not a number
+      int l = 0;
+      for (; l + W <= count; l += W) later |= uint64_t{bits_less(now, load(next_check + c + l))} << l;
+      for (; l < count; ++l) later |= uint64_t{next_check[c + l] > travel} << l;
+      for (uint64_t may = ~later & ~uint64_t{0} >> (kWord - count); may; may &= may - 1)
+        near[found++] = c + __builtin_ctzll(may);
     }
     return found;
   }
@@ -93,8 +101,8 @@ template <class Mode, class V>
 void load_history(Mode& mode, std::ptrdiff_t c, const LawParameters<V>& law) {
   using Law = typename Mode::OfLaw;
   const std::ptrdiff_t row = mode.plan.candidate[c].row;
-  mode.mark_new(c);
   for (int q = 0; q < Law::kGiven; ++q) mode.remembered(c, q) = mode.history_in(place_of<Law>(row, q));
+  mode.mark_new(c);
   if constexpr (Law::kLayered) {
     const auto outer = mode.outermost(c, law);
     mode.marks.rings[c] = rings_of(mode.problem, outer);

@@ -59,10 +59,15 @@ struct Packed : PackedLayout<Law> {
   const Block& block;
   const Plan& plan;
   const ReplicaArrays& lane;
-  V* hot;  // the engine's
+  const Candidate dummy;  // which fills up vectors
+  V* hot;                 // the engine's
 
   Packed(const Problem& problem, const Block& block)
-      : problem(problem), block(block), plan(*block.pack->plan), lane(block.lanes[0]) {}
+      : problem(problem),
+        block(block),
+        plan(*block.pack->plan),
+        lane(block.lanes[0]),
+        dummy{dummy_sphere(), dummy_sphere() + 1, dummy_grain(), dummy_grain(), -1, -1, 0} {}
 
   static int units(const Problem& p) { return (p.grains + W - 1) / W; }
   static int unit_of(int grain) { return grain / W; }
@@ -140,7 +145,10 @@ struct Packed : PackedLayout<Law> {
   }
 
   void mark_new(std::size_t c) const {
-    marks.touched[c] = false;
+    // What remembers something touches, or is found to have come apart like any other contact.
+    bool any = false;
+    for (int q = 0; q < Law::kGiven; ++q) any |= remembered(c, q) != 0.0;
+    marks.touched[c] = any;
     marks.next_check[c] = -1.0;  // not looked at yet
   }
 
@@ -212,6 +220,8 @@ struct Packed : PackedLayout<Law> {
 
   // --- contacts
 
+  static constexpr int kCached = 8192;  // candidates of a pack that stays in the cache by itself: some 700 grains
+
   // Of W contacts.
   struct Segments {
     RowOfSegment* first[W];
@@ -243,19 +253,20 @@ struct Packed : PackedLayout<Law> {
   struct Group {
     int count;
     int c[W];
-    Candidate pair[W];
+    const Candidate* pair[W];  // where they lie: copies would be read before what was written of them has arrived
   };
 
   void contacts(int first, int end, const V* parameter, const LawParameters<V>& law, double travel, Faces<V>& faces) {
     constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether * W, kAhead = 8;
-    int near[kLook + 1], touching[kBatch];
+    const bool asks = plan.candidates > kCached;
+    int near[kLook], touching[kBatch];
     int count = 0;
     for (int look = first; look < end; look += kLook) {
       const int found = marks.find_near(look, end, travel, near);
       for (int n = 0; n < found; ++n) {
         const int c = near[n];
         // Large packs are in no cache: ask in time for what does not lie in a row with what others want.
-        if (n + kAhead < found) {
+        if (asks && n + kAhead < found) {
           const std::size_t later = near[n + kAhead];
           const GrainRows* other = grain + plan.candidate[later].grain_other;
           __builtin_prefetch(sphere + plan.candidate[later].other);
@@ -356,8 +367,7 @@ struct Packed : PackedLayout<Law> {
     g.count = count < W ? count : W;
     for (int l = 0; l < W; ++l) {
       g.c[l] = l < count ? touching[l] : plan.candidates;
-      g.pair[l] = l < count ? plan.candidate[g.c[l]]
-                            : Candidate{dummy_sphere(), dummy_sphere() + 1, dummy_grain(), dummy_grain(), -1, 0};
+      g.pair[l] = l < count ? plan.candidate + g.c[l] : &dummy;
     }
     return g;
   }
@@ -366,13 +376,13 @@ struct Packed : PackedLayout<Law> {
   template <bool periodic>
   GMEM_INLINE ContactInput<V> contact_input(const Group& g, const Cell<V>& cell) const {
     const auto one = [&](Row GrainRows::* row) {
-      return load_rows([&](int l) { return &(grain[g.pair[l].grain_one].*row); });
+      return load_rows([&](int l) { return &(grain[g.pair[l]->grain_one].*row); });
     };
     const auto other = [&](Row GrainRows::* row) {
-      return load_rows([&](int l) { return &(grain[g.pair[l].grain_other].*row); });
+      return load_rows([&](int l) { return &(grain[g.pair[l]->grain_other].*row); });
     };
-    const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l].one; });
-    Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l].other; }), moved{};
+    const Rows centre_one = load_rows([&](int l) { return sphere + g.pair[l]->one; });
+    Rows centre_other = load_rows([&](int l) { return sphere + g.pair[l]->other; }), moved{};
     if constexpr (periodic) {
       const Row edge = edges(cell);
       const Rows images = load_rows([&](int l) { return &image_of(g.c[l]); });
@@ -432,7 +442,7 @@ struct Packed : PackedLayout<Law> {
     Row f[W], t_one[W], t_other[W];
     for (int l = 0; l < W; ++l)
       f[l] = row_of(force, l), t_one[l] = row_of(torque_one, l), t_other[l] = row_of(torque_other, l);
-    for (int l = 0; l < g.count; ++l) add(g.pair[l], f[l], t_one[l], t_other[l]);
+    for (int l = 0; l < g.count; ++l) add(*g.pair[l], f[l], t_one[l], t_other[l]);
   }
 
   GMEM_INLINE void add(const Candidate& pair, Row force, Row torque_one, Row torque_other) {

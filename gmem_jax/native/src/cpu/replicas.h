@@ -301,7 +301,7 @@ struct Replicas : ReplicasLayout<Law, V, C> {
                    Faces<V>& faces) {
     constexpr int kLook = Marks<Law>::kLook, kBatch = kTogether, kAhead = 6;
     const V contact_square = splat<V>(4.0);
-    int near[kLook + 1], touching[kBatch];
+    int near[kLook], touching[kBatch];
     Contact<C> contact[kBatch];
     Unequal<C> unequal[differ ? kBatch : 1];
     int count = 0, remembered = first;
