@@ -1,6 +1,8 @@
 #include "cpu/team.h"
 
 #include <algorithm>
+#include <atomic>
+#include <chrono>
 #include <cmath>
 #include <condition_variable>
 #include <cstdlib>
@@ -31,6 +33,18 @@ inline void pause() {
 #endif
 }
 
+// Looks until something is ready or some time has passed: who sleeps and is woken may be 0.1 ms late, as long as a sample
+// takes between two calls. After some microseconds, which on a quiet machine are enough in a step, lets others have this CPU.
+template <class Ready>
+void linger(const Ready& ready) {
+  constexpr int kSpins = 200;
+  constexpr std::chrono::microseconds kLonger{200};
+  for (int looks = 0; looks < kSpins; ++looks, pause())
+    if (ready()) return;
+  for (const auto end = std::chrono::steady_clock::now() + kLonger; !ready() && std::chrono::steady_clock::now() < end;)
+    std::this_thread::yield();
+}
+
 // Quota over period of a folder of either version of control groups, as files have them; infinite where they have none.
 double share_in(const std::string& folder) {
   double quota = 0.0, period = 0.0;
@@ -50,9 +64,11 @@ class Pool {
     ranks_ += threads - 1;
     Job job{&work, threads - 1, threads - 1, {}};
     jobs_.push_back(&job);
+    ++posted_;
     lock.unlock();
     wake_.notify_all();
     work(0);
+    linger([&job] { return job.left == 0; });
     lock.lock();
     job.done.wait(lock, [&job] { return job.left == 0; });
     ranks_ -= threads - 1;
@@ -80,13 +96,19 @@ class Pool {
  private:
   struct Job {
     const std::function<void(int)>* work;
-    int next, left;  // the ranks up to `next` have not begun, `left` of them have not ended
+    int next;               // the ranks up to it have not begun
+    std::atomic<int> left;  // so many of them have not ended
     std::condition_variable done;
   };
 
   void serve() {
     std::unique_lock<std::mutex> lock(mutex_);
     for (;;) {
+      if (const int posted = posted_; jobs_.empty()) {
+        lock.unlock();
+        linger([&] { return posted_ != posted; });
+        lock.lock();
+      }
       wake_.wait(lock, [this] { return !jobs_.empty(); });
       Job& job = *jobs_.front();
       const int rank = job.next--;
@@ -101,6 +123,7 @@ class Pool {
   std::mutex mutex_;
   std::condition_variable wake_, free_;
   std::deque<Job*> jobs_;        // with ranks that have not begun
+  std::atomic<int> posted_{0};   // jobs there have been
   int workers_ = 0, ranks_ = 0;  // and how many of them are spoken for
   int calls_ = 0, used_ = 0;     // calls in progress or waiting, and the threads they have
 };
@@ -137,7 +160,6 @@ int cpus() {
 }
 
 void Team::barrier() {
-  constexpr int kSpins = 200, kYields = 50;
   if (size_ == 1) return;
   const int phase = phase_.load(std::memory_order_relaxed);
   if (arrived_.fetch_add(1, std::memory_order_acq_rel) == size_ - 1) {
@@ -146,20 +168,15 @@ void Team::barrier() {
     wake();
     return;
   }
-  // Look for some microseconds, which on a quiet machine is enough; then let others have this CPU, and then sleep.
-  for (int looks = 0; phase_.load(std::memory_order_acquire) == phase; ++looks) {
-    if (failed_.load(std::memory_order_relaxed)) throw Left{};
-    if (looks < kSpins) {
-      pause();
-    } else if (looks < kSpins + kYields) {
-      std::this_thread::yield();
-    } else {
-      std::unique_lock<std::mutex> lock(mutex_);
-      ++asleep_;  // before looking once more: whoever ends the phase looks for sleepers after it
-      wake_.wait(lock, [&] { return phase_.load() != phase || failed_.load(); });
-      --asleep_;
-    }
+  const auto over = [&] { return phase_.load() != phase || failed_.load(); };
+  linger(over);
+  if (!over()) {
+    std::unique_lock<std::mutex> lock(mutex_);
+    ++asleep_;  // before looking once more: whoever ends the phase looks for sleepers after it
+    wake_.wait(lock, over);
+    --asleep_;
   }
+  if (phase_.load() == phase) throw Left{};
 }
 
 void Team::wake() {
