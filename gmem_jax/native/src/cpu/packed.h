@@ -63,10 +63,7 @@ struct Packed : PackedLayout<Law> {
   V* hot;                 // the engine's
 
   Packed(const Problem& problem, const Block& block)
-      : problem(problem),
-        block(block),
-        plan(*block.pack->plan),
-        lane(block.lanes[0]),
+      : problem(problem), block(block), plan(*block.pack->plan), lane(block.lanes[0]),
         dummy{dummy_sphere(), dummy_sphere() + 1, dummy_grain(), dummy_grain(), -1, -1, 0} {}
 
   static int units(const Problem& p) { return (p.grains + W - 1) / W; }
