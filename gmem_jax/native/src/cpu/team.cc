@@ -54,7 +54,7 @@ double share_in(const std::string& folder) {
   return std::numeric_limits<double>::infinity();
 }
 
-// Workers live until the process ends; they sleep between jobs.
+// Workers live until the process ends; between jobs they linger, and then sleep.
 class Pool {
  public:
   void run(int threads, const std::function<void(int)>& work) {

@@ -1,4 +1,4 @@
-// Threads: a pool that sleeps between jobs, and teams of threads that share a block.
+// Threads: a pool that waits for jobs, and teams of threads that share a block.
 
 #pragma once
 
