@@ -62,12 +62,30 @@ def compiler() -> list[str]:
     raise BuildError("no C++ compiler (c++, g++ or clang++) was found")
 
 
+def run(command: list[str]) -> None:
+    """Run a compiler.
+
+    Raises:
+        BuildError: if it fails.
+    """
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True)
+    except subprocess.CalledProcessError as error:
+        lines = [line for line in error.stderr.splitlines() if "error" in line] or [str(error)]
+        raise BuildError(f"{command[0]} failed: {lines[0]}") from error
+    except OSError as error:
+        raise BuildError(f"{command[0]} did not run: {error}") from error
+
+
 def known_of(cxx: list[str], flags: tuple[str, ...]) -> tuple[str, ...]:
     """Those flags that a compiler knows."""
 
     def known(flag: str) -> bool:
-        command = [*cxx, flag, "-fsyntax-only", "-x", "c++", os.devnull]
-        return shutil.which(cxx[0]) is not None and not subprocess.run(command, capture_output=True).returncode
+        try:
+            run([*cxx, flag, "-fsyntax-only", "-x", "c++", os.devnull])
+        except BuildError:
+            return False
+        return True
 
     return tuple(filter(known, flags))
 
@@ -147,15 +165,6 @@ def build(target: Path) -> None:
             space = name if kernel == "steps" else f"{name}_{kernel}"
             if (name, kernel) not in NOT_COMPILED:
                 jobs.append(("cpu/kernel.cc", f"{space}.o", (f"-DGMEM_ISA={space}", *more, *flags)))
-
-    def run(command: list[str]) -> None:
-        try:
-            subprocess.run(command, check=True, capture_output=True, text=True)
-        except subprocess.CalledProcessError as error:
-            lines = [line for line in error.stderr.splitlines() if "error" in line] or [str(error)]
-            raise BuildError(f"{cxx[0]} failed: {lines[0]}") from error
-        except OSError as error:
-            raise BuildError(f"{cxx[0]} did not run: {error}") from error
 
     with tempfile.TemporaryDirectory() as folder:
 

@@ -55,6 +55,11 @@ def instruction_sets() -> dict[str, tuple[str, ...]]:
     return {name: build.INSTRUCTION_SETS[name] for name in known}
 
 
+def test_flags_that_a_compiler_does_not_know_are_left_out() -> None:
+    assert build.known_of(compiler(), ("-O1", "-mno-such-flag")) == ("-O1",)
+    assert build.known_of(["no-such-compiler"], ("-O1",)) == ()
+
+
 @pytest.mark.parametrize("name", ["numbers", "physics", "programs", "segments", "threads"])
 def test_unit_tests_in_cpp(name: str, tmp_path: Path) -> None:
     more = [str(build.SOURCES / source) for source in THREADS] if name == "threads" else []
