@@ -62,8 +62,8 @@ def compiler() -> list[str]:
     raise BuildError("no C++ compiler (c++, g++ or clang++) was found")
 
 
-def run(command: list[str]) -> None:
-    """Run a compiler.
+def run_compiler(command: list[str]) -> None:
+    """Run a compiler, given with its arguments.
 
     Raises:
         BuildError: if it fails.
@@ -82,7 +82,7 @@ def known_of(cxx: list[str], flags: tuple[str, ...]) -> tuple[str, ...]:
 
     def known(flag: str) -> bool:
         try:
-            run([*cxx, flag, "-fsyntax-only", "-x", "c++", os.devnull])
+            run_compiler([*cxx, flag, "-fsyntax-only", "-x", "c++", os.devnull])
         except BuildError:
             return False
         return True
@@ -171,13 +171,13 @@ def build(target: Path) -> None:
         def compile_one(job: tuple[str, str, tuple[str, ...]]) -> str:
             source, name, flags = job
             result = str(Path(folder) / name)
-            run([*cxx, *FLAGS, *flags, "-I", str(SOURCES), "-c", str(SOURCES / source), "-o", result])
+            run_compiler([*cxx, *FLAGS, *flags, "-I", str(SOURCES), "-c", str(SOURCES / source), "-o", result])
             return result
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             objects = list(pool.map(compile_one, jobs))
         linked = Path(folder) / LIBRARY
-        run([*cxx, "-shared", "-pthread", *objects, "-ldl", "-o", str(linked)])
+        run_compiler([*cxx, "-shared", "-pthread", *objects, "-ldl", "-o", str(linked)])
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(linked, target.with_suffix(".new"))
         target.with_suffix(".new").replace(target)  # atomically: a running process may have the old one loaded

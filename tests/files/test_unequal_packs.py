@@ -221,7 +221,8 @@ def test_a_prepared_pack_of_many_sizes_is_at_rest_and_remembers() -> None:
     pack = gm.load_pack(SPREAD_27)
     rest, sizes = pack.info["at_rest"], np.asarray(pack.clump.sizes)
     assert sizes.std() / sizes.mean() == pytest.approx(0.1, rel=0.05)
-    np.testing.assert_array_equal(sizes, gm.lognormal(27, 0.1, seed=1))
+    expected = gm.lognormal(27, 0.1, seed=1)
+    np.testing.assert_allclose(sizes, expected, rtol=1e-15)  # NumPy's exp and mean differ by CPU in the last bit
     assert rest["largest_speed"] < 1e-6
     assert rest["pressure"][2] == pytest.approx(2e-3, rel=0.1)
     frames = frames_of_pack(pack)
