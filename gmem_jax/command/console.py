@@ -310,6 +310,11 @@ def reporting(*, goes_on: bool = False) -> "Iterator[Progress]":
         raise RunInterruptedError("nothing was written, and the same command begins anew") from None
 
 
+def begins_anew(fraction: float, last: float) -> bool:
+    """Whether another pass has begun, as points after packs: not where a guess of what is left was mended."""
+    return fraction < 0.9 * last
+
+
 @contextlib.contextmanager
 def _reporting() -> "Iterator[Progress]":
     from rich import progress
@@ -322,7 +327,7 @@ def _reporting() -> "Iterator[Progress]":
         def line(stage: str, moment: float, fraction: float) -> None:
             nonlocal told, at, first, last
             now = time.perf_counter()
-            if first is None or fraction < last:  # less than before: another pass has begun, as points after packs
+            if first is None or begins_anew(fraction, last):
                 first = now, fraction
             last = fraction
             if stage == told and now - at < LOG_INTERVAL:
@@ -340,7 +345,7 @@ def _reporting() -> "Iterator[Progress]":
         task = bar.add_task("compiling", total=1.0)
 
         def move(stage: str, moment: float, fraction: float) -> None:
-            if fraction < bar.tasks[task].completed:
+            if begins_anew(fraction, bar.tasks[task].completed):
                 bar.reset(task)
             bar.update(task, completed=fraction, description=f"{stage}, t = {moment:.0f} t_c" if moment else stage)
 

@@ -31,6 +31,17 @@ def test_a_second_pass_has_a_time_left_of_its_own(clock: list[float], capsys: py
     assert "  51%  points, 490 s left" in points
 
 
+def test_a_guess_that_was_mended_keeps_the_time_so_far(clock: list[float], capsys: pytest.CaptureFixture) -> None:
+    """Where a pack has come to rest it is known what is left: a little more than was thought, at the same pace."""
+    with console.reporting() as progress:
+        for stage, fractions in (("settle", range(65)), ("cycle", range(62, 101))):
+            for hundredth in fractions:
+                progress(stage, 0.0, hundredth / 100)
+                clock[0] += 10.0
+    said = [line for line in capsys.readouterr().err.splitlines() if "cycle" in line]
+    assert said[0] == "  62%  cycle, 398 s left"  # 650 s for 62 %
+
+
 ROW = {
     "pack": "tetra-325-a",
     "gain": 0.2591,
