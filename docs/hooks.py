@@ -12,7 +12,16 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
-MEASURED = ("bench", "paper_rate/bench", "paper_rate/2026-11-28", "large_packs", "gpu", "gpu_h200")
+MEASURED = (
+    "bench",
+    "paper_rate/bench",
+    "paper_rate/2026-11-28",
+    "laws_2026-11-28",
+    "avx2_2026-11-29",
+    "large_packs",
+    "gpu",
+    "gpu_h200",
+)
 FROM_ELSEWHERE = ["CHANGELOG.md", "CONTRIBUTING.md", *(f"benchmarks/{name}.md" for name in MEASURED)]
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 

@@ -171,7 +171,7 @@ def every_point() -> list[str]:
         lines.append(f"| {' | '.join(shown)} |")
     within = sum(abs(one) <= WITHIN for one in apart)
     total = len(lines) - 2
-    told = f"{total - missing} of {total} published points have one of ours of the same N. "
+    told = f"{total - missing} of {total} published points of six signals have one of ours of the same N. "
     told += f"Of {len(apart)} measures {within} lie within two combined errors, and {len(apart) - within} beyond. "
     return [f"{told}Chance alone would put {chance:.0f} beyond, so few are the packs (Student's t).", "", *lines]
 

@@ -65,7 +65,7 @@ def _options(entries: Mapping[str, Field[Any]], **defaults: Any) -> _Options:
     for name, entry in entries.items():
         default, unit = defaults.get(name, entry.default), entry.metadata["unit"]
         kind = type(entry.default) if entry.default is not None else float
-        words = f"{entry.metadata['words']}{unit and ', ' + unit}."
+        words = f"{entry.metadata['words']}{unit and f' (in {unit})'}."
         if not entry.metadata.get("no_option"):
             found[name] = (default, kind if default is not None else kind | None, words, ())
     return found

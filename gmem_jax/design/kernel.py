@@ -209,7 +209,7 @@ class KernelMatrix:
 
     Attributes:
         channels: their names, C.
-        blocks: the kernel of what channel c gives back of channel d, [C][C]; off the diagonal is the cross-talk.
+        blocks: the kernel of what channel c gives back of channel d, C lists of C; off the diagonal is the cross-talk.
     """
 
     channels: tuple[str, ...]

@@ -81,7 +81,7 @@ def optional(name: str, extra: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise ValueError(f"this needs {name}: pip install 'gmem_jax[{extra}]'") from None
+        raise ValueError(f"this needs {name}, of the extra {extra}: pip install '.[{extra}]' in a checkout") from None
 
 
 class Array(NamedTuple):

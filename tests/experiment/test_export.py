@@ -12,7 +12,7 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 
-pytest.importorskip("flatbuffers", reason="pip install 'gmem_jax[aot]'")
+pytest.importorskip("flatbuffers", reason="pip install '.[aot]'")
 
 PACK = TETRA_27
 # What the page on exporting says: the library's calls are allowed by name, for JAX promises nothing about them.

@@ -303,7 +303,7 @@ def test_without_plotly_the_way_to_get_it_is_said(
 ) -> None:
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     assert gmem(monkeypatch, "report", PACK_FILE, "-o", tmp_path / "out.html") == 2
-    assert "pip install 'gmem_jax[report]'" in capsys.readouterr().err
+    assert "pip install '.[report]'" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
