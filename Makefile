@@ -67,9 +67,9 @@ wheel: $(BIN)/python
 	rm dist/*-linux_*.whl
 	$(BIN)/python -m twine check --strict dist/*
 
-# The site, in site/: every link and anchor must lead somewhere.
+# The site, in site/: every link and anchor must lead somewhere. (With --quiet, --strict would count no warning.)
 docs: install-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
