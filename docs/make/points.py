@@ -63,8 +63,9 @@ REASONS: tuple[tuple[Callable[[Mapping[str, Any]], bool], str], ...] = (
     (lambda at: at["gamma0"] > LARGE, "[large shear](differences.md#large-shear)"),
     (lambda at: at["n_grains"] > 20_000, "[large packs](differences.md#g-of-31680-and-100450-grains)"),
     (lambda at: at["shape"] == "sphere", "[spheres](differences.md#spheres)"),
+    (lambda at: at["n_grains"] == APART, "[packs of 3,267](differences.md#g-of-3267-grains)"),
     (
-        lambda at: at["n_grains"] == GRAINS and at["delta0"] >= 0.05,
+        lambda at: at["n_grains"] == GRAINS and at["delta0"] >= 0.05 and at["overlap"] == USUAL["overlap"],
         "[the rate and F](differences.md#f-and-the-rate-of-the-drive)",
     ),
 )
