@@ -192,7 +192,7 @@ def main() -> None:
         sys.exit(code if isinstance(code, int) else 0)
     except TyperException as error:
         problem = error.format_message()
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, OverflowError) as error:
         problem = " ".join(str(error).split())
     except RunFailedError as error:
         log(f"gmem: the run failed: {error}", style="red")

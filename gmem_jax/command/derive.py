@@ -332,6 +332,8 @@ def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
     for item in text.split(","):
         name, _, span = item.partition("=")
         low, _, high = span.partition(":")
+        if name.strip() in bounds:
+            raise InputError(f"--bounds: {name.strip()} is given twice")
         try:
             bounds[name.strip()] = float(low), float(high)
         except ValueError:

@@ -74,7 +74,9 @@ def theta_of(experiment: Experiment, names: Any) -> dict[str, Any]:
     for name, tree in found.items():
         if inside := next((other for other in found if name.startswith(f"{other}.")), ""):
             raise ValueError(f"{name} is part of {inside}; name one of them")
-        if name in STATIC_FIELDS or tree is None or not all(map(_is_number, jax.tree.leaves(tree))):
+        if tree is None and name not in STATIC_FIELDS:
+            raise ValueError(f"the experiment has no {name}: give it a number first")
+        if name in STATIC_FIELDS or not all(map(_is_number, jax.tree.leaves(tree))):
             raise ValueError(
                 f"{name} is fixed when a program is compiled and has no derivative; "
                 "numbers like gamma0, friction.mu, signals.amplitudes and pack.position have"

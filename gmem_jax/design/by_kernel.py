@@ -19,6 +19,7 @@ from gmem_jax.design.waveforms import (
     correction,
     largest,
     refuse_several_scales,
+    require_gain,
     sampled,
     verified,
 )
@@ -125,6 +126,7 @@ def design_by_kernel(
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
     measured = require_whole("measured", measured)
     require_numbers(width=width, gain=gain, damping=damping)
+    require_gain(gain)
     if start is not None and start.count != experiment.signals.count:
         raise ValueError(
             f"{plural(start.count, 'waveform')} to start from, for {plural(experiment.signals.count, 'signal')}; "

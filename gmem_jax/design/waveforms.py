@@ -5,6 +5,7 @@ replicas of one run (`derivatives.push`). A damped Gauss-Newton step is simulate
 whole and in parts.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -165,6 +166,16 @@ def refuse_several_scales(experiment: Experiment) -> None:
         raise ValueError("waveforms are designed at one gamma0 and one delta0, not one for each replica")
 
 
+def require_gain(gain: float | None) -> None:
+    """Refuse a wanted gain that no waveform has.
+
+    Raises:
+        ValueError: if it is 0, infinite or not a number.
+    """
+    if gain is not None and not 0.0 < abs(gain) < math.inf:
+        raise ValueError(f"gain must be a finite number other than 0, got {gain:g}")
+
+
 @usual_rules()
 @shows_progress
 def design_waveforms(
@@ -203,6 +214,7 @@ def design_waveforms(
     refuse_several_scales(experiment)
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
     require_numbers(width=width, gain=gain, **{f"damping {number}": one for number, one in enumerate(damping, 1)})
+    require_gain(gain)
     names = written_sets(experiment)
     work, share = Work(cost(experiment, iterations, n * len(names)), tell), _prefix(experiment)
     prefix = prefix_of(experiment, cache=cache, progress=work.next(share))

@@ -45,6 +45,15 @@ def require_parts(pack: Any, signals: Any, friction: Any) -> None:
         numbers = isinstance(signals, list | tuple | np.ndarray) or hasattr(signals, "shape")
         made = "gm.waveform makes waveforms of samples" if numbers else "as gm.six_signals(), gm.words(3)"
         raise ValueError(f"signals must be waveforms, got {_said(signals)}; {made}")
+    require_law(friction)
+
+
+def require_law(friction: Any) -> None:
+    """Refuse what is no friction law.
+
+    Raises:
+        ValueError: saying what was given, and what makes the right thing of it.
+    """
     plain = isinstance(friction, float | int | str) or hasattr(friction, "shape")
     # A class that JAX does not know may be a law in the making: `Experiment` says what it lacks.
     unregistered = not plain and jax.tree_util.all_leaves([friction])

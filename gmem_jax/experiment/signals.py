@@ -128,6 +128,9 @@ class Bumps:
         width: du, scalar or [S, 1].
         form: what made them, as JSON of their written form; "" for those of one's own. A label: with other numbers it
             is another set's.
+
+    Raises:
+        ValueError: for what are no numbers, or not of these shapes.
     """
 
     amplitudes: jax.Array
@@ -137,6 +140,10 @@ class Bumps:
 
     def __post_init__(self) -> None:
         _require_arrays(self)
+        shapes = [jnp.shape(leaf) for leaf in (self.amplitudes, self.centres, self.width)]
+        given, places, width = (shape[-2:] for shape in shapes)
+        if len(given) != 2 or places != given or width not in ((), (given[0], 1)):
+            raise ValueError(f"amplitudes and centres must be [S, b], width a number or [S, 1]; got {said(shapes)}")
 
     def __repr__(self) -> str:
         return line(

@@ -83,8 +83,9 @@ def _case(experiment: Experiment) -> tuple[tuple[str, ...], Any]:
 
 def _at_rest(experiment: Experiment, law: Any) -> tuple[Simulation, jax.Array, jax.Array, Box]:
     """The arguments of `largest_stable_step` under a law: every replica at u = 0, and every one at u = 1."""
-    pack, single = experiment.pack, max(map(jnp.size, jax.tree.leaves((law, experiment.compression))))
-    law = jax.tree.map(lambda leaf: jnp.tile(leaf, 2) if jnp.ndim(leaf) else leaf, law)
+    pack, own = experiment.pack, (law, experiment.wall_mu)
+    single = max(map(jnp.size, jax.tree.leaves((own, experiment.compression))))
+    law, wall_mu = jax.tree.map(lambda leaf: jnp.tile(leaf, 2) if jnp.ndim(leaf) else leaf, own)
     compression, replicas = jnp.broadcast_to(experiment.compression, (single,)), 2 * single
     shrink = jnp.concatenate([jnp.ones(single), jnp.sqrt(1.0 - compression)])
     scale = jnp.stack([shrink, shrink, jnp.ones(replicas)])
@@ -92,7 +93,8 @@ def _at_rest(experiment: Experiment, law: Any) -> tuple[Simulation, jax.Array, j
     position = centre + scale * (pack.position[..., None] - centre)
     quaternion = jnp.broadcast_to(unit(pack.quaternion[..., None]), (pack.grains, 4, replicas))
     simulation = experiment.simulation(sheared=False)
-    system = replace(simulation.system, friction=law)
+    # A constant force has no part in the growth of what is linear.
+    system = replace(simulation.system, friction=law, wall_mu=wall_mu, gravity=None)
     simulation = replace(simulation, system=system, dt=1.0, drag=0.0, steps=1, precision="double")
     return simulation, position, quaternion, still_box(centre - scale * half, centre + scale * half, pack.periodic)
 

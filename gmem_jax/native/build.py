@@ -52,10 +52,13 @@ def compiler() -> list[str]:
     """The C++ compiler: the environment's CXX, else the first of c++, g++ and clang++.
 
     Raises:
-        BuildError: if there is none.
+        BuildError: if there is none, or CXX does not read as a command.
     """
     if os.environ.get("CXX"):
-        return shlex.split(os.environ["CXX"])
+        try:
+            return shlex.split(os.environ["CXX"])
+        except ValueError as error:
+            raise BuildError(f"CXX: {error}") from error
     for name in ("c++", "g++", "clang++"):
         if shutil.which(name):
             return [name]
@@ -179,8 +182,14 @@ def build(target: Path) -> None:
         linked = Path(folder) / LIBRARY
         run_compiler([*cxx, "-shared", "-pthread", *objects, "-ldl", "-o", str(linked)])
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(linked, target.with_suffix(".new"))
-        target.with_suffix(".new").replace(target)  # atomically: a running process may have the old one loaded
+        if not linked.is_file():
+            raise BuildError(f"{cxx[0]} made no library")
+        made = target.with_suffix(f".{os.getpid()}.new")  # of this process: another may build too
+        try:
+            shutil.copyfile(linked, made)
+            made.replace(target)  # atomically: a running process may have the old one loaded
+        finally:
+            made.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":

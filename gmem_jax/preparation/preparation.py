@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.errors import RunFailedError
-from gmem_jax.experiment.arguments import require_kind
+from gmem_jax.experiment.arguments import require_kind, require_law
 from gmem_jax.experiment.asked import require_walls
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
@@ -23,6 +23,7 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.grain import Clump, tetra
 from gmem_jax.physics.material import Material
+from gmem_jax.physics.numbers import require_whole, said
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Grains, still_box
 from gmem_jax.physics.step import accelerate, start
@@ -117,6 +118,7 @@ class _Preparation:
     ) -> None:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
         self.recipe, self.cache, self.filmed, self.lengths = recipe, cache, frames > 0, lengths
+        self.known = *cycles_of(recipe), last_rest(recipe)
         self.frames = FrameRecorder(preparation_frames(recipe, frames))
         self.periodic = periodic_axes(recipe.boundary)
         self.box = still_box(jnp.zeros((3, 1)), jnp.asarray(lengths)[:, None], self.periodic)
@@ -178,6 +180,9 @@ class _Preparation:
             runner.state, self.box = pressed.state, pressed.box
             done = int(pressed.blocks)
             left -= done
+            # It may take longer than was thought; what comes after it is known.
+            least = runner.work + done * per_bin * work_of_bin(1) + work_of(self.known, 1)
+            runner.total_work = max(runner.total_work, least)
             runner.report(name, done * per_bin, float(done * block))
             if bool(pressed.settled):
                 break
@@ -225,7 +230,7 @@ class _Preparation:
         )
         runner.renew(self.box)
         # How long a pack takes to come to rest was a guess; from here on it is known what is left.
-        runner.total_work = runner.work + work_of((*cycles_of(recipe), last_rest(recipe)), 1)
+        runner.total_work = runner.work + work_of(self.known, 1)
         self.log |= runner.run_cached("cycles", self.cache, *cycles_of(recipe))
         runner.simulation = replace(runner.simulation, steps=outside.steps, dt=outside.dt)
         rest = last_rest(recipe)
@@ -251,7 +256,7 @@ class _Preparation:
             if speed <= recipe.quiet:
                 return last, runner.snapshot()
             if waited > recipe.patience:
-                raise RunFailedError(f"rest: largest speed {speed:.1e} R/t_c after {waited:g} t_c")
+                raise RunFailedError(f"rest: largest speed {speed:.1e} R/t_c after {waited:g} t_c; allow more patience")
             checkpoint.maybe_save(standing)
 
 
@@ -298,8 +303,18 @@ def prepare(
     tell = callback(progress)
     require_x64()
     require_kind("prepare", recipe or Recipe(), Recipe)
+    grain, material, friction = grain or tetra(), material or Material(), Hooke() if friction is None else friction
+    require_law(friction)
+    if not isinstance(grain, Clump):
+        raise ValueError(f"grain must be a grain, as gm.tetra(0.6); got {said(grain)}")
+    if not isinstance(material, Material):
+        raise ValueError(f"material must be a gm.Material; got {said(material)}")
+    if log is not None and not isinstance(log, dict):
+        raise ValueError(f"log must be a dictionary to fill, got {said(log)}")
+    if require_whole("frames", frames) and film is None:
+        raise ValueError("frames go into film: give a list for them")
     recipe = replace(recipe or Recipe(), **changes)
-    clump, material = graded(recipe, grain or tetra()), material or Material()
+    clump = graded(recipe, grain)
     require_walls(periodic_axes(recipe.boundary), material)
     preparation = _Preparation(recipe, clump, material, backend, frames, cache, tell)
     preparation.compact()
@@ -309,7 +324,7 @@ def prepare(
     if film is not None and frames:
         centre = np.asarray(0.5 * (preparation.box.lower + preparation.box.upper))[:, 0]  # the origin of the pack
         film.append(concatenate(preparation.frames.recorded, clump, centre=centre, periodic=preparation.periodic))
-    pack = _finish(preparation, material, friction or Hooke(), name)
+    pack = _finish(preparation, material, friction, name)
     _warn_of_another_pressure(pack)
     return pack
 

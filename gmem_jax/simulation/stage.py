@@ -9,10 +9,12 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import numpy as np
 
+from gmem_jax.physics.numbers import said
 from gmem_jax.physics.pytree import static_record
 from gmem_jax.simulation.channels import CHANNELS
 
 BINS = 256  # bins of a stage of length t0, as in the paper: the resolution of every recorded quantity
+LONGEST_NAME = 150  # of a stage; files take 200, and a protocol appends to a name that comes twice
 SINE = "sine:"  # begins the name of a drive of whole sine periods
 
 Numbers = float | np.ndarray | jax.Array
@@ -183,8 +185,10 @@ class Stage:
             raise ValueError(f"stage {self.name!r}: {problem}")
 
         object.__setattr__(self, "drives", tuple(self.drives))
-        if not isinstance(self.name, str) or not self.name.isprintable() or not self.name or "/" in self.name:
-            raise ValueError(f"a stage has a name of printable letters without '/', got {self.name!r}")
+        name = self.name if isinstance(self.name, str) else ""
+        if not name.isprintable() or not 0 < len(name) <= LONGEST_NAME or "/" in name or name == ".":
+            wanted = f"1 to {LONGEST_NAME} printable letters without '/', not '.'"
+            raise ValueError(f"a stage has a name of {wanted}; got {said(self.name)}")
         if self.role not in get_args(Role):
             refuse(f"its role must be one of {', '.join(get_args(Role))}; got {self.role!r}")
         if self.along not in (None, *get_args(Along)):

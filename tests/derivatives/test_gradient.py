@@ -235,6 +235,8 @@ def test_names_that_cannot_be_differentiated_by_are_refused(experiment: gm.Exper
         gm.value_and_grad(experiment, ["background"])
     with pytest.raises(ValueError, match="steps is fixed when a program is compiled and has no derivative"):
         gm.value_and_grad(experiment, ["steps"])
+    with pytest.raises(ValueError, match="the experiment has no gravity: give it a number first"):
+        gm.value_and_grad(experiment, ["gravity"])
 
 
 def test_a_jacobian_of_several_signals_is_refused(experiment: gm.Experiment) -> None:

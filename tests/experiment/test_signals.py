@@ -44,6 +44,15 @@ def test_each_signal_has_its_amplitudes_at_its_bump_centres_and_is_zero_between(
     assert np.abs(everywhere).max() == pytest.approx(np.abs(heights).max(), rel=1e-8)  # and peaks nowhere else
 
 
+@pytest.mark.parametrize(
+    ("amplitudes", "centres", "width"),
+    [(np.eye(3), np.full(3, 0.5), 0.1), (np.ones(3), np.full(3, 0.5), 0.1), (np.eye(3), np.eye(3), np.full(3, 0.1))],
+)
+def test_bumps_of_another_shape_than_their_centres_are_refused(amplitudes, centres, width):
+    with pytest.raises(ValueError, match=r"amplitudes and centres must be \[S, b\], width a number or \[S, 1\]; got"):
+        Bumps(amplitudes, centres, width)
+
+
 def test_a_bump_is_half_a_period_of_a_cosine():
     u = jnp.asarray([0.25, 0.3 + 0.2 / 3.0])  # a quarter and a third of the width off centre
     np.testing.assert_allclose(SHEAR(SIX, u)[:, 0], np.cos(np.pi * np.array([0.25, 1.0 / 3.0])), rtol=1e-13)

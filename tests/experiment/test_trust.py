@@ -235,6 +235,8 @@ def test_the_smallest_stable_step_is_that_of_the_stiffest_replica_and_of_either_
     assert gm.stable_step(gm.Experiment(PACK, bumps, gm.Hooke(mu=0.0))) == 2.0
     deep = gm.Experiment(PACK, bumps, gm.MindlinRescaled(), delta0=0.2)  # whose springs stiffen with the overlap
     assert gm.stable_step(deep) < gm.stable_step(gm.replace(deep, delta0=0.01))
+    walls = gm.Experiment(PACK, gm.six_signals(), wall_mu=jnp.linspace(0.0, 1.0, 7), gravity=jnp.linspace(0.0, 1e-4, 7))
+    assert gm.stable_step(walls) == 2.0  # rough walls and gravity of each replica; the force itself has no part in it
 
 
 @pytest.mark.parametrize("name", ["spread-27", "periodic-27"])

@@ -60,6 +60,18 @@ def test_flags_that_a_compiler_does_not_know_are_left_out() -> None:
     assert build.known_of(["no-such-compiler"], ("-O1",)) == ()
 
 
+@pytest.mark.parametrize(("given", "words"), [('"g++', "CXX: No closing quotation"), ("true", "true made no library")])
+def test_a_compiler_that_is_none_is_told_in_one_line_and_leaves_the_library(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, given: str, words: str
+) -> None:
+    monkeypatch.setenv("CXX", given)
+    library = tmp_path / build.LIBRARY
+    library.write_bytes(b"as it was")
+    with pytest.raises(build.BuildError, match=words):
+        build.build(library)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"as it was"]
+
+
 @pytest.mark.parametrize("name", ["numbers", "physics", "programs", "segments", "threads"])
 def test_unit_tests_in_cpp(name: str, tmp_path: Path) -> None:
     more = [str(build.SOURCES / source) for source in THREADS] if name == "threads" else []

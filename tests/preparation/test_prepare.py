@@ -261,6 +261,34 @@ def test_impossible_recipes_are_refused(bad: dict, words: str) -> None:
         gm.Recipe(**bad)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"friction": gm.Hooke}, "friction must be a friction law, got the class Hooke"),
+        ({"grain": "tetra"}, "grain must be a grain, as gm.tetra(0.6); got 'tetra'"),
+        ({"material": 1e7}, "material must be a gm.Material; got 10000000.0"),
+        ({"log": []}, "log must be a dictionary to fill, got []"),
+        ({"frames": 6}, "frames go into film: give a list for them"),
+    ],
+)
+def test_what_a_preparation_cannot_use_is_refused_before_it_is_begun(wrong: dict, words: str) -> None:
+    def told(*_: object) -> None:
+        pytest.fail("it was begun")
+
+    with pytest.raises(ValueError, match=re.escape(words)):
+        gm.prepare(grains=27, t0=60.0, progress=told, **wrong)
+
+
+def test_a_pack_that_takes_long_to_settle_is_not_said_to_be_finished() -> None:
+    told: list[tuple[str, float]] = []
+    slow = gm.Recipe(grains=27, t0=60.0, seed=3, settled_speed=1e-9, drag=5e-4)
+    gm.prepare(slow, progress=lambda stage, _, fraction: told.append((stage, fraction)))
+    settling = [fraction for stage, fraction in told if stage == "settle"]
+    assert len(settling) > 20
+    assert max(settling) < 0.95  # the cycles come after it
+    assert sorted(told, key=lambda at: at[1]) == told
+
+
 @pytest.mark.parametrize("wrong", ["open", "periodic,walls", 3, None])
 def test_a_boundary_is_walls_or_periodic(wrong: object) -> None:
     assert gm.Recipe(boundary=("periodic", "walls", "walls")).boundary == "periodic,walls,walls"
