@@ -45,10 +45,10 @@ def require_parts(pack: Any, signals: Any, friction: Any) -> None:
         numbers = isinstance(signals, list | tuple | np.ndarray) or hasattr(signals, "shape")
         made = "gm.waveform makes waveforms of samples" if numbers else "as gm.six_signals(), gm.words(3)"
         raise ValueError(f"signals must be waveforms, got {_said(signals)}; {made}")
-    require_law(friction)
+    require_friction(friction)
 
 
-def require_law(friction: Any) -> None:
+def require_friction(friction: Any) -> None:
     """Refuse what is no friction law.
 
     Raises:

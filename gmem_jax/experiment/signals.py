@@ -124,7 +124,7 @@ class Bumps:
 
     Attributes:
         amplitudes: a_b, [S, b]; zero entries pad signals with fewer bumps.
-        centres: c_b, [S, b].
+        centres: c_b, [S, b], or [1, b] of all signals.
         width: du, scalar or [S, 1].
         form: what made them, as JSON of their written form; "" for those of one's own. A label: with other numbers it
             is another set's.
@@ -142,8 +142,9 @@ class Bumps:
         _require_arrays(self)
         shapes = [jnp.shape(leaf) for leaf in (self.amplitudes, self.centres, self.width)]
         given, places, width = (shape[-2:] for shape in shapes)
-        if len(given) != 2 or places != given or width not in ((), (given[0], 1)):
-            raise ValueError(f"amplitudes and centres must be [S, b], width a number or [S, 1]; got {said(shapes)}")
+        if len(given) != 2 or places not in (given, (1, given[1])) or width not in ((), (given[0], 1)):
+            wanted = "amplitudes must be [S, b], centres [S, b] or [1, b], width a number or [S, 1]"
+            raise ValueError(f"{wanted}; got {said(shapes)}")
 
     def __repr__(self) -> str:
         return line(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.errors import RunFailedError
-from gmem_jax.experiment.arguments import require_kind, require_law
+from gmem_jax.experiment.arguments import require_friction, require_kind
 from gmem_jax.experiment.asked import require_walls
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
@@ -304,7 +304,7 @@ def prepare(
     require_x64()
     require_kind("prepare", recipe or Recipe(), Recipe)
     grain, material, friction = grain or tetra(), material or Material(), Hooke() if friction is None else friction
-    require_law(friction)
+    require_friction(friction)
     if not isinstance(grain, Clump):
         raise ValueError(f"grain must be a grain, as gm.tetra(0.6); got {said(grain)}")
     if not isinstance(material, Material):

@@ -166,8 +166,22 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
             return state, sample
         seen = replace(simulation, system=system, dt=dt, drag=drag, box=last, sample=sample)
         # Ordered, as what checkpoints keep is.
-        observed = OrderedDict((name, reduce(seen, state)) for name, reduce in simulation.observe)
+        observed = OrderedDict(
+            (name, _of_replicas(name, reduce(seen, state), state)) for name, reduce in simulation.observe
+        )
         return state, replace(sample, observed=observed)
+
+
+def _of_replicas(name: str, value: Any, state: State) -> Any:
+    """What an observer gave; refused while the program is made if no file could hold it.
+
+    Raises:
+        ValueError: naming the observer, and what it gave.
+    """
+    if jnp.shape(value)[-1:] != (state.replicas,) or jnp.iscomplexobj(value):
+        given = f"{jnp.result_type(value)} {list(jnp.shape(value))}"
+        raise ValueError(f"observer {name!r} must give real numbers [..., B], B = {state.replicas}; it gave {given}")
+    return value
 
 
 def _crept(simulation: Simulation, state: State, row: Bin) -> State:

@@ -49,7 +49,7 @@ def test_each_signal_has_its_amplitudes_at_its_bump_centres_and_is_zero_between(
     [(np.eye(3), np.full(3, 0.5), 0.1), (np.ones(3), np.full(3, 0.5), 0.1), (np.eye(3), np.eye(3), np.full(3, 0.1))],
 )
 def test_bumps_of_another_shape_than_their_centres_are_refused(amplitudes, centres, width):
-    with pytest.raises(ValueError, match=r"amplitudes and centres must be \[S, b\], width a number or \[S, 1\]; got"):
+    with pytest.raises(ValueError, match=r"amplitudes must be \[S, b\], centres .* got"):
         Bumps(amplitudes, centres, width)
 
 

@@ -478,3 +478,10 @@ def test_a_gradient_through_a_recall_is_that_of_differences() -> None:
     for name, value in at.items():
         up, down = (loss({**at, name: value * (1.0 + step)}) for step in (1e-5, -1e-5))
         assert float(found[name]) == pytest.approx(float(up - down) / (2e-5 * value), rel=1e-4), name
+
+
+@pytest.mark.parametrize("given", [1.0, jnp.zeros(5), jnp.zeros(3) * 1j])
+def test_what_no_file_could_hold_is_refused_before_the_run(given: Any) -> None:
+    experiment = gm.Experiment(PACK, ONE, t0=60.0, observe={"odd": lambda simulation, state: given})
+    with pytest.raises(ValueError, match=r"observer 'odd' must give real numbers \[\.\.\., B\], B = .; it gave "):
+        gm.run(experiment, progress=False)
