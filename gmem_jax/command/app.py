@@ -192,8 +192,10 @@ def main() -> None:
         sys.exit(code if isinstance(code, int) else 0)
     except TyperException as error:
         problem = error.format_message()
-    except (ValueError, OSError, OverflowError) as error:
+    except (ValueError, OSError) as error:
         problem = " ".join(str(error).split())
+    except OverflowError as error:
+        problem = f"a number is too large ({error})"
     except RunFailedError as error:
         log(f"gmem: the run failed: {error}", style="red")
         sys.exit(1)

@@ -15,6 +15,7 @@ from gmem_jax.simulation.channels import CHANNELS
 
 BINS = 256  # bins of a stage of length t0, as in the paper: the resolution of every recorded quantity
 LONGEST_NAME = 150  # of a stage; files take 200, and a protocol appends to a name that comes twice
+LONGEST_STAGE = 1e9  # in t0: more bins than any machine goes through
 SINE = "sine:"  # begins the name of a drive of whole sine periods
 
 Numbers = float | np.ndarray | jax.Array
@@ -199,6 +200,8 @@ class Stage:
                 refuse(f"u must be in [0, 1], and its {name} is {u}")
         if not 0.0 <= self.length < math.inf:
             refuse(f"its length must be in [0, inf), got {self.length}")
+        if self.length > LONGEST_STAGE:
+            refuse(f"its length may be up to {LONGEST_STAGE:g} t0, got {self.length:g}")
         if self.drag is not None and not 0.0 <= self.drag < math.inf:
             refuse(f"its drag must be in [0, inf), got {self.drag}")
         if self.role == "write" and not self.drives:

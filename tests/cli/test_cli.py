@@ -209,6 +209,8 @@ BAD = [
     ),
     (["prepare", "p", "--grains", "27"], "p: a standard pack is called tetra-N-x, N grains and a letter for the seed"),
     (["prepare", "--grains", "0", "-o", "{out}"], "grains must be at least 12 to jam, got 0"),
+    (["prepare", "--grains", "27", "--t0", "1e308", "-o", "{out}"], "a number is too large"),
+    (["recall", "{pack}", "--store", "1e308", "-o", "{out}"], "stage 'store': its length may be up to 1e+09 t0"),
     (["prepare", "--overlap", "1.0", "-o", "{out}"], "overlap must be in [0, 1), got 1"),
     (
         ["prepare", "--shape", "sphere", "--overlap", "0.3", "-o", "{out}"],

@@ -1,5 +1,6 @@
 """The memory kernel and designs, on made-up kernels and on a shortened run of 27 grains."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -169,6 +170,18 @@ def test_two_channels_are_designed_together(experiment: gm.Experiment) -> None:
     with pytest.raises(ValueError, match=r"gm.signals\(\*\*design.sets\)"):
         _ = found.signals
     np.testing.assert_allclose(np.mean(found.fidelity), found.history[-1], atol=1e-3)  # of samples
+
+
+@pytest.mark.parametrize("gain", [0.0, math.nan, -math.inf])
+@pytest.mark.parametrize("design", [gm.design_waveforms, gm.design_by_kernel])
+def test_a_gain_that_no_waveform_has_is_refused_before_anything_runs(
+    experiment: gm.Experiment, design: Any, gain: float
+) -> None:
+    def told(*_: object) -> None:
+        pytest.fail("it was begun")
+
+    with pytest.raises(ValueError, match="gain must be a finite number other than 0, got"):
+        design(experiment, gain=gain, progress=told)
 
 
 def test_designs_of_what_is_read_twice_are_refused(experiment: gm.Experiment) -> None:

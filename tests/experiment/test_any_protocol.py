@@ -88,6 +88,9 @@ def test_what_makes_no_protocol_is_refused(reason: str, stages: tuple[Any, ...])
         ({"of": "write"}, "only a stage that reads"),
         ({"role": "read", "recorded": False}, "what is read is recorded"),
         ({"name": "a/b"}, "without '/'"),
+        ({"name": "."}, "not '.'; got '.'"),
+        ({"name": "x" * 200}, "a name of 1 to 150 printable letters"),
+        ({"length": 1e308}, r"its length may be up to 1e\+09 t0, got 1e\+308"),
     ],
 )
 def test_what_makes_no_stage_is_refused(fields: dict[str, Any], reason: str) -> None:
