@@ -18,7 +18,7 @@ if TYPE_CHECKING or not gmem_start.alone:
     from gmem_jax.derivatives.gradient import value_and_grad
     from gmem_jax.derivatives.jacobian import exact as jacobian
     from gmem_jax.design.kernel import KernelMatrix, MemoryKernel, kernel_matrix, memory_kernel
-    from gmem_jax.errors import FileFormatError, RunFailedError
+    from gmem_jax.errors import FileFormatError, NotAtRestError, RunFailedError
     from gmem_jax.experiment.analysis import running_mean
     from gmem_jax.experiment.changes import replace
     from gmem_jax.experiment.experiment import Experiment
@@ -105,6 +105,7 @@ __all__ = [
     "MemoryKernel",
     "Mindlin",
     "MindlinRescaled",
+    "NotAtRestError",
     "Pack",
     "ProgressBar",
     "Protocol",

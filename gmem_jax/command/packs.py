@@ -126,7 +126,9 @@ def prepare_command(
     made = graded(recipe, clump)
     backend = backend_name(backend, Frictionless())
     cost = announce(f"{recipe.grains} grains", grain_steps(recipe, made), PREPARATION_BYTES * recipe.grains, backend)
-    key = {"recipe": asdict(recipe), "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
+    # Patience is not in the key: with more of it a pack that did not come to rest goes on.
+    told = {name: value for name, value in asdict(recipe).items() if name != "patience"}
+    key = {"recipe": told, "grain": fingerprint(clump), "backend": backend, "frames": frames, **sources()}
     if dry_run:
         foresee(output, key, restart=restart)
         emit_cost(as_json, cost, output, pack_bytes(recipe.grains, frames))

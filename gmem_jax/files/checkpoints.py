@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gmem_jax.errors import FileFormatError, RunFailedError
+from gmem_jax.errors import FileFormatError, NotAtRestError, RunFailedError
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.ours import Folder, release, remove_leftovers
 from gmem_jax.files.seal import BLOCK, PART, require_sealed, seal
@@ -154,11 +154,11 @@ class _StoredCheckpoint(Checkpoint):
     def maybe_save(self, state: Callable[[], Any], *, milestone: bool = False) -> None:
         wait = min(self._wait, AT_MILESTONES) if milestone else self._wait
         if self._keeps and (time.monotonic() - self._last >= wait or _parting):
-            self._save(state)
+            self.save(state)
         while _parting:
             _parting.pop()()
 
-    def _save(self, state: Callable[[], Any]) -> None:
+    def save(self, state: Callable[[], Any]) -> None:
         now, before = self._names
         if self._own.at(now).exists():
             self._own.move(now, before)
@@ -241,6 +241,8 @@ class Checkpoints(ResultCache):
         checkpoint = _StoredCheckpoint(self._own, name, of)
         try:
             result = jax.tree.map(np.asarray, run(checkpoint))
+        except NotAtRestError:
+            raise  # its checkpoint is what more patience goes on from
         except RunFailedError:
             checkpoint.discard()  # whoever tries again changes something
             raise

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.errors import RunFailedError
+from gmem_jax.errors import NotAtRestError, RunFailedError
 from gmem_jax.experiment.arguments import require_friction, require_kind
 from gmem_jax.experiment.asked import require_walls
 from gmem_jax.experiment.pack import Pack, find_pairs
@@ -165,21 +165,21 @@ class _Preparation:
         block, per_bin = STEPS_PER_CHECK * self.dt, STEPS_PER_CHECK / runner.simulation.steps
         no = jnp.asarray(False)
         pressed = Pressed(runner.state, self.box, jnp.zeros(1), jnp.asarray(0), no, no)
-        left = math.ceil(duration / block)
+        spent, allowed = 0, math.ceil(duration / block)
         if saved := checkpoint.restore():
             runner.restore(saved["runner"])
-            pressed, left = saved["pressed"], int(saved["left"])
+            pressed, spent = saved["pressed"], int(saved["spent"])
 
         def standing() -> dict[str, Any]:
-            return {"runner": runner.snapshot(), "pressed": pressed, "left": np.asarray(left)}
+            return {"runner": runner.snapshot(), "pressed": pressed, "spent": np.asarray(spent)}
 
-        while left > 0:
+        while spent < allowed:
             system, march = runner.simulation.system, runner.simulation.resolved.march
-            pressed = _press(system, pressed, servo, self.dt, drag, blocks=min(CALL, left), march=march)
+            pressed = _press(system, pressed, servo, self.dt, drag, blocks=min(CALL, allowed - spent), march=march)
             raise_if_fatal(status_of(pressed.state), name)
             runner.state, self.box = pressed.state, pressed.box
             done = int(pressed.blocks)
-            left -= done
+            spent += done
             # It may take longer than was thought; what comes after it is known.
             least = runner.work + done * per_bin * work_of_bin(1) + work_of(self.known, 1)
             runner.total_work = max(runner.total_work, least)
@@ -190,6 +190,12 @@ class _Preparation:
                 runner.renew(self.box)
                 pressed = replace(pressed, state=runner.state)
             checkpoint.maybe_save(standing)
+        if 0.0 < servo.quiet < math.inf and not bool(pressed.settled):
+            checkpoint.save(standing)
+            raise NotAtRestError(
+                f"{name}: p_z = {float(pressed.pressure[0]):.3e} E and largest speed "
+                f"{float(largest_speed(pressed.state)):.1e} R/t_c after {duration:g} t_c; with more patience it goes on"
+            )
         return runner.snapshot(), pressed
 
     def compact(self) -> None:
@@ -204,12 +210,7 @@ class _Preparation:
         settle = replace(approach, error=recipe.pressure_error, quiet=recipe.settled_speed)
         self.runner.finder = pair_finder(self.runner.simulation.system.clump, self.lengths, DENSE_SKIN)
         self.runner.renew(self.box)
-        pressed = self.press("settle", settle, recipe.patience, recipe.drag)
-        if not bool(pressed.settled):
-            raise RunFailedError(
-                f"settle: p_z = {float(pressed.pressure[0]):.3e} E and largest speed "
-                f"{float(largest_speed(pressed.state)):.1e} R/t_c after {recipe.patience:g} t_c; allow more patience"
-            )
+        self.press("settle", settle, recipe.patience, recipe.drag)
         self.box = still_box(self.box.lower, self.box.upper, self.periodic)
         clump = self.runner.simulation.system.clump
         lengths, diameter = np.asarray(self.box.lengths)[:, 0], float(clump.diameter * clump.largest)
@@ -256,7 +257,10 @@ class _Preparation:
             if speed <= recipe.quiet:
                 return last, runner.snapshot()
             if waited > recipe.patience:
-                raise RunFailedError(f"rest: largest speed {speed:.1e} R/t_c after {waited:g} t_c; allow more patience")
+                checkpoint.save(standing)
+                raise NotAtRestError(
+                    f"rest: largest speed {speed:.1e} R/t_c after {waited:g} t_c; with more patience it goes on"
+                )
             checkpoint.maybe_save(standing)
 
 
@@ -296,7 +300,8 @@ def prepare(
 
     Raises:
         ValueError: for impossible numbers, or if 64-bit mode is off.
-        RunFailedError: if the simulation broke down, did not come to rest, or pressed the pack flatter than a grain.
+        RunFailedError: if the simulation broke down, or pressed the pack flatter than a grain.
+        NotAtRestError: if it did not come to rest; with the same `cache` and more `patience` it goes on.
 
     Warns if the cycles left the pack with another p_z than was wanted (`MET`).
     """

@@ -14,6 +14,9 @@ class Checkpoint:
     def maybe_save(self, state: Callable[[], Any], *, milestone: bool = False) -> None:
         """Save what `state` gives, a tree of arrays, if enough time has passed; at milestones less is enough."""
 
+    def save(self, state: Callable[[], Any]) -> None:
+        """Save it now."""
+
 
 NO_CHECKPOINT = Checkpoint()
 

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import fields
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import pytest
 from scenes import ELASTIC, SPHERE, column, scene
 
 import gmem_jax as gm
+from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.physics.state import still_box
 from gmem_jax.physics.step import march, start
 from gmem_jax.physics.system import System
@@ -105,6 +107,34 @@ def test_a_pack_that_would_be_flatter_than_its_grains_is_refused_before_it_is_be
         gm.prepare(grains=count, filling=filling, grain=grain)
     assert "take more grains" in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_pack_that_did_not_come_to_rest_goes_on_with_more_patience_to_the_same_bits(
+    prepared: tuple[gm.Pack, dict], tmp_path: Path
+) -> None:
+    def try_with(patience: float) -> gm.Pack:
+        return gm.prepare(TINY, gm.sphere(), patience=patience, cache=Checkpoints(tmp_path / "parts", {}))
+
+    with pytest.raises(gm.NotAtRestError, match=r"settle: p_z = .* after 200 t_c; with more patience it goes on"):
+        try_with(200.0)
+    with pytest.raises(gm.NotAtRestError, match="after 400 t_c"):
+        try_with(400.0)
+    pack = try_with(TINY.patience)
+    for name in ("position", "quaternion", "lower", "upper"):
+        np.testing.assert_array_equal(getattr(pack, name), getattr(prepared[0], name))
+    assert pack.info["simulated_time"] == prepared[0].info["simulated_time"]
+
+
+@pytest.mark.filterwarnings("ignore:.*times the wanted")  # the quick way to a last rest
+def test_a_last_rest_that_took_too_long_goes_on_with_more_patience(tmp_path: Path) -> None:
+    def try_with(patience: float) -> gm.Pack:
+        quick = {"settled_speed": 1.0, "pressure_error": 0.5, "quiet": 1e-9}
+        return gm.prepare(TINY, gm.sphere(), **quick, patience=patience, cache=Checkpoints(tmp_path / "parts", {}))
+
+    with pytest.raises(gm.NotAtRestError, match=r"rest: largest speed .* with more patience it goes on"):
+        try_with(1.0)
+    rested = try_with(TINY.patience)
+    assert rested.info["at_rest"]["largest_speed"] <= 1e-9
 
 
 def test_a_pressed_pack_flatter_than_its_grains_is_no_pack() -> None:
