@@ -10,6 +10,7 @@ from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.changes import replace, value_at
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.run import run
+from gmem_jax.experiment.stepping import require_stable
 from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.physics.pytree import comparable
 from gmem_jax.physics.rules import usual_rules
@@ -43,7 +44,8 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
     """The values that a search begins with.
 
     Raises:
-        ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
+        ValueError: if a bound is not lowest <= start <= highest with lowest positive, there is no pack, or the time
+            step is not stable with the highest values.
     """
     require_several(experiments, "experiments")
     if not experiments:
@@ -59,6 +61,12 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
                 f"{name}: bounds must be positive and hold the first value {value:g}, got {low:g} to {high:g}"
             )
         found.append(value)
+    highest = {PARAMETERS.get(name, name): high for name, (_, high) in bounds.items()}
+    for experiment in experiments:
+        try:
+            require_stable(replace(experiment, highest))
+        except ValueError as error:
+            raise ValueError(f"with the highest values of the bounds: {error}") from error
     return found
 
 
@@ -90,7 +98,7 @@ def design_drive(
         progress: told about every run; default a bar in a terminal or a notebook, False for none.
 
     Raises:
-        ValueError: if a bound is not lowest <= start <= highest with lowest positive, or there is no pack.
+        ValueError: as of `start_within`.
         RunFailedError: if a simulation broke down.
     """
     tell, iterations = callback(progress), require_whole("iterations", iterations)

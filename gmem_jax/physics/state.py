@@ -62,7 +62,7 @@ WARNINGS = (
 
 
 SENTENCES = {
-    Status.STALE_PAIRS: "grains moved further than the neighbour list allows; use gm.run, which makes it anew",
+    Status.STALE_PAIRS: "grains moved further than the neighbour list bears; gm.run makes it anew, or use a smaller dt",
     Status.OUTSIDE_BOX: "a grain left the box; use a smaller dt, or check where the grains of the pack lie",
     Status.NOT_FINITE: "a position or a force is not a finite number; use a smaller dt, or check pack and friction law",
     Status.NOT_AT_REST: "grains still move when the readout begins; use a longer store or a larger hold_drag",

@@ -176,7 +176,7 @@ class _Preparation:
         while spent < allowed:
             system, march = runner.simulation.system, runner.simulation.resolved.march
             pressed = _press(system, pressed, servo, self.dt, drag, blocks=min(CALL, allowed - spent), march=march)
-            raise_if_fatal(status_of(pressed.state), name)
+            raise_if_fatal(status_of(pressed.state), name, runner.simulation)
             runner.state, self.box = pressed.state, pressed.box
             done = int(pressed.blocks)
             spent += done

@@ -1,9 +1,8 @@
 """Pictures by matplotlib, which is imported on first use; no display is asked for."""
 
-import contextlib
 import io
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,20 +43,15 @@ class Drawing:
         return content.getvalue()
 
     def _write(self, target: Any, **options: Any) -> None:
-        with without_tex(self.figure):
+        with _without_tex():  # numbers at the axes are made while it is drawn
             self.figure.savefig(target, **options)
 
 
-@contextlib.contextmanager
-def without_tex(figure: Any) -> Iterator[None]:
-    """Draw a figure by matplotlib alone, whatever the user's matplotlibrc says: LaTeX may not be there."""
+def _without_tex() -> Any:
+    """Have matplotlib write by itself, whatever the user's matplotlibrc says: LaTeX may not be there."""
     import matplotlib
-    from matplotlib.text import Text
 
-    for text in figure.findobj(Text):
-        text.set_usetex(False)
-    with matplotlib.rc_context({"text.usetex": False}):  # numbers at the axes are made while it is drawn
-        yield
+    return matplotlib.rc_context({"text.usetex": False})
 
 
 def pyplot() -> Any:
@@ -95,6 +89,12 @@ def save_picture(path: Path, figure: Any, *, also: Sequence[str] = (), caption: 
 
 def to_matplotlib(figure: Figure) -> Drawing:
     """The picture of a figure."""
+    with _without_tex():
+        return Drawing(_canvas(figure))
+
+
+def _canvas(figure: Figure) -> Any:
+    """Matplotlib's figure."""
     from matplotlib.figure import Figure as Canvas
 
     canvas = Canvas(figsize=figure.size, layout="constrained")
@@ -116,7 +116,7 @@ def to_matplotlib(figure: Figure) -> Drawing:
         known |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True)) | known
     if known and figure.legend:
         _legend(canvas, axes[0, 0], figure, known)
-    return Drawing(canvas)
+    return canvas
 
 
 def _legend(canvas: Any, first: Any, figure: Figure, known: dict[str, Any]) -> None:

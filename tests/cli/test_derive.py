@@ -81,7 +81,9 @@ def test_tune_stays_within_bounds_and_says_what_it_found(
     assert (tmp_path / "tuned.png").exists()
 
 
-@pytest.mark.parametrize("bounds", ["mu", "mu=1", "mu=a:b", "colour=1:2", "mu=2:3", "mu=0.5:2,mu=0.9:1"])
+@pytest.mark.parametrize(
+    "bounds", ["mu", "mu=1", "mu=a:b", "colour=1:2", "mu=2:3", "mu=0.5:2,mu=0.9:1", "stiffness=0.1:40"]
+)
 def test_bounds_that_make_no_sense_are_refused_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, bounds: str
 ) -> None:
