@@ -310,31 +310,21 @@ def reporting(*, goes_on: bool = False) -> "Iterator[Progress]":
         raise RunInterruptedError("nothing was written, and the same command begins anew") from None
 
 
-def begins_anew(fraction: float, last: float) -> bool:
-    """Whether another pass has begun, as points after packs: not where a guess of what is left was mended."""
-    return fraction < 0.9 * last
-
-
 @contextlib.contextmanager
 def _reporting() -> "Iterator[Progress]":
     from rich import progress
 
+    from gmem_jax.simulation.progress import TimeLeft, begins_anew
+
     if not stderr.is_terminal:
-        told, at = "", -math.inf
-        first: tuple[float, float] | None = None  # when the first chunk was done: what came before is compiling
-        last = 0.0
+        told, at, time_left = "", -math.inf, TimeLeft()
 
         def line(stage: str, moment: float, fraction: float) -> None:
-            nonlocal told, at, first, last
-            now = time.perf_counter()
-            if first is None or begins_anew(fraction, last):
-                first = now, fraction
-            last = fraction
+            nonlocal told, at
+            now, left = time.perf_counter(), time_left(fraction)
             if stage == told and now - at < LOG_INTERVAL:
                 return
             told, at = stage, now
-            since, done = now - first[0], fraction - first[1]
-            left = f", {since * (1.0 - fraction) / done:.0f} s left" if done > 0.01 and fraction < 1.0 else ""
             log(f"{fraction:5.0%}  {stage}" + (f" (t = {moment:.0f} t_c{left})" if moment else left))
 
         yield line

@@ -6,6 +6,7 @@ By default a bar appears in a terminal or a notebook, for the outermost call alo
 import contextlib
 import functools
 import importlib
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +27,7 @@ _T = TypeVar("_T")
 
 STEP_WORK = 1.0  # work of a step beside its replicas', in theirs: 0.9 at 10,240 grains, 1.4 at 3,267 and 2 at 325
 REFRESH_INTERVAL = 0.3  # seconds between changes of what a bar shows
+PAUSE = 60.0, 10.0  # seconds, and times the longest chunk: beyond both a run was stopped meanwhile
 
 
 def silent(*_: object) -> None:
@@ -47,28 +49,48 @@ def work_of(stages: Iterable[Stage], replicas: int) -> float:
     return sum(stage.bins for stage in stages) * work_of_bin(replicas)
 
 
+def begins_anew(fraction: float, last: float) -> bool:
+    """Whether another pass has begun, as points after packs: not where a guess of what is left was mended."""
+    return fraction < 0.9 * last
+
+
+class TimeLeft:
+    """How long a run will take, at its pace since its first chunk: what came before was compiling."""
+
+    def __init__(self) -> None:
+        self._began = self._told = self._longest = 0.0
+        self._first = self._last = math.inf
+
+    def __call__(self, fraction: float) -> str:
+        """What is said of it after a chunk, ", 12 s left"; "" where it is not known yet."""
+        now, (seconds, times) = time.perf_counter(), PAUSE
+        waited = now - self._told
+        if begins_anew(fraction, self._last):
+            self._began, self._first, self._longest = now, fraction, 0.0
+        elif waited > max(seconds, times * self._longest) and self._longest:
+            self._began += waited
+        else:
+            self._longest = max(self._longest, waited)
+        self._told, self._last, done = now, fraction, fraction - self._first
+        return f", {(now - self._began) * (1.0 - fraction) / done:.0f} s left" if done > 0.01 and fraction < 1.0 else ""
+
+
 class ProgressBar:
     """A bar for `gm.run(experiment, progress=gm.ProgressBar())`, and whatever else takes a progress callback."""
 
     _line = ""  # what stands unfinished in the terminal
 
     def __init__(self) -> None:
-        self._began = self._told = time.perf_counter()
-        self._first = -1.0
+        self._left, self._told = TimeLeft(), -math.inf
         self._display = _notebook()
 
     def __call__(self, stage: str, moment: float, fraction: float) -> None:
         """Show how far a run is; see `Progress`."""
-        now = time.perf_counter()
-        if self._first < 0.0:
-            self._began, self._first = now, fraction  # what came before the first chunk was compiling
-        elif now - self._told < REFRESH_INTERVAL and fraction < 1.0:
+        now, left = time.perf_counter(), self._left(fraction)
+        if now - self._told < REFRESH_INTERVAL and fraction < 1.0:
             return
         self._told = now
-        words = f"{fraction:.0%} {stage}" + (f", t = {moment:.0f} t_c" if moment else "")
-        done = fraction - self._first
-        if done > 0.01 and fraction < 1.0:
-            words += f", {(now - self._began) * (1.0 - fraction) / done:.0f} s left"
+        words = f"{fraction:.0%} {stage}" + (f", t = {moment:.0f} t_c" if moment else "") + left
         if self._display is not None:
             bar = f'<progress value="{fraction:.4f}" max="1"></progress> {escape(words)}'
             self._display.update({"text/html": bar, "text/plain": words}, raw=True)
@@ -82,7 +104,7 @@ class ProgressBar:
         if self._line:
             sys.stderr.write("\n")
             self._line = ""
-        if self._display is not None and self._first < 0.0:
+        if self._display is not None and self._told < 0.0:
             self._display.update({"text/plain": ""}, raw=True)
 
 

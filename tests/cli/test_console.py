@@ -42,6 +42,17 @@ def test_a_guess_that_was_mended_keeps_the_time_so_far(clock: list[float], capsy
     assert said[0] == "  62%  cycle, 398 s left"  # 650 s for 62 %
 
 
+def test_a_pause_is_no_work(clock: list[float], capsys: pytest.CaptureFixture) -> None:
+    """A run that was stopped for a day, and goes on."""
+    with console.reporting() as progress:
+        for hundredth in range(101):
+            progress("encode", 0.0, hundredth / 100)
+            clock[0] += 86400.0 if hundredth == 50 else 10.0
+    said = [line for line in capsys.readouterr().err.splitlines() if "left" in line]
+    assert "  48%  encode, 520 s left" in said
+    assert "  51%  encode, 480 s left" in said  # 500 s of work for 51 %
+
+
 ROW = {
     "pack": "tetra-325-a",
     "gain": 0.2591,
