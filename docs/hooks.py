@@ -16,6 +16,7 @@ MEASURED = (
     "bench",
     "paper_rate/bench",
     "paper_rate/2026-11-28",
+    "paper_rate/avx2_2026-11-29",
     "laws_2026-11-28",
     "avx2_2026-11-29",
     "large_packs",

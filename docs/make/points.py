@@ -60,7 +60,7 @@ CALIBRATED = ("tetra-10240-b", "tetra-10240-c")  # packs by whose G k_H was chos
 WITHIN = 2.0  # combined errors that count as agreement
 REASONS: tuple[tuple[Callable[[Mapping[str, Any]], bool], str], ...] = (
     (
-        lambda at: at["delta0"] <= 0.02 or SHEARED < at["gamma0"] / at["delta0"] < LARGE / 0.05,
+        lambda at: at["delta0"] <= 0.02 or (at["gamma0"] < LARGE and at["gamma0"] / at["delta0"] > SHEARED),
         "[thin compression](differences.md#thin-compression)",
     ),
     (lambda at: at["mu"] < 0.7, "[small friction](differences.md#g-at-small-friction)"),
