@@ -55,7 +55,7 @@ def begins_anew(fraction: float, last: float) -> bool:
 
 
 class TimeLeft:
-    """How long a run will take, at its pace since its first chunk: what came before was compiling."""
+    """How long a run will take, at its pace since its first chunk: before it was compiling. A pause is no work."""
 
     def __init__(self) -> None:
         self._began = self._told = self._longest = 0.0
