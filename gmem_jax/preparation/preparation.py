@@ -190,7 +190,7 @@ class _Preparation:
                 runner.renew(self.box)
                 pressed = replace(pressed, state=runner.state)
             checkpoint.maybe_save(standing)
-        if 0.0 < servo.quiet < math.inf and not bool(pressed.settled):
+        if 0.0 < servo.quiet < math.inf and not bool(pressed.settled):  # a servo that is to bring the pack to rest
             checkpoint.save(standing)
             raise NotAtRestError(
                 f"{name}: p_z = {float(pressed.pressure[0]):.3e} E and largest speed "

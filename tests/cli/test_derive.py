@@ -82,13 +82,24 @@ def test_tune_stays_within_bounds_and_says_what_it_found(
 
 
 @pytest.mark.parametrize(
-    "bounds", ["mu", "mu=1", "mu=a:b", "colour=1:2", "mu=2:3", "mu=0.5:2,mu=0.9:1", "stiffness=0.1:40"]
+    ("bounds", "words"),
+    [
+        ("mu", "should read like mu=0.5:2"),
+        ("mu=1", "should read like mu=0.5:2"),
+        ("mu=a:b", "should read like mu=0.5:2"),
+        ("colour=1:2", "'colour' is none of"),
+        ("mu=2:3", "hold the first value 1, got 2 to 3"),
+        ("mu=0.5:2,mu=0.9:1", "mu is given twice"),
+        ("stiffness=0.1:40", "with the highest values of the bounds: dt = "),
+    ],
 )
 def test_bounds_that_make_no_sense_are_refused_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, bounds: str
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, bounds: str, words: str
 ) -> None:
     assert gmem(monkeypatch, "tune", PACK, "--bounds", bounds, "-o", tmp_path / "t.json", *SHORT) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert words in said
 
 
 @pytest.mark.parametrize("command", ["design", "tune"])
