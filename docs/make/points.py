@@ -75,15 +75,21 @@ REASONS: tuple[tuple[Callable[[Mapping[str, Any]], bool], str], ...] = (
 )
 
 
+def rows_of(path: Path) -> Iterable[tuple[Conditions, dict[str, Any]]]:
+    """What each row of a table of packs ran under, and the row."""
+    with path.open(newline="", encoding="utf-8") as file:
+        for line in csv.DictReader(file):
+            row = {**UNSAID, **line}
+            overlap, mu, delta0, gamma0 = (float(row[name]) for name in ("overlap", "mu", "delta0", "gamma0"))
+            grain = row["law"], row["shape"], overlap, int(row["grains"])
+            yield Conditions(*grain, mu, delta0, gamma0, 0, "sub0"), row
+
+
 def of_packs(path: Path = OWN) -> list[Compared]:
     """Means over the packs of a table, where G and F are those over the ringing period."""
-    with path.open(newline="", encoding="utf-8") as file:
-        lines = list(csv.DictReader(file))
-    groups: dict[Conditions, dict[float, list[dict[str, str]]]] = {}
-    for line in lines:
-        overlap, mu, delta0, gamma0 = (float(line[name]) for name in ("overlap", "mu", "delta0", "gamma0"))
-        at = Conditions(line["law"], line["shape"], overlap, int(line["grains"]), mu, delta0, gamma0, 0, "sub0")
-        groups.setdefault(at, {}).setdefault(float(line["t0"]), []).append(line)
+    groups: dict[Conditions, dict[float, list[dict[str, Any]]]] = {}
+    for at, row in rows_of(path):
+        groups.setdefault(at, {}).setdefault(float(row["t0"]), []).append(row)
     found = []
     for at, rates in groups.items():
         status, members = 0, max(rates.items(), key=lambda rate: (len(rate[1]), rate[0]))[1]
@@ -145,21 +151,16 @@ def at_the_papers_rate() -> dict[Conditions, str]:
     """G; F of packs of `GRAINS` that ran at the paper's rate, in words, by what they ran under."""
     runs: dict[tuple[Conditions, float], set[tuple[str, float, float]]] = {}  # of a pressure before the compression
     for name in SLOW:
-        with (HERE / name).open(newline="", encoding="utf-8") as file:
-            for line in csv.DictReader(file):
-                at: dict[str, Any] = {**UNSAID, **line}
-                if int(at["grains"]) != GRAINS or float(at["t0"]) != PAPER_T0 or at["pack"] in CALIBRATED:
-                    continue
-                overlap, mu, delta0, gamma0 = (float(at[name]) for name in ("overlap", "mu", "delta0", "gamma0"))
-                conditions = Conditions(at["law"], at["shape"], overlap, GRAINS, mu, delta0, gamma0, 0, "sub0")
-                run = at["pack"], float(at.get("G_over_T1", at["G"])), float(at["F_over_T1"])
-                runs.setdefault((conditions, float(at["pressure"])), set()).add(run)
+        for at, row in rows_of(HERE / name):
+            if at.grains == GRAINS and float(row["t0"]) == PAPER_T0 and row["pack"] not in CALIBRATED:
+                run = row["pack"], float(row.get("G_over_T1", row["G"])), float(row["F_over_T1"])
+                runs.setdefault((at, float(row["pressure"])), set()).add(run)
     found: dict[Conditions, str] = {}
-    for (conditions, pressure), each in sorted(runs.items(), key=lambda entry: entry[0][1]):
+    for (at, pressure), each in sorted(runs.items(), key=lambda entry: entry[0][1]):
         gain, fidelity = sum(run[1] for run in each) / len(each), sum(run[2] for run in each) / len(each)
         pressed = "" if pressure == UNSAID["pressure"] else f" at {1e3 * pressure:g}e-3 E"
         told = f"{gain:.3f}; {fidelity:.3f} ({len(each)}{pressed})"
-        found[conditions] = ", ".join(filter(None, (found.get(conditions), told)))
+        found[at] = ", ".join(filter(None, (found.get(at), told)))
     return found
 
 
