@@ -1369,6 +1369,27 @@ MUTATIONS = (
         "test_a_key_stands_for_all_that_numbers_depend_on",
     ),
     mutation(
+        "key-without-the-code-of-a-law",
+        "experiment/record.py",
+        'own["law"] = identity(experiment.friction)',
+        'own["law"] = ""',
+        "test_another_formula_or_number_of_a_law_is_another_law",
+    ),
+    mutation(
+        "key-without-the-code-of-observers",
+        "experiment/record.py",
+        "(name, identity(reduce)) for",
+        '(name, "") for',
+        "test_an_observer_that_gives_something_else_is_another",
+    ),
+    mutation(
+        "one-window-for-all-reads",
+        "experiment/readings.py",
+        "window * self.rates",
+        "window * np.ones_like(self.rates)",
+        "test_a_read_is_averaged_over_what_it_goes_through_in_a_ringing_period",
+    ),
+    mutation(
         "padding-of-zero",
         "simulation/sharding.py",
         "more = np.repeat(leaf[..., :1], self.padded",

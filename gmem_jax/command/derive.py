@@ -37,7 +37,8 @@ from gmem_jax.design.kernel import memory_kernel, relative_error
 from gmem_jax.design.stored import save_kernel
 from gmem_jax.experiment.changes import value_at
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.record import describe, fingerprint, key_of_run, pack_fingerprint
+from gmem_jax.experiment.identity import fingerprint
+from gmem_jax.experiment.record import describe, key_of_run, pack_fingerprint
 from gmem_jax.experiment.run import COPIES, prefix_of, replica_bins, run, run_bytes
 from gmem_jax.experiment.signals import Bumps, Spline
 from gmem_jax.files import schemas
@@ -182,6 +183,7 @@ def kernel_command(
     """The linear memory kernel of a pack: singular values, resolution, capacity, and what it predicts."""
     (experiment,), drawn = chosen.check_output([pack], output, ".h5", picture=picture, force=force)
     _require_one_fidelity(experiment)
+    _needs_sub0(experiment, "a kernel is measured")
     began = time.perf_counter()
     runs = 2.0 * n / experiment.signals.count
     _announce(experiment, "kernel", 1.0 + runs, 2 * n)
@@ -210,9 +212,13 @@ def kernel_command(
     print_result(as_json, result, *summary.lines, told)
 
 
-def _needs_sub0(experiment: Experiment) -> None:
+def _needs_sub0(experiment: Experiment, what: str) -> None:
     if experiment.background != "sub0":
-        raise InputError(f"--background {experiment.background}: designs are made with sub0")
+        raise InputError(f"--background {experiment.background}: {what} with sub0")
+
+
+def _require_designable(experiment: Experiment) -> None:
+    _needs_sub0(experiment, "designs are made")
     if experiment.shear != "during":
         raise InputError(f"--shear {experiment.shear}: designs are of what is encoded during the compression")
 
@@ -275,7 +281,7 @@ def design_command(
     chosen = chosen if words is None else chosen.with_signals(f"words:{words}")
     (experiment,), drawn = chosen.check_output([pack], output, ".csv", picture=picture, force=force)
     _require_one_fidelity(experiment)
-    _needs_sub0(experiment)
+    _require_designable(experiment)
     if start is not None:
         check_output(output, ".csv", inputs=(start,), force=force)
     history = output.with_name(f"{output.stem}-history.png")
@@ -361,7 +367,7 @@ def tune_command(
     names, limits = packs.split(","), parse_bounds(bounds)
     experiments, drawn = chosen.check_output(names, output, ".json", picture=picture, force=force)
     _require_one_fidelity(experiments[0])
-    _needs_sub0(experiments[0])
+    _require_designable(experiments[0])
     start_within(experiments, limits)
     began = time.perf_counter()
     first = experiments[0]

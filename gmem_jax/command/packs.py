@@ -25,8 +25,8 @@ from gmem_jax.command.console import (
 from gmem_jax.command.options import with_recipe
 from gmem_jax.command.resuming import Restart, foresee, resumable
 from gmem_jax.experiment.experiment import PAPER_T0
+from gmem_jax.experiment.identity import fingerprint
 from gmem_jax.experiment.provenance import sources
-from gmem_jax.experiment.record import fingerprint
 from gmem_jax.files.cache import kept_pack, list_packs
 from gmem_jax.files.packs import STANDARD_NAME, save_pack
 from gmem_jax.files.sizes import pack_bytes

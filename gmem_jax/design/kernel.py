@@ -179,7 +179,7 @@ def memory_kernel(
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
-        ValueError: if n < 2, or gamma0 or delta0 differ between replicas.
+        ValueError: if n < 2, gamma0 or delta0 differ between replicas, or the background is not sub0.
         RunFailedError: if the simulation broke down.
     """
     require_kind("memory_kernel", experiment, Experiment)
@@ -197,6 +197,10 @@ def _basis(experiment: Experiment, n: int, width: float) -> Bumps:
     require_numbers(width=width)
     if n < 2:
         raise ValueError(f"a kernel needs at least 2 basis waveforms, got {n}")
+    if experiment.background != "sub0":
+        raise ValueError(
+            f"a kernel is measured with background 'sub0', since with {experiment.background!r} silence has a recall"
+        )
     if jnp.ndim(experiment.scale):
         raise ValueError("a kernel is measured at one gamma0 and one delta0, not one for each replica")
     return bumps(np.concatenate([np.eye(n), -np.eye(n)]), width)

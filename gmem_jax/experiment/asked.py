@@ -145,6 +145,16 @@ def require_memory(protocol: Protocol, background: str) -> None:
             f"background {background!r} takes the second read for the background of the first; the protocol has "
             f"{len(protocol.reads)}"
         )
+    if background != "sub0":
+        first, second = (protocol.stage(name) for name in protocol.reads)
+        if first.ends != second.ends:
+            raise ValueError(
+                f"background {background!r} takes the second read for the background of the first; {first.name!r} goes "
+                f"from u = {first.ends[0]:g} to {first.ends[1]:g}, and {second.name!r} from {second.ends[0]:g} to "
+                f"{second.ends[1]:g}"
+            )
+        if background == "sub2-bl" and first.moves and set(first.ends) != {0.0, 1.0}:
+            raise ValueError(f"background 'sub2-bl' takes off a straight line over all u; {first.name!r} ends before")
 
 
 def require_told_apart(readings: Readings, integrals: np.ndarray) -> None:

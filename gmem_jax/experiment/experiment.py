@@ -417,7 +417,7 @@ class Experiment:
         return self.readings.recalled(pressures)
 
     def compare(self, p_sig: jax.Array, window: Scalar | None = None) -> analysis.Match:
-        """Gain and fidelity of recalled signals; `window` is that of `analysis.compare`."""
+        """Gain and fidelity of recalled signals; `window` is that of `Readings.compare`."""
         return self.readings.compare(p_sig, self.integral(), self.scale, window)
 
     def _facts(self) -> Facts:

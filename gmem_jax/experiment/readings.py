@@ -4,7 +4,7 @@ A run has R reads, C channels and S signals. Its arrays have these axes in this 
 [R, C, C]; an axis of length one is left out, so that the paper's experiment has p_sig [S, 256] and one G and F.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +16,7 @@ from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.protocol import Protocol
-from gmem_jax.simulation.stage import BINS, Drive, Stage
+from gmem_jax.simulation.stage import BINS, Stage
 
 
 class Readings(NamedTuple):
@@ -40,6 +40,11 @@ class Readings(NamedTuple):
         """The C channels."""
         return self.protocol.channels
 
+    @property
+    def rates(self) -> np.ndarray:
+        """Of its reads; see `rates_of`."""
+        return rates_of(self.protocol, self.reads)
+
     def squeezed(self, rows: list[list[jax.Array]]) -> jax.Array:
         """Arrays by read and channel as one; axes of length one are left out."""
         by_read = [row[0] if len(row) == 1 else jnp.stack(row) for row in rows]
@@ -47,10 +52,9 @@ class Readings(NamedTuple):
 
     def recalled(self, pressures: Mapping[str, jax.Array]) -> jax.Array:
         """p_sig in ascending u, [R, C, S, 256], in E, from the pressures [bins, 3, S + 1] by stage."""
-        stages = {stage.name: stage for stage in self.protocol if stage.role == "read"}
 
         def stress(read: str, channel: str) -> jax.Array:
-            return placed(stages[read], CHANNELS[channel].stress(pressures[read]))
+            return placed(self.protocol.stage(read), CHANNELS[channel].stress(pressures[read]))
 
         if self.background == "sub0":
             found = [[analysis.subtract("sub0", stress(read, c)) for c in self.channels] for read in self.reads]
@@ -63,15 +67,14 @@ class Readings(NamedTuple):
         """What `of` gives of a set, for what each read is compared with; zero where nothing was written."""
         known = {name: of(one) for name, one in sets.items()}
         nothing = jnp.zeros_like(next(iter(known.values())))
-        stages = {stage.name: stage for stage in self.protocol}
 
         def one(read: str, channel: str) -> jax.Array:
-            drive: Drive | None = self.protocol.written(read).get(channel)
-            if drive is None or not stages[read].moves:
+            stage, drive = self.protocol.stage(read), self.protocol.written(read).get(channel)
+            if drive is None or not stage.moves:
                 return nothing
             own: jax.Array = known[str(drive.waveform)]
             own = own if drive.amplitude == 1.0 else drive.amplitude * own
-            return jnp.where(_seen(stages[read]), own, 0.0) if _partial(stages[read]) else own
+            return jnp.where(_seen(stage), own, 0.0) if _partial(stage) else own
 
         return self.squeezed([[one(read, channel) for channel in self.channels] for read in self.reads])
 
@@ -87,17 +90,27 @@ class Readings(NamedTuple):
     def compare(
         self, signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None
     ) -> analysis.Match:
-        """Gain [R, C, C] and fidelity [R, C]; see `analysis.compare` and `analysis.compare_channels`."""
-        channels = len(self.channels)
+        """Gain [R, C, C] and fidelity [R, C]; see `analysis.compare` and `analysis.compare_channels`.
 
-        def of_read(signal: jax.Array, integral: jax.Array) -> analysis.Match:
+        `window` is a time in units of t0, and each read is averaged over the part of u that it goes through in it.
+        """
+        channels = len(self.channels)
+        windows: Any = None if window is None else window * self.rates
+
+        def of_read(signal: jax.Array, integral: jax.Array, window: Scalar | None) -> analysis.Match:
             compare = analysis.compare if channels == 1 else analysis.compare_channels
             match: analysis.Match = compare(signal, integral, scale, window)
             return match
 
         if len(self.reads) == 1:
-            return of_read(signal, integral)
-        return jax.vmap(of_read)(signal, integral)
+            return of_read(signal, integral, None if windows is None else windows[0])
+        return jax.vmap(of_read)(signal, integral, windows)
+
+
+def rates_of(protocol: Protocol, reads: Sequence[str]) -> np.ndarray:
+    """How much of u each read goes through in t0, or of its own time where u stands still, [R]."""
+    stages = [protocol.stage(name) for name in reads]
+    return np.array([(abs(np.subtract(*one.ends)) if one.moves else 1.0) / one.length for one in stages])
 
 
 def _partial(stage: Stage) -> bool:

@@ -15,6 +15,7 @@ from gmem_jax.experiment import html
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.asked import require_double
 from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.readings import rates_of
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.validity import compression_speed, readable, rounding, validity
 from gmem_jax.physics.numbers import plural
@@ -50,7 +51,8 @@ class Recall:
         windowed_gain: G after a running mean of p_sig and J over the ringing period.
         windowed_fidelity: F after the same.
         window: that period T_1, in t_c.
-        residual_speed: largest grain speed when the readout began, over the walls' speed, [S + 1].
+        residual_speed: largest grain speed when the readout began, over the walls' speed in it (in a compression in t0
+            where u stands still), [S + 1].
         status: bits of `Status`, [S + 1]; replica 0 is the zero signal. Those of
             `WARNINGS` leave the numbers as they are.
         stages: samples of every stage by name, leading axis bins; one replica before the first waveform. Ordered: JAX
@@ -109,6 +111,11 @@ class Recall:
         whole = tuple(self.configuration.get("reads", reads))  # what `at` gives is a part
         return known[1] if len(known) == 2 and reads == known[:1] == whole else None
 
+    @property
+    def rates(self) -> np.ndarray:
+        """How much of u each read goes through in t0, or of its own time where u stands still, [R]."""
+        return rates_of(self.protocol, self.reads)
+
     def at(self, read: str | int = 0, channel: str | int = 0) -> "Recall":
         """The recall of one channel in one read, as of a run that has no others: p_sig [S, 256], one G and one F.
 
@@ -159,7 +166,9 @@ def unjudged(experiment: Experiment, stages: OrderedDict[str, Sample], status: j
     """Subtract the background and compare with the integrals; and round-off in p_sig over its size, [S]."""
     pack, t0 = experiment.pack, experiment.t0
     step = experiment.timing.dt
-    residual = stages[experiment.protocol.before_read].largest_speed[-1] / compression_speed(experiment)
+    first = experiment.protocol.stage(experiment.protocol.reads[0])
+    walls = compression_speed(experiment) * (experiment.readings.rates[0] if first.moves else 1.0)
+    residual = stages[experiment.protocol.before_read].largest_speed[-1] / walls
     status = status | jnp.where(residual < REST_SPEED, 0, int(Status.NOT_AT_REST)).astype(jnp.int32)
     # A factor, not a choice: the derivative of what is broken must be NaN too.
     sound = jnp.where(jnp.any(status & ~int(WARNINGS)), jnp.nan, 1.0)

@@ -1,16 +1,15 @@
 """The written form of an experiment: what files and keys say of it, down to where and by which code it was run."""
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
 
-import jax
 import numpy as np
 
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.identity import fingerprint, identity
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance, sources
 from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, sets_of, six_signals, word_bits, words
@@ -25,16 +24,6 @@ NAMED: dict[str, Callable[..., Bumps]] = {"six": six_signals, "words": words}
 SIGNALS = {"bumps": Bumps, "spline": Spline}
 PARTS = ("pack", "signals", "friction", "material", "protocol", "observe")
 """Fields of an experiment that are no numbers. What observes it is no part of its written form: it changes nothing."""
-
-
-def fingerprint(tree: Any) -> str:
-    """SHA-256 of the arrays of a pytree, shapes and types included."""
-    digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(tree):
-        array = np.asarray(leaf)
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()
 
 
 def pack_fingerprint(pack: Pack) -> str:
@@ -109,8 +98,13 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
         **more: what else they depend on, like the batch.
     """
     own = {**to_dict(experiment), "pack": pack_fingerprint(experiment.pack)}
+    if entry_of(experiment.friction) is None:
+        own["law"] = identity(experiment.friction)
+    for name, one in experiment.sets.items():
+        if not isinstance(one, tuple(SIGNALS.values())):
+            own[f"signals {name}"] = identity(one)
     if experiment.observe:  # what was kept of another run lacks what these give
-        own["observe"] = [name for name, _ in experiment.observe]
+        own["observe"] = [(name, identity(reduce)) for name, reduce in experiment.observe]
     return {**own, **more, "backend": experiment.runs_on, **sources()}
 
 

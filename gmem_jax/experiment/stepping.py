@@ -10,7 +10,8 @@ import numpy as np
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.changes import replace as with_changes
 from gmem_jax.experiment.experiment import USUAL_STEP, Experiment
-from gmem_jax.experiment.record import fingerprint, pack_fingerprint
+from gmem_jax.experiment.identity import fingerprint
+from gmem_jax.experiment.record import pack_fingerprint
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.laws import entry_of
@@ -29,8 +30,8 @@ LONG_STEP, LONG_DRIVE = 1.2, 1.8e3  # t_c; such steps change G by 1.5e-3 at most
 ENOUGH_RINGS = 10  # rings of a history: their number hardly matters to its stiffness, and 100 take minutes
 MUCH_STIFFER = 144.0  # than one contact; packs at rest, whose grains have many, were 9 to 41 times as stiff
 
-_known: dict[tuple[str, ...], float] = {}  # stable steps that were found
-_borne: dict[tuple[str, ...], float] = {}  # the longest steps that were found to be stable
+_known: dict[tuple[Any, ...], float] = {}  # stable steps that were found
+_borne: dict[tuple[Any, ...], float] = {}  # the longest steps that were found to be stable
 
 
 @usual_rules()
@@ -65,7 +66,7 @@ def is_stable(experiment: Experiment, dt: float) -> bool:
     return True
 
 
-def _case(experiment: Experiment) -> tuple[tuple[str, ...], Any]:
+def _case(experiment: Experiment) -> tuple[tuple[Any, ...], Any]:
     """What the stable step depends on, and the law that stands for the experiment's."""
     law: Any = experiment.friction
     if isinstance(law, CoulombLaw) and not np.any(law.mu):
@@ -76,7 +77,7 @@ def _case(experiment: Experiment) -> tuple[tuple[str, ...], Any]:
     return (
         pack_fingerprint(experiment.pack),
         fingerprint(parts),
-        str(jax.tree.structure(law)),
+        jax.tree.structure(law),  # knows classes of one name apart
         experiment.backend,
     ), law
 

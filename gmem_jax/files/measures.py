@@ -24,8 +24,8 @@ def relative_scale(configuration: Mapping[str, Any]) -> jax.Array:
 
 def read_stress(recall: Recall, read: str) -> jax.Array:
     """The stress of the first channel in a stage that reads, in ascending u, of every replica, [S + 1, 256], in E."""
-    stage = next(stage for stage in recall.protocol if stage.name == read)
-    return placed(stage, CHANNELS[recall.channels[0]].stress(jnp.asarray(recall.stages[read].pressure)))
+    stress = CHANNELS[recall.channels[0]].stress(jnp.asarray(recall.stages[read].pressure))
+    return placed(recall.protocol.stage(read), stress)
 
 
 def of_each(recall: Recall) -> dict[str, np.ndarray]:
@@ -34,10 +34,10 @@ def of_each(recall: Recall) -> dict[str, np.ndarray]:
     Arrays [S], or [R, C, S] as in the recall.
     """
     known, shape = values_of(recall.configuration), np.shape(recall.J)[:-1]
-    scale, window = relative_scale(known), recall.window / np.max(known.get("t0", np.nan))
+    scale, windows = relative_scale(known), recall.window / np.max(known.get("t0", np.nan)) * recall.rates
     curves = [jnp.asarray(each).reshape(-1, *np.shape(each)[-2:]) for each in (recall.p_sig, recall.J)]
     found: dict[str, list[Any]] = {name: [] for name in EACH}
-    for p_sig, integral in zip(*curves, strict=True):
+    for p_sig, integral, window in zip(*curves, np.repeat(windows, len(recall.channels)), strict=True):
         own, smooth = (analysis.each(p_sig, integral, scale, over) for over in (None, window))
         values = (own.gain, own.fidelity, smooth.fidelity, analysis.correlation(p_sig, integral))
         for name, value in zip(EACH, values, strict=True):

@@ -155,7 +155,8 @@ def mean_over_ringing(recall: Recall, signals: np.ndarray, t0: Any) -> np.ndarra
     """
     if not is_number(t0) or t0 >= PAPER_T0 or not np.isfinite(recall.window):
         return None
-    return np.asarray(running_mean(jnp.asarray(signals), float(recall.window) / t0 * signals.shape[-1]))
+    width = float(recall.window) / t0 * recall.rates[0] * signals.shape[-1]
+    return np.asarray(running_mean(jnp.asarray(signals), width))
 
 
 def signals_figure(

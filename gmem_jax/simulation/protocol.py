@@ -89,6 +89,14 @@ class Protocol:
         """Names of the stages from the first that writes to the first that reads."""
         return tuple(stage.name for stage in self.stages[self._place("write") : self._place("read") + 1])
 
+    def stage(self, name: str) -> Stage:
+        """The stage of this name.
+
+        Raises:
+            KeyError: if there is none.
+        """
+        return {stage.name: stage for stage in self.stages}[name]
+
     def _place(self, role: Role) -> int:
         for place, stage in enumerate(self.stages):
             if stage.role == role:

@@ -7,6 +7,7 @@ import numpy as np
 
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.files.validation import is_number
+from gmem_jax.sweeps.table import result_of
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -102,10 +103,13 @@ def lines_of(rows: Rows, axes: Axes, measure: str) -> list[Line]:
     """The lines of a picture, each in the order of x; points without x are in none."""
     there = [row for row in rows if row[axes.x] is not None]
     numbers = all(is_number(row[axes.x]) for row in there)
-    found: dict[tuple[Any, ...], dict[Any, list[float]]] = {}
+    found: dict[tuple[Any, ...], dict[Any, dict[Any, float]]] = {}
     for row in sorted(there, key=lambda row: row[axes.x] if numbers else str(row[axes.x])):
         line = found.setdefault(tuple(row[name] for name in axes.by), {})
-        line.setdefault(row[axes.x], []).append(float(row[measure]))
-    lines = [Line(dict(zip(axes.by, own, strict=True)), list(at), list(at.values())) for own, at in found.items()]
+        line.setdefault(row[axes.x], {})[result_of(row)] = float(row[measure])
+    lines = [
+        Line(dict(zip(axes.by, own, strict=True)), list(at), [list(each.values()) for each in at.values()])
+        for own, at in found.items()
+    ]
     order = {value: place for place, value in enumerate(tuple(row[name] for name in axes.by) for row in there)}
     return sorted(lines, key=lambda line: order[tuple(line.values.values())])

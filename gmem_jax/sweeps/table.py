@@ -75,6 +75,11 @@ def points_in(table: Sequence[_Row]) -> list[_Row]:
     return found
 
 
+def result_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What a row is of: a mean counts each result once, though its point may be asked for in several ways."""
+    return row.get("key", id(row)), *(row.get(name) for name in READ_AND_CHANNEL)
+
+
 def warnings_of(row: Mapping[str, Any]) -> str:
     """Why a point that is done is doubtful, from its row: its status and what was warned of; "" if nothing is."""
     return "; ".join(filter(None, (row["why"], row["warnings"]))) if row["state"] == "done" else ""
@@ -87,12 +92,12 @@ def _cell(value: Any) -> Any:
 def means(table: Sequence[dict[str, Any]], names: Sequence[str], over: Sequence[str]) -> list[dict[str, Any]]:
     """Rows that differ only in the names `over` as one: mean, standard deviation and number of each measure."""
     left = [name for name in names if name not in over]
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    groups: dict[tuple[Any, ...], dict[Any, dict[str, Any]]] = {}
     for row in table:
-        groups.setdefault(tuple(row[name] for name in left), []).append(row)
+        groups.setdefault(tuple(row[name] for name in left), {})[result_of(row)] = row
     found = []
     for values, members in groups.items():
-        done = [row for row in members if row["state"] == "done"]
+        done = [row for row in members.values() if row["state"] == "done"]
         row = dict(zip(left, values, strict=True)) | {"points": len(members), "done": len(done)}
         for measure in MEASURES:
             mean, deviation, error = spread([one[measure] for one in done]) if done else (None, None, None)

@@ -16,6 +16,7 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.protocols import memory_protocol
 from gmem_jax.experiment.readings import placed
 from gmem_jax.experiment.record import key_of_run
+from gmem_jax.files.measures import of_each
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.stage import Drive, Stage
@@ -25,6 +26,7 @@ ONE = gm.Bumps(jnp.asarray([[1.0], [-1.0]]), jnp.full((2, 1), 0.5), 0.6)
 OTHER = gm.Bumps(jnp.asarray([[1.0], [1.0]]), jnp.full((2, 1), 0.4), 0.6)
 QUICK: dict[str, Any] = {"t0": 40.0, "gamma0": 0.01}
 READ = gm.Protocol(gm.write(), gm.hold(0.1), gm.read())
+HALF = (*gm.Protocol(gm.write()), Stage("a", 1.0, 0.5, role="read"))
 
 
 def experiment(protocol: Protocol | None = READ, signals: Any = ONE, **changes: Any) -> gm.Experiment:
@@ -118,6 +120,17 @@ def test_what_makes_no_drive_is_refused(arguments: tuple[Any, ...], reason: str)
     [
         ({"store": 1.0}, "store makes the paper's protocol, and another one was given"),
         ({"background": "sub2"}, "takes the second read for the background of the first; the protocol has 1"),
+        (
+            {"protocol": gm.protocols.partial_readout(to=0.5), "background": "sub2"},
+            "'read-part' goes from u = 1 to 0.5, and 'read-again' from 1 to 0",
+        ),
+        (
+            {
+                "protocol": Protocol(*HALF, Stage("back", 0.5, 1.0), Stage("b", 1.0, 0.5, role="read")),
+                "background": "sub2-bl",
+            },
+            "a straight line over all u; 'a' ends before",
+        ),
         ({"protocol": gm.Protocol(gm.write())}, "no stage that reads"),
         ({"protocol": Protocol(Stage("a", 1.0, 0.0), *READ)}, "rests at u = 0, and stage 'a' begins at u = 1"),
         ({"protocol": gm.Protocol(gm.write([0.5, 1.0, 0.5]), gm.read())}, "writes no waveforms of the replicas"),
@@ -325,6 +338,43 @@ def test_gradients_through_a_protocol_of_ones_own(backend: str) -> None:
             other = gm.replace(one, {name: middle * (1.0 + sign * step)})
             values.append(float(loss(other, gm.run(other, progress=False).p_sig)))
         assert float(slope) == pytest.approx((values[0] - values[1]) / (2.0 * step * middle), rel=1e-4), name
+
+
+def test_two_reads_of_half_of_u_differ_where_they_read_alone() -> None:
+    half = Protocol(*HALF, Stage("back", 0.5, 1.0), Stage("b", 1.0, 0.5, role="read"))
+    p_sig = run(half, background="sub2").p_sig
+    assert not np.any(p_sig[:, :128])
+    assert np.all(p_sig[:, 128:])
+
+
+@pytest.mark.parametrize("length", [0.25, 1.0, 4.0])
+def test_a_read_is_averaged_over_what_it_goes_through_in_a_ringing_period(length: float) -> None:
+    recall = run(gm.Protocol(gm.write(), gm.hold(0.1), gm.read(length=length)))
+    part = float(PACK.ringing_period) / QUICK["t0"] / length
+    match = analysis.compare(recall.p_sig, recall.J, float(PACK.delta0) * QUICK["gamma0"], part)
+    np.testing.assert_allclose([recall.windowed_gain, recall.windowed_fidelity], match, rtol=1e-12)
+    each = of_each(recall)["signal_windowed_fidelity"]
+    alone = analysis.each(recall.p_sig, recall.J, float(PACK.delta0) * QUICK["gamma0"], part)
+    np.testing.assert_allclose(each, alone.fidelity, rtol=1e-12)
+    # The walls are slower in a longer read, and the same grains then less at rest.
+    usual = run()
+    np.testing.assert_allclose(recall.residual_speed, length * usual.residual_speed, rtol=1e-12)
+
+
+def test_reads_of_several_lengths_have_a_window_each() -> None:
+    protocol = gm.Protocol(gm.write(), gm.read("fast", length=0.5), gm.write("xy"), gm.read("slow", length=2.0))
+    recall = run(protocol)
+    for name, length in (("fast", 0.5), ("slow", 2.0)):
+        one = recall.at(name)
+        part = float(PACK.ringing_period) / QUICK["t0"] / length
+        match = analysis.compare(one.p_sig, one.J, float(PACK.delta0) * QUICK["gamma0"], part)
+        assert float(one.windowed_fidelity) == pytest.approx(float(match.fidelity), rel=1e-12)
+        assert one.rates == pytest.approx(1.0 / length)
+
+
+def test_a_kernel_is_measured_with_sub0() -> None:
+    with pytest.raises(ValueError, match="with 'sub2' silence has a recall"):
+        gm.memory_kernel(experiment(gm.protocols.paper_twice_read(), background="sub2"), n=2, width=0.6)
 
 
 def test_kernels_of_two_channels_hold_what_each_says_of_the_other() -> None:

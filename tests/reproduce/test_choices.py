@@ -9,7 +9,8 @@ import pytest
 from scenes import TETRA_27, strain_path
 
 import gmem_jax as gm
-from gmem_jax.experiment.record import fingerprint, signals_to_dict, to_dict
+from gmem_jax.experiment.identity import fingerprint
+from gmem_jax.experiment.record import signals_to_dict, to_dict
 from gmem_jax.experiment.signals import bit_width, words
 from gmem_jax.files.configuration import named_experiment
 from gmem_jax.files.waveforms import named_signals, signals_from_dict

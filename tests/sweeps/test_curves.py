@@ -9,6 +9,7 @@ from gmem_jax.show import render_plotly
 from gmem_jax.show.render_matplotlib import to_matplotlib
 from gmem_jax.show.sweeps import against, sweep_figure
 from gmem_jax.sweeps.curves import Axes, axes_of, lines_of
+from gmem_jax.sweeps.table import means
 
 NAMES = ["prepare.seed", "mu", "gamma0", "pack"]
 ROWS: list[dict[str, Any]] = [
@@ -55,6 +56,17 @@ def test_errors_are_standard_errors_over_the_samples() -> None:
     np.testing.assert_allclose(second.error, 0.1 / np.sqrt(3.0))
     (alone,) = lines_of([row for row in ROWS if row["gamma0"] == 1e-3], Axes("mu", (), ()), "fidelity")
     assert alone.most == 3
+
+
+def test_a_result_that_is_asked_for_twice_counts_once() -> None:
+    keyed = [{**row, "key": str(number), "status": 0, "warnings": ""} for number, row in enumerate(ROWS)]
+    twice = [*keyed, {**keyed[0], "mu": 0.2}]
+    for some in (keyed, twice):
+        first, _ = lines_of(some, axes_of(some, NAMES), "fidelity")
+        assert first.most == 3
+        measured = [{**row, "windowed_gain": 0.0, "windowed_fidelity": 0.0} for row in some]
+        means_ = means(measured, ["prepare.seed", "mu", "gamma0"], ["prepare.seed"])
+        assert [one["points"] for one in means_] == [3] * 4
 
 
 def test_a_picture_has_a_line_with_bars_for_each_value_and_says_over_what() -> None:

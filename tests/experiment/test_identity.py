@@ -1,0 +1,140 @@
+"""Whether keys tell a user's own law, waveform and observer apart: by numbers and code, alike in every process."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+from scenes import TETRA_27
+
+import gmem_jax as gm
+from gmem_jax.experiment.identity import identity
+from gmem_jax.experiment.record import key_of_run
+from gmem_jax.experiment.stepping import _case
+
+LAW = """
+import jax, jax.numpy as jnp
+from dataclasses import dataclass
+from typing import Any
+FACTOR = 2.0
+def spring(x):
+    return FACTOR * x
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Law:
+    mu: float = 1.0
+    table: Any = None
+    power = 1.5
+    @property
+    def stiffness(self):
+        return 0.3
+    def init(self, contacts, replicas, dtype):
+        return jnp.zeros((contacts, 3, replicas), dtype)
+    def __call__(self, contact, normal_force, history):
+        add = lambda x: x + 1.0
+        force = jnp.where(contact.touching, add(spring(history)), 0.0)
+        return force, history if "one" in {"one", "two", "three"} else force
+"""
+PACK = gm.load_pack(TETRA_27)
+SIX = gm.six_signals()
+
+
+def law_of(source: str) -> Any:
+    names: dict[str, Any] = {"__name__": "laws"}
+    exec(compile(source, "laws.py", "exec"), names)
+    return names["Law"]()
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("spring(history)", "2.0 * spring(history)"),
+        ("FACTOR = 2.0", "FACTOR = 3.0"),
+        ("return FACTOR * x", "return FACTOR / x"),
+        ("return 0.3", "return 0.6"),
+        ("x + 1.0", "x - 1.0"),
+        ("power = 1.5", "power = 2.5"),
+        ("mu: float = 1.0", "mu: float = 0.5"),
+    ],
+)
+def test_another_formula_or_number_of_a_law_is_another_law(before: str, after: str) -> None:
+    assert before in LAW
+    one, other = law_of(LAW), law_of(LAW.replace(before, after))
+    assert identity(one) == identity(law_of(LAW + "# of no weight"))
+    assert identity(one) != identity(other)
+    keys = [key_of_run(gm.Experiment(PACK, SIX, friction=law)) for law in (one, other)]
+    assert keys[0] != keys[1]
+
+
+def test_a_large_table_is_told_to_its_last_digit() -> None:
+    law, table = law_of(LAW), jnp.full(2000, 0.3)
+    one, other = (replace(law, table=(each,)) for each in (table, table.at[1000].add(1e-16)))
+    assert repr(one) == repr(other)
+    keys = [key_of_run(gm.Experiment(PACK, SIX, friction=each)) for each in (one, other)]
+    assert keys[0] != keys[1]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Chirps:
+    rate: jax.Array
+
+    @property
+    def count(self) -> int:
+        return len(self.rate)
+
+    def shear(self, u: jax.Array) -> jax.Array:
+        return jnp.sin(self.rate * u[..., None])
+
+    def integral(self, u: jax.Array) -> jax.Array:
+        return self.shear(u)
+
+
+class Slower(Chirps):
+    def shear(self, u: jax.Array) -> jax.Array:
+        return jnp.sin(self.rate * u[..., None] / 2.0)
+
+
+def test_waveforms_of_another_formula_are_others() -> None:
+    one, other = Chirps(jnp.asarray([2.0])), Slower(jnp.asarray([2.0]))
+    assert identity(one) != identity(other)
+    assert identity(one) == identity(Chirps(jnp.asarray([2.0])))
+
+
+def _height(factor: float) -> Callable[..., Any]:
+    return lambda simulation, state: factor * jnp.mean(state.grains.position[:, 2], axis=0)
+
+
+def test_an_observer_that_gives_something_else_is_another() -> None:
+    keys = [
+        key_of_run(gm.Experiment(PACK, SIX, observe={"x": observer}))
+        for observer in (_height(1.0), _height(2.0), jax.jit(_height(1.0)), gm.observables.stress())
+    ]
+    assert keys[0] == keys[2]
+    assert keys[0]["observe"] != keys[1]["observe"] != keys[3]["observe"]
+    one, other = (gm.observables.normal_forces([pair]) for pair in ((0, 4), (0, 5)))
+    assert identity(one) != identity(other)
+
+
+def test_stable_steps_of_two_laws_of_one_name_are_not_confused() -> None:
+    one, other = law_of(LAW), law_of(LAW.replace("FACTOR = 2.0", "FACTOR = 3.0"))
+    cases = [_case(gm.Experiment(PACK, SIX, friction=law))[0] for law in (one, other)]
+    assert cases[0] != cases[1]
+
+
+def test_an_identity_is_that_of_every_process(tmp_path: Path) -> None:
+    (tmp_path / "laws.py").write_text(LAW)
+    say = "import laws; from gmem_jax.experiment.identity import identity; print(identity(laws.Law()))"
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", say], cwd=tmp_path, env={"PYTHONHASHSEED": seed}, capture_output=True, text=True
+        ).stdout
+        for seed in ("1", "2")
+    }
+    assert len(found) == 1
+    assert len(found.pop()) == 65
