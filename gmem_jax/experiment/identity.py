@@ -9,16 +9,18 @@ import sys
 import sysconfig
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
-from pathlib import Path
-from types import CodeType, FunctionType, MethodType
+from enum import Enum
+from pathlib import Path, PurePath
+from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 _INSTALLED = tuple({*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), str(Path(__file__).parents[1])})
 """Folders whose code is told by its name: versions and sources are in keys already."""
-_PLAIN = (str, bytes, int, float, complex)
+_PLAIN = (str, bytes, int, float, complex, range, slice, Enum, PurePath, np.dtype)
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
 
 
@@ -26,7 +28,8 @@ def fingerprint(tree: Any) -> str:
     """SHA-256 of the arrays of a pytree, shapes and types included."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(tree):
-        array = np.asarray(leaf)
+        is_key = isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        array = np.asarray(jax.random.key_data(leaf) if is_key else leaf)
         digest.update(f"{array.dtype.str}{array.shape}".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
@@ -76,14 +79,14 @@ def _parts_of_code(value: Any, seen: dict[int, Any]) -> Iterator[str]:
         yield from _parts((value.__func__, value.__self__), seen)
     elif hasattr(value, "__wrapped__"):  # as of jax.jit
         yield from _parts(value.__wrapped__, seen)
-    elif hasattr(value, "__qualname__"):
-        yield f"{value.__module__}.{value.__qualname__}"
+    elif name := getattr(value, "__qualname__", getattr(value, "__name__", "")):
+        yield f"{getattr(value, '__module__', '')}.{name}"
         if isinstance(value, FunctionType) and not _is_installed(value.__code__.co_filename):
             closed = [cell.cell_contents for cell in value.__closure__ or ()]
-            named = {name: value.__globals__[name] for name in _names(value.__code__) if name in value.__globals__}
-            yield from _parts((value.__code__, value.__defaults__, value.__kwdefaults__, closed, named), seen)
+            parts = (value.__code__, value.__defaults__, value.__kwdefaults__, closed, _named(value))
+            yield from _parts(parts, seen)
         elif isinstance(value, type) and not _is_installed_type(value):
-            yield from _parts({name: each for name, each in vars(value).items() if _is_code(name, each)}, seen)
+            yield from _parts({name: each for name, each in vars(value).items() if _is_own(name)}, seen)
             yield from _parts(value.__bases__, seen)
     else:
         yield from _parts(type(value), seen)
@@ -91,15 +94,32 @@ def _parts_of_code(value: Any, seen: dict[int, Any]) -> Iterator[str]:
             yield from _parts({entry.name: getattr(value, entry.name) for entry in fields(value)}, seen)
         elif isinstance(value, property | staticmethod | classmethod | functools.cached_property):
             yield from _parts([getattr(value, name, None) for name in ("fget", "func", "__func__")], seen)
-        elif not _is_installed_type(type(value)):
-            yield from _parts(vars(value) if hasattr(value, "__dict__") else (), seen)
+        else:
+            yield from _parts(_held(value), seen)
 
 
-def _is_code(name: str, value: Any) -> bool:
-    """Whether an attribute of a class is a method, a property or a constant, and none that Python has made."""
-    own = not name.startswith("__") or name in ("__call__", "__post_init__", "__init__", "__getattr__")
-    kinds = (FunctionType, property, staticmethod, classmethod, functools.cached_property, tuple)
-    return own and isinstance(value, (*_PLAIN, *_ARRAYS, *kinds))
+def _held(value: Any) -> Any:
+    """What an object holds, as a copy of it would be made."""
+    try:
+        made = value.__reduce_ex__(2)
+    except Exception:  # it cannot be copied, for whatever reason of its class
+        return getattr(value, "__dict__", {})
+    return made if isinstance(made, str) else made[1:3]
+
+
+def _is_own(name: str) -> bool:
+    """Whether an attribute of a class is one that its author wrote."""
+    return not name.startswith("__") or name in ("__call__", "__init__", "__post_init__", "__getattr__")
+
+
+def _named(function: FunctionType) -> dict[str, Any]:
+    """What a function names of its module, and of modules there that are not installed."""
+    names = _names(function.__code__)
+    found = {name: function.__globals__[name] for name in names if name in function.__globals__}
+    for name, each in list(found.items()):
+        if isinstance(each, ModuleType) and not _is_installed(_file(each)):
+            found |= {f"{name}.{of}": vars(each)[of] for of in names if of in vars(each)}
+    return found
 
 
 def _names(code: CodeType) -> set[str]:
@@ -113,5 +133,9 @@ def _is_installed(file: str) -> bool:
 
 
 def _is_installed_type(kind: type) -> bool:
-    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-    return kind.__module__ in sys.builtin_module_names or (file is not None and _is_installed(file))
+    return kind.__module__ in sys.builtin_module_names or _is_installed(_file(sys.modules.get(kind.__module__)))
+
+
+def _file(module: ModuleType | None) -> str:
+    """Where a module lies; "" for what was typed, and for what Python has built in."""
+    return getattr(module, "__file__", None) or ""

@@ -1,16 +1,21 @@
 """Whether keys tell a user's own law, waveform and observer apart: by numbers and code, alike in every process."""
 
+import functools
+import runpy
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from scenes import TETRA_27
+from scipy import interpolate
 
 import gmem_jax as gm
 from gmem_jax.experiment.identity import identity
@@ -77,6 +82,43 @@ def test_a_large_table_is_told_to_its_last_digit() -> None:
     assert repr(one) == repr(other)
     keys = [key_of_run(gm.Experiment(PACK, SIX, friction=each)) for each in (one, other)]
     assert keys[0] != keys[1]
+
+
+def test_what_other_libraries_wrap_is_looked_into(tmp_path: Path) -> None:
+    equinox = pytest.importorskip("equinox")
+
+    def module(factor: float) -> Any:
+        class Layer(equinox.Module):
+            weight: jax.Array
+            activation: Any = jnp.tanh
+
+            def __call__(self, x: jax.Array) -> jax.Array:
+                return factor * self.activation(self.weight * x)
+
+        return Layer
+
+    one, other = module(1.0)(jnp.ones(3)), module(2.0)(jnp.ones(3))
+    assert identity(one) == identity(module(1.0)(jnp.ones(3)))
+    assert identity(one) != identity(other)
+    assert identity(one) != identity(replace(one, activation=jnp.sin))
+    assert identity(one) != identity(replace(one, weight=jnp.zeros(3)))
+    net = equinox.nn.MLP(1, 1, 8, 2, key=jax.random.key(0))
+    assert identity(net) != identity(equinox.tree_at(lambda net: net.layers[0].bias, net, jnp.ones(8)))
+    assert identity(functools.partial(max, jax.random.key(0))) != identity(functools.partial(max, jax.random.key(1)))
+    assert identity(np.dtype("f4")) != identity(np.dtype("f8"))
+    # A spline of scipy, and a function of a module that lies beside.
+    splines = [interpolate.CubicSpline([0.0, 1.0, 2.0], [0.0, 1.0, top]) for top in (2.0, 3.0)]
+    assert identity(splines[0]) != identity(splines[1])
+    found = []
+    for factor in (1, 2):
+        (tmp_path / "springs.py").write_text(f"def spring(x):\n    return {factor} * x\n")
+        springs = runpy.run_path(str(tmp_path / "springs.py"))
+        beside = ModuleType("springs")
+        vars(beside).update(springs)
+        names: dict[str, Any] = {"springs": beside, "__name__": "laws"}
+        exec("def force(x):\n    return springs.spring(x)", names)
+        found.append(identity(names["force"]))
+    assert found[0] != found[1]
 
 
 @jax.tree_util.register_dataclass
