@@ -101,7 +101,7 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
     if entry_of(experiment.friction) is None:
         own["law"] = identity(experiment.friction)
     for name, one in experiment.sets.items():
-        if not isinstance(one, tuple(SIGNALS.values())):
+        if type(one) not in SIGNALS.values():
             own[f"signals {name}"] = identity(one)
     if experiment.observe:  # what was kept of another run lacks what these give
         own["observe"] = [(name, identity(reduce)) for name, reduce in experiment.observe]

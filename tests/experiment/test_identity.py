@@ -142,10 +142,22 @@ class Slower(Chirps):
         return jnp.sin(self.rate * u[..., None] / 2.0)
 
 
+@dataclass(frozen=True)
+class Louder(gm.Bumps):
+    def shear(self, u: jax.Array) -> jax.Array:
+        return 2.0 * super().shear(u)
+
+
+jax.tree_util.register_dataclass(Louder, ["amplitudes", "centres", "width"], [], ["form"])
+
+
 def test_waveforms_of_another_formula_are_others() -> None:
     one, other = Chirps(jnp.asarray([2.0])), Slower(jnp.asarray([2.0]))
     assert identity(one) != identity(other)
     assert identity(one) == identity(Chirps(jnp.asarray([2.0])))
+    bumps = [kind(jnp.ones((1, 1)), jnp.full((1, 1), 0.5), 0.2) for kind in (gm.Bumps, Louder)]
+    keys = [key_of_run(gm.Experiment(PACK, signals)) for signals in bumps]
+    assert keys[0] != keys[1]
 
 
 def _height(factor: float) -> Callable[..., Any]:
