@@ -138,6 +138,9 @@ def require_memory(protocol: Protocol, background: str) -> None:
         raise ValueError(f"the pack rests at u = 0, and stage {first.name!r} begins at u = {first.start:g}")
     if not protocol.reads:
         raise ValueError("the protocol has no stage that reads, as gm.read() is one")
+    hasty = [name for name in protocol.reads if not protocol.stage(name).length]
+    if hasty:
+        raise ValueError(f"stage {hasty[0]!r} reads in no time; give it a length, in t0")
     if not protocol.channels:
         raise ValueError("the protocol writes no waveforms of the replicas, as gm.write() does")
     if background != "sub0" and len(protocol.reads) != 2:

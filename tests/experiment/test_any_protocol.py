@@ -131,6 +131,7 @@ def test_what_makes_no_drive_is_refused(arguments: tuple[Any, ...], reason: str)
             },
             "a straight line over all u; 'a' ends before",
         ),
+        ({"protocol": Protocol(*READ, Stage("r", 0.0, 0.0, role="read", length=0.0))}, "stage 'r' reads in no time"),
         ({"protocol": gm.Protocol(gm.write())}, "no stage that reads"),
         ({"protocol": Protocol(Stage("a", 1.0, 0.0), *READ)}, "rests at u = 0, and stage 'a' begins at u = 1"),
         ({"protocol": gm.Protocol(gm.write([0.5, 1.0, 0.5]), gm.read())}, "writes no waveforms of the replicas"),
