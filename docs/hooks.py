@@ -19,6 +19,7 @@ MEASURED = (
     "paper_rate/avx2_2026-11-29",
     "laws_2026-11-28",
     "avx2_2026-11-29",
+    "size_avx2_2026-11-29",
     "large_packs",
     "gpu",
     "gpu_h200",
