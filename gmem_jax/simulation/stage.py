@@ -196,7 +196,7 @@ class Stage:
             refuse(f"along must be one of {', '.join(get_args(Along))}; got {self.along!r}")
         for name in ("start", "stop"):
             u = getattr(self, name)
-            if u is not None and not 0.0 <= u <= 1.0:
+            if u is not None and (isinstance(u, str) or not 0.0 <= u <= 1.0):
                 refuse(f"u must be in [0, 1], and its {name} is {u}")
         if not 0.0 <= self.length < math.inf:
             refuse(f"its length must be in [0, inf), got {self.length}")

@@ -83,6 +83,7 @@ def test_what_makes_no_protocol_is_refused(reason: str, stages: tuple[Any, ...])
     ("fields", "reason"),
     [
         ({"stop": 1.2}, r"u must be in \[0, 1\], and its stop is 1.2"),
+        ({"stop": "stay"}, r"u must be in \[0, 1\], and its stop is stay"),
         ({"role": "write"}, "it writes no waveform"),
         ({"along": "x"}, "along must be one of u, time"),
         ({"drag": -1.0}, r"drag must be in \[0, inf\)"),
