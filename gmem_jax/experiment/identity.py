@@ -3,7 +3,6 @@
 The name of a class says nothing of its formula, and `repr` shortens large arrays.
 """
 
-import functools
 import hashlib
 import sys
 import sysconfig
@@ -73,11 +72,11 @@ def _parts(value: Any, seen: dict[int, Any]) -> Iterator[str]:
 def _parts_of_code(value: Any, seen: dict[int, Any]) -> Iterator[str]:
     if isinstance(value, CodeType):
         yield from _parts((value.co_code, value.co_names, value.co_consts), seen)
-    elif isinstance(value, functools.partial):
-        yield from _parts((value.func, value.args, value.keywords), seen)
     elif isinstance(value, MethodType):
         yield from _parts((value.__func__, value.__self__), seen)
-    elif hasattr(value, "__wrapped__"):  # as of jax.jit
+    elif isinstance(value, property):  # Python 3.13 gives it a name
+        yield from _parts(value.fget, seen)
+    elif hasattr(value, "__wrapped__"):  # as of jax.jit and staticmethod
         yield from _parts(value.__wrapped__, seen)
     elif name := getattr(value, "__qualname__", getattr(value, "__name__", "")):
         yield f"{getattr(value, '__module__', '')}.{name}"
@@ -92,8 +91,6 @@ def _parts_of_code(value: Any, seen: dict[int, Any]) -> Iterator[str]:
         yield from _parts(type(value), seen)
         if is_dataclass(value):
             yield from _parts({entry.name: getattr(value, entry.name) for entry in fields(value)}, seen)
-        elif isinstance(value, property | staticmethod | classmethod | functools.cached_property):
-            yield from _parts([getattr(value, name, None) for name in ("fget", "func", "__func__")], seen)
         else:
             yield from _parts(_held(value), seen)
 

@@ -111,10 +111,14 @@ class Recall:
         whole = tuple(self.configuration.get("reads", reads))  # what `at` gives is a part
         return known[1] if len(known) == 2 and reads == known[:1] == whole else None
 
-    @property
-    def rates(self) -> np.ndarray:
-        """How much of u each read goes through in t0, or of its own time where u stands still, [R]."""
-        return rates_of(self.protocol, self.reads)
+    def windows(self, t0: Any) -> np.ndarray:
+        """The part of u that each read goes through in T_1, or of its own time where u stands still, [R].
+
+        Args:
+            t0: duration of one compression, in t_c; of several the longest counts.
+        """
+        found: np.ndarray = rates_of(self.protocol, self.reads) * (float(self.window) / float(np.max(t0)))
+        return found
 
     def at(self, read: str | int = 0, channel: str | int = 0) -> "Recall":
         """The recall of one channel in one read, as of a run that has no others: p_sig [S, 256], one G and one F.

@@ -34,7 +34,7 @@ def of_each(recall: Recall) -> dict[str, np.ndarray]:
     Arrays [S], or [R, C, S] as in the recall.
     """
     known, shape = values_of(recall.configuration), np.shape(recall.J)[:-1]
-    scale, windows = relative_scale(known), recall.window / np.max(known.get("t0", np.nan)) * recall.rates
+    scale, windows = relative_scale(known), recall.windows(known.get("t0", np.nan))
     curves = [jnp.asarray(each).reshape(-1, *np.shape(each)[-2:]) for each in (recall.p_sig, recall.J)]
     found: dict[str, list[Any]] = {name: [] for name in EACH}
     for p_sig, integral, window in zip(*curves, np.repeat(windows, len(recall.channels)), strict=True):

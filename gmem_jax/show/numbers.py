@@ -161,7 +161,7 @@ def second_readout(recall: Recall, configuration: dict[str, Any]) -> dict[str, A
     first, second = (read_stress(recall, name) for name in recall.protocol.reads)
     scale = relative_scale(configuration)
     rows: dict[str, dict[str, float]] = {name: {} for name in analysis.BACKGROUNDS}
-    smooth = recall.window / np.max(values_of(configuration)["t0"]) * recall.rates[0]
+    smooth = recall.windows(values_of(configuration)["t0"])[0]
     for prefix, window in (("", None), ("windowed_", smooth)):
         for name, match in analysis.backgrounds(first, second, recall.J, scale, window).items():
             rows[name] |= {f"{prefix}gain": float(match.gain), f"{prefix}fidelity": float(match.fidelity)}

@@ -155,8 +155,7 @@ def mean_over_ringing(recall: Recall, signals: np.ndarray, t0: Any) -> np.ndarra
     """
     if not is_number(t0) or t0 >= PAPER_T0 or not np.isfinite(recall.window):
         return None
-    width = float(recall.window) / t0 * recall.rates[0] * signals.shape[-1]
-    return np.asarray(running_mean(jnp.asarray(signals), width))
+    return np.asarray(running_mean(jnp.asarray(signals), recall.windows(t0)[0] * signals.shape[-1]))
 
 
 def signals_figure(

@@ -67,13 +67,12 @@ def errors_table(recall: Recall) -> Table:
     """G and F with their standard errors over signals, as they are and averaged over the ringing period."""
     configuration, window = recall.configuration, float(recall.window)
     scale = np.asarray(relative_scale(configuration))
-    t0 = float(np.max(values_of(configuration)["t0"]))
     told = "G: gain; F: fidelity, 1 if what is recalled is the integral of what was stored; errors: standard errors "
     parts = [*recall.each()]
     where = _where(parts)
     table = Table("", *where, "G", "F", caption=f"{told}over the signals stored in this pack (jackknife)")
     for one in parts:
-        bins = window / t0 * one.rates[0] * BINS
+        bins = one.windows(values_of(configuration)["t0"])[0] * BINS
         for name, values, smooth in (
             ("as recalled", (one.gain, one.fidelity), None),
             (f"averaged over T1 = {window:.0f} t_c", (one.windowed_gain, one.windowed_fidelity), bins),

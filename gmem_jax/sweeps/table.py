@@ -77,7 +77,7 @@ def points_in(table: Sequence[_Row]) -> list[_Row]:
 
 def result_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
     """What a row is of: a mean counts each result once, though its point may be asked for in several ways."""
-    return row.get("key", id(row)), *(row.get(name) for name in READ_AND_CHANNEL)
+    return row["key"], *(row.get(name) for name in READ_AND_CHANNEL)
 
 
 def warnings_of(row: Mapping[str, Any]) -> str:

@@ -14,7 +14,7 @@ import gmem_jax as gm
 from gmem_jax.derivatives.push import push
 from gmem_jax.experiment import analysis
 from gmem_jax.experiment.protocols import memory_protocol
-from gmem_jax.experiment.readings import placed
+from gmem_jax.experiment.readings import placed, rates_of
 from gmem_jax.experiment.record import key_of_run
 from gmem_jax.files.measures import of_each
 from gmem_jax.simulation.channels import CHANNELS
@@ -371,7 +371,8 @@ def test_reads_of_several_lengths_have_a_window_each() -> None:
         part = float(PACK.ringing_period) / QUICK["t0"] / length
         match = analysis.compare(one.p_sig, one.J, float(PACK.delta0) * QUICK["gamma0"], part)
         assert float(one.windowed_fidelity) == pytest.approx(float(match.fidelity), rel=1e-12)
-        assert one.rates == pytest.approx(1.0 / length)
+        assert rates_of(one.protocol, one.reads) == pytest.approx(1.0 / length)
+        assert one.windows(QUICK["t0"]) == pytest.approx(part, rel=1e-12)
 
 
 def test_a_kernel_is_measured_with_sub0() -> None:

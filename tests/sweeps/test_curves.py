@@ -18,8 +18,8 @@ ROWS: list[dict[str, Any]] = [
     for mu in (0.2, 1.0)
     for gamma0 in (1e-3, 2e-3)
 ]
-for row in ROWS:
-    row |= {"state": "done"}
+for number, row in enumerate(ROWS):
+    row |= {"state": "done", "key": str(number)}
 
 
 def test_a_parameter_has_a_line_and_samples_have_a_mean_unless_it_is_said_otherwise() -> None:
@@ -59,7 +59,7 @@ def test_errors_are_standard_errors_over_the_samples() -> None:
 
 
 def test_a_result_that_is_asked_for_twice_counts_once() -> None:
-    keyed = [{**row, "key": str(number), "status": 0, "warnings": ""} for number, row in enumerate(ROWS)]
+    keyed = [{**row, "status": 0, "warnings": ""} for row in ROWS]
     twice = [*keyed, {**keyed[0], "mu": 0.2}]
     for some in (keyed, twice):
         first, _ = lines_of(some, axes_of(some, NAMES), "fidelity")
