@@ -61,7 +61,8 @@ def test_packs_are_called_by_their_files_and_else_by_their_whole_names() -> None
 
 
 def test_a_sweep_is_drawn_over_what_can_be_counted() -> None:
-    rows = [{"pack": pack, "mu": mu, "gain": mu, "state": "done"} for pack in ("a.h5", "b.h5") for mu in (0.2, 1.0)]
+    points = [(pack, mu) for pack in ("a.h5", "b.h5") for mu in (0.2, 1.0)]
+    rows = [{"pack": pack, "mu": mu, "gain": mu, "state": "done", "key": f"{pack} {mu}"} for pack, mu in points]
     (axis,) = to_matplotlib(sweep_figure(rows, ["pack", "mu"], "gain", "mu")).figure.axes
     assert axis.get_xlabel() == "mu"
     np.testing.assert_allclose(axis.lines[1].get_xydata(), [[0.2, 0.2], [1.0, 1.0]])
