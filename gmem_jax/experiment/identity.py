@@ -47,6 +47,14 @@ def identity(value: Any) -> str:
     return digest.hexdigest()
 
 
+def form(tree: Any) -> str:
+    """`identity` of a pytree without its leaves: its classes, their code, and the fields that are no leaves.
+
+    `jax.tree.structure` does not say it: on JAX 0.12 the structures of two dataclasses with the same fields are equal.
+    """
+    return identity(jax.tree.map(lambda _: None, tree))
+
+
 def _parts(value: Any, seen: dict[int, Any]) -> Iterator[str]:
     """What makes an object, in words; `seen` has what is told already, and keeps it, since an id is used again."""
     if isinstance(value, _PLAIN) or value is None:

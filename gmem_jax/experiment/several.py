@@ -17,6 +17,7 @@ import numpy as np
 
 from gmem_jax.experiment.changes import replace, value_at
 from gmem_jax.experiment.experiment import NOT_OF_PAPER, Experiment, acts_on_prefix, replica_parameters
+from gmem_jax.experiment.identity import identity
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.run import PREFIX, finished, runner_of, warn_of_another_compression
@@ -66,7 +67,7 @@ def match(one: Experiment, other: Experiment) -> bool:
     only itself.
     """
     alike = ("protocol", "steps_per_bin", "background", "backend", "precision", "material")
-    laws = [str(jax.tree.structure(each.friction)) for each in (one, other)]
+    laws = [identity(_alike(each)) for each in (one, other)]
     scalars = all(jnp.ndim(value) == 0 for each in (one, other) for value in replica_parameters(each).values())
     slips = [float(np.min(getattr(each.friction, "mu", 1.0))) == 0.0 for each in (one, other)]
     same = slips[0] == slips[1] and all(getattr(one, name) == getattr(other, name) for name in alike)
@@ -74,6 +75,16 @@ def match(one: Experiment, other: Experiment) -> bool:
     same = same and kinds[0] == kinds[1]
     alone = not any(isinstance(each.signals, SignalSets) or each.observe for each in (one, other))
     return alone and scalars and same and one.pack is other.pack and laws[0] == laws[1]
+
+
+def _alike(experiment: Experiment) -> Any:
+    """The law without the numbers that may differ between replicas; a user's law may hold others, deeper in it."""
+    own = replica_parameters(experiment)
+
+    def kept(path: tuple[Any, ...], leaf: Any) -> Any:
+        return None if len(path) == 1 and f"friction.{getattr(path[0], 'name', '')}" in own else leaf
+
+    return jax.tree_util.tree_map_with_path(kept, experiment.friction)
 
 
 class _Side:

@@ -10,7 +10,7 @@ import numpy as np
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.changes import replace as with_changes
 from gmem_jax.experiment.experiment import USUAL_STEP, Experiment
-from gmem_jax.experiment.identity import fingerprint
+from gmem_jax.experiment.identity import fingerprint, form
 from gmem_jax.experiment.record import pack_fingerprint
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -77,7 +77,7 @@ def _case(experiment: Experiment) -> tuple[tuple[Any, ...], Any]:
     return (
         pack_fingerprint(experiment.pack),
         fingerprint(parts),
-        jax.tree.structure(law),  # knows classes of one name apart
+        form(law),
         experiment.backend,
     ), law
 

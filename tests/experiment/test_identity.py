@@ -20,6 +20,7 @@ from scipy import interpolate
 import gmem_jax as gm
 from gmem_jax.experiment.identity import identity
 from gmem_jax.experiment.record import key_of_run
+from gmem_jax.experiment.several import match
 from gmem_jax.experiment.stepping import _case
 
 LAW = """
@@ -179,6 +180,16 @@ def test_stable_steps_of_two_laws_of_one_name_are_not_confused() -> None:
     one, other = law_of(LAW), law_of(LAW.replace("FACTOR = 2.0", "FACTOR = 3.0"))
     cases = [_case(gm.Experiment(PACK, SIX, friction=law))[0] for law in (one, other)]
     assert cases[0] != cases[1]
+
+
+def test_laws_of_one_name_or_with_other_inner_numbers_do_not_run_side_by_side() -> None:
+    """As one run they would all have the law of the first."""
+    law, table = law_of(LAW), jnp.ones(3)
+    one = gm.Experiment(PACK, SIX, friction=replace(law, table=(table,)))
+    assert match(one, gm.replace(one, {"friction.mu": 0.5}))
+    other = law_of(LAW.replace("FACTOR = 2.0", "FACTOR = 3.0"))
+    assert not match(one, gm.replace(one, friction=replace(other, table=(table,))))
+    assert not match(one, gm.replace(one, friction=replace(law, table=(2.0 * table,))))
 
 
 def test_an_identity_is_that_of_every_process(tmp_path: Path) -> None:
