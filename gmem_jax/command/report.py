@@ -8,6 +8,8 @@ import typer
 
 from gmem_jax.command.console import AsJson, Force, Output, check_output, log, print_result
 from gmem_jax.files.atomic import atomic
+from gmem_jax.show.render_plotly import script
+from gmem_jax.show.report import Report
 
 Files = Annotated[
     list[str],
@@ -19,9 +21,6 @@ def report_command(
     files: Files, output: Output = Path("report.html"), force: Force = False, as_json: AsJson = False
 ) -> None:
     """One page of all that files hold, to be looked at in a browser: figures, tables and the pack in 3D; no network."""
-    from gmem_jax.show.render_plotly import script
-    from gmem_jax.show.report import Report
-
     check_output(output, ".html", inputs=tuple(files), force=force)
     began = time.perf_counter()
     script()  # refuses at once where there is no plotly

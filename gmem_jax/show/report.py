@@ -117,8 +117,8 @@ class Report:
             return {"text": "Its pack at rest is shown above."}
         try:
             frames = content.frames()
-        except (OSError, ValueError, KeyError):  # the pack of a recall need not be there any more
-            return {"text": ""}
+        except (OSError, ValueError, KeyError) as error:  # the pack of a recall need not be there any more
+            return {"text": f"Its pack is not shown: {' '.join(str(error).split())}"}
         self._seen |= {content.pack} - {""}
         self._views += 1
         return {"html": _safe(view.figure(f"view-{self._views}", frames, content.material))}

@@ -1,6 +1,8 @@
 """`gmem show` prints and draws every kind of file that a command writes."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
@@ -113,6 +115,15 @@ def test_every_kind_of_file_is_printed_and_drawn(
         picture = tmp_path / f"{what}.png"
         assert gmem(monkeypatch, "show", folder / name, "--plot", what.upper(), "-o", picture) == 0
         assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_by_itself_reports_what_depends_on_its_rules(folder: Path, tmp_path: Path) -> None:
+    """Other tests have imported JAX and set its precision before the command does."""
+    command, files = [sys.executable, "-m", "gmem_jax", "report"], [folder / "recall.h5", folder / "kernel.h5"]
+    subprocess.run([*command, *files, "-o", tmp_path / "r.html"], check=True)
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "save picture" in page  # of the pack in 3D, whose fingerprint is that of double precision
+    assert "is not shown" not in page
 
 
 def test_a_net_is_shown(
