@@ -42,7 +42,7 @@ def check_jacobian(experiment: gm.Experiment) -> tuple[dict[float, dict[str, flo
     for step in STEPS:
         other = jacobian.differences(experiment, step)
         table[step] = jacobian.mismatch(exact, other)
-        one, two = exact.p_xy[:AMPLITUDES], other.p_xy[:AMPLITUDES]
+        one, two = exact.stress[:AMPLITUDES], other.stress[:AMPLITUDES]
         by_bin[step] = np.linalg.norm(one - two, axis=0) / np.linalg.norm(two, axis=0)
     return table, by_bin
 

@@ -16,6 +16,7 @@ from gmem_jax.command.console import (
     InputError,
     Output,
     Picture,
+    RunInterruptedError,
     check_output,
     draw_beside,
     log,
@@ -115,10 +116,13 @@ def classify_command(
     trained = []
     for seed in range(seeds):
         file = check_output(folder / f"words-{stored.bits}-seed-{seed}.msgpack", "", force=True, option="--nets")
-        with _training(budget) as listener:
-            one = training.train_net(
-                TrainingConfig(stored.bits), seed, budget=budget, checkpoint=file, listener=listener
-            )
+        try:
+            with _training(budget) as listener:
+                one = training.train_net(
+                    TrainingConfig(stored.bits), seed, budget=budget, checkpoint=file, listener=listener
+                )
+        except KeyboardInterrupt:
+            raise RunInterruptedError(f"the same command goes on with the nets in {folder}") from None
         trained.append(one)
         state = "trained" if one.finished else "out of time"
         log(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}")

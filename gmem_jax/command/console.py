@@ -47,6 +47,8 @@ class _Log(Console):
         _give_up(2)
 
 
+if not os.environ.get("COLUMNS", "1").strip("0"):  # not known; in no columns rich would print nothing at all
+    del os.environ["COLUMNS"]
 stderr = _Log(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
 out = Console(highlight=False, markup=False)
 

@@ -40,10 +40,10 @@ from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.identity import fingerprint
 from gmem_jax.experiment.record import describe, key_of_run, pack_fingerprint
 from gmem_jax.experiment.run import COPIES, prefix_of, replica_bins, run, run_bytes
-from gmem_jax.experiment.signals import Bumps, Spline
+from gmem_jax.experiment.signals import Bumps, Spline, waveform
 from gmem_jax.files import schemas
 from gmem_jax.files.results import save_result
-from gmem_jax.files.waveforms import named_signals, save_waveforms
+from gmem_jax.files.waveforms import load_waveforms, save_waveforms
 from gmem_jax.show import summaries
 from gmem_jax.show.figures import design_figure, history_figure
 from gmem_jax.show.tables import cell
@@ -282,7 +282,11 @@ def design_command(
     (experiment,), drawn = chosen.check_output([pack], output, ".csv", picture=picture, force=force)
     _require_one_fidelity(experiment)
     _require_designable(experiment)
+    if chosen.target(experiment.signals.count) is not None:
+        raise InputError("--signals: these were designed, and are to be recalled as others; --start goes on from them")
     if start is not None:
+        if not start.is_file():
+            raise InputError(f"--start {start}: is no file of waveforms")
         check_output(output, ".csv", inputs=(start,), force=force)
     history = output.with_name(f"{output.stem}-history.png")
     if picture:
@@ -298,7 +302,7 @@ def design_command(
         effort = kernel_design_cost(experiment, iterations, bumps or KERNEL_BUMPS, measured)
         _announce(experiment, "design", effort, min(count * max(1, measured), options["batch"]))
         if start is not None:
-            options["start"] = named_signals(str(start))
+            options["start"] = waveform(load_waveforms(start))
     elif measured or start is not None:
         option = "--measured" if measured else "--start"
         raise InputError(f"{option}: designs by Jacobians have no use for it; add --by kernel")
@@ -365,6 +369,8 @@ def tune_command(
 ) -> None:
     """Choose gamma0, mu and the friction stiffness within bounds so that the mean fidelity of packs grows."""
     names, limits = packs.split(","), parse_bounds(bounds)
+    if not all(names):
+        raise InputError(f"{packs}: no pack is named beside a comma; name packs as in tetra-325-a,tetra-325-b")
     experiments, drawn = chosen.check_output(names, output, ".json", picture=picture, force=force)
     _require_one_fidelity(experiments[0])
     _require_designable(experiments[0])

@@ -10,8 +10,8 @@ import typer
 from rich.table import Table
 
 from gmem_jax.command.console import AsJson, DryRun, InputError, log, print_result, reporting
+from gmem_jax.command.resuming import check_folder
 from gmem_jax.errors import RunFailedError
-from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
 from gmem_jax.physics.state import combined_status
 from gmem_jax.reproduce import choices
@@ -64,9 +64,7 @@ def reproduce_command(
         _say_cost(what, scale, output, workers or 1, as_json)
         return
     executor_named(executor, workers, options)  # what cannot be had is refused before anything is written
-    if not output.parent.is_dir():
-        raise InputError(f"--output {output}: folder {output.parent} does not exist")
-    probe(output)
+    check_folder(output)
     output.mkdir(exist_ok=True)
     outcomes, verdicts, weighed, drawn = [], [], Weighed([], [], []), []
     archives: list[Path] = []

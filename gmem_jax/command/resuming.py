@@ -2,7 +2,7 @@
 
 import errno
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +12,8 @@ import typer
 from gmem_jax.command.console import InputError, RunInterruptedError, log
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.run import default_batch
-from gmem_jax.files.checkpoints import Checkpoints, locked
+from gmem_jax.files.atomic import probe
+from gmem_jax.files.checkpoints import Checkpoints, lock_of, locked
 from gmem_jax.files.ours import remove_leftovers
 from gmem_jax.physics.numbers import plural
 
@@ -41,6 +42,22 @@ def foresee(output: Path, key: dict[str, Any], *, restart: bool) -> None:
         log(f"{parts}: what is there would be discarded (--restart)")
     else:
         log(f"{parts}: {other}; the run is refused without --restart" if other else f"the run would go on from {parts}")
+
+
+def check_folder(path: Path) -> None:
+    """Refuse an `--output` that is a folder where none can be made or written.
+
+    Raises:
+        InputError: saying what is wrong.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"--output {path}: folder {path.parent} does not exist")
+    try:
+        with suppress(FileNotFoundError):
+            lock_of(path).lstat()  # whose name is longer
+        probe(path)
+    except OSError as error:
+        raise InputError(f"--output {path}: cannot write there ({error.strerror})") from error
 
 
 @contextmanager

@@ -19,8 +19,8 @@ from gmem_jax.command.console import (
     refuse_idle,
     reporting,
 )
+from gmem_jax.command.resuming import check_folder
 from gmem_jax.errors import FileFormatError, RunFailedError
-from gmem_jax.files.atomic import probe
 from gmem_jax.files.checkpoints import locked
 from gmem_jax.physics.numbers import plural
 from gmem_jax.show.sweeps import means_table, points_table, sweep_facts
@@ -98,12 +98,7 @@ def sweep_command(
         print_result(as_json, {"folder": str(target), **cost._asdict(), "status": 0}, *cost.lines)
         return
     chosen = executor_named(kind, count, options)
-    if not target.parent.is_dir():
-        raise InputError(f"--output {target}: folder {target.parent} does not exist")
-    try:
-        probe(target)
-    except OSError as error:
-        raise InputError(f"--output {target}: cannot write there ({error.strerror})") from error
+    check_folder(target)
     with locked(target), reporting(goes_on=True) as progress:
         runner = planned(path, spec, target)
         if retry and (count := runner.store.clear_failures()):

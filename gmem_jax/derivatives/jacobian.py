@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.derivatives.push import push
-from gmem_jax.experiment import analysis
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.changes import replace, value_at
 from gmem_jax.experiment.experiment import Experiment
@@ -20,6 +19,7 @@ from gmem_jax.experiment.run import run
 from gmem_jax.experiment.signals import Bumps
 from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
+from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
 
 LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
@@ -35,13 +35,14 @@ class Jacobian:
         names: of the parameters; "amplitude 1", ..., "gamma0", "mu", "stiffness".
         values: of the parameters, [P].
         p_sig: by each parameter, [P, 256], in E per unit of it.
-        p_xy: p_x - p_y of every bin from the encoding on, by each parameter, [P, bins], of the sheared replica.
+        stress: of the channel, p_x - p_y on "xy", in every bin from the encoding on, by each parameter, [P, bins], of
+            the sheared replica.
     """
 
     names: tuple[str, ...]
     values: np.ndarray
     p_sig: np.ndarray
-    p_xy: np.ndarray
+    stress: np.ndarray
 
     __repr__ = short_repr
 
@@ -57,6 +58,8 @@ def _one_signal(experiment: Experiment) -> tuple[Bumps, np.ndarray]:
         raise ValueError("a Jacobian is taken of one signal made of bumps")
     if experiment.background != "sub0":
         raise ValueError(f"a Jacobian is taken with the background sub0, got {experiment.background}")
+    if len(experiment.readings.reads) * len(experiment.readings.channels) > 1:
+        raise ValueError("a Jacobian is taken of one read and one channel")
     return bumps, np.asarray(bumps.amplitudes)
 
 
@@ -64,11 +67,18 @@ def _law_values(experiment: Experiment) -> list[float]:
     return [float(value_at(experiment, path)) for path in LAW.values()]
 
 
-def _p_xy(experiment: Experiment, pressure: dict[str, np.ndarray]) -> np.ndarray:
-    """p_x - p_y from the first stage that writes to the first that reads, [replicas, bins]."""
+def _stress(experiment: Experiment, pressure: dict[str, np.ndarray]) -> np.ndarray:
+    """That of the channel from the first stage that writes to the first that reads, [replicas, bins]."""
+    (channel,) = experiment.readings.channels
     joined = np.concatenate([pressure[name] for name in experiment.protocol.first_memory])
-    result: np.ndarray = (joined[:, 0] - joined[:, 1]).T
-    return result
+    return np.asarray(CHANNELS[channel].stress(jnp.asarray(joined))).T
+
+
+def _recalled(experiment: Experiment, pressure: dict[str, np.ndarray]) -> np.ndarray:
+    """p_sig of the second half of the replicas, each with a zero signal of its own in the first, [half, 256]."""
+    half = next(iter(pressure.values())).shape[-1] // 2
+    pairs = ({name: jnp.asarray(p[..., [k, half + k]]) for name, p in pressure.items()} for k in range(half))
+    return np.concatenate([experiment.recalled(pair) for pair in pairs])
 
 
 def _pressures(recall: Recall) -> dict[str, np.ndarray]:
@@ -85,7 +95,8 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
-        ValueError: if there is another number of signals, they are not bumps, or the background is not sub0.
+        ValueError: if there is another number of signals, they are not bumps, the background is not sub0, or there are
+            several reads or channels.
         RunFailedError: if the simulation broke down.
     """
     require_kind("jacobian", experiment, Experiment)
@@ -101,7 +112,7 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
     pushed = push(drive, direction, progress=within(tell, 0.0, SHARE))
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
-    p_sig, p_xy = [np.asarray(pushed.p_sig_slope)], [_p_xy(experiment, pushed.slope)[1:]]
+    p_sig, stress = [np.asarray(pushed.p_sig_slope)], [_stress(experiment, pushed.slope)[1:]]
     two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # replicas 0, 1: no signal; 2, 3: it
     wide = {path: jnp.full(4, value_at(experiment, path)) for path in LAW.values()}
     laws = replace(experiment, {**wide, "signals": _copies(bumps, two)})
@@ -110,19 +121,19 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
         "friction.stiffness": jnp.asarray([0.0, 1.0, 0.0, 1.0]),
     }
     pushed = push(laws, direction, progress=within(tell, SHARE, 1.0))
-    change = np.asarray(analysis.recalled(jnp.asarray(pushed.slope[experiment.protocol.reads[0]])))
-    p_sig.append(-(change[2:] - change[:2]))
-    p_xy.append(_p_xy(experiment, pushed.slope)[2:])
+    p_sig.append(_recalled(experiment, pushed.slope))
+    stress.append(_stress(experiment, pushed.slope)[2:])
     names += LAW
     values += _law_values(experiment)
-    return Jacobian(tuple(names), np.asarray(values), np.concatenate(p_sig), np.concatenate(p_xy))
+    return Jacobian(tuple(names), np.asarray(values), np.concatenate(p_sig), np.concatenate(stress))
 
 
 def differences(experiment: Experiment, relative: float) -> Jacobian:
     """Central differences with steps of `relative` times each parameter (amplitudes: times 1), as replicas.
 
     Raises:
-        ValueError: if there is another number of signals, they are not bumps, or the background is not sub0.
+        ValueError: if there is another number of signals, they are not bumps, the background is not sub0, or there are
+            several reads or channels.
         RunFailedError: if the simulation broke down.
     """
     bumps, row = _one_signal(experiment)
@@ -132,11 +143,11 @@ def differences(experiment: Experiment, relative: float) -> Jacobian:
     gamma0[-2:] *= [1.0 + relative, 1.0 - relative]
     drive = replace(experiment, signals=_copies(bumps, jnp.asarray(row + steps)), gamma0=jnp.asarray(gamma0))
     found = run(drive, progress=False)
-    recalled, p_xy = np.asarray(found.p_sig), _p_xy(experiment, _pressures(found))[1:]
+    recalled, stress = np.asarray(found.p_sig), _stress(experiment, _pressures(found))[1:]
     widths = np.full((n + 1, 1), 2.0 * relative)
     widths[n] *= float(experiment.gamma0)
     up, down = [*range(n), 2 * n], [*range(n, 2 * n), 2 * n + 1]
-    slopes = [(recalled[up] - recalled[down]) / widths], [(p_xy[up] - p_xy[down]) / widths]
+    slopes = [(recalled[up] - recalled[down]) / widths], [(stress[up] - stress[down]) / widths]
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
     law_values = _law_values(experiment)
@@ -148,12 +159,11 @@ def differences(experiment: Experiment, relative: float) -> Jacobian:
     rows = jnp.asarray(np.concatenate([np.zeros((3, n)), np.repeat(row, 4, axis=0)]))
     other = replace(experiment, {**shifted, "signals": _copies(bumps, rows)})
     pressure = _pressures(run(other, progress=False))
-    change = np.asarray(analysis.recalled(jnp.asarray(pressure[experiment.protocol.reads[0]])))
-    signal = -(change[4:] - change[:4])
-    p_xy = _p_xy(experiment, pressure)[4:]
+    signal = _recalled(experiment, pressure)
+    stress = _stress(experiment, pressure)[4:]
     widths = 2.0 * relative * np.asarray(law_values)[:, None]
     slopes[0].append((signal[[0, 2]] - signal[[1, 3]]) / widths)
-    slopes[1].append((p_xy[[0, 2]] - p_xy[[1, 3]]) / widths)
+    slopes[1].append((stress[[0, 2]] - stress[[1, 3]]) / widths)
     names += LAW
     values += law_values
     return Jacobian(tuple(names), np.asarray(values), np.concatenate(slopes[0]), np.concatenate(slopes[1]))

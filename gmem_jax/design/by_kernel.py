@@ -11,7 +11,7 @@ step is damped more (Levenberg and Marquardt).
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.design.kernel import MemoryKernel, bumps, memory_kernel, nearest, written_sets
+from gmem_jax.design.kernel import MemoryKernel, amplitude_on, bumps, memory_kernel, nearest, written_sets
 from gmem_jax.design.waveforms import (
     Design,
     Work,
@@ -73,7 +73,8 @@ def refuse_another_drive(kernel: MemoryKernel, experiment: Experiment) -> None:
     Raises:
         ValueError: saying what differs.
     """
-    for name, own in (("gamma0", experiment.gamma0), ("delta0", experiment.compression)):
+    written = amplitude_on(experiment, experiment.readings.channels[0])
+    for name, own in (("gamma0", written), ("delta0", experiment.compression)):
         if getattr(kernel, name) != float(own):
             raise ValueError(f"the kernel is of {name} = {getattr(kernel, name):g}, the experiment's is {float(own):g}")
 

@@ -37,9 +37,10 @@ class MemoryKernel:
         u: centres of the bins, [256].
         centres: of the bumps, [n].
         width: of the bumps.
-        odd: half the difference of the recalls of each waveform and its opposite, [n, 256], in E.
+        odd: half the difference of the recalls of each waveform and its opposite, [n, 256], in E; 0 where the read does
+            not go through u.
         even: half their sum, [n, 256].
-        gamma0: shear amplitude they were measured at.
+        gamma0: shear amplitude they were measured at, with the factor of the stage that writes.
         delta0: areal compression.
     """
 
@@ -79,9 +80,9 @@ class MemoryKernel:
         return values
 
     def _match(self) -> analysis.Match:
-        match: analysis.Match = analysis.compare(
-            jnp.asarray(self.odd), bin_average(self.basis), self.delta0 * self.gamma0
-        )
+        seen = np.any(self.odd, axis=0)
+        integral = jnp.where(seen | ~seen.any(), bin_average(self.basis), 0.0)
+        match: analysis.Match = analysis.compare(jnp.asarray(self.odd), integral, self.delta0 * self.gamma0)
         return match
 
     @usual_rules()
@@ -188,7 +189,7 @@ def memory_kernel(
     if len(wanted.readings.reads) * len(wanted.readings.channels) > 1:
         raise ValueError("a kernel is of one read and one channel; gm.kernel_matrix measures those of several channels")
     p_sig = np.asarray(run(wanted, prefix=prefix, cache=cache.scoped("basis"), progress=tell).p_sig)
-    return _kernel_of(wanted, both, p_sig)
+    return _kernel_of(wanted, both, p_sig, wanted.readings.channels[0])
 
 
 def _basis(experiment: Experiment, n: int, width: float) -> Bumps:
@@ -267,7 +268,7 @@ def kernel_matrix(
         one = replace(experiment, signals=signals(**alone))
         share = within(tell, number / len(channels), (number + 1) / len(channels))
         recall = run(one, cache=cache.scoped(f"basis-{channel}"), progress=share)
-        columns.append([_kernel_of(one, loud, np.asarray(recall.at(channel=name).p_sig)) for name in channels])
+        columns.append([_kernel_of(one, loud, np.asarray(recall.at(channel=name).p_sig), channel) for name in channels])
     return KernelMatrix(channels, tuple(zip(*columns, strict=True)))
 
 
@@ -288,8 +289,14 @@ def written_sets(experiment: Experiment) -> tuple[str, ...]:
     return tuple(str(written[channel].waveform) for channel in channels)
 
 
-def _kernel_of(experiment: Experiment, both: Bumps, p_sig: np.ndarray) -> MemoryKernel:
-    """The kernel from the recalls [2 n, 256] of n bumps and their opposites."""
+def amplitude_on(experiment: Experiment, channel: str) -> float:
+    """gamma0 of what is written on a channel, with the factor of the stage; of one read."""
+    (read,) = experiment.readings.reads
+    return float(experiment.gamma0) * experiment.protocol.written(read)[channel].amplitude
+
+
+def _kernel_of(experiment: Experiment, both: Bumps, p_sig: np.ndarray, channel: str) -> MemoryKernel:
+    """The kernel from the recalls [2 n, 256] of n bumps and their opposites that were written on a channel."""
     n = len(p_sig) // 2
     plus, minus = p_sig[:n], p_sig[n:]
     return MemoryKernel(
@@ -298,7 +305,7 @@ def _kernel_of(experiment: Experiment, both: Bumps, p_sig: np.ndarray) -> Memory
         width=float(both.width),
         odd=0.5 * (plus - minus),
         even=0.5 * (plus + minus),
-        gamma0=float(experiment.gamma0),
+        gamma0=amplitude_on(experiment, channel),
         delta0=float(experiment.compression),
     )
 

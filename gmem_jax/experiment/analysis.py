@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.numbers import said
+from gmem_jax.physics.pytree import Scalar, traced
 from gmem_jax.physics.rules import usual_rules
 
 MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
@@ -189,12 +190,22 @@ def remembered_after(second: jax.Array, integral: jax.Array, scale: Scalar) -> t
 
 
 @usual_rules()
-@jax.jit
 def running_mean(series: jax.Array, width: Scalar) -> jax.Array:
     """Mean over a window of `width` bins (need not be whole) along the last axis, [..., bins].
 
     The integral of the piecewise-constant series over the window, divided by the part of the window inside [0, 1].
+
+    Raises:
+        ValueError: if the width is not above 0.
     """
+    if not traced(width) and not np.all(np.asarray(width) > 0.0):
+        raise ValueError(f"width: a mean over bins needs a width above 0, got {said(width)}")
+    mean: jax.Array = _running_mean(series, width)
+    return mean
+
+
+@jax.jit
+def _running_mean(series: jax.Array, width: Scalar) -> jax.Array:
     bins = series.shape[-1]
     edges = jnp.concatenate([jnp.zeros_like(series[..., :1]), jnp.cumsum(series, axis=-1)], axis=-1)
 

@@ -85,7 +85,7 @@ def named_observers(observe: Any) -> tuple[tuple[str, Any], ...]:
     names = [name for name, _ in named]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"two observers are called {twice[0]!r}; name them, as in observe={{'one': ..., 'two': ...}}")
-    return named
+    return tuple(sorted(named, key=lambda one: one[0]))  # one order in the run, its key and its files
 
 
 def require_several(values: Any, argument: str) -> None:

@@ -116,7 +116,7 @@ def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
 
     Args:
         experiment: what was run.
-        seconds: wall time that the run took; 0 where nobody measured it.
+        seconds: wall time of the call that finished the run; 0 where nobody measured it.
     """
     pack, law, entry = experiment.pack, experiment.friction, entry_of(experiment.friction)
     dt, steps = experiment.timing

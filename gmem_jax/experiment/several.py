@@ -8,7 +8,6 @@ import dataclasses
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -21,42 +20,11 @@ from gmem_jax.experiment.identity import identity
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.run import PREFIX, finished, runner_of, warn_of_another_compression
-from gmem_jax.experiment.signals import Signals, SignalSets, bin_average
-from gmem_jax.physics.pytree import pytree
+from gmem_jax.experiment.signals import ChosenSignals, Signals, SignalSets, bin_average
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.progress import Progress, silent, work_of
 from gmem_jax.simulation.sharding import placement_of
-
-
-@pytree
-@dataclass(frozen=True)
-class ChosenSignals:
-    """Waveforms chosen from some sets; number 0 is no shear, the others count through the sets.
-
-    Attributes:
-        sets: the sets.
-        numbers: of the chosen waveforms, int [S].
-    """
-
-    sets: tuple[Signals, ...]
-    numbers: jax.Array
-
-    @property
-    def count(self) -> int:
-        """Number of signals S."""
-        return int(self.numbers.shape[0])
-
-    def shear(self, u: jax.Array) -> jax.Array:
-        """I_s(u), [..., S]."""
-        return self._chosen([one.shear(u) for one in self.sets], u)
-
-    def integral(self, u: jax.Array) -> jax.Array:
-        """J_s(u), [..., S]."""
-        return self._chosen([one.integral(u) for one in self.sets], u)
-
-    def _chosen(self, values: list[jax.Array], u: jax.Array) -> jax.Array:
-        return jnp.concatenate([jnp.zeros((*u.shape, 1)), *values], axis=-1)[..., self.numbers]
 
 
 def match(one: Experiment, other: Experiment) -> bool:

@@ -91,19 +91,6 @@ def signals(**sets: Signals) -> Signals | SignalSets:
     return SignalSets(tuple(sets.values()), tuple(sets)) if tuple(sets) != ("xy",) else sets["xy"]
 
 
-Chosen = TypeVar("Chosen", bound=Signals | SignalSets)
-
-
-def part(signals: Chosen, first: int, last: int) -> Chosen:
-    """Signals number `first` to `last` - 1 of a set, or of each of several, as a set."""
-
-    def rows(leaf: jax.Array) -> jax.Array:
-        return leaf[first:last] if jnp.ndim(leaf) > 0 and jnp.shape(leaf)[0] == signals.count else leaf
-
-    chosen: Chosen = jax.tree.map(rows, signals)
-    return chosen
-
-
 def _require_arrays(made: "Bumps | Spline") -> None:
     """Refuse what is made of no numbers; numbers in lists become arrays.
 
@@ -222,6 +209,56 @@ class Spline:
         before = jnp.moveaxis(jnp.cumsum(whole, axis=-1) - whole, -1, 0)[place]
         a, b, c, d = (jnp.moveaxis(p, -1, 0)[place] for p in pieces)
         return width * (before + x * (a + x * (b / 2.0 + x * (c / 3.0 + x * d / 4.0))))
+
+
+@pytree
+@dataclass(frozen=True)
+class ChosenSignals:
+    """Waveforms chosen from some sets; number 0 is no shear, the others count through the sets.
+
+    Attributes:
+        sets: the sets.
+        numbers: of the chosen waveforms, int [S].
+    """
+
+    sets: tuple[Signals, ...]
+    numbers: jax.Array
+
+    @property
+    def count(self) -> int:
+        """Number of signals S."""
+        return int(self.numbers.shape[0])
+
+    def shear(self, u: jax.Array) -> jax.Array:
+        """I_s(u), [..., S]."""
+        return self._chosen([one.shear(u) for one in self.sets], u)
+
+    def integral(self, u: jax.Array) -> jax.Array:
+        """J_s(u), [..., S]."""
+        return self._chosen([one.integral(u) for one in self.sets], u)
+
+    def _chosen(self, values: list[jax.Array], u: jax.Array) -> jax.Array:
+        return jnp.concatenate([jnp.zeros((*u.shape, 1)), *values], axis=-1)[..., self.numbers]
+
+
+Chosen = TypeVar("Chosen", bound=Signals | SignalSets)
+
+
+def part(signals: Chosen, first: int, last: int) -> Chosen:
+    """Signals number `first` to `last` - 1 of a set, or of each of several, as a set.
+
+    Only of our own sets is it known which arrays have a row for each signal.
+    """
+    one: Any = signals
+    if isinstance(one, SignalSets):
+        one = SignalSets(tuple(part(each, first, last) for each in one.sets), one.names)
+    elif type(one) in (Bumps, Spline):
+        count = one.count
+        one = jax.tree.map(lambda leaf: leaf[first:last] if jnp.shape(leaf)[:1] == (count,) else leaf, one)
+    else:
+        one = ChosenSignals((one,), jnp.arange(first + 1, last + 1))
+    chosen: Chosen = one
+    return chosen
 
 
 @usual_rules()

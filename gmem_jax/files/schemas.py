@@ -187,7 +187,7 @@ def declared_of_recall(reads: int, channels: int, *, own_steps: bool = False) ->
 
 
 _RUN = {
-    "seconds": Array("real", (), "s", "wall time of the run"),
+    "seconds": Array("real", (), "s", "wall time of the call that finished the run"),
     "status": Array("whole", (), "1", "0: nothing broke; what is doubtful a recall says"),
 }
 _MADE = {**_RUN, "configuration": Array("object", (), "", _CONFIGURATION["configuration"])}

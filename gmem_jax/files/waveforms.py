@@ -266,7 +266,10 @@ def _one_set(
         return words(int(length), **shape)
     if Path(name).suffix.lower() not in (".csv", ".npy"):
         raise ValueError(f'--signals {name}: must be "six", "words:L" or a .csv or .npy file')
-    return waveform(load_waveforms(Path(name), told=told, **done))
+    made = waveform(load_waveforms(Path(name), told=told, **done))
+    if Path(name).suffix.lower() == ".csv" and load_target(Path(name)) is not None:
+        told(f"{name}: designed to be recalled as others; gmem recall compares with these too, all else with its own J")
+    return made
 
 
 def waveforms_of(values: Mapping[str, Any]) -> tuple[Any, ...]:

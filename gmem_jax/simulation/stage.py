@@ -206,6 +206,11 @@ class Stage:
             refuse(f"its drag must be in [0, inf), got {self.drag}")
         if self.role == "write" and not self.drives:
             refuse("it writes no waveform; give it drives, or another role")
+        written = [drive.channel for drive in self.own if drive.channel]
+        if self.role == "write" and len(written) > len(set(written)):
+            refuse(
+                "it writes two sets of waveforms on one channel, and a recall is compared with one; add them up in one"
+            )
         if self.of is not None and self.role != "read":
             refuse("only a stage that reads is compared with another")
         if self.role == "read" and not self.recorded:

@@ -1,6 +1,7 @@
 """The `gmem` command as a user meets it: results, JSON, and one clear line for every kind of bad input."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -37,7 +38,8 @@ def test_help_and_info_work(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
 @pytest.mark.parametrize("command", [["-m", "gmem_jax"], ["-c", "from gmem_jax.command.app import main; main()"]])
 def test_the_version_is_told(command: list[str]) -> None:
-    done = subprocess.run([sys.executable, *command, "--version"], capture_output=True, text=True)
+    unknown = {**os.environ, "COLUMNS": "0"}  # as in some terminals and containers
+    done = subprocess.run([sys.executable, *command, "--version"], capture_output=True, text=True, env=unknown)
     assert (done.returncode, done.stdout) == (0, f"gmem-jax {metadata.version('gmem-jax')}\n")
 
 
@@ -177,6 +179,18 @@ def test_recalled_words_are_classified_and_the_nets_are_used_again(
     assert "nearest template" in capsys.readouterr().out
 
 
+def test_an_interrupted_training_says_where_it_goes_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, one_bit: Path
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gmem_jax.reading.training.train_net", interrupted)
+    nets = tmp_path / "nets"
+    assert gmem(monkeypatch, "classify", one_bit, "-o", tmp_path / "read.json", "--nets", nets) == 130
+    assert f"the same command goes on with the nets in {nets}" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_recall_that_holds_no_words_cannot_be_classified(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:
@@ -263,6 +277,10 @@ BAD = [
         "--signals words:13: words need a length from 1 to 12",
     ),
     (["recall", "{pack}", "--signals", "words", "-o", "{out}"], "words need a length from 1 to 12, as in words:3"),
+    (["design", "{pack}", "--by", "kernel", "--start", "six"], "--start six: is no file of waveforms"),
+    (["tune", "{pack},", "-o", "{json}"], "no pack is named beside a comma"),
+    (["reproduce", "fig08", "-o", "/proc/rep"], "--output /proc/rep: cannot write there"),
+    (["reproduce", "fig08", "-o", "x" * 252], "cannot write there (File name too long)"),
     (["classify", "{pack}", "-o", "{json}"], "this is a pack; a recall is needed"),
     (["classify", "{truncated.h5}", "-o", "{json}"], "its checksum does not fit its content"),
     (["classify", "nothing.h5", "-o", "{json}"], "nothing.h5: no such file"),

@@ -141,7 +141,14 @@ def test_a_recall_of_designed_waveforms_is_compared_with_their_target_too(
     np.testing.assert_allclose(recall.shear, np.asarray(own.shear(recall.u)).T, atol=1e-15)
     assert gmem(monkeypatch, "show", out) == 0
     assert "target of their design" in capsys.readouterr().out
-    gm.save_waveforms(waves, own, gm.words(1))
+    # All else compares with their own J, and says so; a design of them would be of a J that nobody wants.
     capsys.readouterr()
+    assert (
+        gmem(monkeypatch, "gradient", PACK, "--signals", waves, "-o", tmp_path / "g.json", *SHORT, "--no-picture") == 0
+    )
+    assert "designed to be recalled as others" in capsys.readouterr().err
+    assert gmem(monkeypatch, "design", PACK, "--signals", waves, "-o", tmp_path / "d.csv", *SHORT) == 2
+    assert "--start goes on from them" in capsys.readouterr().err
+    gm.save_waveforms(waves, own, gm.words(1))
     assert gmem(monkeypatch, "recall", PACK, "-o", tmp_path / "no.h5", "--signals", waves, *SHORT) == 2
     assert "its target has 2 signals, must have 6" in capsys.readouterr().err

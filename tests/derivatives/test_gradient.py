@@ -101,6 +101,24 @@ def test_the_exact_jacobian_agrees_with_central_differences(
     assert miss["all"] < 1e-2
 
 
+@pytest.mark.parametrize(
+    "stages", [(gm.write(z="xy"), gm.read()), (gm.write(), gm.compress(0.0), gm.read(to=0.75, length=0.5))]
+)
+def test_the_jacobian_is_of_what_the_protocol_reads(experiment: gm.Experiment, stages: tuple[gm.Stage, ...]) -> None:
+    """On another channel, and upwards in another time over a part of u."""
+    protocol = gm.Protocol(gm.cycle(0.1, 0.1), *stages)
+    one = gm.Experiment(experiment.pack, experiment.signals, experiment.friction, protocol=protocol, t0=75.0, dt=0.3)
+    found = jacobian.exact(one, progress=False)
+    for name in ("mu", "stiffness"):
+        path, step = f"friction.{name}", 1e-6
+        up, down = (run(gm.replace(one, {path: value_at(one, path) + sign * step})).p_sig for sign in (1.0, -1.0))
+        slope = np.asarray(up - down)[0] / (2.0 * step)
+        miss = found.p_sig[found.names.index(name)] - slope
+        assert np.linalg.norm(miss) < 0.02 * np.linalg.norm(slope), name  # contacts that begin to slide inside the step
+    with pytest.raises(ValueError, match="one read and one channel"):
+        jacobian.exact(gm.replace(one, protocol=gm.Protocol(gm.write(), gm.read("a"), gm.write(), gm.read("b"))))
+
+
 @pytest.mark.slow
 def test_the_jacobian_by_gamma0_follows_from_that_by_the_amplitudes(exact: jacobian.Jacobian) -> None:
     # Only the product gamma0 a_k enters: gamma0 dp/dgamma0 = sum_k a_k dp/da_k, to round-off.

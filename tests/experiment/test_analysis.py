@@ -76,6 +76,9 @@ def test_a_running_mean_over_one_period_removes_it_and_keeps_a_line() -> None:
 def test_a_running_mean_of_one_bin_changes_nothing() -> None:
     series = jnp.asarray([[1.0, 5.0, 2.0, 8.0]])
     np.testing.assert_allclose(analysis.running_mean(series, 1.0), series, rtol=1e-15)
+    for width in (0.0, -2.0, jnp.asarray([1.0, float("nan")])):
+        with pytest.raises(ValueError, match="needs a width above 0"):
+            analysis.running_mean(series, width)
 
 
 @pytest.mark.parametrize("width", [0.5, 1.0, 2.5, 4.3, 6.9, 40.0])

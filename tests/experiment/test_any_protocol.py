@@ -16,6 +16,7 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.protocols import memory_protocol
 from gmem_jax.experiment.readings import placed, rates_of
 from gmem_jax.experiment.record import key_of_run
+from gmem_jax.experiment.signals import bin_average
 from gmem_jax.files.measures import of_each
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.protocol import Protocol
@@ -85,6 +86,10 @@ def test_what_makes_no_protocol_is_refused(reason: str, stages: tuple[Any, ...])
         ({"stop": 1.2}, r"u must be in \[0, 1\], and its stop is 1.2"),
         ({"stop": "stay"}, r"u must be in \[0, 1\], and its stop is stay"),
         ({"role": "write"}, "it writes no waveform"),
+        (
+            {"role": "write", "drives": [gm.Drive("xy", "xy"), gm.Drive("xy", "b")]},
+            "two sets of waveforms on one channel",
+        ),
         ({"along": "x"}, "along must be one of u, time"),
         ({"drag": -1.0}, r"drag must be in \[0, inf\)"),
         ({"pressure": (0.0, None, None)}, "three numbers above 0 or none"),
@@ -378,6 +383,22 @@ def test_reads_of_several_lengths_have_a_window_each() -> None:
 def test_a_kernel_is_measured_with_sub0() -> None:
     with pytest.raises(ValueError, match="with 'sub2' silence has a recall"):
         gm.memory_kernel(experiment(gm.protocols.paper_twice_read(), background="sub2"), n=2, width=0.6)
+
+
+def test_a_kernel_is_that_of_the_shear_that_the_stage_writes_and_of_the_bins_that_are_read() -> None:
+    def measured(amplitude: float, gamma0: float, read: gm.Stage) -> gm.MemoryKernel:
+        protocol = gm.Protocol(gm.cycle(), gm.write(amplitude=amplitude), read)
+        return gm.memory_kernel(experiment(protocol, gamma0=gamma0), n=2, width=0.6, progress=False)
+
+    whole, half = measured(1.0, 1e-3, gm.read()), measured(0.5, 2e-3, gm.read())  # the same shear
+    np.testing.assert_allclose(half.kernel(), whole.kernel(), rtol=1e-9, atol=1e-12)
+    assert half.gain() == pytest.approx(whole.gain(), rel=1e-9)
+    # A read of half of u is compared with J there.
+    partly = measured(1.0, 1e-3, gm.read(to=0.5, length=0.5))
+    J = np.where(np.arange(256) < 128, 0.0, bin_average(partly.basis))
+    expected = np.sum(J * partly.odd) / np.sum(J * J) / (float(PACK.delta0) * 1e-3)
+    assert partly.gain() == pytest.approx(expected, rel=1e-9)
+    assert not partly.odd[:, :127].any()
 
 
 def test_kernels_of_two_channels_hold_what_each_says_of_the_other() -> None:

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 
 from gmem_jax.experiment.record import names_of, signals_to_dict
-from gmem_jax.experiment.signals import Bumps, bin_average, bit_width, part, six_signals, waveform, word_bits, words
+from gmem_jax.experiment.signals import (
+    Bumps,
+    bin_average,
+    bit_width,
+    part,
+    sets_of,
+    signals,
+    six_signals,
+    waveform,
+    word_bits,
+    words,
+)
 
 SIX = six_signals()
 SHEAR = jax.jit(lambda signals, u: signals.shear(u))
@@ -259,3 +270,34 @@ def test_what_made_waveforms_is_no_part_of_what_programs_are_compiled_for():
     program = jax.jit(lambda signals: seen.append(signals) or signals.shear(FINE[:3]))
     np.testing.assert_array_equal(program(own), program(SIX))
     assert len(seen) == 1
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """Waveforms of one's own: [n, S] factors of n sines, and as many numbers that are no signals'."""
+
+    factors: jax.Array
+    shares: jax.Array
+
+    @property
+    def count(self) -> int:
+        return self.factors.shape[1]
+
+    def shear(self, u):
+        waves = jnp.sin(jnp.pi * (1.0 + jnp.arange(len(self.shares))) * u[..., None])
+        return (self.shares * waves) @ self.factors
+
+    def integral(self, u):
+        k = jnp.pi * (1.0 + jnp.arange(len(self.shares)))
+        return (self.shares * (1.0 - jnp.cos(k * u[..., None])) / k) @ self.factors
+
+
+def test_a_part_of_waveforms_of_one_s_own_has_their_numbers():
+    own, u = Series(jnp.arange(9.0).reshape(3, 3), jnp.asarray([1.0, 0.5, 0.2])), jnp.linspace(0.0, 1.0, 7)
+    for whole in (own, six_signals(), waveform(np.ones((3, 4))), signals(xy=own, z=waveform(np.ones((3, 4))))):
+        few = part(whole, 1, 3)
+        assert few.count == 2
+        for name, one in sets_of(whole).items():
+            np.testing.assert_array_equal(sets_of(few)[name].shear(u), one.shear(u)[:, 1:3])
+            np.testing.assert_array_equal(sets_of(few)[name].integral(u), one.integral(u)[:, 1:3])

@@ -129,7 +129,7 @@ def test_a_json_result_says_what_its_fields_are_and_what_is_none_is_refused(tmp_
     path = tmp_path / "gradient.json"
     save_result(path, schemas.GRADIENT, result)
     stored = json.loads(path.read_text())
-    assert stored["about"]["seconds"] == "wall time of the run (s)"
+    assert stored["about"]["seconds"] == "wall time of the call that finished the run (s)"
     schema, again = load_result(path)
     assert (schema, again["gradient"]["waveform"][1]) == (schemas.GRADIENT, [2.0, None])
     for change, words in (

@@ -408,7 +408,7 @@ def counted(simulation: Simulation, state: State) -> jax.Array:
 def test_observers_are_named_by_themselves_or_by_a_mapping() -> None:
     ready = observables.sliding()
     listed = gm.Experiment(PACK, ONE, observe=[ready, ("count", counted)])
-    assert listed.observe == (("sliding", ready), ("count", counted))
+    assert listed.observe == (("count", counted), ("sliding", ready))  # as files have them
     assert listed == gm.Experiment(PACK, ONE, observe={"sliding": observables.sliding(), "count": counted})
     assert describe(listed, 0.0)["observed"] == {"sliding": {"units": "1", "words": ready.words}}
     own = observables.Observable("count", "1", "grains on the right", counted)
