@@ -1425,6 +1425,27 @@ MUTATIONS = (
         "test_the_command_by_itself_reports_what_depends_on_its_rules",
     ),
     mutation(
+        "key-without-what-a-decorator-adds",
+        "experiment/identity.py",
+        'hasattr(value, "__wrapped__") and not _is_own_function(value)',
+        'hasattr(value, "__wrapped__")',
+        "test_what_holds_or_wraps_the_code_of_the_users_own_is_told_by_it[what a decorator adds]",
+    ),
+    mutation(
+        "key-without-the-class-of-a-tuple",
+        "experiment/identity.py",
+        "isinstance(value, _PLAIN + _HOLDING)",
+        "isinstance(value, _PLAIN)",
+        "test_what_holds_or_wraps_the_code_of_the_users_own_is_told_by_it[a named tuple]",
+    ),
+    mutation(
+        "kernel-in-a-set-called-xy",
+        "design/kernel.py",
+        "signals(**{one: loud if one == name else silent for one in experiment.sets})",
+        "loud",
+        "test_a_kernel_and_a_design_are_of_a_set_of_any_name",
+    ),
+    mutation(
         "one-window-for-all-reads",
         "experiment/readings.py",
         "window * self.rates",

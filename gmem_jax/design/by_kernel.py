@@ -24,7 +24,7 @@ from gmem_jax.design.waveforms import (
     verified,
 )
 from gmem_jax.experiment.arguments import require_kind
-from gmem_jax.experiment.changes import replace
+from gmem_jax.experiment.changes import with_signals
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.run import PREFIX, prefix_of, run
 from gmem_jax.experiment.signals import Signals, Spline
@@ -124,14 +124,14 @@ def design_by_kernel(
     refuse_several_scales(experiment)
     if len(written_sets(experiment)) > 1:
         raise ValueError("a design by one kernel is of one channel; gm.design_waveforms designs several together")
+    count = experiment.waveforms.count
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)
     measured = require_whole("measured", measured)
     require_numbers(width=width, gain=gain, damping=damping)
     require_gain(gain)
-    if start is not None and start.count != experiment.signals.count:
+    if start is not None and start.count != count:
         raise ValueError(
-            f"{plural(start.count, 'waveform')} to start from, for {plural(experiment.signals.count, 'signal')}; "
-            "give one for each"
+            f"{plural(start.count, 'waveform')} to start from, for {plural(count, 'signal')}; give one for each"
         )
     if kernel is not None:
         refuse_another_drive(kernel, experiment)
@@ -179,7 +179,7 @@ def design_by_kernel(
         """As they are written in the end: at slow rates even the cubics between samples are seen in F."""
         return sampled(bumps(rows, width))
 
-    best, p_sig = amplitudes, recall("trial-0", replace(experiment, signals=made(amplitudes)))
+    best, p_sig = amplitudes, recall("trial-0", with_signals(experiment, made(amplitudes)))
     first = experiment.compare(jnp.asarray(p_sig))
     history = [float(original.fidelity), float(first.fidelity)]
     wanted = (float(first.gain) if gain is None else gain) * float(experiment.scale) * target
@@ -198,7 +198,7 @@ def design_by_kernel(
             whose = np.repeat(np.arange(len(best)), share)
             steps = np.concatenate([far[one, :count, None] * strongest[:count] for one, count in enumerate(share)])
             probes = bounded(best[whose] + steps, width)
-            changes = recall(f"slopes-{iteration}", replace(experiment, signals=made(probes)), measured) - p_sig[whose]
+            changes = recall(f"slopes-{iteration}", with_signals(experiment, made(probes)), measured) - p_sig[whose]
             steps = probes - best[whose]
             for one in np.unique(whose):
                 mine, foreseen = whose == one, slopes(kernel, best)[one]
@@ -206,7 +206,7 @@ def design_by_kernel(
             damped = np.minimum(damped, firm)
         slope = slopes(kernel, best) + learned
         tried = bounded(best + correction(slope, wanted - p_sig, damped), width)
-        found = recall(f"trial-{iteration}", replace(experiment, signals=made(tried)))
+        found = recall(f"trial-{iteration}", with_signals(experiment, made(tried)))
         step = tried - best
         unforeseen = found - p_sig - np.einsum("sn,snu->su", step, slope)
         length = np.maximum(np.sum(step**2, axis=1), SHORTEST**2)
@@ -216,5 +216,5 @@ def design_by_kernel(
         damped = damped * np.where(better, EASED, FIRMED)[:, None]
         history.append(float(experiment.compare(jnp.asarray(p_sig)).fidelity))
     signals = made(best)
-    fresh = recall("verified", replace(experiment, signals=signals))
+    fresh = recall("verified", with_signals(experiment, signals))
     return verified(experiment, {name: signals for name in experiment.sets}, fresh, untouched, history)

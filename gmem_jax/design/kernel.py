@@ -185,9 +185,9 @@ def memory_kernel(
     """
     require_kind("memory_kernel", experiment, Experiment)
     tell, both = callback(progress), _basis(experiment, n, width)
-    wanted = replace(experiment, signals=both)
-    if len(wanted.readings.reads) * len(wanted.readings.channels) > 1:
+    if len(experiment.readings.reads) * len(experiment.readings.channels) > 1:
         raise ValueError("a kernel is of one read and one channel; gm.kernel_matrix measures those of several channels")
+    wanted = _writing_alone(experiment, written_sets(experiment)[0], both)
     p_sig = np.asarray(run(wanted, prefix=prefix, cache=cache.scoped("basis"), progress=tell).p_sig)
     return _kernel_of(wanted, both, p_sig, wanted.readings.channels[0])
 
@@ -261,15 +261,19 @@ def kernel_matrix(
     require_kind("kernel_matrix", experiment, Experiment)
     channels, written = experiment.readings.channels, written_sets(experiment)
     loud = _basis(experiment, n, width)
-    silent = bumps(jnp.zeros_like(loud.amplitudes), width)
     tell, columns = callback(progress), []
     for number, channel in enumerate(channels):
-        alone = {name: loud if name == written[number] else silent for name in experiment.sets}
-        one = replace(experiment, signals=signals(**alone))
+        one = _writing_alone(experiment, written[number], loud)
         share = within(tell, number / len(channels), (number + 1) / len(channels))
         recall = run(one, cache=cache.scoped(f"basis-{channel}"), progress=share)
         columns.append([_kernel_of(one, loud, np.asarray(recall.at(channel=name).p_sig), channel) for name in channels])
     return KernelMatrix(channels, tuple(zip(*columns, strict=True)))
+
+
+def _writing_alone(experiment: Experiment, name: str, loud: Bumps) -> Experiment:
+    """The same experiment with these waveforms in the place of the set of a name, and silence in that of others."""
+    silent = bumps(jnp.zeros_like(loud.amplitudes), float(loud.width))
+    return replace(experiment, signals=signals(**{one: loud if one == name else silent for one in experiment.sets}))
 
 
 def written_sets(experiment: Experiment) -> tuple[str, ...]:

@@ -81,8 +81,10 @@ class Design:
 
 def largest(amplitudes: np.ndarray, width: float) -> np.ndarray:
     """Largest |I| of waveforms [S, n], [S]."""
-    v = (jnp.arange(QUADRATURE_POINTS) + 0.5) / QUADRATURE_POINTS
-    found: np.ndarray = np.max(np.abs(np.asarray(bumps(amplitudes, width).shear(v))), axis=0)
+    made = bumps(amplitudes, width)
+    kinks = jnp.concatenate([made.centres[0] - 0.5 * width, made.centres[0] + 0.5 * width])
+    v = jnp.concatenate([(jnp.arange(QUADRATURE_POINTS) + 0.5) / QUADRATURE_POINTS, kinks])
+    found: np.ndarray = np.max(np.abs(np.asarray(made.shear(v))), axis=0)
     return found
 
 

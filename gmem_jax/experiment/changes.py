@@ -8,7 +8,7 @@ from typing import Any
 
 from gmem_jax.experiment.arguments import require_kind, require_once
 from gmem_jax.experiment.experiment import Experiment
-from gmem_jax.experiment.signals import SignalSets, part, sets_of
+from gmem_jax.experiment.signals import Signals, SignalSets, part, sets_of, signals
 from gmem_jax.physics.pytree import traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import Protocol
@@ -51,6 +51,12 @@ def with_part(experiment: Experiment, first: int, last: int) -> Experiment:
     few = copy.copy(experiment)
     object.__setattr__(few, "signals", part(experiment.signals, first, last))
     return few
+
+
+def with_signals(experiment: Experiment, waveforms: Signals) -> Experiment:
+    """The same experiment with other waveforms in its one set, whatever its name."""
+    (name,) = experiment.sets
+    return replace(experiment, signals=signals(**{name: waveforms}))
 
 
 def _with(tree: Any, path: list[str], value: Any) -> Any:

@@ -255,10 +255,10 @@ class Experiment:
         Raises:
             ValueError: if it has several.
         """
-        if isinstance(self.signals, SignalSets):
-            names = ", ".join(self.signals.names)
-            raise ValueError(f"this works with one set of waveforms, and the experiment has {names}")
-        return self.signals
+        if len(self.sets) > 1:
+            raise ValueError(f"this works with one set of waveforms, and the experiment has {', '.join(self.sets)}")
+        (one,) = self.sets.values()
+        return one
 
     @property
     def readings(self) -> Readings:

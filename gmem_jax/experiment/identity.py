@@ -20,6 +20,8 @@ import numpy as np
 _INSTALLED = tuple({*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), str(Path(__file__).parents[1])})
 """Folders whose code is told by its name: versions and sources are in keys already."""
 _PLAIN = (str, bytes, int, float, complex, range, slice, Enum, PurePath, np.dtype)
+_HOLDING = (list, tuple, set, frozenset, Mapping)
+_OF_NO_WEIGHT = ("__repr__", "__str__", "__annotate__", "__annotate_func__", "__class__")
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
 
 
@@ -37,9 +39,9 @@ def fingerprint(tree: Any) -> str:
 def identity(value: Any) -> str:
     """SHA-256 of an object: its numbers, and the code of its class or of the function that it is.
 
-    Of code it is the byte code, its constants, what it closes over, its defaults, and what it names of its module, down
-    to functions called from there. Code of installed packages is told by its name. Another version of Python has other
-    byte code. What an object reads elsewhere, as in a file, is not seen.
+    Of code it is the byte code, its constants, what it closes over, its defaults, and what it names of its module and
+    of others that are not installed, down to functions called from there. Code of installed packages is told by its
+    name. Another version of Python has other byte code. What an object reads elsewhere, as in a file, is not seen.
     """
     digest = hashlib.sha256()
     for part in _parts(value, {}):
@@ -57,6 +59,8 @@ def form(tree: Any) -> str:
 
 def _parts(value: Any, seen: dict[int, Any]) -> Iterator[str]:
     """What makes an object, in words; `seen` has what is told already, and keeps it, since an id is used again."""
+    if not isinstance(value, type) and not _is_installed_type(type(value)) and isinstance(value, _PLAIN + _HOLDING):
+        yield from _parts(type(value), seen)  # as of a NamedTuple, or of a kind of number
     if isinstance(value, _PLAIN) or value is None:
         yield f"{type(value).__name__} {value!r}"
     elif isinstance(value, _ARRAYS):
@@ -84,16 +88,19 @@ def _parts_of_code(value: Any, seen: dict[int, Any]) -> Iterator[str]:
         yield from _parts((value.__func__, value.__self__), seen)
     elif isinstance(value, property):  # Python 3.13 gives it a name
         yield from _parts(value.fget, seen)
-    elif hasattr(value, "__wrapped__"):  # as of jax.jit and staticmethod
-        yield from _parts(value.__wrapped__, seen)
+    elif hasattr(value, "__wrapped__") and not _is_own_function(value):  # as of jax.jit and staticmethod
+        inner, held = value.__wrapped__, getattr(value, "__dict__", {}).items()
+        yield from _parts(inner, seen)
+        if more := {name: each for name, each in held if _is_own_function(each) and each is not inner}:
+            yield from _parts(more, seen)  # a derivative of its own, say
     elif name := getattr(value, "__qualname__", getattr(value, "__name__", "")):
         yield f"{getattr(value, '__module__', '')}.{name}"
-        if isinstance(value, FunctionType) and not _is_installed(value.__code__.co_filename):
+        if _is_own_function(value):
             closed = [cell.cell_contents for cell in value.__closure__ or ()]
             parts = (value.__code__, value.__defaults__, value.__kwdefaults__, closed, _named(value))
             yield from _parts(parts, seen)
         elif isinstance(value, type) and not _is_installed_type(value):
-            yield from _parts({name: each for name, each in vars(value).items() if _is_own(name)}, seen)
+            yield from _parts({name: each for name, each in vars(value).items() if _is_own(name, each)}, seen)
             yield from _parts(value.__bases__, seen)
     else:
         yield from _parts(type(value), seen)
@@ -112,18 +119,23 @@ def _held(value: Any) -> Any:
     return made if isinstance(made, str) else made[1:3]
 
 
-def _is_own(name: str) -> bool:
-    """Whether an attribute of a class is one that its author wrote."""
-    return not name.startswith("__") or name in ("__call__", "__init__", "__post_init__", "__getattr__")
+def _is_own(name: str, value: Any) -> bool:
+    """Whether an attribute of a class is one that its author wrote, and that what it gives depends on."""
+    return not (name.startswith("__") and name.endswith("__")) or (callable(value) and name not in _OF_NO_WEIGHT)
 
 
 def _named(function: FunctionType) -> dict[str, Any]:
-    """What a function names of its module, and of modules there that are not installed."""
-    names = _names(function.__code__)
-    found = {name: function.__globals__[name] for name in names if name in function.__globals__}
-    for name, each in list(found.items()):
+    """What a function names of its module, and of modules that are not installed, however deep in packages."""
+    names, package = _names(function.__code__), function.__globals__.get("__package__")
+    imported = {name: sys.modules.get(name) or sys.modules.get(f"{package}.{name}") for name in names}
+    found = {name: module for name, module in imported.items() if module is not None}
+    found |= {name: function.__globals__[name] for name in names if name in function.__globals__}
+    modules = list(found.items())
+    for name, each in modules:  # which grows
         if isinstance(each, ModuleType) and not _is_installed(_file(each)):
-            found |= {f"{name}.{of}": vars(each)[of] for of in names if of in vars(each)}
+            within = {f"{name}.{of}": vars(each)[of] for of in names if of in vars(each)}
+            modules += [(of, one) for of, one in within.items() if of not in found]
+            found |= within
     return found
 
 
@@ -131,6 +143,10 @@ def _names(code: CodeType) -> set[str]:
     """The names that code looks up, its inner functions included."""
     inner = (_names(each) for each in code.co_consts if isinstance(each, CodeType))
     return set(code.co_names).union(*inner)
+
+
+def _is_own_function(value: Any) -> bool:
+    return isinstance(value, FunctionType) and not _is_installed(value.__code__.co_filename)
 
 
 def _is_installed(file: str) -> bool:

@@ -74,7 +74,8 @@ def law_to_dict(law: FrictionLaw) -> dict[str, Any]:
 def to_dict(experiment: Experiment) -> dict[str, Any]:
     """An experiment as JSON: every field, the pack by its source and content.
 
-    `files.configuration.from_dict` makes the same experiment of it.
+    `files.configuration.from_dict` makes the same experiment of it, if law and waveforms are the library's: those of
+    the user's own are told by the name of their class, waveforms by their hash too.
     """
     require_kind("to_dict", experiment, Experiment)
     pack = experiment.pack

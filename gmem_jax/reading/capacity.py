@@ -7,16 +7,16 @@ the 256 bins of p_sig, of one standard deviation. Between the two bounds lies wh
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.design.kernel import KernelMatrix, MemoryKernel
+from gmem_jax.design.waveforms import bounded
 from gmem_jax.experiment.signals import word_bits
+from gmem_jax.physics.numbers import require_whole
 from gmem_jax.reading.readers import linear_decoder
 from gmem_jax.simulation.stage import BINS
 
 BOOTSTRAP = 400  # samples of the words for an error bar
-POINTS = 512  # of v where waveforms are held to their bound
 
 
 class Decoded(NamedTuple):
@@ -58,12 +58,15 @@ def decoded_bits(signals: jax.typing.ArrayLike, noise: float, *, draws: int = 4,
         seed: of the noise and of the decoder's splits.
 
     Raises:
-        ValueError: if these are not 2^L signals, or the noise is below 0.
+        ValueError: if these are not 2^L signals, the noise is no number from 0, or there are no draws.
     """
     values = np.asarray(signals, dtype=float)
     bits = len(values).bit_length() - 1
-    if len(values) != 2**bits:
-        raise ValueError(f"all words of one length are 2, 4, 8, ... signals, got {len(values)}")
+    if values.ndim != 2 or len(values) != 2**bits or not bits:
+        raise ValueError(f"all words of one length are 2, 4, 8, ... signals [2^L, 256], got {list(values.shape)}")
+    if not 0.0 <= noise < np.inf:
+        raise ValueError(f"noise must be a number from 0, got {noise:g}")
+    draws = require_whole("draws", draws, 1)
     truth, generator = word_bits(bits), np.random.default_rng(seed)
     read = np.zeros(truth.shape)
     for draw in range(draws):
@@ -120,8 +123,8 @@ def water_filled(ratio: np.ndarray, power: float) -> np.ndarray:
     with np.errstate(divide="ignore"):
         bottom = 1.0 / ratio
     level = (power + np.cumsum(bottom)) / np.arange(1, len(bottom) + 1)  # of the water, if so many channels are wet
-    wet = np.flatnonzero(level > bottom)[-1]
-    return np.asarray(np.maximum(0.0, level[wet] - bottom))
+    wet = np.flatnonzero(level > bottom)
+    return np.asarray(np.maximum(0.0, level[wet[-1]] - bottom)) if wet.size else np.zeros(len(bottom))
 
 
 def candidates(kernel: MemoryKernel, count: int, *, seed: int = 0) -> np.ndarray:
@@ -134,8 +137,7 @@ def candidates(kernel: MemoryKernel, count: int, *, seed: int = 0) -> np.ndarray
     level = generator.choice([-1.0, 0.0, 1.0], (count, n))
     anew = generator.random((count, n)) < generator.random((count, 1))
     held = np.take_along_axis(level, np.maximum.accumulate(np.where(anew, np.arange(n), 0), axis=1), axis=1)
-    shapes = np.asarray(kernel.basis.shear((jnp.arange(POINTS) + 0.5) / POINTS))
-    return np.asarray(held / np.maximum(1.0, np.abs(held @ shapes.T).max(axis=1, keepdims=True)))
+    return bounded(held, kernel.width)
 
 
 def greedy_alphabet(recalls: jax.typing.ArrayLike, size: int) -> Alphabet:
@@ -165,7 +167,13 @@ def greedy_alphabet(recalls: jax.typing.ArrayLike, size: int) -> Alphabet:
 
 
 def smallest_distance(recalls: jax.typing.ArrayLike) -> float:
-    """Distance of the two nearest recalls [S, 256], as in `Alphabet`."""
+    """Distance of the two nearest recalls [S, 256], as in `Alphabet`.
+
+    Raises:
+        ValueError: if there are not two.
+    """
     values = np.asarray(recalls, dtype=float)
+    if len(values) < 2:
+        raise ValueError(f"the nearest of several recalls: there must be two at least, got {len(values)}")
     pairs = (np.mean((values[row + 1 :] - values[row]) ** 2, axis=1).min() for row in range(len(values) - 1))
     return float(np.sqrt(min(pairs)))

@@ -401,6 +401,20 @@ def test_a_kernel_is_that_of_the_shear_that_the_stage_writes_and_of_the_bins_tha
     assert not partly.odd[:, :127].any()
 
 
+def test_a_kernel_and_a_design_are_of_a_set_of_any_name() -> None:
+    protocol = gm.Protocol(gm.write(xy="mine"), gm.hold(0.1), gm.read())
+    mine, plain = experiment(protocol, gm.signals(mine=ONE)), experiment(READ)
+    kernels = [gm.memory_kernel(one, n=2, width=0.6, progress=False) for one in (mine, plain)]
+    np.testing.assert_array_equal(kernels[0].odd, kernels[1].odd)
+    designs = [
+        gm.design_by_kernel(one, kernel=kernel, iterations=1, progress=False)
+        for one, kernel in zip((mine, plain), kernels, strict=True)
+    ]
+    assert designs[0].fidelity == designs[1].fidelity
+    with pytest.raises(ValueError, match="works with one set of waveforms"):
+        gm.design_by_kernel(experiment(protocol, gm.signals(mine=ONE, other=OTHER)), iterations=1)
+
+
 def test_kernels_of_two_channels_hold_what_each_says_of_the_other() -> None:
     one = experiment(None, gm.signals(xy=ONE, z=OTHER), store=0.1)
     matrix = gm.kernel_matrix(one, n=2, width=0.6, progress=False)

@@ -122,6 +122,85 @@ def test_what_other_libraries_wrap_is_looked_into(tmp_path: Path) -> None:
     assert found[0] != found[1]
 
 
+HELD = {
+    "what a decorator adds": """
+import functools
+def scaled(f):
+    @functools.wraps(f)
+    def inner(self, x):
+        return K * f(self, x)
+    return inner
+class Own:
+    @scaled
+    def __call__(self, x):
+        return x
+one = Own()""",
+    "a named tuple": """
+from typing import NamedTuple
+class Own(NamedTuple):
+    amplitude: float
+    def shear(self, u):
+        return K * u
+one = Own(1.0)""",
+    "a kind of number": """
+class Own(float):
+    def __mul__(self, other):
+        return K * float(self) * other
+one = {"factor": Own(1.0)}""",
+    "a choice": """
+from enum import Enum
+class Own(Enum):
+    FIRST = 1
+    def force(self, x):
+        return K * x
+one = [Own.FIRST]""",
+    "an operator": """
+class Own:
+    def __mul__(self, other):
+        return K * other
+class Law:
+    own = Own()
+    def __call__(self, x):
+        return self.own * x
+one = Law()""",
+    "a derivative of its own": """
+import jax
+@jax.custom_jvp
+def one(x):
+    return x
+@one.defjvp
+def one_jvp(x, dx):
+    return x[0], K * dx[0]""",
+}
+
+
+@pytest.mark.parametrize("source", HELD.values(), ids=HELD)
+def test_what_holds_or_wraps_the_code_of_the_users_own_is_told_by_it(source: str) -> None:
+    def made(k: str) -> str:
+        names: dict[str, Any] = {"__name__": "laws"}
+        exec(compile(source.replace("K", k), "laws.py", "exec"), names)
+        return identity(names["one"])
+
+    assert made("2.0") == made("2.0")
+    assert made("2.0") != made("3.0")
+
+
+@pytest.mark.parametrize("called", ["lab.helpers.k(x)", "helpers_of_lab(x)"])
+def test_code_of_modules_in_packages_is_seen(tmp_path: Path, called: str) -> None:
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "__init__.py").touch()
+    (tmp_path / "laws.py").write_text(
+        "import lab.helpers\ndef force(x):\n    from lab.helpers import k as helpers_of_lab\n    return " + called
+    )
+    say = "import laws; from gmem_jax.experiment.identity import identity; print(identity(laws.force))"
+    found = []
+    for factor in (1, 1, 20):  # of another length, so that what is compiled of the file is made anew
+        (tmp_path / "lab" / "helpers.py").write_text(f"def k(x):\n    return {factor} * x\n")
+        found.append(subprocess.run([sys.executable, "-c", say], cwd=tmp_path, capture_output=True, text=True).stdout)
+    assert len(found[0]) == 65
+    assert found[0] == found[1] != found[2]
+
+
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Chirps:
