@@ -128,14 +128,15 @@ def _named(function: FunctionType) -> dict[str, Any]:
     """What a function names of its module, and of modules that are not installed, however deep in packages."""
     names, package = _names(function.__code__), function.__globals__.get("__package__")
     imported = {name: sys.modules.get(name) or sys.modules.get(f"{package}.{name}") for name in names}
-    found = {name: module for name, module in imported.items() if module is not None}
+    found = {name: module for name, module in imported.items() if _is_own_module(module)}
     found |= {name: function.__globals__[name] for name in names if name in function.__globals__}
-    modules = list(found.items())
+    modules, looked_into = list(found.items()), set()
     for name, each in modules:  # which grows
-        if isinstance(each, ModuleType) and not _is_installed(_file(each)):
-            within = {f"{name}.{of}": vars(each)[of] for of in names if of in vars(each)}
-            modules += [(of, one) for of, one in within.items() if of not in found]
-            found |= within
+        if _is_own_module(each) and id(each) not in looked_into:
+            looked_into.add(id(each))
+            within = {of: vars(each)[of] for of in names if of in vars(each)}
+            found |= {f"{name}.{of}": one for of, one in within.items()}
+            modules += within.items()
     return found
 
 
@@ -147,6 +148,15 @@ def _names(code: CodeType) -> set[str]:
 
 def _is_own_function(value: Any) -> bool:
     return isinstance(value, FunctionType) and not _is_installed(value.__code__.co_filename)
+
+
+def _is_own_module(value: Any) -> bool:
+    """Whether it is a module that lies in a file, or was made by hand, and is not installed."""
+    return (
+        isinstance(value, ModuleType)
+        and value.__name__ not in sys.builtin_module_names
+        and not _is_installed(_file(value))
+    )
 
 
 def _is_installed(file: str) -> bool:

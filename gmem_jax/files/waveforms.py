@@ -179,7 +179,9 @@ def signals_from_dict(written: Mapping[str, Any]) -> Signals:
     """
     kind = written.get("kind")
     if "sha256" in written:
-        raise ValueError(f"waveforms of a class of its own, {kind}, are told by their hash and cannot be made of it")
+        raise ValueError(
+            f"waveforms of the class {kind}, which is not the library's, are told by a hash and cannot be made from it"
+        )
     require_kinds(written)
     makers: dict[str, Callable[..., Signals]] = {**NAMED, **SIGNALS}
     if kind not in makers:

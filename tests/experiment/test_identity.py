@@ -185,7 +185,7 @@ def test_what_holds_or_wraps_the_code_of_the_users_own_is_told_by_it(source: str
     assert made("2.0") != made("3.0")
 
 
-@pytest.mark.parametrize("called", ["lab.helpers.k(x)", "helpers_of_lab(x)"])
+@pytest.mark.parametrize("called", ["lab.helpers.k(x)", "helpers_of_lab(x)", "lab.helpers.lab.helpers.k(x)"])
 def test_code_of_modules_in_packages_is_seen(tmp_path: Path, called: str) -> None:
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / "__init__.py").touch()
@@ -195,7 +195,7 @@ def test_code_of_modules_in_packages_is_seen(tmp_path: Path, called: str) -> Non
     say = "import laws; from gmem_jax.experiment.identity import identity; print(identity(laws.force))"
     found = []
     for factor in (1, 1, 20):  # of another length, so that what is compiled of the file is made anew
-        (tmp_path / "lab" / "helpers.py").write_text(f"def k(x):\n    return {factor} * x\n")
+        (tmp_path / "lab" / "helpers.py").write_text(f"import lab\ndef k(x):\n    return {factor} * x\n")
         found.append(subprocess.run([sys.executable, "-c", say], cwd=tmp_path, capture_output=True, text=True).stdout)
     assert len(found[0]) == 65
     assert found[0] == found[1] != found[2]

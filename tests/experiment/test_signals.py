@@ -20,6 +20,7 @@ from gmem_jax.experiment.signals import (
     word_bits,
     words,
 )
+from gmem_jax.files.waveforms import signals_from_dict
 
 SIX = six_signals()
 SHEAR = jax.jit(lambda signals, u: signals.shear(u))
@@ -291,6 +292,13 @@ class Series:
     def integral(self, u):
         k = jnp.pi * (1.0 + jnp.arange(len(self.shares)))
         return (self.shares * (1.0 - jnp.cos(k * u[..., None])) / k) @ self.factors
+
+
+def test_waveforms_of_one_s_own_are_told_by_a_hash_and_not_made_from_it():
+    written = signals_to_dict(Series(jnp.ones((3, 3)), jnp.ones(3)))
+    assert set(written) == {"kind", "sha256"}
+    with pytest.raises(ValueError, match="waveforms of the class Series, which is not the library's"):
+        signals_from_dict(written)
 
 
 def test_a_part_of_waveforms_of_one_s_own_has_their_numbers():
