@@ -10,7 +10,7 @@ import numpy as np
 from gmem_jax.experiment.arguments import require_kind
 from gmem_jax.experiment.changes import replace as with_changes
 from gmem_jax.experiment.experiment import USUAL_STEP, Experiment
-from gmem_jax.experiment.identity import fingerprint, form
+from gmem_jax.experiment.identity import fingerprint, identity
 from gmem_jax.experiment.record import pack_fingerprint
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
@@ -73,13 +73,8 @@ def _case(experiment: Experiment) -> tuple[tuple[Any, ...], Any]:
         law = Frictionless()
     if (row := entry_of(law)) and row.layered:
         law = replace(law, points=min(law.points, ENOUGH_RINGS))
-    parts = (law, experiment.material, experiment.compression, experiment.wall_mu)
-    return (
-        pack_fingerprint(experiment.pack),
-        fingerprint(parts),
-        form(law),
-        experiment.backend,
-    ), law
+    parts = (experiment.material, experiment.compression, experiment.wall_mu)
+    return (pack_fingerprint(experiment.pack), identity(law), fingerprint(parts), experiment.backend), law
 
 
 def _at_rest(experiment: Experiment, law: Any) -> tuple[Simulation, jax.Array, jax.Array, Box]:
