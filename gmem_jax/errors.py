@@ -1,4 +1,11 @@
-"""Every exception of the package that a caller may want to catch."""
+"""Every exception of the package that a caller may want to catch, and how it warns."""
+
+import contextlib
+import sys
+import warnings
+from pathlib import Path
+
+_PASSED_OVER = (str(Path(__file__).parent), contextlib.__file__)
 
 
 class RunFailedError(RuntimeError):
@@ -11,3 +18,11 @@ class NotAtRestError(RunFailedError):
 
 class FileFormatError(ValueError):
     """A file that is damaged, or is not what it should be."""
+
+
+def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn of the line outside of this package that led here, whatever functions and decorators lie in between."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PASSED_OVER):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)

@@ -1062,8 +1062,8 @@ MUTATIONS = (
     mutation(
         "bins-sampled",
         "experiment/signals.py",
-        "jnp.mean(signals.integral(u).reshape(bins, points, -1), axis=1).T",
-        "signals.integral(u).reshape(bins, points, -1)[:, points // 2].T",
+        "jnp.mean(signals.integral(u).reshape(BINS, POINTS, -1), axis=1).T",
+        "signals.integral(u).reshape(BINS, POINTS, -1)[:, POINTS // 2].T",
         "test_bins_hold_the_average_of_the_integral_not_its_samples",
     ),
     mutation(
@@ -1660,8 +1660,8 @@ MUTATIONS = (
     mutation(
         "step-too-large-unnoticed",
         "experiment/experiment.py",
-        "jnp.asarray(self.timing.dt) <= LARGEST_STEP)",
-        "jnp.asarray(self.timing.dt) <= 2.0 * LARGEST_STEP)",
+        "jnp.asarray(self.timing.dt) <= LONGEST_STEP)",
+        "jnp.asarray(self.timing.dt) <= 2.0 * LONGEST_STEP)",
         "test_a_step_too_large_for_a_traced_run_gives_nan_and_says_so",
     ),
     mutation(
@@ -2052,6 +2052,69 @@ MUTATIONS = (
         "if path.exists() and not force:",
         "if False:",
         "test_nothing_is_overwritten_unasked",
+    ),
+    mutation(
+        "identity-beside",
+        "experiment/identity.py",
+        'f"{folder}{os.sep}"',
+        'f"{folder}"',
+        "test_code_beside_the_package_is_the_users_own",
+    ),
+    mutation(
+        "validity-amplitude",
+        "experiment/validity.py",
+        "abs(drive.amplitude) * own",
+        "1.0 * own",
+        "test_each_doubt_is_that_of_its_replica_alone",
+    ),
+    mutation(
+        "frames-slowest",
+        "simulation/frames.py",
+        "float(dt[one] if dt.ndim else dt)",
+        "float(np.max(dt))",
+        "test_eight_devices_give_the_numbers_of_one",
+    ),
+    mutation(
+        "links-images",
+        "show/scene.py",
+        " + images_met(frames, frame)",
+        "",
+        "test_forces_through_the_faces_of_a_periodic_pack_are_along_the_nearest_images",
+    ),
+    mutation(
+        "pascals",
+        "show/stages.py",
+        "float(material.modulus) / self.pascals",
+        "1e7 / self.pascals",
+        "test_stresses_are_in_pascals_of_the_experiments_own_material",
+    ),
+    mutation(
+        "dry-run",
+        "sweeps/cost.py",
+        'SweepRunner(spec, Path(nowhere) / "sweep",',
+        "SweepRunner(spec, folder,",
+        "test_a_dry_run_makes_nothing_in_a_folder_that_is_there",
+    ),
+    mutation(
+        "sweep-lock",
+        "sweeps/sweep.py",
+        "with store.lock(job) if store else contextlib.nullcontext():",
+        "with contextlib.nullcontext():",
+        "test_parts_that_a_worker_left_do_not_stop_a_sweep_of_the_library",
+    ),
+    mutation(
+        "parts-other-batch",
+        "sweeps/work.py",
+        "restart=bool(Checkpoints.other_run(folder, key))",
+        "restart=False",
+        "test_parts_that_a_worker_left_do_not_stop_a_sweep_of_the_library",
+    ),
+    mutation(
+        "warn-caller",
+        "errors.py",
+        "frame.f_back, level + 1",
+        "frame.f_back, level",
+        "test_another_delta0_than_the_packs_own_warns",
     ),
 )
 

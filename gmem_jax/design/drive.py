@@ -61,6 +61,8 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
                 f"{name}: bounds must be positive and hold the first value {value:g}, got {low:g} to {high:g}"
             )
         found.append(value)
+    if not bounds:
+        raise ValueError("bounds must name what is tuned, as in {'gamma0': (3e-4, 3e-3)}")
     highest = {PARAMETERS.get(name, name): high for name, (_, high) in bounds.items()}
     for experiment in experiments:
         try:

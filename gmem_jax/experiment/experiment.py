@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,8 @@ from gmem_jax.physics.system import System
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.loop import Observe, Simulation, at_rest
 from gmem_jax.simulation.protocol import Protocol
-from gmem_jax.simulation.stage import BINS, Columns, Drive, Lane, Stage
+from gmem_jax.simulation.stable_step import LONGEST_STEP
+from gmem_jax.simulation.stage import BIN_CENTRES, BINS, Columns, Drive, Lane, Stage
 from gmem_jax.simulation.strain import COMPRESSIONS, Sine, StrainPath, Waveforms
 
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
@@ -52,7 +53,6 @@ HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N 
 MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
 LEAST_STEP = 1e-100  # t_c; its square is a number still
 USUAL_STEP = 0.6  # t_c; less than a third of what is stable under the default law
-LARGEST_STEP = 2.0  # t_c; `stable_step` says what a pack allows: this and more under the default law
 OF_PAPER = ("rest", "hold", "store", "shear")  # make the paper's protocol; another one says it in its stages
 NOT_OF_PAPER = ("creep", "creep_fades", "gravity", "wall_mu")  # None: what they stand for is not there, as in the paper
 
@@ -157,8 +157,8 @@ class Experiment:
         validate(self)
         if self.background not in analysis.BACKGROUNDS:
             raise ValueError(f"background must be one of {', '.join(analysis.BACKGROUNDS)}; got {self.background!r}")
-        if self.shear not in ("during", "before"):
-            raise ValueError(f"shear must be during or before, got {self.shear!r}")
+        if self.shear not in get_args(Shear):
+            raise ValueError(f"shear must be {' or '.join(get_args(Shear))}, got {self.shear!r}")
         self._set_protocol()
         if self.backend not in BACKENDS:
             raise ValueError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
@@ -167,8 +167,8 @@ class Experiment:
         require_walls(self.pack.periodic, self.material, self.wall_mu)
         if self.gravity is not None and self.pack.periodic[2]:
             raise ValueError("gravity acts along z, and a box that is periodic there has no floor: leave gravity out")
-        if not 0.0 < self.dt <= LARGEST_STEP:
-            raise ValueError(f"dt must be in (0, {LARGEST_STEP}], got {self.dt:g}")
+        if not 0.0 < self.dt <= LONGEST_STEP:
+            raise ValueError(f"dt must be in (0, {LONGEST_STEP}], got {self.dt:g}")
         if self.steps is not None:
             object.__setattr__(self, "steps", require_whole("steps", self.steps, 1))
         object.__setattr__(self, "steps_per_bin", self._whole_steps())
@@ -183,10 +183,10 @@ class Experiment:
         step = self.timing.dt
         if not traced(step) and not np.all(np.asarray(step) >= LEAST_STEP):
             raise ValueError(f"t0 = {np.min(self.t0):g} is too short: steps must be {LEAST_STEP:g} t_c or longer")
-        if not traced(step) and not np.all(np.asarray(step) <= LARGEST_STEP):
+        if not traced(step) and not np.all(np.asarray(step) <= LONGEST_STEP):
             raise ValueError(
                 f"steps = {self.steps_per_bin} makes a time step of {np.max(step):g} t_c, which must be at most "
-                f"{LARGEST_STEP}; give more steps, or none to have them chosen"
+                f"{LONGEST_STEP}; give more steps, or none to have them chosen"
             )
 
     def _whole_steps(self) -> int:
@@ -387,7 +387,7 @@ class Experiment:
         if simulation.columns.pressure:
             state = dataclasses.replace(state, servo=at_rest(simulation, state, self.pack.box))
         bits = jnp.where(self._impossible(), int(Status.IMPOSSIBLE), 0)
-        bits |= jnp.where(jnp.all(jnp.asarray(self.timing.dt) <= LARGEST_STEP), 0, int(Status.STEP_TOO_LARGE))
+        bits |= jnp.where(jnp.all(jnp.asarray(self.timing.dt) <= LONGEST_STEP), 0, int(Status.STEP_TOO_LARGE))
         return dataclasses.replace(state, status=state.status | bits.astype(jnp.int32))
 
     def _impossible(self) -> jax.Array:
@@ -454,7 +454,7 @@ def _ends(signals: Signals) -> jax.Array:
 @jax.jit
 def _probe(signals: Signals) -> tuple[jax.Array, jax.Array]:
     """The waveforms at both ends, and in between."""
-    return _ends(signals), signals.shear(jnp.asarray((np.arange(BINS) + 0.5) / BINS))
+    return _ends(signals), signals.shear(jnp.asarray(BIN_CENTRES))
 
 
 NUMBERS = {entry.name: entry for entry in fields(Experiment) if entry.metadata.get("words")}

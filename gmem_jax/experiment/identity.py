@@ -5,6 +5,7 @@ classes apart: on JAX 0.12 the structures of two dataclasses with the same field
 """
 
 import hashlib
+import os
 import sys
 import sysconfig
 from collections.abc import Iterator, Mapping
@@ -18,7 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_INSTALLED = tuple({*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), str(Path(__file__).parents[1])})
+_INSTALLED = tuple(
+    f"{folder}{os.sep}"
+    for folder in {*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), str(Path(__file__).parents[1])}
+)
 """Folders whose code is told by its name: versions and sources are in keys already."""
 _PLAIN = (str, bytes, int, float, complex, range, slice, Enum, PurePath, np.dtype)
 _HOLDING = (list, tuple, set, frozenset, Mapping)

@@ -16,7 +16,7 @@ from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.protocol import Protocol
-from gmem_jax.simulation.stage import BINS, Stage
+from gmem_jax.simulation.stage import BIN_CENTRES, BINS, Stage
 
 
 class Readings(NamedTuple):
@@ -84,8 +84,7 @@ class Readings(NamedTuple):
 
     def shears(self, sets: Mapping[str, Signals]) -> jax.Array:
         """I at the centres of the bins, likewise."""
-        u = (jnp.arange(BINS) + 0.5) / BINS
-        return self._by_drive(sets, lambda one: one.shear(u).T)
+        return self._by_drive(sets, lambda one: one.shear(jnp.asarray(BIN_CENTRES)).T)
 
     def compare(
         self, signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None
@@ -120,8 +119,7 @@ def _partial(stage: Stage) -> bool:
 def _seen(stage: Stage) -> np.ndarray:
     """Which of the 256 bins of u a stage goes through for the greater part, [256]."""
     low, high = sorted(stage.ends)
-    centre = (np.arange(BINS) + 0.5) / BINS
-    inside: np.ndarray = (centre > low) & (centre < high)
+    inside: np.ndarray = (low < BIN_CENTRES) & (high > BIN_CENTRES)
     return inside
 
 

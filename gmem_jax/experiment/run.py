@@ -2,7 +2,6 @@
 
 import dataclasses
 import time
-import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.errors import warn_caller
 from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.changes import with_part
@@ -220,6 +220,11 @@ def replica_bins(experiment: Experiment, batch: int) -> int:
     return before + after * (count + -(-count // batch))
 
 
+def grain_steps(experiment: Experiment, batch: int) -> int:
+    """Steps of a run times its grains and its replicas."""
+    return experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
+
+
 def _join(first: Any, *others: Any) -> np.ndarray:
     """Replicas of several batches, innermost; the zero signal of the first stands for all."""
     return np.concatenate([np.asarray(first), *(np.asarray(other)[..., 1:] for other in others)], axis=-1)
@@ -233,11 +238,10 @@ def warn_of_another_compression(experiment: Experiment) -> None:
     """Warn of a delta0 that the pack was not made for."""
     own = float(experiment.pack.delta0)
     if not np.allclose(np.asarray(experiment.compression), own):
-        warnings.warn(
+        warn_caller(
             f"{experiment.pack.name} was cycled with delta0 = {own:g}, not {experiment.delta0}: its memory of the "
             "preparation differs from the paper's; prepare a pack for this delta0",
             OtherCompressionWarning,
-            stacklevel=3,
         )
 
 

@@ -4,7 +4,6 @@ A set of S signals is a pytree with two methods, `shear(u)` and `integral(u)`, e
 All waveforms vanish at u = 0 and u = 1, so that the box is unsheared outside the stages that apply them.
 """
 
-import functools
 import json
 import math
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from gmem_jax.simulation.stage import BINS
 LONGEST_WORD = 12  # bits
 PAD = 2.0  # bits left free at either end of a word
 WIDTH = 1.0  # of the bumps of a word, in bits
+POINTS = 16  # of a bin, at which J is averaged
 
 
 @runtime_checkable
@@ -353,8 +353,8 @@ def waveform(samples: jax.typing.ArrayLike) -> Spline:
 
 
 @usual_rules()
-@functools.partial(jax.jit, static_argnames=("bins", "points"))  # fused: 4,096 words would fill the memory otherwise
-def bin_average(signals: Signals, bins: int = BINS, points: int = 16) -> jax.Array:
-    """J_s averaged over each bin of u, [S, bins] (midpoint rule on `points` per bin)."""
-    u = (jnp.arange(bins * points) + 0.5) / (bins * points)
-    return jnp.mean(signals.integral(u).reshape(bins, points, -1), axis=1).T
+@jax.jit  # fused: 4,096 words would fill the memory otherwise
+def bin_average(signals: Signals) -> jax.Array:
+    """J_s averaged over each bin of u, [S, 256] (midpoint rule on `POINTS` of each)."""
+    u = (jnp.arange(BINS * POINTS) + 0.5) / (BINS * POINTS)
+    return jnp.mean(signals.integral(u).reshape(BINS, POINTS, -1), axis=1).T

@@ -11,7 +11,6 @@ import os
 import re
 import stat
 import time
-import warnings
 import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from gmem_jax.errors import FileFormatError, NotAtRestError, RunFailedError
+from gmem_jax.errors import FileFormatError, NotAtRestError, RunFailedError, warn_caller
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.ours import Folder, release, remove_leftovers
 from gmem_jax.files.seal import BLOCK, PART, require_sealed, seal
@@ -262,7 +261,7 @@ class Checkpoints(ResultCache):
     def discard(self) -> None:
         """Remove the folder; of one that holds other files too, only what is ours."""
         if left := self._own.clear():
-            warnings.warn(f"{self.folder}: left there, since it holds {left[0]}, which is not ours", stacklevel=2)
+            warn_caller(f"{self.folder}: left there, since it holds {left[0]}, which is not ours")
 
 
 def _difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any]:

@@ -51,11 +51,13 @@ def read_columns(path: Path) -> SampleTable:
         raise FileFormatError(f"{path}: its first line mixes numbers and words ({lines[0].strip()[:40]!r})")
     names = [] if all(numbers) else first
     rows = lines[1:] if names else lines
-    values = _numbers(path, rows, separator) if rows else np.zeros((0, 0))
+    if not rows:
+        return SampleTable(np.zeros((0, 0)))
+    values = _numbers(path, rows, separator)
     said = () if separator == "," else (f"separated by {_SEPARATORS[separator]}",)
     _require_names(path, names, values, rows)
     axes = [place for place, name in enumerate(names) if _AXIS.fullmatch(name)]
-    if len(axes) > 1 or len(axes) == len(values) > 0:
+    if len(axes) > 1 or len(axes) == len(values):
         raise FileFormatError(f"{path}: {', '.join(names)}: must be one axis, and a column for each signal")
     _require_no_axis(path, names, values, axes)
     if not axes:
@@ -90,7 +92,7 @@ def _require_names(path: Path, names: list[str], values: np.ndarray, rows: list[
     halves = len(names) * 2 == count if names else all(map(_PAIRS.fullmatch, rows)) and np.any(values[1::2] > 1.0)
     if halves and "," in rows[0]:
         raise FileFormatError(f"{path}: decimal commas ({rows[0].strip()[:40]!r}); write numbers with points")
-    if names and rows and len(names) != count:
+    if names and len(names) != count:
         raise FileFormatError(f"{path}: {len(names)} names over {count} columns; name each, or none")
     if nameless := [place + 1 for place, name in enumerate(names) if _NAMELESS.fullmatch(name)]:
         raise FileFormatError(f"{path}: column {nameless[0]} has no name, as row numbers have none; {_AS_AXIS}")

@@ -13,7 +13,7 @@ from gmem_jax.errors import FileFormatError
 from gmem_jax.experiment.changes import replace
 from gmem_jax.experiment.experiment import NUMBERS, OF_PAPER, Experiment
 from gmem_jax.experiment.pack import Pack
-from gmem_jax.experiment.record import PARTS, pack_fingerprint
+from gmem_jax.experiment.record import PARTS, pack_fingerprint, values_of
 from gmem_jax.experiment.signals import Signals, SignalSets, signals
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.protocols import ProtocolFile, named_protocol, stage_value
@@ -98,6 +98,11 @@ def material_from(written: Mapping[str, Any]) -> Material:
     if odd := sorted(set(written) - known):
         raise FileFormatError(f"its material has a field {odd[0]!r}, which none has")
     return Material(**{name: _number(value) for name, value in written.items() if name in known})
+
+
+def recorded_material(configuration: Mapping[str, Any]) -> Material:
+    """That of what a configuration records; the default of none. Errors as of `material_from`."""
+    return material_from(values_of(configuration).get("material", {}))
 
 
 def with_protocol(values: Mapping[str, Any], named: Callable[[Any], ProtocolFile] = named_protocol) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +61,7 @@ def check_frames(frames: Frames) -> None:
     """
     fit(_declared(vars(frames)), vars(frames))
     require(all(map(title, frames.stages)), "the stages of its frames are no names")
-    require_finite({f"frames/{entry.name}": getattr(frames, entry.name) for entry in fields(frames)[:11]})
+    require_finite({f"frames/{name}": getattr(frames, name) for name in FRAMES})
     start, spheres, rubbed = frames.start, frames.spheres, frames.wall_friction
     count, per_grain = frames.position.shape[1] * len(frames.offsets), len(frames.offsets)
     require_sizes(frames.radii, frames.sizes)

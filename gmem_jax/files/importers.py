@@ -82,18 +82,18 @@ def load_spheres(path: Path, radius: float = 1.0) -> Spheres:
         radii = radii / radius if len(radii) else np.ones(len(centres))
         radii = np.where(np.abs(radii - 1.0) <= SAME, 1.0, radii)
         require_finite({"radii": radii})
+        require(len(radii) > 0, "it holds no spheres")
         how = "the radius in the file's lengths is given by --radius"
-        alike = np.ptp(radii) <= SAME * np.max(radii, initial=0.0)
+        alike = np.ptp(radii) <= SAME * np.max(radii)
         require(
             not alike or np.all(radii == 1.0),
-            f"its spheres must have radius {radius:g}, found {radius * np.max(radii, initial=0.0):g}; {how}",
+            f"its spheres must have radius {radius:g}, found {radius * np.max(radii):g}; {how}",
         )
         try:
             require_radii(radii)
         except ValueError as error:
             raise FileFormatError(f"{error}; {how}") from error
         _, counts = np.unique(grain, return_counts=True)
-        require(len(counts) > 0, "it holds no spheres")
         told = "; ".join([f"its grains have {counts.min()} to {counts.max()} spheres, all must have the same", *notes])
         require(counts == counts[0], told)
         order = np.argsort(grain, kind="stable")

@@ -124,12 +124,23 @@ class Folder:
 
     def __init__(self, path: Path, marker: str, schema: str, names: re.Pattern[str], about: dict[str, Any]) -> None:
         self.path, self._marker, self._schema, self._names = path, marker, schema, names
+        if not self.is_there(path, marker, schema):
+            path.mkdir(exist_ok=True)
+            self.mark(about)
+
+    @classmethod
+    def is_there(cls, path: Path, marker: str, schema: str) -> bool:
+        """Whether a folder with this marker is there; if not, it can be made there.
+
+        Raises:
+            FileFormatError: if something else is there.
+        """
         if path.is_symlink():
             raise FileFormatError(f"{path}: is a link, which is not followed; name a folder itself")
         if path.exists() and not path.is_dir():
             raise FileFormatError(f"{path}: is a file, and a folder is needed; name another")
-        if self.about(path, marker, schema) is not None:
-            return
+        if cls.about(path, marker, schema) is not None:
+            return True
         if path.is_dir():
             others = sorted(entry.name for entry in path.iterdir() if not _TEMPORARY.fullmatch(entry.name))
             if others:
@@ -137,8 +148,7 @@ class Folder:
                     f"{path}: holds {others[0]} and no {marker} of {schema}, so it is not ours and was left alone; "
                     "move it away, or name another output"
                 )
-        path.mkdir(exist_ok=True)
-        self.mark(about)
+        return False
 
     @staticmethod
     def about(path: Path, marker: str, schema: str) -> dict[str, Any] | None:

@@ -5,7 +5,6 @@ in `gmem_jax.native.calls` and `gmem_jax.native.primitives`.
 """
 
 import functools
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.extend.backend import get_backend
 
+from gmem_jax.errors import warn_caller
 from gmem_jax.native import library, primitives
 from gmem_jax.native.calls import Arrays, Call, Fixed, StepOutput
 from gmem_jax.physics import step as dynamics
@@ -97,7 +97,7 @@ def march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: S
 @functools.cache
 def warn_no_library(reason: str) -> None:
     """Say that a CPU could be faster, and how."""
-    warnings.warn(f"plain JAX runs, and slowly: the native backend is not available: {reason}", stacklevel=4)
+    warn_caller(f"plain JAX runs, and slowly: the native backend is not available: {reason}")
 
 
 class _Mode(NamedTuple):

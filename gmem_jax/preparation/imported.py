@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gmem_jax.errors import FileFormatError
+from gmem_jax.errors import FileFormatError, warn_caller
 from gmem_jax.experiment.pack import Pack, find_pairs
 from gmem_jax.experiment.provenance import provenance
 from gmem_jax.files.importers import Spheres, load_spheres
@@ -165,7 +164,7 @@ def _pack_of(
     if read.density is not None and not np.isclose(read.density, (1.0, spread), rtol=SAME).any():
         notes.append(f"the density {read.density:g} of its spheres is left out: that of grains is the unit rho")
     for note in notes:
-        warnings.warn(f"{path}: {note}", stacklevel=3)
+        warn_caller(f"{path}: {note}")
     imported = {"file": path.name, "radius": radius, "notes": notes}
     record = {"imported": imported, "grain": grain.shape, **provenance()}
     made = Pack(

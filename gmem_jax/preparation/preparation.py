@@ -2,7 +2,6 @@
 
 import json
 import math
-import warnings
 from dataclasses import asdict, replace
 from typing import Any, cast
 
@@ -10,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gmem_jax.errors import NotAtRestError, RunFailedError
+from gmem_jax.errors import NotAtRestError, RunFailedError, warn_caller
 from gmem_jax.experiment.arguments import require_friction, require_kind
 from gmem_jax.experiment.asked import require_walls
 from gmem_jax.experiment.pack import Pack, find_pairs
@@ -338,10 +337,9 @@ def _warn_of_another_pressure(pack: Pack) -> None:
     met = pressure_over_wanted(pack.info)
     if met is not None and not MET[0] < met < MET[1]:
         recipe = pack.info["recipe"]
-        warnings.warn(
+        warn_caller(
             f"{pack.name}: p_z is {met:.2g} times the wanted {recipe['pressure']:g} E: cycling by "
-            f"delta0 = {recipe['delta0']:g} changed it after it was met; ask for another pressure, or for less delta0",
-            stacklevel=3,
+            f"delta0 = {recipe['delta0']:g} changed it after it was met; ask for another pressure, or for less delta0"
         )
 
 

@@ -72,7 +72,7 @@ def ringing_period(
         backend: who does the steps.
 
     Returns:
-        A period within `soundness.period_bounds`.
+        A period within `pack_validation.period_bounds`.
 
     Raises:
         RunFailedError: if the walls feel no oscillation.

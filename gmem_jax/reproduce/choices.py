@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from gmem_jax.experiment.analysis import spread
 from gmem_jax.physics.state import combined_status
 from gmem_jax.reproduce.compare import Estimate, counted
 from gmem_jax.reproduce.figures import SCALES, Scale, Values, crossed
@@ -111,14 +110,9 @@ def _effect(choice: Choice, value: Any, pairs: Sequence[tuple[Any, Any]], t0: fl
     gain, fidelity = counted(t0)
     of_gain = [tried[gain] / default[gain] - 1.0 for default, tried in pairs]
     of_fidelity = [tried[fidelity] - default[fidelity] for default, tried in pairs]
-    own = [_estimate([tried[name] for _, tried in pairs]) for name in (gain, fidelity)]
+    own = [Estimate.of([tried[name] for _, tried in pairs]) for name in (gain, fidelity)]
     status = combined_status([tried["status"] for _, tried in pairs])
-    return Effect(choice, value, own[0], own[1], _estimate(of_gain), _estimate(of_fidelity), status)
-
-
-def _estimate(values: Sequence[float]) -> Estimate:
-    mean, deviation, _ = spread(values)
-    return Estimate(mean, deviation, len(values))
+    return Effect(choice, value, own[0], own[1], Estimate.of(of_gain), Estimate.of(of_fidelity), status)
 
 
 def _row(effect: Effect) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
 
 from gmem_jax.experiment.analysis import spread
+from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.experiment.record import values_of
 from gmem_jax.files.atomic import atomic
 from gmem_jax.physics.contact.laws import LAWS
@@ -16,7 +17,6 @@ from gmem_jax.show.numbers import published, summary
 from gmem_jax.sweeps.store import Store
 
 PAPER_GRAINS = 10_240
-RINGS = 1.8e4  # t_c: drives faster than this ring, and their F is taken after averaging over the ringing period
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,12 @@ class Estimate(NamedTuple):
     mean: float
     sd: float
     packs: int
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Estimate":
+        """That of a value for each pack."""
+        mean, deviation, _ = spread(values)
+        return cls(mean, deviation, len(values))
 
     @property
     def error(self) -> float:
@@ -136,7 +142,7 @@ def points_of(store: Store) -> list[ComputedPoint]:
 
 def counted(t0: float) -> tuple[str, str]:
     """The names of the gain and the fidelity that count at a rate: where it rings, those averaged over the ringing."""
-    return ("windowed_gain", "windowed_fidelity") if t0 < RINGS else ("gain", "fidelity")
+    return ("windowed_gain", "windowed_fidelity") if t0 < PAPER_T0 else ("gain", "fidelity")
 
 
 def _measures(point: ComputedPoint, t0: float) -> dict[Conditions, tuple[float, float]]:
@@ -168,8 +174,7 @@ def compare_points(points: Iterable[ComputedPoint], t0: float) -> list[Compared]
 
 def compared(conditions: Conditions, measure: str, values: Sequence[float], status: int) -> Compared:
     """The mean of a measure over packs, beside what is published of it."""
-    mean, deviation, _ = spread(values)
-    return _beside(conditions, measure, Estimate(mean, deviation, len(values)), status)
+    return _beside(conditions, measure, Estimate.of(values), status)
 
 
 def _beside(conditions: Conditions, measure: str, ours: Estimate, status: int) -> Compared:

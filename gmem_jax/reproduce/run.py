@@ -286,7 +286,8 @@ def _written(target: Path) -> list[Path]:
 
 def _failed(store: Store) -> list[str]:
     """Why points of the last sweep failed, in a list as long as they are many."""
-    return sorted(reason for row in store.card()["points"] if (reason := store.failed().get(row["key"])))
+    failed = store.failed()
+    return sorted(failed[row["key"]] for row in store.card()["points"] if failed.get(row["key"]))
 
 
 def _draw(

@@ -54,12 +54,12 @@ def grains_figure(pack: Pack) -> Figure:
     return Figure((Panel((discs,), title, "x ($R$)", "y ($R$)", **limits),), size=(6.4, 5.4))  # type: ignore[arg-type]
 
 
-def kernel_figure(kernel: MemoryKernel, noise: float, title: str = "") -> Figure:
-    """M(u, v), and its singular values beside the noise, in Pa."""
+def kernel_figure(kernel: MemoryKernel, noise: float, title: str = "", modulus: float = PASCAL) -> Figure:
+    """M(u, v), and its singular values beside the noise, in Pa; `modulus` is E in Pa."""
     diagonal = Curve(np.array([0.0, 1.0]), np.array([0.0, 1.0]), colour="0.3", width=0.8)
     image = Image(kernel.kernel() / kernel.delta0, kernel.centres, kernel.u, r"$M(u, v) / E \delta_0$")
     left = Panel((image, diagonal), title, "v (where the shear acts)", "u (where it is read)")
-    singular = kernel.singular_values() * PASCAL
+    singular = kernel.singular_values() * modulus
     number = np.arange(1, singular.size + 1)
     values = Curve(number, singular, "singular values", style="o-")
     floor = Curve(number[[0, -1]], np.full(2, noise), "noise", "C3", "--", 0.8)
@@ -67,14 +67,14 @@ def kernel_figure(kernel: MemoryKernel, noise: float, title: str = "") -> Figure
     return Figure((left, Panel((values, floor), *labels, log=True)), 2, (9.6, 3.9), legend="below")
 
 
-def bumps_figure(kernel: MemoryKernel, title: str) -> Figure:
-    """Odd and even part of the recall of every bump."""
+def bumps_figure(kernel: MemoryKernel, title: str, modulus: float = PASCAL) -> Figure:
+    """Odd and even part of the recall of every bump, in Pa; `modulus` is E in Pa."""
     colours = ramp(len(kernel.centres))
     parts = {"odd part": kernel.odd, "even part, 0 for a linear memory": kernel.even}
     panels = []
     for name, values in parts.items():
         rows = zip(values, kernel.centres, colours, strict=True)
-        curves = [Curve(kernel.u, PASCAL * row, f"{centre:.2g}", tone, width=0.9) for row, centre, tone in rows]
+        curves = [Curve(kernel.u, modulus * row, f"{centre:.2g}", tone, width=0.9) for row, centre, tone in rows]
         panels.append(Panel(tuple(curves), name, U, "recall of a bump (Pa)"))
     over = (f"{title}, gamma0 = {kernel.gamma0:g}",)
     return Figure(tuple(panels), 2, (9.6, 3.9), over, "right", legend_title="v", shared=("y",))

@@ -12,9 +12,9 @@ from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import values_of
 from gmem_jax.experiment.signals import bin_average
+from gmem_jax.files.configuration import recorded_material
 from gmem_jax.files.measures import of_each, read_stress, relative_scale
 from gmem_jax.files.waveforms import signals_from_dict
-from gmem_jax.physics.material import Material
 from gmem_jax.physics.state import Status, combined_status, explain
 
 LARGE_FOR_SPHERES = 3000  # grains: see `note_on_size`
@@ -89,7 +89,7 @@ def _summary(recall: Recall) -> dict[str, Any]:
     configuration = recall.configuration
     readout = recall.stages[recall.reads[0]]
     pressure = np.asarray(readout.pressure)
-    unit = Material().modulus
+    unit = recorded_material(configuration).modulus
     status = combined_status(recall.status)
     return {
         "pack": configuration["pack"],

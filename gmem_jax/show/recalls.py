@@ -12,9 +12,9 @@ from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import values_of
+from gmem_jax.files.configuration import recorded_material
 from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.validation import is_number
-from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.show import tables
 from gmem_jax.show.figure import Curve, Figure, Image, Panel, U, grid, shown_part, u_label
@@ -88,7 +88,8 @@ def recall_figure(
     t0 = values_of(known).get("t0")
     if found in quantities:
         chosen = {names[number - 1] if number else ZERO: number for number in signals}
-        return stages_figure(recall.stages, quantities[found], title, against=against, t0=t0, chosen=chosen)
+        own: dict[str, Any] = {"against": against, "t0": t0, "chosen": chosen}
+        return stages_figure(recall.stages, quantities[found], title, material=recorded_material(known), **own)
     scale = relative_scale(known) if known else None
     if signals:
         rows = np.asarray(signals) - 1
@@ -182,7 +183,7 @@ def signals_figure(
         target: J that designed waveforms should give, [S, 256].
         page: whether it is for a page: at most 12 panels, without the waveforms.
     """
-    pascal = float(Material().modulus)
+    pascal = float(recorded_material(recall.configuration).modulus)
     u, signals, integrals, waves = (np.asarray(x) for x in (recall.u, recall.p_sig, recall.J, recall.shear))
     if scale is None:
         fitted = integrals * np.sum(integrals * signals) / (np.sum(integrals * integrals) or np.nan)
@@ -240,7 +241,7 @@ def image_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
     """p_sig and J of all signals, however many, as a picture: a row for each."""
     count, u = len(recall.J), np.asarray(recall.u)
     pairs = (
-        (float(Material().modulus) * np.asarray(recall.p_sig), "recalled $p_{sig}$ (Pa)"),
+        (float(recorded_material(recall.configuration).modulus) * np.asarray(recall.p_sig), "recalled $p_{sig}$ (Pa)"),
         (np.asarray(recall.J), "$J(u)$"),
     )
     panels = tuple(

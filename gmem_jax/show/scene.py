@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gmem_jax.files.exporters import frames_of_pack
 from gmem_jax.physics.material import Material
-from gmem_jax.simulation.frames import Frames
+from gmem_jax.simulation.frames import Frames, images_met
 
 COLOUR_RANGE = 0.995  # part of all values that a colour bar spans: the few beyond it have the last colour
 MILLI = 1e3
@@ -58,9 +57,6 @@ class Links:
     force: np.ndarray
 
 
-rest_frames = frames_of_pack
-
-
 def links(frames: Frames) -> Links:
     """The force network of grains from the contacts of their spheres."""
     pairs, forces = [], []
@@ -68,7 +64,7 @@ def links(frames: Frames) -> Links:
         own = slice(frames.start[frame], frames.start[frame + 1])
         one, other = frames.spheres[own].T
         centres = frames.centres(frame)
-        normal = centres[other] - centres[one]
+        normal = centres[other] - centres[one] + images_met(frames, frame)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         force = frames.friction_force[own] - frames.normal_force[own, None] * normal
         touching, place = np.unique(frames.spheres[own] // len(frames.offsets), axis=0, return_inverse=True)

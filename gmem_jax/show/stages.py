@@ -1,6 +1,7 @@
 """Figures of what was recorded in the stages of a recall or a preparation, against time or u."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,27 +26,35 @@ class Quantity(NamedTuple):
         label: of the axis, with its unit.
         curves: values [bins, B] by name.
         log: whether the axis is logarithmic.
+        pascals: of stresses, which are recorded in E: the unit that the label has, in Pa. 0 for all else.
     """
 
     label: str
     curves: Callable[[Sample], dict[str, np.ndarray]]
     log: bool = False
+    pascals: float = 0.0
+
+    def of(self, sample: Sample, material: Material) -> dict[str, np.ndarray]:
+        """The curves in the unit of the label."""
+        factor = float(material.modulus) / self.pascals if self.pascals else 1.0
+        return {name: factor * values for name, values in self.curves(sample).items()}
 
 
 def _of(field: str, of: Measured) -> dict[str, Quantity]:
     """What can be drawn of a field: of vectors all components, and each."""
-    unit = of.plot_unit or {"1": ""}.get(of.unit, f"${of.unit.replace(' ', chr(92) + ',')}$")
-    in_unit = f" ({unit})" if unit else ""
+    unit = {"1": "", "E": "kPa"}.get(of.unit, f"${of.unit.replace(' ', chr(92) + ',')}$")
+    in_unit, pascals = f" ({unit})" if unit else "", 1e3 if unit == "kPa" else 0.0
 
     def values(sample: Sample) -> np.ndarray:
-        return of.plot_factor * np.asarray(getattr(sample, field))
+        return np.asarray(getattr(sample, field))
 
     if not of.symbol:
-        return {of.plot: Quantity(of.label + in_unit, lambda sample: {"": values(sample)}, of.log)}
+        return {of.plot: Quantity(of.label + in_unit, lambda sample: {"": values(sample)}, of.log, pascals)}
     names = [f"{of.symbol}_{axis}" for axis in "xyz"]
-    found = {of.plot: Quantity(of.label + in_unit, lambda sample: _components(values(sample), names), of.log)}
+    found = {of.plot: Quantity(of.label + in_unit, lambda sample: _components(values(sample), names), of.log, pascals)}
     for axis, name in enumerate(names):
-        found[name] = Quantity(f"${name}${in_unit}", lambda sample, axis=axis: {"": values(sample)[:, axis]})  # type: ignore[misc]
+        one = partial(lambda sample, axis: {"": values(sample)[:, axis]}, axis=axis)
+        found[name] = Quantity(f"${name}${in_unit}", one, pascals=pascals)
     return found
 
 
@@ -54,7 +63,7 @@ def _components(values: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarra
 
 
 def _shear_stress(sample: Sample) -> dict[str, np.ndarray]:
-    pressure = float(Material().modulus) * np.asarray(sample.pressure)
+    pressure = np.asarray(sample.pressure)
     return {"": pressure[:, 0] - pressure[:, 1]}
 
 
@@ -63,7 +72,7 @@ QUANTITIES: dict[str, Quantity] = {}
 for _field, _measured in MEASURED.items():
     QUANTITIES |= _of(_field, _measured) if _measured.plot else {}
 QUANTITIES |= {
-    "p_xy": Quantity("$p_x - p_y$ (Pa)", _shear_stress),
+    "p_xy": Quantity("$p_x - p_y$ (Pa)", _shear_stress, pascals=1.0),
     "per_grain": Quantity(
         "contacts per grain, those with walls too", lambda sample: {"": np.asarray(sample.contacts_per_grain)}
     ),
@@ -105,6 +114,7 @@ def stages_figure(
     against: str = "time",
     t0: Any = None,
     chosen: Mapping[str, int] = NO_CHOICE,
+    material: Material = Material(),
 ) -> Figure:
     """A quantity of every stage: a line for the first replica, the zero signal; a band from the lowest to the highest.
 
@@ -117,13 +127,14 @@ def stages_figure(
         against: "time", or "u" for the stages in which it changes.
         t0: duration of a compression in t_c, which time is given in; in t0 without it.
         chosen: numbers of the signals to draw, 0 for the zero signal, by what they are called.
+        material: by which stresses are in pascals.
     """
     marks = []
     time, spans = _times(stages, t0)
     moving = [name for name, sample in stages.items() if np.ptp(np.asarray(sample.u)[:, 0]) > 0.0]
     for name in stages if against == "time" else moving:
         sample, place = stages[name], moving.index(name) if name in moving else 0
-        curves = _of_signals(quantity.curves(sample), chosen)
+        curves = _of_signals(quantity.of(sample, material), chosen)
         for number, (label, values) in enumerate(curves.items()):
             band = np.stack([values.min(axis=1), values.max(axis=1)]) if values.shape[1] > 1 else None
             x, called, colour, style = time[name], label, number, "-"
@@ -166,13 +177,16 @@ def _time_label(t0: Any) -> str:
     return "time ($t_c$)" if is_number(t0) else "time ($t_0$)"
 
 
-def series_figures(stages: Mapping[str, Sample], names: Sequence[str], t0: Any) -> dict[str, Figure]:
+def series_figures(
+    stages: Mapping[str, Sample], names: Sequence[str], t0: Any, material: Material = Material()
+) -> dict[str, Figure]:
     """Pressures, coordination and filling along a run as one line, of the zero signal and the first six others.
 
     Args:
         stages: samples by name, in order.
         names: of the signals; none for a preparation.
         t0: duration of a compression in t_c; what is no number where it differs between replicas.
+        material: by which stresses are in pascals.
 
     Returns:
         The figure against time and that against u, by what a button says.
@@ -184,7 +198,7 @@ def series_figures(stages: Mapping[str, Sample], names: Sequence[str], t0: Any) 
 
     def panel(what: str, parts: Any, label: str, spans: Any) -> Panel:
         quantity = QUANTITIES[what]
-        pieces = [_of_signals(quantity.curves(sample), called) for sample in stages.values()]
+        pieces = [_of_signals(quantity.of(sample, material), called) for sample in stages.values()]
         colours = (GREY, *CYCLE)
         x = np.concatenate(list(parts))
         marks = [

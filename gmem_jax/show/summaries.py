@@ -17,7 +17,9 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import pack_fingerprint, values_of
 from gmem_jax.experiment.signals import bin_average, waveform
+from gmem_jax.files.configuration import recorded_material
 from gmem_jax.files.datasets import to_csv
+from gmem_jax.files.exporters import frames_of_pack
 from gmem_jax.files.frames import load_frames
 from gmem_jax.files.hdf5 import schema_of
 from gmem_jax.files.measures import relative_scale
@@ -34,7 +36,6 @@ from gmem_jax.show import figures, sweeps, tables
 from gmem_jax.show.figure import Figure
 from gmem_jax.show.numbers import summary
 from gmem_jax.show.recalls import MOST_OF_PAGE, OF_SIGNALS, PICTURES, place_of, recall_figure, signals_figure
-from gmem_jax.show.scene import rest_frames
 from gmem_jax.show.stages import QUANTITIES, observed_quantities, series_figures, stages_figure
 from gmem_jax.show.tables import Fact, cell
 from gmem_jax.simulation.frames import Frames
@@ -186,31 +187,33 @@ def _parts_of_recall(recall: Recall, row: dict[str, Any]) -> Iterator[Part]:
     for one in recall.each():
         figure = signals_figure(one, names, "", scale, t0, target=target, page=True)
         yield Part(figure, f"Recalled signals{place_of(recall, one)}{shown}")
-    yield from _series(recall.stages, names, t0, "Along the run")
-    yield from _grains(recall, names, configuration.get("experiment", {}))
+    material = recorded_material(configuration)
+    yield from _series(recall.stages, names, t0, material, "Along the run")
+    yield from _grains(recall, names, material)
 
 
-def _series(stages: Mapping[str, Sample], names: Sequence[str], t0: Any, heading: str) -> Iterator[Part]:
-    yield Part(series_figures(stages, names, t0), heading)
+def _series(
+    stages: Mapping[str, Sample], names: Sequence[str], t0: Any, material: Material, heading: str
+) -> Iterator[Part]:
+    yield Part(series_figures(stages, names, t0, material), heading)
     yield Part(f"Stages, white and grey in turn: {', '.join(stages)}.")
 
 
-def _grains(recall: Recall, names: Sequence[str], written: Mapping[str, Any]) -> Iterator[Part]:
+def _grains(recall: Recall, names: Sequence[str], material: Material) -> Iterator[Part]:
     """The frames of a recall, or its pack at rest if it is there."""
-    material = Material(**written.get("material", {}))
     if (frames := recall.frames) is not None:
         whose = f"the run of {names[frames.signal - 1]}" if frames.signal else "the run without shear"
         yield Part(f"{frames.count} moments of {whose}; displacements are since the first.", "Grains")
         yield Part(GrainView(lambda: frames, material))
         return
     yield Part("No frames in this file: gmem recall --frames 10 keeps some.", "Grains")
-    of_pack = written.get("pack", {})
+    of_pack = recall.configuration.get("experiment", {}).get("pack", {})
 
     def rest() -> Frames:
         pack = load_pack(of_pack["source"])
         if pack_fingerprint(pack) != of_pack["sha256"]:
             raise ValueError("another pack has this name now")
-        return rest_frames(pack)
+        return frames_of_pack(pack, material)
 
     yield Part(GrainView(rest, material, str(of_pack.get("sha256"))))
 
@@ -220,18 +223,19 @@ def of_pack(
 ) -> Summary:
     """What is said of a pack, the stages of its preparation and frames of it, where they were kept."""
     kept, t0 = dict(stages or {}), pack.info.get("recipe", {}).get("t0")
+    material = recorded_material(pack.info)
     drawn: dict[str, Draw] = {"grains": partial(figures.grains_figure, pack)}
     title = f"{pack.name}: preparation"
     if kept:
-        own: dict[str, Any] = {"against": against, "t0": t0}
+        own: dict[str, Any] = {"against": against, "t0": t0, "material": material}
         drawn |= {what: partial(stages_figure, kept, quantity, title, **own) for what, quantity in QUANTITIES.items()}
 
     def parts() -> Iterator[Part]:
-        yield Part(GrainView(lambda: rest_frames(pack), Material(), pack_fingerprint(pack)))
+        yield Part(GrainView(lambda: frames_of_pack(pack, material), material, pack_fingerprint(pack)))
         if kept:
-            yield from _series(kept, [], t0, "Its preparation")
+            yield from _series(kept, [], t0, material, "Its preparation")
         if frames is not None:
-            yield Part(GrainView(lambda: frames, Material()))
+            yield Part(GrainView(lambda: frames, material))
 
     facts = {"pack": pack.name, "grains": pack.grains, "ringing_period": float(pack.ringing_period), **pack.info}
     return Summary(f"Pack {pack.name}", facts, [tables.pack_table(pack)], drawn, parts, pack.info)
@@ -245,7 +249,7 @@ def of_kernel(
     kernel: MemoryKernel, configuration: Mapping[str, Any], noise: float = KERNEL_NOISE, name: str = ""
 ) -> Summary:
     """What is said of a memory kernel; `noise` in Pa RMS."""
-    modulus, count = float(Material().modulus), len(kernel.centres)
+    modulus, count = float(recorded_material(configuration).modulus), len(kernel.centres)
     pack = cell(configuration.get("pack", name))
     capacity = kernel.capacity(noise / modulus)
     told = [
@@ -268,8 +272,8 @@ def of_kernel(
     }
     title = f"memory kernel of {pack}: {count} bumps of width {kernel.width:g}, gamma0 = {kernel.gamma0:g}"
     drawn: dict[str, Draw] = {
-        "kernel": partial(figures.kernel_figure, kernel, noise, pack),
-        "recalls": partial(figures.bumps_figure, kernel, pack),
+        "kernel": partial(figures.kernel_figure, kernel, noise, pack, modulus),
+        "recalls": partial(figures.bumps_figure, kernel, pack, modulus),
     }
 
     def parts() -> Iterator[Part]:

@@ -15,11 +15,11 @@ from gmem_jax.experiment.experiment import NOT_OF_PAPER, NUMBERS, Experiment
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import values_of
+from gmem_jax.files.configuration import recorded_material
 from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.printing import printable
 from gmem_jax.physics.boundary import boundary_of
 from gmem_jax.physics.grain import words_of_sizes
-from gmem_jax.physics.material import Material
 from gmem_jax.physics.numbers import plural
 from gmem_jax.preparation.recipe import pressure_over_wanted
 from gmem_jax.show.numbers import published
@@ -98,9 +98,9 @@ def _with_error(value: float, error: float) -> str:
     return f"{value:.3f} ± {error:.3f}" if not math.isnan(value) else NONE
 
 
-def decimal(value: float, digits: int = 3) -> str:
+def decimal(value: float) -> str:
     """A measure; NaN, where nothing can be said, as "-"."""
-    return NONE if math.isnan(value) else f"{value:.{digits}f}"
+    return NONE if math.isnan(value) else f"{value:.3f}"
 
 
 def target_line(row: dict[str, Any]) -> str:
@@ -322,7 +322,7 @@ def _tetra(shape: str) -> tuple[str, float]:
 
 def pack_table(pack: Pack) -> Table:
     """What a pack file holds."""
-    unit = Material().modulus
+    unit = recorded_material(pack.info).modulus
     rest = pack.info.get("at_rest", {})
     recipe = pack.info.get("recipe", {})
     rows = [

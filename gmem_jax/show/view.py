@@ -9,9 +9,10 @@ from string import Template
 
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.files.atomic import atomic
+from gmem_jax.files.exporters import frames_of_pack
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pytree import short_repr
-from gmem_jax.show.scene import packed, rest_frames
+from gmem_jax.show.scene import packed
 from gmem_jax.simulation.frames import Frames
 
 HEIGHT = 730  # pixels of a view in a notebook
@@ -101,5 +102,5 @@ def view(pack: Pack | Frames) -> View:
     if not isinstance(pack, Pack | Frames):
         kept = "gm.run(experiment, frames=10) keeps frames in recall.frames"
         raise TypeError(f"gm.view takes a gm.Pack or frames, got a {type(pack).__name__}; {kept}")
-    frames, name = (rest_frames(pack), pack.name) if isinstance(pack, Pack) else (pack, "frames")
+    frames, name = (frames_of_pack(pack), pack.name) if isinstance(pack, Pack) else (pack, "frames")
     return View(page(name, figure("pack", frames), three=True, bare=True))

@@ -210,15 +210,16 @@ class FrameRecorder(Observer):
         """
         name, simulation, replicas = chunk.stage.name, chunk.simulation, state.replicas
         one = self.schedule.replica if replicas > 1 else 0
-        friction, wall_mu, dt = jax.tree.map(
+        friction, wall_mu = jax.tree.map(
             lambda leaf: to_host(leaf)[one : one + 1] if np.shape(leaf) == (replicas,) else to_host(leaf),
-            (simulation.system.friction, simulation.system.wall_mu, simulation.dt),
+            (simulation.system.friction, simulation.system.wall_mu),
         )
+        dt = to_host(simulation.dt)  # of B replicas, not of as many as fill the devices
         state, lower, upper = jax.tree.map(
             lambda leaf: leaf[..., one : one + 1] if np.shape(leaf)[-1] > 1 else leaf,
             (chunk.gather(state), lower, upper),
         )
-        time = (chunk.time + later) * float(np.max(dt)) / float(np.max(to_host(simulation.dt)))
+        time = (chunk.time + later) * float(dt[one] if dt.ndim else dt) / float(np.max(dt))
         system = replace(jax.tree.map(to_host, simulation.system), friction=friction, wall_mu=wall_mu)
         frame = configuration(system, state, lower[:, 0], upper[:, 0], time, u)
         self.recorded = OrderedDict({**self.recorded, name: (*self.recorded.get(name, ()), frame)})

@@ -10,7 +10,6 @@ from jax import lax
 from gmem_jax.physics.contact.friction import largest_overlap
 from gmem_jax.physics.contact.wall import wall_kinematics
 from gmem_jax.physics.forces import sphere_table
-from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import image_shifts, slack, sphere_centres, touching_distance
 from gmem_jax.physics.pytree import Scalar, pytree, short_repr
 from gmem_jax.physics.rotation import dot, matrix
@@ -27,8 +26,6 @@ class Measured(NamedTuple):
         dimensions: of the values in one bin.
         plot: what a picture of it is called; "" for none.
         label: of its axis in pictures.
-        plot_unit: of the values in pictures.
-        plot_factor: from the values to those in pictures.
         log: whether the axis is logarithmic.
         symbol: of one component, for vectors.
     """
@@ -38,8 +35,6 @@ class Measured(NamedTuple):
     dimensions: tuple[str, ...] = ("replica",)
     plot: str = ""
     label: str = ""
-    plot_unit: str = ""
-    plot_factor: float = 1.0
     log: bool = False
     symbol: str = ""
 
@@ -50,7 +45,6 @@ def measured(unit: str, description: str, *more: Any, **named: Any) -> Any:
 
 
 _VECTOR = ("axis", "replica")
-_KPA = float(Material().modulus) / 1e3
 
 
 @pytree
@@ -69,8 +63,6 @@ class Sample:
         _VECTOR,
         plot="pressure",
         label="pressure",
-        plot_unit="kPa",
-        plot_factor=_KPA,
         symbol="p",
     )
     lengths: jax.Array = measured(

@@ -9,18 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.contact.laws import entry_of
 from gmem_jax.physics.contact.mindlin import Mindlin
 from gmem_jax.physics.contact.mindlin_rescaled import MindlinRescaled
+from gmem_jax.physics.material import Material
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.sharding import to_host
 
 OVERLAP = 0.05  # R
-_USUAL = {  # what stands for a number that is asked whether it is the cause
-    "material.wall_rigidity": 1.0,
-    "material.normal_damping": 0.23,
-    "friction.stiffness": 0.13,
-    "friction.damping_time": 0.069,
+_USUAL: dict[str, Any] = {  # what stands for a number that is asked whether it is the cause: defaults of the fields
+    **{f"material.{name}": getattr(Material, name) for name in ("wall_rigidity", "normal_damping")},
+    **{f"friction.{name}": getattr(Hooke, name) for name in ("stiffness", "damping_time")},
 }
 
 

@@ -9,11 +9,12 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 import numpy as np
 
-from gmem_jax.physics.numbers import said
+from gmem_jax.physics.numbers import require_numbers, said
 from gmem_jax.physics.pytree import static_record
 from gmem_jax.simulation.channels import CHANNELS
 
 BINS = 256  # bins of a stage of length t0, as in the paper: the resolution of every recorded quantity
+BIN_CENTRES = (np.arange(BINS) + 0.5) / BINS  # u in the middle of each bin of a compression
 LONGEST_NAME = 150  # of a stage; files take 200, and a protocol appends to a name that comes twice
 LONGEST_STAGE = 1e9  # in t0: more bins than any machine goes through
 SINE = "sine:"  # begins the name of a drive of whole sine periods
@@ -84,6 +85,9 @@ class Drive:
         if self.channel and self.channel not in CHANNELS:
             raise ValueError(f"a channel must be one of {', '.join(CHANNELS)}; got {self.channel!r}")
         if not isinstance(self.waveform, str):
+            if not np.iterable(self.waveform):
+                raise ValueError(f"a waveform is a name, or samples; got {said(self.waveform)}")
+            require_numbers(**{f"sample {number} of a waveform": each for number, each in enumerate(self.waveform, 1)})
             object.__setattr__(self, "waveform", tuple(map(float, self.waveform)))
             if len(self.waveform) < 2 or not all(map(math.isfinite, self.waveform)):
                 raise ValueError(
@@ -93,7 +97,8 @@ class Drive:
             raise ValueError(f"a sine has whole periods, as in 'sine:4'; got {self.waveform!r}")
         if self.fixed and not self.channel:
             raise ValueError("a fixed waveform needs a channel, as in channel='xy'")
-        if isinstance(self.amplitude, bool) or not math.isfinite(self.amplitude):
+        require_numbers(**{"the amplitude of a drive": self.amplitude})
+        if not math.isfinite(self.amplitude):
             raise ValueError(f"the amplitude of a drive must be a finite number, got {self.amplitude!r}")
         object.__setattr__(self, "amplitude", float(self.amplitude))
 
@@ -194,11 +199,17 @@ class Stage:
             refuse(f"its role must be one of {', '.join(get_args(Role))}; got {self.role!r}")
         if self.along not in (None, *get_args(Along)):
             refuse(f"along must be one of {', '.join(get_args(Along))}; got {self.along!r}")
+        pressure: tuple[Any, ...] = tuple(self.pressure) if np.iterable(self.pressure) else (self.pressure,)
+        try:
+            require_numbers(start=self.start, stop=self.stop, length=self.length, drag=self.drag)
+            require_numbers(**dict(zip(("pressure along x", "along y", "along z"), pressure, strict=False)))
+        except ValueError as error:
+            refuse(f"its {error}")
         for name in ("start", "stop"):
             u = getattr(self, name)
-            if u is not None and (isinstance(u, str) or not 0.0 <= u <= 1.0):
+            if u is not None and not 0.0 <= u <= 1.0:
                 refuse(f"u must be in [0, 1], and its {name} is {u}")
-        if not 0.0 <= self.length < math.inf:
+        if self.length is None or not 0.0 <= self.length < math.inf:
             refuse(f"its length must be in [0, inf), got {self.length}")
         if self.length > LONGEST_STAGE:
             refuse(f"its length may be up to {LONGEST_STAGE:g} t0, got {self.length:g}")
@@ -216,9 +227,9 @@ class Stage:
         if self.role == "read" and not self.recorded:
             refuse("what is read is recorded")
         if self.pressure is not None:
-            object.__setattr__(self, "pressure", tuple(self.pressure))
-            if len(self.pressure) != 3 or not all(p is None or 0.0 < p < math.inf for p in self.pressure):
+            if len(pressure) != 3 or not all(p is None or 0.0 < p < math.inf for p in pressure):
                 refuse(f"its pressure is three numbers above 0 or none, for x, y and z; got {self.pressure}")
+            object.__setattr__(self, "pressure", pressure)
 
     @property
     def bins(self) -> int:

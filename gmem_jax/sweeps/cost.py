@@ -6,10 +6,13 @@ from typing import NamedTuple
 
 import psutil
 
+from gmem_jax.files.ours import Folder
+from gmem_jax.files.schemas import SWEEP
 from gmem_jax.files.sizes import in_bytes, in_time, pack_bytes, recall_bytes
 from gmem_jax.physics.numbers import plural
 from gmem_jax.sweeps.plan import plan
 from gmem_jax.sweeps.spec import Spec
+from gmem_jax.sweeps.store import SWEEP_MARKER, Store
 from gmem_jax.sweeps.sweep import FREE_CORES, SweepRunner, seconds_of
 
 
@@ -69,7 +72,9 @@ def cost_of(spec: Spec, folder: Path, *, workers: int = 1, only_packs: bool = Fa
         FileNotFoundError: if there is no such pack.
     """
     with TemporaryDirectory() as nowhere:
-        runner = SweepRunner(spec, folder if folder.exists() else Path(nowhere) / "sweep", lambda _: None)
+        runner = SweepRunner(spec, Path(nowhere) / "sweep", lambda _: None)
+        if Folder.is_there(folder, SWEEP_MARKER, SWEEP.name):
+            runner.store = Store(folder, make=False)
         runner.check()
         makes = runner.pack_jobs()
         later, points = ([], []) if only_packs else (runner.points_to_come(), runner.points())

@@ -80,7 +80,7 @@ class Executor(ABC):
                         raise RunFailedError(f"workers end without doing their jobs: {self._last_words(store)}")
                     deaths += 1
                 for name in names[: len(open_)]:
-                    if name not in alive and (deaths <= DEATHS):
+                    if name not in alive:
                         self.start(store, name)
                 time.sleep(POLL)
         finally:

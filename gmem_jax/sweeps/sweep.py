@@ -22,7 +22,6 @@ from gmem_jax.experiment.html import listing
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.run import replica_bins
-from gmem_jax.files.checkpoints import Checkpoints
 from gmem_jax.files.configuration import named_experiment, with_protocol
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.protocols import named_protocol
@@ -34,11 +33,11 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.simulation.progress import Progress, ProgressChoice, callback, shows_progress, within, work_of_bin
 from gmem_jax.sweeps.executors import Executor
-from gmem_jax.sweeps.making import AS_THEY_ARE, pack_job, recipe_of, require_prepared
+from gmem_jax.sweeps.making import AS_THEY_ARE, pack_job, require_prepared
 from gmem_jax.sweeps.plan import ABREAST, Point, digest, groups, plan, point
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
-from gmem_jax.sweeps.work import run_group
+from gmem_jax.sweeps.work import parts_of_job, run_group
 
 FREE_CORES = "of two free cores once compiled (native, law H)"
 SECONDS_PER_GRAIN_STEP = 8e-8  # s a grain-step on two cores, of SIDE_BY_SIDE replicas; see docs/scaling.md
@@ -120,8 +119,10 @@ def sweep(
         share = sum(one.experiment.replicas for one in group)
         on = within(tell, done / total, (done + share) / total)
         keys, experiments = [one.key for one in group], [one.experiment for one in group]
-        cache = Checkpoints(store.parts({"name": digest(keys)}), {"keys": keys}) if store else None
-        found |= run_group(keys, experiments, store=store, cache=cache, progress=on)
+        job = {"name": digest(keys)}
+        with store.lock(job) if store else contextlib.nullcontext():
+            cache = parts_of_job(store, job) if store else None
+            found |= run_group(keys, experiments, store=store, cache=cache, progress=on)
         done += share
     return Results(Result(one.values, found[one.key]) for one in points)
 
@@ -319,11 +320,11 @@ class SweepRunner:
         found = []
         for values in self.spec.combinations():
             all_ = {**self.spec.shared, **values}
-            if "pack" in all_ or self.store.pack_at(self._pack_job(all_)["name"]).is_file():
+            if "pack" in all_ or self.store.pack_at((job := self._pack_job(all_))["name"]).is_file():
                 continue
             with contextlib.suppress(ValueError, FileNotFoundError):  # an impossible point is told of in its turn
                 like = self._experiment(all_, self._packs(ANY_PACK))
-                grains = recipe_of(all_)[0].grains
+                grains = job["recipe"]["grains"]
                 work = grains * like.timing.steps * replica_bins(like, like.signals.count)
                 found.append({"work": work, "replicas": like.replicas, "bytes": recall_bytes(like)})
         return found

@@ -80,6 +80,13 @@ def run_group(
     return dict(zip(keys, recalls, strict=True))
 
 
+def parts_of_job(store: Store, job: dict[str, Any]) -> Checkpoints:
+    """The unfinished parts of a job; those of another batch are discarded."""
+    key, advice = {"job": job["name"], "batch": job.get("batch")}, "remove it, and do the sweep with --retry"
+    folder = store.parts(job)
+    return Checkpoints(folder, key, restart=bool(Checkpoints.other_run(folder, key)), advice=advice)
+
+
 def warned(heard: Sequence[warnings.WarningMessage]) -> list[str]:
     """The texts of warnings, each once, but for what a bit of the status says of each point."""
     texts = [" ".join(str(one.message).split()) for one in heard if one.category is not OtherCompressionWarning]
@@ -112,13 +119,8 @@ class _Worker:
                 self.store.fail(keys[0], reason)
                 print(f"{keys[0]}: {reason}", file=sys.stderr, flush=True)
 
-    def _parts(self, job: dict[str, Any]) -> Checkpoints:
-        key, advice = {"job": job["name"], "batch": job.get("batch")}, "remove it, and do the sweep with --retry"
-        folder = self.store.parts(job)
-        return Checkpoints(folder, key, restart=bool(Checkpoints.other_run(folder, key)), advice=advice)
-
     def _prepare(self, job: dict[str, Any]) -> None:
-        parts = self._parts(job)
+        parts = parts_of_job(self.store, job)
         stages: dict[str, Sample] = {}
         say = self.progress(job["name"])
         made_of: Any = {"grain": clump_of(job["grain"]), "material": Material(**job["material"]), "name": job["name"]}
@@ -133,7 +135,7 @@ class _Worker:
             raise FileFormatError(f"a job whose experiments are none: {error}") from error
 
     def _run(self, job: dict[str, Any]) -> None:
-        say, cache = self.progress(job["name"]), self._parts(job)
+        say, cache = self.progress(job["name"]), parts_of_job(self.store, job)
         run_group(
             job["points"], self._experiments(job), store=self.store, batch=job["batch"], cache=cache, progress=say
         )

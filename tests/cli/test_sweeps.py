@@ -170,6 +170,19 @@ def test_a_dry_run_tells_the_cost_and_does_nothing(
     assert [path.name for path in tmp_path.iterdir()] == ["mu.toml"]
 
 
+def test_a_dry_run_makes_nothing_in_a_folder_that_is_there(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mu.toml").write_text(f'[experiment]\npack = "{TETRA_27}"\n[vary]\nmu = [0.5, 1.0]\n')
+    Path("empty").mkdir()
+    assert gmem(monkeypatch, "sweep", "mu.toml", "-o", "empty", "--dry-run") == 0
+    assert not list(Path("empty").iterdir())
+    Path("empty/notes.txt").write_text("mine")
+    assert gmem(monkeypatch, "sweep", "mu.toml", "-o", "empty", "--dry-run") != 0
+    assert "holds notes.txt and no sweep.json" in capsys.readouterr().err
+
+
 REFUSED = {
     "no such file": ["sweep", "nowhere.toml"],
     "no sweep": ["sweep", "status", "."],

@@ -155,6 +155,16 @@ def test_every_number_that_is_asked_for_is_a_number_and_no_text_of_one() -> None
         (lambda: gm.design_waveforms(EXPERIMENT, iterations="1"), "iterations must be a whole number from 0, got '1'"),
         (lambda: gm.design_by_kernel(EXPERIMENT, gain="1"), "gain must be a number, got '1'"),
         (lambda: gm.design_drive([EXPERIMENT], {"t0": ("1", 99.0)}), r"t0 \(lowest\) must be a number, got '1'"),
+        (lambda: gm.design_drive([EXPERIMENT], {}), r"bounds must name what is tuned, as in \{'gamma0'"),
+        (lambda: gm.hold("2"), "stage 'hold': its length must be a number, got '2'"),  # type: ignore[arg-type]
+        (lambda: gm.Stage("a", length=None), r"its length must be in \[0, inf\), got None"),  # type: ignore[arg-type]
+        (lambda: gm.Stage("a", start=[0.1]), r"its start must be a number, got \[0.1\]"),  # type: ignore[arg-type]
+        (lambda: gm.Stage("a", drag="x"), "its drag must be a number, got 'x'"),  # type: ignore[arg-type]
+        (lambda: gm.Stage("a", pressure=2e-3), "its pressure is three numbers .* got 0.002"),  # type: ignore[arg-type]
+        (lambda: gm.Stage("a", pressure=("x", None, None)), "its pressure along x must be a number, got 'x'"),  # type: ignore[arg-type]
+        (lambda: gm.Drive("xy", 3), "a waveform is a name, or samples; got 3"),  # type: ignore[arg-type]
+        (lambda: gm.Drive("xy", ("a", "b")), "sample 1 of a waveform must be a number, got 'a'"),  # type: ignore[arg-type]
+        (lambda: gm.Drive(amplitude="1"), "the amplitude of a drive must be a number, got '1'"),  # type: ignore[arg-type]
     ]
     for make, words in wrong:
         with pytest.raises(ValueError, match=words) as refused:

@@ -77,6 +77,16 @@ def test_another_formula_or_number_of_a_law_is_another_law(before: str, after: s
     assert keys[0] != keys[1]
 
 
+def test_code_beside_the_package_is_the_users_own() -> None:
+    beside = Path(gm.__file__).parent.with_name("gmem_jax_laws.py")
+    made = []
+    for number in ("1.0", "2.0"):
+        names: dict[str, Any] = {"__name__": "gmem_jax_laws"}
+        exec(compile(f"def double(x):\n    return {number} * x\n", str(beside), "exec"), names)
+        made.append(names["double"])
+    assert identity(made[0]) != identity(made[1])
+
+
 def test_a_large_table_is_told_to_its_last_digit() -> None:
     law, table = law_of(LAW), jnp.full(2000, 0.3)
     one, other = (replace(law, table=(each,)) for each in (table, table.at[1000].add(1e-16)))

@@ -153,8 +153,9 @@ def test_a_step_too_large_for_a_traced_run_gives_nan_and_says_so(pack: gm.Pack) 
 
 
 def test_another_delta0_than_the_packs_own_warns(pack: gm.Pack) -> None:
-    with pytest.warns(UserWarning, match="was cycled with delta0"):
+    with pytest.warns(UserWarning, match="was cycled with delta0") as heard:
         gm.run(gm.Experiment(pack, two_bumps(jnp.ones((1, 2))), delta0=0.04, **SHORT))
+    assert {one.filename for one in heard} == {__file__}
 
 
 def test_single_precision_is_refused(pack: gm.Pack) -> None:

@@ -1,5 +1,6 @@
 """Whether numbers may be trusted: doubtful runs say so, energy is accounted for, the order of grains is nothing."""
 
+import re
 from collections import OrderedDict
 from dataclasses import replace
 from functools import cache
@@ -19,9 +20,10 @@ from gmem_jax.experiment.stepping import require_stable
 from gmem_jax.experiment.validity import compression_speed, validity
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.contact.friction import FrictionLaw
-from gmem_jax.physics.state import WARNINGS, Box, State, Status, replicate
+from gmem_jax.physics.state import SENTENCES, WARNINGS, Box, State, Status, replicate
 from gmem_jax.simulation.loop import walls
 from gmem_jax.simulation.sample import MEASURED, Sample
+from gmem_jax.simulation.stable_step import LONGEST_STEP
 
 PACK = gm.load_pack(TETRA_27)
 LARGER = gm.load_pack("tetra-325-a")
@@ -79,6 +81,8 @@ def around(limit: float) -> list[float]:
 
 
 STIFFEST = float(limits.LARGEST_STIFFNESS * gm.Material().normal_stiffness)
+AMPLIFIED = gm.Protocol((gm.write(amplitude=-limits.LARGEST_WAVEFORM), gm.read()))
+QUIET = gm.Bumps(jnp.asarray([[0.99, 0.0], [1.01, 0.0]]), jnp.asarray([[0.3, 0.7]] * 2), 0.2)
 LOUD = gm.Bumps(jnp.asarray([[1.0, 0.0], [1.01 * limits.LARGEST_WAVEFORM, 0.0]]), jnp.asarray([[0.3, 0.7]] * 2), 0.2)
 
 
@@ -91,6 +95,7 @@ LOUD = gm.Bumps(jnp.asarray([[1.0, 0.0], [1.01 * limits.LARGEST_WAVEFORM, 0.0]])
         ({"friction.stiffness": jnp.asarray(around(STIFFEST))[jnp.asarray([1, 1, 2])]}, Status.LARGE_STIFFNESS),
         ({"gamma0": 1.01 * limits.LARGEST_SHEAR * 0.05}, Status.SHEAR_BEYOND_COMPRESSION),
         ({"signals": LOUD, "gamma0": 1e-4}, Status.LARGE_WAVEFORM),
+        ({"signals": QUIET, "gamma0": 1e-4, "protocol": AMPLIFIED}, Status.LARGE_WAVEFORM),
         ({"speed": around(limits.FASTEST_GRAIN)}, Status.RESTLESS),
         ({"hold_drag": jnp.asarray([1.0, 2.5, 2.6])}, Status.RESTLESS),  # times dt = 0.586
         ({"friction.damping_time": jnp.asarray([3.0, 4.5, 4.9]), "contacts": 10.0}, Status.RESTLESS),
@@ -398,3 +403,22 @@ def test_the_rate_for_an_accuracy_is_that_of_the_ringing_period() -> None:
     for wrong in (0.0, 0.2, np.nan, "little"):
         with pytest.raises(ValueError, match=r"accuracy must be a number from 0.002 to 0.1, got"):
             gm.at_accuracy(experiment, wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("bit", "limit"),
+    [
+        (Status.DEEP_OVERLAP, limits.DEEPEST),
+        (Status.NOT_QUASI_STATIC, limits.FASTEST),
+        (Status.RINGING, limits.RINGING),
+        (Status.SHEAR_BEYOND_COMPRESSION, 1.0 / limits.LARGEST_SHEAR),
+        (Status.LARGE_WAVEFORM, limits.LARGEST_WAVEFORM),
+        (Status.LARGE_FRICTION, limits.LARGEST_FRICTION),
+        (Status.ROUNDED, 100.0 * limits.LARGEST_NOISE),  # %
+        (Status.STEP_TOO_LARGE, LONGEST_STEP),
+    ],
+)
+def test_the_words_of_a_doubt_name_its_limit(bit: Status, limit: float) -> None:
+    assert any(
+        float(number) == pytest.approx(limit) for number in re.findall(r"\d+(?:\.\d+)?(?:e-\d+)?", SENTENCES[bit])
+    )

@@ -38,6 +38,7 @@ REFUSED = {
     "0.1 0.2\n0.3 0.4\n": "numbers separated by blanks ('0.3 0.4'); use commas",
     "time,t,a\n0,0,0\n1,1,1\n2,2,0\n": "time, t, a: must be one axis, and a column for each signal",
     "t\n0\n1\n2\n": "t: must be one axis",
+    "t,a\n": "a waveform needs at least 2 samples",
     "no,time,a\n1,0,0\n2,0.1,1\n3,0.3,0\n": "column 1 ('no') rises by equal steps",
     "t,a\n0,0\n1,1\n1,2\n3,0\n": "times must rise; sample 3 is not after the one before",
     "u,a\n0,0\n1,1\n2,0\n": "times from 0 to 2 lie outside 0 to 1",

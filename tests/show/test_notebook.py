@@ -15,9 +15,9 @@ import pytest
 import gmem_jax as gm
 from gmem_jax.derivatives.gradient import Gradient
 from gmem_jax.experiment.html import listing
+from gmem_jax.files.exporters import frames_of_pack
 from gmem_jax.show import recalls
 from gmem_jax.show.render_matplotlib import to_matplotlib
-from gmem_jax.show.scene import rest_frames
 from gmem_jax.simulation.progress import ProgressChoice, callback, no_further_bar, shows_progress
 from gmem_jax.sweeps.sweep import Result, Results
 
@@ -51,7 +51,7 @@ def test_objects_are_one_line_in_a_terminal(recalled: tuple[gm.Experiment, gm.Re
         (gm.waveform([0.1, 0.2]), "<1 signal: nodes = 4>"),
         (jax.tree.map(lambda _: None, experiment), "<Experiment>"),
         (recall.stages["encode"], "Sample(u=float64[256, 3], pressure=float64[256, 3, 3], "),
-        (rest_frames(experiment.pack), "Frames(time=float64[1], u=float64[1], position=float64[1, 27, 3], "),
+        (frames_of_pack(experiment.pack), "Frames(time=float64[1], u=float64[1], position=float64[1, 27, 3], "),
         (gm.view(experiment.pack), "View(html='<!DOCTYPE html>"),
         (
             Gradient(jnp.asarray(0.5), {"mu": jnp.ones(2)}, jnp.ones((1, 4))),

@@ -20,10 +20,13 @@ from scenes import TETRA_27, gmem
 
 import gmem_jax as gm
 from gmem_jax.experiment import analysis
+from gmem_jax.files.exporters import frames_of_pack
 from gmem_jax.show import render_plotly
-from gmem_jax.show.recalls import signals_figure
+from gmem_jax.show.figure import Image
+from gmem_jax.show.numbers import summary
+from gmem_jax.show.recalls import recall_figure, signals_figure
 from gmem_jax.show.report import Report
-from gmem_jax.show.scene import Colouring, links, packed, quantities, rest_frames
+from gmem_jax.show.scene import Colouring, links, packed, quantities
 from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.sample import MEASURED, Sample
 
@@ -80,14 +83,14 @@ def one_after_the_other(*some: Frames) -> Frames:
     parts = {
         name: np.concatenate([getattr(one, name) for one in some])
         for name in vars(some[0])
-        if name not in ("offsets", "stages", "start", "signal", "radii", "sizes", "wall_friction")
+        if name not in ("offsets", "stages", "start", "signal", "radii", "sizes", "wall_friction", "periodic")
     }
     return Frames(**parts, **alike)
 
 
 def squeezed() -> Frames:
     """The pack, and three times the same in a smaller box, where a grain has moved by itself and contacts rub."""
-    rest = rest_frames(PACK)
+    rest = frames_of_pack(PACK)
 
     def after(number: int) -> Frames:
         shrink = np.array([1.0 - 0.01 * number, 1.0 - 0.01 * number, 1.0])
@@ -173,7 +176,7 @@ def test_contacts_of_one_pair_of_grains_are_one_link_with_their_sum() -> None:
 
 def test_forces_in_a_pack_at_rest_balance_on_every_grain_that_touches_no_wall() -> None:
     pack = gm.load_pack("tetra-325-a")
-    rest = rest_frames(pack)
+    rest = frames_of_pack(pack)
     centres = rest.centres(0)
     one, other = rest.spheres.T
     normal = (centres[other] - centres[one]) / np.linalg.norm(centres[other] - centres[one], axis=1, keepdims=True)
@@ -187,6 +190,36 @@ def test_forces_in_a_pack_at_rest_balance_on_every_grain_that_touches_no_wall() 
     coloured = {one.label: one for one in quantities(rest, links(rest), 1.0)}
     assert "friction force, sum over contacts" not in coloured
     assert coloured["coordination"].values.mean() == pytest.approx(pack.info["at_rest"]["coordination"], rel=1e-12)
+
+
+def test_forces_through_the_faces_of_a_periodic_pack_are_along_the_nearest_images() -> None:
+    rest = frames_of_pack(gm.load_pack(TETRA_27.with_name("periodic-27.h5")))
+    found, (one, other) = links(rest), rest.spheres.T
+    lengths, apart = rest.upper[0] - rest.lower[0], np.diff(rest.centres(0)[rest.spheres], axis=1)[:, 0]
+    images = np.asarray([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)]) * lengths
+    every = apart[:, None] + images
+    nearest = np.take_along_axis(every, np.linalg.norm(every, axis=2).argmin(axis=1)[:, None, None], axis=1)[:, 0]
+    assert np.any(nearest != apart)
+    force = -rest.normal_force[:, None] * nearest / np.linalg.norm(nearest, axis=1, keepdims=True)
+    for (first, second), size in zip(found.grains, found.force, strict=True):
+        of_pair = ([first, second] == np.sort([one // 4, other // 4], axis=0).T).all(axis=1)
+        sign = np.where(one[of_pair] // 4 == first, 1.0, -1.0)[:, None]
+        np.testing.assert_allclose(size, np.linalg.norm((sign * force[of_pair]).sum(axis=0)), rtol=1e-12)
+
+
+def test_stresses_are_in_pascals_of_the_experiments_own_material() -> None:
+    soft = made_up()
+    own = {**soft.configuration["experiment"], "material": {"modulus": 1e9}}
+    stiff = soft.described({**soft.configuration, "experiment": own})
+    for key in ("pressure_pa", "largest_signal_pa"):
+        np.testing.assert_allclose(summary(stiff)[key], 100.0 * np.asarray(summary(soft)[key]), rtol=1e-12)
+    for picture in ("signals", "all", "pressure", "p_z"):
+        curves = [recall_figure(each, picture).panels[0].marks[0] for each in (soft, stiff)]
+        values = [np.asarray(curve.values if isinstance(curve, Image) else curve.y) for curve in curves]
+        assert np.any(values[0])
+        np.testing.assert_allclose(values[1], 100.0 * values[0], rtol=1e-12)
+    alike = [recall_figure(each, "phi").panels[0].marks[0].y for each in (soft, stiff)]
+    np.testing.assert_array_equal(*alike)
 
 
 def test_grains_carried_along_with_the_box_have_no_non_affine_displacement() -> None:

@@ -21,12 +21,12 @@ from gmem_jax.show.numbers import status_words
 from gmem_jax.show.sweeps import points_table
 from gmem_jax.simulation.progress import silent
 from gmem_jax.sweeps.executors import Executor, Submitted, executor
-from gmem_jax.sweeps.plan import plan, point
+from gmem_jax.sweeps.plan import digest, plan, point
 from gmem_jax.sweeps.spec import read_spec, spec_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SweepRunner, _labels
 from gmem_jax.sweeps.table import export_table, means, rows, warnings_of
-from gmem_jax.sweeps.work import run_group
+from gmem_jax.sweeps.work import parts_of_job, run_group
 
 PACK = TETRA_27
 MEMORY = 1 << 33
@@ -462,6 +462,17 @@ def test_runs_that_were_begun_go_on_as_they_were(tmp_path: Path) -> None:
     assert [job["name"] for job in again.jobs] == [
         first.jobs[1]["name"]
     ]  # not two runs of two, which two workers would be given anew
+
+
+def test_parts_that_a_worker_left_do_not_stop_a_sweep_of_the_library(tmp_path: Path) -> None:
+    base = gm.Experiment(gm.load_pack(PACK), gm.six_signals(), t0=60.0, rest=0.02, hold=0.02, store=0.02)
+    store = Store(tmp_path / "store")
+    key = point({"friction.mu": 0.5}, gm.replace(base, {"friction.mu": 0.5})).key
+    parts = parts_of_job(store, run_job(digest([key]), [key]) | {"batch": 6})
+    parts("prefix", lambda _: np.zeros(1))
+    with store.lock({"name": digest([key])}), pytest.raises(gm.FileFormatError):
+        gm.sweep(base, {"friction.mu": [0.5]}, tmp_path / "store")  # another process has it
+    assert len(gm.sweep(base, {"friction.mu": [0.5]}, tmp_path / "store")) == 1
 
 
 def test_what_was_begun_outlives_another_figure_s_jobs(tmp_path: Path) -> None:

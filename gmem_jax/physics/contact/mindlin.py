@@ -1,7 +1,7 @@
 """M2: the Mindlin contact with its whole history, resolved by the overlap at which each part was attached."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from gmem_jax.physics.numbers import require_whole
 from gmem_jax.physics.pytree import Scalar, parameter, pytree, static
 from gmem_jax.physics.rotation import cross, dot
 
+Variant = Literal["averaged", "exact", "paper"]  # in the order of enum Variant (native/src/physics/parameters.h)
 MOST_POINTS = 10_000  # of a history; the paper has 100
 
 
@@ -80,15 +81,15 @@ class Mindlin(SpringLaw):
     stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)", "k_M", "E R^0.5")
     p_max: Scalar = parameter(0.2, "(0, inf)", "m2: largest overlap of its history", "R")
     points: int = static(100, "m2: points of its history")
-    variant: Literal["averaged", "exact", "paper"] = static("averaged", "m2: averaged, exact or paper")
+    variant: Variant = static("averaged", "m2: averaged, exact or paper")
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "points", require_whole("Mindlin.points", self.points))
         if not 2 <= self.points <= MOST_POINTS:
             raise ValueError(f"Mindlin.points must be 2 to {MOST_POINTS}, got {self.points}")
-        if self.variant not in ("averaged", "exact", "paper"):
-            raise ValueError(f"Mindlin.variant must be 'averaged', 'exact' or 'paper', got {self.variant!r}")
+        if self.variant not in get_args(Variant):
+            raise ValueError(f"Mindlin.variant must be one of {', '.join(get_args(Variant))}; got {self.variant!r}")
 
     @property
     def largest_overlap(self) -> Scalar:

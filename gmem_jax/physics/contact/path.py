@@ -37,9 +37,7 @@ def led_contact(overlap: jax.Array, sliding: jax.Array, dt: Scalar) -> Kinematic
     )
 
 
-def lead_contact(
-    law: FrictionLaw, overlap: jax.Array, sliding: jax.Array, dt: Scalar, material: Material | None = None
-) -> jax.Array:
+def lead_contact(law: FrictionLaw, overlap: jax.Array, sliding: jax.Array, dt: Scalar) -> jax.Array:
     """Tangential force of a contact sampled every dt, as the simulator would call the law.
 
     Args:
@@ -47,12 +45,11 @@ def lead_contact(
         overlap: p at each step, [T], in R.
         sliding: tangential velocity of each step, [T], in R / t_c.
         dt: time step, in t_c.
-        material: sets the normal force, that of a static overlap; default the paper's.
 
     Returns:
         The force along the sliding direction, dashpot included, [T], in E R^2.
     """
-    material = Material() if material is None else material
+    material = Material()  # sets the normal force, that of a static overlap
 
     def step(history: Any, sample: tuple[jax.Array, jax.Array]) -> tuple[Any, jax.Array]:
         kin = led_contact(*sample, dt)
@@ -73,7 +70,6 @@ def contact_path(
     displacement: jax.Array,
     *,
     dt: Scalar = 1e6,
-    material: Material | None = None,
 ) -> jax.Array:
     """Quasi-static tangential force along a path (p, sigma) given by its points; the corners may be sharp.
 
@@ -85,7 +81,6 @@ def contact_path(
         overlap: p, [T], in R; the contact is made at the first positive one.
         displacement: sigma, [T], in R.
         dt: time between two points, in t_c; the default is slow enough to leave dashpots out of the Coulomb limit.
-        material: sets the normal force; default the paper's.
 
     Returns:
         The force along the displacement, [T], in E R^2.
@@ -97,7 +92,7 @@ def contact_path(
     calls = 2 * overlap.shape[0] - 1
     p = jnp.zeros(calls, overlap.dtype).at[::2].set(overlap).at[1::2].set(halfway)
     v = jnp.zeros(calls, overlap.dtype).at[1::2].set(pulses)
-    return lead_contact(law, p, v, dt, material)[::2]
+    return lead_contact(law, p, v, dt)[::2]
 
 
 def polyline(corners: jax.Array, points: int) -> jax.Array:
