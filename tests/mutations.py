@@ -2071,7 +2071,7 @@ MUTATIONS = (
         "frames-slowest",
         "simulation/frames.py",
         "float(dt[one] if dt.ndim else dt)",
-        "float(np.max(dt))",
+        "float(dt[one] if dt.ndim and len(dt) == replicas else np.max(dt))",
         "test_eight_devices_give_the_numbers_of_one",
     ),
     mutation(
@@ -2108,6 +2108,34 @@ MUTATIONS = (
         "restart=bool(Checkpoints.other_run(folder, key))",
         "restart=False",
         "test_parts_that_a_worker_left_do_not_stop_a_sweep_of_the_library",
+    ),
+    mutation(
+        "prefix-of-another",
+        "experiment/run.py",
+        "experiment.pack.position, experiment.phases[0]",
+        "experiment.phases[0]",
+        "test_a_prefix_serves_several_simulations",
+    ),
+    mutation(
+        "material-of-the-pack",
+        "experiment/run.py",
+        '_ELASTIC = ("poisson", "normal_damping", "wall_rigidity")',
+        '_ELASTIC = ("poisson", "normal_damping")',
+        "test_another_material_than_the_packs_own_warns",
+    ),
+    mutation(
+        "ringing-weightless",
+        "preparation/preparation.py",
+        "pairs, material, recipe.gravity or None)",
+        "pairs, material, None)",
+        "test_a_pack_that_was_prepared_under_gravity_is_at_rest_under_it",
+    ),
+    mutation(
+        "broken-runs-read",
+        "reading/net.py",
+        "jnp.where(jnp.all(read >= 0), right, jnp.nan)",
+        "right",
+        "test_nothing_is_read_from_a_broken_run",
     ),
     mutation(
         "warn-caller",

@@ -51,6 +51,8 @@ def experiments() -> Iterator[tuple[str, gm.Experiment]]:
     yield "friction of walls", gm.Experiment(pack, bumps, wall_mu=0.5, **short)
     sizes = 1.0 + 0.05 * np.random.default_rng(0).normal(size=pack.grains)
     yield "grains of sizes", gm.Experiment(dataclasses.replace(pack, clump=gm.sized(pack.clump, sizes)), bumps, **short)
+    radii = dataclasses.replace(pack.clump, radii=jnp.asarray([1.0, 1.01, 0.99, 1.0]))
+    yield "unequal spheres", gm.Experiment(dataclasses.replace(pack, clump=radii), bumps, **short)
     yield "a spline", gm.Experiment(pack, gm.waveform(jnp.sin(jnp.linspace(0.2, 3.0, 8))), **short)
 
 

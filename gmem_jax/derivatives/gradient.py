@@ -21,6 +21,7 @@ from gmem_jax.derivatives.moving import (
     fixed_by,
     moving_of,
     numbers_of,
+    require_derivatives,
     state_of,
     theta_of,
     whole_work,
@@ -195,11 +196,16 @@ def value_and_grad(
         checkpoint: where to go on and to keep how far it is on the way back; the way forward, a fifth, is done again.
         progress: told about every chunk of both ways; default a bar in a terminal or a notebook, False for none.
 
+    Returns:
+        The `value`, and its `slope` by each name: what stands there, with derivatives in the place of numbers. Also the
+        recalled `p_sig` of which that is the loss, [S, 256].
+
     Raises:
-        ValueError: for a name that is no field, or a loss that is not one number.
+        ValueError: for a name that is no field, a loss that is not one number, or mixed precision.
         RunFailedError: if the simulation broke down.
     """
     require_kind("value_and_grad", experiment, Experiment)
+    require_derivatives(experiment)
     tell = callback(progress)
     theta, along = theta_of(experiment, by), functools.partial(with_values, experiment)
     common, own = experiment.phases

@@ -88,15 +88,21 @@ def _pressures(recall: Recall) -> dict[str, np.ndarray]:
 @usual_rules()
 @shows_progress
 def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobian:
-    """Forward mode, parameters as replicas; two runs, because mu and the stiffness act on the prefix too.
+    """The derivatives of the recall of one signal by its amplitudes, gamma0, mu and the stiffness.
+
+    In forward mode, parameters as replicas; in two runs, because mu and the stiffness act on the prefix too.
 
     Args:
         experiment: of one signal of n bumps.
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
+    Returns:
+        The `names` and `values` of n + 3 parameters; the derivatives by them of `p_sig`, [n + 3, 256], and of the
+        `stress` that it is made of, p_x - p_y on the channel "xy", in every bin from the encoding on, [n + 3, bins].
+
     Raises:
-        ValueError: if there is another number of signals, they are not bumps, the background is not sub0, or there are
-            several reads or channels.
+        ValueError: if there is another number of signals, they are not bumps, the background is not sub0, there are
+            several reads or channels, or the precision is mixed.
         RunFailedError: if the simulation broke down.
     """
     require_kind("jacobian", experiment, Experiment)

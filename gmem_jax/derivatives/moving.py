@@ -63,6 +63,16 @@ def state_of(moving: Moving, status: jax.Array) -> State:
     return State(moving[0], moving[1], status, *moving[2:])
 
 
+def require_derivatives(experiment: Experiment) -> None:
+    """Refuse an experiment that has none.
+
+    Raises:
+        ValueError: if its contacts are computed in single precision.
+    """
+    if experiment.precision == "mixed":
+        raise ValueError("there are no derivatives in mixed precision; use precision='double'")
+
+
 def theta_of(experiment: Experiment, names: Any) -> dict[str, Any]:
     """What stands at names, as arrays.
 

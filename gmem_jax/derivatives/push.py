@@ -13,6 +13,7 @@ from gmem_jax.derivatives.moving import (
     fixed_by,
     moving_of,
     numbers_of,
+    require_derivatives,
     state_of,
     theta_of,
     whole_work,
@@ -123,6 +124,7 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
         ValueError: for a name that is no field.
         RunFailedError: if the simulation broke down.
     """
+    require_derivatives(experiment)
     theta, tangent = theta_of(experiment, direction), jax.tree.map(jnp.asarray, dict(direction))
     common, own = experiment.phases
     on = runner_of(experiment, progress=progress)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from gmem_jax.derivatives.moving import theta_of
 from gmem_jax.experiment.arguments import require_kind, require_several
-from gmem_jax.experiment.changes import replace, value_at
+from gmem_jax.experiment.changes import replace
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.run import run
 from gmem_jax.experiment.stepping import require_stable
@@ -44,25 +45,33 @@ def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[floa
     """The values that a search begins with.
 
     Raises:
-        ValueError: if a bound is not lowest <= start <= highest with lowest positive, there is no pack, or the time
-            step is not stable with the highest values.
+        ValueError: if a bound is not lowest <= start <= highest with lowest positive, there is no pack, a parameter
+            is no number that can be tuned or differs between experiments, or the time step is not stable with the
+            highest values.
     """
     require_several(experiments, "experiments")
     if not experiments:
         raise ValueError("a drive is designed for at least one pack")
     for experiment in experiments:
         require_kind("design_drive", experiment, Experiment)
-    found = []
-    for name, (low, high) in bounds.items():
+    if not bounds:
+        raise ValueError("bounds must name what is tuned, as in {'gamma0': (3e-4, 3e-3)}")
+    if len(experiments[0].readings.reads) * len(experiments[0].readings.channels) > 1:
+        raise ValueError("a drive is designed for one read and one channel")
+    found, paths = [], [PARAMETERS.get(name, name) for name in bounds]
+    if len(set(paths)) < len(paths):
+        raise ValueError(f"one parameter is named twice: {', '.join(bounds)}")
+    for path, (name, (low, high)) in zip(paths, bounds.items(), strict=True):
         require_numbers(**{f"{name} (lowest)": low, f"{name} (highest)": high})
-        value = float(value_at(experiments[0], PARAMETERS.get(name, name)))
+        values = [theta_of(one, [path])[path] for one in experiments]
+        if any(np.ndim(value) for value in values) or len(set(map(float, values))) > 1:
+            raise ValueError(f"{name} must be one number, the same in all experiments: the search begins there")
+        value = float(values[0])
         if not 0.0 < low <= value <= high:
             raise ValueError(
                 f"{name}: bounds must be positive and hold the first value {value:g}, got {low:g} to {high:g}"
             )
         found.append(value)
-    if not bounds:
-        raise ValueError("bounds must name what is tuned, as in {'gamma0': (3e-4, 3e-3)}")
     highest = {PARAMETERS.get(name, name): high for name, (_, high) in bounds.items()}
     for experiment in experiments:
         try:
@@ -105,6 +114,8 @@ def design_drive(
     """
     tell, iterations = callback(progress), require_whole("iterations", iterations)
     require_numbers(spread=spread)
+    if not 0.0 < spread < 1.0:
+        raise ValueError(f"spread must be in (0, 1), got {spread:g}")
     names = list(bounds)
     paths = [PARAMETERS.get(name, name) for name in names]
     start = start_within(experiments, bounds)

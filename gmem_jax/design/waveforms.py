@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 
+from gmem_jax.derivatives.moving import require_derivatives
 from gmem_jax.derivatives.push import push
 from gmem_jax.design.kernel import QUADRATURE_POINTS, bumps, nearest, written_sets
 from gmem_jax.experiment.arguments import require_kind
@@ -207,11 +208,12 @@ def design_waveforms(
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Raises:
-        ValueError: if gamma0 or delta0 differs between replicas, there are several reads, or a channel has no set of
-            waveforms of its own.
+        ValueError: if gamma0 or delta0 differs between replicas, there are several reads, a channel has no set of
+            waveforms of its own, or the precision is mixed.
         RunFailedError: if a simulation broke down.
     """
     require_kind("design_waveforms", experiment, Experiment)
+    require_derivatives(experiment)
     tell = callback(progress)
     refuse_several_scales(experiment)
     iterations, n = require_whole("iterations", iterations), require_whole("n", n, 1)

@@ -70,7 +70,7 @@ class Experiment:
     """Everything a recall depends on. S signals make S + 1 replicas; replica 0 is the zero signal.
 
     A pytree: its floats can be differentiated and vmapped. The friction law's parameters, gamma0, shear_share, delta0,
-    t0, hold_drag, gravity and wall_mu are one number or one for each replica, [S + 1].
+    t0, hold_drag, creep, creep_fades, gravity and wall_mu are one number or one for each replica, [S + 1].
 
     Attributes:
         pack: the pack at rest.

@@ -15,10 +15,11 @@ from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.asked import require_double, require_inside
 from gmem_jax.experiment.changes import with_part
 from gmem_jax.experiment.experiment import Experiment, replica_parameters
+from gmem_jax.experiment.identity import identity
 from gmem_jax.experiment.recall import Recall, judged, unjudged, with_waveforms
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.stepping import require_stable
-from gmem_jax.physics.numbers import require_whole
+from gmem_jax.physics.numbers import is_real, require_whole, said
 from gmem_jax.physics.pytree import traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
@@ -33,6 +34,7 @@ from gmem_jax.simulation.strain import smallest_box
 
 COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
 GRAIN_BYTES = 800  # of a grain's own numbers and its spheres'
+_ELASTIC = ("poisson", "normal_damping", "wall_rigidity")  # of a `Material`; the others are units
 PREFIX = "prefix"  # name of the part of a run that is common to all waveforms
 LARGEST_BATCH = 63  # signals; with the zero signal they fill whole vectors of every CPU
 
@@ -82,10 +84,16 @@ class Prefix(NamedTuple):
     Attributes:
         runner: at their end.
         samples: theirs.
+        key: of all that they depend on.
     """
 
     runner: Runner
     samples: "OrderedDict[str, Sample]"
+    key: str
+
+
+def _key_of_prefix(experiment: Experiment) -> str:
+    return identity((experiment.simulation(sheared=False), experiment.pack.position, experiment.phases[0]))
 
 
 @usual_rules()
@@ -103,7 +111,7 @@ def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress
     common, _ = experiment.phases
     runner = runner_of(experiment, progress=progress)
     runner.total_work = work_of(common, runner.state.replicas)
-    return Prefix(runner, runner.run_cached(PREFIX, cache, *common))
+    return Prefix(runner, runner.run_cached(PREFIX, cache, *common), _key_of_prefix(experiment))
 
 
 @usual_rules()
@@ -126,7 +134,7 @@ def run(
 
     Args:
         experiment: the experiment.
-        prefix: what `prefix_of` gave for the same pack and law, if it was run already.
+        prefix: what `prefix_of` gave for an experiment that differs in waveforms, gamma0 and shear_share at most.
         batch: signals that run together; default all of them. Each batch has a zero signal of its own.
         devices: that share out the replicas; default all that JAX sees, also those of other processes.
         frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
@@ -139,7 +147,7 @@ def run(
     Raises:
         ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
             for a time step that is not stable (see `stable_step`); for too many or too few frames, a u beyond 0 and 1,
-            frames of a prefix that was run before, or a signal that there is not.
+            frames of a prefix that was run before, the prefix of another experiment, or a signal that there is not.
         TypeError: if it is no `Experiment`.
         RunFailedError: if the simulation broke down.
     """
@@ -153,6 +161,7 @@ def run(
     if prefix and schedule.wanted:
         raise ValueError("frames begin with the prefix: run it in the same call")
     warn_of_another_compression(experiment)
+    warn_of_another_material(experiment)
     common, own = experiment.phases
     firsts = range(0, count, size)
     work = sum(work_of(own, 1 + min(size, count - first)) for first in firsts)
@@ -160,10 +169,12 @@ def run(
     if prefix is None:
         runner = runner_of(experiment, progress=tell, observers=tuple(recorders))
         runner.total_work = work_of(common, runner.state.replicas) + work
-        prefix = Prefix(runner, runner.run_cached(PREFIX, cache, *common))
+        before = runner.run_cached(PREFIX, cache, *common)
         done = work_of(common, runner.state.replicas)
     else:
-        runner = prefix.runner.fork(progress=tell, total_work=work)
+        if prefix.key != _key_of_prefix(experiment):
+            raise ValueError("the prefix is that of another pack, law or protocol; run it by prefix_of(experiment)")
+        runner, before = prefix.runner.fork(progress=tell, total_work=work), prefix.samples
         done = 0.0
     parts: list[tuple[dict[str, Sample], jax.Array]] = []
     recorded = recorders[0].recorded if recorders else OrderedDict()
@@ -188,7 +199,7 @@ def run(
         recorded = seen if wanted else recorded
         done += work_of(own, 1 + last - first)
     after_prefix, status = jax.tree.map(_join, *parts) if len(parts) > 1 else parts[0]
-    found: Recall = finished(experiment, prefix.samples | after_prefix, jnp.asarray(status))
+    found: Recall = finished(experiment, before | after_prefix, jnp.asarray(status))
     found = found.described(describe(experiment, time.perf_counter() - began))
     if not schedule.wanted:
         return found
@@ -242,6 +253,18 @@ def warn_of_another_compression(experiment: Experiment) -> None:
             f"{experiment.pack.name} was cycled with delta0 = {own:g}, not {experiment.delta0}: its memory of the "
             "preparation differs from the paper's; prepare a pack for this delta0",
             OtherCompressionWarning,
+        )
+
+
+def warn_of_another_material(experiment: Experiment) -> None:
+    """Warn of elastic numbers that are not those with which the pack came to rest; units are left out."""
+    pack = experiment.pack
+    made = {name: value for name in _ELASTIC if is_real(value := pack.info.get("material", {}).get(name, ""))}
+    if odd := [name for name in made if not np.allclose(np.asarray(getattr(experiment.material, name)), made[name])]:
+        others = ", ".join(f"{name} = {made[name]:g}, not {said(getattr(experiment.material, name))}" for name in odd)
+        warn_caller(
+            f"{pack.name} was prepared with {others}: it is not at rest so; take its own, as in "
+            "material=gm.Material(...), or prepare a pack with these"
         )
 
 

@@ -327,9 +327,9 @@ xarray.open_dataset("recall.h5", engine="h5netcdf").p_sig.isel(signal=0).plot()
 xarray.open_dataset("recall.h5", engine="h5netcdf", group="stages/readout").pressure
 ```
 
-With it, `gm.to_xarray(gm.load_recall("recall.h5"))` is one dataset, its stages one after the other along `time`. The
-first 512 bytes are a SHA-256 of the rest: a file that was changed by another program is refused here. JSON files carry
-their fields' units and descriptions in `about`.
+With xarray (`pip install '.[export]'`), `gm.to_xarray(gm.load_recall("recall.h5"))` is one dataset, its stages one
+after the other along `time`. The first 512 bytes are a SHA-256 of the rest: a file that was changed by another program
+is refused here. JSON files carry their fields' units and descriptions in `about`.
 """
 
 
@@ -338,6 +338,13 @@ _SEVERAL = (
     "axes read and channel before their own, and the gains a last axis, the channel that was written on. The "
     "attributes `reads` and `channels` name them. In `stages/NAME`, `observed_X` is what the observer X gave: a value "
     "or an array of them for each bin and replica."
+)
+
+
+_STAGES = (
+    "In `stages/NAME`, in the order of the attribute `order` (in packs where they were kept). Stages that all replicas "
+    "have in common, those before the first waveform and of preparations, have the dimension `common` of length 1 in "
+    "the place of `replica`:"
 )
 
 
@@ -354,7 +361,7 @@ def _section(schema: Schema) -> str:
     if schema is RECALL:
         lines += ["", _SEVERAL]
     if schema is RECALL or schema is PACK:
-        lines += ["", "In `stages/NAME`, in the order of the attribute `order` (in packs where they were kept):", ""]
+        lines += ["", _STAGES, ""]
         lines += _table(STAGE)
         lines += ["", "In `frames`, where they were asked for (`--frames`), whose attribute `stages` names theirs:", ""]
         lines += _table(FRAMES | RUBBED)

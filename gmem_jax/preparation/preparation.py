@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from typing import Any, cast
 
 import jax
@@ -102,6 +102,16 @@ def preparation_frames(recipe: Recipe, frames: int) -> FrameSchedule:
     return FrameSchedule(wanted)
 
 
+def _require_lighter(recipe: Recipe, clump: Clump, lengths: np.ndarray) -> None:
+    """Refuse grains that weigh more than they are to be pressed by: the lid would leave them, and settle nowhere."""
+    alone = 0.5 * recipe.gravity * float(clump.volume(recipe.grains)) / float(lengths[0] * lengths[1])
+    if alone >= recipe.pressure:
+        raise ValueError(
+            f"gravity = {recipe.gravity:g} makes p_z = {alone:.2g} E by the weight of the grains alone (the mean of "
+            f"floor and lid), and {recipe.pressure:g} is wanted: ask for a larger pressure, or for less gravity"
+        )
+
+
 class _Preparation:
     """One preparation on its way: a `Runner` with one replica and no friction, and the walls as they are now."""
 
@@ -116,6 +126,7 @@ class _Preparation:
         progress: Progress,
     ) -> None:
         position, quaternion, velocity, spin, lengths = _gas(recipe, clump)
+        _require_lighter(recipe, clump, lengths)
         self.recipe, self.cache, self.filmed, self.lengths = recipe, cache, frames > 0, lengths
         self.known = *cycles_of(recipe), last_rest(recipe)
         self.frames = FrameRecorder(preparation_frames(recipe, frames))
@@ -315,8 +326,15 @@ def prepare(
         raise ValueError(f"material must be a gm.Material; got {said(material)}")
     if log is not None and not isinstance(log, dict):
         raise ValueError(f"log must be a dictionary to fill, got {said(log)}")
-    if require_whole("frames", frames) and film is None:
-        raise ValueError("frames go into film: give a list for them")
+    if not isinstance(film, list | None) or (require_whole("frames", frames) and film is None):
+        raise ValueError(f"frames go into film: give a list for them; got {said(film)}")
+    if not isinstance(name, str) or not name.isprintable():
+        raise ValueError(f"name must be a line of text, got {said(name)}")
+    for entry, given in (
+        (entry, getattr(one, entry.name)) for one in (material, friction) if is_dataclass(one) for entry in fields(one)
+    ):
+        if "interval" in entry.metadata and np.ndim(given):
+            raise ValueError(f"{entry.name} of a pack must be one number, got {said(given)}")
     recipe = replace(recipe or Recipe(), **changes)
     clump = graded(recipe, grain)
     require_walls(periodic_axes(recipe.boundary), material)
@@ -354,7 +372,7 @@ def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw
     edges = np.asarray(box.lengths)[:, 0]
     position = position - np.where(box.periodic, edges * np.rint(position / edges), 0.0)
     pairs = find_pairs(clump, position, quaternion, box, recipe.delta0)
-    system = System(clump, friction, pairs, material)
+    system = System(clump, friction, pairs, material, recipe.gravity or None)
     backend = (
         "jax" if runner.simulation.backend == "jax" else "auto"
     )  # the experiment's law may be one of the user's own

@@ -136,7 +136,7 @@ def _listed(name: str, given: Any) -> list[float]:
     """Numbers of a text like "1,1.4", or of a sequence."""
     words = given.split(",") if isinstance(given, str) and given.strip() else given
     try:
-        return [float(word) for word in words or ()]
+        return [float(word) for word in (() if words is None else words)]
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be numbers with commas between them, like 1,1.4; got {said(given)}") from None
 

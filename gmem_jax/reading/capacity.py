@@ -58,12 +58,14 @@ def decoded_bits(signals: jax.typing.ArrayLike, noise: float, *, draws: int = 4,
         seed: of the noise and of the decoder's splits.
 
     Raises:
-        ValueError: if these are not 2^L signals, the noise is no number from 0, or there are no draws.
+        ValueError: if these are not 2^L signals, or not finite, the noise is no number from 0, or there are no draws.
     """
     values = np.asarray(signals, dtype=float)
     bits = len(values).bit_length() - 1
     if values.ndim != 2 or len(values) != 2**bits or not bits:
         raise ValueError(f"all words of one length are 2, 4, 8, ... signals [2^L, 256], got {list(values.shape)}")
+    if not np.all(np.isfinite(values)):
+        raise ValueError("recalls must be finite numbers: leave out those of broken runs")
     if not 0.0 <= noise < np.inf:
         raise ValueError(f"noise must be a number from 0, got {noise:g}")
     draws = require_whole("draws", draws, 1)
@@ -150,9 +152,12 @@ def greedy_alphabet(recalls: jax.typing.ArrayLike, size: int) -> Alphabet:
         size: S, how many to choose.
 
     Raises:
-        ValueError: if there are not as many candidates.
+        ValueError: if there are not as many candidates, or not all are finite.
     """
     values = np.asarray(recalls, dtype=float)
+    if not np.all(np.isfinite(values)):
+        raise ValueError("recalls must be finite numbers: leave out those of broken runs")
+    size = require_whole("size", size)
     if not 1 <= size <= len(values):
         raise ValueError(f"an alphabet of {len(values)} candidates has 1 to {len(values)} waveforms, got {size}")
     power = np.mean(values**2, axis=1)

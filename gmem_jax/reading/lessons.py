@@ -13,11 +13,14 @@ from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from gmem_jax.experiment.signals import bin_average, bit_width, words
+from gmem_jax.experiment.signals import LONGEST_WORD, bin_average, bit_width, words
 from gmem_jax.physics import chance
+from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.simulation.stage import BINS
 
+MOST_LAYERS = 8
 RATIOS = 64  # of noise to signal at which the size of a set is calculated, and joined by straight lines: right to 1e-5
 
 
@@ -37,6 +40,9 @@ class TrainingConfig:
         held_out: part of the (shift, amplitude, draw) combinations that is kept for validation.
         batch: examples to a step.
         rate: learning rate of plain SGD.
+
+    Raises:
+        ValueError: for what no net can be trained on.
     """
 
     bits: int
@@ -50,6 +56,26 @@ class TrainingConfig:
     held_out: float = 0.1
     batch: int = 32
     rate: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("bits", "shifts", "amplitudes", "draws", "batch"):
+            object.__setattr__(self, name, require_whole(name, getattr(self, name), 1))
+        widths = self.hidden if np.iterable(self.hidden) else (self.hidden,)
+        object.__setattr__(self, "hidden", tuple(require_whole("a width of hidden", width, 1) for width in widths))
+        if self.bits > LONGEST_WORD or len(self.hidden) > MOST_LAYERS:
+            limits = f"at most {LONGEST_WORD} bits and {MOST_LAYERS} hidden layers"
+            raise ValueError(f"a net has {limits}, got {self.bits} and {len(self.hidden)}")
+        for name in ("shift", "amplitude", "noise", "held_out", "rate"):
+            require_numbers(**{name: getattr(self, name)})
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be a number from 0, got {getattr(self, name)}")
+        if self.rate == 0.0:
+            raise ValueError("rate must be above 0")
+        if self.kept >= self.combinations:
+            raise ValueError(
+                f"held_out = {self.held_out:g} of {self.combinations} (shift, amplitude, draw) combinations leaves "
+                "none to train on; hold out less, or take more of them"
+            )
 
     @property
     def classes(self) -> int:

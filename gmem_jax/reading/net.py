@@ -78,14 +78,22 @@ def logits(net: Net, signals: jax.typing.ArrayLike) -> jax.Array:
 
 
 def predict(net: Net, signals: jax.typing.ArrayLike) -> jax.Array:
-    """Number of the word read from each recalled signal [S, 256], from 0, [S]."""
-    return jnp.argmax(logits(net, signals), axis=-1)
+    """Number of the word read from each recalled signal [S, 256], from 0, [S]; -1 where a signal is not finite."""
+    found = logits(net, signals)
+    return jnp.where(jnp.all(jnp.isfinite(found), axis=-1), jnp.argmax(found, axis=-1), -1)
 
 
 def accuracy(net: Net, signals: jax.typing.ArrayLike, word: jax.typing.ArrayLike | None = None) -> jax.Array:
-    """Part of the recalled signals [S, 256] that is read right; `word` [S] as in `cross_entropy`."""
+    """Part of the recalled signals [S, 256] that is read right; `word` [S] as in `cross_entropy`.
+
+    NaN if any of the signals is not finite, or all are zero.
+
+    Raises:
+        ValueError: if there are more signals than words, and no `word` says which each is.
+    """
     read = predict(net, signals)
-    return jnp.mean(read == (jnp.arange(len(read)) if word is None else jnp.asarray(word)), dtype=jnp.float32)
+    right = jnp.mean(read == _stored(net, len(read), word), dtype=jnp.float32)
+    return jnp.where(jnp.all(read >= 0), right, jnp.nan)
 
 
 def cross_entropy(net: Net, signals: jax.typing.ArrayLike, word: jax.typing.ArrayLike | None = None) -> jax.Array:
@@ -95,6 +103,15 @@ def cross_entropy(net: Net, signals: jax.typing.ArrayLike, word: jax.typing.Arra
         net: a trained net.
         signals: p_sig, [S, 256], in any unit.
         word: numbers of the words stored, from 0, [S]; default 0, 1, 2, ...
+
+    Raises:
+        ValueError: if there are more signals than words, and no `word` says which each is.
     """
     signals = jnp.asarray(signals)
-    return loss_of(net, normalise(signals), jnp.arange(len(signals)) if word is None else jnp.asarray(word))
+    return loss_of(net, normalise(signals), _stored(net, len(signals), word))
+
+
+def _stored(net: Net, count: int, word: jax.typing.ArrayLike | None) -> jax.Array:
+    if word is None and count > net.lessons.classes:
+        raise ValueError(f"{count} signals, and the net knows {net.lessons.classes} words: name the word of each")
+    return jnp.arange(count) if word is None else jnp.asarray(word)

@@ -13,7 +13,6 @@ import numpy as np
 from flax import serialization
 
 from gmem_jax.errors import FileFormatError
-from gmem_jax.experiment.signals import LONGEST_WORD
 from gmem_jax.files.atomic import atomic
 from gmem_jax.files.schemas import NET, other_kind
 from gmem_jax.files.seal import BLOCK, require_sealed, seal
@@ -29,6 +28,7 @@ from gmem_jax.files.validation import (
     whole,
 )
 from gmem_jax.physics import chance
+from gmem_jax.physics.numbers import require_whole
 from gmem_jax.reading.lessons import Examples, TrainingConfig, examples
 from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
 from gmem_jax.simulation.progress import silent
@@ -131,10 +131,11 @@ def train_net(
 
     Raises:
         FileFormatError: if the checkpoint is broken.
-        ValueError: if it is of another lessons or seed.
+        ValueError: if it is of other lessons or of another seed, or the seed is no whole number from 0.
         OSError: if it cannot be written.
     """
-    began = saved = time.perf_counter()
+    began, seed = time.perf_counter(), require_whole("seed", seed)
+    saved = began
     training = _take_up(lessons, seed, checkpoint)
     before = training.seconds
     if training.finished and training.validation >= target:
@@ -205,9 +206,9 @@ def load(path: Path) -> Training:
         if found != NET.name:
             raise FileFormatError(f"{path}: {other_kind(found, NET.name)}")
         recipe = json_of(content.get("recipe"), "recipe")
-        require_fields(recipe, "recipe", **_RECIPE)
-        require(set(recipe) == set(_RECIPE), "its recipe has fields that lessons have not")
-        lessons = TrainingConfig(**{**recipe, "hidden": tuple(recipe["hidden"])})
+        known = {entry.name for entry in fields(TrainingConfig)}
+        require(isinstance(recipe, dict) and set(recipe) == known, "its recipe has other fields than lessons have")
+        lessons = TrainingConfig(**recipe)
         require_fields(content.get("training"), "training", **_TRAINING)
         require(set(content["training"]) == set(_TRAINING), "its training has fields that it should not have")
         net = Net(_parameters(content.get("parameters"), lessons), lessons)
@@ -218,14 +219,6 @@ def _part(value: Any) -> bool:
     return is_number(value) and 0.0 <= value <= 1.0
 
 
-_RECIPE: dict[str, Callable[[Any], bool]] = {
-    "bits": lambda value: whole(value) and 1 <= value <= LONGEST_WORD,
-    "hidden": lambda value: isinstance(value, list) and len(value) <= 8 and all(whole(one) and one for one in value),
-    **dict.fromkeys(("shifts", "amplitudes", "draws", "batch"), lambda value: whole(value) and value > 0),
-    **dict.fromkeys(("shift", "amplitude", "noise"), lambda value: is_number(value) and value >= 0.0),
-    "held_out": _part,
-    "rate": lambda value: is_number(value) and value > 0.0,
-}
 _TRAINING: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("seed", "step", "examples"), whole),
     "loss": lambda value: isinstance(value, float),  # NaN before the first step

@@ -22,6 +22,8 @@ import gmem_jax as gm
 PACK = gm.load_pack(TETRA_27)
 SIX: Any = gm.six_signals()
 EXPERIMENT = gm.Experiment(PACK, gm.words(1), t0=60.0)
+MIXED = gm.Experiment(PACK, gm.words(1), t0=60.0)
+object.__setattr__(MIXED, "precision", "mixed")  # which asks for the native library
 
 
 def test_a_wrong_part_of_an_experiment_is_refused_with_what_makes_a_right_one() -> None:
@@ -155,6 +157,33 @@ def test_every_number_that_is_asked_for_is_a_number_and_no_text_of_one() -> None
         (lambda: gm.design_waveforms(EXPERIMENT, iterations="1"), "iterations must be a whole number from 0, got '1'"),
         (lambda: gm.design_by_kernel(EXPERIMENT, gain="1"), "gain must be a number, got '1'"),
         (lambda: gm.design_drive([EXPERIMENT], {"t0": ("1", 99.0)}), r"t0 \(lowest\) must be a number, got '1'"),
+        (
+            lambda: gm.design_drive([EXPERIMENT], {"mu": (0.5, 2.0), "friction.mu": (0.9, 1.1)}),
+            "one parameter is named twice",
+        ),
+        (lambda: gm.design_drive([EXPERIMENT], {"dt": (0.1, 0.6)}), "dt is fixed when a program is compiled"),
+        (
+            lambda: gm.design_drive([EXPERIMENT], {"mu": (0.5, 2.0)}, spread=-0.2),
+            r"spread must be in \(0, 1\), got -0.2",
+        ),
+        (
+            lambda: gm.design_drive([EXPERIMENT, gm.replace(EXPERIMENT, {"friction.mu": 0.6})], {"mu": (0.5, 2.0)}),
+            "mu must be one number, the same in all experiments",
+        ),
+        (lambda: gm.value_and_grad(MIXED), "there are no derivatives in mixed precision"),
+        (lambda: gm.design_waveforms(MIXED), "there are no derivatives in mixed precision"),
+        (lambda: gm.prepare(grains=40, gravity=1e-3), "by the weight of the grains alone .* and 0.002 is wanted"),
+        (lambda: gm.prepare(frames=5, film=()), r"frames go into film: give a list for them; got \(\)"),  # type: ignore[arg-type]
+        (lambda: gm.prepare(friction=gm.Hooke(mu=jnp.ones(2))), "mu of a pack must be one number, got Array"),
+        (lambda: gm.prepare(name="a\nb"), "name must be a line of text"),
+        (lambda: gm.classify.TrainingConfig(2, held_out=1.0), "held_out = 1 of 17325 .* leaves none to train on"),
+        (lambda: gm.classify.TrainingConfig(2, batch=0), "batch must be a whole number from 1, got 0"),
+        (lambda: gm.classify.TrainingConfig(2, rate=0.0), "rate must be above 0"),
+        (lambda: gm.classify.TrainingConfig(2, hidden=(0,)), "a width of hidden must be a whole number from 1, got 0"),
+        (lambda: gm.classify.TrainingConfig(2, noise=np.nan), "noise must be a number from 0, got nan"),
+        (lambda: gm.classify.train(gm.classify.TrainingConfig(2), -1), "seed must be a whole number from 0, got -1"),
+        (lambda: gm.capacity.greedy_alphabet(np.full((4, 256), np.nan), 2), "recalls must be finite numbers"),
+        (lambda: gm.capacity.decoded_bits(np.full((4, 256), np.nan), 0.1), "recalls must be finite numbers"),
         (lambda: gm.design_drive([EXPERIMENT], {}), r"bounds must name what is tuned, as in \{'gamma0'"),
         (lambda: gm.hold("2"), "stage 'hold': its length must be a number, got '2'"),  # type: ignore[arg-type]
         (lambda: gm.Stage("a", length=None), r"its length must be in \[0, inf\), got None"),  # type: ignore[arg-type]

@@ -1,5 +1,6 @@
 """The memory experiment on a pack of 27 grains with a shortened run: interfaces, transformations, derivatives."""
 
+import warnings
 from pathlib import Path
 
 import jax
@@ -156,6 +157,17 @@ def test_another_delta0_than_the_packs_own_warns(pack: gm.Pack) -> None:
     with pytest.warns(UserWarning, match="was cycled with delta0") as heard:
         gm.run(gm.Experiment(pack, two_bumps(jnp.ones((1, 2))), delta0=0.04, **SHORT))
     assert {one.filename for one in heard} == {__file__}
+
+
+def test_another_material_than_the_packs_own_warns(pack: gm.Pack) -> None:
+    soft = gm.Experiment(pack, two_bumps(jnp.ones((1, 2))), material=gm.Material(wall_rigidity=0.5), **SHORT)
+    with pytest.warns(
+        UserWarning, match=r"tetra-27 was prepared with wall_rigidity = 1, not 0\.5: it is not at rest so"
+    ):
+        gm.run(soft)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # units move nothing
+        gm.run(gm.replace(soft, material=gm.Material(modulus=1e9)))
 
 
 def test_single_precision_is_refused(pack: gm.Pack) -> None:

@@ -17,7 +17,8 @@ from gmem_jax.physics.step import march, start
 from gmem_jax.physics.system import System
 from gmem_jax.preparation.piston import Pressed, Servo, press
 from gmem_jax.preparation.preparation import _gas
-from gmem_jax.preparation.recipe import grain_steps, lattice, pressure_over_wanted, sites_of
+from gmem_jax.preparation.recipe import SLOWEST_BINS, grain_steps, lattice, pressure_over_wanted, sites_of, stepping
+from gmem_jax.preparation.ringing import ringing_period
 
 PRESS = jax.jit(press, static_argnames=("blocks", "march"))
 TINY = gm.Recipe(grains=12, gas_time=500.0, t0=300.0, cycles=1)
@@ -240,6 +241,10 @@ def test_a_pack_that_was_prepared_under_gravity_is_at_rest_under_it() -> None:
     assert fastest(g) < 1e-2 * g
     assert fastest(None) > 0.9 * g
     assert pack.info["recipe"]["gravity"] == g
+    system = System(pack.clump, gm.Hooke(), pack.pairs, gm.Material(), g)
+    at_rest = pack.position[..., None], pack.quaternion[..., None], pack.box
+    steps = stepping(max(TINY.t0, SLOWEST_BINS), TINY.dt)[1]
+    np.testing.assert_allclose(pack.ringing_period, ringing_period(system, *at_rest, steps), rtol=1e-3)
 
 
 def test_a_pack_is_centred_with_all_spheres_inside(prepared: tuple[gm.Pack, dict]) -> None:

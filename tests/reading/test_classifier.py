@@ -188,6 +188,12 @@ def test_a_finished_net_is_loaded_not_trained(small: classify.Training, tmp_path
     np.testing.assert_array_equal(classify.logits(again.net, signals), classify.logits(small.net, signals))
 
 
+def test_a_net_of_any_whole_numbers_can_be_read_again(tmp_path: Path) -> None:
+    config = classify.TrainingConfig(np.int64(2), hidden=[8])  # type: ignore[arg-type]
+    trained = classify.train(config, np.int64(3), budget=60.0, most_steps=5, checkpoint=tmp_path / "net.msgpack")  # type: ignore[arg-type]
+    assert classify.load(tmp_path / "net.msgpack").net.lessons == trained.net.lessons
+
+
 def test_the_listener_is_told_loss_and_held_out_accuracy() -> None:
     seen: list[classify.Training] = []
     classify.train(SMALL, 0, target=1.1, most_steps=500, listener=seen.append)
@@ -237,6 +243,15 @@ def test_other_words_can_be_asked_for(small: classify.Training) -> None:
     assert float(classify.accuracy(small.net, signals[order], order)) == 1.0
     assert float(classify.cross_entropy(small.net, signals[order], order)) < 0.1
     assert float(classify.cross_entropy(small.net, signals[order])) > 1.0
+    with pytest.raises(ValueError, match="8 signals, and the net knows 4 words: name the word of each"):
+        classify.accuracy(small.net, jnp.concatenate([signals, signals]))
+
+
+def test_nothing_is_read_from_a_broken_run(small: classify.Training) -> None:
+    broken = bin_average(words(2)).at[1].set(jnp.nan)
+    for signals in (broken, jnp.zeros((4, 256))):
+        assert np.isnan(float(classify.accuracy(small.net, signals)))
+        assert classify.predict(small.net, signals).tolist() == [-1] * 4  # a set is read as a whole
 
 
 def test_jit_changes_nothing(small: classify.Training) -> None:
