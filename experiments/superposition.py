@@ -21,7 +21,7 @@ from gmem_jax.experiment.run import Prefix, prefix_of, run
 from gmem_jax.experiment.signals import bit_width
 from gmem_jax.physics.material import Material
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
-from gmem_jax.simulation.stage import BIN_CENTRES
+from gmem_jax.simulation.stage import bin_centres
 
 GAMMAS = (1e-4, 3e-4, 1e-3, 3e-3)
 BITS = (3, 4, 5)
@@ -57,7 +57,7 @@ def of_words(bits: int) -> tuple[int, float]:
 def draw(path: Path, rows: list[list[Any]], six: dict[str, Any], title: str) -> None:
     """The six recalls beside their predictions, and errors against gamma0 and against the number of bits."""
     figure, axes = pyplot().subplots(2, 4, figsize=(14, 6))
-    pascal, u = Material().modulus, BIN_CENTRES
+    pascal, u = Material().modulus, bin_centres()
     for number, axis in enumerate((*axes[0, :3], *axes[1, :3])):
         axis.plot(u, pascal * six["simulated"][number], color="C0", label="simulated")
         axis.plot(u, pascal * six["both"][number], "--", color="C3", label="superposition")

@@ -39,7 +39,7 @@ from gmem_jax.experiment.changes import value_at
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.identity import fingerprint
 from gmem_jax.experiment.record import describe, key_of_run, pack_fingerprint
-from gmem_jax.experiment.run import COPIES, grain_steps, prefix_of, run, run_bytes
+from gmem_jax.experiment.run import COPIES, prefix_of, run, run_bytes, steps_of_grains
 from gmem_jax.experiment.signals import Bumps, Spline, waveform
 from gmem_jax.files import schemas
 from gmem_jax.files.results import save_result
@@ -65,7 +65,7 @@ def _announce(experiment: Experiment, what: str, runs: float, side_by_side: int,
         side_by_side: signals at once.
         memory: in parts of what they take in a run.
     """
-    steps = grain_steps(experiment, experiment.signals.count)
+    steps = steps_of_grains(experiment, experiment.signals.count)
     backend = experiment.runs_on
     needs = memory * run_bytes(experiment, side_by_side)
     announce(f"{what}, {experiment.pack.grains} grains", runs * steps, needs, backend, side_by_side + 1)

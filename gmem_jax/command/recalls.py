@@ -32,7 +32,7 @@ from gmem_jax.command.resuming import Restart, batch_for, foresee, resumable
 from gmem_jax.experiment.analysis import spread
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.record import key_of_run, signals_to_dict
-from gmem_jax.experiment.run import frame_schedule, grain_steps, run, run_bytes
+from gmem_jax.experiment.run import frame_schedule, run, run_bytes, steps_of_grains
 from gmem_jax.experiment.signals import Signals, six_signals
 from gmem_jax.experiment.stepping import at_accuracy, require_stable, stable_step
 from gmem_jax.files.cache import list_packs
@@ -55,7 +55,7 @@ SHIPPED: dict[str, Any] = {
 
 def _announce(experiment: Experiment, batch: int) -> dict[str, float]:
     """Say what a recall in batches will need."""
-    work = grain_steps(experiment, batch)
+    work = steps_of_grains(experiment, batch)
     backend = experiment.runs_on
     side_by_side = min(batch, experiment.signals.count)
     what = f"{experiment.pack.grains} grains, {plural(experiment.signals.count, 'signal')}"

@@ -23,7 +23,7 @@ from gmem_jax.physics.pytree import comparable, short_repr
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
-from gmem_jax.simulation.stage import BIN_CENTRES, BINS
+from gmem_jax.simulation.stage import BINS, bin_centres
 
 QUADRATURE_POINTS = 2048  # points of v for inner products of basis functions
 
@@ -304,7 +304,7 @@ def _kernel_of(experiment: Experiment, both: Bumps, p_sig: np.ndarray, channel: 
     n = len(p_sig) // 2
     plus, minus = p_sig[:n], p_sig[n:]
     return MemoryKernel(
-        u=BIN_CENTRES.copy(),
+        u=bin_centres(),
         centres=np.asarray(both.centres[0]),
         width=float(both.width),
         odd=0.5 * (plus - minus),

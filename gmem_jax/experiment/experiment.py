@@ -45,7 +45,7 @@ from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.loop import Observe, Simulation, at_rest
 from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.stable_step import LONGEST_STEP
-from gmem_jax.simulation.stage import BIN_CENTRES, BINS, Columns, Drive, Lane, Stage
+from gmem_jax.simulation.stage import BINS, Columns, Drive, Lane, Stage, bin_centres
 from gmem_jax.simulation.strain import COMPRESSIONS, Sine, StrainPath, Waveforms
 
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
@@ -454,7 +454,7 @@ def _ends(signals: Signals) -> jax.Array:
 @jax.jit
 def _probe(signals: Signals) -> tuple[jax.Array, jax.Array]:
     """The waveforms at both ends, and in between."""
-    return _ends(signals), signals.shear(jnp.asarray(BIN_CENTRES))
+    return _ends(signals), signals.shear(jnp.asarray(bin_centres()))
 
 
 NUMBERS = {entry.name: entry for entry in fields(Experiment) if entry.metadata.get("words")}

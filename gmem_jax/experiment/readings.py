@@ -16,7 +16,7 @@ from gmem_jax.experiment.signals import Signals, bin_average
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.protocol import Protocol
-from gmem_jax.simulation.stage import BIN_CENTRES, BINS, Stage
+from gmem_jax.simulation.stage import BINS, Stage, bin_centres
 
 
 class Readings(NamedTuple):
@@ -84,7 +84,7 @@ class Readings(NamedTuple):
 
     def shears(self, sets: Mapping[str, Signals]) -> jax.Array:
         """I at the centres of the bins, likewise."""
-        return self._by_drive(sets, lambda one: one.shear(jnp.asarray(BIN_CENTRES)).T)
+        return self._by_drive(sets, lambda one: one.shear(jnp.asarray(bin_centres())).T)
 
     def compare(
         self, signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None
@@ -119,7 +119,7 @@ def _partial(stage: Stage) -> bool:
 def _seen(stage: Stage) -> np.ndarray:
     """Which of the 256 bins of u a stage goes through for the greater part, [256]."""
     low, high = sorted(stage.ends)
-    inside: np.ndarray = (low < BIN_CENTRES) & (high > BIN_CENTRES)
+    inside: np.ndarray = (low < bin_centres()) & (high > bin_centres())
     return inside
 
 

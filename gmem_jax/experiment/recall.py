@@ -27,7 +27,7 @@ from gmem_jax.simulation.frames import Frames
 from gmem_jax.simulation.loop import Simulation, rollout_stages
 from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.sample import Sample
-from gmem_jax.simulation.stage import BIN_CENTRES, Stage
+from gmem_jax.simulation.stage import Stage, bin_centres
 
 REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than this part of the walls' speed
 
@@ -183,7 +183,7 @@ def unjudged(experiment: Experiment, stages: OrderedDict[str, Sample], status: j
     match = experiment.compare(p_sig)
     smooth = experiment.compare(p_sig, pack.ringing_period / jnp.max(jnp.asarray(t0)))
     made = Recall(
-        u=jnp.asarray(BIN_CENTRES),
+        u=jnp.asarray(bin_centres()),
         shear=experiment.readings.shears(experiment.sets),
         J=experiment.integral(),
         p_sig=p_sig,

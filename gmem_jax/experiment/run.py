@@ -231,7 +231,7 @@ def replica_bins(experiment: Experiment, batch: int) -> int:
     return before + after * (count + -(-count // batch))
 
 
-def grain_steps(experiment: Experiment, batch: int) -> int:
+def steps_of_grains(experiment: Experiment, batch: int) -> int:
     """Steps of a run times its grains and its replicas."""
     return experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
 

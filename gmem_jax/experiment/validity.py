@@ -20,7 +20,7 @@ from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.state import Status
 from gmem_jax.simulation.sample import Sample
-from gmem_jax.simulation.stage import BIN_CENTRES, BINS
+from gmem_jax.simulation.stage import BINS, bin_centres
 
 DEEPEST = 0.2  # R; there a contact's radius is 0.32 R, which Hertz takes for small. delta0 = 0.05 makes 0.14 to 0.17
 FASTEST = 5e-3  # inertial number; at 7e-3 (t0 = 180) F is 0.20 to 0.33 on packs that have 0.66 to 0.88 when not hurried
@@ -158,7 +158,9 @@ def readable(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
 
 def _largest_waveforms(experiment: Experiment) -> jax.Array:
     """max |I| of every replica as it is applied, [S + 1], the zero signal's first."""
-    own = {name: jnp.max(jnp.abs(one.shear(jnp.asarray(BIN_CENTRES))), axis=0) for name, one in experiment.sets.items()}
+    own = {
+        name: jnp.max(jnp.abs(one.shear(jnp.asarray(bin_centres()))), axis=0) for name, one in experiment.sets.items()
+    }
     drives = [drive for stage in experiment.protocol for drive in stage.own]
     largest = [abs(drive.amplitude) * own[str(drive.waveform)] for drive in drives]
     return jnp.concatenate([jnp.zeros(1), functools.reduce(jnp.maximum, largest)])

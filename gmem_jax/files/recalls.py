@@ -35,7 +35,7 @@ from gmem_jax.physics.state import WARNINGS, Status
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.sample import Sample
-from gmem_jax.simulation.stage import BIN_CENTRES
+from gmem_jax.simulation.stage import bin_centres
 
 _EVERY_BIT = int(sum(Status))
 
@@ -140,7 +140,7 @@ def _check(recall: Recall) -> None:
         f"it has {plural(signals, 'signal')} and {plural(replicas, 'replica')}, not one more",
     )
     require((status >= 0) & (status & ~_EVERY_BIT == 0), "its status is none that there is")
-    require(np.abs(np.asarray(recall.u) - BIN_CENTRES) < 1e-12, "its u are not the centres of bins")
+    require(np.abs(np.asarray(recall.u) - bin_centres()) < 1e-12, "its u are not the centres of bins")
     require_finite({name: getattr(recall, name) for name in ("J", "window", "dt")})
     require(
         (recall.window > 0.0) & np.all(np.asarray(recall.dt) > 0.0), "its time step or ringing period is not positive"

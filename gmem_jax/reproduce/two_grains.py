@@ -22,7 +22,7 @@ from gmem_jax.physics.contact.path import contact_path
 from gmem_jax.reproduce.figures import DELTA0
 from gmem_jax.reproduce.single_contact import write_columns
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
-from gmem_jax.simulation.stage import BIN_CENTRES, BINS
+from gmem_jax.simulation.stage import BINS, bin_centres
 
 STORE = 0.2  # t0, in the picture
 POINTS_PER_BIN = 4  # points to a bin
@@ -95,7 +95,7 @@ def two_grains_figure(path: Path, count: int = 96, gamma0: float = 1e-3) -> dict
     story = tell((np.arange(count) + 0.5) / count, signal, gamma0=gamma0)
     integral = np.asarray(bin_average(signal))
     match = compare(jnp.asarray(story.recalled)[None], jnp.asarray(integral), 1.0)
-    u = BIN_CENTRES
+    u = bin_centres()
     figure, (left, middle, right) = pyplot().subplots(1, 3, figsize=(12.0, 3.8), width_ratios=(0.9, 1.6, 1.2))
     _sketch(left)
     shown = [int(np.argmin(np.abs(story.closes - value))) for value in DRAWN_AT]

@@ -14,7 +14,6 @@ from gmem_jax.physics.pytree import static_record
 from gmem_jax.simulation.channels import CHANNELS
 
 BINS = 256  # bins of a stage of length t0, as in the paper: the resolution of every recorded quantity
-BIN_CENTRES = (np.arange(BINS) + 0.5) / BINS  # u in the middle of each bin of a compression
 LONGEST_NAME = 150  # of a stage; files take 200, and a protocol appends to a name that comes twice
 LONGEST_STAGE = 1e9  # in t0: more bins than any machine goes through
 SINE = "sine:"  # begins the name of a drive of whole sine periods
@@ -26,6 +25,12 @@ Role = Literal["condition", "write", "hold", "read"]
 """What a stage is for: to strain the pack without a waveform, to apply one, to wait, or to measure what it recalls."""
 Along = Literal["u", "time"]
 """What a waveform is a function of: the compression u, or the time since the stage began, over its length."""
+
+
+def bin_centres() -> np.ndarray:
+    """u in the middle of each bin of a compression, [256]: a new array, which no trace of another precision knows."""
+    centres: np.ndarray = (np.arange(BINS) + 0.5) / BINS
+    return centres
 
 
 class Bin(NamedTuple):

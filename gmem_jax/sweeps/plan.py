@@ -10,7 +10,7 @@ from typing import Any
 
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.record import key_of_run, to_dict
-from gmem_jax.experiment.run import default_batch, grain_steps
+from gmem_jax.experiment.run import default_batch, steps_of_grains
 from gmem_jax.experiment.several import match
 
 ABREAST = 64  # replicas of a run at most: whole vectors of every CPU, and enough for every thread
@@ -87,7 +87,7 @@ def job(group: Sequence[Point], memory: int) -> Job:
     experiments = [one.experiment for one in group]
     configurations = tuple(_found_anywhere(to_dict(each)) for each in experiments)
     batch = min(default_batch(experiments[0], memory), experiments[0].signals.count)
-    work = sum(grain_steps(each, batch) for each in experiments)
+    work = sum(steps_of_grains(each, batch) for each in experiments)
     replicas = sum(each.replicas for each in experiments) if len(group) > 1 else batch + 1
     return Job(digest(keys), keys, configurations, batch, replicas, float(work))
 

@@ -84,7 +84,7 @@ def test_what_makes_no_protocol_is_refused(reason: str, stages: tuple[Any, ...])
     ("fields", "reason"),
     [
         ({"stop": 1.2}, r"u must be in \[0, 1\], and its stop is 1.2"),
-        ({"stop": "stay"}, r"u must be in \[0, 1\], and its stop is stay"),
+        ({"stop": "stay"}, "its stop must be a number, got 'stay'"),
         ({"role": "write"}, "it writes no waveform"),
         (
             {"role": "write", "drives": [gm.Drive("xy", "xy"), gm.Drive("xy", "b")]},

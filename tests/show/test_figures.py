@@ -56,7 +56,9 @@ def test_what_is_recorded_stands_in_files_and_can_be_drawn(recalled: tuple[gm.Ex
         if not each.plot:
             continue
         (panel,) = recall_figure(recall, each.plot).panels
-        first = each.plot_factor * np.asarray(getattr(recall.stages["readout"], name))[..., 0].reshape(256, -1)[:, 0]
+        first = {"E": 1e4}.get(each.unit, 1.0) * np.asarray(getattr(recall.stages["readout"], name))[..., 0].reshape(
+            256, -1
+        )[:, 0]
         count = first.shape[0]
         assert any(curve.y.shape == (count,) and np.array_equal(curve.y, first) for curve in panel.curves), name
 

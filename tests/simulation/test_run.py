@@ -138,6 +138,7 @@ UNSTABLE = {
 FAST = {"t0": 60.0, "rest": 0.02, "hold": 0.02, "store": 0.02}
 
 
+@pytest.mark.filterwarnings("ignore:tetra-27 was prepared with")
 @pytest.mark.parametrize("name", UNSTABLE)
 def test_a_run_that_broke_names_the_number_that_made_its_steps_unstable(
     name: str, monkeypatch: pytest.MonkeyPatch
@@ -167,6 +168,7 @@ def test_the_number_that_makes_steps_unstable_is_found_by_any_law_and_in_any_rep
     assert re.match(rf"{name} = [\d.]+ makes steps beyond 0\.\d+ t_c unstable, and dt is 0\.\d+; use a smaller", told)
 
 
+@pytest.mark.filterwarnings("ignore:tetra-27 was prepared with")
 def test_a_run_that_broke_for_no_number_that_is_known_says_what_to_try(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gmem_jax.experiment.run.require_stable", lambda _: None)
     stiff = gm.Experiment(PACK, gm.words(1), material=gm.Material(poisson=-0.9999), **FAST)
