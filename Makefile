@@ -28,10 +28,11 @@ test: install-dev
 	$(BIN)/pytest -n 2 --dist loadfile -m "not slow" $(TESTS)
 
 # Cases of ten seconds and more that say of others what a quicker one says, and what takes minutes for one statement. Their
-# programs are as a user's are; those of the others are compiled in half of the time (tests/conftest.py).
+# programs are as a user's are; those of the others are compiled in half of the time (tests/conftest.py). Files come in the
+# order of tests/conftest.py, and not by how many tests they have, of which the longest have two.
 test-slow: install-dev
 	$(REBUILD)
-	XLA_FLAGS= $(BIN)/pytest -n 2 --dist loadfile -m slow $(TESTS)
+	XLA_FLAGS= $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow $(TESTS)
 
 # Wrong code that the tests must notice; an hour or two. Names of mutations: make mutations NAMES="step-* native-*"
 mutations: install-dev

@@ -42,6 +42,11 @@ jax.config.update("jax_enable_x64", True)
 keep_programs()
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The file that takes a worker longest comes first, so that no worker waits for it at the end."""
+    items.sort(key=lambda item: item.path.name != "test_sanitizers.py")
+
+
 @pytest.fixture(autouse=True)
 def no_terminal() -> None:
     """Tables are as wide as they are: some libraries say COLUMNS when they start another process."""

@@ -164,7 +164,8 @@ def several_amplitudes(
 ) -> Protocol:
     """Training that goes through several amplitudes again and again, the smallest last: are all of them remembered?
 
-    In amorphous solids both of two are, but only if the smaller one is last (arXiv:1809.08505; arXiv:1805.09113).
+    In amorphous solids both of two are, but only if the smaller one is last (arXiv:1809.08505; arXiv:1805.09113). In
+    packs of frictional grains both are if the larger one is last (docs/protocols.md).
     The rest is as in `amplitude_training`. Expected: without training the readout of an untrained pack.
 
     Args:
