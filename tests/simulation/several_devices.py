@@ -27,15 +27,16 @@ def main(address: str, backend: str, target: str, processes: str = "1", number: 
     pack = with_skin(gm.load_pack(PACK), 0.05)  # lists are made anew on the way
     base = gm.Experiment(pack, gm.six_signals(), backend=backend, **SHORT)
     points = [gm.replace(base, {"friction.mu": mu, "gamma0": gamma0}) for mu, gamma0 in ((1.0, 1e-3), (0.4, 2e-3))]
-    # One number for each of seven replicas: of what is the same for all grains, of the walls, and of time.
-    own = {"gravity": 1e-5 * np.arange(7.0), "wall_mu": 0.1 * np.arange(7.0), "t0": 75.0 - 5.0 * np.arange(7.0)}
+    # One number for each of nine replicas, more than devices: of all grains, of the walls, of time.
+    each = np.arange(9.0)
+    own = {"gravity": 1e-5 * each, "wall_mu": 0.1 * each, "t0": 75.0 - 5.0 * each, "signals": gm.words(3)}
     filmed = gm.run(gm.replace(base, own), frames=3, frames_of=5)
     recalls = [gm.run(base, batch=3), *run_several(points), filmed]
     if number == "0":
         named = {f"p_sig-{place}": recall.p_sig for place, recall in enumerate(recalls)}
         status = [np.asarray(recall.status) for recall in recalls]
         named["time"] = getattr(filmed.frames, "time", np.zeros(0))
-        np.savez(target, devices=jax.device_count(), status=np.asarray(status), **named)
+        np.savez(target, devices=jax.device_count(), status=np.concatenate(status), **named)
 
 
 if __name__ == "__main__":
