@@ -1,11 +1,12 @@
 """Every exception of the package that a caller may want to catch, and how it warns."""
 
 import contextlib
+import os
 import sys
 import warnings
 from pathlib import Path
 
-_PASSED_OVER = (str(Path(__file__).parent), contextlib.__file__)
+_PASSED_OVER = (f"{Path(__file__).parent}{os.sep}", contextlib.__file__)
 
 
 class RunFailedError(RuntimeError):

@@ -258,8 +258,8 @@ def warn_of_another_compression(experiment: Experiment) -> None:
 
 def warn_of_another_material(experiment: Experiment) -> None:
     """Warn of elastic numbers that are not those with which the pack came to rest; units are left out."""
-    pack = experiment.pack
-    made = {name: value for name in _ELASTIC if is_real(value := pack.info.get("material", {}).get(name, ""))}
+    pack, recorded = experiment.pack, experiment.pack.info.get("material", {})
+    made = {name: recorded[name] for name in _ELASTIC if is_real(recorded.get(name, ""))}
     if odd := [name for name in made if not np.allclose(np.asarray(getattr(experiment.material, name)), made[name])]:
         others = ", ".join(f"{name} = {made[name]:g}, not {said(getattr(experiment.material, name))}" for name in odd)
         warn_caller(

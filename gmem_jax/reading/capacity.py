@@ -60,12 +60,10 @@ def decoded_bits(signals: jax.typing.ArrayLike, noise: float, *, draws: int = 4,
     Raises:
         ValueError: if these are not 2^L signals, or not finite, the noise is no number from 0, or there are no draws.
     """
-    values = np.asarray(signals, dtype=float)
+    values = _finite(signals)
     bits = len(values).bit_length() - 1
     if values.ndim != 2 or len(values) != 2**bits or not bits:
         raise ValueError(f"all words of one length are 2, 4, 8, ... signals [2^L, 256], got {list(values.shape)}")
-    if not np.all(np.isfinite(values)):
-        raise ValueError("recalls must be finite numbers: leave out those of broken runs")
     if not 0.0 <= noise < np.inf:
         raise ValueError(f"noise must be a number from 0, got {noise:g}")
     draws = require_whole("draws", draws, 1)
@@ -77,6 +75,13 @@ def decoded_bits(signals: jax.typing.ArrayLike, noise: float, *, draws: int = 4,
     again = generator.multinomial(len(values), np.full(len(values), 1.0 / len(values)), BOOTSTRAP)
     found = _bitwise(truth, read, np.concatenate([np.ones_like(again[:1]), again]))
     return Decoded(float(found[0]), float(found[1:].std(ddof=1)))
+
+
+def _finite(recalls: jax.typing.ArrayLike) -> np.ndarray:
+    values = np.asarray(recalls, dtype=float)
+    if not np.all(np.isfinite(values)):
+        raise ValueError("recalls must be finite numbers: leave out those of broken runs")
+    return values
 
 
 def _bitwise(truth: np.ndarray, read: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -154,10 +159,7 @@ def greedy_alphabet(recalls: jax.typing.ArrayLike, size: int) -> Alphabet:
     Raises:
         ValueError: if there are not as many candidates, or not all are finite.
     """
-    values = np.asarray(recalls, dtype=float)
-    if not np.all(np.isfinite(values)):
-        raise ValueError("recalls must be finite numbers: leave out those of broken runs")
-    size = require_whole("size", size)
+    values, size = _finite(recalls), require_whole("size", size)
     if not 1 <= size <= len(values):
         raise ValueError(f"an alphabet of {len(values)} candidates has 1 to {len(values)} waveforms, got {size}")
     power = np.mean(values**2, axis=1)

@@ -78,7 +78,7 @@ def logits(net: Net, signals: jax.typing.ArrayLike) -> jax.Array:
 
 
 def predict(net: Net, signals: jax.typing.ArrayLike) -> jax.Array:
-    """Number of the word read from each recalled signal [S, 256], from 0, [S]; -1 where a signal is not finite."""
+    """Number of the word read from each signal [S, 256], from 0, [S]; -1 if any is not finite, or all are zero."""
     found = logits(net, signals)
     return jnp.where(jnp.all(jnp.isfinite(found), axis=-1), jnp.argmax(found, axis=-1), -1)
 

@@ -134,8 +134,8 @@ def train_net(
         ValueError: if it is of other lessons or of another seed, or the seed is no whole number from 0.
         OSError: if it cannot be written.
     """
-    began, seed = time.perf_counter(), require_whole("seed", seed)
-    saved = began
+    began = saved = time.perf_counter()
+    seed = require_whole("seed", seed)
     training = _take_up(lessons, seed, checkpoint)
     before = training.seconds
     if training.finished and training.validation >= target:
