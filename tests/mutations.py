@@ -61,6 +61,7 @@ DOMAINS = "test_spinning_sliding_grains_of_several_domains_move_as_defined"
 ACROSS = "test_derivatives_cross_the_domains_as_defined"
 AT_ROUGH_WALLS = "test_the_adjoint_at_walls_with_friction_is_the_transpose_of_the_tangent"
 IN_A_PERIODIC_BOX = "test_the_adjoint_in_a_periodic_box_is_the_transpose_of_the_tangent"
+CENSUS = "test_the_census_is_that_of_the_definition"
 UNEQUAL = "test_values_of_unequal_spheres_are_those_of_the_definition"
 KERNELS = "test_the_kernels_give_the_values_and_tangents_of_the_definition"
 BACK = "test_the_adjoint_of_the_kernels_is_that_of_the_cpu_and_the_transpose_of_their_tangent"
@@ -220,7 +221,7 @@ MUTATIONS = (
     ),
     mutation(
         "coordination-of-spheres",
-        "simulation/sample.py",
+        "physics/census.py",
         "jnp.sum(touching > 0, axis=0)",
         "jnp.sum(touching, axis=0)",
         "test_observables_are_those_counted_by_hand",
@@ -249,27 +250,27 @@ MUTATIONS = (
     mutation(
         "stale-too-late",
         "simulation/sample.py",
-        "slack(system.pairs, spheres, box, radii) <= 0.0",
-        "slack(system.pairs, spheres, box, radii) <= -0.01",
+        "slack_of(system.pairs, census.deviation, box, radii) <= 0.0",
+        "slack_of(system.pairs, census.deviation, box, radii) <= -0.01",
         "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
     ),
     mutation(
         "stale-too-early",
         "simulation/sample.py",
-        "slack(system.pairs, spheres, box, radii) <= 0.0",
-        "slack(system.pairs, spheres, box, radii) <= 0.01",
+        "slack_of(system.pairs, census.deviation, box, radii) <= 0.0",
+        "slack_of(system.pairs, census.deviation, box, radii) <= 0.01",
         "test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin",
     ),
     mutation(
         "box-margin-below",
-        "simulation/sample.py",
+        "physics/census.py",
         "(spheres < box.lower)",
         "(spheres < box.lower - 0.1)",
         "test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall",
     ),
     mutation(
         "box-margin-above",
-        "simulation/sample.py",
+        "physics/census.py",
         "(spheres > box.upper)",
         "(spheres > box.upper - 0.01)",
         "test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall",
@@ -790,6 +791,48 @@ MUTATIONS = (
         ", c[n].root_overlap = unequal[n].root * c[n].root_overlap;",
         ";",
         f"{UNEQUAL}[M1]",
+    ),
+    mutation(
+        "native-census-of-spheres-that-are-near",
+        "cpu/census.h",
+        "touching = bits_less(square, contact_square) & all_",
+        "touching = bits_less(square, splat<V>(4.01)) & all_",
+        CENSUS,
+    ),
+    mutation(
+        "native-census-of-grains-counted-by-sphere",
+        "cpu/census.h",
+        "if (touching) grains.add(touching);",
+        "if (touching) grains.add(touching), grains.add(touching & 1);",
+        CENSUS,
+    ),
+    mutation(
+        "native-census-without-images",
+        "cpu/census.h",
+        "      if (c_.image) {",
+        "      if (false) {",
+        CENSUS,
+    ),
+    mutation(
+        "native-census-of-one-reference",
+        "cpu/census.h",
+        ": at3(c_.reference, s);",
+        ": at3(c_.reference, 0);",
+        CENSUS,
+    ),
+    mutation(
+        "native-census-of-the-last-thread",
+        "cpu/census.h",
+        "sum.spheres.add(one.spheres), sum.walls.add(one.walls);",
+        "sum.walls.add(one.walls);",
+        "test_threads_change_no_bit_and_instruction_sets_round_off",
+    ),
+    mutation(
+        "native-census-hides-what-is-not-finite",
+        "cpu/census.h",
+        "to(kFinite) = ~bad >> l & 1;",
+        "to(kFinite) = 1.0;",
+        "test_a_number_that_is_not_finite_is_seen_in_its_replica",
     ),
     mutation(
         "native-size-inertia",

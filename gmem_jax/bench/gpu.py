@@ -15,9 +15,9 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.provenance import provenance
 from gmem_jax.native import cuda, library
 from gmem_jax.native.cuda import Needs
+from gmem_jax.physics.census import take_census
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
-from gmem_jax.simulation import sample
 
 PACKS = ("tetra-325-a", "tetra-1024-a", "tetra-10240-b")
 REPLICAS = (1, 8, 32, 128)
@@ -72,8 +72,8 @@ def bytes_per_grain_step(pack: Pack) -> dict[str, float]:
         between steps and in the arrays of a call.
     """
     simulation, state = measure.encode(pack, measure.TIMED_LAWS["H"], 1, "native")
-    sides = float(sample.measure(simulation.system, state, pack.box, jnp.ones((3, 1)), 0.0).contacts[0])
-    rows, touching = float(np.asarray(pack.pairs.valid).sum()) / pack.grains, sides / 2.0
+    touching = float(take_census(simulation.system, state, pack.box).sphere_contacts[0]) / pack.grains
+    rows, sides = float(np.asarray(pack.pairs.valid).sum()) / pack.grains, 2.0 * touching
     spheres, hot, cold, load, remembered = pack.clump.spheres, 9, 4, 6, 3
     touch = 8.0 * (3 * spheres + hot + touching * (2 * remembered + load)) + rows
     move = 8.0 * (2 * hot + 2 * cold + 3 * spheres + touching * load) + rows

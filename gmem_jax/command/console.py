@@ -47,10 +47,18 @@ class _Log(Console):
         _give_up(2)
 
 
+class _Out(Console):
+    """Results, whose reader may leave: `heard` sees it. Rich would end the command as if it had failed."""
+
+    def on_broken_pipe(self) -> None:
+        """Say so."""
+        raise BrokenPipeError
+
+
 if not os.environ.get("COLUMNS", "1").strip("0"):  # not known; in no columns rich would print nothing at all
     del os.environ["COLUMNS"]
 stderr = _Log(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
-out = Console(highlight=False, markup=False)
+out = _Out(highlight=False, markup=False)
 
 STEP_COST = {
     "native": (0.2, 0.08),
@@ -113,7 +121,7 @@ def log(line: str, **style: Any) -> None:
 
 @contextlib.contextmanager
 def heard() -> Iterator[None]:
-    """What is written to stdout in the block arrives there.
+    """What is written to stdout in the block arrives there, or its reader has left.
 
     Raises:
         UnheardError: if stdout takes nothing.
@@ -121,6 +129,8 @@ def heard() -> Iterator[None]:
     try:
         yield
         sys.stdout.flush()
+    except BrokenPipeError:  # as of `| head`, which has what it wanted
+        _give_up(1)
     except OSError as error:
         _give_up(1)
         raise UnheardError(os.strerror(error.errno) if error.errno else str(error)) from error

@@ -81,8 +81,9 @@ def reproduce_command(
             log(f"trying what failed again: {count} of the points and packs")
         for name in wanted((GALLERY, *SCHEMATICS)):
             with _going_on(broken), reporting(goes_on=True) as progress:
-                drawn += reproduction(progress).picture(name)
-                log(f"wrote {drawn[-1]}")
+                drawn += (pictures := reproduction(progress).picture(name))
+                for path in pictures:
+                    log(f"wrote {path}")
         if wanted(["claims"]):
             with _going_on(broken), reporting(goes_on=True) as progress:
                 verdicts = reproduction(progress).claims()

@@ -52,10 +52,12 @@ def check_folder(path: Path) -> None:
     """
     if not path.parent.is_dir():
         raise InputError(f"--output {path}: folder {path.parent} does not exist")
+    if path.exists() and not path.is_dir():
+        raise InputError(f"--output {path}: is a file, and a folder is needed; name another")
     try:
         with suppress(FileNotFoundError):
             lock_of(path).lstat()  # whose name is longer
-        probe(path)
+        probe(path / "probe" if path.is_dir() else path)
     except OSError as error:
         raise InputError(f"--output {path}: cannot write there ({error.strerror})") from error
 

@@ -28,6 +28,7 @@ from gmem_jax.derivatives.moving import (
     with_numbers,
 )
 from gmem_jax.experiment.arguments import require_kind
+from gmem_jax.experiment.asked import require_host
 from gmem_jax.experiment.changes import replace as with_values
 from gmem_jax.experiment.experiment import Experiment, acts_on_prefix
 from gmem_jax.experiment.run import apply_waveforms, runner_of
@@ -201,10 +202,12 @@ def value_and_grad(
         recalled `p_sig` of which that is the loss, [S, 256].
 
     Raises:
-        ValueError: for a name that is no field, a loss that is not one number, or mixed precision.
+        ValueError: for a name that is no field, a loss that is not one number, or mixed precision; or inside a
+            program of JAX.
         RunFailedError: if the simulation broke down.
     """
     require_kind("value_and_grad", experiment, Experiment)
+    require_host("gm.value_and_grad", experiment)
     require_derivatives(experiment)
     tell = callback(progress)
     theta, along = theta_of(experiment, by), functools.partial(with_values, experiment)

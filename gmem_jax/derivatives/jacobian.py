@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gmem_jax.derivatives.push import push
 from gmem_jax.experiment.arguments import require_kind
+from gmem_jax.experiment.asked import require_host
 from gmem_jax.experiment.changes import replace, value_at
-from gmem_jax.experiment.experiment import Experiment
+from gmem_jax.experiment.experiment import Experiment, replica_parameters
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.run import run
 from gmem_jax.experiment.signals import Bumps
@@ -49,7 +51,7 @@ class Jacobian:
 
 def _copies(bumps: Bumps, amplitudes: Any) -> Bumps:
     """One signal's bumps with rows of amplitudes [R, n]."""
-    return Bumps(amplitudes, jnp.broadcast_to(bumps.centres, jnp.shape(amplitudes)), bumps.width)
+    return Bumps(amplitudes, jnp.broadcast_to(bumps.centres, jnp.shape(amplitudes)), jnp.reshape(bumps.width, ()))
 
 
 def _one_signal(experiment: Experiment) -> tuple[Bumps, np.ndarray]:
@@ -60,6 +62,13 @@ def _one_signal(experiment: Experiment) -> tuple[Bumps, np.ndarray]:
         raise ValueError(f"a Jacobian is taken with the background sub0, got {experiment.background}")
     if len(experiment.readings.reads) * len(experiment.readings.channels) > 1:
         raise ValueError("a Jacobian is taken of one read and one channel")
+    if any(map(jnp.ndim, replica_parameters(experiment).values())):
+        raise ValueError("a Jacobian is taken at one value of each parameter, not one for each replica")
+    law = type(experiment.friction).__name__
+    for name, path in LAW.items():
+        value = getattr(experiment.friction, path.removeprefix("friction."), None)
+        if not isinstance(value, float | jax.Array):
+            raise ValueError(f"a Jacobian is by mu and stiffness, and {name} is no number of the friction law {law}")
     return bumps, np.asarray(bumps.amplitudes)
 
 
@@ -102,10 +111,12 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
 
     Raises:
         ValueError: if there is another number of signals, they are not bumps, the background is not sub0, there are
-            several reads or channels, or the precision is mixed.
+            several reads or channels, a parameter has a value for each replica, the friction law has no number mu or
+            stiffness, or the precision is mixed; or inside a program of JAX.
         RunFailedError: if the simulation broke down.
     """
     require_kind("jacobian", experiment, Experiment)
+    require_host("gm.jacobian", experiment)
     tell = callback(progress)
     bumps, row = _one_signal(experiment)
     n = row.shape[1]

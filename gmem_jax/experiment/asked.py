@@ -55,6 +55,16 @@ def require_double(**parts: Any) -> None:
                 )
 
 
+def require_host(what: str, experiment: Any) -> None:
+    """Refuse `what` works on the host where an experiment is traced, or a program of JAX is being made.
+
+    Raises:
+        ValueError: saying what can be used there.
+    """
+    if traced(experiment, jnp.zeros(())):  # inside jax.jit the zero is traced, whatever the experiment is
+        raise ValueError(f"{what} works on the host; inside jax.jit, jax.vmap or jax.grad use gm.recall")
+
+
 def require_inside(pack: Pack) -> None:
     """Refuse a pack that does not lie in its box.
 

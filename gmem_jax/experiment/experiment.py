@@ -475,4 +475,4 @@ def replica_parameters(experiment: Experiment) -> dict[str, Any]:
     law: Any = experiment.friction
     of_law = {f"friction.{field.name}": getattr(law, field.name) for field in fields(law)} if is_dataclass(law) else {}
     numbers = {**own, **of_law}
-    return {name: value for name, value in numbers.items() if isinstance(value, float | jax.Array)}
+    return {name: value for name, value in numbers.items() if isinstance(value, float | np.ndarray | jax.Array)}

@@ -12,7 +12,7 @@ import numpy as np
 
 from gmem_jax.errors import warn_caller
 from gmem_jax.experiment.arguments import require_kind, require_several
-from gmem_jax.experiment.asked import require_double, require_inside
+from gmem_jax.experiment.asked import require_double, require_host, require_inside
 from gmem_jax.experiment.changes import with_part
 from gmem_jax.experiment.experiment import Experiment, replica_parameters
 from gmem_jax.experiment.identity import identity
@@ -20,7 +20,6 @@ from gmem_jax.experiment.recall import Recall, judged, unjudged, with_waveforms
 from gmem_jax.experiment.record import describe
 from gmem_jax.experiment.stepping import require_stable
 from gmem_jax.physics.numbers import is_real, require_whole, said
-from gmem_jax.physics.pytree import traced
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
 from gmem_jax.simulation.compiled import Compiled, require_x64
@@ -60,8 +59,7 @@ def runner_of(experiment: Experiment, **options: Any) -> Runner:
     """
     require_x64()
     require_double(pack=experiment.pack, signals=experiment.signals)
-    if traced(experiment):
-        raise ValueError("gm.run works on the host; inside jax.jit, jax.vmap or jax.grad use gm.recall")
+    require_host("gm.run", experiment)
     require_inside(experiment.pack)
     require_stable(experiment)
     pack, deepest = experiment.pack, float(np.max(np.asarray(experiment.compression)))

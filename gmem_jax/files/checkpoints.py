@@ -303,6 +303,7 @@ def locked(output: Path) -> Iterator[None]:
 
 def lock_of(output: Path) -> Path:
     """The file by which an output is locked."""
+    output = output if output.name not in ("", "..") else output.resolve()  # the present folder has no name else
     return output.with_name(f".{output.name}.lock")
 
 

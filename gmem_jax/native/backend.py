@@ -7,9 +7,11 @@ from typing import Literal, cast, get_args
 from jax.extend.backend import get_backend
 
 from gmem_jax.native import cuda, library
+from gmem_jax.native.census import census_anywhere, census_by_library
 from gmem_jax.native.march import March, march, march_anywhere, march_mixed, require_mixed
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.boundary import WALLS, PeriodicAxes
+from gmem_jax.physics.census import TakeCensus, take_census
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import entry_of
 
@@ -27,12 +29,14 @@ class ResolvedBackend:
         name: "jax" or "native".
         precision: "double" or "mixed".
         march: the steps of a bin; for "auto" also right in what is compiled for other devices than the default one.
+        census: what is counted at its end; likewise.
         why: the instruction set of the native backend on CPUs, or why plain JAX runs.
     """
 
     name: Backend
     precision: Precision
     march: March
+    census: TakeCensus
     why: str
 
 
@@ -61,7 +65,8 @@ def _resolve(backend: str, precision: str, lacks: str, built: bool, said: str) -
     steps = marcher(backend, precision)
     why = "it was asked for" if backend == "jax" else _why_not(lacks, built, said) if backend == "auto" else ""
     name: Backend = "jax" if why else "native"
-    return ResolvedBackend(name, cast(Precision, precision), steps, why or said)
+    census = {"jax": take_census, "native": census_by_library, "auto": census_anywhere}[backend]
+    return ResolvedBackend(name, cast(Precision, precision), steps, census, why or said)
 
 
 def _why_not(lacks: str, built: bool, said: str) -> str:

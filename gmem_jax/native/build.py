@@ -155,10 +155,12 @@ def build(target: Path) -> None:
     cxx, include = compiler(), headers()
     x86 = platform.machine().lower() in ("x86_64", "amd64")
     sets = INSTRUCTION_SETS if x86 else {"baseline": ()}
-    names = ("team", "cache", "plan", "blocks", "search")
+    names = ("team", "cache", "plan", "scratch", "blocks", "search")
     jobs: list[tuple[str, str, tuple[str, ...]]] = [(f"cpu/{name}.cc", f"{name}.o", ()) for name in names]
     stamp = f'-DGMEM_SOURCE_HASH="{source_hash()}"'
+    jobs.append(("call/kernels.cc", "kernels.o", ()))
     jobs.append(("call/handler.cc", "handler.o", (stamp, "-isystem", str(include))))
+    jobs.append(("call/census.cc", "census.o", ("-isystem", str(include))))
     jobs.append(("cuda/handler.cc", "gpu_handler.o", ("-isystem", str(include))))
     jobs += [(f"cuda/{name}.cc", f"gpu_{name}.o", (stamp,)) for name in ("compile", "launch")]
     # From the lowest instruction set up: the linker keeps the first copy of what they share, of the standard library.

@@ -23,7 +23,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from gmem_jax.native import cuda
 from gmem_jax.physics.step import mark_varying
 
-TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint", "gmem_second_adjoint")
+TARGETS = ("gmem_advance", "gmem_tangent", "gmem_adjoint", "gmem_second_adjoint", "gmem_census")
 
 
 class Call(NamedTuple):
@@ -141,8 +141,8 @@ def _leading(parts: Any) -> tuple[int, ...]:
     return np.broadcast_shapes(*(leaf.shape[:axes] for leaf in jax.tree.leaves(parts)))
 
 
-def _whole(parts: Any, likes: Any) -> Any:
-    """Shapes like those of some arguments, with all leading axes."""
+def with_leading(parts: Any, likes: Any) -> Any:
+    """Shapes like `likes`, those of some arguments or like them, with all leading axes."""
     leading = _leading(parts)
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape[len(leading) :]), leaf.dtype), likes)
 
@@ -152,12 +152,12 @@ def of_results(parts: Any) -> list[Any]:
     arrays: Arrays = parts[1]
     *leading, _, replicas = arrays.parameters.shape
     pressure = jax.ShapeDtypeStruct((*leading, 3, replicas), arrays.parameters.dtype)
-    return jax.tree.leaves(_whole(parts, StepOutput(arrays.fields, pressure, arrays.history)))  # type: ignore[arg-type]
+    return jax.tree.leaves(with_leading(parts, StepOutput(arrays.fields, pressure, arrays.history)))  # type: ignore[arg-type]
 
 
 def of_arrays(parts: Any) -> list[Any]:
     """Shapes of the leaves of their `Arrays`."""
-    return jax.tree.leaves(_whole(parts, parts[1]))
+    return jax.tree.leaves(with_leading(parts, parts[1]))
 
 
 Names = tuple[str | None, ...]
@@ -223,8 +223,17 @@ def make_primitive(
     outputs: Callable[[Any], list[Any]],
     plain: Callable[..., Any],
     in_place: bool = False,
+    make: Callable[..., Sequence[jax.Array]] = call_library,
 ) -> Primitive:
-    """A call whose results have the shapes `outputs`."""
+    """A call whose results have the shapes `outputs`.
+
+    Args:
+        target: what XLA knows it by.
+        outputs: the shapes, of its arguments.
+        plain: what it does where there is no library.
+        in_place: whether histories are updated where they are.
+        make: how it is made, with the arguments of `call_library`.
+    """
     primitive = Primitive(target)
     primitive.multiple_results = True
 
@@ -260,7 +269,7 @@ def make_primitive(
             if on_gpu:
                 shapes = outputs(parts)
                 return cuda.call_kernels(target, call, in_place, parts, shapes)[: len(shapes)]
-            return call_library(target, outputs, call, in_place, parts)
+            return make(target, outputs, call, in_place, parts)
 
         def shared_out(*leaves: jax.Array) -> Any:
             return _sharded(here, jax.tree.unflatten(tree, leaves), outputs)(*leaves)

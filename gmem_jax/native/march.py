@@ -267,10 +267,15 @@ def call_of(system: System, periodic: PeriodicAxes = WALLS) -> Call:
         points=row.points(law),
         isotropic=int(system.clump.isotropic),
         leaves=len(row.history),
-        periodic=sum(int(is_periodic) << axis for axis, is_periodic in enumerate(periodic)),
+        periodic=bits_of(periodic),
         unequal=int(not system.clump.equal),
         rubs=int(system.wall_mu is not None),
     )
+
+
+def bits_of(periodic: PeriodicAxes) -> int:
+    """The periodic axes as the library is told of them, a bit each."""
+    return sum(int(is_periodic) << axis for axis, is_periodic in enumerate(periodic))
 
 
 def fixed_of(system: System) -> Fixed:

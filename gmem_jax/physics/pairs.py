@@ -89,15 +89,23 @@ def slack(pairs: Pairs, spheres: jax.Array, box: Box, radii: jax.Array | None = 
     part of their motion, and the non-affine part brings them together by at most twice the largest deviation. Of
     unequal spheres this is least for the largest, as the ratio is 1 at most; radii [S] may have grown since.
     """
+    return slack_of(pairs, largest_deviation(pairs, spheres, box), box, radii)
+
+
+def slack_of(pairs: Pairs, deviation: jax.Array, box: Box, radii: jax.Array | None = None) -> jax.Array:
+    """`slack` where the `largest_deviation` is known."""
     touching: jax.Array | float = 2.0
     if radii is not None or pairs.radii is not None:
         before, now = (jnp.ones(1) if own is None else own for own in (pairs.radii, radii))
         touching = 2.0 * (jnp.max(before) + jnp.max(now - before))
-    lengths = box.lengths
-    affine = box.lower + pairs.reference * lengths
-    deviation = jnp.sqrt(jnp.max(jnp.sum((spheres - affine) ** 2, axis=1), axis=0))
-    ratio = jnp.minimum(1.0, jnp.min(lengths / pairs.smallest[:, None], axis=0))
+    ratio = jnp.minimum(1.0, jnp.min(box.lengths / pairs.smallest[:, None], axis=0))
     return ratio * pairs.reach - touching - 2.0 * deviation
+
+
+def largest_deviation(pairs: Pairs, spheres: jax.Array, box: Box) -> jax.Array:
+    """How far spheres [S, 3, B] are at most from where their places in the box were when the list was made, [B]."""
+    affine = box.lower + pairs.reference * box.lengths
+    return jnp.sqrt(jnp.max(jnp.sum((spheres - affine) ** 2, axis=1), axis=0))
 
 
 def image_shifts(pairs: Pairs, lengths: jax.Array) -> jax.Array | float:

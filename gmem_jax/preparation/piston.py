@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from gmem_jax.native.march import March
-from gmem_jax.physics.pairs import slack, sphere_centres
+from gmem_jax.native.backend import ResolvedBackend
+from gmem_jax.physics.pairs import slack_of
 from gmem_jax.physics.pytree import Scalar, pytree
 from gmem_jax.physics.state import Box, State
 from gmem_jax.physics.system import System
@@ -68,7 +68,7 @@ def largest_speed(state: State) -> jax.Array:
 
 
 def press(
-    system: System, pressed: Pressed, servo: Servo, dt: Scalar, drag: Scalar, blocks: int, march: March
+    system: System, pressed: Pressed, servo: Servo, dt: Scalar, drag: Scalar, blocks: int, backend: ResolvedBackend
 ) -> Pressed:
     """Run up to `blocks` blocks of steps; stop early when settled, when the list needs a rebuild, or on a status bit.
 
@@ -84,14 +84,15 @@ def press(
         climb = jnp.zeros_like(now.box.upper).at[2].set(velocity)
         still, (lower, upper) = jnp.zeros_like(climb), (now.box.lower, now.box.upper)
         boxes = jax.vmap(lambda time: Box(lower, upper + time * climb, still, climb, now.box.periodic))(times)
-        state, total = march(system, now.state, boxes, dt, drag)
+        state, total = backend.march(system, now.state, boxes, dt, drag)
         box = jax.tree.map(lambda leaf: leaf[-1], boxes)
-        state = check(system, state, box)
-        fastest = largest_speed(state)
+        census = backend.census(system, state, box)
+        state = check(system, state, box, census)
+        fastest = jnp.max(census.largest_speed)
         spin = jnp.sqrt(jnp.max(jnp.sum(state.grains.spin**2, axis=1)))
         ahead = 2.0 * STEPS_PER_CHECK * dt * (1.2 * (fastest + reach * spin) + servo.speed)
-        spheres = sphere_centres(state.grains, clump)
-        room = jnp.min(slack(system.pairs, spheres, box, clump.sphere_radii(len(spheres))))
+        radii = clump.sphere_radii(system.pairs.incidence.shape[0])
+        room = jnp.min(slack_of(system.pairs, census.deviation, box, radii))
         pressure = total[2] / STEPS_PER_CHECK
         met = jnp.max(jnp.abs(pressure / servo.target - 1.0)) < servo.error
         return Pressed(

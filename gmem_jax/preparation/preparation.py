@@ -61,7 +61,7 @@ CYCLE_CHUNK = 8  # bins per compiled call during the cycles
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
 MET = 0.8, 1.25  # p_z of the finished pack over the wanted one; shipped packs have 0.84 to 1.00
 
-_press = Compiled(press, static_argnames=("march",))
+_press = Compiled(press, static_argnames=("backend",))
 
 
 def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array, jax.Array, np.ndarray]:
@@ -184,8 +184,9 @@ class _Preparation:
             return {"runner": runner.snapshot(), "pressed": pressed, "spent": np.asarray(spent)}
 
         while spent < allowed:
-            system, march = runner.simulation.system, runner.simulation.resolved.march
-            pressed = _press(system, pressed, servo, self.dt, drag, blocks=min(CALL, allowed - spent), march=march)
+            simulation, blocks = runner.simulation, min(CALL, allowed - spent)
+            backend = simulation.resolved
+            pressed = _press(simulation.system, pressed, servo, self.dt, drag, blocks=blocks, backend=backend)
             raise_if_fatal(status_of(pressed.state), name, runner.simulation)
             runner.state, self.box = pressed.state, pressed.box
             done = int(pressed.blocks)

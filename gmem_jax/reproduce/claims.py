@@ -14,10 +14,10 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.run import apply_waveforms, runner_of
 from gmem_jax.experiment.signals import six_signals
+from gmem_jax.physics.census import overlaps
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.reproduce.figures import Values, crossed
-from gmem_jax.simulation.sample import overlaps
 from gmem_jax.simulation.stage import BINS
 
 STORES = (0.5, 2.0, 8.0)  # t0

@@ -27,8 +27,9 @@ A jammed pack of frictional grains that is slowly compressed while a small shear
 back on decompression, as shear stress on its walls (arXiv:2603.14595). These are {count} such experiments, simulated by
 gmem_jax {version} (`gmem reproduce dataset --scale {scale}`): the points of figs. {figures} of the paper.
 
-- points.csv: a line for each experiment: its file, the SHA-256 of that, the conditions, the pack, t0 (duration of one
-  compression, in units of t_c = R sqrt(rho / E)), gain G and fidelity F, and the bits of its status (0: sound).
+- points.csv: a line for each experiment: its file, the SHA-256 of that, the conditions, the pack's name and SHA-256,
+  t0 (duration of one compression, in units of t_c = R sqrt(rho / E)), gain G and fidelity F, and the bits of its status
+  (0: sound).
 - recalls/*.h5: HDF5, schema {schema}. `p_sig` [signal, u] is the recalled stress, and `J` [signal, u] the integral of
   the waveform: p_sig = G E delta0 gamma0 J, ideally. `u` is the compression, from 0 to 1. Groups below `stages` hold
   pressures, filling, contacts and more in time. Every array has its units and a description. The attribute
@@ -84,11 +85,13 @@ def write_dataset(path: Path, store: Store, points: Sequence[ComputedPoint], sca
 def _row(store: Store, point: ComputedPoint, gain: str, fidelity: str) -> dict[str, Any]:
     """A line of points.csv."""
     configuration = store.load(point.key).configuration
+    pack = configuration["experiment"]["pack"]
     numbers = {
         "file": f"recalls/{point.key}.h5",
         "sha256": hashlib.sha256(store.at(point.key).read_bytes()).hexdigest(),
         **asdict(point.conditions),
-        "pack": configuration["pack"],
+        "pack": pack["name"],
+        "pack_sha256": pack["sha256"],
         "t0": values_of(configuration)["t0"],
         "G": point.numbers[gain],
         "F": point.numbers[fidelity],

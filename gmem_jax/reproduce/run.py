@@ -69,17 +69,19 @@ class Schematic(NamedTuple):
     Attributes:
         title: what it shows.
         draw: writes it to a file, as SVG and, where it has numbers, as CSV beside it; what came out, for a line.
+        has_numbers: whether it does.
     """
 
     title: str
     draw: Callable[[Path], object]
+    has_numbers: bool = False
 
 
 SCHEMATICS = {
     "fig05": Schematic("the waveforms and some words, with their integrals", draw.waveforms),
-    "fig07": Schematic("two grains, and how their contact keeps a shear", two_grains_figure),
-    "fig10": Schematic("one contact under every law, beside closed forms", laws_figure),
-    "fig15": Schematic("M2 with more and more points", convergence_figure),
+    "fig07": Schematic("two grains, and how their contact keeps a shear", two_grains_figure, has_numbers=True),
+    "fig10": Schematic("one contact under every law, beside closed forms", laws_figure, has_numbers=True),
+    "fig15": Schematic("M2 with more and more points", convergence_figure, has_numbers=True),
 }
 GALLERY = "fig03"  # pictures of packs, which may have to be made
 
@@ -147,6 +149,8 @@ class Reproduction:
         if name not in FIGURES:
             raise ValueError(f"no figure {name!r}; there are {', '.join(FIGURES)}")
         size, figure = scale_of(self.scale), FIGURES[name]
+        if name == "fig14":
+            (self.folder / "nets").mkdir(parents=True, exist_ok=True)
         store = self._run(figure_spec(figure, size)).store
         points, failed = points_of(store), _failed(store)
         if not points:
@@ -168,7 +172,7 @@ class Reproduction:
         if name != GALLERY:
             target = self.folder / f"{name}.png"
             self.say(f"{name}: {SCHEMATICS[name].draw(target) or 'drawn'}")
-            return [path for path in _written(target) if path.is_file()]
+            return _written(target)[: None if SCHEMATICS[name].has_numbers else -1]
         size = scale_of(self.scale)
         runner = self._runner(Spec(shared={"t0": size.t0}, extra=tuple(shown_packs(size))))
         shown, target = runner.packs(self.executor or Processes(), self.progress), self._target(name)
@@ -245,7 +249,6 @@ class Reproduction:
 
         Nets are trained once and kept in the folder.
         """
-        (self.folder / "nets").mkdir(exist_ok=True)
         found: dict[tuple[Conditions, str], list[float]] = {}
         for length in sorted({point.conditions.bits for point in points}):
             nets = []

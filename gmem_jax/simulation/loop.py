@@ -16,6 +16,7 @@ from jax import lax
 
 from gmem_jax.native.backend import ResolvedBackend, resolve
 from gmem_jax.physics import step as dynamics
+from gmem_jax.physics.census import overlaps
 from gmem_jax.physics.contact.creep import RelaxingLaw, relaxation
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.pairs import Pairs
@@ -24,7 +25,7 @@ from gmem_jax.physics.state import Box, Grains, HeldWalls, State
 from gmem_jax.physics.step import mark_varying
 from gmem_jax.physics.system import System
 from gmem_jax.simulation import scan
-from gmem_jax.simulation.sample import Sample, end_bin, overlaps
+from gmem_jax.simulation.sample import Sample, end_bin
 from gmem_jax.simulation.stage import Bin, Columns, Stage, table
 from gmem_jax.simulation.strain import StrainPath, servo_strain, stretched
 
@@ -161,7 +162,7 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
         if servo is not None:
             state = replace(state, servo=replace(servo, pressure=pressure))
         last = jax.tree.map(lambda leaf: leaf[-1], boxes)
-        state, sample = end_bin(simulation.system, state, last, pressure, row.u)
+        state, sample = end_bin(simulation.system, state, last, pressure, row.u, simulation.resolved.census)
         if not simulation.observe:
             return state, sample
         seen = replace(simulation, system=system, dt=dt, drag=drag, box=last, sample=sample)

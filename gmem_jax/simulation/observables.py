@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gmem_jax.physics.census import overlaps
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.kinematics import Kinematics
@@ -29,7 +30,6 @@ from gmem_jax.physics.pytree import Scalar
 from gmem_jax.physics.rotation import cross, dot
 from gmem_jax.physics.state import State
 from gmem_jax.simulation.loop import Simulation
-from gmem_jax.simulation.sample import overlaps
 
 AT_LIMIT = 1.0 - 1e-6  # of mu f_n: a force that was scaled back to the limit is there to round-off
 LONGEST_LINE = 200  # letters of name, unit and words

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from gmem_jax.physics.census import Census, TakeCensus, take_census
 from gmem_jax.physics.contact.friction import largest_overlap
 from gmem_jax.physics.contact.wall import wall_kinematics
 from gmem_jax.physics.forces import sphere_table
-from gmem_jax.physics.pairs import image_shifts, slack, sphere_centres, touching_distance
+from gmem_jax.physics.pairs import slack_of
 from gmem_jax.physics.pytree import Scalar, pytree, short_repr
-from gmem_jax.physics.rotation import dot, matrix
+from gmem_jax.physics.rotation import matrix
 from gmem_jax.physics.state import Box, State, Status
 from gmem_jax.physics.system import System
 
@@ -129,51 +130,26 @@ MEASURED: dict[str, Measured] = {
 """What is said of the fields of a `Sample`, by name."""
 
 
-def check(system: System, state: State, box: Box) -> State:
-    """Set the status bits for what can be seen in one configuration: stale list, escaped grain, non-finite number."""
-    grains = state.grains
-    spheres = sphere_centres(grains, system.clump)
-    radii = system.clump.sphere_radii(len(spheres))
-    beyond = (spheres < box.lower) | (spheres > box.upper)
-    outside = jnp.any(beyond & ~box.images if any(box.periodic) else beyond, axis=(0, 1))
-    numbers = grains.position.sum((0, 1)) + grains.acceleration.sum((0, 1)) + grains.spin_rate.sum((0, 1))
+def check(system: System, state: State, box: Box, census: Census) -> State:
+    """Set the status bits for what a census shows: stale list, escaped grain, non-finite number."""
+    radii = system.clump.sphere_radii(system.pairs.incidence.shape[0])
     bits = (
-        jnp.where(slack(system.pairs, spheres, box, radii) <= 0.0, int(Status.STALE_PAIRS), 0)
-        | jnp.where(outside, int(Status.OUTSIDE_BOX), 0)
-        | jnp.where(jnp.isfinite(numbers), 0, int(Status.NOT_FINITE))
+        jnp.where(slack_of(system.pairs, census.deviation, box, radii) <= 0.0, int(Status.STALE_PAIRS), 0)
+        | jnp.where(census.outside > 0.0, int(Status.OUTSIDE_BOX), 0)
+        | jnp.where(census.finite > 0.0, 0, int(Status.NOT_FINITE))
     ).astype(jnp.int32)
     return replace(state, status=state.status | bits)
 
 
-def overlaps(system: System, state: State) -> jax.Array:
-    """Overlap of every candidate pair of spheres, [P, B], in R; negative where they are apart."""
-    pairs, spheres = system.pairs, sphere_centres(state.grains, system.clump)
-    apart = spheres[pairs.second] - spheres[pairs.first]
-    if state.cell is not None:
-        apart += image_shifts(pairs, state.cell.lengths)
-    square = dot(apart, apart)[:, 0]
-    reach = touching_distance(pairs, system.clump)
-    return jnp.where(pairs.valid[:, None], reach - jnp.sqrt(jnp.where(pairs.valid[:, None], square, 1.0)), -1.0)
-
-
-def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scalar) -> Sample:
-    """The instantaneous quantities of a `Sample`, beside the bin-averaged pressure and u, which are given."""
-    grains, clump, pairs = state.grains, system.clump, system.pairs
-    spheres = sphere_centres(grains, clump)
-    overlap = overlaps(system, state)
+def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scalar, census: Census) -> Sample:
+    """A `Sample` from a census, and from the bin-averaged pressure and u, which are given."""
+    grains, clump = state.grains, system.clump
     count = grains.position.shape[0]
-    # Contacts of each pair of grains; both means below follow from it, so that overlaps are looked through once less.
-    touching = jax.ops.segment_sum((overlap > 0.0).astype(jnp.int32), pairs.grain_pair, num_segments=pairs.capacity)
     body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)
     inertia = clump.scaled(clump.inertia[:, None], 5)
     energy = jnp.sum(inertia * body_spin**2, axis=1, keepdims=True)
     energy = clump.masses * jnp.sum(grains.velocity**2, axis=1, keepdims=True) + energy
     lengths = jnp.broadcast_to(box.lengths, pressure.shape)
-    own = clump.sphere_radii(len(spheres))
-    radii = 1.0 if own is None else own[:, None, None]
-    at_walls = (spheres - box.lower < radii) * 1 + (box.upper - spheres < radii)
-    if any(box.periodic):
-        at_walls = at_walls * ~box.images
     rate = jnp.abs(box.upper_velocity[0] - box.lower_velocity[0]) / lengths[0]
     squeezing = 0.5 * (pressure[0] + pressure[1])
     loaded = squeezing > 0.0
@@ -183,12 +159,12 @@ def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scal
         pressure=pressure,
         lengths=lengths,
         kinetic_energy=0.5 * jnp.sum(energy, axis=(0, 1)),
-        largest_speed=jnp.sqrt(jnp.max(jnp.sum(lax.stop_gradient(grains.velocity) ** 2, axis=1), axis=0)),
-        coordination=2.0 * jnp.sum(touching > 0, axis=0) / count,
-        contacts=2.0 * jnp.sum(touching, axis=0) / count,
-        wall_contacts=jnp.sum(at_walls, axis=(0, 1)) / count,
+        largest_speed=census.largest_speed,
+        coordination=2.0 * census.grain_contacts / count,
+        contacts=2.0 * census.sphere_contacts / count,
+        wall_contacts=census.wall_contacts / count,
         filling=clump.volume(count) / jnp.prod(lengths, axis=0),
-        largest_overlap=jnp.max(lax.stop_gradient(overlap), axis=0),
+        largest_overlap=census.largest_overlap,
         inertial_number=jnp.where(loaded, inertial, 0.0),
     )
 
@@ -201,10 +177,22 @@ def _deepest_at_walls(system: System, state: State, box: Box) -> jax.Array:
     return jnp.max(jnp.where(kin.touching, kin.overlap, 0.0), axis=(0, 1))
 
 
-def end_bin(system: System, state: State, box: Box, pressure: jax.Array, u: Scalar) -> tuple[State, Sample]:
-    """Check the state at the end of a bin and take its sample; `pressure` is the bin's average, [3, B]."""
-    state = check(system, state, box)
-    sample = measure(system, state, box, pressure, u)
+def end_bin(
+    system: System, state: State, box: Box, pressure: jax.Array, u: Scalar, counted: TakeCensus = take_census
+) -> tuple[State, Sample]:
+    """Check the state at the end of a bin and take its sample.
+
+    Args:
+        system: the system.
+        state: at the end of the bin.
+        box: its walls there.
+        pressure: the bin's average, [3, B].
+        u: compression variable.
+        counted: what takes the census.
+    """
+    census = counted(system, state, box)
+    state = check(system, state, box, census)
+    sample = measure(system, state, box, pressure, u, census)
     deepest = sample.largest_overlap
     if system.wall_mu is not None:
         deepest = jnp.maximum(deepest, _deepest_at_walls(system, state, box))

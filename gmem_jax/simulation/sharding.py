@@ -5,7 +5,7 @@ from one device to another.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import jax
@@ -65,12 +65,19 @@ class Placement:
         system = simulation.system
         reference = system.pairs.reference
         own = self._put_last(reference) if reference.shape[-1] > 1 else self._put(reference)
-        numbers = {name: getattr(system, name) for name in ("friction", "gravity", "wall_mu")}
-        numbers = jax.tree.map(self._put_number, numbers)
+        numbers = {name: jax.tree.map(self._put_number, getattr(system, name)) for name in ("gravity", "wall_mu")}
         everywhere: Simulation = jax.tree.map(self._put, simulation)
         pairs = replace(everywhere.system.pairs, reference=own)
         mark = jax.tree.map(self._put_last, simulation.mark)
-        return replace(everywhere, system=replace(everywhere.system, pairs=pairs, **numbers), mark=mark)
+        friction = self._put_law(system.friction, everywhere.system.friction)
+        placed = replace(everywhere.system, pairs=pairs, friction=friction, **numbers)
+        return replace(everywhere, system=placed, mark=mark)
+
+    def _put_law(self, law: Any, everywhere: Any) -> Any:
+        """A law that is everywhere, with its own numbers [B] split; arrays deeper in it are of all replicas."""
+        own = {field.name: getattr(law, field.name) for field in fields(law)} if is_dataclass(law) else {}
+        arrays = {name: value for name, value in own.items() if isinstance(value, np.ndarray | jax.Array)}
+        return replace(everywhere, **{name: self._put_number(value) for name, value in arrays.items()})
 
     def _put_number(self, leaf: Any) -> Any:
         """A number for all replicas, or one for each, [B]."""

@@ -281,6 +281,7 @@ BAD = [
     (["tune", "{pack},", "-o", "{json}"], "no pack is named beside a comma"),
     (["reproduce", "fig08", "-o", "/proc/rep"], "--output /proc/rep: cannot write there"),
     (["reproduce", "fig08", "-o", "x" * 252], "cannot write there (File name too long)"),
+    (["reproduce", "fig05", "-o", "{pack}"], "is a file, and a folder is needed; name another"),
     (["classify", "{pack}", "-o", "{json}"], "this is a pack; a recall is needed"),
     (["classify", "{truncated.h5}", "-o", "{json}"], "its checksum does not fit its content"),
     (["classify", "nothing.h5", "-o", "{json}"], "nothing.h5: no such file"),

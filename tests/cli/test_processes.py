@@ -249,6 +249,17 @@ def test_a_result_that_stdout_does_not_take(tmp_path: Path, where: str, code: in
         assert not words or "files that were to be written are complete" in done.stderr
 
 
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_a_reader_that_has_left_is_no_error(options: list[str]) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    command = [sys.executable, "-c", ENTRY, "info", *options]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, env=buffered, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
 @pytest.mark.parametrize("why", ["the disk is full", "its reader is gone"])
 def test_no_command_ends_because_its_log_is_not_taken(why: str) -> None:
     read, write = os.pipe()

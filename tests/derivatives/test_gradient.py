@@ -269,6 +269,37 @@ def test_a_jacobian_of_another_background_is_refused(experiment: gm.Experiment, 
         way(gm.replace(experiment, background="sub2"))
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"gamma0": jnp.full(2, 1e-3)}, "at one value of each parameter, not one for each replica"),
+        ({"friction.mu": np.full(2, 0.5)}, "at one value of each parameter, not one for each replica"),
+        ({"friction": gm.Frictionless()}, "mu is no number of the friction law Frictionless"),
+    ],
+)
+def test_a_jacobian_by_what_there_is_not_is_refused(experiment: gm.Experiment, changes: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        jacobian.exact(gm.replace(experiment, changes))
+
+
+def test_the_width_of_bumps_may_have_axes(experiment: gm.Experiment, exact: jacobian.Jacobian) -> None:
+    bumps: Any = experiment.signals
+    wide = gm.replace(experiment, signals=gm.Bumps(bumps.amplitudes, bumps.centres, jnp.asarray([[bumps.width]])))
+    np.testing.assert_array_equal(jacobian.exact(wide).p_sig, exact.p_sig)
+
+
+@pytest.mark.parametrize(
+    ("name", "call"), [("run", gm.run), ("value_and_grad", gm.value_and_grad), ("jacobian", gm.jacobian)]
+)
+def test_what_works_on_the_host_is_refused_inside_a_program(experiment: gm.Experiment, name: str, call: Any) -> None:
+    def program(x: Any) -> Any:
+        call(experiment, progress=False)  # which is not traced itself
+        return x
+
+    with pytest.raises(ValueError, match=f"gm.{name} works on the host; inside jax.jit"):
+        jax.jit(program)(1.0)
+
+
 CORNERS = {
     "no sliding": ([1.9, 0.0, 0.0], [0.0, 0.0, 0.0]),
     "overlap zero": ([2.0, 0.0, 0.0], [0.0, 0.0, 0.0]),

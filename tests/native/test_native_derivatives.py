@@ -20,7 +20,7 @@ from gmem_jax.physics.state import State, replicate
 from gmem_jax.physics.step import start
 from gmem_jax.physics.system import System
 from gmem_jax.simulation.loop import Simulation, rollout, rollout_chunk
-from gmem_jax.simulation.sample import measure
+from gmem_jax.simulation.sample import end_bin
 from gmem_jax.simulation.stage import BINS, Drive, Stage
 
 BUILT, REASON = native.available()
@@ -141,7 +141,7 @@ def test_modes_agree_with_plain_jax(name: str, isotropic: bool, backwards: bool)
     system, state = squeezed(LAWS[name])
     system = turning(system, isotropic)
     theta = arguments(system, state)
-    touching = measure(system, state, motion().box_at(180.0), jnp.ones((3, 3)), 0.5).contacts
+    touching = end_bin(system, state, motion().box_at(180.0), jnp.ones((3, 3)), 0.5)[1].contacts
     assert np.all(np.asarray(touching) > 5.0)
 
     def both(march: native.March) -> Callable[..., Any]:

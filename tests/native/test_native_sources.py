@@ -25,7 +25,7 @@ AT_HAND = {os.path.realpath(path): name for name in reversed(COMPILERS) if (path
 if native.available()[0]:  # one has built the library
     with contextlib.suppress(build.BuildError):
         AT_HAND.pop(os.path.realpath(shutil.which(build.compiler()[0]) or ""), None)
-THREADS = ("cpu/team.cc", "cpu/cache.cc", "cpu/blocks.cc", "cpu/plan.cc")
+THREADS = ("cpu/team.cc", "cpu/cache.cc", "cpu/scratch.cc", "cpu/blocks.cc", "cpu/plan.cc")
 # For sources that are only read: optimised, GCC's own headers of AVX-512 would warn, and a header by itself warns of
 # its #pragma once. Of clang's warnings those are off that are of bool lanes, and of the stand-in for CUDA's streams.
 STRICT = ("-fsyntax-only", "-Wall", "-Wextra", "-Werror")

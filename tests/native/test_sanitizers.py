@@ -42,7 +42,7 @@ def compiled(sanitizers: str, folder: Path) -> Path:
         objects.append(str(folder / f"{name}.o"))
         kernel = ["-c", str(cpu / "kernel.cc"), f"-DGMEM_ISA={name}", "-DGMEM_DOUBLE_ONLY", *flags, "-O0"]
         subprocess.run([*command, *kernel, "-o", objects[-1]], check=True)
-    sources = [str(DRIVER), *(str(cpu / f"{name}.cc") for name in ("team", "cache", "plan", "blocks"))]
+    sources = [str(DRIVER), *(str(cpu / f"{name}.cc") for name in ("team", "cache", "plan", "scratch", "blocks"))]
     subprocess.run([*command, *sources, *objects, "-o", str(folder / "drive")], check=True)
     return folder / "drive"
 

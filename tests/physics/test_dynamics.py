@@ -32,14 +32,24 @@ from gmem_jax.physics.grain import clump
 from gmem_jax.physics.pairs import sphere_centres
 from gmem_jax.physics.rotation import matrix
 from gmem_jax.physics.search import PairFinder
-from gmem_jax.physics.state import Status, explain, replicate, still_box
+from gmem_jax.physics.state import Box, State, Status, explain, replicate, still_box
+from gmem_jax.physics.system import System
 from gmem_jax.simulation.compiled import Compiled
-from gmem_jax.simulation.sample import check, measure
+from gmem_jax.simulation.sample import Sample, end_bin
 
-CHECK = jax.jit(check)
-OBSERVE = jax.jit(measure)
-START = jax.jit(dynamics.start)
+START, ENDED = jax.jit(dynamics.start), jax.jit(end_bin)
 AMPLITUDES = (1e-3, 5e-3, 2e-2, 3e-2)
+
+
+def checked(system: System, state: State, box: Box) -> State:
+    """The state with the status bits that the end of a bin sets."""
+    after: State = ENDED(system, state, box, jnp.zeros((3, state.replicas)), 0.0)[0]
+    return after
+
+
+def observed(system: System, state: State, box: Box) -> Sample:
+    sample: Sample = ENDED(system, state, box, jnp.zeros((3, state.replicas)), 0.0)[1]
+    return sample
 
 
 def pulse(count: int) -> Bumps:
@@ -194,7 +204,7 @@ def test_status_bits_name_what_is_wrong_with_which_replica():
     position = grains.position.at[3, 0, 1].add(0.3)  # more than half the skin of 0.5
     position = position.at[5, 2, 2].set(-1.0)
     bad = replace(grains, position=position, acceleration=grains.acceleration.at[0, 0, 3].set(jnp.nan))
-    status = CHECK(system, replace(state, grains=bad), box).status
+    status = checked(system, replace(state, grains=bad), box).status
     assert [int(s) for s in status] == [
         0,
         Status.STALE_PAIRS,
@@ -214,7 +224,7 @@ def test_a_grain_is_outside_when_a_sphere_centre_has_crossed_a_wall(axis):
             position = np.zeros((1, 3))
             position[0, axis] = float(wall[axis, 0]) - outermost + beyond * np.sign(outermost)
             system, state, _ = scene(grain, position, box=box)
-            flagged.append(bool(CHECK(system, state, box).status[0] & Status.OUTSIDE_BOX))
+            flagged.append(bool(checked(system, state, box).status[0] & Status.OUTSIDE_BOX))
     assert flagged == [False, True, False, True]
 
 
@@ -222,18 +232,18 @@ def test_a_list_is_stale_when_a_sphere_has_moved_by_half_its_skin():
     lengths = np.array([9.0, 12.0, 10.0])
     box = still_box(jnp.zeros((3, 1)), column(lengths))
     grains = make_grains(np.random.default_rng(0).uniform(1.0, lengths - 1.0, (30, 3)))
-    system = dynamics.System(SPHERE, Hooke(), PairFinder(SPHERE, lengths, 0.5)(grains, SPHERE, box))
+    system = System(SPHERE, Hooke(), PairFinder(SPHERE, lengths, 0.5)(grains, SPHERE, box))
     state = blank_state(system, grains)
     for step, expected in ((0.25 - 1e-9, 0), (0.25 + 1e-9, int(Status.STALE_PAIRS))):
         moved = replace(grains, position=grains.position.at[3, 0, 0].add(step))
-        assert int(CHECK(system, replace(state, grains=moved), box).status[0]) == expected
+        assert int(checked(system, replace(state, grains=moved), box).status[0]) == expected
 
 
 def test_a_nan_position_is_not_finite_rather_than_stale():
     # A stale list is rebuilt and the chunk repeated; that would not help here.
     system, state, box = cluster27()
     bad = replace(state.grains, position=state.grains.position.at[0, 0].set(jnp.nan))
-    assert int(CHECK(system, replace(state, grains=bad), box).status[0]) == Status.NOT_FINITE
+    assert int(checked(system, replace(state, grains=bad), box).status[0]) == Status.NOT_FINITE
 
 
 def test_status_bits_are_sticky():
@@ -307,7 +317,7 @@ def test_observables_are_those_counted_by_hand():
     grain = cached_tetra()
     velocity, spin = np.array([[0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]]), np.array([[0, 0.1, 0], [0.2, 0, 0], [0, 0, 0]])
     system, state, box = scene(grain, [[0, 0, 0], [1.9, 0, 0], [0, 8, 0]], orientations(3), velocity, spin)
-    sample = OBSERVE(system, state, box, jnp.zeros((3, 1)), 0.0)
+    sample = observed(system, state, box)
     spheres = np.asarray(sphere_centres(state.grains, grain))[..., 0].reshape(3, 4, 3)
     overlaps = 2.0 - np.linalg.norm(spheres[0][:, None] - spheres[1], axis=-1)
     assert (overlaps > 0.0).sum() > 1
@@ -318,7 +328,7 @@ def test_observables_are_those_counted_by_hand():
     on_walls = int((near < -1.3 + 1.0).sum() + (near > np.array([3.2, 9.3, 1.3]) - 1.0).sum())
     assert on_walls > 3
     once = (int((overlaps > 0.0).sum()) + on_walls) / 3.0
-    within = OBSERVE(system, state, tight, jnp.zeros((3, 1)), 0.0)
+    within = observed(system, state, tight)
     assert float(within.contacts_per_grain[0]) == pytest.approx(once, rel=1e-15)
     assert float(sample.largest_overlap[0]) == pytest.approx(overlaps.max(), rel=1e-12)
     mass, inertia = float(grain.mass), float(grain.inertia[0])
@@ -338,7 +348,7 @@ def test_the_kinetic_energy_of_a_turned_anisotropic_grain_is_that_of_its_own_ten
     rotation = np.asarray(matrix(state.grains.quaternion))[..., 0]
     tensor = np.einsum("nij,j,nkj->nik", rotation, moments, rotation)
     energy = 0.5 * float(grain.mass) * (velocity**2).sum() + 0.5 * np.einsum("ni,nij,nj->", spin, tensor, spin)
-    sample = OBSERVE(system, state, box, jnp.zeros((3, 1)), 0.0)
+    sample = observed(system, state, box)
     assert float(sample.kinetic_energy[0]) == pytest.approx(energy, rel=1e-12)
 
 

@@ -17,7 +17,7 @@ from gmem_jax.physics.grain import clump
 from gmem_jax.physics.pairs import bucket, carry_history, listed_candidates, slack, sphere_centres, tabulate
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import still_box
-from gmem_jax.simulation.sample import measure
+from gmem_jax.simulation.sample import end_bin
 
 TETRA = cached_tetra()
 CENTRES = jax.jit(sphere_centres)
@@ -261,7 +261,7 @@ def test_a_gas_too_thin_for_any_candidate_can_still_be_observed():
     grains = make_grains([[5.0, 5.0, 5.0], [15.0, 15.0, 15.0]])
     pairs = tabulate(np.zeros((2, 0), int), np.zeros((2, 3, 1)), np.full(3, 20.0), 2.4, 1)
     system = dynamics.System(SPHERE, Hooke(), pairs)
-    sample = jax.jit(measure)(system, blank_state(system, grains), box, jnp.zeros((3, 1)), 0.0)
+    _, sample = jax.jit(end_bin)(system, blank_state(system, grains), box, jnp.zeros((3, 1)), 0.0)
     assert listed_candidates(pairs).shape == (2, 0)
     assert (float(sample.coordination[0]), float(sample.contacts[0])) == (0.0, 0.0)
     assert float(sample.largest_overlap[0]) <= 0.0

@@ -10,13 +10,14 @@ from scenes import ELASTIC, SPHERE, cached_tetra, make_grains, orientations
 
 from gmem_jax.physics import step as dynamics
 from gmem_jax.physics.boundary import WALLS, boundary_of, periodic_axes
+from gmem_jax.physics.census import overlaps
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.pairs import listed_candidates, sphere_centres
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import Box, State, still_box
 from gmem_jax.simulation import observables
 from gmem_jax.simulation.loop import Simulation
-from gmem_jax.simulation.sample import check, measure, overlaps
+from gmem_jax.simulation.sample import end_bin
 from gmem_jax.simulation.stage import Bin
 from gmem_jax.simulation.strain import StrainPath
 
@@ -120,8 +121,8 @@ def test_a_box_with_walls_along_one_axis_has_them_there_and_images_elsewhere() -
     assert float(pressure[1, 0]) == 0.0
     later, _ = march(system, after, jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), box), 0.5, 0.0)
     assert float(later.grains.position[0, 0, 0]) == pytest.approx(8.2, rel=1e-12)
-    assert int(check(system, later, box).status[0]) == 0
-    assert float(measure(system, after, box, pressure, 0.0).wall_contacts[0]) == 1.0
+    assert int(end_bin(system, later, box, pressure, 0.0)[0].status[0]) == 0
+    assert float(end_bin(system, after, box, pressure, 0.0)[1].wall_contacts[0]) == 1.0
 
 
 def test_two_grains_that_meet_through_an_image_feel_what_the_same_two_feel_unwrapped() -> None:
@@ -233,7 +234,7 @@ def energy(system: dynamics.System, state: State) -> float:
     overlap = jnp.maximum(overlaps(system, state), 0.0)
     elastic = 0.4 * system.material.normal_stiffness * jnp.sum(overlap**2.5)
     zero = jnp.ones((3, 1))
-    return float(elastic + measure(system, state, state.cell, zero, 0.0).kinetic_energy[0])
+    return float(elastic + end_bin(system, state, state.cell, zero, 0.0)[1].kinetic_energy[0])
 
 
 def test_a_state_between_walls_cannot_go_on_in_a_periodic_box() -> None:

@@ -35,7 +35,7 @@ from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import listed_candidates, slack, sphere_centres
 from gmem_jax.physics.search import PairFinder
 from gmem_jax.physics.state import still_box
-from gmem_jax.simulation.sample import measure
+from gmem_jax.simulation.sample import end_bin
 
 BALL = 4.0 * np.pi / 3.0
 K_N, K_W = Material().normal_stiffness, Material().wall_stiffness
@@ -133,7 +133,7 @@ def test_an_elastic_collision_of_unequal_spheres_has_hertzs_duration_and_keeps_e
 @pytest.mark.parametrize("law", [Hooke(), MindlinRescaled(), Mindlin()], ids=["H", "M1", "M2"])
 def test_an_oblique_collision_of_unequal_spheres_keeps_momentum_and_angular_momentum(law) -> None:
     system, state, box = head_on(0.05, Material(), law, tangential=0.04, spin=[[0.0, 0.01, 0.02], [0.01, 0.0, -0.03]])
-    before = measure(system, state, box, jnp.ones((3, 1)), 0.0).kinetic_energy
+    before = end_bin(system, state, box, jnp.ones((3, 1)), 0.0)[1].kinetic_energy
     states, _, _ = record(system, state, still(box), 0.05, count=800)
     grains = jax.tree.map(lambda leaf: np.asarray(leaf)[..., 0], states.grains)
     inertia = 0.4 * BALL * np.array([LARGE, SMALL]) ** 5
@@ -144,7 +144,7 @@ def test_an_oblique_collision_of_unequal_spheres_keeps_momentum_and_angular_mome
     np.testing.assert_allclose(total, np.broadcast_to(total[0], total.shape), atol=1e-13 * np.abs(total).max())
     assert np.abs(np.diff(grains.spin[[0, -1]], axis=0)).min(axis=(0, 2)).max() > 0.0
     last = jax.tree.map(lambda leaf: leaf[-1], states)
-    after = measure(system, last, box, jnp.ones((3, 1)), 0.0).kinetic_energy
+    after = end_bin(system, last, box, jnp.ones((3, 1)), 0.0)[1].kinetic_energy
     energy = 0.5 * np.sum(MASSES[:, None] * grains.velocity[-1] ** 2 + inertia[:, None] * grains.spin[-1] ** 2)
     assert float(after[0]) == pytest.approx(energy, rel=1e-13)
     assert 0.2 < float(after[0] / before[0]) < 0.95
@@ -311,7 +311,7 @@ def test_derivatives_by_a_size_and_by_a_radius_are_differences_in_both_modes() -
 def test_samples_of_unequal_grains_count_mass_and_walls_by_size() -> None:
     made = sized(SPHERE, [LARGE, SMALL])
     system, state, box = scene(made, [[-13.5, 0, 0], [14.2, 0, 0]], velocity=[[0.1, 0, 0], [0, 0.2, 0]])
-    sample = measure(system, state, box, jnp.ones((3, 1)), 0.0)
+    _, sample = end_bin(system, state, box, jnp.ones((3, 1)), 0.0)
     assert float(sample.kinetic_energy[0]) == pytest.approx(0.5 * MASSES @ [0.01, 0.04], rel=1e-14)
     assert float(sample.filling[0]) == pytest.approx(MASSES.sum() / 30.0**3, rel=1e-14)
     assert float(sample.wall_contacts[0]) == 0.5  # the small one at 14.2 is 0.1 R from its wall

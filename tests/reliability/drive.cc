@@ -7,12 +7,15 @@
 #include <cstdio>
 #include <cstring>
 #include <deque>
+#include <map>
 #include <string>
 #include <thread>
+#include <utility>
 #include <vector>
 
 #include "../native/check.h"
 #include "cpu/blocks.h"
+#include "cpu/configuration.h"
 #include "cpu/plan.h"
 #include "cpu/team.h"
 
@@ -50,7 +53,7 @@ struct Case {
 struct Scene {
   int grains;
   Numbers position, reference, smallest{1.0, 1.0, 1.0}, offsets{-0.5, 0.0, 0.0, 0.5, 0.0, 0.0};
-  std::vector<int32_t> first, second;
+  std::vector<int32_t> first, second, grain_pair;
   std::vector<char> valid;
   std::vector<int8_t> images;
   Numbers radii{1.0, 0.95}, sizes;
@@ -71,6 +74,11 @@ struct Scene {
         if (first.size() % 5 == 2) list(-7, 1 << 30, false);  // padding may hold anything
         list(i, j, true);
       }
+    std::map<std::pair<int, int>, int> pairs;
+    for (std::size_t row = 0; row < first.size(); ++row)
+      grain_pair.push_back(
+          pairs.emplace(std::pair{first[row] / kSpheres, second[row] / kSpheres}, static_cast<int>(pairs.size()))
+              .first->second);
     for (int g = 0; g < grains; ++g) sizes.push_back(1.0 + 0.03 * noise(g, 0, 12));
     for (std::size_t row = 0; row < first.size(); ++row)
       images.insert(images.end(), {static_cast<int8_t>(row % 7 == 3), 0, 0});
@@ -194,9 +202,21 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
     l += count;
   }
   if (plant == "race") blocks = {blocks[0], blocks[0]};  // two threads write the same results
+  Configuration configuration{};
+  if (forward && plant.empty()) {
+    configuration = {n, kSpheres, candidates, problem.periodic, b, true, scene.first.data(), scene.second.data(),
+                     scene.grain_pair.data(), reinterpret_cast<const bool*>(scene.valid.data()),
+                     c.general ? scene.images.data() : nullptr, c.general ? scene.radii.data() : nullptr,
+                     c.general ? scene.sizes.data() : nullptr, scene.offsets.data()};
+    for (int f = 0; f < kFields; ++f) configuration.fields[f] = lane.grains_in[f];
+    configuration.walls = lane.walls, configuration.edges = lane.walls + 3 * b;
+    configuration.reference = scene.reference.data();
+    configuration.result = array(kCensusRows, true, small);
+  }
   {
     const Threads held(threads);
     run_blocks(problem, kernel, blocks, held.count);
+    if (configuration.result) kernel.census(configuration, held.count);
   }
   Numbers found;
   for (std::size_t i = 0; i < results.size(); i += 2)

@@ -216,10 +216,21 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     for row in rows:
         path = tmp_path / "data" / row["file"]
         assert hashlib.sha256(path.read_bytes()).hexdigest() == row["sha256"]
-        np.testing.assert_allclose(float(gm.load_recall(path).windowed_gain), float(row["G"]), rtol=1e-12)
+        stored = gm.load_recall(path)
+        np.testing.assert_allclose(float(stored.windowed_gain), float(row["G"]), rtol=1e-12)
+        assert row["pack"] == gm.load_pack(PACK).name  # and no path of this machine
+        assert row["pack_sha256"] == stored.configuration["experiment"]["pack"]["sha256"]
     told = (tmp_path / "data" / "README.md").read_text()
     assert "These are 2 such experiments" in told
     assert rows[0]["file"] in told
+
+
+def test_only_what_was_written_is_said_to_be(tmp_path: Path) -> None:
+    for name, suffixes in (("fig05", [".png", ".svg"]), ("fig10", [".png", ".svg", ".csv"])):
+        (tmp_path / f"{name}.csv").write_text("mine")
+        written = Reproduction(tmp_path, say=lambda line: None).picture(name)
+        assert [path.suffix for path in written] == suffixes
+        assert ((tmp_path / f"{name}.csv").read_text() == "mine") == (name == "fig05")
 
 
 def test_each_condition_that_is_varied_has_its_line_of_panels(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from gmem_jax import native
 from gmem_jax.physics.state import Box, replicate
 from gmem_jax.physics.step import mark_varying, start
 from gmem_jax.physics.system import System
+from gmem_jax.simulation.sharding import placement_of
 
 REPLICAS, STEPS, BINS = 8, 5, 2
 jax.config.update("jax_enable_x64", True)  # before the first array
@@ -230,6 +231,36 @@ def mapped_inside(runs: Runs, tolerance: float) -> None:
             np.testing.assert_allclose(b, a, rtol=0.0, atol=tolerance * float(jnp.abs(a).max()))
 
 
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Weights:
+    """Of a law, as many as there are replicas, before or after they were made up to a multiple of the devices."""
+
+    three: Any = field(default_factory=lambda: jnp.asarray([3.0, -2.0, 1.0]))
+    eight: Any = field(default_factory=lambda: jnp.arange(8.0))
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Learnt(gm.Hooke):
+    weights: Weights = field(default_factory=Weights)
+
+
+def weights_of_a_law(runs: Runs, tolerance: float) -> None:
+    """What lies deeper in a law is of all replicas, whatever its shape; its own numbers are split."""
+    placement = placement_of(3)
+    assert placement is not None
+    law = Learnt(mu=jnp.asarray([0.3, 0.4, 0.5]))
+    signals = gm.Bumps(jnp.asarray([[0.5], [1.0]]), jnp.asarray([[0.5], [0.5]]), 0.2)
+    experiment = gm.Experiment(PACK, signals, gm.Hooke(), backend=runs.backend)
+    simulation = experiment.simulation(sheared=False)
+    simulation = replace(simulation, system=replace(simulation.system, friction=law))
+    placed: Any = placement.put_simulation(simulation).system.friction
+    jax.tree.map(np.testing.assert_array_equal, placed.weights, law.weights)
+    np.testing.assert_array_equal(placed.mu[:3], law.mu)
+    assert placed.mu.sharding.shard_shape(placed.mu.shape)[0] < len(placed.mu), placed.mu.sharding
+
+
 ALWAYS = (replicas, replicas_backwards, sweep, mapped)
 # The rest is about the library's calls; in plain JAX it would test JAX, and compile for minutes.
 CHECKS: dict[str, tuple[Callable[[Runs, float], None], ...]] = {
@@ -243,6 +274,7 @@ CHECKS: dict[str, tuple[Callable[[Runs, float], None], ...]] = {
         sweep_of_split_replicas,
         few_replicas,
         mapped_inside,
+        weights_of_a_law,
     ),
 }
 # Forces are 1e-3 and come with round-off of 1e-16; derivatives magnify it (see test_native_derivatives).

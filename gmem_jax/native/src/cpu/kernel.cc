@@ -7,6 +7,7 @@
 #if defined(GMEM_DERIVATIVES) || defined(GMEM_SECOND_DERIVATIVES)
 #include "cpu/adjoint.h"
 #else
+#include "cpu/census.h"
 #include "cpu/packed.h"
 #endif
 #include "cpu/replicas.h"
@@ -78,7 +79,11 @@ void run(const Problem& problem, const Block& block, Team& team, int rank, void*
 #define GMEM_STRING2(name) #name
 #define GMEM_STRING(name) GMEM_STRING2(name)
 extern const InstructionSet kernel;
-const InstructionSet kernel = {GMEM_STRING(GMEM_ISA), W, scratch_bytes, run};
+#if defined(GMEM_DERIVATIVES) || defined(GMEM_SECOND_DERIVATIVES)
+const InstructionSet kernel = {GMEM_STRING(GMEM_ISA), W, scratch_bytes, run, nullptr};
+#else
+const InstructionSet kernel = {GMEM_STRING(GMEM_ISA), W, scratch_bytes, run, census};
+#endif
 
 }  // namespace GMEM_ISA
 }  // namespace gmem

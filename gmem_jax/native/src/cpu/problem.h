@@ -157,12 +157,19 @@ struct Arena {
   }
 };
 
-// A compiled instruction set.
+struct Configuration;  // see configuration.h
+
+// A compiled instruction set; of steps, not of their derivatives, it has `census` too.
 struct InstructionSet {
   const char* name;
   int width;
   std::size_t (*scratch_bytes)(const Problem&, const Block&);
   void (*run)(const Problem&, const Block&, Team&, int rank, void* scratch);
+  void (*census)(const Configuration&, int threads);
 };
+
+// The best that this CPU has. The lanes of derivatives are replicas: few of them are done sooner in narrow vectors. Second
+// derivatives always are: native/build.py says why.
+const InstructionSet& best_kernel(Task task, std::size_t replicas);
 
 }  // namespace gmem
