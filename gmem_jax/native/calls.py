@@ -105,7 +105,7 @@ class StepOutput(NamedTuple):
 
 
 class Definition(Protocol):
-    """The same steps in plain JAX, for platforms without a library; hashable, for it is part of a program.
+    """What a call does in plain JAX, for platforms without a library; hashable, for it is part of a program.
 
     Attributes:
         anywhere: whether it may stand in for the library where there could be one.
@@ -115,8 +115,8 @@ class Definition(Protocol):
     def anywhere(self) -> bool:
         """See above."""
 
-    def __call__(self, fixed: Fixed, arrays: Arrays) -> StepOutput:
-        """The steps."""
+    def __call__(self, common: Any, own: Any, /) -> Any:
+        """Of what replicas have in common and what each has of its own; of steps, of `Fixed` and `Arrays`."""
 
 
 def bind(primitive: Primitive, call: Call, definition: Definition, *parts: Any) -> list[jax.Array]:

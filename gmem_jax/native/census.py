@@ -128,7 +128,8 @@ class PlainCensus:
             incidence=jnp.zeros((len(reference), 1), jnp.int32),
         )
         still = jnp.zeros_like(seen.edges)
-        box = Box(*jnp.split(seen.walls, 2), still, still, self.periodic)
+        lower, upper = jnp.split(seen.walls, 2)
+        box = Box(lower, upper, still, still, self.periodic)
         replicas = seen.edges.shape[-1]
         state = State(Grains(*seen.fields), None, jnp.zeros(replicas, jnp.int32))
         if any(self.periodic):
@@ -143,9 +144,9 @@ def _plain(definition: PlainCensus, listed: Listed, seen: Seen) -> list[jax.Arra
 
 def _rows(parts: tuple[Listed, Seen]) -> list[jax.ShapeDtypeStruct]:
     edges = parts[1].edges
-    return calls.with_leading(
-        parts, [jax.ShapeDtypeStruct((*edges.shape[:-2], len(Census._fields), edges.shape[-1]), edges.dtype)]
-    )
+    rows = jax.ShapeDtypeStruct((*edges.shape[:-2], len(Census._fields), edges.shape[-1]), edges.dtype)
+    found: list[jax.ShapeDtypeStruct] = calls.with_leading(parts, [rows])
+    return found
 
 
 def _call(

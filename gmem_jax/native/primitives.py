@@ -48,7 +48,8 @@ def tangent(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, al
 
 
 def _plain_forward(definition: Definition, fixed: Fixed, arrays: Arrays) -> StepOutput:
-    return definition(fixed, arrays)
+    found: StepOutput = definition(fixed, arrays)
+    return found
 
 
 def _plain_tangent(definition: Definition, fixed: Fixed, arrays: Arrays, along: Arrays) -> StepOutput:

@@ -204,10 +204,20 @@ Numbers run(const Case& c, int threads, const std::string& plant = "") {
   if (plant == "race") blocks = {blocks[0], blocks[0]};  // two threads write the same results
   Configuration configuration{};
   if (forward && plant.empty()) {
-    configuration = {n, kSpheres, candidates, problem.periodic, b, true, scene.first.data(), scene.second.data(),
-                     scene.grain_pair.data(), reinterpret_cast<const bool*>(scene.valid.data()),
-                     c.general ? scene.images.data() : nullptr, c.general ? scene.radii.data() : nullptr,
-                     c.general ? scene.sizes.data() : nullptr, scene.offsets.data()};
+    configuration = {n,
+                     kSpheres,
+                     candidates,
+                     problem.periodic,
+                     b,
+                     true,
+                     scene.first.data(),
+                     scene.second.data(),
+                     scene.grain_pair.data(),
+                     reinterpret_cast<const bool*>(scene.valid.data()),
+                     c.general ? scene.images.data() : nullptr,
+                     c.general ? scene.radii.data() : nullptr,
+                     c.general ? scene.sizes.data() : nullptr,
+                     scene.offsets.data()};
     for (int f = 0; f < kFields; ++f) configuration.fields[f] = lane.grains_in[f];
     configuration.walls = lane.walls, configuration.edges = lane.walls + 3 * b;
     configuration.reference = scene.reference.data();

@@ -32,10 +32,14 @@ enum CensusArgument {
 };
 
 Wants arguments_of_census() {
-  const Wants listed = {{"first spheres", "P", ffi::S32}, {"second spheres", "P", ffi::S32},
-                        {"validities", "P", ffi::PRED},   {"grain pairs", "P", ffi::S32},
-                        {"images", "PI", ffi::S8},        {"radii", "KU"},
-                        {"sizes", "NU"},                  {"offsets", "K3"},
+  const Wants listed = {{"first spheres", "P", ffi::S32},
+                        {"second spheres", "P", ffi::S32},
+                        {"validities", "P", ffi::PRED},
+                        {"grain pairs", "P", ffi::S32},
+                        {"images", "PI", ffi::S8},
+                        {"radii", "KU"},
+                        {"sizes", "NU"},
+                        {"offsets", "K3"},
                         {"common reference", "S3C"}};
   return listed + fields_of_grains() + Wants{{"walls", "6B"}, {"edges", "3B"}, {"own reference", "O3B"}};
 }

@@ -84,9 +84,7 @@ class CensusOf {
     return {at(array, 3 * row), at(array, 3 * row + 1), at(array, 3 * row + 2)};
   }
 
-  int share_begin(int of, int rank) const {
-    return static_cast<int>(static_cast<std::int64_t>(of) * rank / threads_);
-  }
+  int share_begin(int of, int rank) const { return static_cast<int>(static_cast<std::int64_t>(of) * rank / threads_); }
 
   template <class Number>
   static Vec<V> spread(const Number* a) {

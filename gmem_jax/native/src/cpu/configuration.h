@@ -26,14 +26,14 @@ enum CensusRow {
 // Pointers to the first of the replicas; rows are `stride` apart.
 struct Configuration {
   int grains, spheres_per_grain, candidates;
-  int periodic;           // bit of each axis along which the box is
-  std::ptrdiff_t stride;  // doubles between two rows: replicas B of the innermost axis
-  bool common;            // whether all replicas have one reference, [S, 3]
+  int periodic;                                // bit of each axis along which the box is
+  std::ptrdiff_t stride;                       // doubles between two rows: replicas B of the innermost axis
+  bool common;                                 // whether all replicas have one reference, [S, 3]
   const int32_t *first, *second, *grain_pair;  // of each candidate; the last below `candidates`
   const bool* valid;
-  const int8_t* image;   // [candidates, 3]; null without periodic axes
-  const double* radii;   // of the spheres of a grain of size 1; null where all radii are 1
-  const double* sizes;   // of the grains; null likewise
+  const int8_t* image;    // [candidates, 3]; null without periodic axes
+  const double* radii;    // of the spheres of a grain of size 1; null where all radii are 1
+  const double* sizes;    // of the grains; null likewise
   const double* offsets;  // sphere centres of a grain, [K, 3]
   const double* fields[kFields];
   const double* walls;  // lower and upper ones, [6]
