@@ -20,7 +20,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", choices=[name for name, figure in FIGURES.items() if figure.across])
     parser.add_argument("parts", type=Path, nargs="+")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="without a suffix")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, help="without a suffix: figure-scale, as reproduce names its files"
+    )
     parser.add_argument("--only", metavar="NAME=VALUE", default="", help="rows of the parts that have this condition")
     parser.add_argument("--rates", default="", help="t0 of the parts, where it is not that of the scale")
     arguments = parser.parse_args()

@@ -341,6 +341,8 @@ def main() -> None:
     parser.add_argument("--studies", default=",".join(STUDIES))
     parser.add_argument("--t0", type=float, default=1.8e3)
     arguments = parser.parse_args()
+    if unknown := set(arguments.studies.split(",")) - set(STUDIES):
+        parser.error(f"--studies: there is no {', '.join(sorted(unknown))}; there are {', '.join(STUDIES)}")
     arguments.output.mkdir(parents=True, exist_ok=True)
     path = arguments.output / "protocols.csv"
     cases = {name: Case(name, arguments.t0) for name in filter(None, arguments.packs.split(","))}

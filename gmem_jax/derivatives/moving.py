@@ -93,6 +93,8 @@ def theta_of(experiment: Experiment, names: Any) -> dict[str, Any]:
             )
     theta = {name: jax.tree.map(jnp.asarray, tree) for name, tree in found.items()}
     for name, tree in theta.items():
+        if isinstance(tree, jax.Array) and jnp.issubdtype(tree.dtype, jnp.integer):
+            raise ValueError(f"{name} holds whole numbers: write them as floats")
         if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
             raise ValueError(f"{name} holds more than floats; name what to differentiate by, like pack.position")
     return theta

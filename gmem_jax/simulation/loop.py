@@ -165,7 +165,9 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
         state, sample = end_bin(simulation.system, state, last, pressure, row.u, simulation.resolved.census)
         if not simulation.observe:
             return state, sample
-        seen = replace(simulation, system=system, dt=dt, drag=drag, box=last, sample=sample)
+        own = {name: getattr(simulation, name) for name in ("creep", "creep_fades")}
+        creep = {name: _padded(leaf, state.replicas) for name, leaf in own.items() if leaf is not None}
+        seen = replace(simulation, system=system, dt=dt, drag=drag, box=last, sample=sample, **creep)
         # Ordered, as what checkpoints keep is.
         observed = OrderedDict(
             (name, _of_replicas(name, reduce(seen, state), state)) for name, reduce in simulation.observe

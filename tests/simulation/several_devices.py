@@ -29,12 +29,15 @@ def main(address: str, backend: str, target: str, processes: str = "1", number: 
     points = [gm.replace(base, {"friction.mu": mu, "gamma0": gamma0}) for mu, gamma0 in ((1.0, 1e-3), (0.4, 2e-3))]
     # One number for each of nine replicas, more than devices: of all grains, of the walls, of time.
     each = np.arange(9.0)
-    own = {"gravity": 1e-5 * each, "wall_mu": 0.1 * each, "t0": 75.0 - 5.0 * each, "signals": gm.words(3)}
-    filmed = gm.run(gm.replace(base, own), frames=3, frames_of=5)
+    own = {"gravity": 1e-5 * each, "wall_mu": 0.1 * each, "t0": 75.0 - 5.0 * each, "creep": 1e-6 * each}
+    seen = {"creep": lambda simulation, state: simulation.creep * np.ones(state.replicas)}
+    filmed = gm.run(gm.replace(base, {**own, "signals": gm.words(3), "observe": seen}), frames=3, frames_of=5)
     recalls = [gm.run(base, batch=3), *run_several(points), filmed]
     if number == "0":
         named = {f"p_sig-{place}": recall.p_sig for place, recall in enumerate(recalls)}
         status = [np.asarray(recall.status) for recall in recalls]
+        *_, last = filmed.stages.values()
+        np.testing.assert_allclose(last.observed["creep"][-1], own["creep"])
         named["time"] = getattr(filmed.frames, "time", np.zeros(0))
         np.savez(target, devices=jax.device_count(), status=np.concatenate(status), **named)
 
