@@ -254,7 +254,7 @@ def test_names_that_cannot_be_differentiated_by_are_refused(experiment: gm.Exper
     with pytest.raises(ValueError, match="steps is fixed when a program is compiled and has no derivative"):
         gm.value_and_grad(experiment, ["steps"])
     whole = gm.replace(experiment, signals=gm.Bumps(jnp.asarray([[1, -1]]), CENTRES, 0.2))
-    with pytest.raises(ValueError, match="signals.amplitudes holds whole numbers: write them as floats"):
+    with pytest.raises(ValueError, match=r"signals\.amplitudes holds whole numbers: write them as floats"):
         gm.value_and_grad(whole, ["signals.amplitudes"])
     with pytest.raises(ValueError, match="the experiment has no gravity: give it a number first"):
         gm.value_and_grad(experiment, ["gravity"])

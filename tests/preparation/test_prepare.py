@@ -12,15 +12,16 @@ from scenes import ELASTIC, SPHERE, column, scene
 
 import gmem_jax as gm
 from gmem_jax.files.checkpoints import Checkpoints
+from gmem_jax.native.backend import resolve
 from gmem_jax.physics.state import still_box
-from gmem_jax.physics.step import march, start
+from gmem_jax.physics.step import start
 from gmem_jax.physics.system import System
 from gmem_jax.preparation.piston import Pressed, Servo, press
 from gmem_jax.preparation.preparation import _gas
 from gmem_jax.preparation.recipe import SLOWEST_BINS, grain_steps, lattice, pressure_over_wanted, sites_of, stepping
 from gmem_jax.preparation.ringing import ringing_period
 
-PRESS = jax.jit(press, static_argnames=("blocks", "march"))
+PRESS = jax.jit(press, static_argnames=("blocks", "backend"))
 TINY = gm.Recipe(grains=12, gas_time=500.0, t0=300.0, cycles=1)
 
 
@@ -183,7 +184,9 @@ def pressed(error: float = 0.0, flight: float = 0.0, **servo: float) -> Pressed:
     no = jnp.asarray(False)
     now = Pressed(state, box, jnp.asarray([force / area]), jnp.asarray(0), no, no)
     numbers = {"target": force / area / (1.0 + error), "speed": 0.0, "gain": 0.005, "error": 0.01, "quiet": 1e-5}
-    return PRESS(system, now, Servo(**numbers | servo), 0.3, 0.0, blocks=1, march=march)
+    return PRESS(
+        system, now, Servo(**numbers | servo), 0.3, 0.0, blocks=1, backend=resolve("jax", "double", system.friction)
+    )
 
 
 @pytest.mark.parametrize(

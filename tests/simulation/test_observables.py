@@ -15,6 +15,7 @@ from scenes import SPHERE, TETRA_27, accelerate, coast, record, scene, still, st
 import gmem_jax as gm
 from gmem_jax import native
 from gmem_jax.experiment.record import describe
+from gmem_jax.physics.census import overlaps
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.pairs import listed_candidates
@@ -27,7 +28,7 @@ from gmem_jax.simulation import observables
 from gmem_jax.simulation.frames import sphere_places
 from gmem_jax.simulation.loop import Mark, Simulation
 from gmem_jax.simulation.observables import Observable
-from gmem_jax.simulation.sample import measure, overlaps
+from gmem_jax.simulation.sample import end_bin
 
 PACK = gm.load_pack(TETRA_27)
 ONE = gm.Bumps(jnp.asarray([[1.0], [-1.0]]), jnp.full((2, 1), 0.5), 0.6)
@@ -45,7 +46,7 @@ def seen(
 ) -> Simulation:
     """A simulation as observers see it at the end of a bin, of steps `dt`."""
     simulation = Simulation(system, strain_path(box.lower, box.upper, 0.0), dt, drag)
-    sample = jax.jit(measure)(system, state, box, jnp.zeros((3, 1)), 0.0)
+    _, sample = jax.jit(end_bin)(system, state, box, jnp.zeros((3, 1)), 0.0)
     return replace(simulation, box=box, sample=sample, mark=mark or mark_of(system, state, box))
 
 
