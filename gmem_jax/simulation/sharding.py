@@ -5,7 +5,7 @@ from one device to another.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -69,15 +69,13 @@ class Placement:
         everywhere: Simulation = jax.tree.map(self._put, simulation)
         pairs = replace(everywhere.system.pairs, reference=own)
         mark = jax.tree.map(self._put_last, simulation.mark)
-        friction = self._put_law(system.friction, everywhere.system.friction)
+        friction = jax.tree_util.tree_map_with_path(self._put_of_law, system.friction)
         placed = replace(everywhere.system, pairs=pairs, friction=friction, **numbers)
         return replace(everywhere, system=placed, mark=mark)
 
-    def _put_law(self, law: Any, everywhere: Any) -> Any:
-        """A law that is everywhere, with its own numbers [B] split; arrays deeper in it are of all replicas."""
-        own = {field.name: getattr(law, field.name) for field in fields(law)} if is_dataclass(law) else {}
-        arrays = {name: value for name, value in own.items() if isinstance(value, np.ndarray | jax.Array)}
-        return replace(everywhere, **{name: self._put_number(value) for name, value in arrays.items()})
+    def _put_of_law(self, path: tuple[Any, ...], leaf: Any) -> Any:
+        """A number of a law itself, or one of an array deeper in it, which all replicas share."""
+        return self._put_number(leaf) if len(path) == 1 else self._put(leaf)
 
     def _put_number(self, leaf: Any) -> Any:
         """A number for all replicas, or one for each, [B]."""

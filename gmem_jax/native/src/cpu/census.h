@@ -105,7 +105,7 @@ class CensusOf {
 
   void look_at_grains(int rank) {
     Share<V> share;
-    share.deepest = splat<V>(-std::numeric_limits<double>::infinity());
+    share.deepest = splat<V>(c_.candidates ? -std::numeric_limits<double>::infinity() : -1.0);
     const Vec<V> lower = at3(c_.walls, 0), upper = at3(c_.walls, 1), lengths = upper - lower;
     for (int n = share_begin(c_.grains, rank); n < share_begin(c_.grains, rank + 1); ++n) {
       const Vec<V> position = at3(c_.fields[0], n), velocity = at3(c_.fields[2], n);
