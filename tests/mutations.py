@@ -802,8 +802,8 @@ MUTATIONS = (
     mutation(
         "native-census-of-grains-counted-by-sphere",
         "cpu/census.h",
-        "if (touching) grains.add(touching);",
-        "if (touching) grains.add(touching), grains.add(touching & 1);",
+        "grains.add(touching);",
+        "grains.add(touching), grains.add(touching & 1);",
         CENSUS,
     ),
     mutation(

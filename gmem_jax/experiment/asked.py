@@ -56,7 +56,7 @@ def require_double(**parts: Any) -> None:
 
 
 def require_host(what: str, experiment: Any) -> None:
-    """Refuse `what` works on the host where an experiment is traced, or a program of JAX is being made.
+    """Refuse `what`, which works on the host, where an experiment is traced or a program of JAX is being made.
 
     Raises:
         ValueError: saying what can be used there.

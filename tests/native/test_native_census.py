@@ -22,6 +22,7 @@ from gmem_jax.physics.system import System
 pytestmark = pytest.mark.skipif(not native.available()[0], reason="the library was not built")
 
 PACKS = {"walls": TETRA_27, "periodic": PERIODIC_27, "periodic along x and y": PERIODIC_XY_27, "sizes": SPREAD_27}
+MANY = "tetra-325-a"
 DEFINED, COUNTED = jax.jit(take_census), jax.jit(census_by_library)
 Scene = tuple[System, State, Box]
 
@@ -29,7 +30,7 @@ Scene = tuple[System, State, Box]
 @functools.cache
 def scattered(of: str, replicas: int, shared: bool = True) -> Scene:
     """27 grains, in each replica elsewhere: some touch, some are beyond a wall; and a box for each."""
-    pack = gm.load_pack(PACKS[of])
+    pack = gm.load_pack(PACKS.get(of, MANY))
     system = System(pack.clump, gm.Hooke(), pack.pairs)
     state = replicate(start(system, pack.position[..., None], pack.quaternion[..., None], pack.box), replicas)
     draws = np.random.default_rng(0).normal(size=(3, pack.grains, 3, replicas))
@@ -103,7 +104,7 @@ def test_a_number_that_is_not_finite_is_seen_in_its_replica(field: str, value: f
 def test_threads_change_no_bit_and_instruction_sets_round_off(
     monkeypatch: pytest.MonkeyPatch, instructions: str, threads: str
 ) -> None:
-    scene = scattered("sizes", 9)
+    scene = scattered("many", 9)  # whose candidates are shared out to threads
     with monkeypatch.context() as patch:
         patch.setenv("GMEM_ISA", instructions)
         wanted = COUNTED(*scene)

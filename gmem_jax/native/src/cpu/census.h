@@ -3,11 +3,13 @@
 
 #pragma once
 
+#include <algorithm>
 #include <array>
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
-#include <cstring>
 #include <limits>
+#include <new>
 #include <stdexcept>
 #include <utility>
 #include <vector>
@@ -45,7 +47,7 @@ template <class V>
 struct Share {
   Tally<kLanes<V>> spheres, walls;
   V deepest, fastest{}, farthest{};  // an overlap, and the squares of a speed and a distance
-  V amiss{}, lost{};                 // 0, or not a number: of all numbers, and of those that make the former
+  V amiss{}, lost{};  // 0, or not a number: of what the next step goes on from, and of what makes these three
   unsigned outside = 0;
   bool foreign = false;  // a candidate is not of this pack
 };
@@ -58,10 +60,10 @@ class CensusOf {
       : c_(c), replica_(replica), count_(count), all_((1u << count) - 1), threads_(threads), shares_(threads) {
     const std::size_t spheres = static_cast<std::size_t>(c.spheres()), pairs = c.candidates;
     Arena arena{nullptr};
-    arena.take<V>(spheres * 3), arena.take<unsigned char>(threads * pairs);
+    arena.take<V>(spheres * 3), arena.take<Lanes>(pairs);
     scratch_ = take_scratch(arena.used);
     arena = {static_cast<char*>(scratch_.aligned())};
-    sphere_ = arena.take<V>(spheres * 3), pair_ = arena.take<unsigned char>(threads * pairs);
+    sphere_ = arena.take<V>(spheres * 3), pair_ = arena.take<Lanes>(pairs);
   }
   ~CensusOf() { give_scratch(std::move(scratch_)); }
 
@@ -72,6 +74,8 @@ class CensusOf {
   }
 
  private:
+  using Lanes = std::atomic<unsigned char>;  // their bits: any thread may find that a pair of grains touches
+
   V at(const double* array, std::ptrdiff_t row) const {
     const double* from = array + row * c_.stride + replica_;
     if constexpr (kLanes<V> == 1) {
@@ -131,6 +135,8 @@ class CensusOf {
       }
     }
     shares_[rank] = share;
+    for (int p = share_begin(c_.candidates, rank); p < share_begin(c_.candidates, rank + 1); ++p)
+      new (pair_ + p) Lanes(0);
   }
 
   double radius_of(int sphere) const {
@@ -139,8 +145,6 @@ class CensusOf {
 
   void look_at_candidates(int rank) {
     Share<V> share = shares_[rank];
-    unsigned char* const pairs = pair_ + static_cast<std::size_t>(rank) * c_.candidates;
-    std::memset(pairs, 0, static_cast<std::size_t>(c_.candidates));
     const unsigned spheres = static_cast<unsigned>(c_.spheres()), most = static_cast<unsigned>(c_.candidates);
     const Vec<V> edges = at3(c_.edges, 0);
     const V contact_square = splat<V>(4.0), apart = splat<V>(-1.0);
@@ -170,7 +174,10 @@ class CensusOf {
         nearest = -max(-nearest, -square);
         touching = bits_less(square, contact_square) & all_;
       }
-      if (touching) share.spheres.add(touching), pairs[pair] |= static_cast<unsigned char>(touching);
+      if (!touching) continue;
+      share.spheres.add(touching);
+      if (touching & ~pair_[pair].load(std::memory_order_relaxed))
+        pair_[pair].fetch_or(static_cast<unsigned char>(touching), std::memory_order_relaxed);
     }
     share.deepest = max(share.deepest, splat<V>(2.0) - root(nearest));
     shares_[rank] = share;
@@ -188,12 +195,8 @@ class CensusOf {
     }
     if (sum.foreign) throw std::invalid_argument("a candidate is not of spheres of the pack");
     Tally<kLanes<V>> grains;
-    for (int pair = 0; pair < c_.candidates; ++pair) {
-      unsigned touching = 0;
-      for (int rank = 0; rank < threads_; ++rank)
-        touching |= pair_[static_cast<std::size_t>(rank) * c_.candidates + pair];
-      if (touching) grains.add(touching);
-    }
+    for (int pair = 0; pair < c_.candidates; ++pair)
+      if (const unsigned touching = pair_[pair].load(std::memory_order_relaxed)) grains.add(touching);
     const unsigned bad = bits(differ(sum.amiss, V{}));
     const V rows[] = {sum.deepest + sum.lost, root(sum.fastest) + sum.lost, root(sum.farthest) + sum.lost};
     for (int l = 0; l < count_; ++l) {
@@ -217,13 +220,16 @@ class CensusOf {
   const unsigned all_;  // bits of the lanes that are replicas
   const int threads_;
   Scratch scratch_;
-  V* sphere_;            // centres, [S, 3]
-  unsigned char* pair_;  // the lanes where a pair of grains touches, [threads, candidates]
+  V* sphere_;    // centres, [S, 3]
+  Lanes* pair_;  // where a pair of grains touches, [candidates]
   std::vector<Share<V>> shares_;
 };
 
+constexpr int kCandidatesOfAThread = 1024;  // fewer are looked at sooner than a thread wakes
+
 // As many replicas side by side as the steps have: see `run_blocks`.
-inline void census(const Configuration& c, int threads) {
+inline void census(const Configuration& c, int most) {
+  const int threads = std::min(most, std::max(1, c.candidates / kCandidatesOfAThread));
   const int replicas = static_cast<int>(c.stride);
   int done = 0;
   for (; 2 * (replicas - done) >= W; done += W)
