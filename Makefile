@@ -52,7 +52,7 @@ cluster: install-dev
 arm: install-dev
 	$(BIN)/python tests/arm/compare.py
 
-check: install-dev
+check: docs
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/clang-format --dry-run --Werror $$(find gmem_jax tests -name '*.h' -o -name '*.cc' -o -name '*.cu')

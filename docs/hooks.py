@@ -12,21 +12,10 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parent.parent
-MEASURED = (
-    "bench",
-    "paper_rate/bench",
-    "paper_rate/2026-11-28",
-    "paper_rate/avx2_2026-11-29",
-    "paper_rate/xeon_2026-11-30",
-    "laws_2026-11-28",
-    "avx2_2026-11-29",
-    "xeon_2026-11-30",
-    "size_avx2_2026-11-29",
-    "large_packs",
-    "gpu",
-    "gpu_h200",
-)
-FROM_ELSEWHERE = ["CHANGELOG.md", "CONTRIBUTING.md", *(f"benchmarks/{name}.md" for name in MEASURED)]
+FROM_ELSEWHERE = [
+    *("CHANGELOG.md", "CONTRIBUTING.md"),
+    *sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "benchmarks").rglob("*.md")),
+]
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 INLINE = re.compile(r"\$([^$\n]+)\$")
@@ -42,9 +31,9 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(text: str, page: Any, **_: Any) -> str:
     """Links between docs/ and benchmarks/, right in the repository, made right in the site."""
-    if page.file.src_uri in FROM_ELSEWHERE:
-        return text.replace("](../docs/", "](../").replace("](docs/", "](")
     up = "../" * page.file.src_uri.count("/")
+    if page.file.src_uri in FROM_ELSEWHERE:
+        return text.replace(f"]({up}docs/", f"]({up}")
     return text.replace(f"]({up}../benchmarks/", f"]({up}benchmarks/")
 
 
