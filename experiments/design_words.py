@@ -61,11 +61,11 @@ def main() -> None:
         measured = Checkpoints(folder / f"{name}-t0-{arguments.t0:g}.kernel", key_of_run(any_words))
         kernel = gm.memory_kernel(any_words, KERNEL_BUMPS, KERNEL_BUMP_WIDTH, cache=measured, progress=say)
         for bits in map(int, arguments.bits.split(",")):
-            if there(folder / TABLE, name, bits, arguments.t0, arguments.iterations):
+            number = drawn(2**bits, arguments.drawn)
+            if there(folder / TABLE, name, bits, len(number), arguments.t0, arguments.iterations):
                 continue
             kept = folder / f"words-{bits}-seed-0.msgpack"
             net = training.train_net(TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=kept).net
-            number = drawn(2**bits, arguments.drawn)
             row = design(folder, any_words, kernel, bits, number, net, arguments.iterations)
             print(row, flush=True)
             note(folder / TABLE, list(row), [row])
@@ -114,13 +114,16 @@ def design(
     return row | {"seconds": round(time.perf_counter() - began)}
 
 
-def there(table: Path, pack: str, bits: int, t0: float, iterations: int) -> bool:
+def there(table: Path, pack: str, bits: int, words: int, t0: float, iterations: int) -> bool:
     """Whether the table has these words; what is drawn of it is of one rate and one effort."""
     rows = done(table)
     for row in rows:
         if (float(row["t0"]), int(row["iterations"])) != (t0, iterations):
             sys.exit(f"{table}: has words of t0 = {row['t0']}, {row['iterations']} iterations; name another folder")
-    return any((row["pack"], row["bits"]) == (pack, str(bits)) for row in rows)
+    found = {int(row["words"]) for row in rows if (row["pack"], row["bits"]) == (pack, str(bits))}
+    if found - {words}:
+        sys.exit(f"{table}: has {min(found)} words of {bits} bits of {pack}; name another folder")
+    return bool(found)
 
 
 def draw(table: Path, path: Path) -> None:

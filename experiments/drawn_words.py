@@ -67,6 +67,8 @@ def main() -> None:
         if not file.exists():
             run(experiment, file)
         recall = gm.load_recall(file)
+        if recall.configuration["experiment"] != gm.describe(experiment)["experiment"]:
+            parser.error(f"{file}: is of another experiment; name another folder")
         net = training.train_net(
             TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=folder / f"words-{bits}-seed-0.msgpack"
         ).net

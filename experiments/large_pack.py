@@ -47,10 +47,12 @@ def main() -> None:
     parser.add_argument("--dt", type=float, default=0.3)
     parser.add_argument("--store", type=float, default=2.0, help="in t0")
     arguments = parser.parse_args()
+    wanted = [int(number) for number in arguments.waveforms.split(",") if number.isdecimal()]
+    if not wanted or arguments.waveforms != ",".join(map(str, wanted)) or not set(wanted) <= set(range(1, 7)):
+        parser.error(f"--waveforms: numbers from 1 to 6, like 1,3; got {arguments.waveforms}")
     jax.config.update("jax_enable_x64", True)
     folder: Path = arguments.output
     folder.mkdir(parents=True, exist_ok=True)
-    wanted = [int(number) for number in arguments.waveforms.split(",")]
     for seed in map(int, arguments.seeds.split(",")):
         recipe = replace(RECIPES[arguments.prepared], grains=arguments.grains, seed=seed)
         pack = prepared(folder / f"tetra-{recipe.grains}-{seed}-{arguments.prepared}.h5", recipe)

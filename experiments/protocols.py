@@ -29,7 +29,7 @@ from gmem_jax.simulation.stage import BINS
 
 jax.config.update("jax_enable_x64", True)
 
-COLUMNS = ("pack", "N", "study", "quantity", "value", "seconds")
+COLUMNS = ("pack", "N", "t0", "study", "quantity", "value", "seconds")
 PASCAL = float(gm.Material().modulus)
 STORE = 0.5  # t0
 TRAINED = 5e-3  # gamma0 of what is done at u = 1: there 1e-3 moves hardly anything
@@ -330,7 +330,8 @@ def table(rows: list[dict[str, str]]) -> Iterator[str]:
         values = [float(row["value"]) for row in rows
                   if (row["study"], row["quantity"], row["N"]) == (study, quantity, grains)]  # fmt: skip
         mean, _, error = spread(values)
-        yield f"{study:13} {int(grains):6,} {quantity:60} {mean:9.4g} ± {error:.2g} ({len(values)})"
+        told = f" ± {error:.2g}" if len(values) > 1 else ""
+        yield f"{study:13} {int(grains):6,} {quantity:60} {mean:9.4g}{told} ({len(values)})"
 
 
 def main() -> None:
@@ -345,6 +346,8 @@ def main() -> None:
         parser.error(f"--studies: there is no {', '.join(sorted(unknown))}; there are {', '.join(STUDIES)}")
     arguments.output.mkdir(parents=True, exist_ok=True)
     path = arguments.output / "protocols.csv"
+    if other := {float(row["t0"]) for row in done(path)} - {arguments.t0}:
+        parser.error(f"{path}: has studies of t0 = {min(other):g}; name another folder")
     cases = {name: Case(name, arguments.t0) for name in filter(None, arguments.packs.split(","))}
     for study in arguments.studies.split(","):
         for name, case in cases.items():
@@ -353,7 +356,7 @@ def main() -> None:
             began = time.process_time()
             found = STUDIES[study](case)
             seconds = f"{time.process_time() - began:.0f}"
-            own = {"pack": name, "N": case.pack.grains, "study": study, "seconds": seconds}
+            own = {"pack": name, "N": case.pack.grains, "t0": arguments.t0, "study": study, "seconds": seconds}
             note(path, COLUMNS, [own | {"quantity": key, "value": f"{value:.5g}"} for key, value in found.items()])
             print(f"{name} {study}: {seconds} CPU s", flush=True)
     print(*table(done(path)), sep="\n")

@@ -187,7 +187,7 @@ def kernel_command(
     began = time.perf_counter()
     runs = 2.0 * n / experiment.signals.count
     _announce(experiment, "kernel", 1.0 + runs, 2 * n)
-    with resumable(output, key_of_run(experiment, n=n, width=width), restart=restart) as parts:
+    with resumable(output, key_of_run(experiment, bumps=n, width=width), restart=restart) as parts:
         with reporting(goes_on=True) as progress:
             prefix = prefix_of(experiment, cache=parts, progress=within(progress, 0.0, 0.05))
             most = within(progress, 0.05, 0.05 + 0.95 * runs / (1.0 + runs))

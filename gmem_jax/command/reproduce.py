@@ -20,6 +20,7 @@ from gmem_jax.reproduce.cost import spec_of_all
 from gmem_jax.reproduce.dataset import COLLECTED
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import GALLERY, RUNS, SCHEMATICS, Outcome, Reproduction, Weighed, outcome_summary
+from gmem_jax.show.tables import with_error
 from gmem_jax.simulation.progress import Progress
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
@@ -175,7 +176,7 @@ def _choices_table(effects: Sequence[Effect]) -> Table:
     for name in ("choice", "value", "G", "F", "change of G", "change of F"):
         table.add_column(name, justify="left" if name == "choice" else "right")
     for effect in effects:
-        own = [f"{one.mean:.3f}{_error(one.error)}" for one in (effect.gain, effect.fidelity)]
+        own = [with_error(one.mean, one.error) for one in (effect.gain, effect.fidelity)]
         change = [f"{100.0 * effect.of_gain.mean:+.1f} %", f"{effect.of_fidelity.mean:+.3f}"]
         known = (effect.choice.words, str(effect.value), *own, *(["", ""] if effect.default else change))
         table.add_row(*known, style="bold" if effect.default else None)
@@ -190,17 +191,13 @@ def _table(outcome: Outcome) -> Table:
     for name in (*varied, "", "ours", "packs", "published", "N", "apart"):
         table.add_column(name, justify="right")
     for row in outcome.rows:
-        theirs = f"{row.theirs.mean:.3f}{_error(row.theirs.error)}" if row.theirs else ""
+        theirs = with_error(row.theirs.mean, row.theirs.error) if row.theirs else ""
         apart = "" if math.isnan(row.errors_apart) else f"{row.errors_apart:+.1f}"
-        ours = f"{row.ours.mean:.3f}{_error(row.ours.error)}"
+        ours = with_error(row.ours.mean, row.ours.error)
         known = [str(getattr(row.conditions, name)) for name in varied]
         size = f"{row.grains:,}" if row.theirs else ""
         table.add_row(*known, row.measure, ours, str(row.ours.packs), theirs, size, apart)
     return table
-
-
-def _error(value: float) -> str:
-    return "" if math.isnan(value) else f" ± {value:.3f}"
 
 
 COMMANDS = {"reproduce": reproduce_command}

@@ -214,9 +214,9 @@ def value_and_grad(
     common, own = experiment.phases
     on = runner_of(experiment, progress=within(tell, 0.0, FORWARDS))
     on.total_work = whole_work(experiment, on)
-    fixed = fixed_by(by)
+    fixed = fixed_by(theta)
     prefix, rest = _Remembering(fixed, ROOM), _Remembering(fixed, ROOM)
-    on.observers = (prefix,) if any(map(acts_on_prefix, by)) else ()
+    on.observers = (prefix,) if any(map(acts_on_prefix, theta)) else ()
     _, pull_begin = jax.vjp(lambda theta: moving_of(along(theta).begin()), theta)
     on.run_stages(*common)
     fan_out = jax.linear_transpose(_fan_out(experiment), moving_of(on.state))
@@ -251,7 +251,7 @@ def value_and_grad(
     way = _Backwards(within(tell, FORWARDS, 1.0), (rest, prefix), checkpoint)
     back = way.through(rest, back)
     slope = jax.tree.map(jnp.add, slope, pull_numbers(True, rest.numbers))
-    if any(map(acts_on_prefix, by)):
+    if any(map(acts_on_prefix, theta)):
         back = way.through(prefix, fan_out(back)[0])
         if prefix.numbers is not None:  # a protocol may begin with a waveform
             slope = jax.tree.map(jnp.add, slope, pull_numbers(False, prefix.numbers))

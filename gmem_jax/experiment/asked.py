@@ -39,6 +39,21 @@ def static_number(name: str, value: Any) -> float:
     return number
 
 
+def require_data(**parts: Any) -> None:
+    """Refuse what JAX cannot compute with, in a law or waveforms of a user's own.
+
+    Raises:
+        ValueError: naming the first such leaf.
+    """
+    for name, part in parts.items():
+        for path, leaf in jax.tree_util.tree_leaves_with_path(part):
+            if not (hasattr(leaf, "dtype") or isinstance(leaf, bool | int | float)):
+                raise ValueError(
+                    f"{name}{jax.tree_util.keystr(path)} is no number: {said(leaf)}; make it static, so that programs "
+                    "are compiled for it"
+                )
+
+
 def require_double(**parts: Any) -> None:
     """Refuse arrays in less than double precision, as everything has that was made before JAX's 64-bit mode was on.
 

@@ -9,7 +9,7 @@ from typing import Any
 from gmem_jax.experiment.arguments import require_kind, require_once
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.signals import Signals, SignalSets, part, sets_of, signals
-from gmem_jax.physics.pytree import traced
+from gmem_jax.physics.pytree import traced, with_field
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.protocol import Protocol
 
@@ -68,7 +68,7 @@ def _with(tree: Any, path: list[str], value: Any) -> Any:
         sets = [_with(one, path[1:], value) if name == path[0] else one for name, one in sets_of(tree).items()]
         return SignalSets(tuple(sets), tree.names)
     _require_field(tree, path[0])
-    return dataclasses.replace(tree, **{path[0]: _with(getattr(tree, path[0]), path[1:], value)})
+    return with_field(tree, path[0], _with(getattr(tree, path[0]), path[1:], value))
 
 
 def value_at(experiment: Experiment, path: str) -> Any:

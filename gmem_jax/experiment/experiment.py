@@ -14,6 +14,7 @@ from gmem_jax.experiment import analysis
 from gmem_jax.experiment.analysis import Background
 from gmem_jax.experiment.arguments import named_observers, require_parts
 from gmem_jax.experiment.asked import (
+    require_data,
     require_double,
     require_memory,
     require_seen,
@@ -272,6 +273,7 @@ class Experiment:
                     f"{name} must be a pytree: register {type(getattr(self, name)).__name__} with "
                     "jax.tree_util.register_dataclass"
                 )
+        require_data(signals=self.signals, friction=self.friction)
         if jnp.ndim(self.pack.position) != 2:
             raise ValueError(
                 f"an experiment has one pack: positions [N, 3], got {jnp.shape(self.pack.position)}; put a stack of "

@@ -137,6 +137,7 @@ def stack(packs: Sequence[Pack]) -> Pack:
     """
     if isinstance(packs, Pack):
         raise ValueError(f"stack takes several packs, in a list: got {packs.name}")
+    packs = tuple(packs)
     if not packs:
         raise ValueError("stack needs at least one pack")
     first = packs[0]

@@ -111,6 +111,11 @@ class Recall:
         whole = tuple(self.configuration.get("reads", reads))  # what `at` gives is a part
         return known[1] if len(known) == 2 and reads == known[:1] == whole else None
 
+    @property
+    def of_time(self) -> bool:
+        """Whether u stands still in every read: the bins of p_sig are then those of the time of a read."""
+        return not any(stage.moves for stage in self.protocol if stage.name in self.reads)
+
     def windows(self, t0: Any) -> np.ndarray:
         """The part of u that each read goes through in T_1, or of its own time where u stands still, [R].
 

@@ -16,9 +16,11 @@ from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.laws import entry_of
 from gmem_jax.physics.numbers import is_real, said
+from gmem_jax.physics.pytree import map_numbers
 from gmem_jax.physics.rotation import unit
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Box, still_box
+from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.stability import cause, longest_step
 from gmem_jax.simulation.stable_step import GROWTH, SHORTEST_STEP, growth, largest_stable_step
@@ -46,8 +48,12 @@ def stable_step(experiment: Experiment) -> float:
 
     Returns:
         At most 2.
+
+    Raises:
+        ValueError: if JAX's 64-bit mode is off.
     """
     require_kind("stable_step", experiment, Experiment)
+    require_x64()
     key, law = _case(experiment)
     if key not in _known:
         _known[key] = largest_stable_step(*_at_rest(experiment, law))
@@ -79,9 +85,14 @@ def _case(experiment: Experiment) -> tuple[tuple[Any, ...], Any]:
 
 def _at_rest(experiment: Experiment, law: Any) -> tuple[Simulation, jax.Array, jax.Array, Box]:
     """The arguments of `largest_stable_step` under a law: every replica at u = 0, and every one at u = 1."""
-    pack, own = experiment.pack, (law, experiment.wall_mu)
-    single = max(map(jnp.size, jax.tree.leaves((own, experiment.compression))))
-    law, wall_mu = jax.tree.map(lambda leaf: jnp.tile(leaf, 2) if jnp.ndim(leaf) else leaf, own)
+    pack, sizes = experiment.pack, [jnp.size(experiment.compression)]
+
+    def twice(number: Any) -> Any:
+        sizes.append(jnp.size(number))
+        return jnp.tile(number, 2) if jnp.ndim(number) else number
+
+    law, wall_mu = map_numbers(twice, law), jax.tree.map(twice, experiment.wall_mu)
+    single = max(sizes)
     compression, replicas = jnp.broadcast_to(experiment.compression, (single,)), 2 * single
     shrink = jnp.concatenate([jnp.ones(single), jnp.sqrt(1.0 - compression)])
     scale = jnp.stack([shrink, shrink, jnp.ones(replicas)])

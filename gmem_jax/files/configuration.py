@@ -23,6 +23,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import LAWS, law_named
 from gmem_jax.physics.material import Material
 from gmem_jax.physics.rules import usual_rules
+from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.protocol import Protocol
 
 OF_LAW = {entry.name: entry for law in reversed(LAWS) for entry in fields(law.kind)}
@@ -72,6 +73,7 @@ def from_dict(configuration: Mapping[str, Any], pack: Pack | None = None) -> Exp
     of_pack = configuration["pack"]
     pack = load_pack(of_pack["source"]) if pack is None else pack
     if pack_fingerprint(pack) != of_pack["sha256"]:
+        require_x64()  # in 32 bits no pack is the one that was written
         raise FileFormatError(f"{of_pack['source']}: not the pack that this was made with (its content has changed)")
     require_kinds({name: value for name, value in configuration.items() if name not in PARTS})
     require_kinds(configuration["material"])

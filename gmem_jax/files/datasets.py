@@ -82,7 +82,10 @@ def plain_cell(value: Any) -> Any:
 
 
 def to_csv(recall: Recall, *, each: bool = False) -> str:
-    """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F."""
+    """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F.
+
+    Where u stands still in every read, the first column is the time of the read, from 0 to 1.
+    """
     require_kind("to_csv", recall, Recall)
     several = len(recall.reads) * len(recall.channels) > 1
     rows: list[list[Any]]
@@ -94,7 +97,7 @@ def to_csv(recall: Recall, *, each: bool = False) -> str:
             where = [one.reads[0], one.channels[0]] * several
             rows += [[*where, name, *row] for name, row in zip(recall.names, own, strict=True)]
     else:
-        rows = [["u"]]
+        rows = [["time (parts of the read)" if recall.of_time else "u"]]
         for one in recall.each():
             of = f", {one.reads[0]}, {one.channels[0]}" if several else ""
             rows[0] += [f"p_sig of {name}{of} (E)" for name in recall.names]

@@ -186,7 +186,8 @@ def write_vtp(path: Path, frames: Frames, mass: float, material: Material) -> No
         ValueError: if the package pyvista is not there.
         OSError: if the path cannot be written.
     """
-    _write_vtp(path, _points(frames, 0, material))
+    with atomic(path) as temporary:
+        temporary.write_text(_vtp(_points(frames, 0, material)), encoding="utf-8")
 
 
 def write_pvd(path: Path, frames: Frames, mass: float, material: Material) -> None:
@@ -207,7 +208,7 @@ def write_pvd(path: Path, frames: Frames, mass: float, material: Material) -> No
             meshes = {"spheres": _points(frames, number, material), "contacts": _lines(frames, number)}
             for part, (name, mesh) in enumerate(meshes.items()):
                 file = f"{name}-{number:04d}.vtp"
-                _write_vtp(Path(made, file), mesh)
+                Path(made, file).write_text(_vtp(mesh), encoding="utf-8")
                 rows.append(
                     f'<DataSet timestep="{frames.time[number]:.17g}" part="{part}" '
                     f"file={quoteattr(f'{folder.name}/{file}')}/>"
@@ -252,13 +253,13 @@ def _lines(frames: Frames, number: int) -> Any:
     return mesh
 
 
-def _write_vtp(path: Path, mesh: Any) -> None:
+def _vtp(mesh: Any) -> str:
+    """The text of its file; that VTK would write itself, but without saying why it cannot."""
     writer = optional("vtkmodules.vtkIOXML", "vtk").vtkXMLPolyDataWriter()
-    with atomic(path) as temporary:
-        writer.SetFileName(str(temporary))
-        writer.SetInputData(mesh)
-        if not writer.Write():
-            raise OSError(f"{path}: cannot be written")
+    writer.SetInputData(mesh)
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return str(writer.GetOutputString())
 
 
 class Format(NamedTuple):

@@ -126,7 +126,7 @@ RECALL = Schema(
     "Recall (.h5)",
     "What a pack gave back of S signals: `gmem recall`, `gmem demo`, the points of a sweep, `gm.save_recall`.",
     {
-        "u": Array("real", ("u",), "1", "compression variable, centres of the bins"),
+        "u": Array("real", ("u",), "1", "centres of the bins of u, or of the time of a read in which u stands still"),
         "signal": Array("text", ("signal",), "1", "names of the signals; words by their bits"),
         "shear": Array("real", ("signal", "u"), "1", "I(u), the waveforms as applied, in parts of gamma0"),
         "J": Array("real", ("signal", "u"), "1", "J(u), their integrals averaged over each bin"),

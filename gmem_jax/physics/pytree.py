@@ -4,10 +4,12 @@ A field is data (an array, a number, another pytree) unless it says otherwise: `
 structure that a program is compiled for; a `label` is carried along but compiles nothing anew.
 """
 
+import copy
+import inspect
 import json
 import math
-from collections.abc import Iterator
-from dataclasses import MISSING, field, fields, is_dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, field, fields, is_dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -201,6 +203,35 @@ def _hashable(value: Any) -> Any:
             object.__setattr__(made, name, _hashable(part))
         return made
     return tuple(map(_hashable, value)) if isinstance(value, list) else value
+
+
+def with_field(made: _T, name: str, value: Any) -> _T:
+    """The same object with another value of a field.
+
+    Its class makes it anew, with its checks, where that takes all fields. Else it is a copy: a class of a user's whose
+    `__init__` takes something else has no other way.
+    """
+    whole: Any = made
+    if isinstance(made, tuple):
+        return whole._replace(**{name: value})  # type: ignore[no-any-return]
+    taken = inspect.signature(type(made).__init__).parameters
+    anew = is_dataclass(made) and all(entry.name in taken for entry in fields(whole) if entry.init)
+    if anew:
+        return replace(whole, **{name: value})  # type: ignore[no-any-return]
+    changed = copy.copy(made)
+    object.__setattr__(changed, name, value)
+    return changed
+
+
+def map_numbers(change: Callable[[Any], Any], made: _T, deeper: Callable[[Any], Any] = lambda leaf: leaf) -> _T:
+    """An object with its own numbers changed, each one for all replicas or [B]; `deeper` has what objects in it hold.
+
+    Those of a friction law may have [B] entries by chance: weights of a network are shared by all replicas.
+    """
+    found: _T = jax.tree_util.tree_map_with_path(
+        lambda path, leaf: change(leaf) if len(path) == 1 else deeper(leaf), made
+    )
+    return found
 
 
 def traced(*trees: Any) -> bool:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 U = "compression variable u"
+TIME_OF_READ = "time, in parts of the read"
 CYCLE = ("C0", "C3", "C2", "C4", "C1", "C5", "C6")  # of replicas; red is not beside orange
 GREY = "0.27"
 
@@ -179,9 +180,11 @@ def grid(count: int) -> tuple[int, tuple[float, float]]:
     return columns, (max(width * columns, 5.0) + 0.4, height * -(-count // columns) + 0.9)
 
 
-def u_label(columns: int) -> str:
-    """What is written under an axis of u: a letter where panels are narrow."""
-    return U if columns <= 3 else "u"
+def u_label(columns: int, *, of_time: bool = False) -> str:
+    """What is written under an axis of u, or of the time of a read: a word where panels are narrow."""
+    if columns <= 3:
+        return TIME_OF_READ if of_time else U
+    return "time" if of_time else "u"
 
 
 def shown_part(shown: int, count: int) -> str:

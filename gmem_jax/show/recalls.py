@@ -17,7 +17,7 @@ from gmem_jax.files.measures import relative_scale
 from gmem_jax.files.validation import is_number
 from gmem_jax.physics.pytree import Scalar
 from gmem_jax.show import tables
-from gmem_jax.show.figure import Curve, Figure, Image, Panel, U, grid, shown_part, u_label
+from gmem_jax.show.figure import Curve, Figure, Image, Panel, grid, shown_part, u_label
 from gmem_jax.show.render_matplotlib import Drawing, to_matplotlib
 from gmem_jax.show.stages import AGAINST, QUANTITIES, ZERO, observed_quantities, stages_figure
 
@@ -201,12 +201,12 @@ def signals_figure(
     columns, size = grid(shown)
     largest = 1.05 * pascal * max(float(np.nanmax(np.abs(each[:shown]), initial=0.0)) for _, each, *_ in curves) or 1.0
     area: dict[str, Any] = {"behind_label": SHEAR}
-    area["behind_limit"] = 1.05 * max(float(np.nanmax(np.abs(waves[:shown]), initial=0.0)), 1e-12)
+    area["behind_limit"] = 1.05 * float(np.nanmax(np.abs(waves[:shown]), initial=0.0)) or 1.0
     panels = tuple(
         Panel(
             tuple(Curve(u, pascal * each[number], label, colour, style) for label, each, colour, style in curves),
             names[number],
-            u_label(columns),
+            u_label(columns, of_time=recall.of_time),
             "stress (Pa)",
             (0.0, 1.0),
             (-largest, largest),  # both zeros lie in the middle
@@ -239,13 +239,13 @@ def waveforms_figure(recall: Recall, names: Sequence[str], title: str) -> Figure
 
 def image_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
     """p_sig and J of all signals, however many, as a picture: a row for each."""
-    count, u = len(recall.J), np.asarray(recall.u)
+    count, u, x = len(recall.J), np.asarray(recall.u), u_label(1, of_time=recall.of_time)
     pairs = (
         (float(recorded_material(recall.configuration).modulus) * np.asarray(recall.p_sig), "recalled $p_{sig}$ (Pa)"),
         (np.asarray(recall.J), "$J(u)$"),
     )
     panels = tuple(
-        Panel((Image(np.asarray(values), u, np.arange(count), label),), x=U, down=True, y_names=names)
+        Panel((Image(np.asarray(values), u, np.arange(count), label),), x=x, down=True, y_names=names)
         for values, label in pairs
     )
     size = (9.6, min(9.0, 3.0 + 0.12 * count))

@@ -7,6 +7,7 @@ import itertools
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from gmem_jax.physics.contact.wall import PLANES, wall_forces
 from gmem_jax.physics.forces import contact_loads, relative_motion, sphere_table, wall_loads
 from gmem_jax.physics.grain import Clump
 from gmem_jax.physics.numbers import require_numbers
-from gmem_jax.physics.pytree import pytree, short_repr, static
+from gmem_jax.physics.pytree import map_numbers, pytree, short_repr, static
 from gmem_jax.physics.state import State, still_box
 from gmem_jax.physics.system import System
 from gmem_jax.simulation.observers import Chunk, Observer
@@ -210,10 +211,12 @@ class FrameRecorder(Observer):
         """
         name, simulation, replicas = chunk.stage.name, chunk.simulation, state.replicas
         one = self.schedule.replica if replicas > 1 else 0
-        friction, wall_mu = jax.tree.map(
-            lambda leaf: to_host(leaf)[one : one + 1] if np.shape(leaf) == (replicas,) else to_host(leaf),
-            (simulation.system.friction, simulation.system.wall_mu),
-        )
+
+        def of_one(number: Any) -> np.ndarray:
+            return to_host(number)[one : one + 1] if np.shape(number) == (replicas,) else to_host(number)
+
+        friction = map_numbers(of_one, simulation.system.friction, deeper=to_host)
+        wall_mu = jax.tree.map(of_one, simulation.system.wall_mu)
         dt = to_host(simulation.dt)  # of B replicas, not of as many as fill the devices
         state, lower, upper = jax.tree.map(
             lambda leaf: leaf[..., one : one + 1] if np.shape(leaf)[-1] > 1 else leaf,

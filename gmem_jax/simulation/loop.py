@@ -20,7 +20,7 @@ from gmem_jax.physics.census import overlaps
 from gmem_jax.physics.contact.creep import RelaxingLaw, relaxation
 from gmem_jax.physics.contact.friction import CoulombLaw
 from gmem_jax.physics.pairs import Pairs
-from gmem_jax.physics.pytree import Scalar, pytree, static
+from gmem_jax.physics.pytree import Scalar, pytree, static, with_field
 from gmem_jax.physics.state import Box, Grains, HeldWalls, State
 from gmem_jax.physics.step import mark_varying
 from gmem_jax.physics.system import System
@@ -210,7 +210,7 @@ def _rubbing(system: System, row: Bin) -> System:
     if row.friction is None or not isinstance(law, CoulombLaw):
         return system
     wall_mu: Any = None if system.wall_mu is None else system.wall_mu * row.friction
-    return replace(system, friction=replace(law, mu=law.mu * row.friction), wall_mu=wall_mu)  # type: ignore[type-var]
+    return replace(system, friction=with_field(law, "mu", law.mu * row.friction), wall_mu=wall_mu)
 
 
 def rollout(simulation: Simulation, state: State, rows: Bin) -> tuple[State, Sample]:

@@ -13,6 +13,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from gmem_jax.physics.pytree import map_numbers
 from gmem_jax.physics.state import State
 from gmem_jax.simulation.loop import Simulation
 
@@ -69,13 +70,9 @@ class Placement:
         everywhere: Simulation = jax.tree.map(self._put, simulation)
         pairs = replace(everywhere.system.pairs, reference=own)
         mark = jax.tree.map(self._put_last, simulation.mark)
-        friction = jax.tree_util.tree_map_with_path(self._put_of_law, system.friction)
+        friction = map_numbers(self._put_number, system.friction, deeper=self._put)
         placed = replace(everywhere.system, pairs=pairs, friction=friction, **numbers)
         return replace(everywhere, system=placed, mark=mark)
-
-    def _put_of_law(self, path: tuple[Any, ...], leaf: Any) -> Any:
-        """A number of a law itself, or one of an array deeper in it, which all replicas share."""
-        return self._put_number(leaf) if len(path) == 1 else self._put(leaf)
 
     def _put_number(self, leaf: Any) -> Any:
         """A number for all replicas, or one for each, [B]."""

@@ -253,12 +253,17 @@ def _warning(options: dict[str, Any]) -> int:
         return 90
 
 
+KINDS = ("processes", "slurm", "local")
+
+
 def require_options(kind: str, options: dict[str, Any]) -> None:
-    """Refuse options that an executor would not look at; what submitit takes is seen when it is made.
+    """Refuse what is no executor, and options that it would not look at; what submitit takes is seen when it is made.
 
     Raises:
         ValueError: naming one.
     """
+    if kind not in KINDS:
+        raise ValueError(f"executor must be {', '.join(KINDS[:-1])} or {KINDS[-1]}, got {kind!r}")
     if kind == "processes" and options:
         raise ValueError(f"processes have no option {min(options)!r}; the executors slurm and local take submitit's")
 
@@ -273,6 +278,4 @@ def executor(kind: str, workers: int | None, options: dict[str, Any]) -> Executo
     require_options(kind, options)
     if kind == "processes":
         return Processes(workers)
-    if kind in ("slurm", "local"):
-        return Submitted(kind, workers, options)
-    raise ValueError(f"executor must be processes, slurm or local, got {kind!r}")
+    return Submitted(kind, workers, options)

@@ -194,6 +194,7 @@ REFUSED = {
     "should read like timeout_min=240": ["reproduce", "fig06", "--option", "timeout_min"],
     "no option 'mem_gb'": ["reproduce", "fig06", "--option", "mem_gb=1.5"],
     "no option 'timeout_min'": ["reproduce", "fig06", "--dry-run", "--option", "timeout_min=240"],
+    "executor must be processes, slurm or local, got 'pbs'": ["reproduce", "fig06", "--dry-run", "--executor", "pbs"],
     "is given twice": ["reproduce", "fig06", "--executor", "slurm", "--option", "a=1", "--option", "a=2"],
 }
 

@@ -242,6 +242,12 @@ def test_only_slopes_by_sizes_are_those_of_plain_jax(whole: gm.Experiment, monke
             pull(name)
 
 
+def test_names_may_come_one_by_one(experiment: gm.Experiment) -> None:
+    names = ("friction.mu", "pack.position")
+    of_list, of_iterator = (gm.value_and_grad(experiment, by, progress=False).slope for by in (names, iter(names)))
+    jax.tree.map(np.testing.assert_array_equal, of_iterator, of_list)
+
+
 def test_names_that_cannot_be_differentiated_by_are_refused(experiment: gm.Experiment) -> None:
     with pytest.raises(ValueError, match="Hooke has no field 'p_max'"):
         gm.value_and_grad(experiment, ["friction.p_max"])

@@ -12,6 +12,8 @@ from scenes import TETRA_27
 
 import gmem_jax as gm
 from gmem_jax.experiment import protocols
+from gmem_jax.show.figure import TIME_OF_READ
+from gmem_jax.show.recalls import recall_figure
 from gmem_jax.simulation.protocol import Protocol
 
 PACK = gm.load_pack(TETRA_27)
@@ -123,6 +125,9 @@ def test_reading_by_a_shear_of_no_amplitude_is_waiting() -> None:
 
 def test_a_shear_to_one_side_stays_there_and_returns() -> None:
     recall = run(protocols.read_by_shear(2.0, one_sided=True, times=2, length=0.1, store=0.1))
+    assert recall.of_time
+    assert gm.to_csv(recall).startswith("time (parts of the read),")
+    assert {recall_figure(recall, what).panels[0].x for what in ("signals", "all")} == {TIME_OF_READ}
     for read in recall.reads:
         lengths = np.asarray(recall.stages[read].lengths)
         ratio = lengths[:, 1] / lengths[:, 0]

@@ -1,5 +1,6 @@
 """Packs and frames in the formats of others: read back by their own programs, and made packs of again."""
 
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -121,16 +122,16 @@ def test_a_series_that_cannot_be_written_leaves_nothing(
     pytest.importorskip("pyvista")
     with pytest.raises(ValueError, match="characters that XML cannot hold"):
         format_of("vtk", several=True).write(tmp_path / "a\x01.pvd", run_frames, MASS, SOLID)
-    real, written_before = exporters._write_vtp, []
+    real, meshes = exporters._vtp, []
 
-    def full(path: Path, mesh: object) -> None:
-        if len(written_before) == 3:
-            raise OSError("no space left")
-        written_before.append(path)
-        real(path, mesh)
+    def full(mesh: object) -> str:
+        meshes.append(mesh)
+        if len(meshes) == 4:
+            raise OSError(errno.ENOSPC, "no space left")
+        return real(mesh)
 
-    monkeypatch.setattr(exporters, "_write_vtp", full)
-    with pytest.raises(OSError, match="no space left"):
+    monkeypatch.setattr(exporters, "_vtp", full)
+    with pytest.raises(OSError, match=r"/a\.pvd: cannot be written \(No space left on device\)"):
         format_of("vtk", several=True).write(tmp_path / "a.pvd", run_frames, MASS, SOLID)
     assert not list(tmp_path.iterdir())
 

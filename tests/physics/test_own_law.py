@@ -1,10 +1,12 @@
 """A friction law of one's own is tried before a run: what it must return, and what it must leave alone."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from scenes import TETRA_27
 
@@ -117,3 +119,90 @@ def test_a_sound_law_is_taken_within_a_trace_too() -> None:
     assert float(jax.jit(by_t0)(60.0)) == 60.0
     with pytest.raises(ValueError, match="Sticky returned a force"):
         jax.jit(lambda t0: gm.Experiment(PACK, gm.words(1), Sticky(), t0=t0, steps=1).t0)(60.0)
+
+
+class Weights(eqx.Module):
+    """Numbers of a law that all replicas share, made of something else than they are."""
+
+    of: jax.Array
+
+    def __init__(self, *numbers: float) -> None:
+        self.of = jnp.asarray(numbers)
+
+
+class Learnt(eqx.Module):
+    """Hooke's law, its stiffness the sum of some weights."""
+
+    mu: jax.Array
+    weights: Weights
+
+    def __init__(self, *weights: float) -> None:
+        self.mu, self.weights = jnp.asarray(0.5), Weights(*weights)
+
+    @property
+    def plain(self) -> gm.Hooke:
+        return gm.Hooke(self.mu, self.weights.of.sum(), damping_time=0.3)
+
+    def init(self, contacts: int, replicas: int, dtype: Any) -> Any:
+        return self.plain.init(contacts, replicas, dtype)
+
+    def __call__(self, kin: Any, normal_force: jax.Array, history: Any) -> Any:
+        return self.plain(kin, normal_force, history)
+
+
+class Tupled(NamedTuple):
+    """A law that is a tuple."""
+
+    mu: Any = 0.5
+
+    def init(self, contacts: int, replicas: int, dtype: Any) -> Any:
+        return gm.Hooke().init(contacts, replicas, dtype)
+
+    def __call__(self, kin: Any, normal_force: jax.Array, history: Any) -> Any:
+        return gm.Hooke(self.mu, 0.125, damping_time=0.3)(kin, normal_force, history)
+
+
+LEARNT = Learnt(0.0625, 0.03125, 0.03125)  # with exact sums, and as many as there are replicas
+SHORT = {"t0": 75.0, "dt": 0.3, "rest": 0.1, "hold": 0.1, "store": 0.2, "backend": "jax"}
+
+
+def under(law: Any, **more: Any) -> gm.Experiment:
+    return gm.Experiment(PACK, gm.words(1), law, **SHORT, **more)
+
+
+def test_weights_of_a_law_are_shared_by_all_replicas() -> None:
+    assert gm.stable_step(under(LEARNT)) == pytest.approx(gm.stable_step(under(LEARNT.plain)), rel=1e-9)
+    learnt, plain = (gm.run(under(law), frames=2).frames for law in (LEARNT, LEARNT.plain))
+    assert np.any(plain.friction_force != 0.0)
+    np.testing.assert_allclose(learnt.friction_force, plain.friction_force, rtol=1e-9, atol=1e-15)
+
+
+FREELY = gm.Protocol(gm.write(), gm.hold(0.1, friction=False), gm.read())
+
+
+@pytest.mark.parametrize("law", [LEARNT, Tupled()], ids=lambda law: type(law).__name__)
+@pytest.mark.parametrize("more", [{"wall_mu": 0.2}, {"protocol": FREELY}], ids=["walls", "freely"])
+def test_a_law_need_not_take_its_own_fields_to_be_given_another_mu(law: Any, more: dict[str, Any]) -> None:
+    short = {name: value for name, value in SHORT.items() if name in ("t0", "dt", "backend")}
+    found, expected = (
+        gm.run(gm.Experiment(PACK, gm.words(1), one, **short, **more)).p_sig for one in (law, LEARNT.plain)
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
+
+
+def test_parts_of_such_a_law_are_changed_and_differentiated_by_their_names() -> None:
+    changed = gm.replace(under(LEARNT), {"friction.mu": 0.3, "friction.weights.of": jnp.asarray([0.25])})
+    assert (float(changed.friction.mu), float(changed.friction.plain.stiffness)) == (0.3, 0.25)
+    assert float(LEARNT.mu) == 0.5  # law and experiment stay what they are
+    slopes = [
+        float(gm.value_and_grad(under(law), ["friction.mu"], progress=False).slope["friction.mu"])
+        for law in (LEARNT, LEARNT.plain)
+    ]
+    assert slopes[1] != 0.0
+    assert slopes[0] == pytest.approx(slopes[1], rel=1e-9)
+
+
+def test_what_is_no_number_in_a_law_or_in_waveforms_is_refused_by_its_name() -> None:
+    net = eqx.nn.MLP(1, 1, 2, 1, key=jax.random.key(1))
+    with pytest.raises(ValueError, match=r"friction\.weights\.activation is no number: .*make it static"):
+        under(eqx.tree_at(lambda law: law.weights, LEARNT, net))

@@ -1,5 +1,6 @@
 """What tables say a recall was made with, and which published points they put beside it."""
 
+import math
 from typing import Any
 
 import pytest
@@ -37,3 +38,13 @@ def test_a_periodic_pack_has_no_published_point() -> None:
     periodic = described(PERIODIC_27)
     assert periodic["pack_record"]["recipe"]["boundary"] != "walls"
     assert not tables._comparable(periodic)
+
+
+def test_where_there_is_no_error_none_is_printed() -> None:
+    assert [tables.with_error(0.25, error) for error in (0.125, math.nan)] == ["0.250 ± 0.125", "0.250"]
+    assert tables.with_error(math.nan, 0.1) == "-"
+    left = {"correlation": -0.5, "correlation_se": math.nan, "gain": 0.25, "gain_se": math.nan}
+    said = tables.second_readout_lines({"second_readout": left})
+    assert said == "second readout: correlation with J -0.500,\ngain 0.2500 (mean over signals)"
+    sure = tables.second_readout_lines({"second_readout": left | {"correlation_se": 0.1, "gain_se": 0.125}})
+    assert sure.endswith("-0.500 ± 0.100,\ngain 0.2500 ± 0.1250 (mean ± SE over signals)")

@@ -39,6 +39,11 @@ def test_a_kick_dies_out_in_stable_steps_and_grows_beyond_them() -> None:
     assert growth(1.03 * stable) > GROWTH
 
 
+def test_the_step_is_not_looked_for_in_single_precision() -> None:
+    with jax.enable_x64(False), pytest.raises(ValueError, match="float64 is needed"):
+        gm.stable_step(EXPERIMENT)
+
+
 def test_whether_a_step_is_stable_is_known_without_the_longest_one(monkeypatch: pytest.MonkeyPatch) -> None:
     stable = gm.stable_step(EXPERIMENT)
     monkeypatch.setattr(stepping, "_known", {})

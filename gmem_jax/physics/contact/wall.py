@@ -1,6 +1,5 @@
 """Contacts of spheres with the rigid walls of the box: what pushes them back, and friction where walls have it."""
 
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.kinematics import Kinematics
 from gmem_jax.physics.contact.normal import hertz
 from gmem_jax.physics.material import Material
-from gmem_jax.physics.pytree import Scalar
+from gmem_jax.physics.pytree import Scalar, with_field
 from gmem_jax.physics.rotation import cross, dot
 from gmem_jax.physics.state import Box
 
@@ -122,4 +121,4 @@ def wall_friction(
         The forces [6 S, 3, B], and the new history.
     """
     normal_force = jnp.concatenate([lower, upper], axis=1).reshape(kin.overlap.shape)
-    return replace(law, mu=mu)(kin, normal_force, history)  # type: ignore[type-var]
+    return with_field(law, "mu", mu)(kin, normal_force, history)
