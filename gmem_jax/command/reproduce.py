@@ -20,7 +20,7 @@ from gmem_jax.reproduce.cost import spec_of_all
 from gmem_jax.reproduce.dataset import COLLECTED
 from gmem_jax.reproduce.figures import FIGURES, SCALES, scale_of
 from gmem_jax.reproduce.run import GALLERY, RUNS, SCHEMATICS, Outcome, Reproduction, Weighed, outcome_summary
-from gmem_jax.show.tables import with_error
+from gmem_jax.show.tables import decimal
 from gmem_jax.simulation.progress import Progress
 from gmem_jax.sweeps.cost import cost_of
 from gmem_jax.sweeps.executors import executor as executor_named
@@ -176,7 +176,7 @@ def _choices_table(effects: Sequence[Effect]) -> Table:
     for name in ("choice", "value", "G", "F", "change of G", "change of F"):
         table.add_column(name, justify="left" if name == "choice" else "right")
     for effect in effects:
-        own = [with_error(one.mean, one.error) for one in (effect.gain, effect.fidelity)]
+        own = [decimal(one.mean, one.error) for one in (effect.gain, effect.fidelity)]
         change = [f"{100.0 * effect.of_gain.mean:+.1f} %", f"{effect.of_fidelity.mean:+.3f}"]
         known = (effect.choice.words, str(effect.value), *own, *(["", ""] if effect.default else change))
         table.add_row(*known, style="bold" if effect.default else None)
@@ -191,9 +191,9 @@ def _table(outcome: Outcome) -> Table:
     for name in (*varied, "", "ours", "packs", "published", "N", "apart"):
         table.add_column(name, justify="right")
     for row in outcome.rows:
-        theirs = with_error(row.theirs.mean, row.theirs.error) if row.theirs else ""
+        theirs = decimal(row.theirs.mean, row.theirs.error) if row.theirs else ""
         apart = "" if math.isnan(row.errors_apart) else f"{row.errors_apart:+.1f}"
-        ours = with_error(row.ours.mean, row.ours.error)
+        ours = decimal(row.ours.mean, row.ours.error)
         known = [str(getattr(row.conditions, name)) for name in varied]
         size = f"{row.grains:,}" if row.theirs else ""
         table.add_row(*known, row.measure, ours, str(row.ours.packs), theirs, size, apart)

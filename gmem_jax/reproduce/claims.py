@@ -18,7 +18,7 @@ from gmem_jax.physics.census import overlaps
 from gmem_jax.physics.contact.frictionless import Frictionless
 from gmem_jax.physics.contact.hooke import Hooke
 from gmem_jax.reproduce.figures import Values, crossed
-from gmem_jax.show.tables import with_error
+from gmem_jax.show.tables import decimal
 from gmem_jax.simulation.stage import BINS
 
 STORES = (0.5, 2.0, 8.0)  # t0
@@ -90,8 +90,8 @@ def reading_erases(recall: Recall, scale: float) -> Verdict:
     return Verdict(
         "the first readout erases the memory",
         abs(left[0]) < LITTLE * gain,
-        f"gain of the second {with_error(left[0], left[2], 4)} beside {gain:.3f}; "
-        f"correlation with J {with_error(correlation[0], correlation[2], 2)} (mean and SE over signals)",
+        f"gain of the second {decimal(left[0], left[2], 4)} beside {gain:.3f}; "
+        f"correlation with J {decimal(correlation[0], correlation[2], 2)} (mean and SE over signals)",
         {"gain": gain, "second_gain": left[0], "correlation": correlation[0]},
     )
 

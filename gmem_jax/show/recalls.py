@@ -239,14 +239,18 @@ def waveforms_figure(recall: Recall, names: Sequence[str], title: str) -> Figure
 
 def image_figure(recall: Recall, names: Sequence[str], title: str) -> Figure:
     """p_sig and J of all signals, however many, as a picture: a row for each."""
-    count, u, x = len(recall.J), np.asarray(recall.u), u_label(1, of_time=recall.of_time)
+    count, u = len(recall.J), np.asarray(recall.u)
     pairs = (
-        (float(recorded_material(recall.configuration).modulus) * np.asarray(recall.p_sig), "recalled $p_{sig}$ (Pa)"),
-        (np.asarray(recall.J), "$J(u)$"),
+        (
+            float(recorded_material(recall.configuration).modulus) * np.asarray(recall.p_sig),
+            "recalled $p_{sig}$ (Pa)",
+            recall.of_time,
+        ),
+        (np.asarray(recall.J), "$J(u)$", False),
     )
     panels = tuple(
-        Panel((Image(np.asarray(values), u, np.arange(count), label),), x=x, down=True, y_names=names)
-        for values, label in pairs
+        Panel((Image(values, u, np.arange(count), label),), x=u_label(1, of_time=of_time), down=True, y_names=names)
+        for values, label, of_time in pairs
     )
     size = (9.6, min(9.0, 3.0 + 0.12 * count))
     return Figure(panels, 2, size, (title, _measures(recall, count, count)), shared=("y",))

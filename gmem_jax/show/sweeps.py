@@ -11,7 +11,7 @@ from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import SENTENCES, Status, combined_status
 from gmem_jax.show.figure import Curve, Figure, Panel, ramp
 from gmem_jax.show.numbers import status_words
-from gmem_jax.show.tables import cell, decimal, with_error
+from gmem_jax.show.tables import cell, decimal
 from gmem_jax.sweeps.curves import Line, axes_of, is_sample, lines_of
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.table import names_in, points_in
@@ -81,7 +81,7 @@ def means_table(table: list[dict[str, Any]], names: list[str]) -> Table:
 def _with_error(row: dict[str, Any], measure: str) -> str:
     if row[measure] is None:
         return ""
-    return with_error(row[measure], row[f"{measure}_se"])
+    return decimal(row[measure], row[f"{measure}_se"])
 
 
 def sweep_figure(

@@ -85,7 +85,7 @@ def errors_table(recall: Recall) -> Table:
             errors = analysis.errors_over_signals(signal, integral, scale) if known else (math.nan, math.nan)
             pairs = zip(values, errors, strict=True)
             place = (str(getattr(one, f"{name}s")[0]) for name in where)
-            table.add_row(name, *place, *(with_error(float(value), error) for value, error in pairs))
+            table.add_row(name, *place, *(decimal(float(value), error) for value, error in pairs))
     return table
 
 
@@ -94,16 +94,11 @@ def _where(parts: Sequence[Recall]) -> list[str]:
     return [name for name in ("read", "channel") if len({getattr(one, f"{name}s") for one in parts}) > 1]
 
 
-def with_error(value: float, error: float, digits: int = 3) -> str:
-    """A measure and its standard error, where there is one; NaN, where nothing can be said, as "-"."""
+def decimal(value: float, error: float = math.nan, digits: int = 3) -> str:
+    """A measure, and its standard error where there is one; NaN, where nothing can be said, as "-"."""
     if math.isnan(value):
         return NONE
     return f"{value:.{digits}f}" + (f" ± {error:.{digits}f}" if math.isfinite(error) else "")
-
-
-def decimal(value: float) -> str:
-    """A measure; NaN, where nothing can be said, as "-"."""
-    return NONE if math.isnan(value) else f"{value:.3f}"
 
 
 def target_line(row: dict[str, Any]) -> str:
@@ -183,8 +178,8 @@ def second_readout_lines(row: dict[str, Any]) -> str:
     left = row["second_readout"]
     error = " ± SE" if math.isfinite(left["gain_se"]) else ""
     return (
-        f"second readout: correlation with J {with_error(left['correlation'], left['correlation_se'])},\n"
-        f"gain {with_error(left['gain'], left['gain_se'], 4)} (mean{error} over signals)"
+        f"second readout: correlation with J {decimal(left['correlation'], left['correlation_se'])},\n"
+        f"gain {decimal(left['gain'], left['gain_se'], 4)} (mean{error} over signals)"
     )
 
 

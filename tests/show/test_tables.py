@@ -41,8 +41,8 @@ def test_a_periodic_pack_has_no_published_point() -> None:
 
 
 def test_where_there_is_no_error_none_is_printed() -> None:
-    assert [tables.with_error(0.25, error) for error in (0.125, math.nan)] == ["0.250 ± 0.125", "0.250"]
-    assert tables.with_error(math.nan, 0.1) == "-"
+    assert [tables.decimal(0.25, error) for error in (0.125, math.nan)] == ["0.250 ± 0.125", "0.250"]
+    assert tables.decimal(math.nan, 0.1) == "-"
     left = {"correlation": -0.5, "correlation_se": math.nan, "gain": 0.25, "gain_se": math.nan}
     said = tables.second_readout_lines({"second_readout": left})
     assert said == "second readout: correlation with J -0.500,\ngain 0.2500 (mean over signals)"
