@@ -24,7 +24,7 @@ from gmem_jax.experiment.experiment import PAPER_T0
 from gmem_jax.physics.state import Status
 from gmem_jax.reproduce import draw
 from gmem_jax.reproduce.compare import Compared, Conditions, Estimate, compared, comparison_rows, read_csv, write_csv
-from gmem_jax.reproduce.figures import FIGURES
+from gmem_jax.reproduce.figures import CALIBRATED, FIGURES
 from gmem_jax.show.numbers import published
 
 HERE = Path(__file__).parents[1] / "results"
@@ -57,7 +57,6 @@ WHICH: dict[str, Callable[[Compared], bool]] = {
 
 SLOW = ("points.csv", "rates.csv", "pressure.csv", "standard_points.csv")  # tables with runs at the paper's rate
 UNSAID: dict[str, Any] = {**USUAL, "shape": "tetra", "pressure": 2e-3}  # what a table without such a column has
-CALIBRATED = ("tetra-10240-b", "tetra-10240-c")  # packs by whose G k_H was chosen
 WITHIN = 2.0  # combined errors that count as agreement
 REASONS: tuple[tuple[Callable[[Mapping[str, Any]], bool], str], ...] = (
     (

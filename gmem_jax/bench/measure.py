@@ -220,12 +220,16 @@ def _peak_bytes() -> int:
 
 
 def memory(load: Callable[[str], Pack], name: str, grains: int, backend: str, law: str) -> float:
-    """Bytes per grain and replica: growth of the peak from 16 to 32 replicas, each in its own process."""
+    """Bytes per grain and replica: growth of the peak from some replicas to twice as many, each in its own process.
+
+    There are so many of them that what they need, some 2 kB each, stands out from what else a process takes.
+    """
+    replicas = max(16, -(-65_536 // grains))
     peaks = []
-    for count in (16, 32):
+    for count in (replicas, 2 * replicas):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             peaks.append(pool.submit(_peak_memory, load, name, backend, law, count).result())
-    return (peaks[1] - peaks[0]) / (grains * 16)
+    return (peaks[1] - peaks[0]) / (grains * replicas)
 
 
 def _gradient(load: Callable[[str], Pack], name: str, backend: str, values: int, t0: float) -> dict[str, float]:

@@ -22,7 +22,7 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.physics.state import Box, still_box
 from gmem_jax.simulation.compiled import require_x64
 from gmem_jax.simulation.loop import Simulation
-from gmem_jax.simulation.stability import cause, longest_step
+from gmem_jax.simulation.stability import cause, one_contact_limit
 from gmem_jax.simulation.stable_step import GROWTH, SHORTEST_STEP, growth, largest_stable_step
 
 RINGING_PERIODS = 9.6  # of a compression for an error of 1 in G, which falls as 1 / t0^2: at most 0.9 % at 96 of them
@@ -116,7 +116,9 @@ def require_stable(experiment: Experiment) -> None:
         ValueError: saying both numbers, and which number of the experiment is the cause if one is by itself.
     """
     dt, simulation = float(np.max(np.asarray(experiment.timing.dt))), experiment.simulation(sheared=False)
-    if dt <= max(SHORTEST_STEP, min(USUAL_STEP, longest_step(simulation, MUCH_STIFFER))) or is_stable(experiment, dt):
+    if dt <= max(SHORTEST_STEP, min(USUAL_STEP, one_contact_limit(simulation, MUCH_STIFFER))):
+        return
+    if is_stable(experiment, dt):
         return
     if dt > (stable := stable_step(experiment)):
         limit = f"{stable:.3g}" if stable else f"below {SHORTEST_STEP}"

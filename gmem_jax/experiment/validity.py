@@ -28,7 +28,7 @@ RINGING = 0.03  # what averaging over T_1 may add to F: at N = 325 up to 0.005 a
 LARGEST_SHEAR = 0.25  # of delta0; gains are 1.3 to 1.7 times as large at 0.2, 2.0 to 2.5 at 0.3
 LARGEST_WAVEFORM = 2.0  # |I|; the paper's signals have 1 at most, and gains are per gamma0
 LARGEST_FRICTION = 10.0  # no pair of materials has it; beyond it G changes by 4 % up to 1e6: hardly a contact slides
-FASTEST_GRAIN = 3.5  # wall speeds, for a quarter of a stage; 1.2 to 2.8 in sound runs with friction, 8 on in unstable
+FASTEST_GRAIN = 3.5  # wall speeds, for a quarter of a stage; 1.3 to 2.8 in sound runs with friction; 14 if too long
 NOISE = {  # of p_sig, over mean pressure and root of steps; measured, in these units: 1 to 3 (H), 15 (M1); 0.4 to 1.2
     "double": 5.0 * 2.0**-53,
     "mixed": 0.01 * 2.0**-24,

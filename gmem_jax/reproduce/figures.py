@@ -16,7 +16,7 @@ Values = dict[str, Any]
 """Names of a sweep file with the values of one point."""
 
 DELTA0 = 0.05  # the paper's compression, and that of every shipped pack
-CALIBRATED = tuple(f"tetra-10240-{x}" for x in "abc")  # by whose recalls k_H was chosen: no comparison may use them
+CALIBRATED = tuple(f"tetra-10240-{x}" for x in "abc")  # by whose G k_H was chosen: not for law H with friction
 MADE = 101  # seed of the first pack that is made: the shipped ones have small seeds
 SHAPES: list[Values] = [{"shape": "sphere"}, *({"overlap": overlap} for overlap in (0.7, 0.8, 0.9))]
 SHOWN_WORD = 683  # of ten bits, in the paper's Fig. 13

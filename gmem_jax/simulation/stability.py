@@ -24,8 +24,8 @@ _USUAL: dict[str, Any] = {  # what stands for a number that is asked whether it 
 }
 
 
-def longest_step(simulation: Simulation, stiffer: float = 1.0, **changed: float) -> float:
-    """The longest stable step for a grain on a wall and two grains with friction, in t_c.
+def one_contact_limit(simulation: Simulation, stiffer: float = 1.0, **changed: float) -> float:
+    """The longest stable step for one contact: a grain on a wall, or two grains with friction, in t_c.
 
     Args:
         simulation: gives the smallest grain, the material and the law; of replicas the largest numbers count.
@@ -60,8 +60,8 @@ def _numbers(simulation: Simulation) -> dict[str, float]:
 
 def cause(simulation: Simulation) -> str:
     """The number that made a run unstable, as far as can be said; "" if none is beyond its bound."""
-    numbers, longest, dt = _numbers(simulation), longest_step(simulation), _most(simulation.dt)
-    without = {name: longest_step(simulation, **{name: _USUAL[name]}) for name in numbers}
+    numbers, longest, dt = _numbers(simulation), one_contact_limit(simulation), _most(simulation.dt)
+    without = {name: one_contact_limit(simulation, **{name: _USUAL[name]}) for name in numbers}
     name = max(without, key=without.__getitem__)
     if longest >= dt or without[name] <= longest:
         return ""

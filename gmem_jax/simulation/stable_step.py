@@ -20,7 +20,7 @@ from gmem_jax.physics.step import start
 from gmem_jax.simulation.compiled import Compiled
 from gmem_jax.simulation.loop import Simulation
 
-SHORTEST_STEP, LONGEST_STEP = 0.1, 2.0  # t_c; beyond the latter p_sig is some 10 % off, if anything is stable
+SHORTEST_STEP, LONGEST_STEP = 0.1, 2.0  # t_c; beyond the latter p_sig is 3 % off or more, if anything is stable
 CLOSE = 1.02  # ratio of a step that is stable to one that is not
 GROWTH = 1e-4  # in a step; what grows less needs ten thousand steps, and sliding contacts take it away
 ROUNDS = 20  # of the power iteration, each with

@@ -13,7 +13,7 @@ from gmem_jax.physics.numbers import require_whole
 from gmem_jax.physics.pytree import Scalar, parameter, pytree, static
 from gmem_jax.physics.rotation import cross, dot
 
-Variant = Literal["averaged", "exact", "paper"]  # in the order of enum Variant (native/src/physics/parameters.h)
+Variant = Literal["averaged", "exact", "paper"]
 MOST_POINTS = 10_000  # of a history; the paper has 100
 
 
