@@ -60,10 +60,6 @@ if not os.environ.get("COLUMNS", "1").strip("0"):  # not known; in no columns ri
 stderr = _Log(stderr=True, highlight=False, markup=False)  # markup would let names in files style or break a line
 out = _Out(highlight=False, markup=False)
 
-STEP_COST = {
-    "native": (0.2, 0.08),
-    "jax": (2.0, 1.3),
-}  # us a grain-step on two cores, one replica and several; see benchmarks
 LONGEST_DURATION = 3e9  # seconds, a century: what is longer was not meant
 LOG_INTERVAL = 30.0  # seconds between lines of progress where there is no terminal
 
@@ -257,13 +253,13 @@ def announce(what: str, grain_steps: float, memory: float, backend: str, replica
     """
     import psutil
 
-    from gmem_jax.files.sizes import in_bytes, in_time
+    from gmem_jax.files.sizes import STEP_SECONDS, in_bytes, in_time
     from gmem_jax.native.library import require_threads
 
     if backend == "native":
         require_threads()
     free = psutil.virtual_memory().available
-    seconds = 1e-6 * STEP_COST[backend][replicas > 1] * grain_steps
+    seconds = STEP_SECONDS[backend][replicas > 1] * grain_steps
     if not seconds < LONGEST_DURATION:
         years = seconds / 3.15e7
         raise InputError(f"{what} would take {years:.0e} years; choose a larger dt, a smaller t0 or fewer grains")

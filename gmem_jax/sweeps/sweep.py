@@ -25,7 +25,7 @@ from gmem_jax.experiment.run import replica_bins
 from gmem_jax.files.configuration import named_experiment, with_protocol
 from gmem_jax.files.packs import load_pack
 from gmem_jax.files.protocols import named_protocol
-from gmem_jax.files.sizes import in_time, recall_bytes
+from gmem_jax.files.sizes import STEP_SECONDS, in_time, recall_bytes
 from gmem_jax.files.validation import require_kinds
 from gmem_jax.files.waveforms import named_signals, waveforms_of
 from gmem_jax.physics.numbers import plural
@@ -40,7 +40,7 @@ from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import parts_of_job, run_group
 
 FREE_CORES = "of two free cores once compiled (native, law H)"
-SECONDS_PER_GRAIN_STEP = 8e-8  # s a grain-step on two cores, of SIDE_BY_SIDE replicas; see docs/scaling.md
+SECONDS_PER_GRAIN_STEP = STEP_SECONDS["native"][1]  # of SIDE_BY_SIDE replicas; see docs/scaling.md
 SIDE_BY_SIDE = 8  # replicas: a block
 CHECKED = 50  # values of a name that are tried before a sweep begins
 ANY_PACK = "tetra-325-a"
