@@ -2,6 +2,8 @@
 
     python benchmarks/large_packs.py [--t0 1.8e4] [--seconds 4] [--errors tetra-325-a tetra-325-b ...] [--only-errors]
 
+With --only-errors they are printed, and nothing is written.
+
 Each size and number of replicas is timed in both precisions in turn, so that what else the machine does meets both; a
 number is the best of the calls, and beside it stands their median. Errors are those of whole recalls at t0 = 1.8e3
 against double precision.
@@ -89,7 +91,10 @@ def main() -> None:
     if chosen.errors:
         parts.append(["Errors of whole recalls, t0 = 1.8e3, six signals.", "", *errors(chosen.errors)])
     text = "\n".join(["# Large packs, and mixed precision", "", head, *("\n" + "\n".join(part) for part in parts), ""])
-    Path(__file__).with_suffix(".md").write_text(text)
+    if chosen.only_errors:
+        print(text)
+    else:
+        Path(__file__).with_suffix(".md").write_text(text)
 
 
 if __name__ == "__main__":

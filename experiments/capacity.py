@@ -270,6 +270,8 @@ def main() -> None:
     usual = [Case(name, USUAL, arguments.t0, arguments.output) for name in small]
     recalls = np.stack([case.repeated()[0] for case in usual])  # packs, signals, bins
     between = math.sqrt(recalls.var(axis=0, ddof=1).mean() / np.mean(recalls**2))
+    if (noted := table.pick(study="between packs")) and noted[0]["value"] != _text(between):
+        parser.error(f"--packs: {table.path} is of other packs; name another folder with -o")
     table.note(usual[0], "between packs", noise("other pack", between))
     known: list[tuple[Case, Noises]] = []
     for gamma0 in map(float, arguments.gammas.split(",")):

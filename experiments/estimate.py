@@ -82,11 +82,12 @@ def main() -> None:
     places = sample(log_density, sampling, arguments.warm, arguments.samples, arguments.doublings)
     found = np.asarray(numbers(places))
     tell("NUTS", found, np.ones(found.shape[:2]))
-    with arguments.output.with_suffix(".csv").open("w", newline="") as file:
+    table, picture = (arguments.output.with_name(arguments.output.name + suffix) for suffix in (".csv", ".png"))
+    with table.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["chain", "mu", "k_H"])
         writer.writerows([n, *(f"{value:.5f}" for value in row)] for n, chain in enumerate(found) for row in chain)
-    draw(arguments.output.with_suffix(".png"), places, axis, weights, np.asarray(measured), np.asarray(clean), noise)
+    draw(picture, places, axis, weights, np.asarray(measured), np.asarray(clean), noise)
 
 
 def sample(log_density: LogDensity, key: jax.Array, warm: int, count: int, doublings: int) -> np.ndarray:

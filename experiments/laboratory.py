@@ -12,6 +12,7 @@ killed. At the end the table is printed, mean and standard error over packs.
 
 import argparse
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -170,10 +171,15 @@ def main() -> None:
             note(path, COLUMNS, [own | {"quantity": key, "value": f"{value:.5g}"} for key, value in found.items()])
             print(pack, name, gm.explain(status), f"{own['seconds']} CPU s", flush=True)
     rows = done(path)
-    for name, quantity in dict.fromkeys((row["condition"], row["quantity"]) for row in rows):
-        values = [float(row["value"]) for row in rows if (row["condition"], row["quantity"]) == (name, quantity)]
+    for grains, name, quantity in dict.fromkeys(map(of_mean, rows)):
+        values = [float(row["value"]) for row in rows if of_mean(row) == (grains, name, quantity)]
         mean, _, error = spread(values)
-        print(f"{name:22} {quantity:28} {mean:9.4g} ± {error:.2g} ({len(values)})")
+        print(f"{grains:>6} {name:22} {quantity:28} {mean:9.4g} ± {error:.2g} ({len(values)})")
+
+
+def of_mean(row: Mapping[str, str]) -> tuple[str, str, str]:
+    """What the rows of one mean have in common."""
+    return row["N"], row["condition"], row["quantity"]
 
 
 if __name__ == "__main__":

@@ -122,7 +122,7 @@ def draw(output: Path, laws: dict[str, Callable[[jax.Array], jax.Array]], losses
     """The stiffness against the overlap, and how the fit went; the table beside the picture has both."""
     overlaps = jnp.linspace(0.005, 0.2, 40)
     curves = {name: np.asarray(law(overlaps)) for name, law in laws.items()}
-    with output.with_suffix(".csv").open("w", newline="") as file:
+    with output.with_name(f"{output.name}.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["overlap", *curves])
         writer.writerows(
@@ -135,7 +135,7 @@ def draw(output: Path, laws: dict[str, Callable[[jax.Array], jax.Array]], losses
     left.legend(fontsize=8, frameon=False)
     right.semilogy(losses)
     right.set(xlabel="updates", ylabel="square of what differs, over that of the recall", title="the fit")
-    save_picture(output.with_suffix(".png"), figure)
+    save_picture(output.with_name(f"{output.name}.png"), figure)
 
 
 if __name__ == "__main__":

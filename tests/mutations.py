@@ -1281,8 +1281,8 @@ MUTATIONS = (
     mutation(
         "observers-without-the-drag-of-the-stage",
         "simulation/loop.py",
-        "system=system, dt=dt, drag=drag, box=last",
-        "system=system, dt=dt, box=last",
+        "system=system, path=path, dt=dt, drag=drag, box=last",
+        "system=system, path=path, dt=dt, box=last",
         "test_observers_know_the_drag_and_the_friction_of_a_stage",
     ),
     mutation(

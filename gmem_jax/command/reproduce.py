@@ -70,12 +70,13 @@ def reproduce_command(
     outcomes, verdicts, weighed, drawn = [], [], Weighed([], [], []), []
     archives: list[Path] = []
     broken: list[str] = []
+    statuses: list[int] = []
 
     def wanted(names: Iterable[str]) -> list[str]:
         return [name for name in names if what in (name, "all")]
 
     def reproduction(progress: Progress) -> Reproduction:
-        return Reproduction(output, scale, executor_named(executor, workers, options), progress, log)
+        return Reproduction(output, scale, executor_named(executor, workers, options), progress, log, statuses)
 
     with locked(output / "figures"):
         if retry and (count := Store(output / RUNS).clear_failures()):
@@ -102,15 +103,13 @@ def reproduce_command(
             with reporting(goes_on=True) as progress:
                 outcomes.append(reproduction(progress).figure(name))
             _say_written(outcomes[-1])
-    rows: list[Any] = [*weighed.effects, *(row for outcome in outcomes for row in outcome.rows)]
-    status = combined_status([row.status for row in rows])
     result = {
         "figures": [outcome_summary(outcome) for outcome in outcomes],
         "claims": [verdict._asdict() for verdict in verdicts],
         "choices": choices.effect_rows(weighed.effects),
         "pictures": [str(path) for path in drawn],
         "dataset": [str(path) for path in archives],
-        "status": status,
+        "status": combined_status(statuses),
     }
     lines = [f"{'yes' if verdict.holds else 'NO ':4}{verdict.claim}\n    {verdict.numbers}" for verdict in verdicts]
     more = [_choices_table(weighed.effects)] if weighed.effects else []

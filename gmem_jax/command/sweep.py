@@ -1,7 +1,6 @@
 """`gmem sweep`."""
 
 import contextlib
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,7 +31,7 @@ from gmem_jax.sweeps.processes import stop, waiting
 from gmem_jax.sweeps.spec import Spec, read_spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SweepRunner
-from gmem_jax.sweeps.table import TABLE_FORMATS, export_table, means, names_in, points_in, rows, warnings_of
+from gmem_jax.sweeps.table import TABLE_FORMATS, doubts, export_table, means, names_in, points_in, rows
 
 VERBS = ("status", "show", "export", "stop")
 RUN = ("executor", "workers", AS_THEY_ARE)
@@ -108,7 +107,7 @@ def sweep_command(
     failed = [row for row in table if row["state"] == "failed"]
     for row in failed[:3]:
         log(f"failed: {_values(row, spec.names)}: {row['why']}", style="yellow")
-    for line in _doubtful(table):
+    for line in doubts(table):
         log(f"warning: {line}", style="yellow")
     count = len(points_in(table))
     log(f"{count - len(failed)} of {plural(count, 'point')} in {target}; gmem sweep show {target}")
@@ -162,16 +161,9 @@ def _status(store: Store, as_json: bool) -> None:
     at_work = [one for one in store.progress() if one["job"].partition("-")[0] in taken]
     busy = [f"{one['what']}, {one['fraction']:.0%}" for one in at_work if one["fraction"] < 1.0]
     reasons = sorted({row["why"] for row in table if row["state"] == "failed"})
-    problems = [*(f"failed: {reason}" for reason in reasons), *(f"warning: {line}" for line in _doubtful(table))]
+    problems = [*(f"failed: {reason}" for reason in reasons), *(f"warning: {line}" for line in doubts(table))]
     waits = waiting(store)
     print_result(as_json, {**summary, "waiting": waits}, ", ".join(lines), *busy, *waits, *problems)
-
-
-def _doubtful(table: list[dict[str, Any]]) -> list[str]:
-    """How many points are doubtful, and why: a line for each reason."""
-    points = points_in(table)
-    counts = Counter(reason for row in points if (reason := warnings_of(row)))
-    return [f"{count} of {plural(len(points), 'point')}: {reason}" for reason, count in counts.items()]
 
 
 def split_names(text: str) -> list[str]:

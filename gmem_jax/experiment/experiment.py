@@ -100,7 +100,8 @@ class Experiment:
         shear: when the waveforms are applied: "during" the compression, or "before" it, as functions of time at u = 0.
         protocol: what is done; default the paper's, made of rest, hold, store, background and shear. With one of your
             own say lengths there; "sub2" and "sub2-bl" take its second read for the background of the first.
-        observe: functions of (simulation, state) by name, called at the end of each bin; what they give is in
+        observe: functions of (simulation, state) by name, called at the end of each bin for all replicas at once, and
+            of each by itself, as batches and devices have some of them only; what they give is in
             `Recall.stages[...].observed`. See `gmem_jax.simulation.observables`.
         backend: "jax", the definition; "native", C++ on CPUs; "auto", native where it is built and knows the law.
         precision: "double"; or "mixed", contacts in single precision on the native backend, without derivatives.

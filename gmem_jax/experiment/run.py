@@ -158,8 +158,7 @@ def run(
     schedule = frame_schedule(experiment, frames, frames_of, frames_at)
     if prefix and schedule.wanted:
         raise ValueError("frames begin with the prefix: run it in the same call")
-    warn_of_another_compression(experiment)
-    warn_of_another_material(experiment)
+    warn_of_another_preparation(experiment)
     common, own = experiment.phases
     firsts = range(0, count, size)
     work = sum(work_of(own, 1 + min(size, count - first)) for first in firsts)
@@ -243,6 +242,13 @@ class OtherCompressionWarning(UserWarning):
     """A pack was cycled with another delta0: `Status.OTHER_COMPRESSION`, said before the run."""
 
 
+def warn_of_another_preparation(experiment: Experiment) -> None:
+    """Warn of what a pack was not made for: another delta0, other elastic numbers, no weight or another."""
+    warn_of_another_compression(experiment)
+    _warn_of_another_material(experiment)
+    _warn_of_another_weight(experiment)
+
+
 def warn_of_another_compression(experiment: Experiment) -> None:
     """Warn of a delta0 that the pack was not made for."""
     own = float(experiment.pack.delta0)
@@ -254,7 +260,7 @@ def warn_of_another_compression(experiment: Experiment) -> None:
         )
 
 
-def warn_of_another_material(experiment: Experiment) -> None:
+def _warn_of_another_material(experiment: Experiment) -> None:
     """Warn of elastic numbers that are not those with which the pack came to rest; units are left out."""
     pack, recorded = experiment.pack, experiment.pack.info.get("material", {})
     made = {name: recorded[name] for name in _ELASTIC if is_real(recorded.get(name, ""))}
@@ -263,6 +269,17 @@ def warn_of_another_material(experiment: Experiment) -> None:
         warn_caller(
             f"{pack.name} was prepared with {others}: it is not at rest so; take its own, as in "
             "material=gm.Material(...), or prepare a pack with these"
+        )
+
+
+def _warn_of_another_weight(experiment: Experiment) -> None:
+    """Warn of a weight that is taken off a pack. One that gets some sags a little, which is an experiment's choice."""
+    pack, gravity = experiment.pack, 0.0 if experiment.gravity is None else experiment.gravity
+    own = pack.info.get("recipe", {}).get("gravity", 0.0)
+    if is_real(own) and own > 0.0 and not np.allclose(np.asarray(gravity), own, atol=0.0):
+        warn_caller(
+            f"{pack.name} was prepared under gravity = {own:g}, not {said(gravity)}: it is not at rest so; "
+            f"take its own, gravity = {own:g}, or prepare a pack for this one"
         )
 
 

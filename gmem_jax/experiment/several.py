@@ -19,7 +19,7 @@ from gmem_jax.experiment.experiment import NOT_OF_PAPER, Experiment, acts_on_pre
 from gmem_jax.experiment.identity import identity
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.record import describe
-from gmem_jax.experiment.run import PREFIX, finished, runner_of, warn_of_another_compression, warn_of_another_material
+from gmem_jax.experiment.run import PREFIX, finished, runner_of, warn_of_another_preparation
 from gmem_jax.experiment.signals import ChosenSignals, Signals, SignalSets, bin_average
 from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.checkpoints import Checkpoint, ResultCache, no_cache
@@ -116,8 +116,7 @@ def run_several(
     began, side = time.perf_counter(), _Side(experiments)
     common, own = experiments[0].phases
     for each in experiments:
-        warn_of_another_compression(each)
-        warn_of_another_material(each)
+        warn_of_another_preparation(each)
     one_each = np.unique(side.prefix, return_index=True)[1]
     owners = np.repeat(np.arange(len(experiments)), np.diff(side.first))
     sets = side.signals().sets

@@ -88,7 +88,8 @@ def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]
 
     Args:
         packs: what names them.
-        runs: values of points and summaries of their recalls (`show.numbers.summary`); points that failed are missing.
+        runs: values of points and summaries of their recalls (`show.numbers.summary`) with their keys; points that
+            failed are missing. A value that comes to the same run as the default (steps of a bin's length) is left out.
         t0: at which they were run: below the paper's, G and F are those after averaging over the ringing period.
     """
     known = list(runs)
@@ -101,7 +102,7 @@ def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]
         for value in choice.values:
             both = [(at(pack, choice.shared), at(pack, _values(choice, value))) for pack in packs]
             pairs = [(default, tried) for default, tried in both if default and tried]
-            if pairs:
+            if pairs and (value == choice.values[0] or any(one["key"] != other["key"] for one, other in pairs)):
                 found.append(_effect(choice, value, pairs, t0))
     return found
 

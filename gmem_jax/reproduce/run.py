@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,7 @@ from gmem_jax.files.cache import list_packs
 from gmem_jax.files.packs import load_pack
 from gmem_jax.native.backend import backend_name
 from gmem_jax.physics.contact.laws import entry_of, law_named
+from gmem_jax.physics.state import combined_status
 from gmem_jax.reading.lessons import TrainingConfig
 from gmem_jax.reading.readers import stored_words
 from gmem_jax.reading.report import reading_report
@@ -58,6 +59,7 @@ from gmem_jax.sweeps.making import AS_THEY_ARE
 from gmem_jax.sweeps.spec import PREPARE, Spec
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.sweep import SECONDS_PER_GRAIN_STEP, SIDE_BY_SIDE, SweepRunner, Tell
+from gmem_jax.sweeps.table import doubts, rows
 
 RUNS = "runs"  # the folder of the sweep that all figures share
 MOST_SHOWN = 8  # words of a length in Fig. 13
@@ -125,7 +127,8 @@ class Reproduction:
         scale: a name of `SCALES`, or one with changes: see `scale_of`.
         executor: does the runs; default processes of this machine.
         progress: told about them.
-        say: told in a line what is planned, and what happened.
+        say: told in a line what is planned, what happened, and why recalls are doubtful.
+        statuses: takes the status of every recall that was looked at.
 
     Raises:
         ValueError: by its methods if there is no such scale, or JAX runs in 32 bits.
@@ -138,6 +141,7 @@ class Reproduction:
     executor: Executor | None = None
     progress: Progress = silent
     say: Tell = print
+    statuses: list[int] = field(default_factory=list)
 
     def figure(self, name: str) -> Outcome:
         """Run what is missing of a figure of `FIGURES`, and write its picture (PNG, SVG) and its table (CSV).
@@ -155,13 +159,14 @@ class Reproduction:
         points, failed = points_of(store), _failed(store)
         if not points:
             return Outcome(name, [], [], failed)
-        rows = compare_points(points, size.t0)
+        measured = compare_points(points, size.t0)
         if name == "fig14":
-            rows += self._read_words(store, points, size)
+            measured += self._read_words(store, points, size)
         target = self._target(name)
-        write_csv(target.with_suffix(".csv"), comparison_rows(rows))
-        _draw(figure, name, target, rows, points, store, f"{figure.title}\n{draw.said_of(rows, f'{size.t0:,.0f}')}")
-        return Outcome(name, rows, _written(target), failed)
+        write_csv(target.with_suffix(".csv"), comparison_rows(measured))
+        title = f"{figure.title}\n{draw.said_of(measured, f'{size.t0:,.0f}')}"
+        _draw(figure, name, target, measured, points, store, title)
+        return Outcome(name, measured, _written(target), failed)
 
     def picture(self, name: str) -> list[Path]:
         """Draw a figure that needs no experiments: one of `SCHEMATICS`, or the packs of `GALLERY`; the files written.
@@ -187,8 +192,8 @@ class Reproduction:
         spec = Spec(shared={"t0": size.t0}, extra=tuple(choices.choice_points(named)), run=same)
         store = self._run(spec).store
         done = store.done()
-        rows = [row for row in store.card()["points"] if row["key"] in done]
-        runs = [(row["values"], summary(store.load(row["key"]))) for row in rows]
+        points = [row for row in store.card()["points"] if row["key"] in done]
+        runs = [(row["values"], {**summary(store.load(row["key"])), "key": row["key"]}) for row in points]
         found, target = choices.effects(named, runs, size.t0), self._target("choices")
         if not found:
             return Weighed([], [], _failed(store))
@@ -238,6 +243,10 @@ class Reproduction:
         """Do what is missing of a sweep, whose runner has done it."""
         runner = self._runner(spec, quick_cost(spec.extra))
         runner.run(self.executor or Processes(), self.progress)
+        table = rows(runner.store)
+        self.statuses.extend(row["status"] for row in table if row["state"] == "done")
+        for line in doubts(table):
+            self.say(f"warning: {line}")
         return runner
 
     def _target(self, name: str, suffix: str = ".png") -> Path:
@@ -250,19 +259,24 @@ class Reproduction:
         Nets are trained once and kept in the folder.
         """
         found: dict[tuple[Conditions, str], list[float]] = {}
+        status: dict[Conditions, int] = {}
         for length in sorted({point.conditions.bits for point in points}):
             nets = []
             for seed in range(size.nets):
                 file = self.folder / "nets" / f"words-{length}-{seed}.msgpack"
                 net = train_net(TrainingConfig(length), seed, budget=size.budget, checkpoint=file)
                 nets.append(net)
-                self.say(f"net {seed} for {length} bits: {net.step} steps, held-out accuracy {net.validation:.4f}")
+                state = "trained" if net.finished else "out of time"
+                known = f"{net.step} steps, held-out accuracy {net.validation:.4f}"
+                self.say(f"net {seed} for {length} bits: {state}, {known}")
             for point in points:
                 if point.conditions.bits == length:
+                    bits = point.numbers["status"]
+                    status[point.conditions] = combined_status([status.get(point.conditions, 0), bits])
                     read = reading_report(stored_words(store.load(point.key)), nets)["readers"]
                     for reader, row in read.items():
                         found.setdefault((point.conditions, f"accuracy {reader}"), []).append(row["accuracy"])
-        return [compared(conditions, measure, values, 0) for (conditions, measure), values in found.items()]
+        return [compared(at, measure, values, status[at]) for (at, measure), values in found.items()]
 
 
 def quick_cost(points: Sequence[Values]) -> float:

@@ -330,6 +330,7 @@ def pack_table(pack: Pack) -> Table:
         Fact("box", " x ".join(f"{x:.3f}" for x in np.asarray(pack.upper - pack.lower)), "R"),
         *([Fact("boundary", boundary_of(pack.periodic))] if any(pack.periodic) else []),
         Fact("meant for delta0" if "imported" in pack.info else "cycled with delta0", f"{float(pack.delta0):g}"),
+        *([Fact("prepared under gravity", f"{weight:g}", "R/t_c^2")] if (weight := recipe.get("gravity")) else []),
         Fact("ringing period T1", f"{float(pack.ringing_period):.1f}", "t_c"),
         Fact("candidate contacts", int(np.asarray(pack.pairs.valid).sum())),
     ]

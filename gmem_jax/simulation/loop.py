@@ -90,7 +90,7 @@ class Simulation:
         if not self.observe:
             return self
         box = self.box_before(self.rows(stage, 0), state.servo)
-        wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, state.replicas)), box)
+        wide = jax.tree.map(lambda leaf: jnp.broadcast_to(_padded(leaf, state.replicas), (3, state.replicas)), box)
         apart = overlaps(self.system, state)
         return replace(self, mark=Mark(state.grains, wide, jnp.sum(apart > 0.0, axis=0)))
 
@@ -146,6 +146,11 @@ def _padded(leaf: Any, replicas: int) -> Any:
     return jnp.concatenate([leaf, jnp.repeat(leaf[..., :1], replicas - known, axis=-1)], axis=-1)
 
 
+def _with_padded(of: Any, names: tuple[str, ...], replicas: int) -> Any:
+    """An object with `_padded` numbers under some names."""
+    return replace(of, **{name: _padded(getattr(of, name), replicas) for name in names})
+
+
 def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sample]:
     """One bin: its steps, the checks at its end, its sample."""
     with jax.named_scope("walls"):
@@ -165,9 +170,9 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
         state, sample = end_bin(simulation.system, state, last, pressure, row.u, simulation.resolved.census)
         if not simulation.observe:
             return state, sample
-        own = {name: getattr(simulation, name) for name in ("creep", "creep_fades")}
-        creep = {name: _padded(leaf, state.replicas) for name, leaf in own.items() if leaf is not None}
-        seen = replace(simulation, system=system, dt=dt, drag=drag, box=last, sample=sample, **creep)
+        path = _with_padded(simulation.path, ("delta0", "gamma0", "share"), state.replicas)
+        seen = replace(simulation, system=system, path=path, dt=dt, drag=drag, box=last, sample=sample)
+        seen = _with_padded(seen, ("creep", "creep_fades"), state.replicas)
         # Ordered, as what checkpoints keep is.
         observed = OrderedDict(
             (name, _of_replicas(name, reduce(seen, state), state)) for name, reduce in simulation.observe

@@ -60,15 +60,16 @@ class Results(list[Result]):
     def _repr_html_(self) -> str:
         names = list(self[0].values) if self else []
         several = ["read", "channel"] * any(len([*one.recall.each()]) > 1 for one in self)
+        columns = [_labels([one.values[name] for one in self]) for name in names]
         rows = [
             [
-                *(_label(one.values[name]) for name in names),
+                *(column[place] for column in columns),
                 *((part.reads[0], part.channels[0]) if several else ()),
                 part.gain,
                 part.fidelity,
                 explain(combined_status(part.status)),
             ]
-            for one in self
+            for place, one in enumerate(self)
             for part in one.recall.each()
         ]
         return listing(f"Sweep of {plural(len(self), 'point')}", [*names, *several, "G", "F", "status"], rows)
@@ -103,14 +104,16 @@ def sweep(
     for name, several in vary.items():
         require_several(several, name)
     packs = functools.cache(load_pack)  # points on one pack object can run side by side
-    points = []
-    for row in itertools.product(*vary.values()):
-        values = dict(zip(vary, row, strict=True))
+    points, labels = [], []
+    for row in itertools.product(*(zip(several, _labels(several), strict=True) for several in vary.values())):
+        values = {name: value for name, (value, _) in zip(vary, row, strict=True)}
+        labels.append({name: label for name, (_, label) in zip(vary, row, strict=True)})
         own = {**values, "pack": packs(values["pack"])} if isinstance(values.get("pack"), str) else values
         points.append(point(values, with_values(experiment, own)))
     store = None if folder is None else Store(Path(folder))
     if store:
-        store.write_manifest([replace(one, values=_labels(one.values)) for one in points], {}, list(vary))
+        named = [replace(one, values=label) for one, label in zip(points, labels, strict=True)]
+        store.write_manifest(named, {}, list(vary))
     found = {one.key: store.load(one.key) for one in points if store and store.at(one.key).is_file()}
     missing = list({one.key: one for one in points if one.key not in found}.values())
     jobs = list(groups(missing, ABREAST, psutil.virtual_memory().available))
@@ -127,9 +130,18 @@ def sweep(
     return Results(Result(one.values, found[one.key]) for one in points)
 
 
-def _labels(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values as a table shows them."""
-    return {name: _label(value) for name, value in values.items()}
+def _labels(values: Sequence[Any]) -> list[Any]:
+    """Values as a table shows them: different ones of one name (packs, laws of one kind) are numbered."""
+    found = [(_label(value), value if isinstance(value, str) else id(value)) for value in values]
+    numbers: dict[str, dict[Any, int]] = {}
+    for label, own in found:
+        if isinstance(label, str):
+            known = numbers.setdefault(label, {})
+            known.setdefault(own, len(known) + 1)
+    return [
+        f"{label} ({numbers[label][own]})" if isinstance(label, str) and len(numbers[label]) > 1 else label
+        for label, own in found
+    ]
 
 
 def _label(value: Any) -> Any:

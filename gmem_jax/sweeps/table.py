@@ -3,6 +3,7 @@
 import csv
 import functools
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +16,7 @@ from gmem_jax.files.datasets import plain_cell
 from gmem_jax.files.measures import EACH, of_each
 from gmem_jax.files.schemas import RECALL
 from gmem_jax.files.validation import optional
+from gmem_jax.physics.numbers import plural
 from gmem_jax.physics.state import combined_status, explain
 from gmem_jax.sweeps.store import Store
 from gmem_jax.sweeps.work import WARNED
@@ -83,6 +85,13 @@ def result_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
 def warnings_of(row: Mapping[str, Any]) -> str:
     """Why a point that is done is doubtful, from its row: its status and what was warned of; "" if nothing is."""
     return "; ".join(filter(None, (row["why"], row["warnings"]))) if row["state"] == "done" else ""
+
+
+def doubts(table: Sequence[Mapping[str, Any]]) -> list[str]:
+    """How many points are doubtful, and why: a line for each reason."""
+    points = points_in(table)
+    counts = Counter(reason for row in points if (reason := warnings_of(row)))
+    return [f"{count} of {plural(len(points), 'point')}: {reason}" for reason, count in counts.items()]
 
 
 def _cell(value: Any) -> Any:

@@ -1,5 +1,7 @@
 """The memory experiment on a pack of 27 grains with a shortened run: interfaces, transformations, derivatives."""
 
+import dataclasses
+import json
 import warnings
 from pathlib import Path
 
@@ -168,6 +170,18 @@ def test_another_material_than_the_packs_own_warns(pack: gm.Pack) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # units move nothing
         gm.run(gm.replace(soft, material=gm.Material(modulus=1e9)))
+
+
+def test_a_weight_that_is_taken_off_a_pack_warns(pack: gm.Pack) -> None:
+    record = {**pack.info, "recipe": {**pack.info["recipe"], "gravity": 1e-5}}
+    heavy = dataclasses.replace(pack, record=json.dumps(record))
+    light = gm.Experiment(heavy, two_bumps(jnp.ones((1, 2))), **SHORT)
+    with pytest.warns(UserWarning, match=r"tetra-27 was prepared under gravity = 1e-05, not 0\.0"):
+        gm.run(light)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        gm.run(gm.replace(light, gravity=1e-5))
+        gm.run(gm.Experiment(pack, light.signals, gravity=1e-5, **SHORT))  # which sags
 
 
 def test_single_precision_is_refused(pack: gm.Pack) -> None:

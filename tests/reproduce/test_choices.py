@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -105,14 +106,17 @@ def test_every_value_is_tried_once_on_every_pack() -> None:
 def test_effects_are_differences_on_the_same_pack(tmp_path: Path) -> None:
     packs = [{"pack": "a"}, {"pack": "b"}]
 
-    def summary(gain: float, fidelity: float) -> dict[str, float]:
-        return {"windowed_gain": gain, "windowed_fidelity": fidelity, "gain": 0.0, "fidelity": 0.0, "status": 0}
+    def summary(gain: float, fidelity: float) -> dict[str, Any]:
+        known = {"windowed_gain": gain, "windowed_fidelity": fidelity, "gain": 0.0, "fidelity": 0.0, "status": 0}
+        return {**known, "key": f"{gain} {fidelity}"}
 
     runs = [
         ({"pack": "a"}, summary(0.2, 0.7)),
         ({"pack": "b"}, summary(0.4, 0.9)),
         ({"pack": "a", "stiffness": 0.18}, summary(0.22, 0.6)),
         ({"pack": "b", "stiffness": 0.18}, summary(0.48, 0.8)),
+        ({"pack": "a", "dt": 1.2}, summary(0.2, 0.7)),  # steps longer than a bin: the run of the default
+        ({"pack": "b", "dt": 1.2}, summary(0.4, 0.9)),
     ]
     found = {(effect.choice.name, effect.value): effect for effect in effects(packs, runs, 1.8e3)}
     stiff = found["stiffness", 0.18]
@@ -120,6 +124,7 @@ def test_effects_are_differences_on_the_same_pack(tmp_path: Path) -> None:
     assert (stiff.of_gain.sd, stiff.of_gain.packs) == (pytest.approx(0.1 / math.sqrt(2.0)), 2)
     assert found["stiffness", 0.13].default
     assert ("stiffness", 0.10) not in found  # not run
+    assert ("dt", 1.2) not in found
     write_csv(tmp_path / "choices.csv", choices.effect_rows(list(found.values())))
     assert (tmp_path / "choices.csv").read_text().count("\n") == 1 + len(found)
     choices.draw(tmp_path / "choices.png", list(found.values()), "two packs")

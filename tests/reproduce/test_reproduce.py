@@ -190,7 +190,8 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     monkeypatch.setitem(SCALES, "tiny", TINY)
     monkeypatch.setattr(reproducing, "quick_cost", lambda points: 1e-7)
     said: list[str] = []
-    outcome = Reproduction(tmp_path, "tiny", Here(), say=said.append).figure("fig08")
+    statuses: list[int] = []
+    outcome = Reproduction(tmp_path, "tiny", Here(), say=said.append, statuses=statuses).figure("fig08")
     assert [path.name for path in outcome.files] == ["fig08-tiny.png", "fig08-tiny.svg", "fig08-tiny.csv"]
     assert all(path.stat().st_size > 200 for path in outcome.files)
     with (tmp_path / "fig08-tiny.csv").open() as file:
@@ -200,15 +201,20 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     np.testing.assert_allclose(float(table[0]["mean"]), float(recall.windowed_fidelity), rtol=1e-5)
     assert float(table[2]["published_mean"]) == 0.8996
     assert "2 of 2 points" in said[0]
+    assert statuses == [int(gm.Status.NOT_QUASI_STATIC)] * 2
+    doubt = "the walls move too fast (inertial number above 5e-3); use a larger t0 or smaller gamma0"
+    assert said[1:] == [f"warning: 2 of 2 points: {doubt}"]
+    said.clear()
     Reproduction(tmp_path, "tiny", Here(), say=said.append).figure("fig06")
-    assert said[1:] == ["nothing to do: 1 of 1 point there"]
+    assert said == ["nothing to do: 1 of 1 point there", f"warning: 1 of 1 point: {doubt}"]
+    said.clear()
     assert (tmp_path / "fig06-tiny.svg").is_file()
     for name in set(COLLECTED) - {"fig06", "fig08"}:
         monkeypatch.setitem(FIGURES, name, PaperFigure("none", lambda scale: []))
     # mu = 1 is what holds where nothing is said: the same point, which is in the archive once.
     monkeypatch.setitem(FIGURES, "fig09", PaperFigure("as it is", lambda scale: [{"pack": PACK}]))
     (archive,), failed = Reproduction(tmp_path, "tiny", Here(), say=said.append).dataset()
-    assert (archive.name, failed, said[2:]) == ("dataset-tiny.zip", [], ["nothing to do: 2 of 2 points there"])
+    assert (archive.name, failed, said[0]) == ("dataset-tiny.zip", [], "nothing to do: 2 of 2 points there")
     shutil.unpack_archive(archive, tmp_path / "data")
     with (tmp_path / "data" / "points.csv").open() as file:
         rows = list(csv.DictReader(file))

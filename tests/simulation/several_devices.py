@@ -30,14 +30,26 @@ def main(address: str, backend: str, target: str, processes: str = "1", number: 
     # One number for each of nine replicas, more than devices: of all grains, of the walls, of time.
     each = np.arange(9.0)
     own = {"gravity": 1e-5 * each, "wall_mu": 0.1 * each, "t0": 75.0 - 5.0 * each, "creep": 1e-6 * each}
-    seen = {"creep": lambda simulation, state: simulation.creep * np.ones(state.replicas)}
+    own |= {"gamma0": 1e-4 * (1.0 + each), "shear_share": 0.5 + 0.01 * each}
+    seen = {
+        "creep": lambda simulation, state: simulation.creep * np.ones(state.replicas),
+        "gamma0": lambda simulation, state: simulation.path.gamma0 * np.ones(state.replicas),
+        "share": lambda simulation, state: simulation.path.share * np.ones(state.replicas),
+    }
     filmed = gm.run(gm.replace(base, {**own, "signals": gm.words(3), "observe": seen}), frames=3, frames_of=5)
-    recalls = [gm.run(base, batch=3), *run_several(points), filmed]
+    # A mark that is set when waveforms have made the walls differ.
+    marked = gm.Protocol(gm.cycle(), gm.write(), gm.Stage("wait", length=0.02, role="hold", mark=True), gm.read())
+    protocol = {"t0": 75.0, "protocol": marked, "observe": [gm.observables.nonaffine()]}
+    compared = gm.run(gm.Experiment(pack, gm.six_signals(), backend=backend, **protocol))
+    recalls = [gm.run(base, batch=3), *run_several(points), filmed, compared]
     if number == "0":
         named = {f"p_sig-{place}": recall.p_sig for place, recall in enumerate(recalls)}
         status = [np.asarray(recall.status) for recall in recalls]
         *_, last = filmed.stages.values()
-        np.testing.assert_allclose(last.observed["creep"][-1], own["creep"])
+        for name, values in (("creep", own["creep"]), ("gamma0", own["gamma0"]), ("share", own["shear_share"])):
+            np.testing.assert_allclose(last.observed[name][-1], values)
+        *_, after = compared.stages.values()
+        named["nonaffine"] = after.observed["nonaffine"]
         named["time"] = getattr(filmed.frames, "time", np.zeros(0))
         np.savez(target, devices=jax.device_count(), status=np.concatenate(status), **named)
 

@@ -511,8 +511,19 @@ def test_jobs_say_where_a_pack_is_whoever_reads_them_where(tmp_path: Path, monke
 
 
 def test_values_of_any_kind_have_a_label() -> None:
-    values = {"friction": gm.Mindlin(), "mu": 0.5, "t0": np.float64(2.0), "steps": None, "pack": "tetra-325-a"}
-    assert _labels(values) == {"friction": "Mindlin", "mu": 0.5, "t0": 2.0, "steps": None, "pack": "tetra-325-a"}
+    values = [gm.Mindlin(), 0.5, np.float64(2.0), None, "tetra-325-a"]
+    assert _labels(values) == ["Mindlin", 0.5, 2.0, None, "tetra-325-a"]
+
+
+def test_values_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    base = gm.Experiment(gm.load_pack(PACK), gm.six_signals(), t0=60.0, rest=0.02, hold=0.02, store=0.02)
+    weak, strong = gm.Hooke(mu=0.2), gm.Hooke(mu=1.0)
+    assert _labels([weak, strong, weak]) == ["Hooke (1)", "Hooke (2)", "Hooke (1)"]
+    found = gm.sweep(base, {"friction": [weak, strong]}, tmp_path / "laws")
+    table = rows(Store(tmp_path / "laws"))
+    assert [row["friction"] for row in table] == ["Hooke (1)", "Hooke (2)"]
+    assert [row["gain"] for row in table] == [float(one.recall.gain) for one in found]
+    assert "Hooke (2)" in found._repr_html_()
 
 
 def test_what_a_living_worker_has_is_left_to_it(tmp_path: Path) -> None:
