@@ -25,7 +25,7 @@ if TYPE_CHECKING or not gmem_start.alone:
     from gmem_jax.experiment.pack import Pack, pack_from, stack
     from gmem_jax.experiment.recall import Recall, fidelity, gain, recall
     from gmem_jax.experiment.record import describe, to_dict
-    from gmem_jax.experiment.run import run
+    from gmem_jax.experiment.run import prefix_of, run
     from gmem_jax.experiment.samples import waveform_from
     from gmem_jax.experiment.signals import Bumps, Signals, SignalSets, Spline, signals, six_signals, waveform, words
     from gmem_jax.experiment.stages import compress, cycle, hold, read, rest, shake, train, write
@@ -146,6 +146,7 @@ __all__ = [
     "observables",
     "pack_from",
     "plot",
+    "prefix_of",
     "prepare",
     "protocols",
     "read",

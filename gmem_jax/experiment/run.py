@@ -132,7 +132,7 @@ def run(
 
     Args:
         experiment: the experiment.
-        prefix: what `prefix_of` gave for an experiment that differs in waveforms, gamma0 and shear_share at most.
+        prefix: what `gm.prefix_of` gave for an experiment that differs in waveforms, gamma0 and shear_share at most.
         batch: signals that run together; default all of them. Each batch has a zero signal of its own.
         devices: that share out the replicas; default all that JAX sees, also those of other processes.
         frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
@@ -170,7 +170,7 @@ def run(
         done = work_of(common, runner.state.replicas)
     else:
         if prefix.key != _key_of_prefix(experiment):
-            raise ValueError("the prefix is that of another pack, law or protocol; run it by prefix_of(experiment)")
+            raise ValueError("the prefix is that of another pack, law or protocol; run it by gm.prefix_of(experiment)")
         runner, before = prefix.runner.fork(progress=tell, total_work=work), prefix.samples
         done = 0.0
     parts: list[tuple[dict[str, Sample], jax.Array]] = []
