@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from console import say
+from packs import called
 
 import gmem_jax as gm
 from gmem_jax.show.figures import design_figure, history_figure
@@ -23,14 +24,15 @@ def main() -> None:
     """Design, verify and draw, pack by pack."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("designed"), help="folder to write to")
-    parser.add_argument("--packs", default="tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e")
+    packs = "tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e"
+    parser.add_argument("--packs", type=called, default=packs)
     parser.add_argument("--iterations", type=int, default=3)
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
 
     histories: dict[str, tuple[float, ...]] = {}
-    for name in arguments.packs.split(","):
+    for name in arguments.packs:
         began = time.perf_counter()
         experiment = gm.Experiment(gm.load_pack(name), gm.six_signals())
         design = gm.design_waveforms(experiment, iterations=arguments.iterations, progress=say)

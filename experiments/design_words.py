@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from console import say
-from packs import over_packs
+from packs import called, over_packs
 from rows import done, note
 
 import gmem_jax as gm
@@ -45,7 +45,8 @@ def main() -> None:
     """Design, verify and read, pack by pack."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("designed-words"), help="folder to write to")
-    parser.add_argument("--packs", default="tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e")
+    packs = "tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e"
+    parser.add_argument("--packs", type=called, default=packs)
     parser.add_argument("--bits", default="3,5,8")
     parser.add_argument("--iterations", type=int, default=3)
     parser.add_argument("--drawn", type=int, default=256, help="words at most; of more, so many are drawn")
@@ -56,7 +57,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
 
-    for name in arguments.packs.split(","):
+    for name in arguments.packs:
         any_words = gm.Experiment(gm.load_pack(name), gm.words(3), t0=arguments.t0)
         measured = Checkpoints(folder / f"{name}-t0-{arguments.t0:g}.kernel", key_of_run(any_words))
         kernel = gm.memory_kernel(any_words, KERNEL_BUMPS, KERNEL_BUMP_WIDTH, cache=measured, progress=say)

@@ -1,8 +1,23 @@
-"""What tables of the long scripts say of several packs."""
+"""Packs of the long scripts: which there are, and what tables say of several."""
 
+import argparse
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+
+import gmem_jax as gm
+
+
+def called(text: str) -> list[str]:
+    """Packs that have a name, separated by commas: an argument of scripts that call what they keep by the pack.
+
+    Raises:
+        ArgumentTypeError: if there is none of a name.
+    """
+    names, known = [name for name in text.split(",") if name], gm.list_packs()
+    if unknown := [name for name in names if name not in known]:
+        raise argparse.ArgumentTypeError(f"no pack is called {unknown[0]!r}; there are {', '.join(known)}")
+    return names
 
 
 def over_packs(rows: Sequence[Mapping[str, str]], by: str, column: str) -> tuple[list[float], list[float], list[float]]:

@@ -2190,8 +2190,8 @@ MUTATIONS = (
     mutation(
         "prefix-of-another",
         "experiment/run.py",
-        "experiment.pack.position, experiment.phases[0]",
-        "experiment.phases[0]",
+        "pack.position, pack.quaternion, experiment.phases[0]",
+        "pack.position, experiment.phases[0]",
         "test_a_prefix_serves_several_simulations",
     ),
     mutation(

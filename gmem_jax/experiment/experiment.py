@@ -95,7 +95,7 @@ class Experiment:
         steps_per_bin: the number of steps in a bin that follows from `dt` or `steps`.
         rest: rests at u = 0, in t0.
         hold: holds at u = 1, in t0.
-        store: storage, in t0.
+        store: storage, in t0. Like rests and holds it is rounded up to whole bins of t0 / 256, and is one at least.
         background: "sub0", "sub2" or "sub2-bl" (in any case); the last two add a second readout.
         shear: when the waveforms are applied: "during" the compression, or "before" it, as functions of time at u = 0.
         protocol: what is done; default the paper's, made of rest, hold, store, background and shear. With one of your

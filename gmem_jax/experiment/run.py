@@ -91,7 +91,8 @@ class Prefix(NamedTuple):
 
 
 def _key_of_prefix(experiment: Experiment) -> str:
-    return identity((experiment.simulation(sheared=False), experiment.pack.position, experiment.phases[0]))
+    pack = experiment.pack
+    return identity((experiment.simulation(sheared=False), pack.position, pack.quaternion, experiment.phases[0]))
 
 
 @usual_rules()

@@ -273,8 +273,12 @@ def _difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any]:
 
 
 @contextlib.contextmanager
-def locked(output: Path) -> Iterator[None]:
+def locked(output: Path, taken: str = "") -> Iterator[None]:
     """Keep an output to oneself: a second run into it is refused as long as the first one lives.
+
+    Args:
+        output: a file or a folder.
+        taken: what is said where another process has it; default that another run writes it.
 
     Raises:
         FileFormatError: if another process holds it.
@@ -292,7 +296,7 @@ def locked(output: Path) -> Iterator[None]:
             raise FileFormatError(f"{lock}: is in the place of a lock, and none of ours; move it away")
         if not _lock(handle) or not lock.exists() or known.st_ino != lock.stat().st_ino:
             # who had it before us has removed it, and somebody else may have made another
-            raise FileFormatError(f"{output}: another run is writing it; name another output")
+            raise FileFormatError(taken or f"{output}: another run is writing it; name another output")
         try:
             yield
         finally:

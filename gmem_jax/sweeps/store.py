@@ -250,7 +250,8 @@ class Store:
         Raises:
             FileFormatError: if another living process has it.
         """
-        with locked(self._own.at(f"jobs/{job['name']}")):
+        own = self._own.at(f"jobs/{job['name']}")
+        with locked(own, f"{self.folder}: another sweep computes these points; call again when it is done"):
             yield
 
     def taken(self, job: dict[str, Any]) -> bool:

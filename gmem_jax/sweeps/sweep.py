@@ -89,7 +89,7 @@ def sweep(
     Args:
         experiment: what all have in common.
         vary: values by dotted name, like {"friction.mu": [0.0, 0.5], "pack": packs}; packs also by name.
-        folder: keeps the results; what is there already is not computed again.
+        folder: keeps the results; what is there already is not computed again. Its table is of the latest call.
         progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
 
     Returns:
@@ -98,6 +98,7 @@ def sweep(
     Raises:
         ValueError: for a name that is no field, or an impossible value.
         RunFailedError: if a simulation broke down.
+        FileFormatError: if another call computes the same points in this folder now, or it holds something else.
     """
     require_kind("sweep", experiment, Experiment)
     tell = callback(progress)

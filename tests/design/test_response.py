@@ -74,7 +74,9 @@ def test_less_noise_means_finer_resolution() -> None:
 def test_a_prefix_serves_several_simulations(experiment: gm.Experiment) -> None:
     whole = gm.run(experiment)
     prefix = prefix_of(experiment)
-    for other in ({"friction.mu": 0.9}, {"hold_drag": 0.01}, {"pack.position": experiment.pack.position + 1e-9}):
+    pack = experiment.pack
+    moved, turned = {"pack.position": pack.position + 1e-9}, {"pack.quaternion": pack.quaternion[:, ::-1]}
+    for other in ({"friction.mu": 0.9}, {"hold_drag": 0.01}, moved, turned):
         with pytest.raises(ValueError, match="the prefix is that of another pack, law or protocol"):
             run(gm.replace(experiment, other), prefix=prefix)
     for _ in range(2):  # the same programs on the same state: the same bits

@@ -470,7 +470,7 @@ def test_parts_that_a_worker_left_do_not_stop_a_sweep_of_the_library(tmp_path: P
     key = point({"friction.mu": 0.5}, gm.replace(base, {"friction.mu": 0.5})).key
     parts = parts_of_job(store, run_job(digest([key]), [key]) | {"batch": 6})
     parts("prefix", lambda _: np.zeros(1))
-    with store.lock({"name": digest([key])}), pytest.raises(gm.FileFormatError):
+    with store.lock({"name": digest([key])}), pytest.raises(gm.FileFormatError, match="call again when it is done"):
         gm.sweep(base, {"friction.mu": [0.5]}, tmp_path / "store")  # another process has it
     assert len(gm.sweep(base, {"friction.mu": [0.5]}, tmp_path / "store")) == 1
 
