@@ -156,6 +156,7 @@ def run(
     size = count if batch is None else require_whole("batch", batch, 1)
     if size < count and any(jnp.ndim(value) for value in replica_parameters(experiment).values()):
         raise ValueError("parameters with a value for each replica need all signals in one batch")
+    require_host("gm.run", experiment)
     schedule = frame_schedule(experiment, frames, frames_of, frames_at)
     if prefix and schedule.wanted:
         raise ValueError("frames begin with the prefix: run it in the same call")
@@ -239,6 +240,10 @@ def _join(first: Any, *others: Any) -> np.ndarray:
     return np.concatenate([np.asarray(first), *(np.asarray(other)[..., 1:] for other in others)], axis=-1)
 
 
+class OtherGravityWarning(UserWarning):
+    """A pack was prepared under gravity, and the experiment has none, or another."""
+
+
 class OtherCompressionWarning(UserWarning):
     """A pack was cycled with another delta0: `Status.OTHER_COMPRESSION`, said before the run."""
 
@@ -247,7 +252,8 @@ def warn_of_another_preparation(experiment: Experiment) -> None:
     """Warn of what a pack was not made for: another delta0, other elastic numbers, no weight or another."""
     warn_of_another_compression(experiment)
     _warn_of_another_material(experiment)
-    _warn_of_another_weight(experiment)
+    if weight := other_weight(experiment):
+        warn_caller(weight, OtherGravityWarning)
 
 
 def warn_of_another_compression(experiment: Experiment) -> None:
@@ -273,15 +279,19 @@ def _warn_of_another_material(experiment: Experiment) -> None:
         )
 
 
-def _warn_of_another_weight(experiment: Experiment) -> None:
-    """Warn of a weight that is taken off a pack. One that gets some sags a little, which is an experiment's choice."""
+def other_weight(experiment: Experiment) -> str:
+    """What is to be said of a weight that is taken off a pack; "" if none is.
+
+    A pack that gets some sags a little, which is an experiment's choice.
+    """
     pack, gravity = experiment.pack, 0.0 if experiment.gravity is None else experiment.gravity
-    own = pack.info.get("recipe", {}).get("gravity", 0.0)
-    if is_real(own) and own > 0.0 and not np.allclose(np.asarray(gravity), own, atol=0.0):
-        warn_caller(
-            f"{pack.name} was prepared under gravity = {own:g}, not {said(gravity)}: it is not at rest so; "
-            f"take its own, gravity = {own:g}, or prepare a pack for this one"
-        )
+    own = (pack.info.get("recipe") or {}).get("gravity", 0.0)
+    if own <= 0.0 or np.allclose(np.asarray(gravity), own, atol=0.0):
+        return ""
+    return (
+        f"{pack.name} was prepared under gravity = {own:g}, not {said(gravity)}: it is not at rest so; "
+        f"take its own, gravity = {own:g}, or prepare a pack for this one"
+    )
 
 
 def _replica_bytes(experiment: Experiment) -> int:

@@ -235,6 +235,7 @@ def _check_record(found: Found, record: dict[str, Any], overlap: np.ndarray) -> 
     """What was measured of the pack when it was made is what its numbers still say."""
     if "recipe" in record:
         require_fields(record["recipe"], "recipe", seed=whole, t0=is_number)
+        require_fields(record["recipe"], "recipe", **dict.fromkeys({"gravity"} & record["recipe"].keys(), is_number))
     if "material" in record:
         require_fields(record["material"], "material", wall_rigidity=is_number)
     if "at_rest" not in record:

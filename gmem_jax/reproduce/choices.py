@@ -1,6 +1,6 @@
 """What the paper leaves open, and how much G and F change with each choice, on the same packs."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -88,8 +88,8 @@ def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]
 
     Args:
         packs: what names them.
-        runs: values of points and summaries of their recalls (`show.numbers.summary`) with their keys; points that
-            failed are missing. A value that comes to the same run as the default (steps of a bin's length) is left out.
+        runs: values of points and summaries of their recalls (`show.numbers.summary`); points that failed are missing.
+            A value that comes to the same run as the default, as steps longer than a bin do, is left out.
         t0: at which they were run: below the paper's, G and F are those after averaging over the ringing period.
     """
     known = list(runs)
@@ -102,9 +102,14 @@ def effects(packs: Sequence[Values], runs: Iterable[tuple[Values, dict[str, Any]
         for value in choice.values:
             both = [(at(pack, choice.shared), at(pack, _values(choice, value))) for pack in packs]
             pairs = [(default, tried) for default, tried in both if default and tried]
-            if pairs and (value == choice.values[0] or any(one["key"] != other["key"] for one, other in pairs)):
+            if pairs and (value == choice.values[0] or any(_differ(*pair) for pair in pairs)):
                 found.append(_effect(choice, value, pairs, t0))
     return found
+
+
+def _differ(default: Mapping[str, Any], tried: Mapping[str, Any]) -> bool:
+    """Whether two runs are not the same one, which gives the same measures to the last bit."""
+    return any(default[name] != tried[name] for name in ("gain", "fidelity", "windowed_gain", "windowed_fidelity"))
 
 
 def _effect(choice: Choice, value: Any, pairs: Sequence[tuple[Any, Any]], t0: float) -> Effect:

@@ -141,7 +141,7 @@ class Reproduction:
     executor: Executor | None = None
     progress: Progress = silent
     say: Tell = print
-    statuses: list[int] = field(default_factory=list)
+    statuses: list[int] = field(default_factory=list, compare=False)
 
     def figure(self, name: str) -> Outcome:
         """Run what is missing of a figure of `FIGURES`, and write its picture (PNG, SVG) and its table (CSV).
@@ -193,7 +193,7 @@ class Reproduction:
         store = self._run(spec).store
         done = store.done()
         points = [row for row in store.card()["points"] if row["key"] in done]
-        runs = [(row["values"], {**summary(store.load(row["key"])), "key": row["key"]}) for row in points]
+        runs = [(row["values"], summary(store.load(row["key"]))) for row in points]
         found, target = choices.effects(named, runs, size.t0), self._target("choices")
         if not found:
             return Weighed([], [], _failed(store))

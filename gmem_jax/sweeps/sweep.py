@@ -19,6 +19,7 @@ from gmem_jax.experiment.arguments import require_kind, require_several
 from gmem_jax.experiment.changes import replace as with_values
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.html import listing
+from gmem_jax.experiment.identity import identity
 from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.recall import Recall
 from gmem_jax.experiment.run import replica_bins
@@ -104,6 +105,7 @@ def sweep(
     tell = callback(progress)
     for name, several in vary.items():
         require_several(several, name)
+    vary = {name: list(several) for name, several in vary.items()}
     packs = functools.cache(load_pack)  # points on one pack object can run side by side
     points, labels = [], []
     for row in itertools.product(*(zip(several, _labels(several), strict=True) for several in vary.values())):
@@ -133,15 +135,16 @@ def sweep(
 
 def _labels(values: Sequence[Any]) -> list[Any]:
     """Values as a table shows them: different ones of one name (packs, laws of one kind) are numbered."""
-    found = [(_label(value), value if isinstance(value, str) else id(value)) for value in values]
-    numbers: dict[str, dict[Any, int]] = {}
-    for label, own in found:
-        if isinstance(label, str):
-            known = numbers.setdefault(label, {})
-            known.setdefault(own, len(known) + 1)
+    labels = [_label(value) for value in values]
+    objects = {id(value): value for value, label in zip(values, labels, strict=True) if isinstance(label, str)}
+    own = {key: identity(value) for key, value in objects.items()}
+    numbers: dict[str, dict[str, int]] = {}
+    for key, value in objects.items():
+        known = numbers.setdefault(_label(value), {})
+        known.setdefault(own[key], len(known) + 1)
     return [
-        f"{label} ({numbers[label][own]})" if isinstance(label, str) and len(numbers[label]) > 1 else label
-        for label, own in found
+        f"{label} ({numbers[label][own[id(value)]]})" if len(numbers.get(label, ())) > 1 else label
+        for value, label in zip(values, labels, strict=True)
     ]
 
 

@@ -26,7 +26,7 @@ import jax
 from gmem_jax.errors import FileFormatError, RunFailedError
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.recall import Recall
-from gmem_jax.experiment.run import OtherCompressionWarning, run
+from gmem_jax.experiment.run import OtherCompressionWarning, OtherGravityWarning, other_weight, run
 from gmem_jax.experiment.several import run_several
 from gmem_jax.files.checkpoints import Checkpoints, part_with
 from gmem_jax.files.compilation_cache import keep_programs
@@ -71,10 +71,10 @@ def run_group(
     finally:
         for one in heard:  # they are of the log too, or of who called
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
-    told = {WARNED: words} if (words := warned(heard)) else {}
     if store:
-        for key, recall in zip(keys, recalls, strict=True):
-            store.save(key, recall.described({**recall.configuration, **told}))
+        for key, experiment, recall in zip(keys, experiments, recalls, strict=True):
+            words = [*warned(heard), *filter(None, [other_weight(experiment)])]
+            store.save(key, recall.described({**recall.configuration, **({WARNED: words} if words else {})}))
     if cache:
         cache.discard()
     return dict(zip(keys, recalls, strict=True))
@@ -88,8 +88,9 @@ def parts_of_job(store: Store, job: dict[str, Any]) -> Checkpoints:
 
 
 def warned(heard: Sequence[warnings.WarningMessage]) -> list[str]:
-    """The texts of warnings, each once, but for what a bit of the status says of each point."""
-    texts = [" ".join(str(one.message).split()) for one in heard if one.category is not OtherCompressionWarning]
+    """The texts of warnings, each once, but for those that are said of each point by itself."""
+    own = (OtherCompressionWarning, OtherGravityWarning)
+    texts = [" ".join(str(one.message).split()) for one in heard if one.category not in own]
     return list(dict.fromkeys(texts))
 
 

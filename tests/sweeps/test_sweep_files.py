@@ -518,8 +518,10 @@ def test_values_of_any_kind_have_a_label() -> None:
 def test_values_of_one_name_are_told_apart(tmp_path: Path) -> None:
     base = gm.Experiment(gm.load_pack(PACK), gm.six_signals(), t0=60.0, rest=0.02, hold=0.02, store=0.02)
     weak, strong = gm.Hooke(mu=0.2), gm.Hooke(mu=1.0)
-    assert _labels([weak, strong, weak]) == ["Hooke (1)", "Hooke (2)", "Hooke (1)"]
-    found = gm.sweep(base, {"friction": [weak, strong]}, tmp_path / "laws")
+    assert _labels([weak, strong, weak, gm.Hooke(mu=1.0)]) == ["Hooke (1)", "Hooke (2)", "Hooke (1)", "Hooke (2)"]
+    assert _labels([weak, gm.Hooke(mu=0.2)]) == ["Hooke", "Hooke"]
+    assert _labels([*np.arange(4.0).reshape(2, 2)]) == ["ndarray (1)", "ndarray (2)"]
+    found = gm.sweep(base, {"friction": iter([weak, strong])}, tmp_path / "laws")
     table = rows(Store(tmp_path / "laws"))
     assert [row["friction"] for row in table] == ["Hooke (1)", "Hooke (2)"]
     assert [row["gain"] for row in table] == [float(one.recall.gain) for one in found]
