@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from console import say
-from packs import over_packs
+from packs import FIVE, over_packs
 from rows import done, note
 
 import gmem_jax as gm
@@ -253,8 +253,7 @@ def main() -> None:
     """The noise between packs first, then each case, and last what takes longest."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("capacity"), help="folder to write to")
-    packs = "tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e"
-    parser.add_argument("--packs", default=packs, help="two or more of one size")
+    parser.add_argument("--packs", default=FIVE, help="two or more of one size")
     parser.add_argument("--large", default="tetra-1024-a,tetra-3267-a", help=f"packs at gamma0 = {USUAL:g} only")
     parser.add_argument("--simulated", default="tetra-325-a", help="packs whose words of 8 bits are simulated")
     parser.add_argument("--gammas", default="1e-3,3e-4,3e-3")

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from console import say
-from packs import called
+from packs import FIVE, called
 
 import gmem_jax as gm
 from gmem_jax.show.figures import design_figure, history_figure
@@ -24,8 +24,7 @@ def main() -> None:
     """Design, verify and draw, pack by pack."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("designed"), help="folder to write to")
-    packs = "tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e"
-    parser.add_argument("--packs", type=called, default=packs)
+    parser.add_argument("--packs", type=called, default=FIVE)
     parser.add_argument("--iterations", type=int, default=3)
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from console import say
-from packs import called, over_packs
+from packs import FIVE, called, over_packs
 from rows import done, note
 
 import gmem_jax as gm
@@ -45,8 +45,7 @@ def main() -> None:
     """Design, verify and read, pack by pack."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("designed-words"), help="folder to write to")
-    packs = "tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e"
-    parser.add_argument("--packs", type=called, default=packs)
+    parser.add_argument("--packs", type=called, default=FIVE)
     parser.add_argument("--bits", default="3,5,8")
     parser.add_argument("--iterations", type=int, default=3)
     parser.add_argument("--drawn", type=int, default=256, help="words at most; of more, so many are drawn")

@@ -7,6 +7,8 @@ import numpy as np
 
 import gmem_jax as gm
 
+FIVE = "tetra-325-a,tetra-325-b,tetra-325-c,tetra-325-d,tetra-325-e"  # all that ship of this size
+
 
 def called(text: str) -> list[str]:
     """Packs that have a name, separated by commas: an argument of scripts that call what they keep by the pack.

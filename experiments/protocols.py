@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from packs import FIVE
 from rows import done, note
 
 import gmem_jax as gm
@@ -338,7 +339,7 @@ def main() -> None:
     """Run what is not done, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("protocols"), help="folder to write to")
-    parser.add_argument("--packs", default=",".join(f"tetra-325-{letter}" for letter in "abcde"))
+    parser.add_argument("--packs", default=FIVE)
     parser.add_argument("--studies", default=",".join(STUDIES))
     parser.add_argument("--t0", type=float, default=1.8e3)
     arguments = parser.parse_args()

@@ -70,3 +70,11 @@ class Material:
         """k_M of the Mindlin laws, df = k_M p^0.5 dsigma."""
         stiffness: Scalar = 3.0 * self.normal_stiffness * (1.0 - self.poisson) / (2.0 - self.poisson)
         return stiffness
+
+    def pascal(self, pressure: Scalar) -> Scalar:
+        """A simulation pressure (in E) in Pa."""
+        return pressure * self.modulus
+
+    def seconds(self, time: Scalar) -> Scalar:
+        """A simulation time (in t_c) in s."""
+        return time * self.time_unit

@@ -147,8 +147,9 @@ def _padded(leaf: Any, replicas: int) -> Any:
 
 
 def _with_padded(of: Any, names: tuple[str, ...], replicas: int) -> Any:
-    """An object with `_padded` numbers under some names."""
-    return replace(of, **{name: _padded(getattr(of, name), replicas) for name in names})
+    """An object with `_padded` numbers under some names, of those that it has."""
+    known = {name: value for name in names if (value := getattr(of, name)) is not None}
+    return replace(of, **{name: _padded(value, replicas) for name, value in known.items()})
 
 
 def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sample]:

@@ -88,9 +88,9 @@ def warnings_of(row: Mapping[str, Any]) -> str:
 
 
 def doubts(table: Sequence[Mapping[str, Any]]) -> list[str]:
-    """How many points are doubtful, and why: a line for each reason."""
-    points = points_in(table)
-    counts = Counter(reason for row in points if (reason := warnings_of(row)))
+    """How many points are doubtful, and why: a line for each reason. One that is asked for in several ways is one."""
+    points = {row["key"]: row for row in points_in(table)}
+    counts = Counter(reason for row in points.values() if (reason := warnings_of(row)))
     return [f"{count} of {plural(len(points), 'point')}: {reason}" for reason, count in counts.items()]
 
 

@@ -29,6 +29,12 @@ def test_the_time_unit_is_the_papers():
     assert Material().time_unit == pytest.approx(5.477e-6, rel=1e-4)  # printed to 4 digits
 
 
+def test_conversions_to_si_scale_with_modulus_and_time_unit():
+    material = Material(radius=1e-3, modulus=4e6, density=1000.0)
+    assert material.pascal(2e-3) == pytest.approx(8e3, rel=1e-14)
+    assert material.seconds(10.0) == pytest.approx(10.0 * 1e-3 * (1000.0 / 4e6) ** 0.5, rel=1e-14)
+
+
 @pytest.mark.parametrize("name", ["radius", "modulus", "density"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
 def test_size_modulus_and_density_must_be_positive(name, value):

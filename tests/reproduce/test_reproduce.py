@@ -214,7 +214,8 @@ def test_a_figure_is_run_drawn_tabled_and_not_run_again(monkeypatch: pytest.Monk
     # mu = 1 is what holds where nothing is said: the same point, which is in the archive once.
     monkeypatch.setitem(FIGURES, "fig09", PaperFigure("as it is", lambda scale: [{"pack": PACK}]))
     (archive,), failed = Reproduction(tmp_path, "tiny", Here(), say=said.append).dataset()
-    assert (archive.name, failed, said[0]) == ("dataset-tiny.zip", [], "nothing to do: 2 of 2 points there")
+    told = ["nothing to do: 2 of 2 points there", f"warning: 2 of 2 points: {doubt}"]
+    assert (archive.name, failed, said) == ("dataset-tiny.zip", [], told)
     shutil.unpack_archive(archive, tmp_path / "data")
     with (tmp_path / "data" / "points.csv").open() as file:
         rows = list(csv.DictReader(file))
