@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from console import say
-from packs import FIVE, over_packs
+from packs import FIVE, called, over_packs
 from rows import done, note
 
 import gmem_jax as gm
@@ -253,20 +253,27 @@ def main() -> None:
     """The noise between packs first, then each case, and last what takes longest."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("capacity"), help="folder to write to")
-    parser.add_argument("--packs", default=FIVE, help="two or more of one size")
-    parser.add_argument("--large", default="tetra-1024-a,tetra-3267-a", help=f"packs at gamma0 = {USUAL:g} only")
-    parser.add_argument("--simulated", default="tetra-325-a", help="packs whose words of 8 bits are simulated")
+    parser.add_argument("--packs", type=called, default=FIVE, help="two or more of one size")
+    parser.add_argument(
+        "--large", type=called, default="tetra-1024-a,tetra-3267-a", help=f"packs at gamma0 = {USUAL:g} only"
+    )
+    parser.add_argument(
+        "--simulated", type=called, default="tetra-325-a", help="packs whose words of 8 bits are simulated"
+    )
     parser.add_argument("--gammas", default="1e-3,3e-4,3e-3")
     parser.add_argument("--t0", type=float, default=1.8e3)
     arguments = parser.parse_args()
+    if len(arguments.packs) < 2:
+        parser.error(f"--packs: two or more of one size, got {len(arguments.packs)}")
     arguments.output.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
     table = Table(arguments.output / "capacity.csv")
-    small, large, simulated = (
-        [name for name in names.split(",") if name] for names in (arguments.packs, arguments.large, arguments.simulated)
-    )
+    small, large, simulated = arguments.packs, arguments.large, arguments.simulated
 
-    usual = [Case(name, USUAL, arguments.t0, arguments.output) for name in small]
+    try:
+        usual = [Case(name, USUAL, arguments.t0, arguments.output) for name in small]
+    except gm.FileFormatError:
+        parser.error(f"{arguments.output} holds parts of other experiments; name another folder with -o")
     recalls = np.stack([case.repeated()[0] for case in usual])  # packs, signals, bins
     between = math.sqrt(recalls.var(axis=0, ddof=1).mean() / np.mean(recalls**2))
     if (noted := table.pick(study="between packs")) and noted[0]["value"] != _text(between):

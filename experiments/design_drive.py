@@ -8,12 +8,11 @@ The drive is found on some packs and checked on others. Half an hour on two core
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from console import say
+from console import new_folder, say
 
 import gmem_jax as gm
 from gmem_jax.show.figures import history_figure
@@ -31,7 +30,7 @@ def mean_and_error(values: list[float]) -> str:
 def main() -> None:
     """Design, check on other packs, then vary delta0."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-o", "--output", type=Path, default=Path("drive"), help="folder to write to")
+    parser.add_argument("-o", "--output", type=new_folder, default="drive", help="folder to write to")
     parser.add_argument("--packs", default="tetra-325-a,tetra-325-b,tetra-325-c", help="packs to design on")
     parser.add_argument("--check", default="tetra-325-d,tetra-325-e", help="packs to check on")
     parser.add_argument("--delta0", default="0.025,0.05,0.1", help="compressions to prepare packs for; empty for none")

@@ -7,12 +7,11 @@ By default on the five packs of 325 grains; some ten minutes a pack on two cores
 
 import argparse
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from console import say
+from console import new_folder, say
 from packs import FIVE, called
 
 import gmem_jax as gm
@@ -23,7 +22,7 @@ from gmem_jax.show.render_matplotlib import to_matplotlib
 def main() -> None:
     """Design, verify and draw, pack by pack."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-o", "--output", type=Path, default=Path("designed"), help="folder to write to")
+    parser.add_argument("-o", "--output", type=new_folder, default="designed", help="folder to write to")
     parser.add_argument("--packs", type=called, default=FIVE)
     parser.add_argument("--iterations", type=int, default=3)
     arguments = parser.parse_args()

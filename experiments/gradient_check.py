@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from console import say
+from console import new_folder, say
 
 import gmem_jax as gm
 from gmem_jax.derivatives import jacobian
@@ -126,7 +126,7 @@ def draw(
 def main() -> None:
     """Compute all, print and draw the comparison."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-o", "--output", type=Path, default=Path("gradient_check"), help="folder to write to")
+    parser.add_argument("-o", "--output", type=new_folder, default="gradient_check", help="folder to write to")
     parser.add_argument("--pack", default="tetra-325-a")
     parser.add_argument("--t0", type=float, default=1.8e3)
     arguments = parser.parse_args()

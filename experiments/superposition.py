@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from console import new_folder
 
 import gmem_jax as gm
 from gmem_jax import classify
@@ -83,7 +84,7 @@ def draw(path: Path, rows: list[list[Any]], six: dict[str, Any], title: str) -> 
 def main() -> None:
     """Measure, predict, simulate, classify and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-o", "--output", type=Path, default=Path("superposition"), help="folder to write to")
+    parser.add_argument("-o", "--output", type=new_folder, default="superposition", help="folder to write to")
     parser.add_argument("--packs", default="tetra-325-a,tetra-325-b,tetra-325-c")
     parser.add_argument("--t0", type=float, default=1.8e3)
     parser.add_argument("--long", type=int, default=LONG, help="bits of the long words; 0 for none")
