@@ -191,9 +191,13 @@ def remembered_after(second: jax.Array, integral: jax.Array, scale: Scalar) -> t
 
 @usual_rules()
 def running_mean(series: jax.Array, width: Scalar) -> jax.Array:
-    """Mean over a window of `width` bins (need not be whole) along the last axis, [..., bins].
+    """Running mean along the last axis, in the shape of the series.
 
-    The integral of the piecewise-constant series over the window, divided by the part of the window inside [0, 1].
+    It is the mean of the piecewise-constant series over the part of the window that lies inside the series.
+
+    Args:
+        series: values in each bin, [..., bins].
+        width: width of the window in bins; need not be whole.
 
     Raises:
         ValueError: if the width is not above 0.

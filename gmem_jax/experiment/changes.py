@@ -1,4 +1,4 @@
-"""An experiment with other numbers: its fields by dotted names."""
+"""Copies of an experiment with other values of some fields, named by dotted names."""
 
 import copy
 import dataclasses
@@ -16,18 +16,18 @@ from gmem_jax.simulation.protocol import Protocol
 
 @usual_rules()
 def replace(experiment: Experiment, values: Mapping[str, Any] | None = None, /, **changes: Any) -> Experiment:
-    """The same experiment with other fields.
+    """A copy of an experiment with other values of some fields.
 
-    A traced t0 keeps the number of steps that the experiment has; a concrete one has it chosen anew unless it was
-    given.
+    With a traced t0 the copy keeps the number of steps in a bin. With a concrete t0 that number is chosen anew, unless
+    the experiment was made with `steps`.
 
     Args:
         experiment: the experiment; it stays as it is.
-        values: what changes by dotted name, like {"friction.mu": 0.5}.
-        changes: what changes by field.
+        values: new values by dotted name, like {"friction.mu": 0.5}.
+        changes: new values by field, like gamma0=2e-3.
 
     Raises:
-        ValueError: if there is no such field, it is given twice, or the new experiment is impossible.
+        ValueError: if there is no such field, a field is given twice, or the new experiment is impossible.
     """
     require_kind("replace", experiment, Experiment)
     found: dict[str, Any] = dict(changes)

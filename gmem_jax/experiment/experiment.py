@@ -1,4 +1,4 @@
-"""The one description of a memory experiment: every field, default and check (paper, Secs. II and III)."""
+"""The description of a memory experiment: its fields, their defaults, and the checks (paper, Secs. II and III)."""
 
 import dataclasses
 import math
@@ -68,47 +68,57 @@ class Timing(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class Experiment:
-    """Everything a recall depends on. S signals make S + 1 replicas; replica 0 is the zero signal.
+    """Everything a recall depends on. S signals make S + 1 replicas; replica 0 has the zero signal.
 
-    A pytree: its floats can be differentiated and vmapped. The friction law's parameters, gamma0, shear_share, delta0,
-    t0, hold_drag, creep, creep_fades, gravity and wall_mu are one number or one for each replica, [S + 1].
+    An experiment is a pytree: its floats can be differentiated and vmapped. The parameters of the friction law, gamma0,
+    shear_share, delta0, t0, hold_drag, creep, creep_fades, gravity and wall_mu are one number, or one for each
+    replica, [S + 1].
 
     Attributes:
         pack: the pack at rest.
-        signals: the waveforms; several sets of them by `gmem_jax.experiment.signals.signals`.
+        signals: the S waveforms; `gm.signals` joins several sets, for several channels or writes.
         friction: the friction law.
-        material: the elastic solid.
-        gamma0: shear amplitude.
-        shear_share: the part of gamma by which L_x shrinks and L_y grows; see
+        material: the elastic solid that the spheres are made of.
+        gamma0: amplitude of the shear strain gamma = gamma0 I, where I is the waveform.
+        shear_share: the part of gamma by which L_x shrinks and L_y grows (1/2: by gamma / 2 each); see
             `gmem_jax.simulation.strain.StrainPath`.
-        delta0: areal compression; default the pack's own. Another value makes `run` warn.
+        delta0: fraction of its area in x and y that the box loses at u = 1; default the pack's own. `run` warns of any
+            other value.
         t0: duration of one compression, in t_c. The paper's is 1.8e4.
-        hold_drag: viscous drag while the walls stand still, 1 / t_c; default 0.05 for t0 below the paper's, else 0.
-        creep: rate at which elastic tangential forces relax, 1 / t_c; default: they never relax. In one bin at most a
-            twentieth of a force may relax.
-        creep_fades: time in a stage after which that rate falls as 1 / t, in t_c; default: the rate stays constant.
-        gravity: its acceleration along -z, in R / t_c^2, that is E / (rho R); default none. It acts from the start on.
-        wall_mu: friction coefficient of the walls, whose contacts take the friction law with it; default smooth walls.
-            Like mu it acts from the start on, and a stage without friction has none.
-        dt: largest time step, in t_c.
-        steps: steps in a bin of t0 / 256; default the fewest that `dt` allows. Needed where t0 is a tracer.
-        steps_per_bin: the number of steps in a bin that follows from `dt` or `steps`.
-        rest: rests at u = 0, in t0.
-        hold: holds at u = 1, in t0.
-        store: storage, in t0. Like rests and holds it is rounded up to whole bins of t0 / 256, and is one at least.
-        background: "sub0", "sub2" or "sub2-bl" (in any case); the last two add a second readout.
-        shear: when the waveforms are applied: "during" the compression, or "before" it, as functions of time at u = 0.
-        protocol: what is done; default the paper's, made of rest, hold, store, background and shear. With one of your
-            own say lengths there; "sub2" and "sub2-bl" take its second read for the background of the first.
-        observe: functions of (simulation, state) by name, called at the end of each bin for all replicas at once, and
-            of each by itself, as batches and devices have some of them only; what they give is in
-            `Recall.stages[...].observed`. See `gmem_jax.simulation.observables`.
-        backend: "jax", the definition; "native", C++ on CPUs; "auto", native where it is built and knows the law.
-        precision: "double"; or "mixed", contacts in single precision on the native backend, without derivatives.
+        hold_drag: viscous drag while the walls stand still, in 1 / t_c; default 0.05 for t0 below the paper's, else 0.
+        creep: rate at which the elastic tangential forces of contacts relax, in 1 / t_c; default: they never relax. At
+            most a twentieth of a force may relax in one bin.
+        creep_fades: time since the beginning of a stage after which the rate of creep falls as 1 / t, in t_c; default:
+            the rate is constant.
+        gravity: acceleration of gravity along -z, in R / t_c^2, which is E / (rho R); default none. It acts from the
+            start of the run.
+        wall_mu: friction coefficient of the walls; default smooth walls. Contacts with walls take the friction law with
+            this mu. It acts from the start of the run, except in stages without friction.
+        dt: largest time step, in t_c; a bin is divided into whole steps no longer than this.
+        steps: number of steps in a bin of t0 / 256, instead of dt; default the fewest that dt allows. Needed where t0
+            is a tracer.
+        steps_per_bin: number of steps in a bin; it follows from `steps` or `dt` and cannot be given.
+        rest: length of each rest at u = 0, in t0.
+        hold: length of each hold at u = 1 other than the storage, in t0.
+        store: length of the storage at u = 1, in t0. Rests, holds and storage are rounded up to whole bins of t0 / 256,
+            and last one bin at least.
+        background: what is subtracted from the readout: "sub0", that of the zero signal; "sub2", a second readout of
+            the same replica; "sub2-bl", the same, and then the line through the ends of the result.
+        shear: "during": waveforms are functions of u, applied during the compression; "before": they are functions of
+            time, applied at u = 0 before it.
+        protocol: the stages of the run; default the paper's, made of rest, hold, store, background and shear. In any
+            other protocol its stages give all lengths, and "sub2" and "sub2-bl" need two reads: the second is the
+            background of the first.
+        observe: functions of (simulation, state), as a dictionary by name or a list of `gm.observables`. They are
+            called at the end of each bin and give arrays [..., B], kept in `Recall.stages[...].observed`. Each replica
+            must be treated by itself, since the B replicas of a batch or device are not always all S + 1.
+        backend: "jax", plain JAX, which defines the physics; "native", the same in C++, on CPUs and CUDA GPUs; "auto",
+            native where it is built and knows the law, else "jax".
+        precision: "double"; or "mixed": contacts in single precision, on the native backend, without derivatives.
 
     Raises:
-        ValueError: for impossible numbers or waveforms, and shapes that do not fit. What is traced cannot be refused:
-            it sets `Status.IMPOSSIBLE`.
+        ValueError: for impossible numbers or waveforms, and shapes that do not fit. Traced values cannot be refused:
+            impossible ones set `Status.IMPOSSIBLE`.
     """
 
     pack: Pack
@@ -252,10 +262,10 @@ class Experiment:
 
     @property
     def waveforms(self) -> Signals:
-        """The signals of an experiment that has one set of them.
+        """The set of waveforms, if there is only one.
 
         Raises:
-            ValueError: if it has several.
+            ValueError: if there are several sets.
         """
         if len(self.sets) > 1:
             raise ValueError(f"this works with one set of waveforms, and the experiment has {', '.join(self.sets)}")
@@ -264,7 +274,7 @@ class Experiment:
 
     @property
     def readings(self) -> Readings:
-        """What is read."""
+        """The reads and channels of the protocol, and how p_sig is made of their pressures."""
         return Readings(self.protocol, self.background)
 
     def _check_shapes(self) -> None:
@@ -312,17 +322,17 @@ class Experiment:
 
     @property
     def replicas(self) -> int:
-        """S + 1."""
+        """Number of replicas, S + 1."""
         return self.signals.count + 1
 
     @property
     def compression(self) -> Scalar:
-        """delta0."""
+        """delta0, the pack's own where none is given."""
         return self.pack.delta0 if self.delta0 is None else self.delta0
 
     @property
     def drag(self) -> Scalar:
-        """hold_drag."""
+        """hold_drag, the default for t0 where none is given, in 1 / t_c."""
         if self.hold_drag is not None:
             return self.hold_drag
         if isinstance(self.t0, float):
@@ -331,22 +341,22 @@ class Experiment:
 
     @property
     def runs_on(self) -> Backend:
-        """What `backend` means for this law and these walls on JAX's default device."""
+        """The backend that runs this law on JAX's default device: "jax" or "native"."""
         return backend_name(self.backend, self.friction)
 
     @property
     def timing(self) -> Timing:
-        """dt, a little smaller than asked for so that bins are whole, and the steps in a bin."""
+        """The time step that is used, in t_c: `dt`, or less so that a bin holds whole steps; and the steps in a bin."""
         return Timing(self.t0 / (BINS * self.steps_per_bin), self.steps_per_bin)
 
     @property
     def phases(self) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
-        """The shear-free prefix, run once for all signals; and the stages from the first sheared one on."""
+        """The stages of the shear-free prefix, run once for all signals; and those from the first sheared one on."""
         phases: tuple[tuple[Stage, ...], tuple[Stage, ...]] = self.protocol.phases
         return phases
 
     def simulation(self, *, sheared: bool) -> Simulation:
-        """What a rollout is told, in the prefix or after it."""
+        """Parameters, walls and time step of a rollout, without waveforms (the prefix) or with them (`sheared`)."""
         lower, upper = self.pack.box.lower, self.pack.box.upper
         columns: Columns = self.protocol.columns
         if sheared:
@@ -380,7 +390,7 @@ class Experiment:
             return waveform(np.asarray(lane.waveform))
 
     def begin(self) -> State:
-        """The pack at rest with friction switched on: one replica, or all where parameters differ in the prefix."""
+        """The state at the start: one replica of the pack at rest, or S + 1 where parameters differ in the prefix."""
         before = (value for name, value in replica_parameters(self).items() if acts_on_prefix(name))
         wide = self.replicas if any(jnp.ndim(value) for value in before) else 1
         turned = unit(self.pack.quaternion[..., None])
@@ -401,26 +411,35 @@ class Experiment:
         return impossible
 
     def fan_out(self, state: State) -> State:
-        """A replica for the zero signal and one for each of the others, if there is only one so far."""
+        """The state of one replica copied to S + 1; a state that has all of them already stays as it is."""
         copies: State = replicate(state, self.replicas) if state.replicas == 1 < self.replicas else state
         return copies
 
     @property
     def scale(self) -> Scalar:
-        """E delta0 gamma0, what gains are measured in; scalar, or [S, 1] where it differs between signals."""
+        """E delta0 gamma0, the unit of gains; a scalar, or [S, 1] where it differs between signals."""
         scale = self.compression * self.gamma0
         return scale if jnp.ndim(scale) == 0 else jnp.asarray(scale)[1:, None]
 
     def integral(self) -> jax.Array:
-        """J of every signal averaged over each bin, [S, 256]; by read and channel where there are several."""
+        """J of every signal averaged over each bin, [S, 256]; [R, C, S, 256] with several reads or channels."""
         return self.readings.integrals(self.sets)
 
     def recalled(self, pressures: Mapping[str, jax.Array]) -> jax.Array:
-        """p_sig of every signal in ascending u, likewise, in E, from the pressures [bins, 3, S + 1] by stage."""
+        """p_sig of every signal in ascending u, shaped like `integral`, in E.
+
+        Args:
+            pressures: wall pressures of each read by the name of its stage, [bins, 3, S + 1], in E.
+        """
         return self.readings.recalled(pressures)
 
     def compare(self, p_sig: jax.Array, window: Scalar | None = None) -> analysis.Match:
-        """Gain and fidelity of recalled signals; `window` is that of `Readings.compare`."""
+        """Gain and fidelity of recalled signals.
+
+        Args:
+            p_sig: recalled signals, shaped like `integral`, in E.
+            window: time in t0 over which p_sig and J are averaged first; default none.
+        """
         return self.readings.compare(p_sig, self.integral(), self.scale, window)
 
     def _facts(self) -> Facts:

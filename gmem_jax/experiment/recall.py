@@ -1,4 +1,4 @@
-"""What a pack gives back: an experiment run, its background subtracted, compared with the integrals (Secs. II, III)."""
+"""The recall: p_sig of a run with its background subtracted, and its gain and fidelity (paper, Secs. II and III)."""
 
 import dataclasses
 import json
@@ -35,35 +35,36 @@ REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than
 @pytree
 @dataclass(frozen=True)
 class Recall:
-    """What a pack gave back of S signals. Where the status is fatal, p_sig and all measures are NaN.
+    """The recall of S signals. If a bit of the status is fatal, p_sig and all gains and fidelities are NaN.
 
-    With R reads and C channels, shear, J and p_sig are [R, C, S, 256], gains [R, C, C] and fidelities [R, C]; an axis
-    of length one is left out, as below. `at` gives one read of one channel. p_sig and J are 0 where a read does not go.
+    With R reads and C channels, shear, J and p_sig are [R, C, S, 256], gains [R, C, C] and fidelities [R, C]. An axis
+    of length one is left out: the shapes below are those of one read and one channel, which `at` picks out. p_sig and J
+    are 0 in the bins of u that a read does not go through.
 
     Attributes:
         u: centres of the bins, [256].
-        shear: the waveforms I there, [S, 256].
+        shear: the waveforms I at u, [S, 256].
         J: integrals of the waveforms, averaged over each bin, [S, 256].
         p_sig: recalled signals, [S, 256], in E.
-        rounding: what round-off makes of each, root mean square over the bins, [S], in E; see `validity.rounding`.
-        gain: G of the set.
-        fidelity: F of the set.
-        windowed_gain: G after a running mean of p_sig and J over the ringing period.
-        windowed_fidelity: F after the same.
-        window: that period T_1, in t_c.
-        residual_speed: largest grain speed when the readout began, over the walls' speed in it (in a compression in t0
-            where u stands still), [S + 1].
-        status: bits of `Status`, [S + 1]; replica 0 is the zero signal. Those of
-            `WARNINGS` leave the numbers as they are.
-        stages: samples of every stage by name, leading axis bins; one replica before the first waveform. Ordered: JAX
-            sorts the keys of plain dictionaries.
-        dt: the time step used, in t_c.
-        protocol: the stages that were gone through.
-        reads: names of the R stages that p_sig is of.
+        rounding: estimated round-off in each p_sig, root mean square over the bins, [S], in E.
+        gain: G, one number for all S signals.
+        fidelity: F, one number for all S signals.
+        windowed_gain: G after a running mean of p_sig and J over the ringing period T_1.
+        windowed_fidelity: F after the same running mean.
+        window: T_1, in t_c.
+        residual_speed: largest grain speed when the first readout began, over the speed of the walls in that readout
+            (over their speed in a compression in t0, if u stands still in it), [S + 1].
+        status: bits of `Status`, [S + 1]; replica 0 has the zero signal. Bits that only warn leave the numbers as they
+            are (`Status.fatal`).
+        stages: a `Sample` of every recorded stage by name, with a leading axis of bins; one replica before the first
+            waveform, S + 1 from there on. An ordered dictionary, since JAX sorts the keys of plain ones.
+        dt: the time step that was used, in t_c.
+        protocol: the stages of the run.
+        reads: names of the R stages that p_sig was read in.
         channels: names of the C channels.
-        frames: configurations of one replica along the run, if they were asked for.
-        record: JSON of the configuration that it belongs to: what `describe` says of the experiment. "{}" for a recall
-            of a traced experiment. A label: no part of what programs are compiled for.
+        frames: configurations of one replica along the run; None if none were asked for.
+        record: JSON of what `describe` says of the experiment; "{}" if the experiment was traced. A label: programs are
+            not compiled for it.
     """
 
     u: jax.Array
@@ -94,39 +95,43 @@ class Recall:
 
     @property
     def names(self) -> list[str]:
-        """What the signals are called: words by their bits, others by their number from 1."""
+        """Names of the S signals: "0110" for words, "signal 1", "signal 2", ... for others."""
         known, count = self.configuration.get("signals"), self.J.shape[-2]
         if isinstance(known, list) and len(known) == count:
             return [str(name) for name in known]
         return [f"signal {number + 1}" for number in range(count)]
 
     def described(self, configuration: Mapping[str, Any]) -> "Recall":
-        """The same recall with this configuration."""
+        """The same recall with another configuration as its record."""
         return dataclasses.replace(self, record=json.dumps(configuration))
 
     @property
     def second_readout(self) -> str | None:
-        """The stage that was read for the background, if there is one."""
+        """Name of the stage that was read for the background; None if there is none."""
         known, reads = self.protocol.reads, self.reads
         whole = tuple(self.configuration.get("reads", reads))  # what `at` gives is a part
         return known[1] if len(known) == 2 and reads == known[:1] == whole else None
 
     @property
     def of_time(self) -> bool:
-        """Whether u stands still in every read: the bins of p_sig are then those of the time of a read."""
+        """Whether u stands still in every read; p_sig is then a function of the time in the read, from 0 to 1."""
         return not any(stage.moves for stage in self.protocol if stage.name in self.reads)
 
     def windows(self, t0: Any) -> np.ndarray:
-        """The part of u that each read goes through in T_1, or of its own time where u stands still, [R].
+        """The part of u that each read goes through in a time T_1, [R]; of its own duration, if u stands still in it.
 
         Args:
-            t0: duration of one compression, in t_c; of several the longest counts.
+            t0: duration of one compression, in t_c; if it differs between replicas, the longest counts.
         """
         found: np.ndarray = rates_of(self.protocol, self.reads) * (float(self.window) / float(np.max(t0)))
         return found
 
     def at(self, read: str | int = 0, channel: str | int = 0) -> "Recall":
-        """The recall of one channel in one read, as of a run that has no others: p_sig [S, 256], one G and one F.
+        """The recall of one channel in one read, as if there were no others: p_sig [S, 256], one G and one F.
+
+        Args:
+            read: name of the stage, or its number among the reads from 0.
+            channel: name of the channel, or its number from 0.
 
         Raises:
             ValueError: if there is no such read or channel.
@@ -143,7 +148,7 @@ class Recall:
         return dataclasses.replace(self, **curves, **gains, reads=(reads,), channels=(channels,))
 
     def each(self) -> "Iterator[Recall]":
-        """`at` every read and channel."""
+        """The recalls of all reads and channels, one by one: `at` of each."""
         return (self.at(read, channel) for read in self.reads for channel in self.channels)
 
     def _facts(self) -> html.Facts:
@@ -244,10 +249,10 @@ def _recall(experiment: Experiment) -> Recall:
 
 @usual_rules()
 def recall(experiment: Experiment) -> Recall:
-    """Run an experiment as one traced computation, for jit, vmap and grad; compiled once for each structure.
+    """Run an experiment as one JAX computation, for jit, vmap and grad. It is compiled once for each structure.
 
-    Nothing is raised: what goes wrong sets bits of `status`, and turns p_sig, gain and fidelity, and their derivatives,
-    into NaN. The pack's own neighbour list must last; `run` makes it anew.
+    A run that fails raises nothing: it sets fatal bits of `status`, and p_sig, gains, fidelities and their derivatives
+    are NaN. The neighbour list of the pack serves the whole run; only `run` can rebuild it.
 
     Raises:
         ValueError: if 64-bit mode is off, or was when the pack or the signals were made.
@@ -261,12 +266,12 @@ def recall(experiment: Experiment) -> Recall:
 
 
 def fidelity(experiment: Experiment) -> jax.Array:
-    """F of an experiment; see `recall`."""
+    """The fidelity F of an experiment, by `recall`: a scalar; [R, C] with several reads or channels (see `Recall`)."""
     return recall(experiment).fidelity
 
 
 def gain(experiment: Experiment) -> jax.Array:
-    """G of an experiment; see `recall`."""
+    """The gain G of an experiment, by `recall`: a scalar; [R, C, C] with several reads or channels (see `Recall`)."""
     return recall(experiment).gain
 
 

@@ -1,4 +1,4 @@
-"""The written form of an experiment: what files and keys say of it, down to where and by which code it was run."""
+"""The written form of an experiment in files and keys, and where and by which code it was run."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -72,10 +72,10 @@ def law_to_dict(law: FrictionLaw) -> dict[str, Any]:
 
 @usual_rules()
 def to_dict(experiment: Experiment) -> dict[str, Any]:
-    """An experiment as JSON: every field, the pack by its source and content.
+    """An experiment as a dictionary that JSON can hold: every field but `observe`; the pack by its source and SHA-256.
 
-    `files.configuration.from_dict` makes the same experiment of it, if law and waveforms are the library's: those of
-    the user's own are told by the name of their class, waveforms by their hash too.
+    `from_dict` makes the same experiment of it, if the law and the waveforms are of this library. A law of the user's
+    own is written as its `repr`, and waveforms of the user's own as the name of their class and a hash.
     """
     require_kind("to_dict", experiment, Experiment)
     pack = experiment.pack
@@ -111,13 +111,14 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
 
 @usual_rules()
 def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
-    """All that is to be known of a result: the experiment as written, what its defaults came to, and where it ran.
+    """The configuration that is kept with a result, as a dictionary that JSON can hold.
 
-    `values_of` reads it.
+    It has the experiment as `to_dict` writes it, the values of its defaults, facts about the pack, the names of
+    signals, reads and channels, and where it ran: versions, device and backend.
 
     Args:
-        experiment: what was run.
-        seconds: wall time of the call that finished the run; 0 where nobody measured it.
+        experiment: the experiment, not traced.
+        seconds: wall time of the call that finished the run, in s; 0 if it was not measured.
     """
     pack, law, entry = experiment.pack, experiment.friction, entry_of(experiment.friction)
     dt, steps = experiment.timing

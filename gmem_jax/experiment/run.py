@@ -1,4 +1,4 @@
-"""An experiment run on the host: the prefix once, then batches of waveforms in chunks, and what memory that takes."""
+"""Running an experiment on the host: the prefix once, then batches of waveforms in chunks; the memory it needs."""
 
 import dataclasses
 import time
@@ -97,14 +97,20 @@ def _key_of_prefix(experiment: Experiment) -> str:
 
 @usual_rules()
 def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress: Progress = silent) -> Prefix:
-    """Run the shear-free prefix, common to all waveforms on this pack under this law, for any number of `run`.
+    """Run the stages before the first waveform once, for use in any number of calls of `run`.
+
+    They are common to all waveforms on one pack, under one law and protocol.
 
     Args:
-        experiment: pack, law and protocol.
-        cache: asked for the part "prefix".
-        progress: told about every chunk.
+        experiment: the experiment; its waveforms, gamma0 and shear_share do not matter.
+        cache: see `run`; it is asked for the part "prefix".
+        progress: see `run`; default none.
+
+    Returns:
+        The state and the samples at the end of these stages, to be passed to `run` as `prefix`.
 
     Raises:
+        ValueError: as of `run`.
         RunFailedError: if the simulation broke down.
     """
     common, _ = experiment.phases
@@ -127,26 +133,30 @@ def run(
     cache: ResultCache = no_cache,
     progress: ProgressChoice = None,
 ) -> Recall:
-    """Run an experiment on the host, in chunks: stale neighbour lists are built anew, a broken run raises.
+    """Run an experiment on the host, in chunks of bins: stale neighbour lists are rebuilt, and a broken run raises.
 
-    With several processes (`jax.distributed`) all must call it alike, and all get the recall; one should keep it.
+    With several processes (`jax.distributed`) all must call it alike. All get the recall; one of them should keep it.
 
     Args:
-        experiment: the experiment.
-        prefix: what `gm.prefix_of` gave for an experiment that differs in waveforms, gamma0 and shear_share at most.
-        batch: signals that run together; default all of them. Each batch has a zero signal of its own.
-        devices: that share out the replicas; default all that JAX sees, also those of other processes.
-        frames: configurations to keep along the run, chosen by `frames.places`; the other numbers stay as they are.
-        frames_of: the signal whose replica is recorded, from 1; 0 for the zero signal.
-        frames_at: compressions u, 0 to 1, at which more are kept, each time that the run passes them, to the next of
-            256 bins: u = 0.5 gives one of every compression and decompression.
-        cache: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).
-        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
+        experiment: the experiment, not traced.
+        prefix: what `gm.prefix_of` returned for an experiment that differs at most in waveforms, gamma0 and
+            shear_share; default none: the prefix is run here.
+        batch: number of signals that run together; default all of them. Each batch has a zero signal of its own.
+        devices: devices that share the replicas; default all that JAX sees, those of other processes included.
+        frames: number of configurations to keep along the run, at places chosen by
+            `gmem_jax.simulation.frames.places`; 0 for none. The recall is the same with and without.
+        frames_of: number of the signal whose replica is recorded, from 1; 0 for the zero signal.
+        frames_at: compressions u in [0, 1] at which further configurations are kept, each time that the run passes
+            them, to the nearest bin: u = 0.5 gives one of every compression and decompression.
+        cache: keeps the finished parts of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`);
+            default none are kept.
+        progress: called after every chunk with the name of the stage, the simulated time in t_c and the fraction done;
+            default a bar in a terminal or a notebook, False for none.
 
     Raises:
-        ValueError: if 64-bit mode is off, or parameters that differ between replicas would be torn apart by batches;
-            for a time step that is not stable (see `stable_step`); for too many or too few frames, a u beyond 0 and 1,
-            frames of a prefix that was run before, the prefix of another experiment, or a signal that there is not.
+        ValueError: if 64-bit mode is off; if parameters differ between replicas and `batch` would divide them; for a
+            time step that is not stable (see `stable_step`); for too many or too few frames, a u outside [0, 1], a
+            signal that does not exist, frames together with a prefix, or the prefix of another experiment.
         TypeError: if it is no `Experiment`.
         RunFailedError: if the simulation broke down.
     """

@@ -1,4 +1,4 @@
-"""The largest stable time step of an experiment, its refusal of longer ones, and the rate for a wanted accuracy."""
+"""The largest stable time step of an experiment, and the t0 and dt for a wanted accuracy of G."""
 
 from dataclasses import replace
 from typing import Any
@@ -38,16 +38,17 @@ _borne: dict[tuple[Any, ...], float] = {}  # the longest steps that were found t
 
 @usual_rules()
 def stable_step(experiment: Experiment) -> float:
-    """The largest stable time step of a pack, law, material and compression, in t_c.
+    """The largest stable time step of an experiment, in t_c.
 
-    It is that of the steps made linear around the pack at rest, uncompressed and compressed as a whole, with contacts
-    that stick; the smallest of all replicas. Found once for each of these in a process.
+    One step is linearised around the pack at rest, with sticking contacts, at u = 0 and at u = 1 (all positions scaled
+    with the box). The result is the smallest of both and of all replicas. It depends on pack, law, material, delta0 and
+    wall_mu; a process remembers it for each of these.
 
     Args:
-        experiment: what is to be run, not traced.
+        experiment: the experiment, not traced.
 
     Returns:
-        At most 2.
+        The step, at most 2 t_c; 0 if not even 0.1 t_c is stable.
 
     Raises:
         ValueError: if JAX's 64-bit mode is off.
@@ -130,20 +131,21 @@ def require_stable(experiment: Experiment) -> None:
 
 @usual_rules()
 def at_accuracy(experiment: Experiment, accuracy: float) -> Experiment:
-    """The experiment with a t0 and a dt for which G is as exact as wanted, compared with slow drives and short steps.
+    """The same experiment with the t0 and dt at which G has a wanted accuracy, relative to slow drives and short steps.
 
-    In drives that are too fast G is too large, by some (9.6 T1 / t0)^2 in parts of it, and F is off by about as much
-    (docs/scaling.md). T1 is the ringing period of the pack.
+    In a drive that is too fast G is too large by a relative error of some (9.6 T1 / t0)^2, and F is off by about as
+    much (docs/scaling.md). T1 is the ringing period of the pack.
 
     Args:
-        experiment: what is to be run, not traced; its own t0, dt and steps do not count.
-        accuracy: error of G, relative, 0.002 to 0.1.
+        experiment: the experiment, not traced; its own t0, dt and steps do not matter.
+        accuracy: relative error of G, 0.002 to 0.1.
 
     Returns:
-        t0 is 9.6 T1 / accuracy^0.5, and dt 0.6 of the stable step, but at most 1.2 t_c, or 0.6 where t0 is below 1,800.
+        The experiment with t0 = 9.6 T1 / accuracy^0.5, and dt 0.6 of the stable step, but at most 1.2 t_c, or 0.6 t_c
+        if t0 is below 1,800.
 
     Raises:
-        ValueError: if the accuracy is outside of this.
+        ValueError: if the accuracy is outside its range.
     """
     require_kind("at_accuracy", experiment, Experiment)
     least, most = ACCURACIES
