@@ -1,4 +1,4 @@
-"""Waveforms from samples of anything: times become u; noise is smoothed and ends are brought to zero where asked."""
+"""Waveforms from samples at given times: times become u; on demand they are smoothed, tapered and scaled."""
 
 from collections.abc import Callable
 
@@ -34,26 +34,26 @@ def waveform_from(
     scale: bool = False,
     told: Told = untold,
 ) -> Spline:
-    """A waveform from what was measured or made at given times; these become u, from 0 to 1.
+    """Waveforms from samples at given times, which are mapped to u from 0 to 1.
 
-    Samples at equal steps become the nodes of the curve as they are. Others, and those that are smoothed, are taken
-    over to equal steps of 1/256 or less, along straight lines. Nothing else is changed unless it is asked for: a curve
-    that no pack could hold is refused. What is asked for is done in the order of the arguments.
+    Equally spaced samples are used as they are. Others, and those that are smoothed, are interpolated linearly to equal
+    steps of at most 1/256. Smoothing, tapering and scaling are done only if asked for, in this order. A waveform that
+    a pack cannot follow is refused.
 
     Args:
         t: times or places, rising, [n], in any unit.
-        x: samples there, for one signal [n] or several [S, n]. A waveform has no unit, and 1 is its usual size.
-        span: the times at which u is 0 and 1, where the waveform is zero if there is no sample; default the first and
-            the last.
-        smooth: width in u over which samples are averaged (with the weight of a squared cosine); 0 leaves them alone.
-        taper: width in u at either end within which the waveform is brought to zero, by a squared sine; 0 leaves it.
-        scale: whether to divide by the largest value of all signals.
-        told: gets a line on what was changed, if anything was: print, say.
+        x: samples at t, of one signal [n] or several [S, n], without unit; the usual size is 1.
+        span: the two times that become u = 0 and u = 1; default the first and the last of t. Where the samples do not
+            reach them, the waveform is zero there.
+        smooth: width in u of the running average, whose weight is a squared cosine; 0 for none.
+        taper: width in u at both ends within which the waveform is brought to zero by a squared sine; 0 for none.
+        scale: whether to divide all signals by the largest absolute value of all.
+        told: called with one line of text on what was changed, if anything was, such as `print`.
 
     Raises:
         ValueError: if the shapes do not fit, a number is not finite, times do not rise or lie outside the span, a width
-            is none; if a waveform does not begin or end at zero, or is steeper than a pack can follow: the line says
-            what would help.
+            is not in [0, 0.5]; if a waveform does not begin and end at zero, or is steeper than a pack can follow. The
+            message says what would help.
     """
     for name, given in (("t", t), ("x", x)):
         if not is_real(given):

@@ -27,7 +27,7 @@ POINTS = 16  # of a bin, at which J is averaged
 
 @runtime_checkable
 class Signals(Protocol):
-    """A set of S waveforms: a pytree whose arrays with a leading axis of length S belong to one signal each."""
+    """What a set of S waveforms provides. It is a pytree; in arrays with a leading axis [S], row s is of signal s."""
 
     @property
     def count(self) -> int:
@@ -35,22 +35,22 @@ class Signals(Protocol):
         ...
 
     def shear(self, u: jax.Array) -> jax.Array:
-        """I_s(u), [..., S]."""
+        """I_s(u), [..., S] for u of shape [...]."""
         ...
 
     def integral(self, u: jax.Array) -> jax.Array:
-        """J_s(u), the integral of I_s from 0 to u, [..., S]."""
+        """J_s(u), the integral of I_s from 0 to u, [..., S] for u of shape [...]."""
         ...
 
 
 @pytree
 @dataclass(frozen=True)
 class SignalSets:
-    """Several sets of S waveforms: each replica has one of each. Made by `signals`.
+    """Several sets of S waveforms: replica s has waveform s of each set. `signals` makes it.
 
     Attributes:
         sets: the sets.
-        names: of them; one that is called like a channel is written there where a protocol does not say otherwise.
+        names: their names; unless the protocol says otherwise, a set is written on the channel that has its name.
     """
 
     sets: tuple[Signals, ...]
@@ -74,14 +74,17 @@ def sets_of(signals: Signals | SignalSets) -> dict[str, Signals]:
 
 @usual_rules()
 def signals(**sets: Signals) -> Signals | SignalSets:
-    """Waveforms for several channels, or for several writes: replica s has the s-th of each set.
+    """Join sets of waveforms for several channels or several writes: replica s has waveform s of each set.
 
     Args:
-        sets: sets of one length, as `xy=..., z=...` for two channels at once, or by names that stages ask for, as
+        sets: sets of equal length S by name: `xy=..., z=...` for two channels at once; or names that stages refer to,
             `first=..., second=...` with `gm.write(xy="first")`.
 
+    Returns:
+        The sets as `SignalSets`; the set itself, if xy is the only one.
+
     Raises:
-        ValueError: if there is none, one is called "kind", or they differ in length.
+        ValueError: if there is no set, one is called "kind", or they differ in length.
     """
     if "kind" in sets:
         raise ValueError('a set of waveforms cannot be called "kind"; call it by what it is for')
@@ -111,13 +114,13 @@ class Bumps:
 
     Attributes:
         amplitudes: a_b, [S, b]; zero entries pad signals with fewer bumps.
-        centres: c_b, [S, b], or [1, b] of all signals.
-        width: du, scalar or [S, 1].
-        form: what made them, as JSON of their written form; "" for those of one's own. A label: with other numbers it
-            is another set's.
+        centres: c_b, [S, b]; or [1, b], the same for all signals.
+        width: du, the full width of a bump in u; scalar or [S, 1].
+        form: JSON of the call that made them, as by `six_signals` or `words`; else "". A label: a set with changed
+            numbers may still carry it.
 
     Raises:
-        ValueError: for what are no numbers, or not of these shapes.
+        ValueError: for values that are no numbers, or not of these shapes.
     """
 
     amplitudes: jax.Array
@@ -165,7 +168,7 @@ class Spline:
     """Waveforms through samples, joined by a C1 cubic (Catmull-Rom) curve.
 
     Attributes:
-        nodes: I_s at the n + 2 equally spaced nodes u = k / (n + 1), [S, n + 2]; first and last are zero.
+        nodes: I_s at the n + 2 nodes u = k / (n + 1), k = 0..n + 1, [S, n + 2]; the first and the last are zero.
     """
 
     nodes: jax.Array
@@ -298,16 +301,16 @@ def word_bits(bits: int) -> np.ndarray:
 
 @usual_rules()
 def words(bits: int, pad: float = PAD, width: float = WIDTH) -> Bumps:
-    """All binary words of a length (App. A): J is a plateau of height +u_b / pi for a 1 and -u_b / pi for a 0.
+    """All binary words of a length (App. A): J has a plateau of height +u_b / pi for a 1 and -u_b / pi for a 0.
 
-    A bit is u_b = 1 / (bits + 2 pad) wide, `pad` of these are left free at either end, and plateaus that differ are
-    joined by bumps. Signal s, from 1 to 2^bits, is the number s - 1, its most significant bit at small u. The scale is
-    the paper's: amplitudes of 1 between bits, 1/2 at the ends, whatever the word.
+    A bit is u_b = 1 / (bits + 2 pad) wide; `pad` such widths are left free at both ends. A bump of I joins plateaus
+    that differ. Signal s, from 1 to 2^bits, is the word of the number s - 1, most significant bit at small u. As in the
+    paper, bumps between bits have an amplitude of 1, and those at the ends of the word 1/2.
 
     Args:
-        bits: L.
-        pad: free bits at either end.
-        width: of the bumps, in bits; plateaus are as high as this.
+        bits: length L of the words.
+        pad: free widths of a bit at either end.
+        width: width of the bumps, in widths of a bit; the height of the plateaus is proportional to it.
 
     Raises:
         ValueError: if `bits` is not a whole number from 1 to 12, or bumps of this width do not fit into [0, 1].
@@ -331,10 +334,10 @@ def bit_width(bits: int, pad: float = PAD) -> float:
 
 @usual_rules()
 def waveform(samples: jax.typing.ArrayLike) -> Spline:
-    """Any waveform from its samples.
+    """Waveforms from equally spaced samples; `waveform_from` takes samples at any times.
 
     Args:
-        samples: I at u = k / (n + 1), k = 1..n, for one signal [n] or several [S, n]; I is zero at u = 0 and 1.
+        samples: I at u = k / (n + 1), k = 1..n, of one signal [n] or several [S, n]; I is zero at u = 0 and 1.
 
     Raises:
         ValueError: if the shape is not [n] or [S, n] with n >= 2, or a concrete sample is not a finite real number.

@@ -1,8 +1,8 @@
-"""Builders of the stages of a protocol. Lengths are in t0.
+"""Builders of the stages of a protocol; all lengths are in t0.
 
     gm.Protocol(gm.cycle(), gm.rest(), gm.write(), gm.hold(2.0), gm.read())
 
-Builders leave open where u is: each stage begins where the one before ends.
+A stage begins at the u at which the one before ends.
 """
 
 from collections.abc import Sequence
@@ -40,9 +40,14 @@ def _samples(waveform: Waveform) -> Any:
 
 
 def cycle(rest: float = 0.2, hold: float = 0.2, *, to: float = 1.0) -> tuple[Stage, ...]:
-    """One compress/decompress cycle without shear: rest, compress to u = `to`, hold, decompress to u = 0.
+    """One cycle without shear: rest at u = 0, compress to u = `to`, hold, decompress to u = 0.
 
-    Compressions and decompressions last as long as at the rate of one t0 from u = 0 to 1.
+    Compression and decompression last `to` t0 each, at the usual rate of one t0 from u = 0 to 1.
+
+    Args:
+        rest: length of the rest, in t0.
+        hold: length of the hold, in t0.
+        to: u at the end of the compression.
     """
     return (
         Stage("rest", 0.0, 0.0, rest, "hold"),
@@ -53,17 +58,35 @@ def cycle(rest: float = 0.2, hold: float = 0.2, *, to: float = 1.0) -> tuple[Sta
 
 
 def rest(length: float = 0.2, **more: Any) -> Stage:
-    """Walls stand still where they are; `more` are fields of `Stage`."""
+    """The walls stand still for a short time, so that grains come to rest.
+
+    Args:
+        length: length of the stage, in t0.
+        more: further fields of `Stage`.
+    """
     return Stage("rest", length=length, role="hold", **more)
 
 
 def hold(length: float = 2.0, *, name: str = "hold", **more: Any) -> Stage:
-    """Walls stand still where they are: storage. `more` are fields of `Stage`, as pressure=(None, None, 2e-3)."""
+    """The walls stand still: storage.
+
+    Args:
+        length: length of the stage, in t0.
+        name: name of the stage.
+        more: further fields of `Stage`, as pressure=(None, None, 2e-3).
+    """
     return Stage(name, length=length, role="hold", **more)
 
 
 def compress(to: float, length: float | None = None, *, name: str = "compress", **more: Any) -> Stage:
-    """u goes to `to`, in `length` (default 1), without a waveform; `more` are fields of `Stage`."""
+    """Compress or decompress to another u, without a waveform.
+
+    Args:
+        to: u at the end.
+        length: length of the stage, in t0; default 1.
+        name: name of the stage.
+        more: further fields of `Stage`.
+    """
     return Stage(name, stop=to, length=1.0 if length is None else length, **more)
 
 
@@ -77,20 +100,24 @@ def write(
     name: str = "write",
     **channels: Any,
 ) -> Stage:
-    """Waveforms are applied while u goes to `to`; or in time where it stands, with `to` None.
+    """Apply waveforms while u goes to `to`, or while it stands still.
+
+    A waveform is the name of a set of `gm.signals`, "sine:n" (n whole periods), samples at k / (n + 1), k = 1..n, or a
+    `Signals` of one waveform. A set has one waveform for each replica; all others are applied to every replica, that of
+    the zero signal included.
 
     Args:
-        waveform: on channel xy.
-        to: u at the end.
-        length: of the stage.
-        amplitude: what waveforms are multiplied with.
-        along: "u" or "time".
-        name: of the stage.
-        channels: waveforms by channel, as xy="first", z=[0.5, 1.0, 0.5]; without any each set of the experiment is
-            written on the channel that it is called like.
+        waveform: the waveform on channel xy.
+        to: u at the end; None if u stands still.
+        length: length of the stage, in t0.
+        amplitude: factor on the waveforms, beside gamma0.
+        along: what waveforms are a function of, "u" or "time"; default u, or time if u stands still.
+        name: name of the stage.
+        channels: waveforms by channel, as xy="first", z=[0.5, 1.0, 0.5]. If no waveform is given at all, each set of
+            the experiment is written on the channel that has its name.
 
     Raises:
-        ValueError: for what makes no waveform or no stage.
+        ValueError: for an impossible waveform or stage.
     """
     given = dict(channels) if waveform is None else {"xy": waveform, **channels}
     return Stage(name, stop=to, length=length, role="write", drives=_drives(given, amplitude), along=along)
@@ -106,16 +133,16 @@ def read(
     mark: bool = False,
     **channels: Any,
 ) -> Stage:
-    """Stresses are read while u goes to `to`; or, with `to` None, while waveforms (`channels`) shear the pack.
+    """Read the stresses while u goes to `to`, or while it stands still and waveforms shear the pack.
 
     Args:
-        name: of the stage.
-        to: u at the end.
-        length: of the stage.
-        amplitude: what waveforms are multiplied with.
-        of: the stage that the recall is compared with; default the last that wrote on each channel.
-        mark: whether observers compare with its beginning.
-        channels: waveforms by channel that are applied meanwhile.
+        name: name of the stage.
+        to: u at the end; None if u stands still.
+        length: length of the stage, in t0.
+        amplitude: factor on the waveforms in `channels`, beside gamma0.
+        of: name of the stage whose waveforms the recall is compared with; default the last that wrote on each channel.
+        mark: whether observers compare with the beginning of this stage.
+        channels: waveforms by channel that are applied during the read, as in `write`; default none.
     """
     drives = _drives(channels, amplitude) if channels else ()
     return Stage(name, stop=to, length=length, role="read", drives=drives, of=of, mark=mark)
@@ -130,15 +157,15 @@ def train(
     role: Role = "write",
     **channels: Any,
 ) -> tuple[Stage, ...]:
-    """A waveform is applied again and again, in time where u stands, `times` times.
+    """Apply a waveform `times` times while u stands still, as a function of time.
 
     Args:
-        times: how often.
-        waveform: on channel xy; default the sets of the experiment.
-        amplitude: what it is multiplied with.
-        length: of each time.
-        role: of the stages.
-        channels: waveforms by channel.
+        times: number of stages, of which each applies the waveform once.
+        waveform: the waveform on channel xy, as in `write`; default the sets of the experiment.
+        amplitude: factor on the waveform, beside gamma0.
+        length: length of each stage, in t0.
+        role: role of each stage; see `Stage`.
+        channels: waveforms by channel, as in `write`.
     """
     given = dict(channels) if waveform is None else {"xy": waveform, **channels}
     return (Stage("train", length=length, role=role, drives=_drives(given, amplitude), along="time"),) * times
@@ -147,15 +174,15 @@ def train(
 def shake(
     amplitude: float, periods: int, *, length: float = 1.0, channel: str = "xy", name: str = "shake", **more: Any
 ) -> Stage:
-    """Walls swing by a sine of whole periods where u stands; the amplitude is a multiple of gamma0.
+    """Shear the pack by a sine of whole periods while u stands still, the same in all replicas.
 
     Args:
-        amplitude: of the sine.
-        periods: how many of them.
-        length: of the stage.
-        channel: the mode of strain.
-        name: of the stage.
-        more: fields of `Stage`.
+        amplitude: amplitude of the sine, in gamma0.
+        periods: number of periods.
+        length: length of the stage, in t0.
+        channel: mode of strain, one of `CHANNELS`.
+        name: name of the stage.
+        more: further fields of `Stage`.
     """
     drives = (Drive(channel, f"{SINE}{periods}", amplitude),)
     return Stage(name, length=length, drives=drives, along="time", **more)

@@ -1,4 +1,4 @@
-"""A protocol: stages one after the other, and what follows from their order."""
+"""Protocols: stages one after the other, and which of them write, read and come first."""
 
 import itertools
 from collections import Counter
@@ -17,12 +17,13 @@ class Protocol:
     """Stages one after the other.
 
     Args:
-        stages: stages, or tuples of them as the builders of `gmem_jax.experiment.protocols` give. A stage that does not
-            say where u is goes on from the one before, the first from u = 0. Of several that share a name the second
-            becomes NAME-2, and so on.
+        stages: stages, or tuples of them, as `gm.cycle` and `gm.train` return. A stage without `start` begins at the u
+            at which the one before ends; the first begins at u = 0. If several stages have one name, the second becomes
+            NAME-2, and so on.
 
     Raises:
-        ValueError: if there is none, the walls would jump from one to the next, or a waveform would not end at zero.
+        ValueError: if there is no stage, the walls would jump from one stage to the next, a waveform would not end at
+            zero, or a stage reads what was not written before.
     """
 
     stages: tuple[Stage, ...]
@@ -71,7 +72,7 @@ class Protocol:
 
     @property
     def bins(self) -> int:
-        """Bins of all stages."""
+        """Number of bins of all stages."""
         return sum(stage.bins for stage in self.stages)
 
     @property
@@ -81,7 +82,7 @@ class Protocol:
 
     @property
     def before_read(self) -> str:
-        """Name of the stage before the first that reads: how quiet the pack is at its end limits the reading."""
+        """Name of the stage before the first that reads. The grain speeds at its end are `Recall.residual_speed`."""
         return self.stages[max(0, self._place("read") - 1)].name
 
     @property
@@ -105,13 +106,13 @@ class Protocol:
 
     @property
     def phases(self) -> tuple[tuple[Stage, ...], tuple[Stage, ...]]:
-        """The stages before the first with a waveform, common to all replicas and run once; and those from it on."""
+        """The stages before the first with a waveform, which are run once for all replicas; and those from it on."""
         common = tuple(itertools.takewhile(lambda stage: not stage.drives, self.stages))
         return common, self.stages[len(common) :]
 
     @property
     def columns(self) -> Columns:
-        """The columns that its table of bins has."""
+        """The columns of its table of bins."""
         return columns_of(self.stages)
 
     @property
@@ -121,7 +122,7 @@ class Protocol:
         return tuple(channel for channel in CHANNELS if channel in written)
 
     def written(self, read: str) -> dict[str, Drive]:
-        """What a stage that reads is compared with: the drive that last wrote on each channel before it.
+        """The drives that a stage that reads is compared with, by channel: the last that wrote there before it.
 
         Raises:
             ValueError: if there is no stage of this name.
@@ -132,19 +133,23 @@ class Protocol:
         return {drive.channel: drive for stage in before for drive in stage.own}
 
     def with_sets(self, names: Iterable[str]) -> "Protocol":
-        """The same protocol for sets of waveforms of these names: drives that leave channel or set open say which.
+        """The same protocol with the channels and sets that drives leave open filled in, for sets with these names.
 
         Raises:
-            ValueError: if a drive names a set that there is not, or none of them is called like a channel.
+            ValueError: if a drive names a set that does not exist, or no set has the name of a channel.
         """
         names = tuple(names)
         return Protocol(replace(stage, drives=_named_drives(stage, names)) for stage in self.stages)
 
     def with_value(self, path: str, value: Any) -> "Protocol":
-        """The same protocol with another value of a stage's field, by a name like "store.length".
+        """The same protocol with another value of one field of a stage.
+
+        Args:
+            path: stage and field, like "store.length"; "amplitude" is that of all drives of the stage.
+            value: the new value.
 
         Raises:
-            ValueError: if there is no such stage or field, or it becomes no protocol.
+            ValueError: if there is no such stage or field, or the new protocol is impossible.
         """
         name, _, field = path.rpartition(".")
         known = [entry.name for entry in fields(Stage)]
@@ -160,15 +165,15 @@ class Protocol:
         return Protocol(replace(s, **{field: value}) if s.name == name else s for s in self.stages)
 
     def to_list(self) -> list[dict[str, Any]]:
-        """The stages as JSON has them, without what is left to its default."""
+        """The stages as dictionaries that JSON can hold, without fields that have their default."""
         return [_without_defaults(stage) for stage in self.stages]
 
     @classmethod
     def from_list(cls, stages: Iterable[Mapping[str, Any]]) -> "Protocol":
-        """The protocol of `to_list`.
+        """The protocol whose `to_list` this is.
 
         Raises:
-            ValueError: if a stage has other fields, two have one name, or they make no protocol.
+            ValueError: if a stage has unknown fields, two stages have one name, or they make no protocol.
         """
         try:
             made = [

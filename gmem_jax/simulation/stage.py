@@ -1,4 +1,4 @@
-"""A stage of a protocol as data, and the table of bins that stages make up."""
+"""Stages of a protocol as data, and the table of their bins."""
 
 import math
 from collections import Counter
@@ -72,14 +72,15 @@ class Drive:
     """A waveform on a channel.
 
     Attributes:
-        channel: one of `CHANNELS`; "" for the channel that is called like the waveforms.
-        waveform: the name of a set of waveforms, of which each replica has its own; "" for all sets that are called
-            like a channel. Or one for all replicas, the zero signal's too: its samples at k / (n + 1), k = 1..n, or
-            "sine:n", n whole periods.
-        amplitude: what it is multiplied with, beside gamma0.
+        channel: mode of strain, one of `CHANNELS`; "" for the channel that has the name of the set, or else "xy".
+        waveform: the name of a set of waveforms, one for each replica; "" for the set that has the name of the channel,
+            or else the first set, and without a channel for all sets that have the name of a channel. Or one waveform
+            for all replicas, that of the zero signal included: its samples at k / (n + 1), k = 1..n, or "sine:n",
+            n whole periods.
+        amplitude: factor on the waveform, beside gamma0.
 
     Raises:
-        ValueError: for an unknown channel, or what makes no waveform.
+        ValueError: for an unknown channel, or an impossible waveform.
     """
 
     channel: str = ""
@@ -114,13 +115,13 @@ class Drive:
 
     @property
     def periods(self) -> int:
-        """Of a sine; 0 of what is none."""
+        """Number of periods of a sine; 0 for other waveforms."""
         count = self.waveform.removeprefix(SINE) if isinstance(self.waveform, str) else ""
         return int(count) if count.isdecimal() else 0
 
     @property
     def lane(self) -> "Lane":
-        """What of it does not change from bin to bin."""
+        """Channel and waveform, without the amplitude."""
         return Lane(self.channel, self.waveform)
 
 
@@ -154,27 +155,28 @@ class Columns(NamedTuple):
 @static_record
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a protocol.
+    """One stage of a protocol. u goes linearly from `start` to `stop`.
 
     Attributes:
-        name: for people; nothing follows from it.
-        start: u at its beginning; None for where the stage before ends.
-        stop: u at its end; None for where it begins.
-        length: duration in units of t0.
-        role: what it is for.
+        name: key of its samples in `Recall.stages`, and the name by which `of` and sweeps refer to it.
+        start: u at its beginning; None for the u at which the stage before ends.
+        stop: u at its end; None for the u at which it begins.
+        length: duration, in t0.
+        role: "condition" strains the pack without a waveform of its own, "write" applies waveforms, "hold" waits, and
+            "read" measures the recall.
         drives: the waveforms that are applied.
-        along: what they are a function of; default u, or time where u stands still.
-        drag: viscous drag, 1 / t_c; default the experiment's where the walls stand still, else none.
-        friction: whether grains rub.
-        pressure: at which the walls of x, y, z are held by a servo, in E; None for walls that follow u. They stay where
-            the stage leaves them: what follows strains the box from there.
-        of: of a stage that reads, the stage whose waveforms its recall is compared with; default the last that wrote on
-            each channel.
+        along: what the waveforms are a function of, "u" or "time"; default u, or time if u stands still.
+        drag: viscous drag, in 1 / t_c; default the experiment's `hold_drag` if all walls stand still, else none.
+        friction: whether contacts have friction.
+        pressure: pressures in E at which a servo holds the walls of x, y and z; None in the place of one for walls that
+            follow u. Later stages strain the box from where the servo left it.
+        of: in a stage that reads, the name of the stage whose waveforms the recall is compared with; default the last
+            that wrote on each channel.
         mark: whether observers compare with the beginning of this stage (`gmem_jax.simulation.observables`).
-        recorded: whether its samples are kept.
+        recorded: whether its samples are kept in the recall.
 
     Raises:
-        ValueError: for what no stage can be.
+        ValueError: for an impossible stage.
     """
 
     name: str
@@ -238,12 +240,12 @@ class Stage:
 
     @property
     def bins(self) -> int:
-        """Length in bins of t0 / 256; a hold is rounded up to whole bins."""
+        """Length in bins of t0 / 256, rounded up to a whole number, at least 1."""
         return max(1, math.ceil(self.length * BINS - 1e-9))
 
     @property
     def ends(self) -> tuple[float, float]:
-        """u at its beginning and at its end, of a stage of a protocol."""
+        """u at its beginning and at its end, once the stage is part of a protocol."""
         return self.start or 0.0, self.stop or 0.0
 
     @property
@@ -262,12 +264,12 @@ class Stage:
         return tuple(drive for drive in self.drives if not drive.fixed)
 
     def rows(self, first: Any, count: int | None = None, columns: Columns | None = None) -> Bin:
-        """The bin of number `first`, or `count` bins from there on, as columns [count].
+        """One bin of the stage, or `count` bins as a table whose columns are [count].
 
         Args:
-            first: number of the bin, from 0.
-            count: how many; None for one bin, of numbers.
-            columns: which columns the table has; default those that this stage needs.
+            first: number of the first bin, from 0.
+            count: number of bins; None for one bin, whose entries are numbers.
+            columns: columns of the table; default those that this stage needs.
         """
         columns = columns_of((self,)) if columns is None else columns
         held = None if self.pressure is None else tuple(p or 0.0 for p in self.pressure)
