@@ -1,4 +1,4 @@
-"""A prepared pack: what the memory experiment starts from."""
+"""Prepared packs: grains at rest in their box, the start of every experiment."""
 
 import json
 from collections.abc import Sequence
@@ -24,23 +24,24 @@ from gmem_jax.simulation.strain import smallest_box
 @pytree
 @dataclass(frozen=True)
 class Pack:
-    """Grains at rest in their box at u = 0 (R = E = rho = 1).
+    """N grains at rest in their box at u = 0 (R = E = rho = 1).
 
     Attributes:
-        clump: the grain.
-        position: grain centres, [N, 3], in R.
-        quaternion: orientations, [N, 4].
-        lower: lower planes of the box, [3], in R.
-        upper: upper planes, [3].
-        delta0: areal compression the pack was cycled with.
-        ringing_period: T_1, period of the slowest shear mode of the box that wall motion excites, in t_c.
-        pairs: candidate contacts for a compression by delta0.
-        periodic: the periodic axes of the box; centres of grains are between its planes, and spheres may be beyond.
-        name: for logs and files.
-        record: JSON of the resolved configuration and of what was measured at the end of the preparation.
+        clump: the shape of the grains, and their sizes if they differ.
+        position: centres of mass of the grains, [N, 3], in R.
+        quaternion: body-to-lab rotations (w, x, y, z), [N, 4].
+        lower: coordinates of the lower planes of the box, [3], in R.
+        upper: those of the upper planes, [3], in R.
+        delta0: areal compression by which the pack was cycled.
+        ringing_period: T_1, the period of the slowest shear mode of the box that wall motion excites, in t_c.
+        pairs: neighbour list (candidate contacts) that serves a compression by delta0.
+        periodic: which axes of the box are periodic, three truth values. There the centres of grains lie between the
+            planes; their spheres may reach beyond.
+        name: a name for logs and files.
+        record: JSON of the recipe of the preparation and of what was measured at its end.
         source: the file it was read from, or the name of a shipped pack.
 
-    The last three are labels: they are no part of what a program is compiled for.
+    The last three are labels: programs are not compiled for them.
     """
 
     clump: Clump
@@ -63,7 +64,7 @@ class Pack:
 
     @property
     def box(self) -> Box:
-        """The walls at u = 0, one replica."""
+        """The box at u = 0, of one replica."""
         return still_box(self.lower[:, None], self.upper[:, None], self.periodic)
 
     @property
@@ -109,9 +110,15 @@ def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: 
 
 @usual_rules()
 def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: str = "") -> Pack:
-    """The same box and grain with other centres [N, 3] and orientations [N, 4], and their own neighbour list.
+    """A pack with the box and the grain of another, and other positions; its neighbour list is built anew.
 
-    Quaternions are brought to length 1. What was measured of the old ones at rest is no part of the record.
+    The record keeps no measurements of the old pack at rest.
+
+    Args:
+        pack: the pack whose box, grain, delta0 and ringing period are taken.
+        position: centres of mass, [N, 3], in R.
+        quaternion: body-to-lab rotations (w, x, y, z), [N, 4]; they are normalised.
+        name: name of the new pack; default that of the old one.
 
     Raises:
         ValueError: if a number is not finite, a quaternion is zero, or shapes and sizes are not those of one pack.
@@ -130,10 +137,13 @@ def pack_from(pack: Pack, *, position: jax.Array, quaternion: jax.Array, name: s
 
 @usual_rules()
 def stack(packs: Sequence[Pack]) -> Pack:
-    """Packs of one size and grain as one `Pack` with a leading axis on every array, for `jax.vmap`.
+    """Stack packs into one `Pack` whose arrays have a leading axis, for `jax.vmap`.
+
+    Args:
+        packs: packs with the same number of grains, shape of grain and boundary.
 
     Raises:
-        ValueError: if there is no pack, or the packs differ in size, in the grain, or in the boundary.
+        ValueError: if there is no pack, or they differ in one of these.
     """
     if isinstance(packs, Pack):
         raise ValueError(f"stack takes several packs, in a list: got {packs.name}")

@@ -26,19 +26,20 @@ LARGEST_RATIO = 10.0  # of the radii in a pack: around a large sphere cells hold
 @pytree
 @dataclass(frozen=True)
 class Clump:
-    """One kind of grain, in its principal frame with the centre of mass at the origin (R = rho = 1).
+    """A rigid grain of K spheres, in its principal frame with the centre of mass at the origin (R = rho = 1).
 
-    The grains of a pack may differ in size. Then all that is said here but `sizes` is of a grain of size 1.
+    `clump`, `tetra` and `sphere` make it. If the grains of a pack differ in size, all attributes but `sizes` are those
+    of a grain of size 1.
 
     Attributes:
-        offsets: sphere centres, [K, 3], in R.
-        mass: mass, equal to the volume of the union, in rho R^3.
-        inertia: principal moments, [3], in rho R^5.
-        diameter: outer diameter, of the sphere about its centre of mass that holds it, in R.
+        offsets: centres of the spheres, [K, 3], in R.
+        mass: mass, equal to the volume of the union of the spheres, in rho R^3.
+        inertia: principal moments of inertia, [3], in rho R^5.
+        diameter: diameter of the smallest sphere about the centre of mass that holds the grain, in R.
         isotropic: whether the three moments are equal, so that no gyroscopic term is needed.
         shape: a name for logs and files.
-        radii: of the spheres, [K], in R; None where all are 1.
-        sizes: of the grains of a pack, factors on all their lengths, [N]; None where all are 1.
+        radii: radii of the spheres, [K], in R; None if all are 1.
+        sizes: factors on all lengths of each grain of a pack, [N]; None if all are 1.
     """
 
     offsets: jax.Array
@@ -62,7 +63,7 @@ class Clump:
 
     @property
     def masses(self) -> jax.Array:
-        """Mass of the grains, as of `scaled`, in rho R^3."""
+        """Mass of each grain, in rho R^3; shaped as by `scaled`."""
         return self.scaled(self.mass, 3)
 
     @property
@@ -77,20 +78,23 @@ class Clump:
 
     @property
     def widest(self) -> Scalar:
-        """Diameter of the largest sphere, at which the last spheres touch, in R."""
+        """Diameter of the largest sphere, in R: two spheres whose centres are further apart cannot touch."""
         return 2.0 * self.largest if self.radii is None else 2.0 * self.largest * jnp.max(self.radii)
 
     def scaled(self, value: jax.Array, power: int) -> jax.Array:
-        """What goes with a power of the size of a grain: of all grains, [N, 1, 1]; or the value where all are alike.
+        """A quantity of each grain that grows with a power of its size.
 
         Args:
-            value: of a grain of size 1; scalar, [B] or [3, B].
-            power: of the size.
+            value: the quantity for a grain of size 1; scalar, [B] or [3, B].
+            power: the power.
+
+        Returns:
+            The quantity with an axis of grains, [N, ...], or `value` itself if all grains have size 1.
         """
         return value if self.sizes is None else value * self.sizes[:, None, None] ** power
 
     def sphere_radii(self, spheres: int) -> jax.Array | None:
-        """Radii of the S = N K spheres of a pack, [S], in R; None where all are 1."""
+        """Radii of all `spheres` = N K spheres of a pack, [N K], in R; None if all are 1."""
         if self.equal:
             return None
         own = jnp.ones(self.spheres) if self.radii is None else self.radii
@@ -98,7 +102,7 @@ class Clump:
         return (sizes[:, None] * own).reshape(-1)
 
     def volume(self, grains: int) -> jax.Array:
-        """Volume of all N grains of a pack, in R^3; scalar or [B]."""
+        """Volume of all `grains` of a pack together, in R^3; scalar or [B]."""
         return grains * self.mass if self.sizes is None else jnp.sum(self.sizes**3) * self.mass
 
 
@@ -160,16 +164,17 @@ def clump(
 ) -> Clump:
     """A rigid grain of spheres centred at `offsets`.
 
-    Mass properties are those of the solid union, to about 1e-5; the offsets are moved to the centre of mass and
-    turned to the principal axes.
+    Mass and inertia are those of the solid union of the spheres, to about 1e-5. The offsets are shifted to the centre
+    of mass and rotated to the principal axes.
 
     Args:
-        offsets: sphere centres, [K, 3], in R, in any frame.
+        offsets: centres of the spheres, [K, 3], in R, in any frame.
         shape: a name for logs and files.
-        radii: of the spheres, [K], in R; default 1.
+        radii: radii of the spheres, [K], in R; default all 1.
 
     Raises:
-        ValueError: if `offsets` is not a finite [K, 3] array with K >= 1, or the radii are none of `require_radii`.
+        ValueError: if `offsets` is not a finite [K, 3] array with K >= 1, a radius is outside [0.1, 10], or the largest
+            is more than 10 times the smallest.
     """
     if not is_real(offsets):
         raise ValueError(f"clump offsets must be numbers, [K, 3], got {said(offsets)}")
@@ -235,16 +240,17 @@ def require_radii(radii: np.ndarray) -> None:
 
 @usual_rules()
 def sized(clump: Clump, sizes: Sequence[float] | np.ndarray | jax.Array) -> Clump:
-    """The grain of a pack whose grains have sizes of their own.
+    """A grain for a pack whose grains differ in size, as by `gm.lognormal` or `gm.mixture`.
 
-    Lengths go with the size, mass with its cube and moments of inertia with its fifth power.
+    Lengths grow with the size, mass with its cube and moments of inertia with its fifth power.
 
     Args:
-        clump: a grain of size 1.
+        clump: the grain of size 1.
         sizes: factors on all lengths of each grain, [N]; may be traced.
 
     Raises:
-        ValueError: if they are no positive numbers, or their spheres none of `require_radii`.
+        ValueError: if they are no positive numbers, the radius of a sphere is outside [0.1, 10], or the largest radius
+            is more than 10 times the smallest.
     """
     if traced(clump, sizes):
         return replace(clump, sizes=jnp.asarray(sizes))

@@ -1,7 +1,7 @@
-"""The material of the grains, and the step between SI and simulation units.
+"""The material of the grains, and the conversion between SI and simulation units.
 
-Everything downstream works in units where the sphere radius R, Young's modulus E and density rho are one, so
-that time is measured in t_c = R sqrt(rho / E), pressure in E, force in E R^2 and stiffness in E R.
+Everything else works in units where the sphere radius R, Young's modulus E and density rho are one: time is in
+t_c = R sqrt(rho / E), pressure in E, force in E R^2 and stiffness in E R.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,10 @@ from gmem_jax.physics.pytree import Scalar, parameter, pytree, validate
 @pytree
 @dataclass(frozen=True)
 class Material:
-    """An elastic solid: what the spheres of all grains and their contacts are made of.
+    """The elastic solid of all spheres, which sets units and normal contact forces.
 
-    The defaults are the paper's (Sec. II). Friction laws have stiffness and damping of their own, which do not follow.
+    The defaults are the paper's (Sec. II). The stiffness and damping of friction laws do not follow from it: they are
+    parameters of the law.
 
     Attributes:
         radius: sphere radius R, in m.
@@ -22,8 +23,8 @@ class Material:
         density: mass density rho, in kg/m^3.
         poisson: Poisson's ratio nu.
         normal_damping: ratio gamma_n / k_n of the Hertz contact, in t_c.
-        wall_rigidity: stiffness of a wall contact over that with a rigid plane; 1/2 for walls as soft as the grains.
-            Through softer ones than 0.1 grains get out.
+        wall_rigidity: stiffness of a contact with a wall over that with a rigid plane, at least 0.1 (grains pass softer
+            walls); 1/2 for walls as soft as the grains.
 
     Raises:
         ValueError: if a value is outside its physical range.
@@ -49,32 +50,32 @@ class Material:
 
     @property
     def plane_stiffness(self) -> Scalar:
-        """Of a sphere on a rigid plane, f = k p^1.5 (Hertz; effective radius R), in E R^0.5."""
+        """Stiffness k of a sphere on a rigid plane, f = k p^1.5 (Hertz; effective radius R), in E R^0.5."""
         stiffness: Scalar = (4.0 / 3.0) / ((1.0 - self.poisson) * (1.0 + self.poisson))
         return stiffness
 
     @property
     def wall_stiffness(self) -> Scalar:
-        """k_w of a sphere on a wall, f = k_w p^1.5, in E R^0.5."""
+        """Stiffness k_w of a sphere on a wall, f = k_w p^1.5, in E R^0.5."""
         stiffness: Scalar = self.wall_rigidity * self.plane_stiffness
         return stiffness
 
     @property
     def normal_stiffness(self) -> Scalar:
-        """k_n of two equal spheres, f = k_n p^1.5 (Hertz; effective radius R/2, two compliant bodies)."""
+        """Stiffness k_n of two spheres of radius R, f = k_n p^1.5 (Hertz; both compliant), in E R^0.5."""
         stiffness: Scalar = self.plane_stiffness * 2.0**-1.5
         return stiffness
 
     @property
     def mindlin_stiffness(self) -> Scalar:
-        """k_M of the Mindlin laws, df = k_M p^0.5 dsigma."""
+        """Tangential stiffness k_M of the Mindlin laws, df = k_M p^0.5 dsigma, in E R^0.5."""
         stiffness: Scalar = 3.0 * self.normal_stiffness * (1.0 - self.poisson) / (2.0 - self.poisson)
         return stiffness
 
     def pascal(self, pressure: Scalar) -> Scalar:
-        """A simulation pressure (in E) in Pa."""
+        """A pressure in E, converted to Pa."""
         return pressure * self.modulus
 
     def seconds(self, time: Scalar) -> Scalar:
-        """A simulation time (in t_c) in s."""
+        """A time in t_c, converted to s."""
         return time * self.time_unit

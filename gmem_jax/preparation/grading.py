@@ -1,7 +1,7 @@
-"""Sizes of the grains of a pack: a lognormal distribution, or a mixture of some sizes.
+"""Sizes of the grains of a pack: a lognormal distribution, or a mixture of a few sizes.
 
-How many grains have which size is that of the distribution; only which of them has it is left to chance. So a small
-pack has the spread that was asked for, too.
+The sizes follow the distribution exactly; chance decides only which grain has which size. So a small pack has the
+spread that was asked for, too.
 """
 
 import math
@@ -22,14 +22,15 @@ _STREAM = 4  # of the random numbers of a seed: the first three are those of the
 
 @usual_rules()
 def lognormal(grains: int, spread: float, *, seed: int = 0) -> np.ndarray:
-    """Sizes of a lognormal distribution whose mean is 1, cut at 3 standard deviations of ln(size), [N].
-
-    They are its quantiles, in random order.
+    """Sizes of grains with a lognormal distribution whose mean is 1, cut at 3 standard deviations of ln(size).
 
     Args:
         grains: number of grains N.
-        spread: standard deviation of the sizes over their mean, before the cut, which takes some 2 % off it.
-        seed: of the order.
+        spread: standard deviation of the sizes over their mean, before the cut, which lowers it by some 2 %.
+        seed: random seed of the order of the sizes.
+
+    Returns:
+        Quantiles of the distribution in random order, [N].
 
     Raises:
         ValueError: if the spread is not in [0, 0.35], or there are no grains.
@@ -46,13 +47,16 @@ def lognormal(grains: int, spread: float, *, seed: int = 0) -> np.ndarray:
 
 @usual_rules()
 def mixture(grains: int, sizes: Sequence[float], shares: Sequence[float] | None = None, *, seed: int = 0) -> np.ndarray:
-    """Sizes of a mixture, as of a bidisperse pack, in random order, [N].
+    """Sizes of grains that are a mixture of a few sizes, as in a bidisperse pack.
 
     Args:
         grains: number of grains N.
-        sizes: that there are.
-        shares: part of all grains that has each of them; default equal parts.
-        seed: of the order.
+        sizes: the sizes of the mixture.
+        shares: fraction of all grains that has each of these sizes; default equal fractions.
+        seed: random seed of the order of the sizes.
+
+    Returns:
+        The sizes in random order, [N].
 
     Raises:
         ValueError: if sizes or shares are no positive numbers, the shares do not sum to 1 or are not as many as the

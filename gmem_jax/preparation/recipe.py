@@ -1,4 +1,4 @@
-"""The numbers of a preparation, where its grains begin, and what it will cost."""
+"""The parameters of a preparation, the lattice on which its grains begin, and what it will cost."""
 
 import math
 import operator
@@ -31,38 +31,40 @@ BIN_OVERHEAD = 4000.0  # and that a bin of a cycle costs beside its steps
 
 @dataclass(frozen=True)
 class Recipe:
-    """The numbers of a preparation; what the paper leaves open is a field here (docs/physics.md, "Preparation").
+    """The parameters of a preparation, including all that the paper leaves open (docs/physics.md, "Preparation").
 
-    Each field knows its meaning, interval and unit (`dataclasses.fields`): `gmem prepare --help` shows them.
+    `gmem prepare --help` shows meaning, interval and unit of each field, which are in its metadata.
 
     Attributes:
         grains: number of grains N.
-        seed: of orientations, velocities and spins.
+        seed: random seed of orientations, velocities and spins.
         delta0: areal compression of the cycles.
         t0: duration of one compression, in t_c.
         dt: largest time step, in t_c.
-        filling: of the lattice the gas starts from; less where grains are so long that they would not turn freely.
+        filling: packing fraction of the lattice that the gas starts from; less for grains so long that they could not
+            turn freely.
         gas_speed: rms of each grain's initial velocity, and of its spin times R, in R / t_c.
         gas_time: duration of the gas, in t_c.
-        pressure: p_z, in E, under which the piston is fixed; the cycles change it. Law H has one stiffness for all
-            overlaps: at another pressure give it k_H = k_M <sqrt(p)> over the contacts (docs/physics.md).
-        piston_speed: largest speed of the +z wall, in R / t_c.
-        piston_gain: its speed per relative pressure error, in R / t_c.
+        pressure: p_z, in E, at which the piston (the +z wall) is fixed; the cycles change it. Law H has one stiffness
+            for all overlaps: at another pressure give it k_H = k_M <sqrt(p)> over the contacts (docs/physics.md).
+        piston_speed: largest speed of the piston, in R / t_c.
+        piston_gain: speed of the piston per relative error of the pressure, in R / t_c.
         cycles: number of compress/decompress cycles.
-        rest: rests at u = 0, in t0.
-        hold: hold at u = 1, in t0.
-        drag: viscous drag once the piston has met its pressure, and whenever the walls stand still, 1 / t_c. More of it
-            comes to rest later: soft frictionless modes are then overdamped.
+        rest: length of the rests at u = 0, in t0.
+        hold: length of the holds at u = 1, in t0.
+        drag: viscous drag while the piston settles at its pressure, and whenever the walls stand still, in 1 / t_c. A
+            larger drag takes longer to bring the pack to rest: it overdamps soft frictionless modes.
         settled_speed: largest grain speed at which the piston is fixed, in R / t_c.
         quiet: largest grain speed of the finished pack, in R / t_c.
         pressure_error: relative error of p_z at which the piston is fixed.
-        patience: longest time spent on coming to rest, in t_c; four times what 100,450 grains should need (`SETTLING`).
-        size_spread: standard deviation of the sizes of grains over their mean, which is 1; see `grading.lognormal`.
-        sizes: of the grains of a mixture, as in "1,1.4" or (1.0, 1.4), instead of a spread; see `grading.mixture`.
-        shares: part of the grains that has each of these sizes, as in "0.5,0.5"; default equal parts.
-        gravity: its acceleration along -z, from the gas on, in R / t_c^2; that of an experiment is its own.
+        patience: longest time spent on coming to rest, in t_c; the default is four times what 100,450 grains should
+            need.
+        size_spread: standard deviation of the sizes of grains over their mean, which is 1; see `gm.lognormal`.
+        sizes: sizes of the grains of a mixture, as in "1,1.4" or (1.0, 1.4), instead of a spread; see `gm.mixture`.
+        shares: fraction of the grains that has each of these sizes, as in "0.5,0.5"; default equal fractions.
+        gravity: acceleration of gravity along -z in all of the preparation, in R / t_c^2. An experiment has its own.
         boundary: "walls", "periodic", or one for each axis, as in "periodic,periodic,walls". A periodic box is
-            compressed as one between walls is, and its grains are carried along.
+            compressed like one between walls, and its grains are displaced with it.
     """
 
     grains: int = parameter(325, "[12, inf)", "Number of grains N")
@@ -121,10 +123,10 @@ class Recipe:
         self.drawn_sizes()
 
     def drawn_sizes(self) -> np.ndarray | None:
-        """Sizes of the grains, [N]; None where all are alike.
+        """Sizes of the grains, [N]; None if all have size 1.
 
         Raises:
-            ValueError: if the recipe asks for impossible ones.
+            ValueError: if the recipe asks for impossible sizes.
         """
         if self.sizes:
             shares = _listed("shares", self.shares)
