@@ -1,4 +1,4 @@
-"""Every exception of the package that a caller may want to catch, and how it warns."""
+"""The exceptions of the package, and its way to warn."""
 
 import contextlib
 import os
@@ -10,15 +10,15 @@ _PASSED_OVER = (f"{Path(__file__).parent}{os.sep}", contextlib.__file__)
 
 
 class RunFailedError(RuntimeError):
-    """A run whose numbers are meaningless: a grain escaped, a number overflowed, an overlap left the law's range."""
+    """A run failed and its results are meaningless: a grain escaped, a number overflowed, ... (see `Status`)."""
 
 
 class NotAtRestError(RunFailedError):
-    """A pack that did not come to rest in the time allowed; with more patience its preparation goes on."""
+    """A pack did not come to rest within the `patience` of its recipe."""
 
 
 class FileFormatError(ValueError):
-    """A file that is damaged, or is not what it should be."""
+    """A file is damaged, or does not hold what it should."""
 
 
 def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:

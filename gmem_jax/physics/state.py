@@ -1,4 +1,4 @@
-"""What evolves in time: grains, walls, contact histories; and the sticky status bits that guard a run.
+"""The state of a run: grains, walls and contact histories; and the status bits that say what went wrong.
 
 Replicas (B runs of one pack that differ in waveform or parameters) are always the last axis of an array.
 """
@@ -17,7 +17,11 @@ from gmem_jax.physics.pytree import pytree, static
 
 
 class Status(enum.IntFlag):
-    """Reasons to distrust a run. Bits are sticky and per replica; 0 is a clean run."""
+    """Reasons to distrust a run, as bits of an integer; 0 is a clean run.
+
+    Each replica has its own status, and a bit that is set once stays set. `explain` says what bits mean and what helps;
+    docs/trust.md gives the reasons.
+    """
 
     STALE_PAIRS = 1
     OUTSIDE_BOX = 2
@@ -40,7 +44,7 @@ class Status(enum.IntFlag):
 
     @property
     def fatal(self) -> bool:
-        """Whether the numbers of the run are meaningless, and not only doubtful."""
+        """Whether the results of the run are meaningless, not only doubtful: whether any bit but warnings is set."""
         return bool(self & ~WARNINGS)
 
 
@@ -89,7 +93,11 @@ def combined_status(status: npt.ArrayLike) -> int:
 
 
 def explain(status: npt.ArrayLike) -> str:
-    """The bits of `status` as one readable line ("ok" when none is set): of one replica, or of several together."""
+    """The meaning of status bits, and what helps, in one line; "ok" if no bit is set.
+
+    Args:
+        status: the status of one replica, or of several, whose bits are joined.
+    """
     bits = combined_status(status)
     return "; ".join(text for bit, text in SENTENCES.items() if bits & bit) or "ok"
 

@@ -1,10 +1,10 @@
-"""Friction laws: tangential force from the sliding history of a contact, limited by Coulomb friction.
+"""The interface of friction laws, and the Coulomb limit that they share.
 
-A law is a frozen pytree of parameters with two methods, `init` and `__call__`, and nothing else; a user's law is
-one such class. `coulomb` and `kinematics.transport` are the shared pieces.
+A law is a frozen pytree of parameters with two methods, `init` and `__call__`. It computes the tangential force of a
+contact from its sliding history; a user's own law is one such class. `coulomb` and `kinematics.transport` are shared.
 
-A law is called once in a step, with positions at its end and velocities of its middle: the sliding of the step is
-`kin.sliding` times `kin.dt`.
+A law is called once in a step, with the positions at its end and the velocities of its middle: the tangential
+displacement in the step is `kin.sliding` times `kin.dt`.
 """
 
 from dataclasses import dataclass
@@ -37,16 +37,28 @@ class SpringLaw:
 
 @runtime_checkable
 class FrictionLaw(Protocol):
-    """What the simulator asks of a friction law."""
+    """The interface of a friction law: a frozen pytree of parameters with these two methods."""
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> Any:
-        """The history of `contacts` untouched contacts: a pytree with leaves [contacts, ..., replicas]."""
+        """The history of contacts that have not touched: a pytree with leaves [contacts, ..., replicas].
+
+        Args:
+            contacts: number of candidate contacts P.
+            replicas: number of replicas B.
+            dtype: floating-point type of the history.
+        """
         ...
 
     def __call__(self, kin: Kinematics, normal_force: jax.Array, history: Any) -> tuple[jax.Array, Any]:
-        """Tangential force on sphere i, [P, 3, B] (on j its opposite), and the new history.
+        """One step of the law. Where `kin.touching` is False, force and history must be 0 and what `init` returns.
 
-        Both must be exactly zero (the history as `init` gives it) where `kin.touching` is False.
+        Args:
+            kin: geometry and motion of the P candidate contacts.
+            normal_force: f_n, [P, 1, B], in E R^2.
+            history: the history after the step before.
+
+        Returns:
+            The tangential force on sphere i, [P, 3, B], in E R^2 (that on j is its opposite), and the new history.
         """
         ...
 
@@ -63,11 +75,11 @@ class CoulombLaw(Protocol):
 
 @runtime_checkable
 class RangedLaw(Protocol):
-    """A law that is valid up to some overlap only, and says so."""
+    """A friction law that is valid only up to some overlap; a run that exceeds it has failed."""
 
     @property
     def largest_overlap(self) -> Scalar:
-        """Largest overlap the law can represent; scalar or [B], in R."""
+        """The largest valid overlap, in R; scalar or [B]."""
         ...
 
 
@@ -77,10 +89,14 @@ def largest_overlap(law: FrictionLaw) -> Scalar:
 
 
 def coulomb(trial: jax.Array, limit: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Scale tangential forces [P, 3, B] back to the friction limit [P, 1, B] where they exceed it.
+    """Limit tangential forces by Coulomb friction.
+
+    Args:
+        trial: forces without the limit, [P, 3, B].
+        limit: mu f_n, [P, 1, B], in the unit of the forces.
 
     Returns:
-        The limited force, and whether the contact slides, [P, 1, B].
+        The forces, scaled back to the limit where they exceed it, [P, 3, B]; and whether the contact slides, [P, 1, B].
     """
     square = dot(trial, trial)
     slides = square > limit * limit

@@ -13,10 +13,10 @@ from gmem_jax.physics.pytree import pytree
 @pytree
 @dataclass(frozen=True)
 class Frictionless:
-    """mu = 0 (paper, Sec. II: the pack is prepared without friction)."""
+    """No friction, mu = 0: the law under which packs are prepared (paper, Sec. II)."""
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> tuple[()]:
-        """Nothing to remember."""
+        """The empty history."""
         return ()
 
     def __call__(self, kin: Kinematics, normal_force: jax.Array, history: tuple[()]) -> tuple[jax.Array, tuple[()]]:

@@ -14,9 +14,10 @@ from gmem_jax.physics.pytree import pytree
 @pytree
 @dataclass(frozen=True)
 class Hooke(SpringLaw):
-    """df_e = k dsigma, f_d = damping_time k dsigma/dt, |f_e + f_d| <= mu f_n (paper, Sec. II).
+    """Law H: df_e = k dsigma, f_d = damping_time k dsigma/dt, |f_e + f_d| <= mu f_n (paper, Sec. II).
 
-    The stiffness is one for all contacts, whatever the radii of the spheres.
+    sigma is the tangential displacement of a contact, f_e and f_d are its elastic and damping force. All contacts have
+    the same stiffness k, whatever the radii of the spheres.
 
     Attributes:
         mu: friction coefficient; scalar or [B].
@@ -24,12 +25,12 @@ class Hooke(SpringLaw):
             Mindlin law: k_M <sqrt(p)> is 0.10 to 0.145 over the compression. The default is calibrated within
             these, on packs of 10,240 (docs/decisions/physics.md).
         damping_time: gamma_H / k_H in t_c; scalar or [B].
-        spinning: 1 where the history turns with a contact about its normal, 0 where it does not (as in LAMMPS, which
-            only tumbles it); scalar or [B].
+        spinning: 1 if the history turns with the contact about its normal; 0 if it is only kept in the tangent plane,
+            as in LAMMPS; scalar or [B].
     """
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> jax.Array:
-        """No elastic force yet: zeros, [contacts, 3, replicas]."""
+        """The history of contacts that do not touch: elastic force zero, [contacts, 3, replicas]."""
         return jnp.zeros((contacts, 3, replicas), dtype)
 
     def relaxed(self, history: jax.Array, factor: jax.Array) -> jax.Array:

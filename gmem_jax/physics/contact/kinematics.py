@@ -1,4 +1,4 @@
-"""The geometry and motion of sphere-sphere contacts, computed once for every law."""
+"""The geometry and motion of sphere-sphere contacts, computed once for all laws."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -27,23 +27,24 @@ class Unequal(NamedTuple):
 @pytree
 @dataclass(frozen=True)
 class Kinematics:
-    """Relative position and motion at P candidate contacts; [P, 3, B] vectors, [P, 1, B] scalars.
+    """Relative position and motion at P candidate contacts; vectors are [P, 3, B], scalars [P, 1, B].
 
-    The contact point is at x_i + n (R_i - p/2); "relative" means surface j minus surface i there.
-    `gmem_jax.physics.contact.wall.wall_kinematics` says what they are at walls.
+    The contact point is at x_i + n (R_i - p/2). Relative velocities are those of surface j minus surface i there. For
+    contacts with walls see `gmem_jax.physics.contact.wall.wall_kinematics`.
 
     Attributes:
         normal: unit vector n from sphere i to sphere j.
-        overlap: p = R_i + R_j - r_ij; negative where the spheres are apart.
-        safe_overlap: the overlap where they touch and 1 elsewhere, so that roots and their derivatives stay finite.
+        overlap: p = R_i + R_j - r_ij, in R; negative if the spheres are apart.
+        safe_overlap: the overlap where the spheres touch and 1 elsewhere, so that roots and their derivatives stay
+            finite.
         touching: whether p > 0.
-        closing: dp/dt.
-        sliding: tangential relative velocity.
-        twist: half the sum of the two spins along n, the rate at which the contact itself turns about n.
-        arm: R_i - p/2.
-        dt: the time step, scalar or [B].
-        other_arm: R_j - p/2; None where all radii are 1, so that it is `arm`.
-        radius: harmonic mean of the two radii, 2 R_i R_j / (R_i + R_j), [P, 1, 1]; None where all are 1.
+        closing: dp/dt, in R / t_c.
+        sliding: tangential relative velocity, in R / t_c.
+        twist: half the sum of the two spins along n: the rate at which the contact turns about n, in 1 / t_c.
+        arm: distance of the contact point from the centre of sphere i, R_i - p/2, in R.
+        dt: the time step, in t_c; scalar or [B].
+        other_arm: the same for sphere j, R_j - p/2; None if all radii are 1, since it is then `arm`.
+        radius: harmonic mean of the two radii, 2 R_i R_j / (R_i + R_j), [P, 1, 1], in R; None if all radii are 1.
     """
 
     normal: jax.Array
@@ -60,9 +61,10 @@ class Kinematics:
 
     @property
     def root(self) -> jax.Array:
-        """sqrt(radius p), to which the stiffness of a Mindlin contact is proportional, where they touch; [P, 1, B].
+        """sqrt(radius p), [P, 1, B]: the stiffness of a Mindlin contact is proportional to it.
 
-        It is the radius of the contact area times sqrt(2): sqrt(p) between spheres of radius 1.
+        It is the radius of the contact area times sqrt(2), and sqrt(p) between spheres of radius 1. Where the spheres
+        do not touch, `safe_overlap` stands for p.
         """
         return jnp.sqrt(self.safe_overlap if self.radius is None else self.radius * self.safe_overlap)
 
@@ -119,10 +121,15 @@ def kinematics(
 
 
 def transport(force: jax.Array, kin: Kinematics, spinning: Scalar = 1.0) -> jax.Array:
-    """Carry a tangential force [P, 3, B] along with its contact through one step.
+    """Carry a tangential force along with its contact through one step.
 
-    Tumbling: project on the new tangent plane and restore the magnitude. Spinning: turn about n by twist * dt
-    (Cayley map, right to third order in the angle of one step), times `spinning`: 1, or 0 to leave it out.
+    Tumbling: the force is projected on the new tangent plane, and its magnitude restored. Spinning: it is turned about
+    n by spinning * twist * dt (Cayley map, right to third order in the angle of one step).
+
+    Args:
+        force: the force of the step before, [P, 3, B].
+        kin: geometry and motion of the contacts now.
+        spinning: 1, or 0 to leave out the turn about n; scalar or [B].
     """
     flat = force - dot(force, kin.normal) * kin.normal
     before, after = dot(force, force), dot(flat, flat)

@@ -42,25 +42,26 @@ def any_tangent(normal: jax.Array) -> jax.Array:
 @pytree
 @dataclass(frozen=True)
 class Mindlin(SpringLaw):
-    """f_e is the integral of f(q) over 0 < q < sqrt(p), where df = k dsigma; f beyond is forgotten (App. D.2).
+    """Law M2: f_e is the integral of f(q) over 0 < q < sqrt(p), where df = k dsigma (paper, App. D.2).
 
-    f(q) is the elastic force per unit of q in the ring of contact area that was attached when sqrt(p) passed q. It is
-    kept on Q points a spacing dq = sqrt(p_max) / (Q - 1) apart: with x = sqrt(p) / dq and the outermost ring
-    jp = floor(x), f_e = dq sum_j w_j f_j over j <= jp. The dashpot is f_d = damping_time k p^0.5 dsigma/dt, and
-    |f_e + f_d| <= mu f_n; a sliding contact gives up the same f in all its rings. These turn with the contact alike:
-    what is kept of f_j are its components in a frame that does.
+    p is the overlap and sigma the tangential displacement. f(q) is the elastic force per unit of q in the ring of the
+    contact area that was attached when sqrt(p) passed q; rings beyond sqrt(p) are detached, and their f is lost. f is
+    kept at Q points, dq = sqrt(p_max) / (Q - 1) apart: with x = sqrt(p) / dq and the outermost ring jp = floor(x),
+    f_e = dq sum_j w_j f_j over j <= jp. The dashpot is f_d = damping_time k p^0.5 dsigma/dt, and |f_e + f_d| <= mu f_n.
+    A sliding contact loses the same amount of f in all its rings. All rings turn with the contact: f_j is kept as its
+    components in a frame that turns.
 
-    Between spheres of other radii than 1, q runs to sqrt(r p), where r is their harmonic mean: in all contacts it is
-    the radius of the contact area times sqrt(2). The points of a contact are sqrt(r) dq apart, so that they reach to
-    the overlap p_max everywhere, and x is as above.
+    Between spheres of radii other than 1, q runs to sqrt(r p), where r is their harmonic mean; q is then, in every
+    contact, the radius of the contact area times sqrt(2). The points are sqrt(r) dq apart, so that they reach to the
+    overlap p_max in every contact, and x is as above.
 
-    The variants differ in the outermost ring, which the contact fills in part only:
+    The variants differ in the outermost ring, which the contact fills only in part:
 
-    - "averaged": w_j = 1 and w_jp = x - jp, so that the stiffness dq sum w_j is sqrt(p) to the last digit. While the
-      ring fills, its f_jp is diluted: the force in it stays. So no path whatever can extract energy, and f_e is in
-      error by what is in one ring, or by dq^2.
-    - "exact": the same weights without the dilution. Filling the ring adds force that nobody put in, so that f_e is
-      in error by dq, and a cycle of p within one ring can create energy.
+    - "averaged": w_j = 1 and w_jp = x - jp, so that the stiffness dq sum w_j is exactly sqrt(p). While the ring fills,
+      f_jp is diluted so that its force w_jp f_jp is constant. So no path can extract energy, and f_e is in error by the
+      force in one ring, or by dq^2.
+    - "exact": the same weights without the dilution. Filling the ring then adds a spurious force: f_e is in error by
+      dq, and a cycle of p within one ring can create energy.
     - "paper": as "exact", but w_0 less by 1/2, the weights of App. D.2. The stiffness sqrt(p) - dq/2 would be
       negative below x = 1/2; there this variant has no spring at all.
 
@@ -69,9 +70,9 @@ class Mindlin(SpringLaw):
         stiffness: k_M in E R^0.5, by default that of the default material; scalar or [B].
         damping_time: gamma_M / k_M in t_c; scalar or [B].
         spinning: see `gmem_jax.physics.contact.hooke.Hooke`.
-        p_max: largest overlap that the points cover, in R. Packs of the paper reach 0.16 at u = 1. Beyond it the
-            outermost ring is extrapolated, and the run has failed (`Status.OVERLAP_RANGE`).
-        points: Q, 2 to 10,000.
+        p_max: largest overlap that the points cover, in R. The paper's packs reach 0.16 at u = 1. A larger overlap
+            makes the run fail (`Status.OVERLAP_RANGE`).
+        points: number Q of points, 2 to 10,000.
         variant: "averaged", "exact" or "paper".
 
     Raises:
@@ -102,7 +103,7 @@ class Mindlin(SpringLaw):
         return jnp.sqrt(jnp.asarray(self.p_max)) / (self.points - 1)
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> LayeredHistory:
-        """Nothing attached yet."""
+        """The history of contacts that do not touch: no ring is attached."""
         return LayeredHistory(
             jnp.zeros((contacts, self.points, 2, replicas), dtype),
             jnp.zeros((contacts, 3, replicas), dtype),
@@ -118,7 +119,7 @@ class Mindlin(SpringLaw):
         return jnp.minimum(jnp.floor(x), self.points - 2)
 
     def weights(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """How each point counts in the force of a contact that reaches to x = sqrt(p) / dq > 0.
+        """The weights w_j of the points in the force of a contact with x = sqrt(p) / dq > 0.
 
         Args:
             x: [P, 1, B].

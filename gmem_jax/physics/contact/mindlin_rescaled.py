@@ -29,10 +29,11 @@ class RescaledHistory:
 @pytree
 @dataclass(frozen=True)
 class MindlinRescaled(SpringLaw):
-    """f_e *= sqrt(p / p_old) on unloading, then df_e = k p^0.5 dsigma, f_d = damping_time k p^0.5 dsigma/dt (Sec. II).
+    """Law M1: df_e = k p^0.5 dsigma, f_d = damping_time k p^0.5 dsigma/dt, |f_e + f_d| <= mu f_n (paper, Sec. II).
 
-    The Coulomb limit |f_e + f_d| <= mu f_n applies as in the other laws. Between spheres of other radii than 1, k is
-    times the root of their harmonic mean.
+    p is the overlap and sigma the tangential displacement. When the overlap decreases from p_old to p, f_e is first
+    multiplied by sqrt(p / p_old). Between spheres of radii other than 1, k is multiplied by the square root of their
+    harmonic mean.
 
     Attributes:
         mu: friction coefficient; scalar or [B].
@@ -44,7 +45,7 @@ class MindlinRescaled(SpringLaw):
     stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)", "k_M", "E R^0.5")
 
     def init(self, contacts: int, replicas: int, dtype: Any) -> RescaledHistory:
-        """No elastic force and no overlap yet."""
+        """The history of contacts that do not touch: elastic force and overlap zero."""
         return RescaledHistory(jnp.zeros((contacts, 3, replicas), dtype), jnp.zeros((contacts, 1, replicas), dtype))
 
     def relaxed(self, history: RescaledHistory, factor: jax.Array) -> RescaledHistory:

@@ -1,4 +1,4 @@
-"""One contact led along a prescribed path of overlap and tangential displacement, through a friction law alone."""
+"""One contact under a friction law, led along a prescribed path of overlap and tangential displacement."""
 
 from typing import Any
 
@@ -71,16 +71,16 @@ def contact_path(
     *,
     dt: Scalar = 1e6,
 ) -> jax.Array:
-    """Quasi-static tangential force along a path (p, sigma) given by its points; the corners may be sharp.
+    """Quasi-static tangential force of one contact along a path (p, sigma) of T points; it may have sharp corners.
 
-    The displacement between two points happens halfway between them, at their mean overlap, and the force is read at
-    rest at each point. The error falls with the square of the spacing of the points.
+    The displacement between two points happens at their mean overlap, and the force is read at rest at each point. The
+    error falls with the square of the spacing of the points.
 
     Args:
         law: the friction law.
-        overlap: p, [T], in R; the contact is made at the first positive one.
+        overlap: p, [T], in R; the contact begins at the first positive one.
         displacement: sigma, [T], in R.
-        dt: time between two points, in t_c; the default is slow enough to leave dashpots out of the Coulomb limit.
+        dt: time between two points, in t_c; the default is so slow that dashpots do not matter.
 
     Returns:
         The force along the displacement, [T], in E R^2.
