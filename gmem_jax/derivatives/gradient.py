@@ -1,9 +1,9 @@
-"""Reverse mode: the gradient of a number by what an experiment depends on, chunk by chunk on the host.
+"""Reverse mode: the gradient of a loss with respect to parameters of an experiment, chunk by chunk on the host.
 
 `jax.grad` and `jax.jvp` of `gm.fidelity` work as they are. The observer here does the same in the chunks of
-`simulation.runner`: it reports progress, compiles small programs, makes stale lists anew, and keeps the states before
-all bins as long as there is room, then those before all chunks. What is differentiated by is named: "gamma0",
-"friction.mu", "signals.amplitudes", ...
+`simulation.runner`: it reports progress, compiles small programs and rebuilds stale neighbour lists. It keeps the state
+before each bin as long as there is room, and then the state before each chunk. Parameters are named by dotted names:
+"gamma0", "friction.mu", "signals.amplitudes", ...
 """
 
 import functools
@@ -158,12 +158,13 @@ class _Remembering(Observer):
 @comparable
 @dataclass(frozen=True)
 class Gradient:
-    """A number and its derivatives.
+    """A loss and its gradient.
 
     Attributes:
-        value: the loss.
-        slope: its derivatives by name, each a pytree like what stands there in the experiment.
-        p_sig: recalled signals, [S, 256].
+        value: the loss, a scalar.
+        slope: derivatives of the loss by dotted name, each a pytree of the same structure as the part of the experiment
+            that has this name.
+        p_sig: recalled signals from which the loss was computed, [S, 256], in E.
     """
 
     value: jax.Array
@@ -183,27 +184,30 @@ def value_and_grad(
     checkpoint: Checkpoint = NO_CHECKPOINT,
     progress: ProgressChoice = None,
 ) -> Gradient:
-    """Reverse mode: a number and its derivatives by all parameters, through the whole experiment.
+    """The value of a loss and its gradient in reverse mode, through the whole experiment, on the host.
 
-    The way forward keeps the state before each bin, in up to a GB, and beyond it the state before each chunk of 32. The
-    way back replays such a chunk, and every bin. On the native backend bins are differentiated in the library; a
-    gradient costs some four forward runs, and one more where chunks are replayed.
+    The forward pass keeps the state before each bin, up to 1 GiB, and beyond that the state before each chunk of 32
+    bins. The backward pass runs such chunks again, and differentiates bin by bin. On the native backend a gradient
+    costs about four forward runs; about five if it goes through the prefix too, as for "friction"; and one more if
+    chunks are run again.
 
     Args:
-        experiment: where.
-        by: what to differentiate by: dotted names of floats or of parts that hold them, like "signals.amplitudes",
-            "friction.mu", "t0", "pack.clump" or "pack.position". None within another.
-        loss: what is differentiated; default the fidelity.
-        checkpoint: where to go on and to keep how far it is on the way back; the way forward, a fifth, is done again.
-        progress: told about every chunk of both ways; default a bar in a terminal or a notebook, False for none.
+        experiment: the experiment at which the gradient is taken, not traced.
+        by: the parameters to differentiate with respect to: dotted names of floats, or of parts of the experiment that
+            hold them, like "signals.amplitudes", "friction.mu", "t0", "pack.clump" or "pack.position". No name may be a
+            part of another.
+        loss: function of (experiment, p_sig) that returns a scalar, with p_sig [S, 256] in E; default the fidelity.
+        checkpoint: keeps the progress of the backward pass, so that it can be resumed; default none. A resumed call
+            repeats the forward pass, a fifth of the time.
+        progress: see `run`.
 
     Returns:
-        The `value`, and its `slope` by each name: what stands there, with derivatives in the place of numbers. Also the
-        recalled `p_sig` of which that is the loss, [S, 256].
+        The scalar `value`; `slope`, a dictionary by name of pytrees of derivatives, structured as the parts of the
+        experiment with these names; and the recalled `p_sig`, [S, 256], in E.
 
     Raises:
-        ValueError: for a name that is no field, a loss that is not one number, or mixed precision; or inside a
-            program of JAX.
+        ValueError: for a name that is no field, a loss that is not a scalar, mixed precision, or a call inside a traced
+            function.
         RunFailedError: if the simulation broke down.
     """
     require_kind("value_and_grad", experiment, Experiment)

@@ -31,14 +31,14 @@ SHARE = 0.7  # of the time that all derivatives take, those by the drive
 @comparable
 @dataclass(frozen=True)
 class Jacobian:
-    """Derivatives of one recalled signal.
+    """Derivatives of one recalled signal with respect to n + 3 parameters.
 
     Attributes:
-        names: of the parameters; "amplitude 1", ..., "gamma0", "mu", "stiffness".
-        values: of the parameters, [P].
-        p_sig: by each parameter, [P, 256], in E per unit of it.
-        stress: of the channel, p_x - p_y on "xy", in every bin from the encoding on, by each parameter, [P, bins], of
-            the sheared replica.
+        names: names of the parameters: "amplitude 1", ..., "amplitude n", "gamma0", "mu", "stiffness".
+        values: values of the parameters, [n + 3].
+        p_sig: derivative of p_sig with respect to each parameter, [n + 3, 256], in E per unit of the parameter.
+        stress: derivative of the stress of the channel (p_x - p_y on "xy") in the sheared replica, in every bin from
+            the first stage that writes to the end of the first that reads, [n + 3, bins].
     """
 
     names: tuple[str, ...]
@@ -97,22 +97,24 @@ def _pressures(recall: Recall) -> dict[str, np.ndarray]:
 @usual_rules()
 @shows_progress
 def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobian:
-    """The derivatives of the recall of one signal by its amplitudes, gamma0, mu and the stiffness.
+    """The derivatives of the recall of one signal with respect to its amplitudes, gamma0, mu and the stiffness.
 
-    In forward mode, parameters as replicas; in two runs, because mu and the stiffness act on the prefix too.
+    It is computed in forward mode, with one replica for each parameter, in two runs: mu and the stiffness act on the
+    prefix too.
 
     Args:
-        experiment: of one signal of n bumps.
-        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
+        experiment: an experiment with one signal of n bumps, not traced.
+        progress: see `run`.
 
     Returns:
-        The `names` and `values` of n + 3 parameters; the derivatives by them of `p_sig`, [n + 3, 256], and of the
-        `stress` that it is made of, p_x - p_y on the channel "xy", in every bin from the encoding on, [n + 3, bins].
+        `names` and `values` of the n + 3 parameters; the derivatives of `p_sig`, [n + 3, 256], and of the `stress` of
+        the channel (p_x - p_y on "xy") in every bin from the first stage that writes to the end of the first that
+        reads, [n + 3, bins].
 
     Raises:
-        ValueError: if there is another number of signals, they are not bumps, the background is not sub0, there are
-            several reads or channels, a parameter has a value for each replica, the friction law has no number mu or
-            stiffness, or the precision is mixed; or inside a program of JAX.
+        ValueError: if there is more than one signal, it is not made of bumps, the background is not sub0, there are
+            several reads or channels, a parameter has a value for each replica, mu or the stiffness is no number of the
+            law, the precision is mixed, or in a call inside a traced function.
         RunFailedError: if the simulation broke down.
     """
     require_kind("jacobian", experiment, Experiment)

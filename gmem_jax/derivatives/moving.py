@@ -1,4 +1,4 @@
-"""What of an experiment and of a running state is differentiated by."""
+"""The numbers of an experiment and of a running state with respect to which a run can be differentiated."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import fields

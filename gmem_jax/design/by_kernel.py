@@ -1,11 +1,10 @@
-"""Inverse design of many waveforms at once, as all words of a length: corrected by the memory kernel.
+"""Inverse design by the memory kernel, for many waveforms at once, such as all words of a length.
 
-A Jacobian of its own for every waveform (`waveforms`) costs some tens of runs of each. Here the one kernel of the pack,
-2 n + 1 replicas, serves them all: it says how each waveform should change for what its last recall missed. It is only
-nearly right, so the miss is simulated and corrected again, and what each simulation shows of a waveform's own slopes is
-added to the kernel (Broyden's update). They can be measured too, all at once, and most of those waveforms that miss
-most: what is left then lies along directions in which the kernel is small. What gets worse is taken back, and the next
-step is damped more (Levenberg and Marquardt).
+A Jacobian for every waveform (`waveforms`) costs some tens of runs of each. Here one kernel of the pack (2 n + 1
+replicas) serves as the Jacobian of all. Since it is only approximate, corrections are simulated and repeated, and each
+simulation updates the derivatives of each waveform (Broyden's method). These derivatives can also be measured, with
+most runs for the waveforms that miss their target most; the remaining error lies along directions in which the kernel
+is small. A step that makes a recall worse is undone, and the next is damped more (Levenberg and Marquardt).
 """
 
 import jax.numpy as jnp
@@ -96,27 +95,32 @@ def design_by_kernel(
     cache: ResultCache = no_cache,
     progress: ProgressChoice = None,
 ) -> Design:
-    """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
+    """Pre-distort many waveforms, by the memory kernel, so that their recalls follow the J of `experiment.signals`.
+
+    All recalls follow G E delta0 gamma0 J with one gain G. `design_waveforms` does the same by exact Jacobians, for few
+    waveforms.
 
     Args:
-        experiment: the pack, the drive, and the signals whose J are the targets.
-        iterations: simulations of all waveforms, each but the first after a correction.
-        n: bumps of a designed waveform.
-        width: of the bumps.
-        kernel: of this pack and drive, if it has been measured before: its bumps are taken.
-        gain: wanted common gain; default that of `start`, or half of the untouched waveforms' own, or less, so that the
-            bound |I| <= 1 leaves room for what the kernel says is needed.
-        start: waveforms that were designed before for the same J, to be made better; default what the kernel says.
-        damping: of the first correction, in parts of the kernel's largest singular value.
-        measured: directions along which the slopes of a waveform are measured twice on the way, on average: those that
-            miss most have most of the runs, up to all n directions, the kernel's strongest first.
-        batch: signals that run together; default all of them.
-        cache: asked for every part of every simulation, so that a design can be resumed.
-        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
+        experiment: the pack, the parameters, and the signals whose J are the targets; with one read and one channel.
+        iterations: number of simulations of all waveforms, each but the first after a correction.
+        n: number of bumps of a designed waveform.
+        width: full width of the bumps in u.
+        kernel: the memory kernel of this pack at these parameters, whose n and width are then used; default: it is
+            measured.
+        gain: wanted gain G; default that of `start`; without it half of the gain of the original waveforms, or less if
+            the designed waveforms would exceed the bound |I| <= 1.
+        start: waveforms designed earlier for the same J, one for each signal, that are improved; default a first guess
+            by the kernel.
+        damping: damping of the first correction, relative to the largest singular value of the kernel.
+        measured: mean number of directions along which the derivatives of a waveform are measured, at two times in the
+            design. Waveforms that miss most get most of them, up to n, the kernel's strongest first.
+        batch: number of signals that run together; default all of them.
+        cache: see `run`; it keeps every part of every simulation.
+        progress: see `run`.
 
     Raises:
-        ValueError: if the kernel was measured at another gamma0 or delta0, or either differs between replicas, there
-            are not as many waveforms to start from as signals, or there are several reads or channels.
+        ValueError: if the kernel was measured at another gamma0 or delta0, either differs between replicas, `start` has
+            another number of waveforms than there are signals, or there are several reads or channels.
         RunFailedError: if a simulation broke down.
     """
     require_kind("design_by_kernel", experiment, Experiment)

@@ -1,4 +1,4 @@
-"""Drives that recall best: gamma0 and the friction law's parameters, tuned over several packs."""
+"""Tuning gamma0 and parameters of the friction law for the largest mean fidelity of several packs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,14 +24,14 @@ PARAMETERS = {"gamma0": "gamma0", "mu": "friction.mu", "stiffness": "friction.st
 @comparable
 @dataclass(frozen=True)
 class TunedDrive:
-    """Drive parameters found, and the way there.
+    """Tuned parameters, and how the search went.
 
     Attributes:
-        values: of the best drive, by name.
-        fidelity: mean F over the packs, there.
-        each: F of every pack, there, [packs].
-        before: mean F of the drive that was begun with.
-        history: (values, mean F) after every iteration, the first drive first.
+        values: the best values that were found, by name.
+        fidelity: mean F over the packs at these values.
+        each: F of every pack at these values, [packs].
+        before: mean F at the first values.
+        history: (values, mean F) at the first values and after every iteration.
     """
 
     values: dict[str, float]
@@ -92,24 +92,27 @@ def design_drive(
     cache: ResultCache = no_cache,
     progress: ProgressChoice = None,
 ) -> TunedDrive:
-    """Choose gamma0 and parameters of the friction law within bounds so that the mean fidelity of some packs grows.
+    """Choose gamma0 and parameters of the friction law, within bounds, so that the mean fidelity of some packs grows.
 
-    F of one pack is rugged in mu and the stiffness: the exact derivative holds for changes of 1e-5 (see
-    experiments/gradient_check.py), because grains rearrange. What can be climbed is the slope on a coarser scale, from
-    central differences over +- `spread` of each logarithm, averaged over packs. The best drive that was simulated is
-    kept; where none is better than the present one, the spread is halved. The maximum of a rugged function is biased:
-    check the drive on other packs.
+    F of one pack is rugged in mu and the stiffness, because grains rearrange: the exact derivative holds only for
+    relative changes of some 1e-5 (experiments/gradient_check.py). So the search climbs a coarser slope: central
+    differences of the mean F over steps of +-`spread` in the logarithm of each parameter. The best values that were
+    simulated are kept; if none are better than the present ones, the spread is halved. The maximum of a rugged function
+    is biased: check the result on other packs.
 
     Args:
-        experiments: one for each pack, alike in all else; where they stand is the start.
-        bounds: lowest and highest value by name: "gamma0", "mu", "stiffness" (any of them), or another dotted name.
-        iterations: steps; each costs 2 n + 1 runs a pack for n parameters.
-        spread: of the differences at first, in parts of each parameter.
-        cache: asked for the fidelity of every run, so that a long search can be resumed.
-        progress: told about every run; default a bar in a terminal or a notebook, False for none.
+        experiments: one for each pack, alike in all else; their parameters are the start of the search.
+        bounds: lowest and highest value of each tuned parameter, by name: "gamma0", "mu", "stiffness" or any dotted
+            name, as in {"mu": (0.5, 2.0)}.
+        iterations: number of steps; each takes 2 n + 1 runs of each pack for n parameters.
+        spread: first step of the differences in the logarithms, in (0, 1).
+        cache: see `run`; it keeps the fidelity of every run.
+        progress: see `run`; called after every run.
 
     Raises:
-        ValueError: as of `start_within`.
+        ValueError: if a parameter does not begin within its bounds, is no positive number or differs between
+            experiments; if there is no pack, there are several reads or channels, or the time step is not stable with
+            the highest values.
         RunFailedError: if a simulation broke down.
     """
     tell, iterations = callback(progress), require_whole("iterations", iterations)

@@ -31,17 +31,17 @@ QUADRATURE_POINTS = 2048  # points of v for inner products of basis functions
 @comparable
 @dataclass(frozen=True)
 class MemoryKernel:
-    """The recall of n basis waveforms, for unit amplitude.
+    """The recalls of n basis waveforms: half-cosine bumps of height 1.
 
     Attributes:
         u: centres of the bins, [256].
-        centres: of the bumps, [n].
-        width: of the bumps.
-        odd: half the difference of the recalls of each waveform and its opposite, [n, 256], in E; 0 where the read does
-            not go through u.
-        even: half their sum, [n, 256].
-        gamma0: shear amplitude they were measured at, with the factor of the stage that writes.
-        delta0: areal compression.
+        centres: centres of the bumps in u, [n].
+        width: full width of the bumps in u.
+        odd: half the difference of the recalls of each bump and its negative, [n, 256], in E; 0 in bins that the read
+            does not go through.
+        even: half the sum of the same two recalls, [n, 256], in E.
+        gamma0: shear amplitude at which they were measured: that of the experiment times that of the drive.
+        delta0: areal compression at which they were measured.
     """
 
     u: np.ndarray
@@ -56,11 +56,11 @@ class MemoryKernel:
 
     @property
     def basis(self) -> Bumps:
-        """The n waveforms."""
+        """The n basis waveforms."""
         return bumps(np.eye(self.centres.size), self.width)
 
     def kernel(self) -> np.ndarray:
-        """M at (bins of u, centres in v), [256, n], in E: the response over the integral of the bump."""
+        """M(u, v) at the bins u and the centres v, [256, n], in E: `odd` over gamma0 and the integral of the bump."""
         area = np.asarray(self.basis.integral(jnp.asarray(1.0)))
         result: np.ndarray = (self.odd / (self.gamma0 * area[:, None])).T
         return result
@@ -74,7 +74,7 @@ class MemoryKernel:
         return whiten @ self.odd, whiten @ shapes
 
     def singular_values(self) -> np.ndarray:
-        """RMS of p_sig (in E) for the best, second best, ... waveform of unit RMS, [n], falling."""
+        """Singular values, [n], falling, in E: RMS of p_sig for the best, second best, ... waveform of RMS 1."""
         recalled, _ = self._orthonormal()
         values: np.ndarray = np.linalg.svd(recalled, compute_uv=False) / np.sqrt(BINS)
         return values
@@ -87,25 +87,26 @@ class MemoryKernel:
 
     @usual_rules()
     def gain(self) -> float:
-        """G of the ideal kernel G E delta0 (v < u) that is nearest to this one on the basis."""
+        """G of the perfect integral (M = G E delta0 for v < u, else 0) that is nearest to this kernel on its basis."""
         return float(self._match().gain)
 
     def distance(self) -> float:
-        """|odd - ideal| / |odd| over the basis: 0 for a perfect integral, 1 for none; 1 - distance is like F."""
+        """Distance from that perfect integral, |odd - ideal| / |odd|: 0 for a perfect memory, 1 for none (1 - F)."""
         return 1.0 - float(self._match().fidelity)
 
     def asymmetry(self) -> float:
-        """|even| / |odd| over the basis: 0 for a linear memory."""
+        """|even| / |odd|, with norms over the basis: 0 for a linear memory."""
         return float(np.linalg.norm(self.even) / np.linalg.norm(self.odd))
 
     def capacity(self, noise: float) -> int:
-        """How many independent values of unit RMS can be told from noise of RMS `noise` (in E) in p_sig."""
+        """Number of singular values above `noise`, the RMS in E of noise in p_sig."""
         return int(np.sum(self.singular_values() > noise))
 
     def resolution(self, noise: float) -> float:
-        """Width in v of what a point of the waveform becomes when read back with the values above `noise`.
+        """Resolution in v of waveforms that are read back with noise of RMS `noise` in p_sig, in E.
 
-        Full width at half maximum of the truncated inverse's point-spread function, mean over 0.2 < v < 0.8.
+        It is the full width at half maximum of the point-spread function of the inverse, truncated to singular values
+        above the noise; the mean over 0.2 < v < 0.8. 1 if no value is above the noise.
         """
         recalled, shapes = self._orthonormal()
         left, values, _ = np.linalg.svd(recalled, full_matrices=False)
@@ -124,22 +125,22 @@ class MemoryKernel:
 
     @usual_rules()
     def coefficients(self, signals: Signals) -> np.ndarray:
-        """Amplitudes of the basis functions that come nearest to waveforms, [S, n]."""
+        """Amplitudes of the bumps whose sums are nearest to given waveforms (least squares), [S, n]."""
         return nearest(self.basis, signals)
 
     @usual_rules()
     def predict(self, signals: Signals, *, even: bool = True) -> np.ndarray:
-        """p_sig of waveforms by superposition, [S, 256], in E, at the kernel's gamma0.
+        """p_sig of waveforms by superposition, without a simulation, [S, 256], in E, at the gamma0 of the kernel.
 
         Args:
-            signals: waveforms that were never simulated.
-            even: add the even parts, in proportion to the absolute amplitudes.
+            signals: the waveforms.
+            even: whether to add the even parts, in proportion to the absolute amplitudes.
         """
         return self.recalled(self.coefficients(signals), even=even)
 
     @usual_rules()
     def recalled(self, amplitudes: np.ndarray, *, even: bool = True) -> np.ndarray:
-        """`predict` for amplitudes of the basis functions, [S, n]."""
+        """The same as `predict`, [S, 256], for amplitudes of the bumps, [S, n]."""
         linear: np.ndarray = amplitudes @ self.odd
         return linear + np.abs(amplitudes) @ self.even if even else linear
 
@@ -169,18 +170,19 @@ def memory_kernel(
     cache: ResultCache = no_cache,
     progress: ProgressChoice = None,
 ) -> MemoryKernel:
-    """Measure the memory kernel of a pack.
+    """Measure the memory kernel M of a pack, p_sig(u) = int M(u, v) gamma(v) dv, by one run of 2 n + 1 replicas.
 
     Args:
-        experiment: pack and parameters; its signals do not matter.
-        n: basis waveforms; 2 n + 1 replicas are run.
-        width: of the bumps; narrow ones drive the walls faster.
-        prefix: what `run.prefix_of` gave for the same pack and law, if there is one.
-        cache: asked for the recalls of the basis, so that a long run can be resumed (see `gmem_jax.files.checkpoints`).
-        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
+        experiment: the pack and all parameters, with one read and one channel; its signals do not matter.
+        n: number of basis waveforms, half-cosine bumps.
+        width: full width of the bumps in u; narrow bumps move the walls faster.
+        prefix: what `gm.prefix_of` returned for the same pack, law and protocol; default none.
+        cache: see `run`.
+        progress: see `run`.
 
     Raises:
-        ValueError: if n < 2, gamma0 or delta0 differ between replicas, or the background is not sub0.
+        ValueError: if n < 2, gamma0 or delta0 differs between replicas, the background is not sub0, or there are
+            several reads or channels.
         RunFailedError: if the simulation broke down.
     """
     require_kind("memory_kernel", experiment, Experiment)
@@ -210,11 +212,12 @@ def _basis(experiment: Experiment, n: int, width: float) -> Bumps:
 @comparable
 @dataclass(frozen=True)
 class KernelMatrix:
-    """What each channel gives back of what was written on each: the kernels of several channels of one pack.
+    """The memory kernels of C channels of one pack, for every pair of a channel that writes and one that reads.
 
     Attributes:
-        channels: their names, C.
-        blocks: the kernel of what channel c gives back of channel d, C lists of C; off the diagonal is the cross-talk.
+        channels: names of the C channels.
+        blocks: blocks[c][d] is the kernel of the recall on channel c of waveforms written on channel d; those with
+            c != d are the cross-talk.
     """
 
     channels: tuple[str, ...]
@@ -223,9 +226,10 @@ class KernelMatrix:
     __repr__ = short_repr
 
     def singular_values(self) -> np.ndarray:
-        """RMS of p_sig over all channels (in E) for the best, second best, ... set of waveforms, [C n], falling.
+        """Singular values, [C n], falling, in E.
 
-        One channel alone has those of its `MemoryKernel`; a waveform of unit RMS is one on any of the channels.
+        They are the root of the mean squares of p_sig, summed over channels, for the best, second best, ... set of
+        waveforms whose mean squares sum to 1. With one channel they are those of its `MemoryKernel`.
         """
         recalled = np.block(
             [[block._orthonormal()[0] for block in column] for column in zip(*self.blocks, strict=True)]
@@ -244,18 +248,19 @@ def kernel_matrix(
     cache: ResultCache = no_cache,
     progress: ProgressChoice = None,
 ) -> KernelMatrix:
-    """Measure the memory kernels of all channels that an experiment writes on.
+    """Measure the memory kernels of all channels that an experiment writes on, by one run of 2 n + 1 replicas for each.
 
     Args:
-        experiment: pack, parameters and protocol, with one read; its waveforms do not matter, the names of their sets
-            do: each is written alone.
-        n: basis waveforms; 2 n + 1 replicas are run for each set.
-        width: of the bumps.
-        cache: asked for the recalls of each set.
-        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
+        experiment: the pack, all parameters and a protocol with one read. The names of its sets of waveforms matter,
+            the waveforms do not: in each run the bumps replace one set, and the others are zero.
+        n: number of basis waveforms, half-cosine bumps.
+        width: full width of the bumps in u.
+        cache: see `run`.
+        progress: see `run`.
 
     Raises:
-        ValueError: as of `memory_kernel`; or if there are several reads, or not a set of waveforms for each channel.
+        ValueError: if n < 2, gamma0 or delta0 differs between replicas, the background is not sub0, there are several
+            reads, or not a set of waveforms for each channel.
         RunFailedError: if the simulation broke down.
     """
     require_kind("kernel_matrix", experiment, Experiment)

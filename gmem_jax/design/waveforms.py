@@ -1,8 +1,7 @@
-"""Inverse design: waveforms whose nonlinear recall follows wanted curves, on one channel or on several at once.
+"""Inverse design by Jacobians: waveforms whose recalls follow wanted curves, on one or several channels.
 
-Waveforms are corrected by the exact Jacobian of the recall around the present ones: one tangent per amplitude, as
-replicas of one run (`derivatives.push`). A damped Gauss-Newton step is simulated before it is accepted,
-whole and in parts.
+The exact Jacobian of the recall at the present waveforms has one tangent for each amplitude, as replicas of one run
+(`derivatives.push`). A damped Gauss-Newton step is simulated, whole and in parts, before it is accepted.
 """
 
 import math
@@ -41,20 +40,20 @@ TANGENT = 2.5  # cost of a tangent in runs; see benchmarks
 @comparable
 @dataclass(frozen=True)
 class Design:
-    """Waveforms found, and the way there.
+    """Designed waveforms, and how the design went.
 
-    Of C channels each has its own targets, recalls and F: arrays have a leading axis [C], in the order of
-    `Recall.p_sig`, and gains are a matrix [C, C].
+    With C > 1 channels arrays have a leading axis [C], in the order of `Recall.channels`; F is [C] and G is [C, C].
 
     Attributes:
-        sets: the waveforms, as samples, |I| <= 1, by the name of their set; see `signals`.
-        target: J that their recall should follow, averaged over bins, [S, 256].
-        p_sig: their recall in a fresh run, [S, 256], in E.
-        fidelity: F of that recall with respect to the target.
-        gain: G of that recall with respect to the target.
-        untouched: recall of the untouched waveforms, [S, 256], in E.
-        before: F of that.
-        history: F after every iteration, the untouched waveforms first; of several channels their mean.
+        sets: the designed waveforms by the name of their set, as samples with |I| <= 1.
+        target: the integrals J of the original waveforms, which the recalls should follow, averaged over each bin,
+            [S, 256].
+        p_sig: recalls of the designed waveforms in a fresh run, [S, 256], in E.
+        fidelity: F of these recalls with respect to the target.
+        gain: G of these recalls with respect to the target.
+        untouched: recalls of the original waveforms, [S, 256], in E.
+        before: F of these.
+        history: F of the original waveforms and after every iteration; the mean over channels if there are several.
     """
 
     sets: dict[str, Spline]
@@ -70,7 +69,7 @@ class Design:
 
     @property
     def signals(self) -> Spline:
-        """The waveforms of a design on one channel.
+        """The designed waveforms, if there is one set.
 
         Raises:
             ValueError: if there are several sets, which `gm.signals(**design.sets)` puts together.
@@ -192,20 +191,22 @@ def design_waveforms(
     cache: ResultCache = no_cache,
     progress: ProgressChoice = None,
 ) -> Design:
-    """Pre-distort waveforms so that their recall follows the integrals of `experiment.signals` with one gain.
+    """Pre-distort waveforms, by Jacobians, so that their recalls follow the integrals J of `experiment.signals`.
 
-    Of several channels each has one gain, and what a channel gives back of the others is part of what is corrected.
+    All recalls of a channel follow G E delta0 gamma0 J with one gain G. Cross-talk between channels is corrected, too.
 
     Args:
-        experiment: the pack, the drive, and the signals whose J are the targets; with one read.
-        iterations: corrections; each takes a Jacobian of n tangents a signal and channel, and up to three simulations.
-        n: bumps of a designed waveform.
-        width: of the bumps.
-        gain: wanted common gain; default half of the untouched waveforms' own, so that the bound leaves room.
-        damping: of the steps one after the other, in parts of the Jacobian's largest singular value; the last for all
-            that follow.
-        cache: asked for every simulation and Jacobian, so that a design can be resumed.
-        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
+        experiment: the pack, the parameters, and the signals whose J are the targets; with one read.
+        iterations: number of corrections. Each takes a Jacobian, of n tangents for each signal and channel, and one run
+            that tries three lengths of the step.
+        n: number of bumps of a designed waveform.
+        width: full width of the bumps in u.
+        gain: wanted gain G; default half of the gain of the original waveforms on each channel, so that the bound
+            |I| <= 1 leaves room.
+        damping: damping of each correction, relative to the largest singular value of the Jacobian; the last is used
+            for all that follow.
+        cache: see `run`; it keeps every simulation and Jacobian.
+        progress: see `run`.
 
     Raises:
         ValueError: if gamma0 or delta0 differs between replicas, there are several reads, a channel has no set of

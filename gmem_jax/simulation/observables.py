@@ -1,12 +1,13 @@
-"""Ready observers, `gm.observables`: what is seen of a pack at the end of each bin.
+"""Ready observers, `gm.observables`: quantities that are measured on the pack at the end of each bin.
 
     gm.Experiment(pack, signals, observe=[gm.observables.stress(), gm.observables.fabric()])
 
-Each is a function of (simulation, state) with a name, a unit and words. It is plain JAX on the state, the same after
-every backend. Contact forces are taken again from the state: dashpots with the velocities at the end of the bin, where
-steps take those of their middle. Whether a contact slides is asked as if one more step had been made: one that does is
-at its limit to round-off then. Several observers share one evaluation of the contacts: the compiler sees that it is the
-same.
+Each is a function of (simulation, state) with a name, a unit and a description. It is plain JAX on the state, the same
+for every backend. Contact forces are computed from the state, with dashpots at the velocities of the end of the bin
+(steps take those of their middle). Whether a contact slides is decided as if one more step were made: a sliding contact
+is then at its limit to round-off. The compiler evaluates the contacts once for all observers.
+
+"The mark" is the beginning of the stage with `mark`, or of the first sheared stage if no stage has it.
 """
 
 import operator
@@ -40,18 +41,18 @@ SpherePairs = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True)
 class Observable:
-    """An observer that says what it gives: make one of a function of your own, too.
+    """An observer: a function with a name, a unit and a description. A function of your own becomes one, too.
 
     Attributes:
-        name: in results and files.
-        unit: of the values, with R = E = rho = 1.
-        words: what they are.
-        reduce: a function of a simulation, a state and `arguments`, in plain JAX, that gives an array [..., B]. It must
-            be hashable, as functions of modules are; programs are compiled for it.
-        arguments: hashable.
+        name: name in results and files.
+        unit: unit of the values, with R = E = rho = 1.
+        words: description of the values.
+        reduce: function of (simulation, state, *arguments) in plain JAX that returns an array [..., B]. It must be
+            hashable, as functions of a module are; programs are compiled for it.
+        arguments: further arguments of `reduce`, hashable.
 
     Raises:
-        ValueError: for a name, unit or words that files could not hold: more than a line of 200 letters.
+        ValueError: for a name, unit or description that is not one printable line of up to 200 letters.
     """
 
     name: str
@@ -74,13 +75,13 @@ class Observable:
 
 
 def stress() -> Observable:
-    """The stress tensor by contacts, [3, 3, B], in E; pressure is positive.
+    """The stress tensor of the contacts, [3, 3, B], in E; pressure is positive.
 
-    sigma_ij = sum_c f_i l_j / V, over sphere contacts and wall contacts. f is the force of a contact on what lies
-    beyond it, seen from a grain; l is the branch from the grain's centre to the centre of the other grain, or to the
-    point of the wall. Pairs are counted once, in a periodic box with the image that they meet. Where grains are
-    accelerated it differs from the stress on the walls, and where they move from that of a periodic box, which has
-    their momentum flux in it.
+    sigma_ij = sum_c f_i l_j / V over contacts of spheres and contacts with walls, each counted once. f is the force of
+    a grain on the other grain, or on the wall; l is the branch vector from its centre to the centre of the other grain
+    (in a periodic box, of the image that it touches), or to the contact point at the wall. V is the volume of the box.
+    Where grains accelerate it differs from the stress on the walls. The stress of a periodic box also contains the
+    momentum flux of moving grains, which is left out here.
     """
     return Observable("stress", "E", "stress tensor of the contacts, by branches between grain centres", _stress)
 
@@ -105,9 +106,10 @@ def _stress(simulation: Simulation, state: State) -> jax.Array:
 
 
 def wall_stress() -> Observable:
-    """The stress on the walls, [3, 3, B], in E: p_x, p_y, p_z of the bin on the diagonal, without the walls' friction.
+    """The normal stress on the walls, [3, 3, B], in E: p_x, p_y, p_z, averaged over the bin, on the diagonal.
 
-    Along periodic axes, where there are no walls, it is the mean over all sections; see `section_force`.
+    Friction of the walls is not in it. Along periodic axes it is the mean over all sections of the box; see
+    `gmem_jax.physics.forces.section_force`.
     """
     return Observable("wall_stress", "E", "stress on the walls, averaged over the steps of the bin", _wall_stress)
 
@@ -117,7 +119,7 @@ def _wall_stress(simulation: Simulation, state: State) -> jax.Array:
 
 
 def fabric() -> Observable:
-    """The fabric tensor <n_i n_j>, [3, 3, B], over touching pairs of spheres; 0 where none touch, else of trace 1."""
+    """The fabric tensor <n_i n_j> over touching pairs of spheres, [3, 3, B]; its trace is 1, or 0 if none touch."""
     return Observable("fabric", "1", "fabric tensor, mean of n n over touching pairs of spheres", _fabric)
 
 
@@ -131,9 +133,9 @@ def _fabric(simulation: Simulation, state: State) -> jax.Array:
 
 
 def sliding() -> Observable:
-    """The part of the contacts whose tangential force is at its limit mu f_n, [B].
+    """The fraction of contacts whose tangential force is at its limit mu f_n, [B].
 
-    Only contacts with a limit above 0 count, and not those with walls; without any it is 0. Needs a law with mu, or
+    Only contacts of spheres whose limit is above 0 count; without any it is 0. The law must have a mu, or be
     `Frictionless`.
     """
     return Observable("sliding", "1", "share of contacts at the Coulomb limit", _sliding)
@@ -145,7 +147,7 @@ def _sliding(simulation: Simulation, state: State) -> jax.Array:
 
 
 def mobilisation() -> Observable:
-    """The mean of |f_t| / (mu f_n), [B], over the contacts that `sliding` counts."""
+    """The mean of |f_t| / (mu f_n) over the contacts that `sliding` counts, [B]."""
     return Observable("mobilisation", "1", "mean of the tangential force over its Coulomb limit", _mobilisation)
 
 
@@ -168,7 +170,7 @@ def _rubbing(simulation: Simulation, state: State) -> tuple[jax.Array, jax.Array
 
 
 def contacts_made() -> Observable:
-    """Pairs of spheres that touch, and did not at the mark, [B]."""
+    """Number of pairs of spheres that touch now and did not at the mark, [B]."""
     return Observable("contacts_made", "1", "pairs of spheres that touch, and did not at the mark", _made)
 
 
@@ -178,7 +180,7 @@ def _made(simulation: Simulation, state: State) -> jax.Array:
 
 
 def contacts_lost() -> Observable:
-    """Pairs of spheres that touched at the mark, and do not now, [B]."""
+    """Number of pairs of spheres that touched at the mark and do not now, [B]."""
     return Observable("contacts_lost", "1", "pairs of spheres that touched at the mark, and do not now", _lost)
 
 
@@ -196,9 +198,10 @@ def _touching(simulation: Simulation, state: State) -> tuple[jax.Array, jax.Arra
 
 
 def nonaffine() -> Observable:
-    """Root mean square of the grains' displacements since the mark, beyond those of the box, [B], in R.
+    """Root mean square of the non-affine displacements of grains since the mark, [B], in R.
 
-    A grain that moves with the box keeps its place in units of the box's edges. The slope at no displacement is 0.
+    A grain that moves affinely with the box keeps its position in units of the edges. The derivative at zero
+    displacement is set to 0.
     """
     return Observable("nonaffine", "R", "rms displacement of grains since the mark, beyond that of the box", _nonaffine)
 
@@ -213,7 +216,8 @@ def _nonaffine(simulation: Simulation, state: State) -> jax.Array:
 def rotation() -> Observable:
     """Root mean square of the angles by which grains have turned since the mark, [B], in rad.
 
-    It is the angle of the rotation from then to now, 0 to pi, not the length of the path. The slope at 0 is 0.
+    Each is the angle of the rotation from then to now, 0 to pi, not the length of the path. The derivative at zero
+    angle is set to 0.
     """
     return Observable("rotation", "rad", "rms angle by which grains have turned since the mark", _rotation)
 
@@ -229,12 +233,11 @@ def _rotation(simulation: Simulation, state: State) -> jax.Array:
 
 
 def friction_power() -> Observable:
-    """Power that goes into tangential forces at the end of the bin, those of walls too, [B], in E R^3 / t_c: the sum of
-    f_t v_t.
+    """Power that goes into tangential forces at the end of the bin, walls included, [B], in E R^3 / t_c.
 
-    v_t is the sliding velocity. What the springs of contacts that stick take up is in it, and what they give back; over
-    a closed cycle that is nothing, and the work of friction and tangential dashpots remains. This is one moment of each
-    bin: a sum over bins times their duration samples the work once a bin, and misses what changes within one.
+    It is the sum over contacts of f_t v_t, where v_t is the sliding velocity. It contains the power that tangential
+    springs store and return; over a closed cycle this cancels, and the work of friction and tangential dashpots
+    remains. It is one moment of each bin: a sum over bins times their duration misses what changes within a bin.
     """
     return Observable("friction_power", "E R^3/t_c", "power into tangential forces, at the end of the bin", _rub_power)
 
@@ -251,8 +254,8 @@ def _rub_power(simulation: Simulation, state: State) -> jax.Array:
 def normal_power() -> Observable:
     """Power that normal damping dissipates at the end of the bin, walls included, [B], in E R^3 / t_c.
 
-    It is what f_n has beyond Hertz's elastic force, times the closing velocity, summed over contacts: never below 0.
-    This is one moment of each bin; see `friction_power`.
+    It is the sum over contacts of (f_n less Hertz's elastic force) times the closing velocity, and never below 0. It is
+    one moment of each bin; see `friction_power`.
     """
     words = "power dissipated by normal damping, at the end of the bin"
     return Observable("normal_power", "E R^3/t_c", words, _normal_power)
@@ -274,7 +277,7 @@ def _normal_power(simulation: Simulation, state: State) -> jax.Array:
 def drag_power() -> Observable:
     """Power that the viscous drag dissipates at the end of the bin, [B], in E R^3 / t_c; 0 in stages without drag.
 
-    It is twice the drag times the kinetic energy. This is one moment of each bin; see `friction_power`.
+    It is twice the drag times the kinetic energy, at one moment of each bin; see `friction_power`.
     """
     return Observable("drag_power", "E R^3/t_c", "power dissipated by the drag, at the end of the bin", _drag_power)
 
@@ -287,13 +290,15 @@ def _drag_power(simulation: Simulation, state: State) -> jax.Array:
 
 
 def normal_forces(pairs: Iterable[tuple[int, int]]) -> Observable:
-    """Normal forces of n chosen contacts, [n, B], in E R^2; repulsion is positive, 0 where they are apart.
+    """Normal forces of n chosen contacts, [n, B], in E R^2; repulsion is positive, and 0 is no contact.
 
     Args:
-        pairs: numbers of two spheres each: sphere k of grain g has the number g K + k, as in `Frames.spheres`.
+        pairs: two spheres for each contact: sphere k of grain g, both from 0, has the number g K + k, where K is the
+            number of spheres of a grain.
 
     Raises:
-        ValueError: for what are no pairs of spheres of different grains.
+        ValueError: if these are no pairs of different numbers from 0. That the spheres exist and belong to different
+            grains is checked when the experiment runs.
     """
     return Observable("normal_forces", "E R^2", "normal forces of chosen contacts", _normal_forces, (_pairs(pairs),))
 
@@ -309,7 +314,7 @@ def tangential_forces(pairs: Iterable[tuple[int, int]]) -> Observable:
         pairs: see `normal_forces`.
 
     Raises:
-        ValueError: likewise.
+        ValueError: as `normal_forces`.
     """
     words = "tangential forces of chosen contacts, on the first sphere"
     return Observable("tangential_forces", "E R^2", words, _tangential_forces, (_pairs(pairs),))

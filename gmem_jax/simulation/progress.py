@@ -1,4 +1,4 @@
-"""How far a run is: what is told to whoever waits for it, and in which unit; and the bar that shows it.
+"""Progress of runs: callbacks that report it, and bars that show it.
 
 By default a bar appears in a terminal or a notebook, for the outermost call alone.
 """
@@ -76,7 +76,7 @@ class TimeLeft:
 
 
 class ProgressBar:
-    """A bar for `gm.run(experiment, progress=gm.ProgressBar())`, and whatever else takes a progress callback."""
+    """A progress bar, in a terminal or a notebook: `gm.run(experiment, progress=gm.ProgressBar())`."""
 
     _line = ""  # what stands unfinished in the terminal
 
@@ -85,7 +85,7 @@ class ProgressBar:
         self._display = _notebook()
 
     def __call__(self, stage: str, moment: float, fraction: float) -> None:
-        """Show how far a run is; see `Progress`."""
+        """Show the progress; arguments as of `Progress`: stage, simulated time in t_c, fraction done."""
         now, left = time.perf_counter(), self._left(fraction)
         if now - self._told < REFRESH_INTERVAL and fraction < 1.0:
             return
@@ -100,7 +100,7 @@ class ProgressBar:
             sys.stderr.flush()
 
     def close(self) -> None:
-        """Leave the terminal at the beginning of a line, and the notebook without a bar that never moved."""
+        """End the line in the terminal; in a notebook remove a bar that never moved."""
         if self._line:
             sys.stderr.write("\n")
             self._line = ""

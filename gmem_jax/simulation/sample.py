@@ -1,4 +1,4 @@
-"""What is recorded of every bin, and what is checked at its end."""
+"""Samples: the quantities that are recorded of every bin; and the checks at its end."""
 
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
@@ -51,10 +51,10 @@ _VECTOR = ("axis", "replica")
 @pytree
 @dataclass(frozen=True)
 class Sample:
-    """What is recorded of one bin of steps: arrays [B], or [3, B] of vectors; a rollout adds a leading axis of bins.
+    """The quantities that are recorded of one bin: arrays [B], or [3, B] for x, y and z.
 
-    The fields and their units are in docs/files.md, which is made of their `measured`, as are files and pictures.
-    `observed` holds what the observers of the simulation gave, by name: arrays [..., B].
+    In `Recall.stages` they have a leading axis of bins. docs/files.md lists the fields with their units. `observed` is
+    a dictionary of the values of the observers by name, arrays [..., B]; None without observers.
     """
 
     u: jax.Array = measured("1", "compression variable at the end of the bin", ())
@@ -116,7 +116,7 @@ class Sample:
 
     @property
     def contacts_per_grain(self) -> jax.Array:
-        """Sphere contacts per grain, each counted once, those with walls too, [B].
+        """Number of contacts per grain, each counted once, those with walls included, [B].
 
         What the paper's "average number of contacts on a grain" compares with: it grows alike in a compression, the
         `coordination` half as much (docs/physics.md).
