@@ -13,7 +13,7 @@ def kept_pack(name: str) -> Path | None:
 
 
 def list_packs() -> list[str]:
-    """Names of the packs that ship with the package."""
+    """Names of the packs that ship with the package, for `load_pack`."""
     folder = resources.files("gmem_jax") / "packs"
     if not folder.is_dir():
         return []

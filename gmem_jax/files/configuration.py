@@ -55,16 +55,16 @@ def _law_from(written: Mapping[str, Any]) -> FrictionLaw:
 
 @usual_rules()
 def from_dict(configuration: Mapping[str, Any], pack: Pack | None = None) -> Experiment:
-    """The experiment of a written form.
+    """The experiment that `to_dict` has written.
 
     Args:
-        configuration: what `to_dict` gave.
-        pack: its pack; default the one that it names, read from its file or from those that ship.
+        configuration: what `to_dict` returned.
+        pack: the pack; default the one that the configuration names, read from its file or from those that ship.
 
     Raises:
         FileNotFoundError: if the pack is not there.
-        FileFormatError: if the pack is another one than was written, or the form is not one of an experiment.
-        ValueError: for impossible numbers, or own laws and signals, which have no written form.
+        FileFormatError: if the pack differs from the one that was written, or the configuration is of no experiment.
+        ValueError: for impossible numbers, or laws and signals of the user's own, which cannot be made from it.
     """
     known = {entry.name for entry in fields(Experiment) if entry.init} - {"observe"}
     if odd := sorted(known ^ set(configuration)):

@@ -1,4 +1,4 @@
-"""Results with names on their axes: xarray (an extra of the package), and CSV."""
+"""Recalls as xarray datasets (with the extra `export`), and as CSV."""
 
 import csv
 import io
@@ -18,10 +18,13 @@ from gmem_jax.simulation.stage import BINS
 
 
 def to_xarray(recall: Recall) -> Any:
-    """A recall as an xarray.Dataset with names, units and descriptions; samples of all stages are joined along `time`.
+    """A recall as an `xarray.Dataset` with named axes, units and descriptions.
+
+    The samples of all stages are joined along the axis `time`; those of stages that were run once for all replicas are
+    repeated for each replica.
 
     Args:
-        recall: the recall; stages that were run once for all replicas are repeated for each.
+        recall: the recall.
 
     Raises:
         ValueError: if xarray is not installed.
@@ -82,9 +85,12 @@ def plain_cell(value: Any) -> Any:
 
 
 def to_csv(recall: Recall, *, each: bool = False) -> str:
-    """The recalled signals as CSV: u, and p_sig of every signal in E; or a row for each signal with its G and F.
+    """A recall as the text of a CSV table.
 
-    Where u stands still in every read, the first column is the time of the read, from 0 to 1.
+    Args:
+        recall: the recall.
+        each: whether to give a row for each signal with its G and F. Otherwise there is a row for each of 256 bins: u
+            (the time in the read, from 0 to 1, if u stands still in every read), and p_sig of every signal in E.
     """
     require_kind("to_csv", recall, Recall)
     several = len(recall.reads) * len(recall.channels) > 1

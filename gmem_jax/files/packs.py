@@ -1,4 +1,4 @@
-"""Pack files, the packs that ship with the package, and those that were made by name."""
+"""Reading and writing packs: files, the packs that ship with the package, and those made by name."""
 
 import re
 from collections import OrderedDict
@@ -47,7 +47,13 @@ def _arrays(pack: Pack) -> dict[str, Any]:
 def save_pack(
     path: str | Path, pack: Pack, stages: dict[str, Sample] | None = None, frames: Frames | None = None
 ) -> None:
-    """Write a pack, and the time series of its preparation and configurations along it if given.
+    """Write a pack to an HDF5 file.
+
+    Args:
+        path: the file.
+        pack: the pack.
+        stages: samples of the stages of its preparation by name (`log` of `prepare`); default none.
+        frames: configurations along its preparation (`film` of `prepare`); default none.
 
     Raises:
         FileFormatError: if `load_pack` would refuse it, saying why; nothing is written.
@@ -105,15 +111,15 @@ def _check(
 
 @usual_rules()
 def load_pack(source: str | Path) -> Pack:
-    """Read a pack from a file, or by name, neighbour list included.
+    """Read a pack, its neighbour list included.
 
     Args:
-        source: a file, a shipped pack (see `list_packs`), or one that `gmem prepare NAME` has made.
+        source: path of a file, name of a shipped pack (see `list_packs`), or name of one that `gmem prepare NAME` made.
 
     Raises:
         FileNotFoundError: if there is no such file or pack.
-        FileFormatError: if the file is damaged, not a complete pack of this schema, or its numbers are not those of
-            grains at rest in their box (see `pack_validation`).
+        FileFormatError: if the file is damaged, is no complete pack, or its numbers cannot be those of grains at rest
+            in their box (see `gmem_jax.files.pack_validation`).
     """
     path = _path_of(source)
     with refusing(path, "pack"):

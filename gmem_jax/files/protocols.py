@@ -104,20 +104,20 @@ def named_protocol(name: Any) -> ProtocolFile:
 
 @usual_rules()
 def load_protocol(path: str | Path) -> Protocol:
-    """Read a protocol from TOML; the form is described in docs/tutorial_protocols.md.
+    """Read a protocol from a TOML file; docs/tutorial_protocols.md describes the format.
 
-    Its table [signals], if it has one, is for `gmem recall --protocol` and sweeps.
+    A table [signals] in the file is not read here: it is for `gmem recall --protocol` and sweeps.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it is no TOML, or makes no protocol; it names the stage, and what would be right.
+        FileFormatError: if the file is no TOML, or makes no protocol; the message names the stage.
     """
     return read_protocol(Path(path)).protocol
 
 
 @usual_rules()
 def save_protocol(path: str | Path, protocol: Protocol) -> None:
-    """Write a protocol as TOML, stage by stage; `load_protocol` gives the same one.
+    """Write a protocol as a TOML file, from which `load_protocol` makes the same protocol.
 
     Raises:
         OSError: if the path cannot be written.

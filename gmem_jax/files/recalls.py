@@ -1,4 +1,4 @@
-"""Recall files: what was measured, and the configuration that it belongs to."""
+"""Reading and writing recalls, with their configurations."""
 
 import json
 from collections.abc import Sequence
@@ -42,10 +42,10 @@ _EVERY_BIT = int(sum(Status))
 
 @usual_rules()
 def save_recall(path: str | Path, recall: Recall) -> None:
-    """Write a recall with its configuration.
+    """Write a recall and its configuration to an HDF5 file.
 
     Raises:
-        ValueError: if the recall does not say what it is of.
+        ValueError: if the recall has no configuration, as that of a traced experiment.
         OSError: if the path cannot be written.
     """
     require_kind("save_recall(path, recall)", recall, Recall)
@@ -74,12 +74,11 @@ def _declared(reads: Sequence[str], channels: Sequence[str], dt_dimensions: int)
 
 @usual_rules()
 def load_recall(path: str | Path) -> Recall:
-    """Read a recall, and the configuration that it belongs to.
+    """Read a recall and its configuration.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if the file is damaged, not a complete recall of this schema, or its numbers do not fit each
-            other.
+        FileFormatError: if the file is damaged, is no complete recall, or its numbers do not fit each other.
     """
     path = Path(path)
     with refusing(path, "recall"):

@@ -1,4 +1,4 @@
-"""Waveforms from tables of samples (CSV and NPY), from their written form, and by what the command line calls them."""
+"""Waveforms from files of samples (CSV and NPY), from their written form, and by their names on the command line."""
 
 import codecs
 import json
@@ -41,22 +41,26 @@ _TARGET, _DESIGN = "# target: ", "# design: "
 def load_waveforms(
     path: str | Path, *, smooth: float = 0.0, taper: float = 0.0, scale: bool = False, told: Told = untold
 ) -> np.ndarray:
-    """Waveform samples [S, n] from a CSV (one column per signal) or NPY ([n] or [S, n]) file.
+    """Read samples of S waveforms from a CSV file (a column for each) or an NPY file (a row for each), for `waveform`.
 
-    Row k is I at u = k / (n + 1), k = 1..n, in the file and in what is returned. A CSV may have a line of names; a
-    column called u, or t or time with or without a unit, is the axis: times become u from 0 to 1, first to last.
+    Sample k, k = 1..n, is I at u = k / (n + 1). A CSV file may begin with a line of names. If it has a column called u,
+    or t or time (with or without a unit), the samples were taken there; times become u from 0 to 1, first to last, and
+    the waveforms are interpolated as by `waveform_from`.
 
     Args:
         path: the file.
-        smooth: width in u over which samples are averaged; see `waveform_from` for this and what follows.
-        taper: width in u at either end within which waveforms are brought to zero.
-        scale: whether to divide by the largest value of all.
-        told: gets a line on what was found and changed, if anything was: print, say.
+        smooth: as in `waveform_from`.
+        taper: as in `waveform_from`.
+        scale: as in `waveform_from`.
+        told: called with one line of text on what was found and changed, if anything was, such as `print`.
+
+    Returns:
+        The samples, [S, n].
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it cannot be read as real numbers, is ragged, has decimal commas, names that fit no columns
-            or an axis that is not called so; holds numbers that are not finite, or waveforms that no pack could hold.
+        FileFormatError: if the file has other than real, finite numbers, rows of different lengths, decimal commas,
+            names that do not fit its columns, or an axis under another name; or waveforms that no pack can follow.
     """
     path = Path(path)
     with refusing(path, "table of numbers"):
@@ -148,13 +152,14 @@ def _npy(path: Path) -> np.ndarray:
 def save_waveforms(
     path: str | Path, signals: Signals, target: Signals | None = None, *, design: Mapping[str, Any] | None = None
 ) -> None:
-    """Write waveforms as a CSV that `load_waveforms` and `gmem recall --signals` read: a column for every signal.
+    """Write waveforms as a CSV file, a column for each, which `load_waveforms` and `gmem recall --signals` read.
 
     Args:
         path: the file.
-        signals: the waveforms; of any but a `Spline` samples are written, one for each of 256 bins.
-        target: those whose recall they imitate, kept in a comment that `load_target` reads.
-        design: how that went, kept in a comment that `load_design` reads.
+        signals: the waveforms. The samples of a `Spline` are written as they are; others are sampled at k / 256,
+            k = 1..255.
+        target: if they were designed, the waveforms whose J their recalls follow; kept in a comment.
+        design: if they were designed, facts about the design; kept in a comment.
 
     Raises:
         OSError: if the path cannot be written.

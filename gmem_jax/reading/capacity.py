@@ -1,7 +1,7 @@
-"""How many bits a pack holds: what a reader gets from it at least, and what a linear memory could carry at most.
+"""Bounds on the bits that a pack stores: what a reader decodes at least, and what a linear memory carries at most.
 
-A simulation repeats itself to nine digits, so that a capacity is one at a stated noise: normal, independent in each of
-the 256 bins of p_sig, of one standard deviation. Between the two bounds lies what better waveforms or readers may add.
+A simulation is reproducible to nine digits, so a capacity needs a stated noise: here normal, independent in each of the
+256 bins of p_sig, with one standard deviation. Better waveforms or readers may add bits up to the upper bound.
 """
 
 from typing import NamedTuple
@@ -20,11 +20,11 @@ BOOTSTRAP = 400  # samples of the words for an error bar
 
 
 class Decoded(NamedTuple):
-    """Information that a reader got from words.
+    """The information that a reader decoded from words.
 
     Attributes:
-        bits: sum over the bits of a word of what is known of each by itself.
-        error: standard error, by bootstrap over the words. It is 0 where every word was read right.
+        bits: mutual information of each bit stored and read, summed over the bits of a word, in bits.
+        error: standard error of this, by bootstrap over the words; 0 if every word was read right.
     """
 
     bits: float
@@ -32,12 +32,12 @@ class Decoded(NamedTuple):
 
 
 class Alphabet(NamedTuple):
-    """Waveforms chosen one by one, each as far from all before as can be.
+    """Waveforms chosen one by one, each with a recall as far as possible from those chosen before.
 
     Attributes:
-        chosen: their numbers among the candidates, in the order of choice, [S].
-        distance: between the two nearest recalls of the first 1, 2, ... S chosen, [S]: root mean square over bins,
-            in the unit of the recalls; infinite for the first.
+        chosen: numbers of the waveforms among the candidates, from 0, in the order of choice, [S].
+        distance: smallest distance between the recalls of the first 1, 2, ..., S of them, [S]: root mean square over
+            the bins, in the unit of the recalls; infinite for the first.
     """
 
     chosen: np.ndarray
@@ -45,17 +45,17 @@ class Alphabet(NamedTuple):
 
 
 def decoded_bits(signals: jax.typing.ArrayLike, noise: float, *, draws: int = 4, seed: int = 0) -> Decoded:
-    """Information that the linear decoder reads from noisy recalls of words it has not seen: a lower bound.
+    """Information that a linear decoder reads from noisy recalls of words: a lower bound on the bits stored.
 
-    The decoder learns from other words, with noise of their own (`readers.linear_decoder`). What the answers say of
-    each bit is added up: no more than they say of the word, since the bits stored are independent. S words bias the
-    sum upwards by 1 / (2 S ln 2) a bit, which matters only where hardly anything is read.
+    The decoder is trained on other words than it reads, with other noise (`gmem_jax.reading.readers.linear_decoder`).
+    The information on each bit is summed, which is at most that on the word, since the bits stored are independent.
+    With S words the sum is biased upwards by 1 / (2 S ln 2) a bit, which matters only if hardly anything is read.
 
     Args:
         signals: p_sig of all words of L bits, in order, [2^L, 256].
-        noise: standard deviation in each bin, in the unit of the signals.
-        draws: of the noise.
-        seed: of the noise and of the decoder's splits.
+        noise: standard deviation of the noise in each bin, in the unit of the signals.
+        draws: number of draws of the noise.
+        seed: random seed of the noise and of the splits into training and reading.
 
     Raises:
         ValueError: if these are not 2^L signals, or not finite, the noise is no number from 0, or there are no draws.
@@ -105,16 +105,19 @@ def _bitwise(truth: np.ndarray, read: np.ndarray, weight: np.ndarray) -> np.ndar
 
 
 def channels(kernel: MemoryKernel | KernelMatrix, noise: float, power: float = 1.0) -> np.ndarray:
-    """Bits that each singular waveform of a linear memory can carry at most, [n], falling: an upper bound in all.
+    """Largest number of bits that each singular waveform of a linear memory carries; their sum is an upper bound.
 
-    Shannon's capacity of parallel channels, 1/2 log2(1 + p_i 256 s_i^2 / noise^2), with the power shared out by
-    water-filling. |I| <= 1 implies a mean of I^2 below 1, not the other way round: the bound is generous. It holds
-    for the odd part of the kernel and for waveforms made up of its basis, and for nothing else.
+    It is Shannon's capacity of parallel channels, 1/2 log2(1 + p_i 256 s_i^2 / noise^2), for singular values s_i, with
+    the power p_i shared out by water-filling. The bound is generous: |I| <= 1 implies a mean of I^2 below 1, but not
+    the reverse. It holds only for the odd part of the kernel, and for waveforms that are sums of its bumps.
 
     Args:
-        kernel: of n basis waveforms; or of n for each of several channels of strain.
-        noise: standard deviation in each bin, in E.
-        power: largest mean of I^2 over u, of all channels of strain together.
+        kernel: a kernel of n bumps, or the matrix of kernels of several channels of strain.
+        noise: standard deviation of the noise in each bin, in E.
+        power: largest mean of I^2 over u, summed over channels of strain.
+
+    Returns:
+        Bits, falling, [n]; [C n] for C channels of strain.
 
     Raises:
         ValueError: if noise or power is not above 0.
@@ -126,7 +129,15 @@ def channels(kernel: MemoryKernel | KernelMatrix, noise: float, power: float = 1
 
 
 def water_filled(ratio: np.ndarray, power: float) -> np.ndarray:
-    """The power of each channel that carries most in all, [n], for falling ratios of signal to noise at unit power."""
+    """The powers of parallel channels that give the largest total capacity (water-filling).
+
+    Args:
+        ratio: ratios of signal to noise at unit power, falling, [n].
+        power: sum of the powers.
+
+    Returns:
+        The power of each channel, [n].
+    """
     with np.errstate(divide="ignore"):
         bottom = 1.0 / ratio
     level = (power + np.cumsum(bottom)) / np.arange(1, len(bottom) + 1)  # of the water, if so many channels are wet
@@ -135,10 +146,18 @@ def water_filled(ratio: np.ndarray, power: float) -> np.ndarray:
 
 
 def candidates(kernel: MemoryKernel, count: int, *, seed: int = 0) -> np.ndarray:
-    """Amplitudes of random waveforms with |I| <= 1 on the kernel's bumps, [count, n], for an alphabet.
+    """Random waveforms with |I| <= 1, from which `greedy_alphabet` chooses.
 
-    Levels of -1, 0 and 1 are held over runs of bumps, long in some waveforms and short in others: of the same height,
-    slow waveforms are recalled best and fast ones differ most.
+    Levels of -1, 0 and 1 are held over runs of bumps, long in some waveforms and short in others: of equal height, slow
+    waveforms have the largest recalls and fast ones differ most.
+
+    Args:
+        kernel: the kernel whose n bumps make the waveforms.
+        count: number of waveforms.
+        seed: random seed.
+
+    Returns:
+        Amplitudes of the bumps, [count, n].
     """
     n, generator = kernel.centres.size, np.random.default_rng(seed)
     level = generator.choice([-1.0, 0.0, 1.0], (count, n))
@@ -148,16 +167,16 @@ def candidates(kernel: MemoryKernel, count: int, *, seed: int = 0) -> np.ndarray
 
 
 def greedy_alphabet(recalls: jax.typing.ArrayLike, size: int) -> Alphabet:
-    """Choose waveforms by their recalls: the largest first, then always the farthest from all chosen so far.
+    """Choose waveforms by their recalls: the largest first, then always the one farthest from all chosen so far.
 
-    The smallest distance is at least half of the best that `size` of these candidates could have.
+    The smallest distance between the chosen is at least half of the largest that any choice could have.
 
     Args:
         recalls: p_sig of the candidates, [count, 256], in any unit.
-        size: S, how many to choose.
+        size: number S of waveforms to choose.
 
     Raises:
-        ValueError: if there are not as many candidates, or not all are finite.
+        ValueError: if there are fewer candidates, or a recall is not finite.
     """
     values, size = _finite(recalls), require_whole("size", size)
     if not 1 <= size <= len(values):
@@ -174,10 +193,13 @@ def greedy_alphabet(recalls: jax.typing.ArrayLike, size: int) -> Alphabet:
 
 
 def smallest_distance(recalls: jax.typing.ArrayLike) -> float:
-    """Distance of the two nearest recalls [S, 256], as in `Alphabet`.
+    """Smallest distance between two of several recalls: root mean square over the bins, in the unit of the recalls.
+
+    Args:
+        recalls: p_sig, [S, 256], in any unit.
 
     Raises:
-        ValueError: if there are not two.
+        ValueError: if there are fewer than two.
     """
     values = np.asarray(recalls, dtype=float)
     if len(values) < 2:

@@ -1,4 +1,4 @@
-"""The paper's reader in one place, as `gmem_jax.classify`: its lessons, the net, its training."""
+"""The paper's reader of binary words, `gm.classify`: the net, its training data and its training."""
 
 from gmem_jax.reading.lessons import Examples, TrainingConfig, examples
 from gmem_jax.reading.net import Net, accuracy, cross_entropy, initial, logits, normalise, predict

@@ -1,10 +1,10 @@
-"""What the paper's reader learns from: the inputs J_s alone, shifted, scaled, with noise (paper, Sec. III).
+"""Training data of the paper's reader: the inputs J_s alone, shifted, scaled and with noise (paper, Sec. III).
 
-All words under one transformation are a set, and each set is divided by its own <|J|>, as what is recalled is when it
-is read: of a factor there remains how much smaller or larger the noise is.
+All words under one transformation are a set. Each set is divided by its own <|J|>, as recalled signals are when they
+are read, so that a factor changes only the relative size of the noise.
 
-Nothing of the training set is stored but the shifted J_s, [S, shifts, 256]: an example follows from the numbers of its
-word, shift, amplitude and draw, and from the seed. All functions are pure.
+Only the shifted J_s are stored, [S, shifts, 256]: an example follows from the numbers of its word, shift, amplitude and
+draw, and from the seed. All functions are pure.
 """
 
 import functools
@@ -26,23 +26,23 @@ RATIOS = 64  # of noise to signal at which the size of a set is calculated, and 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """What the net is and what it is trained on; by default the paper's net and 17,325 examples a word.
+    """The layers of the net and its training data; by default the paper's net, and 17,325 examples of each word.
 
     Attributes:
-        bits: L, the length of the words.
+        bits: length L of the words.
         hidden: widths of the hidden layers.
         shifts: number of shifts in u, equally spaced in +-`shift`.
-        shift: largest shift, in bits (u_b).
-        amplitudes: number of factors, equally spaced in 1 +- `amplitude`.
-        amplitude: largest change of the amplitude.
-        draws: noise draws; their SDs are equally spaced from 0 to `noise`.
-        noise: largest SD of the noise, in <|J|>.
-        held_out: part of the (shift, amplitude, draw) combinations that is kept for validation.
-        batch: examples to a step.
+        shift: largest shift, in widths of a bit u_b.
+        amplitudes: number of factors on J, equally spaced in 1 +- `amplitude`.
+        amplitude: largest relative change of J.
+        draws: number of draws of the noise; their standard deviations are equally spaced from 0 to `noise`.
+        noise: largest standard deviation of the noise, in <|J|>.
+        held_out: fraction of the (shift, amplitude, draw) combinations that is held out for validation.
+        batch: number of examples in a step of the training.
         rate: learning rate of plain SGD.
 
     Raises:
-        ValueError: for what no net can be trained on.
+        ValueError: for impossible numbers, or if no example is left to train on.
     """
 
     bits: int
@@ -84,12 +84,12 @@ class TrainingConfig:
 
     @property
     def combinations(self) -> int:
-        """Transformations of one word."""
+        """Number of transformations (shift, amplitude, draw) of one word."""
         return self.shifts * self.amplitudes * self.draws
 
     @property
     def kept(self) -> int:
-        """How many of them are held out."""
+        """Number of transformations of one word that are held out for validation."""
         return max(1, round(self.held_out * self.combinations))
 
 

@@ -38,11 +38,11 @@ class Perceptron(nn.Module):
 @functools.partial(jax.tree_util.register_dataclass, data_fields=["parameters"], meta_fields=["lessons"])
 @dataclass(frozen=True)
 class Net:
-    """A net.
+    """A net that reads words from recalled signals.
 
     Attributes:
-        parameters: flax's tree of weights and biases, float32.
-        lessons: what it was built from.
+        parameters: weights and biases, a pytree of flax, float32.
+        lessons: its layers and training data.
     """
 
     parameters: Any
@@ -73,20 +73,39 @@ def normalise(signals: jax.Array) -> jax.Array:
 
 
 def logits(net: Net, signals: jax.typing.ArrayLike) -> jax.Array:
-    """Logits [S, words] of a set of recalled signals [S, 256], in any unit."""
+    """Logits of all words for a set of recalled signals.
+
+    Args:
+        net: a trained net.
+        signals: p_sig, [S, 256], in any unit: they are divided by the mean of |p_sig| over the set.
+
+    Returns:
+        Logits, [S, 2^L].
+    """
     return raw_logits(net, normalise(jnp.asarray(signals)))
 
 
 def predict(net: Net, signals: jax.typing.ArrayLike) -> jax.Array:
-    """Number of the word read from each signal [S, 256], from 0, [S]; -1 if any is not finite, or all are zero."""
+    """The word that is read from each of a set of recalled signals.
+
+    Args:
+        net: a trained net.
+        signals: p_sig, [S, 256], in any unit.
+
+    Returns:
+        Numbers of the words, from 0, [S]; all are -1 if a signal is not finite, or all are zero.
+    """
     found = logits(net, signals)
     return jnp.where(jnp.all(jnp.isfinite(found), axis=-1), jnp.argmax(found, axis=-1), -1)
 
 
 def accuracy(net: Net, signals: jax.typing.ArrayLike, word: jax.typing.ArrayLike | None = None) -> jax.Array:
-    """Part of the recalled signals [S, 256] that is read right; `word` [S] as in `cross_entropy`.
+    """Fraction of recalled signals that is read right; NaN if a signal is not finite, or all are zero.
 
-    NaN if any of the signals is not finite, or all are zero.
+    Args:
+        net: a trained net.
+        signals: p_sig, [S, 256], in any unit.
+        word: numbers of the words stored, from 0, [S]; default 0, 1, 2, ...
 
     Raises:
         ValueError: if there are more signals than words, and no `word` says which each is.
@@ -97,7 +116,7 @@ def accuracy(net: Net, signals: jax.typing.ArrayLike, word: jax.typing.ArrayLike
 
 
 def cross_entropy(net: Net, signals: jax.typing.ArrayLike, word: jax.typing.ArrayLike | None = None) -> jax.Array:
-    """Mean cross-entropy, in nats, of recalled signals; differentiable with respect to them.
+    """Mean cross-entropy of recalled signals, in nats; it can be differentiated with respect to them.
 
     Args:
         net: a trained net.

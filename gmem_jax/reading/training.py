@@ -1,4 +1,4 @@
-"""How the paper's reader learns, and its files."""
+"""Training of the paper's reader, and files of trained nets."""
 
 import json
 import time
@@ -73,17 +73,17 @@ def validation_accuracy(net: Net, data: Examples, count: int) -> jax.Array:
 
 @dataclass(frozen=True)
 class Training:
-    """A training, finished or broken off.
+    """The state of a training, finished or interrupted.
 
     Attributes:
-        net: as it is now.
+        net: the net.
         seed: random seed of weights, order and noise.
-        step: steps done.
-        loss: mean cross-entropy of the last call's steps.
+        step: number of steps done.
+        loss: mean cross-entropy over the last 250 steps or fewer, in nats.
         validation: accuracy on held-out examples at the last check.
-        examples: how many these were.
-        finished: whether the accuracy asked for was reached, confirmed on `LAST_CHECK` examples or all there are.
-        seconds: spent so far, compilation included.
+        examples: number of examples in that check.
+        finished: whether the target accuracy was reached, confirmed on 65,536 held-out examples or all there are.
+        seconds: time spent so far, compilation included, in s.
     """
 
     net: Net
@@ -115,24 +115,25 @@ def train_net(
     checkpoint: Path | None = None,
     listener: Listener = silent,
 ) -> Training:
-    """Train a net until it reads held-out transformed inputs, or until time is up.
+    """Train a net until it reads held-out examples with the target accuracy, or until time is up.
 
-    The same lessons and seed go through the same nets, bit for bit on one machine, however often they are broken off.
+    On one machine the same lessons and seed give the same net, bit for bit, even if the training is interrupted.
 
     Args:
-        lessons: the net and its training data.
-        seed: of weights, order and noise.
-        budget: seconds that this call may take; it ends within `STEPS_PER_CALL` steps and a last check of them.
-        target: validation accuracy to stop at.
-        most_steps: steps to stop at; default no limit.
-        checkpoint: file that holds the training, written every 30 s and at the end; if it exists, training goes on
-            from there, and one that has reached `target` is only loaded.
-        listener: told about every `STEPS_PER_CALL` steps.
+        lessons: the layers of the net and its training data.
+        seed: random seed of weights, order and noise.
+        budget: time that this call may take, in s; it ends after the 250 steps at which this has passed, and a last
+            check.
+        target: accuracy on held-out examples at which the training stops.
+        most_steps: number of steps at which the training stops; default no limit.
+        checkpoint: file that keeps the training, written every 30 s and at the end; default none. If it exists, the
+            training continues from it; if that has reached `target`, it is only loaded.
+        listener: called with the `Training` after every 250 steps; default none.
 
     Raises:
         FileFormatError: if the checkpoint is broken.
-        ValueError: if it is of other lessons or of another seed, or the seed is no whole number from 0.
-        OSError: if it cannot be written.
+        ValueError: if the checkpoint is of other lessons or of another seed, or the seed is no whole number from 0.
+        OSError: if the checkpoint cannot be written.
     """
     began = saved = time.perf_counter()
     seed = require_whole("seed", seed)

@@ -38,19 +38,24 @@ def plot(
     against: str = "time",
     signals: Sequence[int] = (),
 ) -> Drawing:
-    """A picture of a recall, which a notebook shows: `.save(path)` writes it, `.figure` is matplotlib's.
+    """A picture of a recall.
 
-    Of several reads or channels all are in one picture; `gm.plot(recall.at(read, channel))` draws one.
+    All reads and channels are in one picture; `gm.plot(recall.at(read, channel))` draws one of them.
 
     Args:
         recall: the recall.
-        what: "signals", recalled; "waveforms", stored; "all", an image of all; or a quantity of the stages, like
-            "pressure", "p_xy", "Z" or "phi"; or what an observer gave, like "observed:sliding".
-        against: "time" or "u", for the stages.
-        signals: the numbers of the signals to draw, from 1; of the stages also 0, the zero signal. Default all.
+        what: "signals", the recalled signals; "waveforms", the stored ones; "all", an image with a row for each signal;
+            a quantity of the stages, like "pressure", "p_xy", "Z" or "phi" (docs/glossary.md lists them); or the values
+            of an observer, like "observed:sliding".
+        against: horizontal axis of quantities of the stages, "time" or "u".
+        signals: numbers of the signals to draw, from 1; 0 is the zero signal, for quantities of the stages only.
+            Default all.
+
+    Returns:
+        A drawing that a notebook shows; its method `save(path)` writes it, and its `figure` is matplotlib's.
 
     Raises:
-        ValueError: if there is no such picture, or no such signal; it names those that there are.
+        ValueError: if there is no such picture or signal; the message names those that exist.
     """
     require_kind("plot", recall, Recall)
     require_several(signals, "signals")

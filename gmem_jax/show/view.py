@@ -1,4 +1,4 @@
-"""A pack in three dimensions, in a page of its own: `gm.view(pack)` in a notebook, and figures of a report."""
+"""Interactive pictures of packs in three dimensions: `gm.view(pack)` in a notebook, and figures of a report."""
 
 import base64
 import html
@@ -91,13 +91,13 @@ class View:
 
 
 def view(pack: Pack | Frames) -> View:
-    """A pack at rest, or the frames of a recall, in 3D: to be turned, cut and coloured.
+    """An interactive 3D picture of a pack at rest, or of the frames of a recall, to be turned, cut and coloured.
 
     Args:
         pack: a pack, or `recall.frames`.
 
     Returns:
-        What a notebook shows, and `save` writes as a page.
+        A view that a notebook shows; its method `save(path)` writes it as an HTML page.
     """
     if not isinstance(pack, Pack | Frames):
         kept = "gm.run(experiment, frames=10) keeps frames in recall.frames"

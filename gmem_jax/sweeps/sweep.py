@@ -1,4 +1,4 @@
-"""A sweep from its beginning to its end: points, packs, jobs, results."""
+"""Running a sweep from its points to its results: `gm.sweep`, and the sweeps of the command line."""
 
 import contextlib
 import functools
@@ -85,21 +85,24 @@ def sweep(
     *,
     progress: ProgressChoice = None,
 ) -> Results:
-    """Run every combination of some values, in this process; what may run side by side does.
+    """Run an experiment with every combination of some values, in this process, side by side where possible.
 
     Args:
-        experiment: what all have in common.
-        vary: values by dotted name, like {"friction.mu": [0.0, 0.5], "pack": packs}; packs also by name.
-        folder: keeps the results; what is there already is not computed again. Its table is of the latest call.
-        progress: told about every chunk; default a bar in a terminal or a notebook, False for none.
+        experiment: the experiment; all that is not varied is the same in all points.
+        vary: lists of values by dotted name, like {"friction.mu": [0.0, 0.5], "pack": packs}. Packs may be given by
+            name or file.
+        folder: folder that keeps the results: points that are there already are not computed again, and its table shows
+            the points of the latest call. Default none.
+        progress: see `run`.
 
     Returns:
-        The points in the order of `itertools.product`, the last name fastest.
+        A list of points, each with its `values` by name and its `recall`, in the order of `itertools.product`: the last
+        name changes fastest.
 
     Raises:
         ValueError: for a name that is no field, or an impossible value.
         RunFailedError: if a simulation broke down.
-        FileFormatError: if another call computes the same points in this folder now, or it holds something else.
+        FileFormatError: if another call is computing the same points in this folder, or it holds something else.
     """
     require_kind("sweep", experiment, Experiment)
     tell = callback(progress)
