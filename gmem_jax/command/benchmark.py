@@ -1,4 +1,4 @@
-"""`gmem bench`."""
+"""The command `gmem bench`."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -21,13 +21,15 @@ def bench_command(
     t0: Annotated[
         float, typer.Option(help="Duration of the compression whose first bins are timed, in t_c.", metavar="<float>")
     ] = measure.T0,
-    with_lammps: Annotated[bool, typer.Option("--lammps/--no-lammps", help="Measure LAMMPS beside us.")] = True,
-    with_jax: Annotated[bool, typer.Option("--jax/--no-jax", help="Measure plain JAX beside us.")] = True,
-    scaling: Annotated[bool, typer.Option("--scaling/--no-scaling", help="Cost against N, memory, gradient.")] = True,
+    with_lammps: Annotated[bool, typer.Option("--lammps/--no-lammps", help="Measure LAMMPS too.")] = True,
+    with_jax: Annotated[bool, typer.Option("--jax/--no-jax", help="Measure plain JAX too.")] = True,
+    scaling: Annotated[
+        bool, typer.Option("--scaling/--no-scaling", help="Measure cost against N, memory and gradients too.")
+    ] = True,
     baseline: Annotated[Path | None, typer.Option(help="A bench.json to compare with.")] = None,
     device: Annotated[
         Literal["cpu", "gpu"],
-        typer.Option(help="gpu: the native backend there, N = 325 to 10,240; no files."),
+        typer.Option(help="gpu measures the native backend there, for N = 325 to 10,240, and writes no files."),
     ] = "cpu",
     as_json: AsJson = False,
 ) -> None:

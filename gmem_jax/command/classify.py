@@ -1,4 +1,4 @@
-"""`gmem classify`."""
+"""The command `gmem classify`."""
 
 import contextlib
 import time
@@ -73,14 +73,14 @@ def _chosen(found: Recall, file: Path, read: str, channel: str) -> Recall:
 def classify_command(
     recall: Annotated[Path, typer.Argument(help="A recall of binary words (gmem recall --signals words:L).")],
     output: Output = Path("classify.json"),
-    seeds: Annotated[int, typer.Option(min=1, help="Nets to train, with seeds 0, 1, ...")] = 3,
-    budget: Annotated[float, typer.Option(min=0.0, help="Longest training of one net, seconds.")] = 300.0,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of nets to train, with seeds 0, 1, ...")] = 3,
+    budget: Annotated[float, typer.Option(min=0.0, help="Longest training of one net, in s.")] = 300.0,
     nets: Annotated[
         Path | None,
-        typer.Option(help="Folder of trained nets, used and added to; default gmem-nets beside the recall."),
+        typer.Option(help="Folder of trained nets, which are used and added to; default gmem-nets beside the recall."),
     ] = None,
-    read: Annotated[str, typer.Option(help="Of several reads, the one that is read.")] = "",
-    channel: Annotated[str, typer.Option(help="Of several channels, the one that is read.")] = "",
+    read: Annotated[str, typer.Option(help="Name of the read; needed if the recall has several.")] = "",
+    channel: Annotated[str, typer.Option(help="Name of the channel; needed if the recall has several.")] = "",
     picture: Picture = True,
     force: Force = False,
     as_json: AsJson = False,

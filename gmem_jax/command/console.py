@@ -1,4 +1,4 @@
-"""What every command says and how: logs and progress on stderr, results on stdout, outputs that destroy nothing."""
+"""Output of all commands: logs and progress on stderr, results on stdout, files that overwrite nothing unasked."""
 
 import contextlib
 import errno
@@ -65,10 +65,13 @@ LOG_INTERVAL = 30.0  # seconds between lines of progress where there is no termi
 
 Output = Annotated[Path, typer.Option("-o", "--output", help="File to write.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout; logs go to stderr.")]
-Picture = Annotated[bool, typer.Option(help="Also draw it, beside the output.")]
+Picture = Annotated[bool, typer.Option(help="Also draw a picture, beside the output.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace outputs that exist.")]
 KeptFrames = Annotated[
-    int, typer.Option("--frames", min=0, help="Configurations along the run to keep, the first and last among them.")
+    int,
+    typer.Option(
+        "--frames", min=0, help="Number of configurations to keep along the run, the first and last among them."
+    ),
 ]
 PackName = Annotated[str, typer.Argument(help="A pack file, or the name of a pack that is shipped or made.")]
 

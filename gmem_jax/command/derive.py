@@ -1,4 +1,4 @@
-"""`gmem gradient`, `gmem kernel`, `gmem design`, `gmem tune`."""
+"""The commands `gmem gradient`, `gmem kernel`, `gmem design` and `gmem tune`."""
 
 import time
 from pathlib import Path
@@ -172,9 +172,11 @@ def kernel_command(
     chosen: ExperimentOptions,
     pack: PackName,
     output: Output = Path("kernel.h5"),
-    n: Annotated[int, typer.Option("-n", "--bumps", min=2, max=512, help="Basis waveforms.")] = 17,
+    n: Annotated[int, typer.Option("-n", "--bumps", min=2, max=512, help="Number of basis waveforms.")] = 17,
     width: Annotated[float, typer.Option(min=0.01, max=0.9, help="Width of the bumps, in u.")] = 0.2,
-    noise: Annotated[float, typer.Option(min=0.0, help="Noise in the recall, Pa RMS.")] = 1.0,
+    noise: Annotated[
+        float, typer.Option(min=0.0, help="RMS of the noise in a recall, in Pa; for resolution and capacity.")
+    ] = 1.0,
     restart: Restart = False,
     picture: Picture = True,
     force: Force = False,
@@ -228,23 +230,24 @@ def design_command(
     chosen: ExperimentOptions,
     pack: PackName,
     output: Output = Path("designed.csv"),
-    words: Annotated[int | None, typer.Option(help="Design all words of so many bits, as --signals words:L.")] = None,
+    words: Annotated[int | None, typer.Option(help="Design all words of so many bits, like --signals words:L.")] = None,
     by: Annotated[
         str | None,
         typer.Option(
-            help=f"jacobian: of each waveform; kernel: of the pack, default for words and above {MANY} signals."
+            help=f"jacobian, of each waveform; or kernel, of the pack: default for --words and above {MANY} signals."
         ),
     ] = None,
     iterations: Annotated[
         int | None,
         typer.Option(
-            min=1, help=f"Corrections; default {waveforms.ITERATIONS} by Jacobians, {KERNEL_ITERATIONS} by the kernel."
+            min=1,
+            help=f"Corrections, default {waveforms.ITERATIONS}; by the kernel simulations, {KERNEL_ITERATIONS}.",
         ),
     ] = None,
     bumps: Annotated[
         int | None,
         typer.Option(
-            min=2, help=f"Of a waveform; default {waveforms.BUMPS} by Jacobians, {KERNEL_BUMPS} by the kernel."
+            min=2, help=f"Bumps of a waveform; default {waveforms.BUMPS} by Jacobians, {KERNEL_BUMPS} by the kernel."
         ),
     ] = None,
     width: Annotated[
@@ -252,20 +255,20 @@ def design_command(
         typer.Option(
             min=0.01,
             max=1.0,
-            help=f"Of bumps, in u; default {waveforms.BUMP_WIDTH} by Jacobians, {KERNEL_BUMP_WIDTH} by the kernel.",
+            help=f"Width of bumps, in u; default {waveforms.BUMP_WIDTH}; by the kernel {KERNEL_BUMP_WIDTH}.",
         ),
     ] = None,
     gain: Annotated[
-        float | None, typer.Option(help="Wanted gain; default at most half of the untouched waveforms'.")
+        float | None, typer.Option(help="Wanted gain; default at most half of that of the original waveforms.")
     ] = None,
     start: Annotated[
-        Path | None, typer.Option(help="Designed waveforms to make better, as --output wrote them; by the kernel only.")
+        Path | None, typer.Option(help="File of designed waveforms to improve; by the kernel only.")
     ] = None,
     measured: Annotated[
         int,
         typer.Option(
             min=0,
-            help="Directions, on average, along which a waveform's slopes are measured twice; by the kernel only.",
+            help="Mean number of directions in which slopes of a waveform are measured, twice; by the kernel only.",
         ),
     ] = 0,
     restart: Restart = False,
@@ -361,7 +364,9 @@ def tune_command(
     bounds: Annotated[
         str, typer.Option(help="Lowest and highest value of gamma0, mu or stiffness, as in mu=0.5:2,gamma0=3e-4:3e-3.")
     ] = "gamma0=3e-4:3e-3,mu=0.5:2,stiffness=0.07:0.29",
-    iterations: Annotated[int, typer.Option(min=1, help="Steps; each 7 runs a pack.")] = 6,
+    iterations: Annotated[
+        int, typer.Option(min=1, help="Steps; each takes 2 n + 1 runs of each pack, for n bounds.")
+    ] = 6,
     restart: Restart = False,
     picture: Picture = True,
     force: Force = False,

@@ -1,4 +1,4 @@
-"""`gmem export`, `gmem import`: configurations to and from the formats of others."""
+"""The commands `gmem export` and `gmem import`: configurations in the formats of other programs."""
 
 from pathlib import Path
 from typing import Annotated
@@ -28,9 +28,14 @@ from gmem_jax.show import tables
 
 def export(
     file: Annotated[Path, typer.Argument(help="A pack or a recall file, or the name of a pack.")],
-    to: Annotated[str, typer.Option(help=f"{', '.join(EXPORT_FORMATS)}.")],
+    to: Annotated[str, typer.Option(help=f"Format: {', '.join(EXPORT_FORMATS)}.")],
     output: Output,
-    frames: Annotated[bool, typer.Option("--frames", help="Of a pack: the configurations of its preparation.")] = False,
+    frames: Annotated[
+        bool,
+        typer.Option(
+            "--frames", help="Of a pack: the configurations kept during its preparation, not the pack at rest."
+        ),
+    ] = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -68,7 +73,7 @@ def import_command(
     output: Output,
     radius: Annotated[float, typer.Option(help="R in the file's unit of length: the radius of equal spheres.")] = 1.0,
     delta0: Annotated[float, typer.Option(help="Areal compression that the pack is meant for.")] = 0.05,
-    name: Annotated[str, typer.Option(help="Name of the pack; default the file's.")] = "",
+    name: Annotated[str, typer.Option(help="Name of the pack; default that of the file.")] = "",
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""`gmem info`."""
+"""The command `gmem info`."""
 
 from typing import Any
 

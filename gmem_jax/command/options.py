@@ -29,13 +29,13 @@ _OTHERS: _Options = {
     "signals": (
         "six",
         str,
-        "six; words:L, all words of L bits; or a file: .csv, a column per signal (one may be time), "
-        ".npy, a row per signal. "
+        "Waveforms: six, the paper's; words:L, all words of L bits; or a file: .csv, a column per signal (one may be "
+        "time), .npy, a row per signal. "
         "For several channels or writes NAME=six,NAME=words:L.",
         (),
     ),
-    "word_pad": (None, float | None, "words: bits left free at either end; default 2.", ()),
-    "word_width": (None, float | None, "words: width of bumps, in bits; default 1.", ()),
+    "word_pad": (None, float | None, "words: free widths of a bit at either end; default 2.", ()),
+    "word_width": (None, float | None, "words: width of the bumps, in widths of a bit; default 1.", ()),
     "smooth": (None, float | None, "Samples in a file: width in u over which they are averaged.", ()),
     "taper": (
         None,

@@ -1,4 +1,4 @@
-"""`gmem prepare`."""
+"""The command `gmem prepare`."""
 
 import time
 from dataclasses import asdict, fields
@@ -87,14 +87,16 @@ def prepare_command(
             metavar="[NAME]", help="A standard pack, tetra-N-x, to be made at the paper's rate and kept by that name."
         ),
     ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write.")] = None,
-    shape: Annotated[str, typer.Option(help="tetra, sphere, or a file of spheres: x y z r in every line.")] = "tetra",
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="File to write; needed without NAME.")] = None,
+    shape: Annotated[
+        str, typer.Option(help="Grain: tetra, sphere, or a file of spheres, x y z r in every line.")
+    ] = "tetra",
     overlap: Annotated[
         float | None,
         typer.Option(help=f"Overlap O of a tetra grain, in [0, 1); default {CLUMP_OVERLAP}.", show_default=False),
     ] = None,
     name: Annotated[str, typer.Option(help="Name of the pack; default from grain, size and seed.")] = "",
-    backend: Annotated[str, typer.Option(help="auto, jax or native.")] = "auto",
+    backend: Annotated[str, typer.Option(help="Code that computes the steps: auto, jax or native.")] = "auto",
     frames: KeptFrames = 0,
     restart: Restart = False,
     dry_run: DryRun = False,

@@ -1,4 +1,4 @@
-"""`gmem recall`, `gmem demo`."""
+"""The commands `gmem recall` and `gmem demo`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -101,15 +101,17 @@ def recall_command(
     pack: PackName,
     output: Output = Path("recall.h5"),
     batch: Annotated[
-        int | None, typer.Option(min=1, help="Signals run together; default what fits the free memory.")
+        int | None, typer.Option(min=1, help="Number of signals run together; default as many as fit the free memory.")
     ] = None,
     frames: KeptFrames = 0,
-    frames_of: Annotated[int, typer.Option(min=0, help="Signal whose configurations they are; 0: no shear.")] = 1,
+    frames_of: Annotated[
+        int, typer.Option(min=0, help="Number of the signal whose configurations are kept, from 1; 0: the zero signal.")
+    ] = 1,
     frames_at: Annotated[
         str, typer.Option(metavar="U,U", help="Keep configurations wherever u passes these, as in 0,0.5,1.")
     ] = "",
     accuracy: Annotated[
-        float | None, typer.Option(help="Wanted error of G, relative, 0.002 to 0.1: chooses t0 and dt.")
+        float | None, typer.Option(help="Relative error of G that is accepted, 0.002 to 0.1; chooses t0 and dt.")
     ] = None,
     restart: Restart = False,
     dry_run: DryRun = False,
@@ -154,7 +156,9 @@ def _compressions(text: str) -> list[float]:
 
 
 def demo(
-    packs: Annotated[str, typer.Option(help="all, or names of shipped packs, separated by commas.")] = "",
+    packs: Annotated[
+        str, typer.Option(help="all, or names of shipped packs, separated by commas; default one typical pack.")
+    ] = "",
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder to write to.")] = Path("gmem-demo"),
     mu: Annotated[float, typer.Option(help="Friction coefficient.")] = 1.0,
     force: Force = False,

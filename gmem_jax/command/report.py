@@ -1,4 +1,4 @@
-"""`gmem report`."""
+"""The command `gmem report`."""
 
 import time
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""`gmem reproduce`."""
+"""The command `gmem reproduce`."""
 
 import contextlib
 import math
@@ -38,12 +38,14 @@ def reproduce_command(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for pictures, tables and runs.")] = Path(
         "reproduce"
     ),
-    executor: Annotated[str, typer.Option(help="processes, slurm or local.")] = "processes",
-    workers: Annotated[int | None, typer.Option(min=1, help="Workers; default 1, of processes 1 for 8 CPUs.")] = None,
-    option: Annotated[
-        list[str] | None, typer.Option(help="Of submitit, NAME=VALUE, again for each: timeout_min=240.")
+    executor: Annotated[str, typer.Option(help="Who runs the points: processes, slurm or local.")] = "processes",
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Number of workers; default 1, or one for 8 CPUs with processes.")
     ] = None,
-    retry: Annotated[bool, typer.Option("--retry", help="Try points and packs that failed again.")] = False,
+    option: Annotated[
+        list[str] | None, typer.Option(help="Option of submitit as NAME=VALUE, like timeout_min=240; may be repeated.")
+    ] = None,
+    retry: Annotated[bool, typer.Option("--retry", help="Run points and packs again that failed.")] = False,
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:

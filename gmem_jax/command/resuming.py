@@ -1,4 +1,4 @@
-"""Runs that go on where they were interrupted: parts beside the output, and a lock on it."""
+"""Resuming interrupted commands: finished parts are kept beside the output, which is locked."""
 
 import errno
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""`gmem show`."""
+"""The command `gmem show`."""
 
 import sys
 from pathlib import Path
@@ -21,19 +21,26 @@ def show(
         Path, typer.Argument(help="Any file that a command wrote, the folder of a sweep, or a pack by its name.")
     ],
     as_json: AsJson = False,
-    plot: Annotated[str, typer.Option(metavar="WHAT", help="Draw this into --output; list says what there is.")] = "",
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture to write: .png, .svg, .pdf.")] = None,
-    against: Annotated[str, typer.Option(help="What stages are drawn over: time or u.")] = "time",
-    signal: Annotated[
-        str, typer.Option(metavar="N,N", help="Signals of a recall to draw, from 1; of stages 0 too, the zero signal.")
+    plot: Annotated[
+        str, typer.Option(metavar="WHAT", help="Picture to draw into --output; list prints those of the file.")
     ] = "",
-    each: Annotated[bool, typer.Option("--each", help="Of a recall: G and F of each signal.")] = False,
-    x: Annotated[str, typer.Option("--x", metavar="NAME", help="Of a sweep: what is drawn along the axis.")] = "",
-    by: Annotated[str, typer.Option(metavar="NAMES", help="Of a sweep: a line for each value of these.")] = "",
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture to write: .png, .svg, .pdf.")] = None,
+    against: Annotated[str, typer.Option(help="Horizontal axis of pictures of stages: time or u.")] = "time",
+    signal: Annotated[
+        str,
+        typer.Option(
+            metavar="N,N", help="Signals of a recall to draw, from 1; 0, the zero signal, in pictures of stages."
+        ),
+    ] = "",
+    each: Annotated[bool, typer.Option("--each", help="Of a recall: print G and F of each signal.")] = False,
+    x: Annotated[str, typer.Option("--x", metavar="NAME", help="Of a sweep: the name along the horizontal axis.")] = "",
+    by: Annotated[
+        str, typer.Option(metavar="NAMES", help="Of a sweep: names; a line for each combination of their values.")
+    ] = "",
     over: Annotated[
         str,
         typer.Option(
-            metavar="NAMES", help="Of a sweep: means and standard errors over these; default packs and seeds."
+            metavar="NAMES", help="Of a sweep: names to average over, with standard errors; default packs and seeds."
         ),
     ] = "",
     csv: Annotated[

@@ -1,4 +1,4 @@
-"""`gmem sweep`."""
+"""The command `gmem sweep`."""
 
 import contextlib
 from collections.abc import Iterator
@@ -38,17 +38,25 @@ RUN = ("executor", "workers", AS_THEY_ARE)
 
 
 def sweep_command(
-    what: Annotated[str, typer.Argument(help="A sweep file (.toml) to be done; or status, show, export, stop.")],
+    what: Annotated[str, typer.Argument(help="A sweep file (.toml) to run; or a verb: status, show, export, stop.")],
     folder: Annotated[Path | None, typer.Argument(help="With a verb: the folder of the sweep.")] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Folder of the sweep, default the file's name; or of export.")
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="Folder of the sweep, default the name of its file; with export, the table to write."
+        ),
     ] = None,
-    executor: Annotated[str, typer.Option(help="processes, slurm or local; default the file's, or processes.")] = "",
+    executor: Annotated[
+        str, typer.Option(help="processes, slurm or local; default as in the file, else processes.")
+    ] = "",
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Workers; default the file's, or 1, of processes 1 for 8 CPUs.")
+        int | None,
+        typer.Option(
+            min=1, help="Number of workers; default as in the file, else 1, or one for 8 CPUs with processes."
+        ),
     ] = None,
-    over: Annotated[str, typer.Option(help="show: names to average over, separated by commas.")] = "",
-    retry: Annotated[bool, typer.Option("--retry", help="Try points that failed again.")] = False,
+    over: Annotated[str, typer.Option(help="With show: names to average over, separated by commas.")] = "",
+    retry: Annotated[bool, typer.Option("--retry", help="Run points again that failed.")] = False,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,

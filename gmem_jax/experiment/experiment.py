@@ -129,16 +129,26 @@ class Experiment:
     shear_share: Scalar = parameter(
         0.5, "(0, 1]", "Part of gamma by which L_x shrinks and L_y grows", varies=True, after_prefix=True
     )
-    delta0: Scalar | None = parameter(None, COMPRESSIONS, "Areal compression; default the pack's own", varies=True)
+    delta0: Scalar | None = parameter(
+        None, COMPRESSIONS, "Areal compression at u = 1; default the pack's own", varies=True
+    )
     t0: Scalar = parameter(1.8e3, "(0, inf)", "Duration of one compression (the paper's is 18000)", "t_c", varies=True)
     hold_drag: Scalar | None = parameter(
-        None, "[0, inf)", "Viscous drag in holds; default 0.05 if t0 < 18000", "1/t_c", varies=True
+        None,
+        "[0, inf)",
+        "Viscous drag while walls stand still; default 0.05 if t0 < 18000, else 0",
+        "1/t_c",
+        varies=True,
     )
     creep: Scalar | None = parameter(
         None, "[0, inf)", "Rate at which elastic tangential forces relax; default never", "1/t_c", varies=True
     )
     creep_fades: Scalar | None = parameter(
-        None, "(0, inf)", "Time in a stage after which creep falls as 1/t; default it stays", "t_c", varies=True
+        None,
+        "(0, inf)",
+        "Time in a stage after which the rate of creep falls as 1/t; default never",
+        "t_c",
+        varies=True,
     )
     gravity: Scalar | None = parameter(
         None, "[0, 0.01]", "Acceleration of gravity along -z; default none", "R/t_c^2", varies=True
@@ -148,13 +158,13 @@ class Experiment:
     )
     dt: float = static(USUAL_STEP, "Largest time step", "t_c")
     steps: int | None = static(None, "Steps in a bin of t0 / 256, in the place of dt", no_option=True)
-    rest: float = static(0.2, "Rests at u = 0", "t0")
-    hold: float = static(0.2, "Holds at u = 1", "t0")
-    store: float = static(2.0, "Storage", "t0")
-    background: Background = static("sub0", "sub0, sub2 or sub2-bl")
+    rest: float = static(0.2, "Length of each rest at u = 0", "t0")
+    hold: float = static(0.2, "Length of each hold at u = 1 but the storage", "t0")
+    store: float = static(2.0, "Length of the storage at u = 1", "t0")
+    background: Background = static("sub0", "Background that is subtracted: sub0, sub2 or sub2-bl")
     shear: Shear = static("during", "Waveforms are applied during the compression, or before it (in time, at u = 0)")
-    backend: Backend = static("auto", "auto, jax or native")
-    precision: Precision = static("double", "double; or mixed, contacts in single precision (native)")
+    backend: Backend = static("auto", "Code that computes the steps: auto, jax or native")
+    precision: Precision = static("double", "double; or mixed: contacts in single precision (native)")
     protocol: Protocol = static(None)
     observe: tuple[tuple[str, Observe], ...] = static(())
     steps_per_bin: int = dataclasses.field(init=False, default=1, metadata={"static": True})

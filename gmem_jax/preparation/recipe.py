@@ -72,18 +72,22 @@ class Recipe:
     delta0: float = parameter(0.05, COMPRESSIONS, "Areal compression of the cycles and of the experiment")
     t0: float = parameter(1.8e3, "(0, inf)", "Duration of one compression", "t_c")
     dt: float = parameter(0.3, "(0, 0.5]", "Largest time step", "t_c")
-    filling: float = parameter(0.30, "(0, 0.6)", "Of the lattice that the gas starts from; less for long grains")
-    gas_speed: float = parameter(0.02, "(0, inf)", "Rms velocity, and spin times R, of the gas", "R/t_c")
+    filling: float = parameter(
+        0.30, "(0, 0.6)", "Packing fraction of the lattice that the gas starts from; less for long grains"
+    )
+    gas_speed: float = parameter(0.02, "(0, inf)", "Rms velocity of grains in the gas, and rms spin times R", "R/t_c")
     gas_time: float = parameter(6.0e3, "(0, inf)", "Duration of the gas", "t_c")
     pressure: float = parameter(
         2.0e-3, "(0, inf)", "p_z before the cycles (law H: k_H follows it, see docs/howto/grain.md)", "E"
     )
     piston_speed: float = parameter(0.02, "(0, inf)", "Largest speed of the upper wall", "R/t_c")
-    piston_gain: float = parameter(0.005, "(0, inf)", "Its speed per relative error of p_z", "R/t_c")
-    cycles: int = parameter(2, "[0, 1000]", "Compress/decompress cycles")
-    rest: float = parameter(0.2, "[0, inf)", "Rests at u = 0", "t0")
-    hold: float = parameter(0.2, "[0, inf)", "Holds at u = 1", "t0")
-    drag: float = parameter(0.01, "[0, inf)", "Viscous drag while walls stand still", "1/t_c")
+    piston_gain: float = parameter(0.005, "(0, inf)", "Speed of the upper wall per relative error of p_z", "R/t_c")
+    cycles: int = parameter(2, "[0, 1000]", "Number of compress/decompress cycles")
+    rest: float = parameter(0.2, "[0, inf)", "Length of each rest at u = 0", "t0")
+    hold: float = parameter(0.2, "[0, inf)", "Length of each hold at u = 1", "t0")
+    drag: float = parameter(
+        0.01, "[0, inf)", "Viscous drag while the piston settles, and while walls stand still", "1/t_c"
+    )
     settled_speed: float = parameter(1.0e-5, "(0, inf)", "Largest grain speed at which the piston is fixed", "R/t_c")
     quiet: float = parameter(1.0e-6, "(0, inf)", "Largest grain speed of the finished pack", "R/t_c")
     pressure_error: float = parameter(0.01, "(0, inf)", "Relative error of p_z at which the piston is fixed")
@@ -93,8 +97,10 @@ class Recipe:
         0.0, f"[0, {LARGEST_SPREAD:g}]", "SD of the sizes of grains over their mean, lognormal, cut at 3 SD"
     )
     sizes: str = static("", "Sizes of the grains of a mixture, like 1,1.4")
-    shares: str = static("", "Their shares of all grains, like 0.5,0.5; default equal ones")
-    boundary: str = static("walls", "walls, periodic, or one for each axis: periodic,periodic,walls")
+    shares: str = static("", "Fraction of the grains that has each of --sizes, like 0.5,0.5; default equal")
+    boundary: str = static(
+        "walls", "Boundary of the box: walls, periodic, or one for each axis, as periodic,periodic,walls"
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "boundary", boundary_of(periodic_axes(self.boundary)))

@@ -27,7 +27,7 @@ class SpringLaw:
     mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")
     stiffness: Scalar = parameter(0.13, "(0, inf)", "k_H in E R, or k_M in E R^0.5; default the law's")
     damping_time: Scalar = parameter(
-        TANGENTIAL_DAMPING, "[0, inf)", "Tangential damping over stiffness; default the law's", "t_c"
+        TANGENTIAL_DAMPING, "[0, inf)", "Tangential damping over tangential stiffness; default the law's", "t_c"
     )
     spinning: Scalar = parameter(1.0, "[0, 1]", "1: the history turns with a contact about its normal; 0: not")
 

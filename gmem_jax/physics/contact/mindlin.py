@@ -80,9 +80,9 @@ class Mindlin(SpringLaw):
     """
 
     stiffness: Scalar = parameter(Material().mindlin_stiffness, "(0, inf)", "k_M", "E R^0.5")
-    p_max: Scalar = parameter(0.2, "(0, inf)", "m2: largest overlap of its history", "R")
-    points: int = static(100, "m2: points of its history")
-    variant: Variant = static("averaged", "m2: averaged, exact or paper")
+    p_max: Scalar = parameter(0.2, "(0, inf)", "m2: largest overlap that its history covers", "R")
+    points: int = static(100, "m2: number of points of its history")
+    variant: Variant = static("averaged", "m2: its outermost ring is averaged, exact or paper")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,4 +1,4 @@
-"""Whether a user's own friction law does what the simulator asks of it: tried on a few contacts before a run."""
+"""Check of a user's own friction law, which is tried on a few contacts before a run."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Contacts of spheres with the rigid walls of the box: what pushes them back, and friction where walls have it."""
+"""Contacts of spheres with the walls of the box: normal forces, and friction if the walls have it."""
 
 from typing import Any
 
