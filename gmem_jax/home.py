@@ -1,4 +1,4 @@
-"""Where the package keeps what no user named."""
+"""The package's own folder in the user's cache."""
 
 import os
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""What a grain-step costs, here and in LAMMPS beside it."""
+"""Measurements of the cost of a grain-step, here and in LAMMPS."""

@@ -1,4 +1,4 @@
-"""What a grain-step costs on a GPU: timed where there is one; registers, launches and bytes are known without."""
+"""The cost of a grain-step on a GPU: times if there is one; registers, launches and bytes without."""
 
 import itertools
 import time

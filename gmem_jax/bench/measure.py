@@ -1,4 +1,4 @@
-"""What a grain-step costs, measured: native backend, plain JAX and LAMMPS in one run on one machine.
+"""Measuring the cost of a grain-step: native backend, plain JAX and LAMMPS in one run on one machine.
 
 The unit is the microsecond of wall time per grain-step (one grain, one time step, one replica), in the encode stage:
 moving walls, binning and list checks included. Results are checked in the same run: native and plain JAX must end at

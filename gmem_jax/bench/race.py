@@ -1,4 +1,4 @@
-"""Rivals timed in turn, so that whatever else the machine does falls on all of them alike."""
+"""Timing several programs in turn, so that other load of the machine falls on all of them alike."""
 
 import statistics
 from collections.abc import Callable, Sequence

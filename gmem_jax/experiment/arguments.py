@@ -1,4 +1,4 @@
-"""What may stand where a pack, waveforms, a law or names belong: refused in one line that says what is right."""
+"""Checks of the kinds of arguments: packs, waveforms, laws, names."""
 
 import json
 from collections.abc import Iterable, Mapping

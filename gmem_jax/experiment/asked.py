@@ -1,4 +1,4 @@
-"""What is refused when an experiment is made or run, beside impossible numbers and shapes that do not fit."""
+"""Checks of an experiment when it is made or run, beyond the ranges of numbers and the shapes of arrays."""
 
 import math
 from typing import Any

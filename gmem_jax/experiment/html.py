@@ -1,4 +1,4 @@
-"""What is shown in the place of an object: a line in a terminal, a short table in a notebook."""
+"""How objects are displayed: a line in a terminal, a short table in a notebook."""
 
 from collections.abc import Callable, Mapping, Sequence
 from html import escape

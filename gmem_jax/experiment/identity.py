@@ -1,4 +1,4 @@
-"""What a user's own law, waveform or observer is, told by its numbers and by its code: a hash that outlasts a process.
+"""Hashes of laws, waveforms and observers by their numbers and their code, the same in every process.
 
 The name of a class says nothing of its formula, `repr` shortens large arrays, and `jax.tree.structure` does not tell
 classes apart: on JAX 0.12 the structures of two dataclasses with the same fields are equal.

@@ -1,4 +1,4 @@
-"""Where a result came from: versions, backend and device, for every file and log."""
+"""Where a result comes from: versions, backend and device, for files and logs."""
 
 import functools
 import hashlib

@@ -1,4 +1,4 @@
-"""What is read: from the pressures of a protocol's stages to recalled signals by read and channel.
+"""Recalled signals by read and channel, from the wall pressures of the stages of a protocol.
 
 A run has R reads, C channels and S signals. Its arrays have these axes in this order, [R, C, S, 256], gains
 [R, C, C]; an axis of length one is left out, so that the paper's experiment has p_sig [S, 256] and one G and F.

@@ -1,4 +1,4 @@
-"""Experiments on one pack side by side: those that differ only in what may differ between replicas, as one run.
+"""Several experiments on one pack as one run, if they differ only in what may differ between replicas.
 
 The shear-free prefix is run once for each set of parameters that act on it, the rest once for each signal of each
 experiment and its zero signal. The numbers are those of the experiments run one by one.

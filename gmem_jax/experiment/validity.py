@@ -1,4 +1,4 @@
-"""What makes a recall doubtful though nothing broke: the model or the drive has left where it is known to hold.
+"""Warnings: a recall is doubtful where the model or the drive leaves the range in which it was tested.
 
 The numbers stand and bits of `Status` say why not to believe them blindly. Each threshold has its reason beside it;
 what was measured on either side of it is in docs/trust.md. All follows from the samples and the parameters, so that

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written under a temporary name, flushed to disk, and put in their place."""
+"""Atomic writing: files are written under a temporary name, flushed to disk, and moved into place."""
 
 import contextlib
 import errno

@@ -1,4 +1,4 @@
-"""Where things are that no user named: packs that ship, and what is kept between runs, compiled programs and packs."""
+"""The places of packs that ship with the package, and of packs that are kept between runs."""
 
 from importlib import resources
 from pathlib import Path

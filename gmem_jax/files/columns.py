@@ -1,4 +1,4 @@
-"""Tables of numbers in text, as spreadsheets and instruments write them: columns, their names, an axis among them."""
+"""Reading tables of numbers in text, as spreadsheets and instruments write them."""
 
 import csv
 import re

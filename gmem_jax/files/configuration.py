@@ -1,4 +1,4 @@
-"""Experiments from their written form (see `gmem_jax.experiment.record`), and by the names of fields.
+"""Making experiments from their written form (see `gmem_jax.experiment.record`), or from values by name.
 
 The command line and sweep files give those names to the fields of an experiment and to those of its law.
 """

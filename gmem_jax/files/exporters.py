@@ -1,4 +1,4 @@
-"""Configurations written in the formats of others: GSD, VTK, extended XYZ, LAMMPS. Lengths are in R, times in t_c.
+"""Writing configurations for other programs: GSD, VTK, extended XYZ, LAMMPS. Lengths are in R, times in t_c.
 
 What is written is spheres, each with its grain's number; formats and fields are listed in docs/exchange.md.
 """

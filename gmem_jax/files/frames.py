@@ -1,4 +1,4 @@
-"""Configurations along a run in HDF5 files: the group /frames."""
+"""The group /frames of HDF5 files: configurations along a run."""
 
 import json
 from collections.abc import Mapping

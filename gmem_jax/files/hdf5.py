@@ -1,4 +1,4 @@
-"""What all HDF5 files of this package have in common: a seal, a schema, the configuration that made them, samples.
+"""The common parts of all HDF5 files of this package: seal, schema, configuration, samples.
 
 A file is sealed (see `seal`), holds nothing but what `tree` allows, and every array is compared with a declaration
 before it is read.

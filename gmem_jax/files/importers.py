@@ -1,4 +1,4 @@
-"""Spheres of rigid grains read from files of others: LAMMPS data files and GSD."""
+"""Reading spheres of rigid grains from files of other programs: LAMMPS data files and GSD."""
 
 import re
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""LAMMPS data files: spheres and the molecules they belong to, every number checked and refused with its line."""
+"""Reading LAMMPS data files: spheres and their molecules; errors name the line."""
 
 import re
 from collections.abc import Mapping

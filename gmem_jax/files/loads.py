@@ -1,4 +1,4 @@
-"""What the walls do in a configuration, and the pressure tensor of all its contacts."""
+"""Wall forces and the pressure tensor of the contacts in a configuration, for export."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What is said of each signal by itself: it follows from a recall and its configuration, and stands in files."""
+"""Measures of each signal by itself, which files hold; they follow from a recall and its configuration."""
 
 from collections.abc import Mapping
 from typing import Any

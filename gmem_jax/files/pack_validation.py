@@ -1,4 +1,4 @@
-"""Whether the numbers of a pack can be those of grains at rest in their box: cheap checks of all that a run relies on.
+"""Cheap checks that the numbers of a pack can be those of grains at rest in their box.
 
 They take some 0.1 s at N = 10,240. The mass of a grain is not integrated anew; it must fit the filling on record.
 """

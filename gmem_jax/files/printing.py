@@ -1,4 +1,4 @@
-"""What anything can be printed as: text that does not act on a terminal, values that JSON has."""
+"""Printing values safely: text without control characters, and values that JSON can hold."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""Results as JSON: of a schema, with every field's units and description beside it."""
+"""Writing results as JSON by a schema, with the units and description of every field."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What every kind of file holds, with units: the one table to write from, read by, and print in docs/files.md."""
+"""The contents of every kind of file, with units: the table by which files are written, read and documented."""
 
 from collections.abc import Container, Mapping
 from typing import Any, NamedTuple

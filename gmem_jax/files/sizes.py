@@ -1,4 +1,4 @@
-"""What runs take of time and disk, before they are done, and such amounts in words."""
+"""Estimates of the time and disk space of runs, and such amounts in words."""
 
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.files.schemas import STAGE

@@ -1,4 +1,4 @@
-"""A grain of one's own from a text file: a sphere in every line."""
+"""Reading a grain from a text file with a sphere in every line."""
 
 from pathlib import Path
 

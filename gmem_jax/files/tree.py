@@ -1,4 +1,4 @@
-"""What an HDF5 file declares, looked at before anything is read.
+"""Checks of the structure of an HDF5 file before anything is read.
 
 Files of this package hold groups, short attributes, and arrays of numbers or names in one piece. All else that HDF5 can
 hold is refused: links to elsewhere, storage elsewhere, virtual, compressed or unwritten data, objects, strings without

@@ -1,4 +1,4 @@
-"""What a file must be before its numbers are used: shapes and kinds of arrays, fields of JSON, refusals in one line.
+"""Checks of files before their numbers are used: shapes and types of arrays, fields of JSON.
 
 One place for packs, recalls, parts, nets and waveforms.
 """

@@ -1,4 +1,4 @@
-"""Which code does the steps: what "auto" means here, for a friction law and a precision, decided once."""
+"""The choice of the backend: which code computes the steps for a friction law, precision and device."""
 
 import functools
 from dataclasses import dataclass

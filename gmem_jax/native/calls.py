@@ -1,4 +1,4 @@
-"""A call into the library as an operation of JAX: its arguments, their shapes, and what does it where.
+"""Calls into the library as operations of JAX: their arguments, shapes and lowering on each device.
 
 Which code runs is settled when a program is lowered: the library on CPUs and, where it serves the call (see `cuda`), on
 CUDA GPUs; the definition in plain JAX elsewhere.

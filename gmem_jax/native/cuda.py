@@ -1,4 +1,4 @@
-"""The native backend on CUDA GPUs: which arrays a call has there, and whether it can be made at all.
+"""The native backend on CUDA GPUs: the arrays of a call, and whether it is supported.
 
 The kernels (src/cuda) are the physics of the CPU's library, compiled where they run by NVRTC. A step is two launches: a
 thread is a candidate of a replica in the first, and a grain in the second. Reverse mode keeps what it needs of each

@@ -1,4 +1,4 @@
-"""The compiled library: where it lies, whether it can be loaded, and what it says of itself."""
+"""Loading the compiled library, and its properties."""
 
 import ctypes
 import functools

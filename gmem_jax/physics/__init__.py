@@ -1,3 +1,1 @@
-"""What one time step is, in plain JAX: the definition that everything faster is checked against. It knows no
-experiment.
-"""
+"""One time step in plain JAX: the definition of the physics, against which all faster code is checked."""

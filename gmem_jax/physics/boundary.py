@@ -1,4 +1,4 @@
-"""What a box ends at, axis by axis: rigid walls, or its own periodic images."""
+"""The boundary of the box on each axis: rigid walls, or periodic."""
 
 from typing import Any
 

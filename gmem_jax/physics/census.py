@@ -1,4 +1,4 @@
-"""What one configuration of grains shows: who touches, how fast and how far grains are, whether anything is amiss."""
+"""Counts and checks of one configuration: contacts, speeds, overlaps, grains outside the box."""
 
 from collections.abc import Callable
 from typing import NamedTuple

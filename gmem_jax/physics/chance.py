@@ -1,4 +1,4 @@
-"""Random numbers that follow from a seed alone: the one place where a seed becomes a key.
+"""Random keys that depend on a seed alone, not on settings of JAX.
 
 JAX's own keys depend on settings of the machine (JAX_DEFAULT_PRNG_IMPL, JAX_THREEFRY_PARTITIONABLE,
 JAX_RANDOM_SEED_OFFSET). These keys name their generator: threefry-2x32, whose counters are the numbers of the elements.

@@ -1,4 +1,4 @@
-"""From places and motion of grains to forces and torques on them: contacts, walls, sections of a periodic cell."""
+"""Forces and torques on grains by contacts and walls, and the stress on sections of a periodic cell."""
 
 from collections.abc import Callable
 from typing import Any

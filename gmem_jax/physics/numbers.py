@@ -1,4 +1,4 @@
-"""What counts as a number where one is asked for (a text, a yes or no and a complex number do not); counts in words."""
+"""Checks that arguments are real numbers, and numbers and counts in words."""
 
 import operator
 from decimal import Decimal

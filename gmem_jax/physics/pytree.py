@@ -1,4 +1,4 @@
-"""Frozen dataclasses that JAX can take apart, whose numbers are checked when a user makes one and not when JAX does.
+"""Frozen dataclasses as pytrees; their numbers are checked when a user makes one, not when JAX does.
 
 A field is data (an array, a number, another pytree) unless it says otherwise: `static` fields are part of the
 structure that a program is compiled for; a `label` is carried along but compiles nothing anew.

@@ -1,4 +1,4 @@
-"""What the package asks of JAX itself: that it starts, and its usual rules for the package's own arithmetic."""
+"""Settings of JAX under which the package computes, whatever the user's are; and whether JAX starts."""
 
 import contextlib
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""What does not change during a run: grain, friction law, candidates, solid."""
+"""The constants of a run: grain, friction law, candidate contacts, material."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Packs made of spheres that others have put somewhere: the shape of the grain, and how each of them lies."""
+"""Packs made of spheres from files of other programs: shape of the grain, positions and orientations."""
 
 import itertools
 import json

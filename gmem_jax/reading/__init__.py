@@ -1,1 +1,1 @@
-"""Who reads binary words from a recall: the paper's net, and other readers."""
+"""Readers of binary words from recalls: the paper's net, and others."""

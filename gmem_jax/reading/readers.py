@@ -1,4 +1,4 @@
-"""Readers of binary words that know more than the paper's net, as baselines, and what any reader's answers are worth.
+"""Baseline readers of binary words, which know more than the paper's net, and scores of any reader.
 
 Signals and templates are [S, 256], row k holding word number k; answers are numbers of words, [S].
 """

@@ -1,4 +1,4 @@
-"""What the paper leaves open, and how much G and F change with each choice, on the same packs."""
+"""How much G and F change with each choice that the paper leaves open, on the same packs."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What the paper says in words, put to the test: one verdict a claim, with its numbers."""
+"""Tests of the paper's claims: a verdict on each, with numbers."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""What figures, claims and choices need together, as one sweep: for saying what they cost."""
+"""The points of figures, claims and choices as one sweep, to estimate their cost."""
 
 import json
 from collections.abc import Collection

@@ -1,4 +1,4 @@
-"""What a figure shows, in plain data: `render_matplotlib` makes a picture of it, `render_plotly` a part of a page.
+"""Figures as plain data, which `render_matplotlib` draws and `render_plotly` puts into a page.
 
 Texts may hold formulas between dollars, with Greek letters and indices. Colours are those of matplotlib's cycle ("C0"),
 greys from "0.0" to "1.0" or hexadecimal.

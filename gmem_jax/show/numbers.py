@@ -1,4 +1,4 @@
-"""The numbers of a recall as programs read them, and the published ones."""
+"""The numbers of a recall for programs, and the published ones."""
 
 import csv
 from importlib import resources

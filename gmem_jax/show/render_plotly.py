@@ -1,4 +1,4 @@
-"""Figures of a page, to be zoomed and pointed at, by plotly, which is imported on first use."""
+"""Interactive figures of a page by plotly, which is imported on first use."""
 
 import re
 from collections.abc import Mapping

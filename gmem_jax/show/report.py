@@ -1,4 +1,4 @@
-"""One page of everything that some files hold, which needs nothing else to be read: `gmem report`."""
+"""The self-contained page of `gmem report`, which shows what files hold."""
 
 import functools
 import json

@@ -1,4 +1,4 @@
-"""What is to be seen of a pack: its grains, what each of them does, and the forces between them, frame by frame.
+"""The data of a 3D picture of a pack: grains, their quantities, and contact forces, frame by frame.
 
 All that a picture shows is computed here; `web/view.js` only draws it.
 """

@@ -1,4 +1,4 @@
-"""Figures of what was recorded in the stages of a recall or a preparation, against time or u."""
+"""Figures of quantities recorded in the stages of a recall or a preparation, against time or u."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""What any file that a command writes holds, told once for commands, `gmem show` and pages: facts, lines, figures."""
+"""Summaries of all kinds of files, for commands, `gmem show` and reports: facts, lines, figures."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Numbers as a person wants to read them: tables beside the published points."""
+"""Tables of results beside the published points."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,1 +1,1 @@
-"""How grains are moved through a protocol: knows walls, stages and bins, and no memory experiment."""
+"""The simulation of grains through a protocol of stages; it knows no memory experiment."""

@@ -1,4 +1,4 @@
-"""Where a long run stands, and which of its parts are finished: the interfaces; `files.checkpoints` keeps them."""
+"""The interfaces of checkpoints and of caches of finished parts; `files.checkpoints` implements them."""
 
 from collections.abc import Callable
 from typing import Any

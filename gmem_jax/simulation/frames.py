@@ -1,4 +1,4 @@
-"""Configurations along a run: grains, walls and contact forces of one replica at some moments, kept to be looked at.
+"""Frames: grains, walls and contact forces of one replica at some moments of a run.
 
 Watching changes nothing: frames are recorded from states that a run goes through anyway, or goes through again.
 """

@@ -1,4 +1,4 @@
-"""The neighbour lists of a run: how wide they are, who searches, and what of one is left."""
+"""The neighbour lists of a run: their skin, the search, and how much of the skin is used up."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Observers: what looks at a run, chunk by chunk, while it goes on.
+"""The interface of observers, which are called for each chunk of a run.
 
 Samples, frames, derivatives and checkpoints are observers with the same three calls. A chunk is some bins of a stage
 that are run in one call; one that ends with a stale neighbour list is run again, and committed once.

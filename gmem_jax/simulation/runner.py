@@ -1,4 +1,4 @@
-"""Rollouts on the host: chunks of bins, with what only a host can do: renew a stale list, report progress, resume.
+"""Rollouts on the host in chunks of bins, which rebuild stale lists, report progress and resume.
 
 A chunk that ends with a stale list is thrown away, the list is built anew from the chunk's start, and the chunk is run
 again. What looks at the chunks is up to the observers: samples, frames, derivatives in both modes, checkpoints.

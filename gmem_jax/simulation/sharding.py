@@ -1,4 +1,4 @@
-"""Replicas shared out over all devices that JAX sees, of one process or of several: the compiler does the rest.
+"""Distribution of replicas over all devices that JAX sees, of one process or of several.
 
 The replica axis is padded with copies of replica 0 up to a multiple of the number of devices. A step sends nothing
 from one device to another.

@@ -1,4 +1,4 @@
-"""Which number of a run makes its steps unstable: what is said where a run broke.
+"""The parameter that makes the time steps of a run unstable, for error messages.
 
 The steps are explicit. A spring k on a mass m needs dt < 2 sqrt(m / k) and a dashpot c needs dt < 2 m / c. Here one
 contact is looked at, of an overlap as in a pack: what exceeds these bounds is a cause, what does not may still be one.

@@ -1,4 +1,4 @@
-"""The largest stable time step: the one-step map of a pack at rest, made linear, must let nothing grow.
+"""The largest stable time step: no perturbation of a pack at rest grows under the linearised step.
 
 A mode of frequency w whose dashpot takes the rate c off its velocity is stable while (w dt)^2 + 2 c dt < 4
 (docs/decisions/physics.md).

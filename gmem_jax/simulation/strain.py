@@ -1,4 +1,4 @@
-"""How the walls move: compression u(t), waveforms on channels of shear (paper, Sec. II), a servo for pressures."""
+"""The motion of the walls: compression u(t), waveforms on channels of shear (paper, Sec. II), pressure servo."""
 
 from dataclasses import dataclass
 from typing import Protocol

@@ -1,4 +1,4 @@
-"""What a sweep would cost, said without doing anything of it."""
+"""Estimates of the cost of a sweep, without running it."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,4 +1,4 @@
-"""A measure of a sweep against one name: a line for each set of others, means and standard errors over the rest."""
+"""Curves of a measure of a sweep against one name, with means and standard errors over others."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Who does the jobs of a sweep: processes on this machine, or SLURM.
+"""Executors of the jobs of a sweep: processes on this machine, or SLURM.
 
 An executor keeps workers alive as long as jobs are left that nobody has; the workers find their jobs in the store.
 """

@@ -1,4 +1,4 @@
-"""Packs that a sweep makes: what their preparation follows from, and packs that were prepared for something else."""
+"""Packs that a sweep prepares, and packs that were prepared for other parameters."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, fields

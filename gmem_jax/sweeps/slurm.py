@@ -1,4 +1,4 @@
-"""What is asked of SLURM's own commands: whether it is there, and which jobs run or wait for what."""
+"""Queries of SLURM: whether it is there, and which jobs run or wait."""
 
 import shutil
 import subprocess

@@ -1,4 +1,4 @@
-"""What a sweep varies, as a TOML file says it.
+"""The format of sweep files: what a sweep varies, in TOML.
 
     [experiment]                    # what all points share: the options of `gmem recall`
     t0 = 1800

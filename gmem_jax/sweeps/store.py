@@ -1,4 +1,4 @@
-"""The folder of a sweep: its points, their results by content, what failed and why, who is at work.
+"""The folder of a sweep: its points and results, failures with their reasons, and workers.
 
     sweep.json         the points: their values and keys, in order; the marker of the folder, see `gmem_jax.files.ours`
     jobs/              what is to be computed, one file a job

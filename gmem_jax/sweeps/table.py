@@ -1,4 +1,4 @@
-"""The results of a sweep as a table: a row for each point, and means over what is only a sample, like packs."""
+"""The results of a sweep as a table, with means over names that are samples, such as packs."""
 
 import csv
 import functools
