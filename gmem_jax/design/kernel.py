@@ -216,7 +216,7 @@ class KernelMatrix:
 
     Attributes:
         channels: names of the C channels.
-        blocks: blocks[c][d] is the kernel of the recall on channel c of waveforms written on channel d; those with
+        blocks: `blocks[c][d]` is the kernel of the recall on channel c of waveforms written on channel d; those with
             c != d are the cross-talk.
     """
 
