@@ -259,7 +259,8 @@ def design_command(
         ),
     ] = None,
     gain: Annotated[
-        float | None, typer.Option(help="Wanted gain; default at most half of that of the original waveforms.")
+        float | None,
+        typer.Option(help="Wanted gain; default that of --start, or at most half of that of the original waveforms."),
     ] = None,
     start: Annotated[
         Path | None, typer.Option(help="File of designed waveforms to improve; by the kernel only.")
@@ -268,7 +269,7 @@ def design_command(
         int,
         typer.Option(
             min=0,
-            help="Mean number of directions in which slopes of a waveform are measured, twice; by the kernel only.",
+            help="Mean number of directions in which slopes of a waveform are measured, at 2 times; for --by kernel.",
         ),
     ] = 0,
     restart: Restart = False,

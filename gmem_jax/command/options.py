@@ -43,7 +43,7 @@ _OTHERS: _Options = {
         "Samples in a file: width in u at either end within which they are brought to zero.",
         (),
     ),
-    "scale": (None, bool | None, "Samples in a file: divide them by the largest.", ("--scale",)),
+    "scale": (None, bool | None, "Samples in a file: divide them by the largest absolute value.", ("--scale",)),
     "protocol": (
         None,
         str | None,

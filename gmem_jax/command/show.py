@@ -22,7 +22,7 @@ def show(
     ],
     as_json: AsJson = False,
     plot: Annotated[
-        str, typer.Option(metavar="WHAT", help="Picture to draw into --output; list prints those of the file.")
+        str, typer.Option(metavar="WHAT", help="Picture to draw into --output; list prints all of a file.")
     ] = "",
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Picture to write: .png, .svg, .pdf.")] = None,
     against: Annotated[str, typer.Option(help="Horizontal axis of pictures of stages: time or u.")] = "time",

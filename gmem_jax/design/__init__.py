@@ -1,1 +1,1 @@
-"""Better memories: the memory kernel of a pack, designed waveforms, tuned drives."""
+"""Memory kernels of packs, inverse design of waveforms, and tuning of parameters."""

@@ -1,4 +1,4 @@
-"""Compiled programs kept between runs: half of the time of a short command is XLA compiling the same programs again."""
+"""The cache of compiled programs, which saves half of the time of a short command."""
 
 import errno
 import hashlib

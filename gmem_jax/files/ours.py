@@ -1,4 +1,4 @@
-"""The one rule of removing: nothing is removed, renamed or replaced that was not proven ours.
+"""Removing, renaming and replacing files: only those that were proven to be the package's own.
 
 A folder of ours holds a marker, written when the folder was made. What lies in it is ours if it is a plain file whose
 name fits the pattern of the names that we make. Links are not followed. A new output takes a place that is free.

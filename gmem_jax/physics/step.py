@@ -1,4 +1,4 @@
-"""One time step, and `march`, a step for each of some boxes: the definition of the physics, in plain JAX."""
+"""One time step in plain JAX, and `march`, a step for each of several successive boxes."""
 
 from dataclasses import replace
 from typing import Any

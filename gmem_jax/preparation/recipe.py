@@ -78,7 +78,7 @@ class Recipe:
     gas_speed: float = parameter(0.02, "(0, inf)", "Rms velocity of grains in the gas, and rms spin times R", "R/t_c")
     gas_time: float = parameter(6.0e3, "(0, inf)", "Duration of the gas", "t_c")
     pressure: float = parameter(
-        2.0e-3, "(0, inf)", "p_z before the cycles (law H: k_H follows it, see docs/howto/grain.md)", "E"
+        2.0e-3, "(0, inf)", "p_z before the cycles (at another one choose k_H of law H anew: docs/howto/grain.md)", "E"
     )
     piston_speed: float = parameter(0.02, "(0, inf)", "Largest speed of the upper wall", "R/t_c")
     piston_gain: float = parameter(0.005, "(0, inf)", "Speed of the upper wall per relative error of p_z", "R/t_c")

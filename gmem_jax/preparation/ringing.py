@@ -1,4 +1,4 @@
-"""The slowest mode of the box that wall motion excites: its period T_1, over which a recall is averaged."""
+"""The ringing period T_1: that of the slowest mode of the box that wall motion excites."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""How well the words of a recall are read, by every reader."""
+"""Scores of all readers on the words of a recall."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,1 +1,1 @@
-"""The paper's figures and claims, run again: which points each needs, how ours compare with the published ones."""
+"""Reproduction of the paper's figures and claims: the points that each needs, beside the published ones."""

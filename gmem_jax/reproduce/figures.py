@@ -1,4 +1,4 @@
-"""Which points each figure of the paper needs, at three scales.
+"""The points that each figure of the paper needs, at three scales.
 
 A figure is a sweep: all figures share one store, so that a point that two of them need is computed once.
 """

@@ -1,4 +1,4 @@
-"""A figure from its sweep to its picture and its table."""
+"""Running a figure of the paper, from its sweep to its picture and its table."""
 
 import json
 import math

@@ -1,1 +1,1 @@
-"""Numbers and pictures for people."""
+"""Tables, figures and reports."""

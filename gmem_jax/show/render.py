@@ -1,4 +1,4 @@
-"""Packs as they would look: spheres with a depth buffer, in parallel perspective."""
+"""Rendered pictures of packs: spheres with a depth buffer, in parallel projection."""
 
 from collections.abc import Sequence
 from pathlib import Path

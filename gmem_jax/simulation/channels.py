@@ -1,4 +1,4 @@
-"""Channels: the modes of strain of a box of six walls that can carry a waveform, and the stresses that answer."""
+"""Channels: the modes of strain of the box that can carry a waveform, and the conjugate stresses."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""`jax.jit` as this package uses it on the host: settings of the default device, chosen at the first call."""
+"""`jax.jit` with compiler settings for the default device, chosen at the first call."""
 
 import functools
 from collections.abc import Callable

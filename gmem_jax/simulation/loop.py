@@ -1,4 +1,4 @@
-"""The one loop: a bin is some steps under prescribed walls; a rollout is one bin after the other.
+"""The loop of a run: a bin is some steps under prescribed walls; a rollout is one bin after the other.
 
 Everything that moves grains along a protocol goes through `bin_step`: the rollout of a whole protocol in one traced
 computation, and the chunks of the host (`simulation.runner`), forwards and for derivatives.

@@ -1,1 +1,1 @@
-"""Sweeps: many experiments planned as few runs, their results in one store, done by any number of processes."""
+"""Sweeps: many experiments planned as few runs, done by several processes, with one store of results."""

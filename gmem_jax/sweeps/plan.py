@@ -1,4 +1,4 @@
-"""From points to jobs: points that may run side by side become one run, packs that do not exist yet are made first."""
+"""The jobs of a sweep: points that may run side by side become one run; missing packs are made first."""
 
 import hashlib
 import json

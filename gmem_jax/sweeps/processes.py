@@ -1,4 +1,4 @@
-"""The processes of a sweep: how they are started, told apart from others, and ended."""
+"""Starting, identifying and ending the processes of a sweep."""
 
 import contextlib
 import os

@@ -1,1 +1,1 @@
-"""Contact mechanics: kinematics once, then the normal law, then a friction law; walls alike."""
+"""Contact mechanics of spheres and walls: kinematics, the normal force, friction laws."""

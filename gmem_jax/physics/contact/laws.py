@@ -1,4 +1,4 @@
-"""The friction laws by name: the one table for the command line, files, benchmarks and the native backend."""
+"""The table of friction laws by name, for the command line, files, benchmarks and the native backend."""
 
 from collections.abc import Iterable
 from dataclasses import fields, replace
