@@ -19,6 +19,7 @@ import blackjax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from console import in_one_line, new_name
 
 import gmem_jax as gm
 from gmem_jax.show.render_matplotlib import pyplot, save_picture
@@ -43,7 +44,7 @@ def numbers(place: Any) -> Any:
 def main() -> None:
     """Measure, sample, integrate, draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-o", "--output", type=Path, default=Path("estimate"), help="without a suffix")
+    parser.add_argument("-o", "--output", type=new_name, default="estimate", help="without a suffix")
     parser.add_argument("--pack", default="tests/data/tetra-27.h5")
     parser.add_argument("--t0", type=float, default=600.0)
     parser.add_argument("--signals", type=int, default=3, help="of the six waveforms, the first so many")
@@ -186,4 +187,4 @@ def draw(
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

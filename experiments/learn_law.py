@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from console import in_one_line, new_name
 
 import gmem_jax as gm
 from gmem_jax.physics.contact.friction import coulomb
@@ -82,7 +83,7 @@ class Network(eqx.Module):
 def main() -> None:
     """Make the recall, fit, draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-o", "--output", type=Path, default=Path("learn-law"), help="without a suffix")
+    parser.add_argument("-o", "--output", type=new_name, default="learn-law", help="without a suffix")
     parser.add_argument("--pack", default="tests/data/tetra-27.h5")
     parser.add_argument("--t0", type=float, default=60.0)
     parser.add_argument("--updates", type=int, default=200)
@@ -139,4 +140,4 @@ def draw(output: Path, laws: dict[str, Callable[[jax.Array], jax.Array]], losses
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)
