@@ -160,8 +160,9 @@ def draw(
     top.plot(u, clean[0] * 1e6, color="#1f5fa8", label="without noise")
     top.set(xlabel="compression variable u", ylabel="$p_{sig}$ ($10^{-6}$ E)", title="one of the recalled waveforms")
     falling = np.sort(weights.ravel())[::-1]
-    levels = [falling[np.searchsorted(np.cumsum(falling), part)] for part in (0.95, 0.5)]
-    joint.contourf(*grid.T, weights.T, [*levels, 1.0], colors=["#dbe6f2", "#a9c4e2"])
+    ends = np.searchsorted(np.cumsum(falling), (0.95, 0.5))
+    levels = sorted({float(falling[place]) for place in ends})  # one, where a point of the grid has nearly all
+    joint.contourf(*grid.T, weights.T, [*levels, 2.0], colors=["#dbe6f2", "#a9c4e2"][-len(levels) :])
     for chain in np.asarray(numbers(places)):
         joint.plot(*chain.T, ".", ms=3)
     joint.plot(*TRUE, "k+", ms=14, mew=2, label="true")
