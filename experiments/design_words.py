@@ -19,7 +19,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from console import say
+from console import in_one_line, say
 from packs import FIVE, called, over_packs
 from rows import done, note
 
@@ -65,8 +65,10 @@ def main() -> None:
             if there(folder / TABLE, name, bits, len(number), arguments.t0, arguments.iterations):
                 continue
             kept = folder / f"words-{bits}-seed-0.msgpack"
-            net = training.train_net(TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=kept).net
-            row = design(folder, any_words, kernel, bits, number, net, arguments.iterations)
+            trained = training.train_net(TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=kept)
+            if not trained.finished:
+                print(f"net of {bits} bits: out of time, held-out accuracy {trained.validation:.4f}", flush=True)
+            row = design(folder, any_words, kernel, bits, number, trained.net, arguments.iterations)
             print(row, flush=True)
             note(folder / TABLE, list(row), [row])
             draw(folder / TABLE, folder / "words.png")
@@ -154,4 +156,4 @@ def draw(table: Path, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

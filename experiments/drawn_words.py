@@ -8,7 +8,8 @@ a CPU and take twenty minutes. A GPU runs 64 in half a minute. Words are drawn w
 the paper shows is put in the place of
 the last. F of those drawn stands for F of all within its standard error over words; of an accuracy p the standard error
 is sqrt(p (1 - p) / drawn). The paper's net, which has seen inputs of all words, and the templates choose among all.
-Resumes; recalls are kept. A pack and rate have one table, to which lengths may be added later, and its picture.
+Resumes; recalls are kept. A pack, rate and time step have one table, to which lengths may be added later, and its
+picture. A net that ran out of time is said to have; the same command goes on training it.
 """
 
 import argparse
@@ -19,7 +20,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from console import say
+from console import in_one_line, say
 from design_words import drawn
 
 import gmem_jax as gm
@@ -57,26 +58,28 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
 
     pack = gm.load_pack(arguments.pack)
-    table = folder / f"{pack.name}-t0-{arguments.t0:g}.csv"
+    rate = f"t0-{arguments.t0:g}" + ("" if arguments.dt == parser.get_default("dt") else f"-dt-{arguments.dt:g}")
+    table = folder / f"{pack.name}-{rate}.csv"
     rows = read_rows(table) if table.exists() else []
     for bits in map(int, arguments.bits.split(",")):
         every, number = gm.words(bits), chosen(bits, arguments.drawn)
         some = replace(every, amplitudes=every.amplitudes[number], centres=every.centres[number])
         experiment = gm.Experiment(pack, some, t0=arguments.t0, dt=arguments.dt, background="sub2-bl")
-        file = folder / f"{pack.name}-{bits}-{len(number)}-t0-{arguments.t0:g}.h5"
+        file = folder / f"{pack.name}-{bits}-{len(number)}-{rate}.h5"
         if not file.exists():
             run(experiment, file)
         recall = gm.load_recall(file)
         if recall.configuration["experiment"] != gm.describe(experiment)["experiment"]:
             parser.error(f"{file}: is of another experiment; name another folder")
-        net = training.train_net(
-            TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=folder / f"words-{bits}-seed-0.msgpack"
-        ).net
-        row = {"pack": pack.name, "t0": arguments.t0, **read(experiment, recall, bits, number, net)}
+        kept = folder / f"words-{bits}-seed-0.msgpack"
+        trained = training.train_net(TrainingConfig(bits), 0, budget=arguments.budget, checkpoint=kept)
+        if not trained.finished:
+            print(f"net of {bits} bits: out of time, held-out accuracy {trained.validation:.4f}", flush=True)
+        row = {"pack": pack.name, "t0": arguments.t0, **read(experiment, recall, bits, number, trained.net)}
         print(row, flush=True)
         rows = sorted([row, *(other for other in rows if other["bits"] != bits)], key=lambda one: int(one["bits"]))
         write_csv(table, rows)
-        draw(rows, table.with_suffix(".png"))
+        draw(rows, table.with_suffix(".png"), pack.grains)
 
 
 def chosen(bits: int, most: int) -> np.ndarray:
@@ -132,8 +135,11 @@ def over_packs(rows: list[Row]) -> list[Row]:
     return found
 
 
-def draw(rows: list[Row], path: Path) -> None:
-    """F by three backgrounds, and accuracies, against L, beside the published; means where several packs ran."""
+def draw(rows: list[Row], path: Path, grains: int | None = None) -> None:
+    """F by three backgrounds, and accuracies, against L, beside the published; means where several packs ran.
+
+    Without the number of grains it is read in the name of a shipped pack.
+    """
     rows = over_packs(rows)
     lengths = np.array([int(row["bits"]) for row in rows])
     theirs = published("binary_words.csv")
@@ -161,7 +167,7 @@ def draw(rows: list[Row], path: Path) -> None:
         f"{words} of {', '.join(bits)} bits on {'one pack' if packs == 1 else f'{packs} packs'}"
         for (words, packs), bits in alike.items()
     )
-    size = int(str(rows[0]["pack"]).split("-")[1])
+    size = int(str(rows[0]["pack"]).split("-")[1]) if grains is None else grains
     figure.suptitle(
         f"Drawn words ({counts}), N = {size:,}, $t_0$ = {float(rows[0]['t0']):,.0f} $t_c$,\n"
         "mean ± SE over words; published: all words, N = 10,240",
@@ -171,4 +177,4 @@ def draw(rows: list[Row], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)
