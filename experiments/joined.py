@@ -10,6 +10,8 @@ and what was run at several rates says so (`--rates "1,800 to 18,000"`).
 import argparse
 from pathlib import Path
 
+from console import in_one_line
+
 from gmem_jax.reproduce import draw
 from gmem_jax.reproduce.compare import Compared, Conditions, comparison_rows, read_csv, write_csv
 from gmem_jax.reproduce.figures import FIGURES, scale_of
@@ -30,11 +32,19 @@ def main() -> None:
     scale = ",".join([named, *changes])
     figure, t0 = FIGURES[arguments.figure], arguments.rates or f"{scale_of(scale).t0:,.0f}"
     name, _, value = arguments.only.partition("=")
+    if name and name not in Conditions.__dataclass_fields__:
+        parser.error(f"--only: no condition {name!r}; there are {', '.join(Conditions.__dataclass_fields__)}")
     rows: dict[tuple[Conditions, str], Compared] = {}
     for part in arguments.parts:
-        for row in read_csv(part):
+        try:
+            table = read_csv(part)
+        except (KeyError, TypeError):
+            parser.error(f"{part}: is no table that `gmem reproduce` wrote")
+        for row in table:
             if not name or getattr(row.conditions, name) == type(getattr(row.conditions, name))(value):
                 rows.setdefault((row.conditions, row.measure), row)
+    if not rows:
+        parser.error(f"--only: no row has {arguments.only}" if name else "there is no row in the parts")
     ordered = sorted(rows.values(), key=lambda row: [getattr(row.conditions, name) for name in figure.across])
     target = arguments.output.parent / f"{arguments.output.name}.png"
     write_csv(target.with_name(f"{arguments.output.name}.csv"), comparison_rows(ordered))
@@ -42,4 +52,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)
