@@ -15,7 +15,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from console import say
+from console import in_one_line, say
 from packs import FIVE, called, over_packs
 from rows import done, note
 
@@ -299,4 +299,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

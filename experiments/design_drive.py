@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from console import new_folder, say
+from console import in_one_line, new_folder, say
 
 import gmem_jax as gm
 from gmem_jax.show.figures import history_figure
@@ -71,4 +71,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

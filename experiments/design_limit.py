@@ -14,6 +14,7 @@ import argparse
 import jax
 import jax.numpy as jnp
 import numpy as np
+from console import in_one_line
 
 import gmem_jax as gm
 from gmem_jax.design.kernel import bumps, nearest
@@ -78,4 +79,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

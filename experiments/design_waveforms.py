@@ -11,7 +11,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from console import new_folder, say
+from console import in_one_line, new_folder, say
 from packs import FIVE, called
 
 import gmem_jax as gm
@@ -52,4 +52,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

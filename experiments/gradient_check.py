@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from console import new_folder, say
+from console import in_one_line, new_folder, say
 
 import gmem_jax as gm
 from gmem_jax.derivatives import jacobian
@@ -156,4 +156,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

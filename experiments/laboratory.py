@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from console import in_one_line
 from rows import done, note
 
 import gmem_jax as gm
@@ -183,4 +184,4 @@ def of_mean(row: Mapping[str, str]) -> tuple[str, str, str]:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from console import say
+from console import in_one_line, say
 from drawn_words import run
 from rows import done
 
@@ -103,4 +103,4 @@ def add(path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

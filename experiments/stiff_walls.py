@@ -12,6 +12,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from console import in_one_line
 from rows import done, note
 
 import gmem_jax as gm
@@ -82,4 +83,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)

@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from console import new_folder
+from console import in_one_line, new_folder
 
 import gmem_jax as gm
 from gmem_jax import classify
@@ -132,4 +132,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    in_one_line(main)
