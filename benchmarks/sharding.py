@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--here", action="store_true", help="measure in this process, with the devices it has")
     options = parser.parse_args()
-    if odd := [devices for devices in options.devices if options.replicas % devices]:
+    if odd := [devices for devices in options.devices if devices < 1 or options.replicas % devices]:
         parser.error(f"--devices: {odd[0]} do not divide --replicas {options.replicas}")
     if options.here:
         import jax

@@ -46,6 +46,8 @@ def main() -> None:
     parser.add_argument("--t0", default="1800")
     parser.add_argument("--repeats", type=int, default=2)
     options = parser.parse_args()
+    if options.repeats < 1:
+        parser.error(f"--repeats: at least 1, got {options.repeats}")
     best: dict[str, tuple[float, float]] = {}
     with tempfile.TemporaryDirectory() as name:
         for repeat in range(options.repeats + 1):

@@ -10,6 +10,7 @@ the folder and not done again. Every run of the study "builds" is a process of i
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -161,6 +162,10 @@ def main() -> None:
     parser.add_argument("--one", help=argparse.SUPPRESS)  # file name of a run to do in this process
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
+    to_build = [piece for piece in pieces(given.studies) if "build" in piece.changes]
+    for compiler in {BUILDS[one.changes["build"]][0] for one in to_build if not (given.folder / one.file).exists()}:
+        if shutil.which(compiler) is None:
+            parser.error(f"the study builds needs {compiler}, which is not here; name other --studies")
     done = []
     for piece in pieces(given.studies):
         file = given.folder / piece.file
