@@ -45,7 +45,7 @@ def reproduce_command(
     option: Annotated[
         list[str] | None, typer.Option(help="Option of submitit as NAME=VALUE, like timeout_min=240; may be repeated.")
     ] = None,
-    retry: Annotated[bool, typer.Option("--retry", help="Run points and packs again that failed.")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Run failed points and packs again.")] = False,
     dry_run: DryRun = False,
     as_json: AsJson = False,
 ) -> None:

@@ -56,7 +56,7 @@ def sweep_command(
         ),
     ] = None,
     over: Annotated[str, typer.Option(help="With show: names to average over, separated by commas.")] = "",
-    retry: Annotated[bool, typer.Option("--retry", help="Run points again that failed.")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Run failed points again.")] = False,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
