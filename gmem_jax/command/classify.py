@@ -10,6 +10,7 @@ import typer
 from rich import progress
 
 from gmem_jax.command.console import (
+    BEGINS_ANEW,
     LOG_INTERVAL,
     AsJson,
     Force,
@@ -113,7 +114,7 @@ def classify_command(
     if status := combined_status(kept.status):
         log(f"{recall}: {explain(status)}", style="yellow")
     began = time.perf_counter()
-    trained = []
+    trained: list[training.Training] = []
     for seed in range(seeds):
         file = check_output(folder / f"words-{stored.bits}-seed-{seed}.msgpack", "", force=True, option="--nets")
         try:
@@ -122,7 +123,8 @@ def classify_command(
                     TrainingConfig(stored.bits), seed, budget=budget, checkpoint=file, listener=listener
                 )
         except KeyboardInterrupt:
-            raise RunInterruptedError(f"the same command goes on with the nets in {folder}") from None
+            goes_on = f"the same command goes on with the nets in {folder}"
+            raise RunInterruptedError(goes_on if trained or file.exists() else BEGINS_ANEW) from None
         trained.append(one)
         state = "trained" if one.finished else "out of time"
         log(f"seed {seed}: {state}, {one.step} steps, held-out accuracy {one.validation:.4f}")

@@ -109,6 +109,9 @@ class UnheardError(Exception):
     """A result that stdout does not take, once all files are written."""
 
 
+BEGINS_ANEW = "nothing was kept yet; the same command begins anew"
+
+
 class RunInterruptedError(Exception):
     """Ctrl-C in a run, and how to go on; no KeyboardInterrupt, which typer makes an exit without words."""
 

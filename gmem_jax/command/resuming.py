@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import psutil
 import typer
 
-from gmem_jax.command.console import InputError, RunInterruptedError, log
+from gmem_jax.command.console import BEGINS_ANEW, InputError, RunInterruptedError, log
 from gmem_jax.experiment.experiment import Experiment
 from gmem_jax.experiment.run import default_batch
 from gmem_jax.files.atomic import probe
@@ -93,7 +93,7 @@ def resumable(output: Path, key: dict[str, Any], *, restart: bool) -> Iterator[C
         except (KeyboardInterrupt, RunInterruptedError):
             if parts.finished() or parts.begun():
                 raise RunInterruptedError(f"the same command goes on from {parts.folder}") from None
-            raise RunInterruptedError("nothing was kept yet; the same command begins anew") from None
+            raise RunInterruptedError(BEGINS_ANEW) from None
         finally:
             if done or not (parts.finished() or parts.begun()):
                 parts.discard()

@@ -126,8 +126,8 @@ def train_net(
             check.
         target: accuracy on held-out examples at which the training stops.
         most_steps: number of steps at which the training stops; default no limit.
-        checkpoint: file that keeps the training, written every 30 s and at the end; default none. If it exists, the
-            training continues from it; if that has reached `target`, it is only loaded.
+        checkpoint: file that keeps the training, written every 30 s, at the end and after an interrupt; default none.
+            If it exists, the training continues from it; if that has reached `target`, it is only loaded.
         listener: called with the `Training` after every 250 steps; default none.
 
     Raises:
@@ -143,25 +143,30 @@ def train_net(
         return training
     data = _examples(lessons, seed)
     total = lessons.classes * lessons.kept
-    over = False
-    while not over:
-        count = STEPS_PER_CALL if most_steps is None else min(STEPS_PER_CALL, most_steps - training.step)
-        if count > 0:
-            net, loss = _learn(training.net, data, seed, training.step, count)
-            training = replace(training, net=net, step=training.step + count, loss=float(loss))
-        quick = float(_validate(training.net, data, QUICK_CHECK))
-        over = time.perf_counter() - began > budget or (most_steps is not None and training.step >= most_steps)
-        training = replace(training, validation=quick, examples=min(QUICK_CHECK, total), finished=False)
-        if over or quick >= target:
-            whole = float(_validate(training.net, data, LAST_CHECK))
-            training = replace(training, validation=whole, examples=min(LAST_CHECK, total), finished=whole >= target)
-            over = over or training.finished
-        now = time.perf_counter()
-        training = replace(training, seconds=before + now - began)
-        if checkpoint is not None and (over or now - saved > SAVE_EVERY):
+    kept, over = training, False
+    try:
+        while not over:
+            new = training
+            count = STEPS_PER_CALL if most_steps is None else min(STEPS_PER_CALL, most_steps - new.step)
+            if count > 0:
+                net, loss = _learn(new.net, data, seed, new.step, count)
+                new = replace(new, net=net, step=new.step + count, loss=float(loss))
+            quick = float(_validate(new.net, data, QUICK_CHECK))
+            over = time.perf_counter() - began > budget or (most_steps is not None and new.step >= most_steps)
+            new = replace(new, validation=quick, examples=min(QUICK_CHECK, total), finished=False)
+            if over or quick >= target:
+                whole = float(_validate(new.net, data, LAST_CHECK))
+                new = replace(new, validation=whole, examples=min(LAST_CHECK, total), finished=whole >= target)
+                over = over or new.finished
+            now = time.perf_counter()
+            training = replace(new, seconds=before + now - began)
+            if checkpoint is not None and now - saved > SAVE_EVERY:
+                kept, saved = training, now
+                save(checkpoint, training)
+            listener(training)
+    finally:  # the last whole round, also where the next was interrupted
+        if checkpoint is not None and training is not kept:
             save(checkpoint, training)
-            saved = now
-        listener(training)
     return training
 
 

@@ -179,16 +179,20 @@ def test_recalled_words_are_classified_and_the_nets_are_used_again(
     assert "nearest template" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("begun", [False, True])
 def test_an_interrupted_training_says_where_it_goes_on(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, one_bit: Path
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture, tmp_path: Path, one_bit: Path, begun: bool
 ) -> None:
-    def interrupted(*_: Any, **__: Any) -> None:
+    def interrupted(*_: Any, checkpoint: Path, **__: Any) -> None:
+        if begun:
+            checkpoint.write_bytes(b"a round")
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gmem_jax.reading.training.train_net", interrupted)
     nets = tmp_path / "nets"
     assert gmem(monkeypatch, "classify", one_bit, "-o", tmp_path / "read.json", "--nets", nets) == 130
-    assert f"the same command goes on with the nets in {nets}" in " ".join(capsys.readouterr().err.split())
+    then = f"goes on with the nets in {nets}" if begun else "nothing was kept yet; the same command begins anew"
+    assert then in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_recall_that_holds_no_words_cannot_be_classified(

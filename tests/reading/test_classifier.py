@@ -162,11 +162,20 @@ def test_training_is_reproducible_and_depends_on_the_seed(small: classify.Traini
     assert np.abs(np.asarray(first) - np.asarray(second)).max() > 0.1
 
 
-def test_broken_off_training_goes_on_to_the_same_net(tmp_path: Path) -> None:
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_broken_off_training_goes_on_to_the_same_net(tmp_path: Path, interrupted: bool) -> None:
+    def interrupt(_: classify.Training) -> None:
+        raise KeyboardInterrupt
+
     file = tmp_path / "net.msgpack"
     limit = 3 * STEPS_PER_CALL
     through = classify.train(SMALL, 3, target=1.1, most_steps=limit)
-    broken = classify.train(SMALL, 3, target=1.1, budget=0.0, checkpoint=file)  # one call, then out of time
+    if interrupted:
+        with pytest.raises(KeyboardInterrupt):
+            classify.train(SMALL, 3, target=1.1, checkpoint=file, listener=interrupt)
+        broken = classify.load(file)
+    else:
+        broken = classify.train(SMALL, 3, target=1.1, budget=0.0, checkpoint=file)  # one call, then out of time
     assert (broken.step, broken.finished) == (STEPS_PER_CALL, False)
     resumed = classify.train(SMALL, 3, target=1.1, most_steps=limit, checkpoint=file)
     assert resumed.step == through.step == limit
