@@ -5,8 +5,9 @@ import os
 import signal
 import tempfile
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
+
+from xla_flags import COMPILED_SOON
 
 # Workers of xdist, and the processes that tests start, find what others have compiled. It is gone at the end.
 # Set before the package is imported, which tells its library of the folder at once.
@@ -15,14 +16,7 @@ if "GMEM_COMPILE_CACHE" not in os.environ:
     os.environ["GMEM_COMPILE_CACHE"] = programs.name
     atexit.register(programs.cleanup)
 
-# Much of the time of all tests is the compiler's, which makes programs fast that are small and run once. The slow tests
-# have programs as a user's are: there XLA_FLAGS is set (Makefile). The emitters of fusions, which XLA can do without up
-# to jaxlib 0.9, take half of the time that is left; an unknown flag ends the process. A program in one piece compiles
-# in four fifths of the time that several take side by side, where workers have all cores already.
-if "XLA_FLAGS" not in os.environ:
-    os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
-    if version("jaxlib").startswith("0.9."):
-        os.environ["XLA_FLAGS"] += " --xla_cpu_use_fusion_emitters=false"
+os.environ.setdefault("XLA_FLAGS", COMPILED_SOON)  # the slow tests have programs as a user's are (Makefile)
 
 # Threads of the library wait for each other in loops, and workers side by side have no core to spare for that.
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -42,9 +36,12 @@ jax.config.update("jax_enable_x64", True)
 keep_programs()
 
 
+LONGEST = ("test_sanitizers.py", "test_native_derivatives.py", "test_devices.py", "test_docs.py")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The file that takes a worker longest comes first, so that no worker waits for it at the end."""
-    items.sort(key=lambda item: item.path.name != "test_sanitizers.py")
+    """The slow files that take a worker longest come first, so that no worker waits for one at the end."""
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
 
 
 @pytest.fixture(autouse=True)

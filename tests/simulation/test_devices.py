@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes import TESTS
+from xla_flags import COMPILED_SOON
 
 from gmem_jax import native
 
@@ -21,7 +22,7 @@ BUILT, REASON = native.available()
 def start(devices: int, *arguments: object) -> subprocess.Popen[str]:
     """A process whose CPU counts as some devices."""
     paths = os.pathsep.join([str(TESTS), *filter(None, [os.environ.get("PYTHONPATH")])])
-    flags = f"--xla_force_host_platform_device_count={devices}"
+    flags = f"--xla_force_host_platform_device_count={devices} {COMPILED_SOON}"
     environment = {**os.environ, "PYTHONPATH": paths, "XLA_FLAGS": flags}
     command = [sys.executable, str(HERE / "several_devices.py"), *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)

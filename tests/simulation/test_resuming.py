@@ -83,7 +83,6 @@ def test_a_run_goes_on_with_the_lists_it_had(law: Any, tmp_path: Path) -> None:
         pytest.param({"grains": 12}, id="walls"),
         # Some seeds of so few spheres lose their pressure in the cycles, which is warned of; on either backend.
         pytest.param({"grains": 56, "boundary": "periodic", "seed": 6}, id="periodic", marks=pytest.mark.slow),
-        pytest.param({"grains": 40, "boundary": "walls,periodic,walls"}, id="periodic along y", marks=pytest.mark.slow),
     ],
 )
 def test_a_preparation_goes_on(changes: dict[str, Any], tmp_path: Path) -> None:
