@@ -32,13 +32,13 @@ def periodic_axes(boundary: Any) -> PeriodicAxes:
 
 
 def boundary_of(periodic: PeriodicAxes) -> str:
-    """Axes in words, one where one says it."""
+    """The boundary in words: one word if all axes are alike, else one for each axis."""
     words = [_WORDS[bool(axis)] for axis in periodic]
     return words[0] if len(set(words)) == 1 else ",".join(words)
 
 
 def require_room(lengths: np.ndarray, periodic: PeriodicAxes, reach: float, diameter: float) -> None:
-    """Refuse a box in which two spheres could be listed through two images, or a grain could touch its own.
+    """Refuse a box in which two spheres could be listed through two images, or a grain could touch its own image.
 
     Args:
         lengths: edges of the box at its smallest, [3], in R.
@@ -47,7 +47,7 @@ def require_room(lengths: np.ndarray, periodic: PeriodicAxes, reach: float, diam
         diameter: outer diameter of a grain, in R.
 
     Raises:
-        ValueError: naming the edge that there must be.
+        ValueError: naming the smallest edge that is allowed.
     """
     least = max(2.0 * reach, diameter)
     if any(edge < least for edge, axis in zip(lengths, periodic, strict=True) if axis):

@@ -14,18 +14,18 @@ from gmem_jax.physics.system import System
 
 
 class Census(NamedTuple):
-    """What is counted and compared in a configuration: arrays [B], float64. Nothing of it has a derivative.
+    """Counts and extremes of one configuration: arrays [B], float64. None of them has a derivative.
 
     Attributes:
-        sphere_contacts: how many pairs of spheres touch.
-        grain_contacts: how many pairs of grains do.
-        wall_contacts: how many spheres touch a wall, once for each wall.
-        largest_overlap: of two spheres, in R; negative where all are apart.
-        largest_speed: of a grain, in R / t_c.
+        sphere_contacts: number of pairs of spheres that touch.
+        grain_contacts: number of pairs of grains that touch.
+        wall_contacts: number of contacts of spheres with walls.
+        largest_overlap: largest overlap of two spheres, in R; negative where all are apart.
+        largest_speed: largest speed of a grain, in R / t_c.
         deviation: largest distance of a sphere from where an affine motion since the list was made would have brought
             it, in R; see `gmem_jax.physics.pairs.slack`.
         outside: 1 where a sphere's centre is beyond a wall, else 0.
-        finite: 1 where the numbers that the next step goes on from are finite, else 0.
+        finite: 1 where all positions, accelerations and spin rates of grains are finite, else 0.
     """
 
     sphere_contacts: jax.Array
@@ -54,12 +54,12 @@ def overlaps(system: System, state: State) -> jax.Array:
 
 
 def take_census(system: System, state: State, box: Box) -> Census:
-    """The census of a state between walls `box`, leaves [3, B]; the definition of what the library counts."""
+    """The census of a state between the walls `box`, leaves [3, B]. It defines what the native library counts."""
     system, state, box = lax.stop_gradient((system, state, box))
     grains, pairs = state.grains, system.pairs
     spheres, kind = sphere_centres(grains, system.clump), grains.position.dtype
     overlap = overlaps(system, state)
-    # Contacts of each pair of grains; both numbers follow from it, so that overlaps are looked through once less.
+    # The sphere contacts of each pair of grains. Both counts follow from them, which saves a pass over the overlaps.
     touching = jax.ops.segment_sum((overlap > 0.0).astype(jnp.int32), pairs.grain_pair, num_segments=pairs.capacity)
     own = system.clump.sphere_radii(len(spheres))
     radii = 1.0 if own is None else own[:, None, None]

@@ -2,7 +2,7 @@
 
 JAX's own keys depend on settings of the machine (JAX_DEFAULT_PRNG_IMPL, JAX_THREEFRY_PARTITIONABLE,
 JAX_RANDOM_SEED_OFFSET). These keys name their generator: threefry-2x32, whose counters are the numbers of the elements.
-`jax.random` takes them like its own; the numbers are those that it gives where nothing is set.
+`jax.random` takes them like its own, and gives the same numbers as with its own keys under JAX's default settings.
 """
 
 import math

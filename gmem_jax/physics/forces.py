@@ -16,7 +16,7 @@ from gmem_jax.physics.rotation import cross
 from gmem_jax.physics.state import Box, Grains
 from gmem_jax.physics.system import System
 
-Histories = tuple[Any, Any]  # of the candidates, and of the walls
+Histories = tuple[Any, Any]  # those of the candidate contacts, and those of contacts with walls
 
 
 def _fusion_barrier(alive: jax.Array, function: Callable[..., Any], *args: Any) -> Any:
@@ -33,7 +33,7 @@ def _fusion_barrier(alive: jax.Array, function: Callable[..., Any], *args: Any) 
 def sphere_table(clump: Clump, grains: Grains, cell: Box | None = None) -> tuple[jax.Array, jax.Array]:
     """Sphere centres, their velocities and spins as rows [S, 9, B], and the arms from the grain centre [N, K, 3, B].
 
-    Grains of a periodic `cell` move with it, and beside that with their own velocities.
+    In a periodic `cell`, `grains.velocity` is relative to its affine motion; the velocities in the table contain both.
     """
     arms = sphere_offsets(grains.quaternion, clump)
     spin = jnp.broadcast_to(grains.spin[:, None], arms.shape)
@@ -45,10 +45,9 @@ def sphere_table(clump: Clump, grains: Grains, cell: Box | None = None) -> tuple
 def relative_motion(
     system: System, table: jax.Array, cell: Box | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array, Unequal | None]:
-    """Separations and relative velocities of candidates, and the sums of their spins, [P, 3, B] each.
+    """Separations and relative velocities of candidates, sums of their spins, [P, 3, B] each; and `Unequal` or None.
 
-    Of the second sphere of a pair it is the listed image in the periodic `cell` that counts. Where spheres differ in
-    radius, what is to be known of that.
+    In a periodic `cell` the second sphere of a pair is its listed image. `Unequal` is None if all radii are 1.
     """
     pairs, radii = system.pairs, system.clump.sphere_radii(len(table))
     one, other = table[pairs.first], table[pairs.second]
@@ -64,7 +63,7 @@ def relative_motion(
 
 
 def strain_rate(cell: Box) -> jax.Array:
-    """Of each axis, [3, B], in 1 / t_c; 0 where there are walls."""
+    """Rate of strain of a periodic cell along each axis, [3, B], in 1 / t_c; 0 along axes with walls."""
     return jnp.where(cell.images, cell.growth / cell.lengths, 0.0)
 
 
@@ -82,8 +81,8 @@ def contact_loads(
     history: Any,
     dt: jax.Array,
 ) -> tuple[Kinematics, jax.Array, jax.Array, Any]:
-    """The law of a contact: of every candidate its kinematics, the repulsive normal force [P, 1, B], the tangential
-    force on the first sphere [P, 3, B], and the new history.
+    """Forces at every candidate: its kinematics, the repulsive normal force [P, 1, B], the tangential force on the
+    first sphere [P, 3, B], and the new history.
 
     Args:
         system: the system.
@@ -91,8 +90,8 @@ def contact_loads(
         velocity: likewise.
         spin_sum: likewise.
         unequal: likewise.
-        history: the friction law's.
-        dt: time step; 0 leaves the histories as they are.
+        history: the history of the friction law.
+        dt: time step; with 0 the contacts slide no further.
     """
     kin = kinematics(separation, velocity, spin_sum, system.pairs.valid, dt, unequal)
     material = system.material
@@ -106,18 +105,19 @@ def contact_loads(
 def contact_forces(
     system: System, table: jax.Array, history: Any, dt: jax.Array, alive: jax.Array, cell: Box | None = None
 ) -> tuple[jax.Array, Any, jax.Array | None]:
-    """Force and tangential torque (about the sphere centre) on every sphere from the others.
+    """Force and tangential torque (about the sphere centre) on every sphere from its contacts with other spheres.
 
     Args:
         system: the system.
         table: rows of `sphere_table`, [S, 9, B].
-        history: the friction law's.
+        history: the history of the friction law.
         dt: time step.
         alive: see `_fusion_barrier`.
         cell: the box, if any of its axes is periodic.
 
     Returns:
-        [S, 6, B], the new history, and the forces that act through the faces of the cell, [3, B] (None without it).
+        Forces and torques, [S, 6, B]; the new history; and the forces that act through the faces of the cell, [3, B]
+        (None without a cell).
     """
     pairs = system.pairs
 
@@ -144,8 +144,9 @@ def contact_forces(
 def _loads(
     system: System, grains: Grains, histories: Histories, box: Box, dt: jax.Array, alive: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array | None, Histories, jax.Array | None]:
-    """Of every sphere: its arm [N, K, 3, B], contact forces and torques [S, 6, B], wall forces, friction of walls as of
-    contacts (None if they are smooth); the new histories; and forces through the faces of a periodic cell.
+    """Arms of all spheres [N, K, 3, B]; forces and torques on them by contacts [S, 6, B]; normal forces by the lower
+    and by the upper walls [S, 3, B]; forces and torques by the friction of walls [S, 6, B] (None if they are smooth);
+    the new histories; and forces through the faces of a periodic cell [3, B] (None without a cell).
     """
     material, cell = system.material, box if any(box.periodic) else None
     with jax.named_scope("spheres"):
@@ -168,18 +169,18 @@ def _loads(
 def wall_loads(
     system: System, grains: Grains, box: Box, lower: jax.Array, upper: jax.Array, history: Any, dt: jax.Array
 ) -> tuple[Kinematics, jax.Array, jax.Array, Any]:
-    """The friction of walls that have it: the kinematics of all spheres at all planes, in the order of
-    `wall_kinematics`; tangential forces on the spheres and their torques about their centres, [6 S, 3, B] each; and the
-    new history.
+    """Friction of walls: the kinematics of all spheres at all planes, in the order of `wall_kinematics`; tangential
+    forces on the spheres and their torques about the sphere centres, [6 S, 3, B] each; and the new history.
 
-    The walls of a box that is periodic along other axes are strained with it: under each grain as its centre is.
+    If the box is periodic along other axes, its walls strain with it: the wall under a grain moves with the affine
+    velocity at the centre of the grain.
 
     Args:
         system: the system, with a `wall_mu`.
         grains: the grains.
         box: the planes.
         lower: normal forces of the lower planes on spheres, [S, 3, B], of `wall_forces`.
-        upper: of the upper ones.
+        upper: normal forces of the upper planes, likewise.
         history: `State.wall_history`.
         dt: time step; 0 leaves the history as it is.
     """
@@ -194,7 +195,8 @@ def forces_on_grains(
 ) -> tuple[jax.Array, jax.Array, Histories, jax.Array]:
     """Total force and torque on every grain [N, 3, B], the new histories, and the wall forces [2, 3, B].
 
-    Wall forces are normal ones. In the place of a periodic axis' two walls stand its sections; see `section_force`.
+    Wall forces are normal forces. Along a periodic axis both are the mean force across its sections; see
+    `section_force`.
     """
     arms, contact, lower, upper, rubbing, histories, through = _loads(system, grains, histories, box, dt, alive)
     per_sphere = (*arms.shape[:2], -1, contact.shape[-1])
@@ -217,13 +219,13 @@ def section_force(clump: Clump, grains: Grains, force: jax.Array, through: jax.A
 
     It is the virial V p = sum_c f l + sum_g m v^2 of the axis over its edge L. With branch vectors l between centres of
     grains, the sum over contacts is L times the force through the face, and sum_g x F over the forces on grains, which
-    vanish at rest. Velocities v are those beside the cell's own motion.
+    vanish at rest. Velocities v are relative to the affine motion of the cell.
 
     Args:
         clump: the grain.
         grains: the grains.
-        force: of the contacts on them, without the friction of walls, [N, 3, B].
-        through: of those contacts that go through the face of the axis, [3, B].
+        force: total force of contacts on each grain, without the friction of walls, [N, 3, B].
+        through: force of the contacts that act through the face of each axis, [3, B].
         cell: the periodic box.
     """
     place = grains.position - cell.lower

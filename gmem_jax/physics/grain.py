@@ -19,8 +19,8 @@ from gmem_jax.physics.pytree import Scalar, label, pytree, static, traced
 from gmem_jax.physics.rules import usual_rules
 
 _LINES = 700  # lines per side of the integration grid: volume and inertia to about 1e-5
-RADII = 0.1, 10.0  # R, of the smallest and the largest sphere; skins of lists and springs of law H are in R
-LARGEST_RATIO = 10.0  # of the radii in a pack: around a large sphere cells hold its cube of small ones
+RADII = 0.1, 10.0  # R, allowed range of radii: the skin of lists and the stiffness of law H do not scale with them
+LARGEST_RATIO = 10.0  # of two radii in a pack; a cell as wide as a large sphere holds up to ratio^3 small ones
 
 
 @pytree
@@ -207,10 +207,10 @@ def clump(
 
 
 def _lengths(name: str, values: Any, count: int | None = None) -> np.ndarray:
-    """Positive numbers in a row.
+    """Positive numbers as an array [count].
 
     Raises:
-        ValueError: if they are none, or not so many.
+        ValueError: if they are not positive numbers, or not `count` of them.
     """
     found = np.asarray(values, float) if is_real(values) else np.zeros(0)
     if found.ndim != 1 or found.size == 0 or found.size != (count or found.size) or not np.all(found > 0.0):
@@ -222,7 +222,7 @@ def require_radii(radii: np.ndarray) -> None:
     """Refuse spheres that cannot be listed together: lists have one skin and one size of cells.
 
     Args:
-        radii: of all spheres of a pack, in R.
+        radii: radii of all spheres of a pack, in R.
 
     Raises:
         ValueError: if one is outside `RADII`, or no number; or if the largest is more than `LARGEST_RATIO` times the

@@ -13,7 +13,7 @@ LONGEST = 160  # characters of a value in a message
 
 
 def is_real(value: Any) -> bool:
-    """Whether it is a real number, or an array or a sequence of them; what JAX traces is taken for one."""
+    """Whether a value is a real number, or an array or a sequence of real numbers; tracers of JAX count as real."""
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value)):
         return True
     try:
@@ -26,16 +26,16 @@ def is_real(value: Any) -> bool:
 
 
 def said(value: Any) -> str:
-    """A value as a message names it: in one line, and no longer than that."""
+    """A value as a message shows it: its repr in one line, cut after `LONGEST` characters."""
     words = " ".join(repr(value).split())
     return words if len(words) <= LONGEST else f"{words[:LONGEST]}..."
 
 
 def require_numbers(**values: Any) -> None:
-    """Refuse what is no real number where one is asked for; None stands for a default.
+    """Refuse values that are not single real numbers; None, which stands for a default, is accepted.
 
     Raises:
-        ValueError: naming the first that is none, and what was given.
+        ValueError: naming the first such value, and what was given.
     """
     for name, value in values.items():
         if value is not None and not (is_real(value) and np.ndim(value) == 0):
@@ -43,10 +43,10 @@ def require_numbers(**values: Any) -> None:
 
 
 def require_whole(name: str, value: Any, least: int = 0) -> int:
-    """A whole number, however it was written.
+    """An integer of any type, as an int.
 
     Raises:
-        ValueError: if it is none, or smaller than `least`.
+        ValueError: if `value` is no integer (a float or a bool is none), or smaller than `least`.
     """
     try:
         number = least - 1 if isinstance(value, bool | np.bool) else operator.index(value)
@@ -58,5 +58,5 @@ def require_whole(name: str, value: Any, least: int = 0) -> int:
 
 
 def plural(number: int, what: str) -> str:
-    """So many of something whose plural ends in s: "1 signal", "2 signals"."""
+    """A count with its noun, whose plural ends in s: "1 signal", "2 signals"."""
     return f"{number} {what}{'s' * (number != 1)}"

@@ -1,7 +1,7 @@
 """Candidate contacts: which sphere pairs may touch, one list shared by all replicas (`search` makes it).
 
-A half list in canonical (i, j) order, with an incidence table by which forces are gathered. Its capacities are rounded
-up to a few sizes, so that lists of packs of one size fit one compiled program.
+It is a half list, sorted by (i, j), with an incidence table by which the forces on each sphere are gathered. Its
+capacities are rounded up to a few sizes, so that lists of packs of one size fit one compiled program.
 """
 
 from dataclasses import dataclass
@@ -33,16 +33,17 @@ class Pairs:
         first: sphere i of each candidate, int32 [P], i < j; padding is (0, 0).
         second: sphere j, int32 [P].
         valid: False for padding, [P].
-        incidence: for each sphere the rows of its contacts in the stack (as i: c; as j: P + c; padding: 2 P), [S, C].
+        incidence: for each sphere, the rows of its contacts in the stack of forces: c where it is sphere i of candidate
+            c, P + c where it is sphere j, and 2 P for padding, [S, C].
         grain_pair: number of the grain pair each candidate belongs to, below P; padding has one of its own, [P].
         reference: sphere centres in box coordinates (0 to 1) when the list was built, [S, 3, B], or [S, 3, 1] for
-            replicas that had not parted yet.
-        smallest: edge lengths of the box the distances were measured in, [3].
-        reach: largest centre distance listed there, the diameter of the largest sphere + skin; pairs of smaller spheres
-            are listed up to R_i + R_j + skin.
-        radii: of the spheres when the list was built, [S], in R; None where all were 1.
-        image: which image of sphere j meets sphere i: by how many edges of the box it is moved along each axis, int8
-            [P, 3]; None between walls.
+            replicas that were still alike.
+        smallest: edge lengths of the box in which distances were measured, [3].
+        reach: largest listed distance of centres in that box, the diameter of the largest sphere + skin; pairs of
+            smaller spheres are listed up to R_i + R_j + skin.
+        radii: radii of the spheres when the list was built, [S], in R; None where all were 1.
+        image: the image of sphere j that is listed: the number of edges of the box by which it is moved along each
+            axis, int8 [P, 3]; None between walls.
     """
 
     first: jax.Array
@@ -86,14 +87,15 @@ def slack(pairs: Pairs, spheres: jax.Array, box: Box, radii: jax.Array | None = 
     """How much closer two unlisted spheres may still come before they could touch, [B], in R.
 
     Positive while the list is certainly complete: unlisted spheres are at least ratio * reach apart after the affine
-    part of their motion, and the non-affine part brings them together by at most twice the largest deviation. Of
-    unequal spheres this is least for the largest, as the ratio is 1 at most; radii [S] may have grown since.
+    part of their motion, and the non-affine part brings them together by at most twice the largest deviation. Among
+    unequal spheres the slack is least for the largest, since the ratio is at most 1. `radii` [S] are the present radii;
+    they may have grown since the list was built.
     """
     return slack_of(pairs, largest_deviation(pairs, spheres, box), box, radii)
 
 
 def slack_of(pairs: Pairs, deviation: jax.Array, box: Box, radii: jax.Array | None = None) -> jax.Array:
-    """`slack` where the `largest_deviation` is known."""
+    """`slack` from a known `largest_deviation`."""
     touching: jax.Array | float = 2.0
     if radii is not None or pairs.radii is not None:
         before, now = (jnp.ones(1) if own is None else own for own in (pairs.radii, radii))
@@ -103,15 +105,16 @@ def slack_of(pairs: Pairs, deviation: jax.Array, box: Box, radii: jax.Array | No
 
 
 def largest_deviation(pairs: Pairs, spheres: jax.Array, box: Box) -> jax.Array:
-    """How far spheres [S, 3, B] are at most from where their places in the box were when the list was made, [B]."""
+    """Largest distance of a sphere from where affine motion since the list was built would have brought it, [B]."""
     affine = box.lower + pairs.reference * box.lengths
     return jnp.sqrt(jnp.max(jnp.sum((spheres - affine) ** 2, axis=1), axis=0))
 
 
 def image_shifts(pairs: Pairs, lengths: jax.Array) -> jax.Array | float:
-    """What is to be added to the separation x_j - x_i of each candidate in a box of these edges [3, B], [P, 3, B].
+    """The displacement of the listed image of sphere j from sphere j, for each candidate, [P, 3, B]; 0 between walls.
 
-    With the velocities at which the edges grow it is what is to be added to relative velocities.
+    `lengths` are the edges of the box, [3, B]. If they are the rates at which the edges grow, the result is the
+    velocity of the image relative to sphere j.
     """
     return 0.0 if pairs.image is None else pairs.image[..., None] * lengths
 
@@ -119,9 +122,9 @@ def image_shifts(pairs: Pairs, lengths: jax.Array) -> jax.Array | float:
 def nearest_images(
     found: np.ndarray, reference: np.ndarray, smallest: np.ndarray, periodic: PeriodicAxes
 ) -> np.ndarray:
-    """The images of `Pairs.image` of sphere pairs [2, n]: those that are nearest, in the replica where they are.
+    """`Pairs.image` of sphere pairs `found` [2, n]: the nearest image, in the replica where it comes nearest.
 
-    Other arguments are those of `Pairs` and `Box`.
+    The other arguments are those of `Pairs` and `Box`.
     """
     apart = reference[found[1]] - reference[found[0]]
     turns = np.where(np.asarray(periodic)[:, None], -np.rint(apart), 0.0)
@@ -151,19 +154,20 @@ def tabulate(
         reach: see `Pairs`.
         spheres_per_grain: K.
         capacity: rows to allocate at least; rounded up (see `bucket`), and raised to what was found.
-        per_sphere: columns of the incidence table to allocate at least; likewise, to multiples of four.
+        per_sphere: columns of the incidence table to allocate at least; rounded up to a multiple of four, and raised to
+            what was found.
         periodic: the periodic axes of the box.
         radii: see `Pairs`.
     """
     pairs, count = found.shape[1], reference.shape[0]
     capacity = bucket(max(8, capacity, pairs))  # a gas may have no candidates, but arrays need rows
     found = found.astype(np.int32)
-    # Of a sphere's contacts those in which it is first come first, in the order of the list.
+    # In the row of a sphere stand first the contacts whose sphere i it is, then the others, both in the list's order.
     as_first, as_second = (np.bincount(side, minlength=count).astype(np.int32) for side in found)
     per_sphere = -(-max(1, per_sphere, (as_first + as_second).max(initial=0)) // 4) * 4
     incidence = np.full((count, per_sphere), 2 * capacity, dtype=np.int32)
     rows = np.arange(pairs, dtype=np.int32)
-    # Its columns come in the order of a stable sort, and a sparse matrix counts where sorts compare.
+    # The columns of a sparse matrix are a stable sort by the second sphere, made by counting instead of comparing.
     from scipy import sparse  # half a second, which most commands never need
 
     entries = (rows, found[1], np.arange(pairs + 1, dtype=np.int32))
@@ -176,7 +180,7 @@ def tabulate(
         incidence[owners, place] = number + order
     padded = np.zeros((2, capacity), dtype=np.int32)
     padded[:, :pairs] = found
-    # What is listed is all but sorted, of which a stable sort makes use. With the padding it took most of the time.
+    # The listed pairs are nearly sorted, and a stable sort is fast on these; with the padding it took most of the time.
     one, other = found // spheres_per_grain
     keys = one.astype(np.int64) * count + other
     order = np.argsort(keys, kind="stable")
@@ -212,7 +216,7 @@ def carry_history(history: Any, blank: Any, old: Pairs, new: Pairs) -> Any:
 
     Args:
         history: pytree with leaves [P_old, ...].
-        blank: the same for untouched contacts of the new list, leaves [P_new, ...].
+        blank: histories of untouched contacts for the new list, leaves [P_new, ...].
         old: the list `history` belongs to.
         new: the list it moves to.
     """
@@ -231,7 +235,7 @@ def carry_history(history: Any, blank: Any, old: Pairs, new: Pairs) -> Any:
 
 @jax.jit
 def _carried(history: Any, blank: Any, source: jax.Array, carried: jax.Array) -> Any:
-    """Rows `source` of a history where there are any, else those of the blank one."""
+    """Rows `source` of a history where `carried`, else the rows of the blank one."""
 
     def chosen(leaf: jax.Array, empty: jax.Array) -> jax.Array:
         kept = carried.reshape(-1, *(1 for _ in empty.shape[1:]))

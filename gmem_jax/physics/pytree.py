@@ -27,20 +27,20 @@ _T = TypeVar("_T")
 
 
 class Interval(NamedTuple):
-    """Where a parameter may lie; read from words like "[0, inf)"."""
+    """The interval in which a parameter may lie; read from words like "[0, inf)"."""
 
     words: str
     low: float
     high: float
 
     def holds(self, value: Any) -> Any:
-        """Whether it does, elementwise; False for what is not a number."""
+        """Whether a value lies in the interval, elementwise; False for NaN."""
         above = value >= self.low if self.words.startswith("[") else value > self.low
         return above & (value <= self.high if self.words.endswith("]") else value < self.high)
 
 
 def interval(words: str) -> Interval:
-    """The interval of such words."""
+    """The interval that words like "[0, inf)" describe."""
     low, high = words[1:-1].split(",")
     return Interval(words, float(low), float(high))
 
@@ -53,7 +53,7 @@ def parameter(default: Any, within: str = "(-inf, inf)", words: str = "", unit: 
         within: an interval, like "[0, inf)".
         words: what it is, for `--help` and the tables of the documentation.
         unit: its unit, "" for a pure number.
-        more: what else is to be known of it (`gmem_jax.experiment.experiment.NUMBERS`).
+        more: further metadata (see `gmem_jax.experiment.experiment.NUMBERS`).
     """
     return field(default=default, metadata={"interval": interval(within), "words": words, "unit": unit, **more})
 
@@ -64,11 +64,11 @@ def static(default: Any = MISSING, words: str = "", unit: str = "", **more: bool
 
 
 def label(default: str, *, given: bool = True) -> Any:
-    """A text that programs are not compiled for: what comes out of a transformation may carry another's.
+    """A text field that no program is compiled for; the result of a transformation may carry another object's label.
 
     Args:
         default: its default.
-        given: whether who makes the object gives it, and `==` compares it.
+        given: whether it is an argument of `__init__`, and `==` compares it.
     """
     return field(default=default, metadata={"label": True}, init=given, compare=given)
 
@@ -84,7 +84,7 @@ def static_record(cls: type[_T]) -> type[_T]:
 
 
 class _Labels(tuple[str, ...]):
-    """Texts that look alike to JAX."""
+    """Texts that are equal to JAX, whatever they say."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Labels)
@@ -119,7 +119,7 @@ def _equal(self: Any, other: Any) -> Any:
 
 
 def _short(value: Any) -> str:
-    """A value in few letters: of an array its kind and shape."""
+    """A value in few letters; an array is shown by its dtype and shape."""
     if isinstance(value, dict):
         return f"{{{', '.join(f'{name!r}: {_short(each)}' for name, each in value.items())}}}"
     if isinstance(value, np.ndarray | jax.Array):
@@ -129,7 +129,7 @@ def _short(value: Any) -> str:
 
 
 def short_repr(made: Any) -> str:
-    """What `__repr__` may be of a dataclass whose arrays would fill pages: its fields in one line."""
+    """A `__repr__` for dataclasses with large arrays: the fields in one line, arrays by dtype and shape."""
     told = (f"{entry.name}={_short(getattr(made, entry.name))}" for entry in fields(made) if entry.repr)
     return f"{type(made).__name__}({', '.join(told)})"
 
@@ -141,9 +141,9 @@ def comparable(cls: type[_T]) -> type[_T]:
 
 
 def typed(tree: _T) -> _T:
-    """The same tree, its floats and arrays that came of floats as numbers of a type of their own.
+    """The same tree without weak types: Python's floats become np.float64, weakly typed arrays strongly typed.
 
-    Programs are compiled for one kind of number: the same for a number that was given as a float, and as an array.
+    So a number that was given as a float and one that was given as an array share a compiled program.
     """
 
     def one(leaf: Any) -> Any:
@@ -187,7 +187,7 @@ def pytree(cls: type[_T]) -> type[_T]:
 
 
 def _structure(written: bytes | bytearray) -> Any:
-    """What `flatten` gives beside the children, from an exported program."""
+    """The structure that `flatten` returns beside the children, read from an exported program."""
     fixed, labels = json.loads(written)
     return tuple(map(_hashable, fixed)), _Labels(labels)
 
@@ -208,8 +208,8 @@ def _hashable(value: Any) -> Any:
 def with_field(made: _T, name: str, value: Any) -> _T:
     """The same object with another value of a field.
 
-    Its class makes it anew, with its checks, where that takes all fields. Else it is a copy: a class of a user's whose
-    `__init__` takes something else has no other way.
+    If `__init__` takes all fields, the class makes the object anew, with its checks. Otherwise the object is copied: a
+    user's class may have an `__init__` with other arguments.
     """
     whole: Any = made
     if isinstance(made, tuple):
@@ -224,9 +224,10 @@ def with_field(made: _T, name: str, value: Any) -> _T:
 
 
 def map_numbers(change: Callable[[Any], Any], made: _T, deeper: Callable[[Any], Any] = lambda leaf: leaf) -> _T:
-    """An object with its own numbers changed, each one for all replicas or [B]; `deeper` has what objects in it hold.
+    """An object whose own numbers, scalar or [B], are changed by `change`, and numbers of objects in it by `deeper`.
 
-    Those of a friction law may have [B] entries by chance: weights of a network are shared by all replicas.
+    The two differ because an array within a friction law may have length B by chance: the weights of a network, for
+    example, are shared by all replicas.
     """
     found: _T = jax.tree_util.tree_map_with_path(
         lambda path, leaf: change(leaf) if len(path) == 1 else deeper(leaf), made
@@ -235,14 +236,14 @@ def map_numbers(change: Callable[[Any], Any], made: _T, deeper: Callable[[Any], 
 
 
 def traced(*trees: Any) -> bool:
-    """Whether anything in them is a tracer of JAX."""
+    """Whether any leaf of the trees is a tracer of JAX."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def _number(value: Any) -> Any:
     """One kind of number for every way to write it, so that 1, 1.0 and np.float32(1) share a program.
 
-    An array of JAX stays one: libraries tell by it what is to be differentiated by.
+    An array of JAX stays one, since some libraries differentiate with respect to arrays of JAX alone.
     """
     if not isinstance(value, jax.Array) and np.ndim(value) == 0:
         return float(value)
@@ -260,7 +261,7 @@ def validate(made: Any) -> None:
     """Bring the parameters of a new object to one kind of number, and refuse those outside their interval.
 
     Raises:
-        ValueError: naming the parameter, where it may lie, and what was given. Traced ones cannot be refused; see
+        ValueError: naming the parameter, where it may lie, and what was given. Traced values cannot be refused; see
             `out_of_range`.
     """
     for name, interval in _parameters(made):

@@ -42,13 +42,13 @@ def turn(quaternion: jax.Array, angle: jax.Array) -> jax.Array:
     return unit
 
 
-_UNIT = 1e-12  # of a quaternion's length: nearer to 1 it stays as it is
+_UNIT = 1e-12  # a quaternion whose length is nearer to 1 than this stays as it is
 
 
 def unit(quaternion: jax.Array) -> jax.Array:
     """Quaternions [..., 4, B] of any length but zero, brought to length 1; those that have it stay, bit for bit.
 
-    Their derivatives are those of the division by the length in both cases: the length itself counts for nothing.
+    In both cases the derivative is that of the division by the length: it vanishes along the quaternion itself.
     """
     scale = 1.0 / jnp.sqrt(jnp.sum(quaternion * quaternion, axis=-2, keepdims=True))
     rest = jnp.where(jnp.abs(scale - 1.0) < _UNIT, 1.0 - scale, 0.0)

@@ -27,7 +27,7 @@ def usual_rules() -> Iterator[None]:
 
 
 def why_not_started() -> str:
-    """Why JAX does not start, in one line; "" if it does. Starts it."""
+    """Start JAX; return in one line why it does not start, or "" if it does."""
     try:
         jax.devices()
     except Exception as error:  # RuntimeError for an unknown platform, a bare AssertionError for one without a device

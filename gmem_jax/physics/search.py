@@ -19,11 +19,11 @@ from gmem_jax.physics.pairs import Pairs, sphere_centres, tabulate
 from gmem_jax.physics.state import Box, Grains
 
 Search = Callable[[np.ndarray, int, float], np.ndarray]
-"""From sphere centres [S, 3], spheres per grain and a reach to the sorted numbers i S + j of all pairs i < j of spheres
-of different grains that are closer."""
+"""A function of sphere centres [S, 3], the number of spheres per grain and a distance. It returns the sorted numbers
+i S + j of all pairs i < j of spheres of different grains that are closer than that distance."""
 
 _centres = jax.jit(sphere_centres)
-_SPARE = 1.15  # capacity allocated over what is needed now: a list that is built again should fit the same program
+_SPARE = 1.15  # capacity over what is needed now, so that the next list fits the same compiled program
 
 
 class PairFinder:
@@ -73,7 +73,7 @@ class PairFinder:
 
     @functools.cached_property
     def _list(self) -> tuple[Any, Any]:
-        """How jax-md makes a list from positions, and a jitted way to make another like it."""
+        """jax-md's function that allocates a list for positions, and a jitted one that updates it."""
         # Imported here because jax-md takes seconds to load, and most commands never look for neighbours.
         from jax_md import space
 
@@ -84,7 +84,7 @@ class PairFinder:
 
     @functools.cached_property
     def _periodic_list(self) -> tuple[Any, Any]:
-        """The same in a periodic box: it takes places in units of the edges, and the edges."""
+        """As `_list`, in a periodic box: positions are in units of its edges, and updates take the edges too."""
         from jax_md import space
 
         edges = jnp.asarray(self._extent)
@@ -107,7 +107,7 @@ class PairFinder:
         return functions.allocate, functions.update
 
     def kept(self) -> dict[str, np.ndarray]:
-        """Arguments, apart from the grain, of a finder whose lists have the capacities of this one's."""
+        """Arguments, apart from `clump` and `search`, of a finder whose lists have the capacities of this one's."""
         numbers = {"skin": self.skin, "capacity": self._capacity, "per_sphere": self._per_sphere}
         return {"extent": self._extent, **{name: np.asarray(number) for name, number in numbers.items()}}
 
@@ -131,14 +131,14 @@ class PairFinder:
         if self._neighbors is not None:
             self._neighbors = update(positions, self._neighbors, **box)
         known = self._neighbors
-        # Arrays too small, or cells too narrow for a box that shrank.
+        # A new list is needed where arrays are too small, or the box shrank so far that its cells are too narrow.
         if known is None or bool(known.did_buffer_overflow) or bool(known.cell_size_too_small):
             self._neighbors = allocate(positions, **box)
 
     def _keys(
         self, mapped: np.ndarray, radii: np.ndarray | None, smallest: np.ndarray, periodic: PeriodicAxes
     ) -> np.ndarray:
-        """Pairs i < j of spheres of different grains within reach, of centres [S, 3], as sorted numbers i S + j."""
+        """Pairs i < j of spheres of different grains within reach, as sorted numbers i S + j; centres are [S, 3]."""
         spheres = np.int64(len(mapped))
         if self._search and not any(periodic):
             found = self._search(mapped, self._spheres_per_grain, self._widest + self.skin)
@@ -162,7 +162,7 @@ class PairFinder:
         return keys
 
     def __call__(self, grains: Grains, clump: Clump, box: Box, smallest: np.ndarray | None = None) -> Pairs:
-        """The candidate list of `grains` in `box`, which holds what any of the replicas needs.
+        """The candidate list of `grains` in `box`: all pairs that any of the replicas needs.
 
         Args:
             grains: the grains.

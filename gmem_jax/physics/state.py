@@ -88,7 +88,7 @@ SENTENCES = {
 
 
 def combined_status(status: npt.ArrayLike) -> int:
-    """The bits that any of several replicas or packs has set; 0 for none of them."""
+    """The bits that any of several replicas or packs has set; 0 if there is no replica."""
     return int(np.bitwise_or.reduce(np.asarray(status, int), axis=None))
 
 
@@ -129,8 +129,7 @@ class Grains:
 class Box:
     """Six planes and their velocities; [3, B] each (x, y, z), in R and R / t_c.
 
-    They are rigid walls, but for the planes of a periodic axis: what leaves through one of them comes in through the
-    other, and what is beyond them are images of what is between.
+    They are rigid walls, except the two planes of a periodic axis: beyond these lie images of the grains between them.
     """
 
     lower: jax.Array
@@ -146,12 +145,12 @@ class Box:
 
     @property
     def growth(self) -> jax.Array:
-        """By how much each edge grows in a unit of time, [3, B]."""
+        """Rate at which each edge grows, [3, B], in R / t_c."""
         return self.upper_velocity - self.lower_velocity
 
     @property
     def images(self) -> np.ndarray:
-        """Where the box is periodic, truth values [3, 1]."""
+        """Whether each axis is periodic, bool [3, 1]."""
         return np.asarray(self.periodic)[:, None]
 
 
@@ -161,8 +160,8 @@ class HeldWalls:
     """Walls that give way to the pressure on them, axis by axis.
 
     Attributes:
-        stretch: by how much of it each edge of the box is longer than prescribed, [3, B].
-        pressure: on the walls, averaged over the last bin, [3, B], in E.
+        stretch: fraction by which each edge of the box is longer than prescribed, [3, B].
+        pressure: pressure on the walls, averaged over the last bin, [3, B], in E.
     """
 
     stretch: jax.Array
@@ -178,10 +177,11 @@ class State:
         grains: see `Grains`.
         history: what the friction law remembers of each candidate contact, a pytree with leaves [P, ..., B].
         status: sticky bits of `Status`, int32 [B].
-        servo: of walls that are held at a pressure; None where none ever are.
+        servo: the servo of walls that are held at a pressure; None if the walls are never held.
         cell: the box that the positions are in, if any of its axes is periodic; else None.
         wall_history: what the friction law remembers of each sphere at each plane of the box, a pytree with leaves
-            [6 S, ..., B], in the order of `wall_kinematics`; None where walls are smooth. Lists leave it alone.
+            [6 S, ..., B], in the order of `wall_kinematics`; None where walls are smooth. A new neighbour list does not
+            change it.
     """
 
     grains: Grains

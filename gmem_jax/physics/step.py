@@ -20,8 +20,8 @@ from gmem_jax.physics.system import System
 def mark_varying(tree: Any) -> Any:
     """`tree`, each leaf marked as varying over the axes of a `jax.shard_map` that any of them varies over.
 
-    What the devices have in common becomes part of what they have not, in a loop at the latest; said at the start, the
-    types of the loop agree. Outside a shard_map there is nothing to mark.
+    A loop mixes values that all devices share with values that differ between devices. Marked before the loop, the
+    types of its carry are the same before and after a pass. Outside a shard_map there is nothing to mark.
     """
 
     def axes(leaf: Any) -> frozenset[str]:
@@ -36,7 +36,8 @@ def mark_varying(tree: Any) -> Any:
 def _carried(before: Box, cell: Box, position: jax.Array, displacement: jax.Array) -> jax.Array:
     """Positions [N, 3, B] after a step in which a periodic cell went from `before` to `cell`.
 
-    They keep their places in the cell, but for a displacement of their own, which is stretched on its way by half.
+    Positions keep their fractions of the edges. Added to this are the grains' own displacements, multiplied by the mean
+    of 1 and the stretch of the cell.
     """
     stretch = jnp.where(cell.images, cell.lengths / before.lengths, 1.0)
     moved = cell.lower + stretch * (position - before.lower)
@@ -63,7 +64,7 @@ def step(
 ) -> tuple[State, jax.Array]:
     """One velocity-Verlet step; forces use the velocities of its middle (docs/physics.md, "Time integration").
 
-    In a periodic box velocities are those beside its affine motion, v = dx/dt - (dL/dt / L) x, and
+    In a periodic box velocities are relative to its affine motion, v = dx/dt - (dL/dt / L) x, and
     dv/dt = F / m - (dL/dt / L) v: Newton's equation for dx/dt as long as the edges L grow steadily (docs/physics.md,
     "Periodic boxes").
 
@@ -94,7 +95,7 @@ def step(
         state, slowing = replace(state, cell=_wide(box, state.replicas)), drag + strain_rate(box)
     histories = state.history, state.wall_history
     force, torque, (history, wall_history), walls = forces_on_grains(system, midway, histories, box, dt, alive)
-    # Of drag on the velocities at the end, which are found with it.
+    # Drag acts on the velocities at the end of the step, so these equations are implicit; they are solved here.
     acceleration = system.weighed(force / system.clump.masses - slowing * velocity) / (1.0 + 0.5 * dt * slowing)
     turning = _angular_acceleration(system.clump, midway, torque, 0.5 * dt)
     spin_rate = (turning - drag * spin) / (1.0 + 0.5 * dt * drag)
@@ -135,7 +136,7 @@ def require_shapes(state: State, boxes: Box, **numbers: Any) -> None:
 
 
 def require_wall_history(system: System, state: State) -> None:
-    """Raise if a state does not remember the walls of a system that has friction there, or remembers those of none.
+    """Raise if walls have friction and the state has no history of them, or the other way round.
 
     Raises:
         ValueError: saying what to do.
@@ -145,7 +146,7 @@ def require_wall_history(system: System, state: State) -> None:
 
 
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
-    """One step for each of the boxes: what a backend does with a bin.
+    """One step for each of the boxes. This is how a backend runs the steps of a bin.
 
     Args:
         system: the system.
@@ -155,7 +156,7 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
         drag: see `step`.
 
     Returns:
-        The state after them, and the sum over the steps of the wall pressures, [3, B].
+        The state after all steps, and the sum of the wall pressures over the steps, [3, B].
 
     Raises:
         ValueError: if an argument does not fit the number of replicas.
@@ -185,7 +186,7 @@ def _wide(box: Box, replicas: int) -> Box:
 
 
 def start(system: System, position: jax.Array, quaternion: jax.Array, box: Box) -> State:
-    """Grains at rest at `position` [N, 3, B], `quaternion` [N, 4, B], with blank histories and their accelerations."""
+    """Grains at rest at `position` [N, 3, B], `quaternion` [N, 4, B], with blank histories and with accelerations."""
     still = jnp.zeros_like(position)
     grains = Grains(position, quaternion, still, still, still, still)
     replicas = position.shape[-1]
@@ -196,7 +197,7 @@ def start(system: System, position: jax.Array, quaternion: jax.Array, box: Box) 
 
 
 def wall_histories(system: System, replicas: int, grains: int, dtype: Any = float) -> Any:
-    """Blank histories of all spheres of some grains at all planes; None where walls are smooth."""
+    """Blank histories of all spheres of `grains` grains at all planes; None where walls are smooth."""
     if system.wall_mu is None:
         return None
     return system.friction.init(PLANES * grains * system.clump.spheres, replicas, dtype)

@@ -15,7 +15,7 @@ from gmem_jax.physics.pytree import Scalar, pytree
 @pytree
 @dataclass(frozen=True)
 class System:
-    """What does not change during a run.
+    """The constants of a run.
 
     Attributes:
         clump: the grain.
@@ -34,7 +34,7 @@ class System:
     wall_mu: Scalar | None = None
 
     def weighed(self, acceleration: jax.Array) -> jax.Array:
-        """Accelerations [N, 3, B] with that of gravity."""
+        """Accelerations [N, 3, B] plus the acceleration of gravity."""
         if self.gravity is None:
             return acceleration
         return acceleration.at[:, 2].add(-jnp.asarray(self.gravity, acceleration.dtype))

@@ -18,12 +18,13 @@ class RelaxingLaw(Protocol):
 
 
 def relaxation(rate: Scalar, fades: Scalar | None, begun: jax.Array, ended: jax.Array) -> jax.Array:
-    """What is left of an elastic force between two times of a stage: it solves df/dt = -r(t) f.
+    """The factor by which an elastic force f changes between two times of a stage, where df/dt = -r(t) f.
 
     Args:
         rate: r at the beginning of the stage, 1 / t_c; scalar or [B].
-        fades: time tau after which the rate falls as 1 / t, in t_c: r(t) = rate / (1 + t / tau), so that forces fall by
-            a logarithm of time. None for a rate that stays, the solid of Maxwell.
+        fades: time tau after which the rate falls as 1 / t, in t_c: r(t) = rate / (1 + t / tau), so that forces fall as
+            (1 + t / tau)^(-rate tau), a logarithm of time while they fall little. None for a constant rate, that of a
+            Maxwell solid.
         begun: time since the stage began, in t_c.
         ended: later time.
 

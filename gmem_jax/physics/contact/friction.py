@@ -17,12 +17,15 @@ from gmem_jax.physics.contact.kinematics import Kinematics
 from gmem_jax.physics.pytree import Scalar, parameter, validate
 from gmem_jax.physics.rotation import dot
 
-TANGENTIAL_DAMPING = 0.069  # gamma / k of a tangential spring, in t_c; the paper's, of every law
+TANGENTIAL_DAMPING = 0.069  # gamma / k of a tangential spring, in t_c; the paper's value for every law
 
 
 @dataclass(frozen=True)
 class SpringLaw:
-    """The numbers of a law with a tangential spring and dashpot, which each law describes; the stiffness is H's."""
+    """The parameters of a law with a tangential spring and dashpot; the default stiffness is that of law H.
+
+    The subclasses describe what the parameters mean in each law.
+    """
 
     mu: Scalar = parameter(1.0, "[0, inf)", "Friction coefficient")
     stiffness: Scalar = parameter(0.13, "(0, inf)", "k_H in E R, or k_M in E R^0.5; default the law's")
@@ -50,12 +53,12 @@ class FrictionLaw(Protocol):
         ...
 
     def __call__(self, kin: Kinematics, normal_force: jax.Array, history: Any) -> tuple[jax.Array, Any]:
-        """One step of the law. Where `kin.touching` is False, force and history must be 0 and what `init` returns.
+        """One step of the law. Where `kin.touching` is False, the force must be 0 and the history that of `init`.
 
         Args:
             kin: geometry and motion of the P candidate contacts.
             normal_force: f_n, [P, 1, B], in E R^2.
-            history: the history after the step before.
+            history: the history after the previous step.
 
         Returns:
             The tangential force on sphere i, [P, 3, B], in E R^2 (that on j is its opposite), and the new history.

@@ -11,7 +11,7 @@ from gmem_jax.physics.rotation import cross, dot
 
 
 class Unequal(NamedTuple):
-    """What is to be known of candidates where spheres differ in radius.
+    """Further data of the candidates, needed where spheres differ in radius.
 
     Attributes:
         first: R_i, [P, 1, 1], in R.
@@ -85,7 +85,7 @@ def kinematics(
         spin_sum: sum of the two grains' spins.
         valid: [P], False for padding.
         dt: time step.
-        unequal: where spheres differ in radius; else all are of radius 1.
+        unequal: given where spheres differ in radius; if None, all are of radius 1.
     """
     reach = 2.0 if unequal is None else unequal.first + unequal.second
     # Padding pairs sphere 0 with itself; twice the distance of touching keeps them apart and every root finite.
@@ -100,7 +100,7 @@ def kinematics(
     else:
         arm, other_arm = unequal.first - 0.5 * overlap, unequal.second - 0.5 * overlap
         radius = 2.0 * unequal.first * unequal.second / reach
-        # arm spin_i + other_arm spin_j; the arms are half the distance, less and more by half the radii's difference.
+        # arm spin_i + other_arm spin_j; the arms are half the distance, minus and plus (R_j - R_i) / 2.
         relative = velocity - cross(spin_sum, 0.5 * separation)
         relative -= cross(unequal.spin_difference, 0.5 * (unequal.second - unequal.first) * normal)
     along = dot(relative, normal)

@@ -15,10 +15,10 @@ class Entry(NamedTuple):
     """A law that has a name, and what the native library knows of it (native/src/physics/parameters.h).
 
     Attributes:
-        name: in files and on the command line.
-        paper: what the paper calls it.
+        name: its name in files and on the command line.
+        paper: its name in the paper.
         kind: its class.
-        native: its number, enum Law.
+        native: its number in enum Law.
         history: axes of the arrays of its history: contacts P, points Q, replicas B, or a length.
         numbers: attributes that the library is given, in the order of its parameter array.
         variants: values of its attribute `variant`, in the order of enum Variant.
@@ -42,13 +42,13 @@ class Entry(NamedTuple):
         return int(law.points) if self.layered else 0
 
     def variant(self, law: Any) -> int:
-        """The number of the variant of a law of this kind; 0 if there is one only."""
+        """The number of the variant of a law of this kind; 0 if the kind has no variants."""
         return self.variants.index(law.variant) if self.variants else 0
 
     def with_numbers(self, law: Any, values: Iterable[Any]) -> Any:
         """A law of this kind with other `numbers`, the first of `values`."""
         own = dict(zip(self.numbers, values, strict=False))
-        if "spacing" in own:  # which the law has from its largest overlap
+        if "spacing" in own:  # the law derives it from p_max
             own["p_max"] = (own.pop("spacing") * (law.points - 1)) ** 2
         return replace(law, **own)
 

@@ -24,7 +24,8 @@ class LayeredHistory:
 
     Attributes:
         layers: f_j, along the frame and across it, [P, Q, 2, B], in E R^1.5.
-        frame: a unit vector of the tangent plane that is carried along like a force, [P, 3, B]; n x frame is the other.
+        frame: a unit vector of the tangent plane that is carried along like a force, [P, 3, B]; the second axis is
+            n x frame.
         overlap: overlap of the last step, [P, 1, B], in R.
     """
 
@@ -34,7 +35,7 @@ class LayeredHistory:
 
 
 def any_tangent(normal: jax.Array) -> jax.Array:
-    """Unit vectors that are not along unit vectors `normal`, both [P, 3, B]: projected, where a frame begins."""
+    """Unit vectors that are not along the unit vectors `normal`, both [P, 3, B]. Projected, they start a frame."""
     near_x = jnp.abs(normal[:, :1]) > 0.6
     return jnp.concatenate([jnp.where(near_x, 0.0, 1.0), jnp.where(near_x, 1.0, 0.0), jnp.zeros_like(normal[:, :1])], 1)
 
@@ -137,7 +138,7 @@ class Mindlin(SpringLaw):
         return inside, jnp.where(inside, weight - 0.5 * (points == 0), 0.0), jnp.where(x > 0.5, x - 0.5, 1.0)
 
     def _diluted(self, history: LayeredHistory, x: jax.Array) -> jax.Array:
-        """The layers after the contact grew to x: the force w f of the ring that was partly filled stays."""
+        """The layers after the contact grew to x: the force w f of the ring that was partly filled does not change."""
         known = history.overlap > 0.0
         reached = jnp.where(known, jnp.sqrt(jnp.where(known, history.overlap, 1.0)) / self.spacing, 0.0)
         ring = self.outermost(reached)

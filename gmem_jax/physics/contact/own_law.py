@@ -9,7 +9,7 @@ import numpy as np
 from gmem_jax.physics.contact.friction import CoulombLaw, FrictionLaw
 from gmem_jax.physics.contact.kinematics import Kinematics, kinematics
 
-_DT = 0.3  # t_c, of the step that is tried
+_DT = 0.3  # t_c, length of the step on which a law is tried
 
 
 def require_law(law: FrictionLaw, replicas: int) -> None:
@@ -17,18 +17,18 @@ def require_law(law: FrictionLaw, replicas: int) -> None:
 
     Args:
         law: the law, not traced.
-        replicas: B, which parameters with a value for each replica are for.
+        replicas: B, the length of parameters that have a value for each replica.
 
     Raises:
         ValueError: naming the law, what it returned and what is expected.
     """
-    contacts = replicas + 4  # no other length of an axis
+    contacts = replicas + 4  # a length that differs from those of the other axes
 
     def tried(overlap: float, history: Any) -> Any:
         kin = _moving(contacts, replicas, overlap)
         return law(kin, jnp.where(kin.touching, 1e-3, 0.0), history)
 
-    # Not staged, should an experiment be made within a function that is traced.
+    # Evaluated at once, even if the experiment is made within a traced function.
     with jax.ensure_compile_time_eval():
         blank = law.init(contacts, replicas, jnp.zeros(()).dtype)
         _require_history(law, "init", blank, contacts, replicas)
@@ -47,7 +47,7 @@ def require_law(law: FrictionLaw, replicas: int) -> None:
 
 
 def _moving(contacts: int, replicas: int, overlap: float) -> Kinematics:
-    """Contacts that overlap by so much and slide, the last row padding."""
+    """Kinematics of sliding contacts with this overlap; the last row is padding."""
     shape = (contacts, 3, replicas)
     away = jnp.broadcast_to(jnp.asarray([0.6, 0.0, 0.8])[:, None] * (2.0 - overlap), shape)
     motion = jnp.broadcast_to(jnp.asarray([1e-3, 2e-3, -1e-3])[:, None], shape)
@@ -88,6 +88,6 @@ def _name(law: FrictionLaw) -> str:
 
 
 def _described(tree: Any) -> str:
-    """Kind and shape of every array, like float64[6, 3, 2]."""
+    """Dtype and shape of every array, like float64[6, 3, 2]."""
     leaves = [f"{jnp.result_type(leaf)}{list(jnp.shape(leaf))}" for leaf in jax.tree.leaves(tree)]
     return leaves[0] if len(leaves) == 1 else f"({', '.join(leaves)})"

@@ -86,7 +86,7 @@ def contact_path(
         The force along the displacement, [T], in E R^2.
     """
     overlap, displacement = jnp.asarray(overlap), jnp.asarray(displacement)
-    # One law call at rest on each point and one in motion between.
+    # The law is called at rest at each point, and in motion between two points.
     halfway = 0.5 * (overlap[1:] + overlap[:-1])
     pulses = jnp.diff(displacement) / dt
     calls = 2 * overlap.shape[0] - 1

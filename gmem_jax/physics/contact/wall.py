@@ -33,7 +33,7 @@ def wall_forces(
         box: the planes.
         stiffness: k_w of a sphere of radius 1, in E R^0.5.
         damping_time: gamma_w / k_w, in t_c.
-        radii: of the spheres, [S], in R; None where all are 1.
+        radii: radii of the spheres, [S], in R; None where all are 1.
 
     Returns:
         The forces from the lower and from the upper planes (both as magnitudes >= 0), each [S, 3, B]; 0 along periodic
@@ -56,16 +56,16 @@ def wall_kinematics(
     """Kinematics of all spheres with all planes of the box, [6 S, ..., B]: row 6 s + w is sphere s at plane w.
 
     "Sphere j" of a `Kinematics` is the plane: it moves along its normal alone, and does not turn. The arm is R, as in
-    LAMMPS' walls (between spheres it is R - p / 2 here). The radius is that of
-    two equal spheres whose contact is as stiff as this one of the same overlap, 8 wall_rigidity^2 R: the effective
-    radius is R in the place of R / 2, and one body is compliant in the place of two (docs/physics.md).
+    LAMMPS' walls (between spheres it is R - p / 2 here). The radius is 8 wall_rigidity^2 R: two equal spheres of this
+    radius have a contact as stiff as the contact with the wall at the same overlap. At the wall the effective radius is
+    R instead of R / 2, and one body is compliant instead of two (docs/physics.md).
 
     Args:
-        table: centres, velocities and spins of the spheres, [S, 9, B]; beside the motion of a periodic box.
+        table: centres, velocities and spins of the spheres, [S, 9, B]; velocities relative to a periodic box's motion.
         box: the planes; those of periodic axes touch nothing.
         material: the elastic solid.
         dt: time step, scalar or [B].
-        radii: of the spheres, [S], in R; None where all are 1.
+        radii: radii of the spheres, [S], in R; None where all are 1.
     """
     planes = np.concatenate([-np.eye(3), np.eye(3)])
 
@@ -107,14 +107,14 @@ def wall_kinematics(
 def wall_friction(
     law: FrictionLaw, mu: Scalar, kin: Kinematics, lower: jax.Array, upper: jax.Array, history: Any
 ) -> tuple[jax.Array, Any]:
-    """The tangential forces of the walls on spheres: those of the friction law with another coefficient.
+    """The tangential forces of the walls on spheres, by the friction law of the grains with the walls' coefficient.
 
     Args:
-        law: of the grains among themselves; it has a coefficient `mu`.
-        mu: of the walls, scalar or [B].
-        kin: of `wall_kinematics`.
+        law: friction law of contacts between grains; it has a coefficient `mu`.
+        mu: friction coefficient of the walls, scalar or [B].
+        kin: result of `wall_kinematics`.
         lower: normal forces of the lower planes, [S, 3, B], of `wall_forces`.
-        upper: of the upper ones.
+        upper: normal forces of the upper planes, likewise.
         history: what the law remembers of each sphere at each plane, leaves [6 S, ..., B].
 
     Returns:
