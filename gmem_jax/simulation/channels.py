@@ -15,7 +15,7 @@ class Channel(NamedTuple):
     words: str
 
     def stress(self, pressure: Any) -> Any:
-        """-2 sum_i mode_i p_i of wall pressures [..., 3, B], in E: [..., B]. Of "xy" it is p_x - p_y."""
+        """-2 sum_i mode_i p_i of wall pressures [..., 3, B], in E: [..., B]. For "xy" it is p_x - p_y."""
         terms = [-2.0 * part * pressure[..., axis, :] for axis, part in enumerate(self.mode) if part]
         total = terms[0]
         for term in terms[1:]:

@@ -5,38 +5,41 @@ from typing import Any
 
 
 class Checkpoint:
-    """Where an unfinished part of a long run stands. This one keeps nothing."""
+    """The saved state of an unfinished part of a long run. This base class saves nothing."""
 
     def restore(self) -> Any:
         """What was saved when the run was interrupted; None for a run that begins."""
         return None
 
     def maybe_save(self, state: Callable[[], Any], *, milestone: bool = False) -> None:
-        """Save what `state` gives, a tree of arrays, if enough time has passed; at milestones less is enough."""
+        """Save the tree of arrays that `state` returns, if enough time has passed; less is enough at milestones."""
 
     def save(self, state: Callable[[], Any]) -> None:
-        """Save it now."""
+        """Save the tree of arrays that `state` returns, now."""
 
 
 NO_CHECKPOINT = Checkpoint()
 
 Run = Callable[[Checkpoint], Any]
-"""Runs a part of a long run from its checkpoint on, and gives its result: a tree of arrays."""
+"""A function that runs a part of a long run from its checkpoint on and returns its result, a tree of arrays."""
 
 
 class ResultCache:
-    """Results of the parts of a long run by name, as stored earlier or by running the part. This one stores nothing."""
+    """Results of the parts of a long run, by name: stored earlier, or made by running the part.
+
+    This base class stores nothing, and runs every part.
+    """
 
     def __call__(self, name: str, run: Run) -> Any:
-        """The result of the part of that name."""
+        """The result of the part `name`."""
         return run(NO_CHECKPOINT)
 
     def scoped(self, scope: str) -> "ResultCache":
-        """The same cache for one of several runs, whose parts have this name before their own."""
+        """The same cache for one of several runs: `scope` stands before the names of its parts."""
         return _Asking(lambda name, run: self(f"{scope}-{name}", run))
 
     def memoised(self) -> "ResultCache":
-        """The same cache, by which a part is run or loaded once, however often it is asked for."""
+        """A cache over this one that runs or loads each part once, however often it is asked for."""
         found: dict[str, Any] = {}
 
         def ask(name: str, run: Run) -> Any:
@@ -47,12 +50,12 @@ class ResultCache:
         return _Asking(ask)
 
     def shared(self, part: str, other: "ResultCache") -> "ResultCache":
-        """This cache, but for one part, of which `other` is asked."""
+        """This cache for all parts but one, which is taken from `other`."""
         return _Asking(lambda name, run: (other if name == part else self)(name, run))
 
 
 class _Asking(ResultCache):
-    """A cache that asks a function."""
+    """A cache that gets its results from a function of the part's name and run."""
 
     def __init__(self, ask: Callable[[str, Run], Any]) -> None:
         self._ask = ask

@@ -12,10 +12,10 @@ from gmem_jax.physics.pytree import typed
 
 @functools.cache
 def _settings(quick: bool) -> dict[str, Any] | None:
-    """Compiler settings that suit this code on the default device; `quick` to compile, in a third of the time.
+    """Compiler settings that suit this code on the default device; with `quick` it compiles in a third of the time.
 
     On CPUs XLA's newer fusion emitters do not vectorise the contact law over the replicas; the older ones do, and
-    make a step of plain JAX 1.3 times faster (8 replicas, jax 0.9.2). Later releases have no others to choose.
+    make a step of plain JAX 1.3 times faster (8 replicas, jax 0.9.2). Later releases have the newer ones alone.
     """
     settings = {"xla_cpu_use_fusion_emitters": False, **({"xla_backend_optimization_level": 0} if quick else {})}
     if jax.default_backend() != "cpu":
@@ -30,7 +30,7 @@ def _settings(quick: bool) -> dict[str, Any] | None:
 class Compiled:
     """`jax.jit` with settings chosen when it is first called: importing must not start a backend.
 
-    `quick` is for what is called once in a run, on small arrays, for answers that round-off does not change.
+    `quick` is for functions that are called once in a run, on small arrays, and whose results bear round-off.
     """
 
     def __init__(self, function: Callable[..., Any], *, quick: bool = False, **options: Any) -> None:
@@ -38,11 +38,11 @@ class Compiled:
 
     @functools.cached_property
     def program(self) -> Any:
-        """What `jax.jit` made."""
+        """The function as `jax.jit` compiles it."""
         return jax.jit(self._function, compiler_options=_settings(self._quick), **self._options)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Call it: a number given as a float, and one given as an array, are of one program."""
+        """Call the function. A number that is given as a float uses the same program as one given as an array."""
         args, kwargs = typed((args, kwargs))
         return self.program(*args, **kwargs)
 

@@ -55,23 +55,22 @@ class Frames:
     stand one after the other: those of frame f are start[f] to start[f + 1].
 
     Attributes:
-        time: since the beginning, [F], in t_c.
+        time: time since the beginning of the run, [F], in t_c.
         u: compression, 0 to 1, [F].
         position: grain centres, [F, N, 3], in R.
         quaternion: body-to-lab rotations (w, x, y, z), [F, N, 4].
         lower: lower planes of the box, [F, 3], in R.
         upper: upper planes, [F, 3].
         start: where the contacts of a frame begin, and where the last ends, whole, [F + 1].
-        spheres: numbers i < j of the two that touch, whole, [M, 2]; walls are not listed.
-        normal_force: by which they repel each other, [M], in E R^2.
-        friction_force: tangential force on sphere i, the opposite of that on j, [M, 3]. Half of the next step's
-            increment is in it, as in the history that a law keeps.
+        spheres: numbers i < j of the two spheres that touch, whole, [M, 2]; walls are not listed.
+        normal_force: repulsive normal force, [M], in E R^2.
+        friction_force: tangential force on sphere i, the opposite of that on j, [M, 3], in E R^2.
         offsets: sphere centres of a grain of size 1 in its own frame, [K, 3], in R.
         stages: the stage that each frame ends or is in, [F].
-        signal: whose replica it is: from 1, or 0 for no signal.
+        signal: number of the replica's signal, from 1; 0 for no signal.
         periodic: the periodic axes of the box; grains may have left it through these faces.
-        radii: of the spheres of a grain of size 1, [K], in R; None where all are 1.
-        sizes: of the grains, factors on their lengths, [N]; None where all are 1.
+        radii: radii of the spheres of a grain of size 1, [K], in R; None where all are 1.
+        sizes: factors on the lengths of each grain, [N]; None where all are 1.
         wall_friction: tangential forces of the planes on every sphere, the lower planes of x, y and z, then the upper
             ones, [F, N K, 6, 3], in E R^2; None between smooth walls.
     """
@@ -112,7 +111,7 @@ class Frames:
 
 
 def images_met(frames: Frames, number: int) -> np.ndarray:
-    """What the second sphere of each contact of a frame is moved by to be the image that the first meets, [M, 3]."""
+    """The displacement that brings the second sphere of each contact to its image beside the first, [M, 3], in R."""
     centres, lengths = frames.centres(number), frames.upper[number] - frames.lower[number]
     one, other = frames.spheres[slice(*frames.start[number : number + 2])].T
     nearest = -lengths * np.rint((centres[other] - centres[one]) / lengths)
@@ -137,8 +136,8 @@ def sphere_places(
     Args:
         position: grain centres, in R.
         quaternion: body-to-lab rotations (w, x, y, z).
-        offsets: of the spheres in the grain's frame, [K, 3], in R.
-        sizes: of the grains, [N]; None where all are 1.
+        offsets: sphere centres in the grain's frame, [K, 3], in R.
+        sizes: sizes of the grains, [N]; None where all are 1.
     """
     w, x, y, z = np.asarray(quaternion).T
     rows = (
@@ -161,8 +160,8 @@ class FrameSchedule:
     """Which configurations of a run are recorded.
 
     Attributes:
-        wanted: finished bins of a stage after which one is, by the stage's name.
-        replica: whose, once there are several.
+        wanted: numbers of finished bins after which a configuration is recorded, by the name of the stage.
+        replica: the replica that is recorded, once there are several.
     """
 
     wanted: Mapping[str, Sequence[int]] = field(default_factory=dict)
@@ -170,7 +169,7 @@ class FrameSchedule:
 
 
 class FrameRecorder(Observer):
-    """Records configurations, each as it was seen: those within a chunk are run up to once more."""
+    """Records configurations. For a configuration within a chunk, the bins of the chunk up to it are run again."""
 
     def __init__(self, schedule: FrameSchedule) -> None:
         self.schedule = schedule
@@ -183,7 +182,7 @@ class FrameRecorder(Observer):
             self.record(chunk, chunk.state, np.asarray(path.lower), np.asarray(path.upper), chunk.stage.ends[0])
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
-        """Record what is wanted of a chunk."""
+        """Record the wanted configurations of a chunk."""
         for done in self.schedule.wanted.get(chunk.stage.name, ()):
             bins = done - chunk.first
             if not 0 < bins <= chunk.count:
@@ -202,12 +201,12 @@ class FrameRecorder(Observer):
         """Record a configuration.
 
         Args:
-            chunk: in which it lies.
-            state: then.
-            lower: planes of the box, [3, 1] or [3, B].
-            upper: planes, likewise.
+            chunk: the chunk in which it lies.
+            state: the state at this moment.
+            lower: lower planes of the box, [3, 1] or [3, B].
+            upper: upper planes, likewise.
             u: compression.
-            later: time from the beginning of the chunk to then, in t_c.
+            later: time since the beginning of the chunk, in t_c.
         """
         name, simulation, replicas = chunk.stage.name, chunk.simulation, state.replicas
         one = self.schedule.replica if replicas > 1 else 0
@@ -217,7 +216,7 @@ class FrameRecorder(Observer):
 
         friction = map_numbers(of_one, simulation.system.friction, deeper=to_host)
         wall_mu = jax.tree.map(of_one, simulation.system.wall_mu)
-        dt = to_host(simulation.dt)  # of B replicas, not of as many as fill the devices
+        dt = to_host(simulation.dt)  # of B replicas, without the copies that pad them to the number of devices
         state, lower, upper = jax.tree.map(
             lambda leaf: leaf[..., one : one + 1] if np.shape(leaf)[-1] > 1 else leaf,
             (chunk.gather(state), lower, upper),
@@ -228,28 +227,30 @@ class FrameRecorder(Observer):
         self.recorded = OrderedDict({**self.recorded, name: (*self.recorded.get(name, ()), frame)})
 
     def saved(self) -> OrderedDict[str, tuple[Frame, ...]]:
-        """What was recorded so far."""
+        """The configurations recorded so far."""
         return self.recorded
 
     def restore(self, saved: OrderedDict[str, tuple[Frame, ...]]) -> None:
-        """Go on after these."""
+        """Go on after the configurations `saved`."""
         self.recorded = OrderedDict(saved)
 
 
 def places(stages: Sequence[Stage], count: int, every: int) -> dict[str, list[int]]:
     """Moments of `count` configurations along some stages, as finished bins by the stage's name.
 
-    The first and the last; then always the longest stretch without one is halved, as well as can be at the end of a
-    stage, or else after a multiple of `every` bins; where neither lies in the middle half of it, in its middle. So the
-    ends of encoding, storage and readout are there from five on, and those of fewer are among those of more.
+    The first are the beginning and the end of the run. Each further one divides the longest stretch between two chosen
+    moments, as close to its middle as possible: at the end of a stage, if one lies in the middle half of the stretch;
+    else after a multiple of `every` bins of a stage, if one lies there; else in the middle. So the ends of encoding,
+    storage and readout are among five or more moments, and the moments for a smaller count are among those for a
+    larger one.
 
     Args:
-        stages: with names of their own.
-        count: how many, at least 2.
-        every: bins that are run in one go: to stop there costs nothing.
+        stages: stages with different names.
+        count: number of configurations, at least 2.
+        every: number of bins that are run in one call: to stop after a call costs nothing.
 
     Raises:
-        ValueError: if that is too few, or more than there are bins.
+        ValueError: if `count` is below 2, or above the number of bins plus 1.
     """
     ends = list(itertools.accumulate(stage.bins for stage in stages))
     if not FEWEST_FRAMES <= count <= ends[-1] + 1:
@@ -273,11 +274,11 @@ def places_at(stages: Sequence[Stage], compressions: Sequence[float]) -> dict[st
     """The moments at which a run passes chosen compressions, to the next bin: once in every stage that changes u.
 
     Args:
-        stages: with names of their own.
-        compressions: u, each 0 to 1.
+        stages: stages with different names.
+        compressions: values of u, each 0 to 1.
 
     Returns:
-        Finished bins by the stage's name, as of `places`; the beginning of a stage is the end of the one before.
+        Finished bins by the stage's name, as from `places`; the beginning of a stage is the end of the one before.
 
     Raises:
         ValueError: if one is not within 0 and 1.
@@ -299,9 +300,9 @@ def places_at(stages: Sequence[Stage], compressions: Sequence[float]) -> dict[st
 
 @jax.jit
 def _contacts(system: System, state: State) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of every candidate: whether it touches, its normal force and its friction, [P, 1, B] and [P, 3, B]."""
+    """For every candidate: whether it touches and its normal force, [P, 1, B] each; its tangential force, [P, 3, B]."""
     table, _ = sphere_table(system.clump, state.grains, state.cell)
-    still = jnp.zeros(())  # in no time a history stays as it is
+    still = jnp.zeros(())  # dt = 0: contacts slide no further
     motion = relative_motion(system, table, state.cell)
     kin, normal, friction, _ = contact_loads(system, *motion, state.history, still)
     return kin.touching, normal, friction
@@ -309,7 +310,7 @@ def _contacts(system: System, state: State) -> tuple[jax.Array, jax.Array, jax.A
 
 @jax.jit
 def _rubbing(system: System, state: State, lower: jax.Array, upper: jax.Array) -> jax.Array:
-    """Tangential forces of the planes on every sphere, [S, 6, 3, B]; the normal ones that limit them are elastic."""
+    """Tangential forces of the planes on every sphere, [S, 6, 3, B], limited by mu times the elastic normal forces."""
     cell = state.cell
     box = still_box(lower, upper) if cell is None else replace(cell, lower=lower, upper=upper)
     table, _ = sphere_table(system.clump, state.grains, cell)
@@ -320,14 +321,14 @@ def _rubbing(system: System, state: State, lower: jax.Array, upper: jax.Array) -
 
 
 def configuration(system: System, state: State, lower: np.ndarray, upper: np.ndarray, time: float, u: float) -> Frame:
-    """The configuration that a state of one replica is in.
+    """The configuration of one replica in a state.
 
     Args:
-        system: what the state is one of.
-        state: of one replica.
-        lower: planes of the box, [3].
-        upper: planes, [3].
-        time: since the beginning, in t_c.
+        system: the system of the state.
+        state: the state of one replica.
+        lower: lower planes of the box, [3].
+        upper: upper planes, [3].
+        time: time since the beginning, in t_c.
         u: compression.
     """
     touching, normal, friction = (np.asarray(leaf)[..., 0] for leaf in _contacts(system, state))
@@ -356,13 +357,13 @@ def concatenate(
     centre: np.ndarray | float = 0.0,
     periodic: PeriodicAxes = WALLS,
 ) -> Frames:
-    """Frames as one.
+    """Recorded frames, joined as `Frames`.
 
     Args:
-        recorded: by stage, at least one.
+        recorded: frames by stage, at least one.
         clump: the grain.
-        signal: whose replica it is.
-        centre: what becomes the origin, [3].
+        signal: number of the replica's signal.
+        centre: the point that becomes the origin, [3].
         periodic: the periodic axes of the box.
     """
     every = [frame for frames in recorded.values() for frame in frames]

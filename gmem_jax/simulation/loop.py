@@ -30,21 +30,22 @@ from gmem_jax.simulation.stage import Bin, Columns, Stage, table
 from gmem_jax.simulation.strain import StrainPath, servo_strain, stretched
 
 Observe = Callable[["Simulation", State], Any]
-"""A reduction of a state to an array [..., B], in plain JAX: jitted, vmapped and differentiated with the steps."""
+"""A function of (simulation, state) to an array [..., B], in plain JAX: jitted, vmapped and differentiated with the
+steps."""
 
 
 class Mark(NamedTuple):
-    """What observers compare with: a state, without its histories, and its walls."""
+    """The configuration with which observers compare: a state without its histories, and its walls."""
 
     grains: Grains
     box: Box
-    touching: jax.Array  # pairs of spheres, [B]
+    touching: jax.Array  # number of pairs of spheres that touch, [B]
 
 
 @pytree
 @dataclass(frozen=True)
 class Simulation:
-    """What a rollout is told, and does not change.
+    """The constants of a rollout.
 
     Attributes:
         system: grains, law, candidates, material.
@@ -52,17 +53,17 @@ class Simulation:
         dt: time step, in t_c; scalar or [B].
         drag: viscous drag while the walls stand still, 1 / t_c; scalar or [B].
         steps: steps in a bin.
-        backend: who does them; see `gmem_jax.native.resolve`.
-        precision: of contacts, likewise.
+        backend: the backend that runs the steps; see `gmem_jax.native.resolve`.
+        precision: precision of contacts, likewise.
         creep: rate at which elastic tangential forces relax, 1 / t_c; scalar or [B], None for never.
         creep_fades: time in a stage after which that rate falls, in t_c; see `relaxation`.
-        columns: what the stages make use of.
-        observe: names and functions of (simulation, state), called at the end of each bin: what they give, an array
-            [..., B], is kept in `Sample.observed`. They find the walls in `box`, the sample in `sample`, and the drag
-            and the friction that act in the bin.
-        mark: the state and walls that they may compare with.
-        box: walls at the end of the bin, for them.
-        sample: of the bin, for them.
+        columns: the columns of the table of bins.
+        observe: names and functions of (simulation, state), called at the end of each bin. Their results, arrays
+            [..., B], are kept in `Sample.observed`. The simulation that they get holds the walls in `box`, the sample
+            in `sample`, and the drag and the friction that act in the bin.
+        mark: the configuration with which observers may compare.
+        box: walls at the end of the bin, for observers.
+        sample: sample of the bin, for observers.
     """
 
     system: System
@@ -82,11 +83,11 @@ class Simulation:
 
     @property
     def resolved(self) -> ResolvedBackend:
-        """What does the steps; the same object for all simulations that ask for the same."""
+        """The backend that runs the steps; one object for all simulations with equal settings."""
         return resolve(self.backend, self.precision, self.system.friction)
 
     def marked(self, state: State, stage: Stage) -> "Simulation":
-        """The same, whose observers compare with a state at the beginning of a stage."""
+        """This simulation, with its mark at a state at the beginning of a stage; unchanged without observers."""
         if not self.observe:
             return self
         box = self.box_before(self.rows(stage, 0), state.servo)
@@ -95,25 +96,25 @@ class Simulation:
         return replace(self, mark=Mark(state.grains, wide, jnp.sum(apart > 0.0, axis=0)))
 
     def with_pairs(self, pairs: Pairs) -> "Simulation":
-        """The same with another list of candidates."""
+        """This simulation with another list of candidates."""
         return replace(self, system=replace(self.system, pairs=pairs))
 
     def duration(self, bins: int) -> float:
-        """How long some bins take, in t_c; the longest of the replicas."""
+        """Simulated time of `bins` bins, in t_c; the longest of all replicas."""
         return bins * self.steps * float(np.max(np.asarray(self.dt)))
 
     def rows(self, stage: Stage, first: Any, count: int | None = None) -> Bin:
-        """Bins of a stage as this simulation takes them; see `Stage.rows`."""
+        """Bins of a stage with the columns of this simulation; see `Stage.rows`."""
         return stage.rows(first, count, self.columns)
 
     def box_before(self, row: Bin, servo: HeldWalls | None = None) -> Box:
-        """The walls at the beginning of a bin; their velocities are per bin here."""
+        """The walls at the beginning of a bin; their velocities are in R per bin."""
         box = self.path.box_at(row, jnp.asarray(row.number, float), jnp.asarray(row.bins, float))
         return box if servo is None else stretched(box, servo.stretch)
 
 
 def at_rest(simulation: Simulation, state: State, box: Box) -> HeldWalls:
-    """The servo of a pack at rest in a box: nothing stretched, and the pressures on its walls."""
+    """The servo of a pack at rest in a box: no stretch, and the pressures on its walls."""
     replicas = state.replicas
     wide = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (1, 3, replicas)), box)
     nothing = jnp.zeros(())
@@ -122,7 +123,7 @@ def at_rest(simulation: Simulation, state: State, box: Box) -> HeldWalls:
 
 
 def walls(simulation: Simulation, row: Bin, state: State) -> tuple[Box, HeldWalls | None]:
-    """The walls at the end of each step of a bin, leaves [steps, 3, B]; and where its servo ends."""
+    """The walls at the end of each step of a bin, leaves [steps, 3, B]; and the servo at its end, None without one."""
     replicas = state.replicas
     dt, steps = jnp.asarray(simulation.dt), simulation.steps
     count = row.number * steps + 1 + jnp.arange(steps)
@@ -139,7 +140,7 @@ def walls(simulation: Simulation, row: Bin, state: State) -> tuple[Box, HeldWall
 
 
 def _padded(leaf: Any, replicas: int) -> Any:
-    """A number for each replica, also for the copies of replica 0 that fill up devices (see `sharding`)."""
+    """Numbers [..., B] with more copies of replica 0's, up to `replicas` (see `sharding`); others as they are."""
     known = jnp.shape(leaf)[-1] if jnp.ndim(leaf) else 1
     if not 1 < known < replicas:
         return leaf
@@ -147,7 +148,7 @@ def _padded(leaf: Any, replicas: int) -> Any:
 
 
 def _with_padded(of: Any, names: tuple[str, ...], replicas: int) -> Any:
-    """An object with `_padded` numbers under some names, of those that it has."""
+    """An object whose fields `names` are `_padded`, except those that are None."""
     known = {name: value for name in names if (value := getattr(of, name)) is not None}
     return replace(of, **{name: _padded(value, replicas) for name, value in known.items()})
 
@@ -174,7 +175,7 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
         path = _with_padded(simulation.path, ("delta0", "gamma0", "share"), state.replicas)
         seen = replace(simulation, system=system, path=path, dt=dt, drag=drag, box=last, sample=sample)
         seen = _with_padded(seen, ("creep", "creep_fades"), state.replicas)
-        # Ordered, as what checkpoints keep is.
+        # An ordered dictionary, as in checkpoints: JAX sorts the keys of plain ones.
         observed = OrderedDict(
             (name, _of_replicas(name, reduce(seen, state), state)) for name, reduce in simulation.observe
         )
@@ -182,10 +183,10 @@ def bin_step(simulation: Simulation, state: State, row: Bin) -> tuple[State, Sam
 
 
 def _of_replicas(name: str, value: Any, state: State) -> Any:
-    """What an observer gave; refused while the program is made if no file could hold it.
+    """The result of an observer, checked while the program is traced: files hold real numbers [..., B] only.
 
     Raises:
-        ValueError: naming the observer, and what it gave.
+        ValueError: naming the observer, and its result.
     """
     if jnp.shape(value)[-1:] != (state.replicas,) or jnp.iscomplexobj(value):
         given = f"{jnp.result_type(value)} {list(jnp.shape(value))}"
@@ -194,7 +195,7 @@ def _of_replicas(name: str, value: Any, state: State) -> Any:
 
 
 def _crept(simulation: Simulation, state: State, row: Bin) -> State:
-    """The state after the creep of a bin."""
+    """The state after its histories have relaxed by the creep of one bin."""
     law = simulation.system.friction
     if simulation.creep is None or not isinstance(law, RelaxingLaw):
         return state
@@ -211,7 +212,7 @@ def _crept(simulation: Simulation, state: State, row: Bin) -> State:
 
 
 def _rubbing(system: System, row: Bin) -> System:
-    """The system with friction as the stage has it."""
+    """The system with its friction coefficients, or with zero ones in a stage without friction."""
     law = system.friction
     if row.friction is None or not isinstance(law, CoulombLaw):
         return system
@@ -220,7 +221,7 @@ def _rubbing(system: System, row: Bin) -> System:
 
 
 def rollout(simulation: Simulation, state: State, rows: Bin) -> tuple[State, Sample]:
-    """The bins of a table one after the other; the state after them, and their samples with a leading axis.
+    """Run the bins of a table; return the state after them, and their samples with a leading axis of bins.
 
     Reverse mode keeps states at two levels and computes the rest again (see `scan.scan`).
     """
@@ -229,7 +230,7 @@ def rollout(simulation: Simulation, state: State, rows: Bin) -> tuple[State, Sam
 
 
 def rollout_stages(simulation: Simulation, state: State, stages: tuple[Stage, ...]) -> tuple[Simulation, State, Sample]:
-    """Stages one after the other; the simulation with its last mark, the state after them, and their samples."""
+    """Run stages; return the simulation with its last mark, the state after the stages, and the samples."""
     parts, first = [], 0
     for place in range(1, len(stages) + 1):
         if place < len(stages) and not (stages[place].mark and simulation.observe):
@@ -244,23 +245,26 @@ def rollout_stages(simulation: Simulation, state: State, stages: tuple[Stage, ..
 
 
 Keep = Callable[[State, Sample], Any]
-"""What is kept of a bin, arrays: of the state before it and its sample."""
+"""A function of the state before a bin and the sample of the bin; it returns the arrays that are kept of the bin."""
 
 
 def sample_of(state: State, sample: Sample) -> Sample:
-    """The sample alone: a `Keep`."""
+    """The `Keep` that keeps the sample alone."""
     return sample
 
 
 def rollout_chunk(
     simulation: Simulation, state: State, first: Bin, count: jax.Array | None, most: int, keep: Keep = sample_of
 ) -> tuple[State, Any]:
-    """`count` bins of one stage from the bin `first`, in a program for any count up to `most`; not for reverse mode.
+    """Run `count` bins of one stage from the bin `first`, in a program for all counts up to `most`.
 
-    Without a count, `most`: a GPU whose program knows the number of bins does not wait for the host after each.
+    It is not for reverse mode.
+
+    If `count` is None, `most` bins are run. The program then knows their number, and a GPU does not wait for the host
+    after each bin.
 
     Returns:
-        The state, and what was to be kept with a leading axis [most], zero beyond `count`.
+        The state after the bins, and the arrays of `keep` with a leading axis [most], zero beyond `count`.
     """
 
     def step(state: State, place: Any) -> tuple[State, Any]:

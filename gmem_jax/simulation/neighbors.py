@@ -19,11 +19,11 @@ LARGEST_SKIN = 2.0  # skin beyond which a list that goes stale within a bin is a
 
 
 def pair_finder(clump: Clump, extent: np.ndarray, skin: float, **sizes: Any) -> PairFinder:
-    """A `PairFinder` that searches in the library where there is one."""
+    """A `PairFinder` with the search of the native library, if that is available."""
     return PairFinder(clump, extent, skin, search=native_search(), **sizes)
 
 
 def skin_left(system: System, state: State, box: Box) -> jax.Array:
-    """What the list still allows for, [B], in R: its skin at first; see `pairs.slack`."""
+    """The part of the list's skin that is not used up, [B], in R; see `pairs.slack`."""
     spheres = sphere_centres(state.grains, system.clump)
     return slack(system.pairs, spheres, box, system.clump.sphere_radii(len(spheres)))

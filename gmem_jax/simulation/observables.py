@@ -189,7 +189,10 @@ def _lost(simulation: Simulation, state: State) -> jax.Array:
 
 
 def _touching(simulation: Simulation, state: State) -> tuple[jax.Array, jax.Array]:
-    """How many pairs touch now, and how many of these did at the mark, [B]. All of both are in the list of now."""
+    """Numbers of pairs that touch now, and of pairs that touch now and touched at the mark, [B] each.
+
+    The present list holds all of these pairs.
+    """
     now = overlaps(simulation.system, state) > 0.0
     mark = _known(simulation.mark)
     cell = None if state.cell is None else mark.box
@@ -336,7 +339,7 @@ def _pairs(pairs: Iterable[tuple[int, int]]) -> SpherePairs:
 
 
 def _chosen(simulation: Simulation, values: jax.Array, pairs: SpherePairs) -> jax.Array:
-    """Of values [P, k, B] of the candidates those of chosen pairs, [n, k, B]; 0 where a pair is not listed."""
+    """The values of chosen pairs, [n, k, B], out of those of all candidates, [P, k, B]; 0 for pairs not listed."""
     listed, each = simulation.system.pairs, simulation.system.clump.spheres
     spheres = listed.reference.shape[-3]
     for pair in pairs:
@@ -360,7 +363,7 @@ class _Seen(NamedTuple):
     friction: jax.Array
 
     def walls(self, simulation: Simulation, damping_time: Scalar | None = None) -> tuple[jax.Array, jax.Array]:
-        """Forces of the lower and upper walls on spheres, [S, 3, B] each, with the material's damping or another."""
+        """Normal forces of the lower and upper walls on spheres, [S, 3, B] each; default the material's damping."""
         material = simulation.system.material
         damping = material.normal_damping if damping_time is None else damping_time
         places, velocities = self.table[:, :3], self.table[:, 3:6]
@@ -368,7 +371,7 @@ class _Seen(NamedTuple):
         return wall_forces(places, velocities, _known(simulation.box), material.wall_stiffness, damping, radii)
 
     def rubbed(self, simulation: Simulation, state: State) -> tuple[Kinematics, jax.Array] | None:
-        """Kinematics of spheres at walls with friction, and its forces on them, [6 S, ...]; None at smooth walls."""
+        """Kinematics of spheres at walls, and friction forces of walls on them, [6 S, ...]; None at smooth walls."""
         if simulation.system.wall_mu is None:
             return None
         forces, box = self.walls(simulation), _known(simulation.box)
@@ -378,10 +381,10 @@ class _Seen(NamedTuple):
 
 
 def _contacts(simulation: Simulation, state: State, *, ahead: bool = False) -> _Seen:
-    """The contacts now, with tangential forces after another step of sliding, or not."""
+    """The present contacts; with `ahead`, tangential forces are those after one more step of sliding."""
     system = simulation.system
     table, _ = sphere_table(system.clump, state.grains, state.cell)
-    dt = jnp.asarray(simulation.dt) if ahead else jnp.zeros(())  # in no time a history stays as it is
+    dt = jnp.asarray(simulation.dt) if ahead else jnp.zeros(())  # dt = 0: contacts slide no further
     motion = relative_motion(system, table, state.cell)
     kin, normal_force, friction, _ = contact_loads(system, *motion, state.history, dt)
     return _Seen(table, kin, normal_force, friction)
@@ -394,20 +397,20 @@ def _known(part: T | None) -> T:
 
 
 def _tensor(one: jax.Array, other: jax.Array) -> jax.Array:
-    """The sum of the products of vectors [n, 3, B], [3, 3, B]."""
+    """The sum over n of the outer products of vectors [n, 3, B], [3, 3, B]."""
     return jnp.einsum("nib,njb->ijb", one, other)
 
 
 def _diagonal(values: jax.Array) -> jax.Array:
-    """A tensor [3, 3, B] with these values [3, B]."""
+    """The diagonal tensor [3, 3, B] of values [3, B]."""
     return jnp.eye(3)[:, :, None] * values
 
 
 def _root(square: jax.Array) -> jax.Array:
-    """The root, whose slope at 0 is 0."""
+    """The square root, with derivative 0 at 0."""
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
 
 
 def _mean(values: jax.Array, which: jax.Array) -> jax.Array:
-    """The mean of values [P, 1, B] where there are any, else 0; [B]."""
+    """The mean of values [P, 1, B] over the rows where `which` is True, [B]; 0 where there are none."""
     return jnp.sum(jnp.where(which, values, 0.0), axis=(0, 1)) / jnp.maximum(jnp.sum(which, axis=(0, 1)), 1)

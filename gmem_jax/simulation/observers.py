@@ -26,15 +26,16 @@ forward = Compiled(rollout_chunk, static_argnames="most")
 
 
 def told_of(count: int, most: int) -> int | None:
-    """The `count` that `rollout_chunk` is told: none for a whole chunk on a GPU, which then need not wait for the host.
+    """The argument `count` of `rollout_chunk`: None for a whole chunk on a GPU, which then need not wait for the host.
 
-    CPUs have nothing to wait for, and run one program for all counts.
+    CPUs do not wait for a host, and run one program for all counts.
     """
     return None if count == most and jax.default_backend() != "cpu" else count
 
 
 Move = Callable[[Any, Any], Any]
-"""From a history of an old list and a blank one of the new, to the history of the new: linear in both."""
+"""A function of a history for the old list and a blank one for the new list; it returns the history for the new list,
+and is linear in both."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,12 @@ class Chunk:
     """Some bins of a stage, before they are run.
 
     Attributes:
-        simulation: what is run.
-        state: at their beginning.
-        stage: theirs.
-        first: number of the first of them in the stage.
-        count: how many there are.
-        time: at their beginning, since that of the run, in t_c.
+        simulation: the simulation.
+        state: the state at the beginning of the chunk.
+        stage: the stage.
+        first: number of the first bin in the stage.
+        count: number of bins.
+        time: simulated time from the beginning of the run to that of the chunk, in t_c.
         gather: brings arrays [..., B] of the run to this host, if they lie on several devices.
     """
 
@@ -66,13 +67,13 @@ class Chunk:
 
     @property
     def ends_stage(self) -> bool:
-        """Whether its last bin is the stage's."""
+        """Whether its last bin is the last of the stage."""
         return self.first + self.count == self.stage.bins
 
     def run(self, bins: int | None = None, program: Compiled = forward) -> tuple[State, Any]:
-        """Run it, or its first bins; samples have a leading axis of `CHUNK`, of which the bins that were run count.
+        """Run the chunk, or its first `bins`; another `program` is a `rollout_chunk` that keeps more than samples.
 
-        Another program is `rollout_chunk` that keeps more than samples.
+        Samples have a leading axis of `CHUNK`, zero beyond the bins that were run.
         """
         count = told_of(self.count if bins is None else bins, CHUNK)
         done: tuple[State, Any] = program(self.simulation, self.state, self.row, count, most=CHUNK)
@@ -80,24 +81,24 @@ class Chunk:
 
 
 class Observer:
-    """Looks at a run, and leaves its numbers as they are. This one sees nothing."""
+    """An observer of a run, which does not change its numbers. This base class does nothing."""
 
     def step(self, chunk: Chunk) -> tuple[State, Sample] | None:
-        """A chunk is about to be run. Whoever must look inside runs it, and returns what `Chunk.run` would."""
+        """Called before a chunk is run. An observer that must look inside runs it and returns the state and samples."""
         return None
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
-        """A chunk was run and stands: the state after it, and the samples of its bins."""
+        """Called after a chunk was run and accepted, with the state after it and the samples of its bins."""
 
     def rebuild(self, history: Any, move: Move, blank: Any) -> None:
-        """The neighbour list was built anew: `history` became `move(history, blank)`."""
+        """Called when the neighbour list was built anew: `history` becomes `move(history, blank)`."""
 
     def saved(self) -> Any:
-        """What a resumed run needs of it, a tree of arrays."""
+        """The tree of arrays that this observer needs in a resumed run."""
         return ()
 
     def restore(self, saved: Any) -> None:
-        """Go on from what `saved` gave."""
+        """Go on from the result of an earlier `saved`."""
 
 
 class SampleRecorder(Observer):
@@ -112,7 +113,7 @@ class SampleRecorder(Observer):
         self._chunks.setdefault(chunk.stage.name, []).append(own)
 
     def bins(self, stage: str) -> int:
-        """Bins of a stage that are there."""
+        """Number of bins of a stage whose samples are kept."""
         return sum(len(sample.pressure) for sample in self._chunks.get(stage, []))
 
     def saved(self) -> OrderedDict[str, Sample]:
@@ -122,21 +123,21 @@ class SampleRecorder(Observer):
         )
 
     def restore(self, saved: OrderedDict[str, Sample]) -> None:
-        """Go on after these."""
+        """Go on after the samples `saved`."""
         self._chunks = OrderedDict((name, [sample]) for name, sample in saved.items())
 
 
 class CheckpointWriter(Observer):
-    """Saves where a run stands.
+    """Saves the state of a run after its chunks.
 
     Args:
-        checkpoint: where to.
-        snapshot: what to.
+        checkpoint: the checkpoint in which it is saved.
+        snapshot: returns the tree of arrays that is saved.
     """
 
     def __init__(self, checkpoint: Checkpoint, snapshot: Callable[[], Any]) -> None:
         self._checkpoint, self._snapshot = checkpoint, snapshot
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
-        """Save if it is time."""
+        """Save if enough time has passed."""
         self._checkpoint.maybe_save(self._snapshot, milestone=chunk.ends_stage)

@@ -25,13 +25,15 @@ ProgressChoice = Progress | bool | None
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-STEP_WORK = 1.0  # work of a step beside its replicas', in theirs: 0.9 at 10,240 grains, 1.4 at 3,267 and 2 at 325
+# Work of a step apart from its replicas, in units of the work of one replica: 0.9 at 10,240 grains, 1.4 at 3,267 and 2
+# at 325.
+STEP_WORK = 1.0
 REFRESH_INTERVAL = 0.3  # seconds between changes of what a bar shows
-PAUSE = 60.0, 10.0  # seconds, and times the longest chunk: beyond both a run was stopped meanwhile
+PAUSE = 60.0, 10.0  # seconds, and multiples of the longest chunk: a wait beyond both was a pause of the program
 
 
 def silent(*_: object) -> None:
-    """Report nothing: a callback for whatever reports."""
+    """A callback that reports nothing."""
 
 
 def within(progress: Progress, begun: float, ended: float) -> Progress:
@@ -40,29 +42,29 @@ def within(progress: Progress, begun: float, ended: float) -> Progress:
 
 
 def work_of_bin(replicas: int) -> float:
-    """What a bin costs, in replica-bins: it takes as long as `STEP_WORK` replicas more than there are."""
+    """The work of a bin, in bins of one replica: as much as for `STEP_WORK` replicas more than there are."""
     return replicas + STEP_WORK
 
 
 def work_of(stages: Iterable[Stage], replicas: int) -> float:
-    """What some stages cost, in replica-bins."""
+    """The work of some stages, in bins of one replica."""
     return sum(stage.bins for stage in stages) * work_of_bin(replicas)
 
 
 def begins_anew(fraction: float, last: float) -> bool:
-    """Whether another pass has begun, as points after packs: not where a guess of what is left was mended."""
+    """Whether a new pass has begun, such as the points of a sweep after its packs; small drops correct an estimate."""
     return fraction < 0.9 * last
 
 
 class TimeLeft:
-    """How long a run will take, at its pace since its first chunk: before it was compiling. A pause is no work."""
+    """The time that a run still takes, from its pace since its first chunk. Compilation and pauses are left out."""
 
     def __init__(self) -> None:
         self._began = self._told = self._longest = 0.0
         self._first = self._last = math.inf
 
     def __call__(self, fraction: float) -> str:
-        """What is said of it after a chunk, ", 12 s left"; "" where it is not known yet."""
+        """The time left in words, ", 12 s left"; "" while it is not known."""
         now, (seconds, times) = time.perf_counter(), PAUSE
         waited = now - self._told
         if begins_anew(fraction, self._last):
@@ -78,14 +80,14 @@ class TimeLeft:
 class ProgressBar:
     """A progress bar, in a terminal or a notebook: `gm.run(experiment, progress=gm.ProgressBar())`."""
 
-    _line = ""  # what stands unfinished in the terminal
+    _line = ""  # the unfinished line in the terminal
 
     def __init__(self) -> None:
         self._left, self._told = TimeLeft(), -math.inf
         self._display = _notebook()
 
     def __call__(self, stage: str, moment: float, fraction: float) -> None:
-        """Show the progress; arguments as of `Progress`: stage, simulated time in t_c, fraction done."""
+        """Show the progress; the arguments are those of `Progress`: stage, simulated time in t_c, fraction done."""
         now, left = time.perf_counter(), self._left(fraction)
         if now - self._told < REFRESH_INTERVAL and fraction < 1.0:
             return
@@ -109,19 +111,19 @@ class ProgressBar:
 
 
 def watched() -> bool:
-    """Whether someone looks on: at a notebook, or at a terminal in which the program runs."""
+    """Whether the program runs in a notebook, or its standard error is a terminal."""
     return _shell() is not None or (sys.stderr is not None and sys.stderr.isatty())
 
 
 def _notebook() -> Any:
-    """Where a notebook shows something that changes; None elsewhere."""
+    """A display in a notebook whose content can be changed; None elsewhere."""
     if _shell() is None:
         return None
     return importlib.import_module("IPython.display").display({"text/plain": "compiling"}, raw=True, display_id=True)
 
 
 def _shell() -> Any:
-    """The notebook's; None elsewhere."""
+    """The IPython shell of a notebook; None elsewhere."""
     module = sys.modules.get("IPython")
     shell = module.get_ipython() if module else None
     return shell if hasattr(shell, "kernel") else None
@@ -165,5 +167,5 @@ def _bar(asked: ProgressChoice) -> Iterator[Progress | None]:
 
 
 def callback(progress: ProgressChoice) -> Progress:
-    """What to call."""
+    """The callback of a choice; `silent` if the choice is no callback."""
     return progress if callable(progress) else silent

@@ -122,7 +122,7 @@ class Protocol:
         return tuple(channel for channel in CHANNELS if channel in written)
 
     def written(self, read: str) -> dict[str, Drive]:
-        """The drives that a stage that reads is compared with, by channel: the last that wrote there before it.
+        """The drives with which a stage that reads is compared, by channel: those of its `of`, or the last before it.
 
         Raises:
             ValueError: if there is no stage of this name.
@@ -133,7 +133,7 @@ class Protocol:
         return {drive.channel: drive for stage in before for drive in stage.own}
 
     def with_sets(self, names: Iterable[str]) -> "Protocol":
-        """The same protocol with the channels and sets that drives leave open filled in, for sets with these names.
+        """The same protocol, in which every drive has a channel and one of the sets of waveforms with these names.
 
         Raises:
             ValueError: if a drive names a set that does not exist, or no set has the name of a channel.
@@ -211,7 +211,7 @@ def _require_closed(stage: Stage) -> None:
 
 
 def _named_drives(stage: Stage, names: tuple[str, ...]) -> tuple[Drive, ...]:
-    """The drives of a stage with channel and set."""
+    """The drives of a stage, each with its channel and set of waveforms."""
     found: list[Drive] = []
     for drive in stage.drives:
         if drive.fixed:

@@ -1,7 +1,7 @@
 """Rollouts on the host in chunks of bins, which rebuild stale lists, report progress and resume.
 
 A chunk that ends with a stale list is thrown away, the list is built anew from the chunk's start, and the chunk is run
-again. What looks at the chunks is up to the observers: samples, frames, derivatives in both modes, checkpoints.
+again. Observers look at the chunks: for samples, frames, derivatives in both modes, and checkpoints.
 """
 
 import functools
@@ -38,7 +38,7 @@ def raise_if_fatal(status: int, where: str, simulation: Simulation | None = None
     """Raise if `status` says that the numbers are meaningless.
 
     Raises:
-        RunFailedError: naming the stage and what happened; and why, where a number of the simulation tells.
+        RunFailedError: naming the stage and what happened; and the cause, where a parameter of the simulation is one.
     """
     if Status(status).fatal:
         why = "" if simulation is None else cause(simulation)
@@ -51,7 +51,7 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 @Compiled
 def _box_and_skin(simulation: Simulation, state: State, row: Bin) -> tuple[Box, jax.Array]:
-    """The walls before a bin, and what the list allows for between them."""
+    """The walls before a bin, and the skin that the list has left between them."""
     box = simulation.box_before(row, state.servo)
     return box, skin_left(simulation.system, state, box)
 
@@ -61,20 +61,21 @@ class Runner:
     """A pack on its way through stages.
 
     Attributes:
-        simulation: changes only in its list.
-        state: now.
+        simulation: the simulation; only its list and its mark change.
+        state: the present state.
         smallest: smallest box of the motion to come, [3], for the neighbour list; default the present one.
-        skin: of lists that are built anew, in R.
-        chunk: bins per call at most; fewer where a list does not last as long.
-        observers: that look at every chunk.
+        skin: skin of lists that are built anew, in R.
+        chunk: largest number of bins per call; it becomes smaller where a list does not last as long.
+        observers: the observers of every chunk.
         progress: see `Progress`.
         finder: builds lists; made when first needed if not given.
         time: simulated time so far, in t_c.
-        work: work done so far; `total_work` is all there is to do.
-        rebuilds: lists built anew so far.
-        placement: where the replicas are put, if on several devices.
-        foresees: whether lists are built anew before they go stale rather than after, for runs on which none lasts:
-            every second or third chunk would be thrown away.
+        work: work done so far.
+        total_work: work of the whole run.
+        rebuilds: number of lists built anew so far.
+        placement: the distribution of the replicas over devices; None for one device.
+        foresees: whether lists are built anew before they go stale rather than after. Where lists do not last long,
+            every second or third chunk would be thrown away otherwise.
     """
 
     simulation: Simulation
@@ -95,7 +96,7 @@ class Runner:
     _lasted: int = 0  # bins since the list was built
 
     def fork(self, **changes: Any) -> "Runner":
-        """A runner that begins where this one is, whatever lists were built on the way here."""
+        """A runner that begins in the state of this one, with a new finder and the usual skin and chunk."""
         return replace(self, **{"finder": None, "skin": SKIN, "chunk": CHUNK, **changes})
 
     def place_on(self, placement: Placement | None) -> None:
@@ -110,7 +111,7 @@ class Runner:
         return jax.tree.map(np.asarray, tree) if self.placement is None else self.placement.gather(tree)
 
     def snapshot(self) -> dict[str, Any]:
-        """All that `restore` needs to go on from here to the same bits, as a tree of arrays."""
+        """All that `restore` needs to go on from here with the same bits, as a tree of arrays."""
         counters = np.asarray([self.time, self.work, self.rebuilds, self.skin, self.chunk, self._lasted], float)
         pairs = self.simulation.system.pairs
         if self.placement and pairs.reference.shape[-1] > 1:
@@ -125,7 +126,7 @@ class Runner:
         }
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Stand where a runner of the same simulation stood when it gave `snapshot`."""
+        """Go on from the point at which a runner of the same simulation gave `snapshot`."""
         mark = Mark(*snapshot["mark"]) if snapshot["mark"] else None
         listed = self.simulation.with_pairs(snapshot["pairs"])
         self.state, self.simulation = snapshot["state"], replace(listed, mark=mark)
@@ -142,11 +143,11 @@ class Runner:
         """Run stages one after the other.
 
         Args:
-            stages: with names of their own.
-            checkpoint: where to go on, and where to save how far it is.
+            stages: stages with different names.
+            checkpoint: the checkpoint from which the run goes on, and in which it saves its state.
 
         Returns:
-            Their samples by name, numpy arrays with a leading axis of bins.
+            The samples by the name of the stage, numpy arrays with a leading axis of bins.
 
         Raises:
             RunFailedError: if the numbers became meaningless.
@@ -165,7 +166,10 @@ class Runner:
         return OrderedDict((stage.name, found[stage.name]) for stage in stages)
 
     def run_cached(self, name: str, cache: ResultCache, *stages: Stage) -> OrderedDict[str, Sample]:
-        """Run stages as one part of a long run, and stand at its end, also where it was cached; see `run_stages`."""
+        """Run stages as one part of a long run, or load it from the cache; the runner is then at its end.
+
+        See `run_stages`.
+        """
 
         def part(checkpoint: Checkpoint) -> Any:
             return self.run_stages(*stages, checkpoint=checkpoint), self.snapshot()
@@ -176,13 +180,13 @@ class Runner:
         return found
 
     def _run_chunk(self, stage: Stage, done: int, observers: tuple[Observer, ...], last: Observer) -> None:
-        """Run the next bins of a stage, of which some are done; or build the list anew for them.
+        """Run the next bins of a stage; or, if the list went stale in them, build it anew.
 
         Args:
             stage: the stage.
-            done: bins of it that are done.
-            observers: that look at the chunk.
-            last: looks at it when the list for the next one stands.
+            done: number of its bins that are done.
+            observers: the observers of the chunk.
+            last: the observer that is called after the list for the next chunk was built.
         """
         count = min(self.chunk, stage.bins - done)
         chunk = Chunk(self.simulation, self.state, stage, done, count, self.time, self.gather)
@@ -211,7 +215,7 @@ class Runner:
     def renew(self, box: Box) -> None:
         """Build the neighbour list anew where the grains are now, between the walls as they are now."""
         placement, self.placement = self.placement, None
-        if placement:  # the search is the host's
+        if placement:  # the search runs on the host
             snapshot = replace(self, placement=placement).snapshot()
             self.state, self.simulation = snapshot["state"], self.simulation.with_pairs(snapshot["pairs"])
             box = jax.tree.map(to_host, box)
@@ -230,7 +234,7 @@ class Runner:
         self.place_on(placement)
 
     def _foresee(self, stage: Stage, done: int) -> None:
-        """Renew a list that would not last for another chunk, if grains went on using it up as they have."""
+        """Renew the list if, at the mean rate since it was built, the next chunk would use up its skin."""
         count = min(self.chunk, stage.bins - done)
         box, skins = _box_and_skin(self.simulation, self.state, self.simulation.rows(stage, done))
         left = float(np.min(np.asarray(skins)))
@@ -241,7 +245,7 @@ class Runner:
     def _renew_stale(self, chunk: Chunk) -> None:
         """Renew a stale list before its chunk is redone; if that was just done, shorten the chunk or widen the skin.
 
-        Frictionless grains turn and fly freely in their cages: what a list must allow for grows with the time it lasts.
+        Frictionless grains turn and fly freely in their cages: the skin that a list needs grows with the time it lasts.
         """
         if self._renewed_at == (chunk.stage.name, self.time):
             if self.chunk > 1:

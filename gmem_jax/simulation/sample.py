@@ -19,16 +19,16 @@ from gmem_jax.physics.system import System
 
 
 class Measured(NamedTuple):
-    """What files, pictures, pages and docs/files.md say of a field of a `Sample`.
+    """The description of a field of a `Sample`, for files, pictures, pages and docs/files.md.
 
     Attributes:
-        unit: of the values.
-        description: what it is.
-        dimensions: of the values in one bin.
-        plot: what a picture of it is called; "" for none.
-        label: of its axis in pictures.
+        unit: unit of the values.
+        description: the quantity in words.
+        dimensions: names of the axes of the values in one bin.
+        plot: name of the picture of it; "" for none.
+        label: label of its axis in pictures.
         log: whether the axis is logarithmic.
-        symbol: of one component, for vectors.
+        symbol: symbol of one component, for vectors.
     """
 
     unit: str
@@ -118,8 +118,8 @@ class Sample:
     def contacts_per_grain(self) -> jax.Array:
         """Number of contacts per grain, each counted once, those with walls included, [B].
 
-        What the paper's "average number of contacts on a grain" compares with: it grows alike in a compression, the
-        `coordination` half as much (docs/physics.md).
+        Compare it with the paper's "average number of contacts on a grain": in a compression it grows as much as that,
+        and `coordination` half as much (docs/physics.md).
         """
         return 0.5 * self.contacts + self.wall_contacts
 
@@ -127,7 +127,7 @@ class Sample:
 MEASURED: dict[str, Measured] = {
     entry.name: entry.metadata["measured"] for entry in fields(Sample) if "measured" in entry.metadata
 }
-"""What is said of the fields of a `Sample`, by name."""
+"""The descriptions of the fields of a `Sample`, by name."""
 
 
 def check(system: System, state: State, box: Box, census: Census) -> State:
@@ -142,7 +142,7 @@ def check(system: System, state: State, box: Box, census: Census) -> State:
 
 
 def measure(system: System, state: State, box: Box, pressure: jax.Array, u: Scalar, census: Census) -> Sample:
-    """A `Sample` from a census, and from the bin-averaged pressure and u, which are given."""
+    """The `Sample` of a state with a given census, bin-averaged pressure [3, B] and u."""
     grains, clump = state.grains, system.clump
     count = grains.position.shape[0]
     body_spin = jnp.sum(matrix(grains.quaternion) * grains.spin[:, :, None], axis=1)
@@ -184,11 +184,11 @@ def end_bin(
 
     Args:
         system: the system.
-        state: at the end of the bin.
-        box: its walls there.
-        pressure: the bin's average, [3, B].
+        state: the state at the end of the bin.
+        box: the walls at the end of the bin.
+        pressure: pressure on the walls, averaged over the bin, [3, B].
         u: compression variable.
-        counted: what takes the census.
+        counted: the function that takes the census.
     """
     census = counted(system, state, box)
     state = check(system, state, box, census)

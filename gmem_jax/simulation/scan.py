@@ -1,4 +1,4 @@
-"""Scans whose reverse mode needs little memory: states are kept at two levels, the rest is computed again."""
+"""Scans whose reverse mode needs little memory: states are kept at two levels, and the others are computed again."""
 
 import math
 from collections.abc import Callable
@@ -12,7 +12,7 @@ SHORT = 32  # carries that one level may keep
 
 
 def inner_length(length: int) -> int:
-    """A length of blocks near the square root of `length`: a divisor if there is one, for the body is compiled once."""
+    """A length of blocks near the square root of `length`; if possible a divisor, so that the body is compiled once."""
     root = math.isqrt(max(1, length))
     return next((part for part in range(root, root // 2, -1) if length % part == 0), root)
 
@@ -20,8 +20,8 @@ def inner_length(length: int) -> int:
 def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any) -> tuple[Any, Any]:
     """`jax.lax.scan` over xs, leaves [n, ...], in blocks of blocks: reverse mode keeps about 2 sqrt(n) carries, not n.
 
-    The price is one more evaluation of the body, which short scans are spared. Forward evaluation and forward mode are
-    those of one scan. What the blocks leave over is a block by itself.
+    The price is one more evaluation of the body, which scans of up to `SHORT` steps are spared. Forward evaluation and
+    forward mode are those of one scan. The steps beyond the last whole block are a block by themselves.
 
     Args:
         body: as for `jax.lax.scan`.

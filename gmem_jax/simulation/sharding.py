@@ -21,7 +21,7 @@ AXIS = "replicas"
 
 
 def to_host(array: Any) -> np.ndarray:
-    """An array that may lie on several devices, or on those of other processes, on this host."""
+    """A numpy array on this host, of an array that may lie on several devices, or on those of other processes."""
     if isinstance(array, jax.Array) and not array.is_fully_addressable:
         array = multihost_utils.process_allgather(array, tiled=True)
     return np.asarray(array)
@@ -29,10 +29,10 @@ def to_host(array: Any) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where replicas are put.
+    """The distribution of replicas over devices.
 
     Attributes:
-        replicas: how many there are, B.
+        replicas: number of replicas B.
         mesh: the devices, on one axis.
     """
 
@@ -41,7 +41,7 @@ class Placement:
 
     @property
     def padded(self) -> int:
-        """B up to a multiple of the devices."""
+        """B, rounded up to a multiple of the number of devices."""
         whole: int = -(-self.replicas // self.mesh.size) * self.mesh.size
         return whole
 
@@ -50,19 +50,19 @@ class Placement:
         return placed
 
     def _put_last(self, leaf: Any) -> jax.Array:
-        """With the replica axis last, [..., B], padded already or not."""
+        """An array [..., B], padded already or not, padded and split over the devices along its last axis."""
         leaf = to_host(leaf)[..., : self.replicas]
         more = np.repeat(leaf[..., :1], self.padded - leaf.shape[-1], axis=-1)
         wide = np.concatenate([leaf, more], axis=-1)
         return self._put(wide, *(None for _ in wide.shape[1:]), AXIS)
 
     def put_state(self, state: State) -> State:
-        """A state of B replicas."""
+        """A state of B replicas, padded and split over the devices."""
         placed: State = jax.tree.map(self._put_last, state)
         return placed
 
     def put_simulation(self, simulation: Simulation) -> Simulation:
-        """A simulation: lists and numbers of a system are split if replicas differ in them, the rest is everywhere."""
+        """A simulation on all devices: arrays in which replicas differ are split, the others are copied to each."""
         system = simulation.system
         reference = system.pairs.reference
         own = self._put_last(reference) if reference.shape[-1] > 1 else self._put(reference)
@@ -75,7 +75,7 @@ class Placement:
         return replace(everywhere, system=placed, mark=mark)
 
     def _put_number(self, leaf: Any) -> Any:
-        """A number for all replicas, or one for each, [B]."""
+        """A number for all replicas, copied to each device; or one for each replica, [B], split over the devices."""
         return self._put_last(leaf) if np.shape(leaf) in ((self.replicas,), (self.padded,)) else self._put(leaf)
 
     def gather(self, tree: Any) -> Any:
@@ -84,6 +84,6 @@ class Placement:
 
 
 def placement_of(replicas: int, devices: Sequence[jax.Device] | None = None) -> Placement | None:
-    """How some replicas are shared out over devices, default all of them; None where there is nothing to share."""
+    """The distribution of replicas over devices, default all devices; None if one device would hold all replicas."""
     found = list(jax.devices() if devices is None else devices)[:replicas]
     return Placement(replicas, Mesh(np.asarray(found), (AXIS,))) if len(found) > 1 and replicas > 1 else None

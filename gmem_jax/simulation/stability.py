@@ -1,7 +1,8 @@
 """The parameter that makes the time steps of a run unstable, for error messages.
 
-The steps are explicit. A spring k on a mass m needs dt < 2 sqrt(m / k) and a dashpot c needs dt < 2 m / c. Here one
-contact is looked at, of an overlap as in a pack: what exceeds these bounds is a cause, what does not may still be one.
+The steps are explicit. A spring k on a mass m needs dt < 2 sqrt(m / k) and a dashpot c needs dt < 2 m / c. These bounds
+are evaluated here for one contact with an overlap as in a pack. A parameter that violates them is a cause; one that
+does not may still be a cause.
 """
 
 import math
@@ -18,7 +19,7 @@ from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.sharding import to_host
 
 OVERLAP = 0.05  # R
-_USUAL: dict[str, Any] = {  # what stands for a number that is asked whether it is the cause: defaults of the fields
+_USUAL: dict[str, Any] = {  # defaults, each put in the place of a parameter to see whether that one is the cause
     **{f"material.{name}": getattr(Material, name) for name in ("wall_rigidity", "normal_damping")},
     **{f"friction.{name}": getattr(Hooke, name) for name in ("stiffness", "damping_time")},
 }
@@ -28,16 +29,16 @@ def one_contact_limit(simulation: Simulation, stiffer: float = 1.0, **changed: f
     """The longest stable step for one contact: a grain on a wall, or two grains with friction, in t_c.
 
     Args:
-        simulation: gives the smallest grain, the material and the law; of replicas the largest numbers count.
-        stiffer: factor of every spring and dashpot.
-        changed: numbers in `_USUAL` that stand for those of the simulation.
+        simulation: gives the smallest grain, the material and the law; parameters are the largest of all replicas.
+        stiffer: factor on every spring and dashpot.
+        changed: values of parameters in `_USUAL`, in the place of those of the simulation.
     """
     system = simulation.system
     numbers = {**_USUAL, **_numbers(simulation), **changed}
     rigidity, damping, spring, tangential_damping = (numbers[name] for name in _USUAL)
     mass = _most(system.clump.mass) * float(system.clump.smallest) ** 3 / stiffer
     root = math.sqrt(OVERLAP)
-    stiffness = _most(system.material.plane_stiffness) * root * max(rigidity, 2.0**-0.5)  # or of two, of mass m / 2
+    stiffness = _most(system.material.plane_stiffness) * root * max(rigidity, 2.0**-0.5)  # of a wall, or of two grains
     spring *= root if isinstance(system.friction, MindlinRescaled | Mindlin) else 1.0
     rates = (
         0.5 * math.sqrt(1.5 * stiffness / mass),
@@ -49,7 +50,7 @@ def one_contact_limit(simulation: Simulation, stiffer: float = 1.0, **changed: f
 
 
 def _numbers(simulation: Simulation) -> dict[str, float]:
-    """Those in `_USUAL` that are known: of the material, and of a law that has a name."""
+    """The parameters in `_USUAL` of a simulation: those of the material, and those of the law if it has a name."""
     material, law = simulation.system.material, simulation.system.friction
     of_material = ("wall_rigidity", "normal_damping")
     known: dict[str, Any] = {f"material.{name}": getattr(material, name) for name in of_material}
@@ -59,7 +60,7 @@ def _numbers(simulation: Simulation) -> dict[str, float]:
 
 
 def cause(simulation: Simulation) -> str:
-    """The number that made a run unstable, as far as can be said; "" if none is beyond its bound."""
+    """The parameter that made a run unstable, in words; "" if none is found."""
     numbers, longest, dt = _numbers(simulation), one_contact_limit(simulation), _most(simulation.dt)
     without = {name: one_contact_limit(simulation, **{name: _USUAL[name]}) for name in numbers}
     name = max(without, key=without.__getitem__)

@@ -1,6 +1,6 @@
 """The largest stable time step: no perturbation of a pack at rest grows under the linearised step.
 
-A mode of frequency w whose dashpot takes the rate c off its velocity is stable while (w dt)^2 + 2 c dt < 4
+A mode of frequency w, whose velocity a dashpot damps at the rate c, is stable while (w dt)^2 + 2 c dt < 4
 (docs/decisions/physics.md).
 """
 
@@ -21,17 +21,17 @@ from gmem_jax.simulation.compiled import Compiled
 from gmem_jax.simulation.loop import Simulation
 
 SHORTEST_STEP, LONGEST_STEP = 0.1, 2.0  # t_c; beyond the latter p_sig is 3 % off or more, if anything is stable
-CLOSE = 1.02  # ratio of a step that is stable to one that is not
-GROWTH = 1e-4  # in a step; what grows less needs ten thousand steps, and sliding contacts take it away
-ROUNDS = 20  # of the power iteration, each with
-DECAY = 8  # steps, in which what is damped vanishes,
-RISE = 2  # and differences of steps, in which what is slow does
+CLOSE = 1.02  # the search ends at this ratio of a step that is not stable to one that is
+GROWTH = 1e-4  # ln |z| in a step; slower growth needs ten thousand steps, and sliding contacts dissipate it
+ROUNDS = 20  # rounds of the power iteration
+DECAY = 8  # steps in a round, in which damped modes vanish
+RISE = 2  # differences of successive steps in a round, in which slow modes vanish
 
 
 def largest_stable_step(simulation: Simulation, position: jax.Array, quaternion: jax.Array, box: Box) -> float:
-    """The largest stable step of grains at rest, in t_c; of replicas the smallest of theirs.
+    """The largest time step that is stable for grains at rest, in all replicas, in t_c.
 
-    Contacts stick: sliding ones are no stiffer. It takes `growth` once, or some four times.
+    Contacts stick: sliding ones are no stiffer. `growth` is evaluated once, or about four times.
 
     Args:
         simulation: system and backend; its parameters are scalars or [B].
@@ -46,22 +46,23 @@ def largest_stable_step(simulation: Simulation, position: jax.Array, quaternion:
 
 
 def growth(simulation: Simulation, position: jax.Array, quaternion: jax.Array, box: Box, dt: float) -> float:
-    """ln |z| in a step of `dt` of the mode that grows most, of all replicas; beyond `GROWTH` the step is not stable.
+    """ln |z| of the mode that grows most, in all replicas, where z is its factor in a step of length `dt`.
 
-    It takes some 200 steps with their tangents. The other arguments are those of `largest_stable_step`.
+    Beyond `GROWTH` the step is not stable. It takes some 200 steps with their tangents. The other arguments are those
+    of `largest_stable_step`.
     """
     return float(np.max(np.asarray(_growth(simulation, position, quaternion, box, jnp.asarray(dt)))))
 
 
 def largest_without(growth: Callable[[float], float]) -> float:
-    """The longest dt, to 2 %, that is found to be without `growth` in a step."""
+    """The longest dt, to 2 %, at which `growth` is at most `GROWTH`; 0 if `SHORTEST_STEP` is too long."""
     high = low = LONGEST_STEP
     below, above = CLOSE**0.5, CLOSE
     while not (grown := growth(low)) <= GROWTH:
         if low == SHORTEST_STEP:
             return 0.0
         high = low
-        # An undamped mode that flips its sign in each step has (w dt)^2 = |z| + 2 + 1 / |z|; what is stable has 4.
+        # An undamped mode that flips its sign in each step has (w dt)^2 = |z| + 2 + 1 / |z|; the limit is at 4.
         low = max(SHORTEST_STEP, float(high / np.cosh(0.5 * grown) / below))
         below **= 2
     while high > CLOSE * low:
@@ -74,7 +75,7 @@ def largest_without(growth: Callable[[float], float]) -> float:
 
 
 def _dot(one: Any, other: Any) -> jax.Array:
-    """Of two trees in every replica, [B]."""
+    """The scalar product of two trees in every replica, [B]."""
     parts = jax.tree.map(lambda a, b: jnp.sum(a * b, axis=tuple(range(a.ndim - 1))), one, other)
     return sum(jax.tree.leaves(parts), jnp.zeros(()))
 

@@ -14,7 +14,7 @@ from gmem_jax.physics.pytree import static_record
 from gmem_jax.simulation.channels import CHANNELS
 
 BINS = 256  # bins of a stage of length t0, as in the paper: the resolution of every recorded quantity
-LONGEST_NAME = 150  # of a stage; files take 200, and a protocol appends to a name that comes twice
+LONGEST_NAME = 150  # letters; files take 200, and a protocol appends to a name that comes twice
 LONGEST_STAGE = 1e9  # in t0: more bins than any machine goes through
 SINE = "sine:"  # begins the name of a drive of whole sine periods
 
@@ -39,14 +39,15 @@ class Bin(NamedTuple):
     Attributes:
         start: u at the beginning of its stage.
         stop: u at the end of its stage.
-        bins: length of its stage.
+        bins: length of its stage, in bins.
         number: its place in the stage, from 0.
         timed: whether waveforms are functions of time.
         still: whether the drag of the simulation acts.
-        amplitudes: of each of `Columns.lanes`; 0 where it is not applied.
-        drag: of the stage, in the place of the simulation's, 1 / t_c; None where no stage has one.
-        friction: 1, or 0 where the stage switches friction off; None where no stage does.
-        pressure: that the walls of each axis are held at, in E, 0 for walls that are not; None where no stage has one.
+        amplitudes: amplitude of each of `Columns.lanes`; 0 where it is not applied.
+        drag: drag of the stage, in the place of the simulation's, 1 / t_c; None if no stage has a drag of its own.
+        friction: 1, or 0 where the stage switches friction off; None if no stage does.
+        pressure: pressure at which the walls of each axis are held, in E, 0 for walls that are not held; None if no
+            stage holds walls.
     """
 
     start: Numbers
@@ -137,13 +138,13 @@ OWN = (Drive(),)
 
 
 class Columns(NamedTuple):
-    """What some stages make use of: programs are compiled for it.
+    """The columns that a table of bins of some stages needs: programs are compiled for them.
 
     Attributes:
         lanes: waveforms by channel.
         drag: whether any stage has a drag of its own.
-        friction: whether any switches friction off.
-        pressure: whether any holds walls at a pressure.
+        friction: whether any stage switches friction off.
+        pressure: whether any stage holds walls at a pressure.
     """
 
     lanes: tuple[Lane, ...] = ()

@@ -13,13 +13,13 @@ from gmem_jax.physics.state import Box, HeldWalls
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.stage import Bin, Lane, Numbers
 
-COMPRESSIONS = "[1e-9, 0.5)"  # delta0 of a compression: of less, rounding leaves the walls where they are
+COMPRESSIONS = "[1e-9, 0.5)"  # delta0 of a compression; a smaller one would be lost in round-off
 SERVO_GAIN = 2.5e-4  # strain in a bin for a relative error of 1: stresses follow within some 20 bins, and do not ring
 SERVO_STRAIN = 2.5e-4  # strain in a bin at most: some times that of a compression
 
 
 class Waveforms(Protocol):
-    """What drives a shear: a pytree."""
+    """The waveforms of a shear: a pytree."""
 
     def shear(self, u: jax.Array) -> jax.Array:
         """I_s(u) of S waveforms, [..., S], for u of shape [...]."""
@@ -56,10 +56,10 @@ class StrainPath:
         upper: upper planes at u = 0, [3, 1].
         delta0: areal compression at u = 1, scalar or [B].
         gamma0: shear amplitude, scalar or [B].
-        waveforms: of each lane: one for all replicas, or one for each but replica 0, which has none.
-        share: of gamma on each axis, scalar or [B]. The paper does not say; a half is this project's reading.
-        lanes: which waveforms are applied on which channel; rows of a table say when.
-        fixed: of each lane, whether its waveform is the same for all replicas.
+        waveforms: waveforms of each lane: one for all replicas, or one for each but replica 0, which has none.
+        share: share of gamma on each axis, scalar or [B]. The paper does not say; a half is this project's reading.
+        lanes: which waveforms are applied on which channel; the table of bins says when.
+        fixed: whether the waveform of each lane is the same for all replicas.
         periodic: the periodic axes of the box, whose edges are strained alike.
     """
 
@@ -74,7 +74,7 @@ class StrainPath:
     periodic: PeriodicAxes = static(WALLS)
 
     def _shear(self, lane: int, at: jax.Array, amplitude: Numbers) -> jax.Array:
-        """Share of gamma of one lane, [B] or [1]."""
+        """share gamma of one lane, [B] or [1]."""
         shapes = self.waveforms[lane].shear(at)
         if not self.fixed[lane]:
             shapes = jnp.concatenate([jnp.zeros((*at.shape, 1)), shapes], axis=-1)
@@ -87,9 +87,9 @@ class StrainPath:
         """Planes and their velocities, [3, B] (or [3, 1] without shear).
 
         Args:
-            row: a bin of the stage; only what is common to the stage counts.
-            time: since the start of the stage, in t_c.
-            duration: of the stage, in t_c.
+            row: any bin of the stage; its `number` does not matter.
+            time: time since the start of the stage, in t_c.
+            duration: duration of the stage, in t_c.
         """
 
         def lengths(moment: jax.Array) -> jax.Array:
@@ -113,7 +113,7 @@ class StrainPath:
 
 
 def stretched(box: Box, stretch: jax.Array, rate: Scalar = 0.0) -> Box:
-    """A box whose edges are longer by a factor 1 + stretch [3, B], which grows at a rate, in 1 / t_c."""
+    """A box with its edges multiplied by 1 + stretch, [3, B]; `rate` is d(stretch)/dt, in 1 / t_c."""
     lengths, growth = box.lengths, box.growth
     half = 0.5 * lengths * (1.0 + stretch)
     speed = 0.5 * (growth * (1.0 + stretch) + lengths * rate)
@@ -122,9 +122,9 @@ def stretched(box: Box, stretch: jax.Array, rate: Scalar = 0.0) -> Box:
 
 
 def servo_rate(pressure: jax.Array, target: Scalar | jax.Array, gain: Scalar, fastest: Scalar) -> jax.Array:
-    """How fast a servo lets a wall go: in proportion to its relative error of pressure, at most `fastest` either way.
+    """Outward rate of a wall under a servo: `gain` times its relative excess of pressure, at most `fastest` either way.
 
-    That of the piston of a preparation, in each block of steps, and that of walls held at a pressure, in each bin.
+    It moves the piston of a preparation in each block of steps, and walls held at a pressure in each bin.
     """
     return jnp.clip(gain * (pressure / target - 1.0), -fastest, fastest)
 
@@ -132,7 +132,7 @@ def servo_rate(pressure: jax.Array, target: Scalar | jax.Array, gain: Scalar, fa
 def servo_strain(servo: HeldWalls, target: jax.Array) -> jax.Array:
     """Strain of each axis in the next bin, [3, B], by which its pressure is brought to `target` [3, 1].
 
-    Where the target is 0 the strain is. Pressures that are too large let the wall go.
+    The strain is 0 where the target is 0. Walls move outwards where the pressure is too large.
     """
     held = target > 0.0
     return jnp.where(held, servo_rate(servo.pressure, jnp.where(held, target, 1.0), SERVO_GAIN, SERVO_STRAIN), 0.0)
