@@ -2,18 +2,19 @@
 
 One call into the library runs all steps of one bin for all replicas; walls, checks and samples are computed in JAX.
 It works under `jax.jit`, `jax.vmap`, `jax.shard_map`, on sharded arrays, and in both modes of differentiation, whose
-derivatives are computed in the library too. The rooms: `backend` decides which code does the steps, `march` puts a
+derivatives are computed in the library too. The modules: `backend` decides which code runs the steps, `march` puts a
 state into the arrays of a call, `calls` makes a call an operation of JAX, `primitives` says how the calls are
-differentiated, `library` loads what `build` compiled, `cuda` has what GPUs need beside that, and `search` looks for
-candidate contacts.
+differentiated, `library` loads the library that `build` compiled, `cuda` makes the calls on GPUs, `census` counts
+contacts, and `search` looks for candidate contacts.
 
-On CUDA GPUs the same C++ runs as kernels; see `gmem_jax.native.cuda` and docs/gpu.md. What follows is said of CPUs.
+On CUDA GPUs the same C++ runs as kernels; see `gmem_jax.native.cuda` and docs/gpu.md. The rest of this text is about
+CPUs.
 
 Numbers depend neither on threads nor on what else is in a batch, and are the same with AVX2 and AVX-512. CPUs without
-fused multiply-add ("baseline" in `available`) differ from those in last digits, fidelities by some 1e-11. Calls at once
-share out the CPUs; GMEM_THREADS limits the threads of each, and GMEM_CACHE (in MB) stands for the caches that are found
-when it is not right about how many blocks of replicas fit into them. JAX does not survive os.fork: start processes by
-"spawn".
+fused multiply-add ("baseline" in `available`) give numbers that differ in the last digits, and fidelities that differ
+by some 1e-11. Calls at the same time share the CPUs; GMEM_THREADS limits the threads of each call. GMEM_CACHE (in MB)
+replaces the size of the caches that the library finds, from which it decides how many blocks of replicas fit into them.
+JAX does not survive os.fork: start processes by "spawn".
 """
 
 import sys
@@ -21,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import gmem_start
 
-# In a process of the command a module loads what it needs, as in `gmem_jax`.
+# In a process of the command, modules import only what they need, as in `gmem_jax`.
 if TYPE_CHECKING or not gmem_start.alone:
     from gmem_jax.native import library
     from gmem_jax.native.backend import (
@@ -41,9 +42,9 @@ if TYPE_CHECKING or not gmem_start.alone:
     from gmem_jax.native.march import March, march
     from gmem_jax.native.search import search
 
-    # Now, and not when a march is first asked for: a program that `jax.export` wrote calls the library by name, in a
-    # process that may have imported the package and no more. It starts no backend. While Python looks for the module
-    # of ``python -m gmem_jax.native.build``, which compiles the library, it must not be imported yet.
+    # The library is loaded at import, not at the first march: a program that `jax.export` wrote calls it by name, in a
+    # process that may only have imported the package. Loading starts no backend of JAX. The library must not be loaded
+    # while Python looks for the module of ``python -m gmem_jax.native.build``, which compiles it.
     if getattr(sys, "argv", [""])[:1] != ["-m"]:
         library.load_library()
 

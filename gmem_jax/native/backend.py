@@ -23,13 +23,13 @@ PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 
 @dataclass(frozen=True)
 class ResolvedBackend:
-    """A backend, as it was asked for, on JAX's default device.
+    """The backend that runs on JAX's default device.
 
     Attributes:
         name: "jax" or "native".
         precision: "double" or "mixed".
-        march: the steps of a bin; for "auto" also right in what is compiled for other devices than the default one.
-        census: what is counted at its end; likewise.
+        march: runs the steps of a bin; that of "auto" also serves programs for other devices than the default one.
+        census: takes the census at the end of a bin; likewise.
         why: the instruction set of the native backend on CPUs, or why plain JAX runs.
     """
 
@@ -46,15 +46,15 @@ def supports(law: FrictionLaw) -> bool:
 
 
 def resolve(backend: str, precision: str, law: FrictionLaw) -> ResolvedBackend:
-    """What does the steps for a friction law; the same object for the same arguments.
+    """The backend that runs the steps under a friction law; one object for equal arguments.
 
     Args:
-        backend: as of `marcher`.
+        backend: as in `marcher`.
         precision: likewise.
-        law: its class matters, and not its parameters.
+        law: the friction law; only its class matters, not its parameters.
 
     Raises:
-        ValueError: if the backend is unknown or not available, or the precision is not to be had with it.
+        ValueError: if the backend is unknown or not available, or does not have the precision.
     """
     lacks = "" if supports(law) else f"the friction law {type(law).__name__}"
     return _resolve(backend, precision, lacks, *library.available())
@@ -82,10 +82,10 @@ def _why_not(lacks: str, built: bool, said: str) -> str:
 
 
 def backend_name(backend: str, law: FrictionLaw) -> Backend:
-    """What "auto" means on JAX's default device, "jax" or "native"; others are themselves.
+    """The backend that "auto" chooses on JAX's default device, "jax" or "native"; other names stay as they are.
 
     Args:
-        backend: as of `resolve`.
+        backend: as in `resolve`.
         law: likewise.
 
     Raises:
@@ -110,10 +110,10 @@ def require_precision(
     equal: bool = True,
     smooth: bool = True,
 ) -> None:
-    """Refuse a precision that is unknown, or not to be had.
+    """Refuse a precision that is unknown or not available.
 
     Args:
-        precision: as of `marcher`.
+        precision: as in `marcher`.
         backend: likewise.
         law: the friction law.
         periodic: the periodic axes of the box.
@@ -138,14 +138,13 @@ def marcher(backend: str = "auto", precision: str = "double") -> March:
     """The `march` of a backend, for any friction law.
 
     Args:
-        backend: "jax", the definition; "native", the library, which is refused where there is none; or "auto": native
-            in what is compiled for CPUs and CUDA GPUs, where the library is at hand and knows the friction law, else
-            plain JAX.
+        backend: "jax", the definition; "native", the library, refused if it is not available; or "auto": native in
+            programs for CPUs and CUDA GPUs, if the library is available and knows the friction law, else plain JAX.
         precision: "double", or "mixed": contacts and their histories in single precision, on the native backend; see
             `gmem_jax.native.march.march_mixed`.
 
     Raises:
-        ValueError: if the backend is unknown or not available, or the precision is not its own.
+        ValueError: if the backend is unknown or not available, or does not have the precision.
     """
     _require_known(backend)
     if precision not in PRECISIONS or (precision == "mixed" and backend == "jax"):

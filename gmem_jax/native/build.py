@@ -1,10 +1,11 @@
 """Compile the native backend: at install time (setup.py), or in place with ``python -m gmem_jax.native.build``.
 
-With ``--if-stale`` it is compiled only if it is not there, or not made of the sources beside it.
+With ``--if-stale`` it is compiled only if it is missing, cannot be loaded, or was compiled from other sources.
 
-The library has no Python in it: one shared object whose symbols `gmem_jax.native` registers with XLA. The time step,
-its derivatives and theirs are compiled once per instruction set, and the best one that the CPU has is chosen when it
-runs. Only the standard library is imported here, because setup.py loads this file before the package exists.
+The library has no Python in it: it is one shared object whose symbols `gmem_jax.native` registers with XLA. The time
+step and its derivatives are compiled once per instruction set (see `NOT_COMPILED`); the best set that the CPU has is
+chosen when the library runs. Only Python's standard library is imported here, because setup.py loads this file before
+the package exists.
 """
 
 import ctypes
@@ -30,17 +31,17 @@ INSTRUCTION_SETS = {
     "avx2": ("-mavx2", "-mfma"),
     "avx512": ("-mavx512f", "-mavx512dq", "-mavx512bw", "-mavx512vl", "-mfma", "-mprefer-vector-width=512"),
 }
-# If GCC is not told, it copies structures for AVX2 by halves of a vector. Other compilers do not know these.
+# Without these options GCC copies structures by halves of a vector of AVX2. Other compilers do not know them.
 WIDE_COPIES = {"avx2": ("-mmove-max=256", "-mstore-max=256")}
 
-# What is compiled of cpu/kernel.cc, each by itself. With -O1 second derivatives run as fast as with -O2, and compile in
-# two thirds of the time; first ones are 10 to 15 % slower with it.
+# The parts of cpu/kernel.cc, each compiled by itself. With -O1 second derivatives run as fast as with -O2, and compile
+# in two thirds of the time; first derivatives would be 10 to 15 % slower with -O1.
 KERNELS = {
     "steps": (),
     "derivatives": ("-DGMEM_DERIVATIVES", "-O2"),
     "second_derivatives": ("-DGMEM_SECOND_DERIVATIVES", "-O1"),
 }
-# A minute less to compile: CPUs with AVX-512 run the code for AVX2.
+# Left out, which saves a minute of compiling: CPUs with AVX-512 run these for AVX2.
 NOT_COMPILED = {("avx512", "second_derivatives")}
 
 
@@ -81,7 +82,7 @@ def run_compiler(command: list[str]) -> None:
 
 
 def known_of(cxx: list[str], flags: tuple[str, ...]) -> tuple[str, ...]:
-    """Those flags that a compiler knows."""
+    """The flags among `flags` that a compiler knows."""
 
     def known(flag: str) -> bool:
         try:
@@ -106,7 +107,7 @@ def headers() -> Path:
 
 
 def source_hash() -> str:
-    """What the library would be compiled from: a hash of its sources and flags; "" where the sources are not there."""
+    """A hash of the sources and flags from which the library is compiled; "" if the sources are not there."""
     files = sorted(path for path in SOURCES.rglob("*") if path.suffix in (".cc", ".h", ".cu"))
     if not files:
         return ""
@@ -117,11 +118,11 @@ def source_hash() -> str:
 
 
 def is_stale(library: ctypes.CDLL) -> bool:
-    """Whether a library was compiled from other sources than those that lie here, if any do."""
+    """Whether a library was compiled from other sources or flags than those beside this file; False without sources."""
     try:
         library.gmem_source_hash.restype = ctypes.c_char_p
         compiled: str = library.gmem_source_hash().decode()
-    except AttributeError:  # from before there were hashes
+    except AttributeError:  # a library that is older than hashes
         compiled = ""
     return source_hash() not in ("", compiled)
 
@@ -140,7 +141,7 @@ def opened(target: Path) -> tuple[ctypes.CDLL | None, str]:
 
 
 def instruction_set(library: ctypes.CDLL) -> str:
-    """What the steps of a library are done with on this machine: "avx512", "avx2" or "baseline"."""
+    """The instruction set of the steps of a library on this machine: "avx512", "avx2" or "baseline"."""
     library.gmem_instruction_set.restype = ctypes.c_char_p
     name: str = library.gmem_instruction_set().decode()
     return name
@@ -163,7 +164,8 @@ def build(target: Path) -> None:
     jobs.append(("call/census.cc", "census.o", ("-isystem", str(include))))
     jobs.append(("cuda/handler.cc", "gpu_handler.o", ("-isystem", str(include))))
     jobs += [(f"cuda/{name}.cc", f"gpu_{name}.o", (stamp,)) for name in ("compile", "launch")]
-    # From the lowest instruction set up: the linker keeps the first copy of what they share, of the standard library.
+    # The lowest instruction set comes first: objects share functions of the standard library, and the linker keeps the
+    # first copy of each.
     for name, flags in sets.items():
         flags = (*flags, *known_of(cxx, WIDE_COPIES.get(name, ())))
         for kernel, more in KERNELS.items():
@@ -186,7 +188,7 @@ def build(target: Path) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         if not linked.is_file():
             raise BuildError(f"{cxx[0]} made no library")
-        made = target.with_suffix(f".{os.getpid()}.new")  # of this process: another may build too
+        made = target.with_suffix(f".{os.getpid()}.new")  # named after this process: another may build too
         try:
             shutil.copyfile(linked, made)
             made.replace(target)  # atomically: a running process may have the old one loaded

@@ -1,8 +1,8 @@
 """Calls into the library as operations of JAX: their arguments, shapes and lowering on each device.
 
-Which code runs is settled when a program is lowered: the library on CPUs and, where it serves the call (see `cuda`), on
-CUDA GPUs; the definition in plain JAX elsewhere.
-Replicas know nothing of each other, so a call on arrays that are sharded by replicas runs on each device by itself.
+Which code runs is decided when a program is lowered: the library on CPUs and, if it has kernels for the call (see
+`cuda`), on CUDA GPUs; the definition in plain JAX elsewhere. Replicas do not interact, so a call on arrays that are
+sharded by replicas runs on each device by itself.
 """
 
 import functools
@@ -34,7 +34,7 @@ class Call(NamedTuple):
         variant: number of the Mindlin law's variant.
         points: Q of the Mindlin law.
         isotropic: whether all moments of inertia are equal.
-        leaves: arrays of the candidates' history.
+        leaves: number of arrays in the history of the candidates.
         mixed: whether contacts are computed in single precision.
         periodic: bits of the periodic axes.
         unequal: whether spheres differ in radius.
@@ -53,18 +53,18 @@ class Call(NamedTuple):
 
 
 class Fixed(NamedTuple):
-    """What the steps cannot be differentiated by.
+    """The arguments with respect to which the steps cannot be differentiated.
 
     Attributes:
-        first: of `Pairs`, [P], as the next five.
+        first: see `Pairs`, [P]; so for the next five.
         second: [P].
         valid: [P].
         incidence: [S, C].
-        reference: of the first replica, [S, 3].
+        reference: that of the first replica, [S, 3].
         smallest: [3].
-        images: of `Pairs.image`, [P, 3]; [P, 0] without periodic axes.
-        radii: of the spheres of a grain of size 1, [K, 1], in R; [K, 0] where all spheres of the pack are of radius 1.
-        sizes: of the grains, [N, 1]; or [N, 0] likewise.
+        images: `Pairs.image`, [P, 3]; [P, 0] without periodic axes.
+        radii: radii of the spheres of a grain of size 1, [K, 1], in R; [K, 0] if all spheres of the pack have radius 1.
+        sizes: sizes of the grains, [N, 1]; [N, 0] likewise.
     """
 
     first: jax.Array
@@ -79,14 +79,15 @@ class Fixed(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """What the steps can be differentiated by.
+    """The arguments with respect to which the steps can be differentiated.
 
     Attributes:
         fields: leaves of `Grains`, [N, 3 or 4, B].
         parameters: rows of src/physics/parameters.h's parameter array, [rows, B].
-        walls: lower, upper and their velocities of every step, [steps, 12, B].
-        offsets: sphere centres of a grain, [K, 3, B], in R; alike in all replicas, as their derivatives need not be.
-        history: leaves of the candidates' history, [P, ..., B]; then of that of walls with friction, [6 S, ..., B].
+        walls: lower planes, upper planes and their velocities after every step, [steps, 12, B].
+        offsets: sphere centres of a grain, [K, 3, B], in R; equal in all replicas, but their derivatives may differ.
+        history: leaves of the candidates' history, [P, ..., B]; then leaves of the history of walls with friction,
+            [6 S, ..., B].
     """
 
     fields: list[jax.Array]
@@ -97,7 +98,7 @@ class Arrays(NamedTuple):
 
 
 class StepOutput(NamedTuple):
-    """What the steps give: `Arrays` that moved, and the sum of the wall pressures, [3, B]."""
+    """The results of the steps: fields and histories as in `Arrays`, and the sum of the wall pressures, [3, B]."""
 
     fields: list[jax.Array]
     pressure: jax.Array
@@ -105,10 +106,10 @@ class StepOutput(NamedTuple):
 
 
 class Definition(Protocol):
-    """What a call does in plain JAX, for platforms without a library; hashable, for it is part of a program.
+    """A call in plain JAX, for devices without the library; hashable, since it is part of a program.
 
     Attributes:
-        anywhere: whether it may stand in for the library where there could be one.
+        anywhere: whether it may run in the place of the library; if not, devices without the library are refused.
     """
 
     @property
@@ -116,23 +117,23 @@ class Definition(Protocol):
         """See above."""
 
     def __call__(self, common: Any, own: Any, /) -> Any:
-        """Of what replicas have in common and what each has of its own; of steps, of `Fixed` and `Arrays`."""
+        """The results, from what replicas share and what each has of its own: for steps, `Fixed` and `Arrays`."""
 
 
 def bind(primitive: Primitive, call: Call, definition: Definition, *parts: Any) -> list[jax.Array]:
-    """The leaves of what a primitive gives of its arguments."""
+    """The leaves of the results of a primitive for the arguments `parts`."""
     leaves, tree = jax.tree.flatten(mark_varying(parts))
     found: list[jax.Array] = primitive.bind(*leaves, tree=tree, call=call, definition=definition)
     return found
 
 
 def results_of(arrays: Arrays, found: list[Any]) -> StepOutput:
-    """Leaves of a result like that of the steps as one."""
+    """A `StepOutput` made of its leaves."""
     count = len(arrays.fields)
     return StepOutput(found[:count], found[count], found[count + 1 :])
 
 
-# Shapes. Every argument may have leading axes, as many as the others, of size one where there is nothing to share out.
+# Shapes. All arguments have equally many leading axes (none or more), of size one where an argument does not vary.
 
 
 def _leading(parts: Any) -> tuple[int, ...]:
@@ -142,13 +143,13 @@ def _leading(parts: Any) -> tuple[int, ...]:
 
 
 def with_leading(parts: Any, likes: Any) -> Any:
-    """Shapes like `likes`, those of some arguments or like them, with all leading axes."""
+    """The shapes of `likes`, with their leading axes replaced by those of the results of a call."""
     leading = _leading(parts)
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*leading, *leaf.shape[len(leading) :]), leaf.dtype), likes)
 
 
 def of_results(parts: Any) -> list[Any]:
-    """Shapes of the leaves of what the steps of these arguments give."""
+    """Shapes of the leaves of the results of steps with these arguments."""
     arrays: Arrays = parts[1]
     *leading, _, replicas = arrays.parameters.shape
     pressure = jax.ShapeDtypeStruct((*leading, 3, replicas), arrays.parameters.dtype)
@@ -156,12 +157,12 @@ def of_results(parts: Any) -> list[Any]:
 
 
 def of_arrays(parts: Any) -> list[Any]:
-    """Shapes of the leaves of their `Arrays`."""
+    """Shapes of the leaves of derivatives with respect to the `Arrays` of these arguments."""
     return jax.tree.leaves(with_leading(parts, parts[1]))
 
 
 Names = tuple[str | None, ...]
-"""What the axes of an array are to all others: a leading axis, the replicas, or (None) nothing to be shared out."""
+"""Names of the axes of an array: one for each leading axis, "replicas", or None for axes that are not split."""
 
 
 def _names(leading: tuple[int, ...], shape: Sequence[int], replicas: bool = True) -> Names:
@@ -171,14 +172,14 @@ def _names(leading: tuple[int, ...], shape: Sequence[int], replicas: bool = True
 
 
 def _names_of_arguments(parts: Any) -> list[Names]:
-    """Of all leaves in turn."""
+    """The names of the axes of all leaves of the arguments, in their order."""
     fixed, *others = parts
     leading = _leading(parts)
     own = jax.tree.leaves(others)
     return [_names(leading, leaf.shape, False) for leaf in fixed] + [_names(leading, leaf.shape) for leaf in own]
 
 
-# What a call does: in the library, and elsewhere.
+# The call in the library, and in plain JAX.
 
 
 def call_library(
@@ -190,7 +191,7 @@ def call_library(
     del pack["incidence"]
     before = [*arrays.fields, *pack.values(), arrays.parameters, arrays.walls]
     shapes, aliases = outputs(parts), {}
-    if in_place:  # histories, much the largest arrays, are updated where they are
+    if in_place:  # histories, by far the largest arrays, are updated in their own memory
         for number, leaf in enumerate(arrays.history):
             argument, result = len(before) + number, len(arrays.fields) + 1 + number
             if leaf.shape == shapes[result].shape:
@@ -201,7 +202,7 @@ def call_library(
 
 
 def over(function: Callable[..., Any], leading: tuple[int, ...]) -> Callable[..., Any]:
-    """`function` for every index into leading axes."""
+    """`function` mapped over leading axes."""
     if not leading:
         return function
 
@@ -225,21 +226,21 @@ def make_primitive(
     in_place: bool = False,
     make: Callable[..., Sequence[jax.Array]] = call_library,
 ) -> Primitive:
-    """A call whose results have the shapes `outputs`.
+    """The primitive of a call whose results have the shapes `outputs`.
 
     Args:
-        target: what XLA knows it by.
-        outputs: the shapes, of its arguments.
-        plain: what it does where there is no library.
-        in_place: whether histories are updated where they are.
-        make: how it is made, with the arguments of `call_library`.
+        target: name of the call in XLA.
+        outputs: function from the arguments to the shapes of the results.
+        plain: the call in plain JAX, a function of the definition and the arguments.
+        in_place: whether histories are updated in their own memory.
+        make: makes the call of the library, with the arguments of `call_library`.
     """
     primitive = Primitive(target)
     primitive.multiple_results = True
 
     def abstract(*leaves: Any, tree: Any, **_: Any) -> list[Any]:
         parts = jax.tree.unflatten(tree, leaves)
-        # Where the mesh is part of types, an axis is split as in the first argument in which it is.
+        # If types contain the mesh, an axis of a result is split as in the first argument in which it is split.
         mesh, split = leaves[0].sharding.mesh, {}
         for leaf, names in zip(leaves, _names_of_arguments(parts), strict=True):
             for name, axes in zip(names, leaf.sharding.spec, strict=True):
@@ -304,7 +305,7 @@ def make_primitive(
     compiled = jax.jit(primitive.bind, static_argnames=("tree", "call", "definition"))
 
     def alone(*leaves: Any, **static: Any) -> Any:
-        with jax.disable_jit(False):  # where it is off, `compiled` would call itself
+        with jax.disable_jit(False):  # with jit disabled, `compiled` would call itself
             return compiled(*leaves, **static)
 
     primitive.def_impl(alone)
@@ -316,7 +317,7 @@ def make_primitive(
     mlir.register_lowering(primitive, library, platform="cpu")
     mlir.register_lowering(primitive, on_cuda, platform="cuda")
     mlir.register_lowering(primitive, on_others)
-    # `custom_partitioning` wants to know the devices, and JAX has no public name for saying so.
+    # `custom_partitioning` needs to know the devices, and JAX has no public way to ask for them.
     dispatch.prim_requires_devices_during_lowering.add(primitive)
     return primitive
 
@@ -335,7 +336,7 @@ def _sharded(here: Callable[..., Any], parts: Any, outputs: Callable[[Any], list
         split = {}
         for name, size, axes in zip(results[0], first.shape, first.sharding.spec, strict=True):
             parts = math.prod(mesh.shape[axis] for axis in (axes if isinstance(axes, tuple) else (axes,)) if axis)
-            # Padding could be anything, and the library is not asked to survive that.
+            # An axis is split only into equal parts: padding holds arbitrary numbers, which may break the library.
             split[name] = axes if name and size % parts == 0 else None
 
         def placed(names: Names) -> NamedSharding:

@@ -17,18 +17,18 @@ from gmem_jax.physics.system import System
 
 
 class Listed(NamedTuple):
-    """What replicas have in common.
+    """The arguments that replicas share.
 
     Attributes:
-        first: of `Pairs`, [P], as the next three.
+        first: see `Pairs`, [P]; so for the next three.
         second: [P].
         valid: [P].
         grain_pair: [P].
-        images: of `gmem_jax.native.calls.Fixed`, [P, 3] or [P, 0], as the next two.
+        images: see `gmem_jax.native.calls.Fixed`, [P, 3] or [P, 0]; so for the next two.
         radii: [K, 1] or [K, 0].
         sizes: [N, 1] or [N, 0].
         offsets: sphere centres of a grain, [K, 3], in R.
-        reference: of `Pairs`, [S, 3, 1] where replicas share it; else [S, 3, 0].
+        reference: `Pairs.reference`, [S, 3, 1], if replicas share it; else [S, 3, 0].
     """
 
     first: jax.Array
@@ -43,13 +43,13 @@ class Listed(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What each replica has of its own.
+    """The arguments that each replica has of its own.
 
     Attributes:
         fields: leaves of `Grains`, [N, 3 or 4, B].
-        walls: lower and upper ones, [6, B].
-        edges: of the periodic cell, [3, B].
-        reference: of `Pairs`, [S, 3, B], where replicas do not share it; else [0, 3, B].
+        walls: lower and upper planes, [6, B].
+        edges: edges of the periodic cell, or of the box, [3, B].
+        reference: `Pairs.reference`, [S, 3, B], if replicas do not share it; else [0, 3, B].
     """
 
     fields: list[jax.Array]
@@ -70,7 +70,7 @@ def census_by_library(system: System, state: State, box: Box) -> Census:
 
 
 def census_anywhere(system: System, state: State, box: Box) -> Census:
-    """`census_by_library` on CPUs where there is the library, its definition elsewhere."""
+    """`census_by_library` in programs for CPUs, if the library is available; else `take_census`."""
     if state.grains.position.dtype != jnp.float64 or not library.available()[0]:
         return take_census(system, state, box)
     return _census(system, state, box, anywhere=True)
@@ -95,14 +95,14 @@ def _census(system: System, state: State, box: Box, anywhere: bool) -> Census:
         jnp.broadcast_to(reference[: 0 if shared else None], (0 if shared else len(reference), 3, replicas)),
     )
     definition = PlainCensus(jax.tree.structure(system), anywhere, box.periodic)
-    call = calls.Call(0, 0, 0, 0, 0, periodic=bits_of(box.periodic), unequal=int(not system.clump.equal))  # of any law
+    call = calls.Call(0, 0, 0, 0, 0, periodic=bits_of(box.periodic), unequal=int(not system.clump.equal))  # for any law
     (found,) = calls.bind(_census_p, call, definition, listed, seen)
     return Census(*found)
 
 
 @dataclass(frozen=True)
 class PlainCensus:
-    """`take_census` on the arguments of a call, `gmem_jax.native.calls.Definition`.
+    """`take_census` on the arguments of a call; a `gmem_jax.native.calls.Definition`.
 
     Attributes:
         system: structure of the `System`.
@@ -152,7 +152,7 @@ def _rows(parts: tuple[Listed, Seen]) -> list[jax.ShapeDtypeStruct]:
 def _call(
     target: str, outputs: Callable[[Any], list[Any]], call: calls.Call, in_place: bool, parts: Any
 ) -> Sequence[jax.Array]:
-    """`gmem_jax.native.calls.call_library` for a census: nothing is `in_place`."""
+    """`gmem_jax.native.calls.call_library` for a census; `in_place` is not used."""
     run = jax.ffi.ffi_call(target, outputs(parts))
     found: Sequence[jax.Array] = run(*jax.tree.leaves(parts), periodic=call.periodic, unequal=call.unequal)
     return found

@@ -2,8 +2,8 @@
 
 The kernels (src/cuda) are the physics of the CPU's library, compiled where they run by NVRTC. A step is two launches: a
 thread is a candidate of a replica in the first, and a grain in the second. Reverse mode keeps what it needs of each
-step, and then goes back through them (src/cuda/back.h). What is kept, or needed from one step to the next, are further
-results of the call, so that XLA manages all memory.
+step, and then goes back through the steps (src/cuda/back.h). Arrays that are kept, or needed from one step to the next,
+are further results of the call, so that XLA manages all memory.
 """
 
 import ctypes
@@ -30,14 +30,14 @@ CUDA_TARGETS = {
 """Symbols of the library by the names of calls; see `serves`."""
 
 Task = Literal["forward", "tangent", "adjoint"]
-"""What kernels are compiled for, in the order of src/physics/parameters.h."""
+"""The task that kernels are compiled for, in the order of src/physics/parameters.h."""
 
 _NAMES = ("libnvrtc.so.13", "libnvrtc.so.12", "libnvrtc.so")
 _registered: list[ctypes.CDLL] = []  # the library, once it is loaded
 
 
 def _nvrtc() -> str:
-    """Where NVRTC may be, joined by ":": as Python packages bring it, the newest first, and where the system has it."""
+    """Paths where NVRTC may be, joined by ":": those of Python packages, the newest first, then names of the system."""
     spec = find_spec("nvidia")
     roots = [] if spec is None else list(spec.submodule_search_locations or ())
     found = [path for root in roots for path in Path(root).glob("*/lib/libnvrtc.so.*") if path.suffix[1:].isdigit()]
@@ -46,7 +46,7 @@ def _nvrtc() -> str:
 
 
 def _architectures() -> set[str]:
-    """The GPUs of this process, as "sm_90"; none where it has none."""
+    """The architectures of the GPUs of this process, like "sm_90"."""
     try:
         devices = jax.local_devices(backend="cuda")
     except RuntimeError:
@@ -57,7 +57,7 @@ def _architectures() -> set[str]:
 
 @functools.cache
 def missing() -> str:
-    """Why GPUs run plain JAX; "" if they need not, as far as that is known before a program runs."""
+    """Why GPUs run plain JAX; "" if the kernels can run, as far as that is known before a program runs."""
     if not _registered:
         return "the native library is not there"
     said = ctypes.create_string_buffer(1 << 10)
@@ -69,17 +69,17 @@ def missing() -> str:
 
 @functools.cache
 def warn_no_nvrtc(reason: str) -> None:
-    """Say that a GPU could be faster, and how."""
+    """Warn that plain JAX runs on the GPU, and say why; once for each reason."""
     warnings.warn(f"plain JAX runs on the GPU, and slowly: {reason}", stacklevel=2)
 
 
 def serves(target: str, call: Any) -> bool:
-    """Whether there are kernels for a call; if not, GPUs have it in plain JAX.
+    """Whether there are kernels for a call; if not, GPUs run it in plain JAX.
 
-    Reverse mode is of equal spheres between smooth walls, with any law but Mindlin's. There are no second derivatives.
+    Reverse mode has kernels for equal spheres between smooth walls, under any law but M2. Second derivatives have none.
 
     Args:
-        target: what XLA knows the call by.
+        target: name of the call in XLA.
         call: its attributes, `gmem_jax.native.calls.Call`.
     """
     beyond = call.points or call.periodic or call.unequal or call.rubs
@@ -87,7 +87,7 @@ def serves(target: str, call: Any) -> bool:
 
 
 def _cache() -> str:
-    """The folder for compiled kernels; "" where nothing is to be kept."""
+    """The folder for compiled kernels; "" if they are not kept."""
     chosen = os.environ.get("GMEM_COMPILE_CACHE", "")
     if chosen == "off":
         return ""
@@ -98,12 +98,12 @@ def _cache() -> str:
 
 
 def initializing(symbol: str) -> str:
-    """The symbol of what loads the kernels of a call, before it is made."""
+    """The symbol of the function that loads the kernels of a call before it is made."""
     return f"{symbol}_load"
 
 
 def register(library: ctypes.CDLL, sources: Path) -> None:
-    """Tell XLA of the library's calls on GPUs, and the library where its sources are."""
+    """Register the calls on GPUs with XLA, and tell the library where NVRTC, its sources and its cache are."""
     for target, symbol in CUDA_TARGETS.items():
         stages = {"initialize": initializing(symbol), "execute": symbol}
         handlers = {stage: jax.ffi.pycapsule(getattr(library, name)) for stage, name in stages.items()}
@@ -113,11 +113,11 @@ def register(library: ctypes.CDLL, sources: Path) -> None:
 
 
 class Needs(NamedTuple):
-    """What a kernel takes of a multiprocessor.
+    """The resources that a kernel needs.
 
     Attributes:
-        registers: of a thread.
-        spilt: bytes of a thread that go to memory and back, because it has no more registers.
+        registers: registers of a thread.
+        spilt: bytes that a thread stores in memory and loads again, because it has no more registers.
     """
 
     registers: int
@@ -127,14 +127,14 @@ class Needs(NamedTuple):
 def kernel_needs(
     library: ctypes.CDLL, law: int, variant: int, architecture: str, task: Task = "forward"
 ) -> dict[str, Needs]:
-    """The kernels, compiled for an architecture without a GPU, by their names.
+    """The needs of the kernels of a law by their names, compiled for an architecture; no GPU need be present.
 
     Args:
         library: the native library.
-        law: its number, as of `gmem_jax.native.calls.Call`.
-        variant: alike.
-        architecture: as "sm_90".
-        task: what the kernels are for; "adjoint" for a law that has reverse mode there.
+        law: number of the law, as in `gmem_jax.native.calls.Call`.
+        variant: number of its variant, likewise.
+        architecture: the architecture, like "sm_90".
+        task: the task of the kernels; "adjoint" for a law that has reverse mode on GPUs.
 
     Raises:
         RuntimeError: if there is no NVRTC, or it fails.
@@ -155,7 +155,7 @@ def is_sound(pairs: Any) -> jax.Array:
     """Whether every candidate is listed once by each of its two spheres, and nothing else is.
 
     Args:
-        pairs: with `first`, `second`, `valid`, [P], and `incidence`, [S, C], as of `Pairs`.
+        pairs: an object with `first`, `second`, `valid`, [P], and `incidence`, [S, C], as in `Pairs`.
     """
     capacity, rows = len(pairs.first), pairs.incidence
     spheres = jnp.arange(len(rows), dtype=jnp.int32)[:, None]
@@ -171,16 +171,16 @@ def is_sound(pairs: Any) -> jax.Array:
 def between_steps(
     fixed: Any, history: Sequence[Any], grains: int, call: Any, kinds: int, lanes: int, kept: int | None = None
 ) -> list[Any]:
-    """Shapes of what the kernels need from one step to the next; see src/cuda/arguments.h.
+    """Shapes of the arrays that the kernels need from one step to the next; see src/cuda/arguments.h.
 
     Args:
-        fixed: of the call.
-        history: of the call, leaves [1, P, ..., B], and [1, 6 S, ..., B] where walls have friction.
-        grains: N.
-        call: its attributes, `gmem_jax.native.calls.Call`.
+        fixed: the `Fixed` arguments of the call.
+        history: the histories of the call, leaves [1, P, ..., B], and [1, 6 S, ..., B] where walls have friction.
+        grains: number of grains N.
+        call: attributes of the call, `gmem_jax.native.calls.Call`.
         kinds: one for values, two for values and derivatives.
-        lanes: replicas of all entries, L.
-        kept: steps that reverse mode keeps, T; None forwards.
+        lanes: number of replicas of all entries together, L.
+        kept: number of steps that reverse mode keeps, T; None in a forward run.
     """
     spheres, rows = fixed.incidence.shape[1], fixed.first.shape[1]
 
@@ -191,7 +191,7 @@ def between_steps(
     found += [array(kinds, spheres, 12 if call.rubs or kept is not None else 6)]
     found += [array(kinds, rows, 6 if kept is None else 18)]
     found += [array(rows + spheres, dtype=jnp.uint8)]
-    if kinds == 2 or kept is not None:  # forwards, of values alone, histories are in the results
+    if kinds == 2 or kept is not None:  # in a forward run of values alone, the results hold the histories
         found += [array(kinds, *leaf.shape[1:3]) for leaf in history if leaf.ndim == 4]
     for count in (rows, 6 * spheres)[: 1 + call.rubs if call.points else 0]:
         found += [array(kinds, count, 6), array(kinds, count, call.points, 3), array(count, dtype=jnp.int32)]
@@ -199,26 +199,26 @@ def between_steps(
         return found
     remembered, chunks = sum(leaf.shape[2] for leaf in history), -(-grains // 64)
     found += [array(kept, grains, 19), array(kept, grains, 6), array(kept, rows, remembered)]
-    found += [array(grains, 19), array(grains, 12)]  # of the step that is gone back through; then sums
+    found += [array(grains, 19), array(grains, 12)]  # for the step that reverse mode is at; then sums
     return [*found, array(grains, 14 + 3 * (spheres // grains)), array(rows, 7), array(kept, chunks, 12)]
 
 
 def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Sequence[Any]) -> Sequence[jax.Array]:
-    """A call of the library, with results of the given shapes, and what was needed between its steps.
+    """A call of the library; returns the results, of the given shapes, and then the arrays of `between_steps`.
 
     Args:
-        target: what XLA knows it by.
-        call: its attributes, `gmem_jax.native.calls.Call`.
-        in_place: whether histories may take the place of those that were given.
-        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`; then the tangent's `Arrays` or, for reverse mode, a
-            `StepOutput`.
-        shapes: of the results.
+        target: name of the call in XLA.
+        call: attributes of the call, `gmem_jax.native.calls.Call`.
+        in_place: whether new histories may overwrite those that were given.
+        parts: `Fixed` and `Arrays` of `gmem_jax.native.calls`; then the `Arrays` of the tangent or, for reverse mode,
+            a `StepOutput`.
+        shapes: shapes of the results.
     """
     outer = shapes[0].shape[:-3]
     entries = math.prod(outer)
 
     def flat(leaf: jax.Array) -> jax.Array:
-        """With one leading axis, of size one or of that of all."""
+        """A leaf with its leading axes joined in one, of size one or `entries`."""
         inner = leaf.shape[len(outer) :]
         if math.prod(leaf.shape[: len(outer)]) == 1:
             return leaf.reshape(1, *inner)
@@ -231,7 +231,7 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
     sound = jax.vmap(lambda **lists: is_sound(fixed._replace(**lists)))(**whole)
     blank, odd = 2 * fixed.first.shape[1], -fixed.incidence.shape[2] % 4
     lists["incidence"] = jnp.pad(fixed.incidence, ((0, 0), (0, 0), (0, odd)), constant_values=blank)  # read in fours
-    numbers = jnp.where(sound[:, None, None], arrays.parameters, jnp.nan)  # there is no other way to refuse a list
+    numbers = jnp.where(sound[:, None, None], arrays.parameters, jnp.nan)  # a call cannot refuse a list otherwise
     before = [*arrays.fields, *lists.values(), fixed.images]
     before += [arrays.offsets[..., 0], fixed.radii, fixed.sizes]
     before += [numbers, arrays.walls]
@@ -244,13 +244,13 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
                 aliases[argument] = result
     _, grains, _, replicas = arrays.fields[0].shape
     lanes = entries * replicas
-    along = [type(one) is type(arrays) for one in slopes]  # or derivatives by the results: reverse mode
+    along = [type(one) is type(arrays) for one in slopes]  # else derivatives by the results: reverse mode
     kept = None if all(along) else arrays.walls.shape[1]
     kinds = 2 if any(along) else 1
     between = between_steps(fixed, arrays.history, grains, call, kinds, lanes, kept)
     ffi = jax.ffi.ffi_call(target, [*results, *between], input_output_aliases=aliases)
     found: list[jax.Array] = list(ffi(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict()))
-    if kept is not None:  # where nothing touches, not all derivatives ask for the parameters
+    if kept is not None:  # where nothing touches, not all derivatives depend on the parameters, and so become NaN
         for number, bar in enumerate(found[: len(arrays.fields) + 3]):
             known = jnp.expand_dims(sound, tuple(range(1, bar.ndim)))
             found[number] = jnp.where(known, bar, jnp.full_like(bar, jnp.nan))

@@ -46,7 +46,7 @@ def available() -> tuple[bool, str]:
 
 
 def cpus() -> int | None:
-    """How many CPUs this process may keep busy: fewer than it may run on where its container has a quota of their time.
+    """Number of CPUs that this process may keep busy: a quota of CPU time may allow fewer than it may run on.
 
     None if the library is not available.
     """
@@ -65,10 +65,10 @@ def require_library() -> None:
 
 
 def require_threads() -> None:
-    """Refuse a GMEM_THREADS that the library would refuse in its first call: what is planned before says its cost.
+    """Refuse a GMEM_THREADS that the library would refuse in its first call, before work is begun.
 
     Raises:
-        ValueError: if it is no number of threads.
+        ValueError: if it is not a number of threads.
     """
     told = os.environ.get("GMEM_THREADS", "")
     if told and not (re.fullmatch(r"\s*\+?[0-9]{1,9}", told) and 1 <= int(told) <= MOST_THREADS):
@@ -88,11 +88,11 @@ def entry(law: FrictionLaw) -> Entry:
 
 
 def needs(law: FrictionLaw, architecture: str, task: cuda.Task = "forward") -> dict[str, cuda.Needs]:
-    """What the kernels of a law take of a GPU, compiled for its architecture ("sm_90") on this machine.
+    """Registers and spills of the kernels of a law, compiled on this machine for the architecture of a GPU.
 
     Args:
-        law: one that the library knows.
-        architecture: as NVRTC calls it.
+        law: a law that the library knows.
+        architecture: the architecture as NVRTC names it, like "sm_90".
         task: what the kernels are for; "adjoint" for a law that has reverse mode on GPUs.
 
     Raises:

@@ -27,7 +27,7 @@ from gmem_jax.physics.system import System
 March = Callable[[System, State, Box, Scalar, Scalar], tuple[State, jax.Array]]
 """The signature of `gmem_jax.physics.step.march`."""
 
-_LAW_NUMBERS = max(len(entry.numbers) for entry in LAWS)  # rows of the parameter array for a law's own
+_LAW_NUMBERS = max(len(entry.numbers) for entry in LAWS)  # rows of the parameter array for the numbers of a law
 
 
 def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
@@ -41,12 +41,12 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
         drag: scalar or [B], in 1 / t_c.
 
     Returns:
-        The state after them, and the sum over the steps of the wall pressures, [3, B], in E.
+        The state after all steps, and the sum of the wall pressures over the steps, [3, B], in E.
 
     Raises:
         ValueError: if the backend is not available, does not know the friction law, or the state is not float64; or if
             an argument does not fit the number of replicas.
-        NotImplementedError: if it is compiled for anything but a CPU or a CUDA GPU, or for that without NVRTC.
+        NotImplementedError: if it is compiled for anything but a CPU or a CUDA GPU, or for a GPU without NVRTC.
     """
     return _march(system, state, boxes, dt, drag, _Mode())
 
@@ -54,11 +54,12 @@ def march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) ->
 def march_mixed(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
     """`march` with contacts in single precision: their forces, torques and histories.
 
-    Positions, orientations, velocities, the sums of forces and the gaps of contacts are in double precision, and the
-    gaps rounded. It pays from many replicas side by side, so that a lone one runs in double precision.
+    Positions, orientations, velocities and the sums of forces are in double precision. The gaps of contacts are
+    computed in double precision, and then rounded. Only many replicas side by side are faster so; a single replica runs
+    in double precision.
 
     Raises:
-        ValueError: as of `march` and `require_mixed`.
+        ValueError: as in `march` and `require_mixed`.
     """
     require_mixed(system.friction, boxes.periodic, system.clump.equal, system.wall_mu is None)
     return _march(system, state, boxes, dt, drag, _Mode(mixed=state.replicas > 1))
@@ -84,7 +85,7 @@ def require_mixed(law: FrictionLaw, periodic: PeriodicAxes, equal: bool, smooth:
 
 
 def march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar) -> tuple[State, jax.Array]:
-    """`march` on CPUs and CUDA GPUs, its definition elsewhere."""
+    """`march` on CPUs and CUDA GPUs, if the library is available and knows the friction law; else plain JAX."""
     if entry_of(system.friction) is None:
         return dynamics.march(system, state, boxes, dt, drag)
     built, reason = library.available()
@@ -96,16 +97,16 @@ def march_anywhere(system: System, state: State, boxes: Box, dt: Scalar, drag: S
 
 @functools.cache
 def warn_no_library(reason: str) -> None:
-    """Say that a CPU could be faster, and how."""
+    """Warn that plain JAX runs because the library is not available; once for each reason."""
     warn_caller(f"plain JAX runs, and slowly: the native backend is not available: {reason}")
 
 
 class _Mode(NamedTuple):
-    """How the steps of a bin are done.
+    """How the steps of a bin are run.
 
     Attributes:
-        anywhere: their definition stands for them where there is no library.
-        mixed: contacts in single precision.
+        anywhere: whether plain JAX may run on devices without the library.
+        mixed: whether contacts are in single precision.
     """
 
     anywhere: bool = False
@@ -130,7 +131,7 @@ def _march(system: System, state: State, boxes: Box, dt: Scalar, drag: Scalar, m
     return replace(state, grains=grains, history=history, cell=cell, wall_history=walls), total
 
 
-_Histories = tuple[Any, Any]  # of the candidates, and of walls with friction
+_Histories = tuple[Any, Any]  # history of the candidates, and history of walls with friction
 _Result = tuple[Grains, _Histories, jax.Array]
 _Numbers = tuple[jax.Array, jax.Array]
 
@@ -139,10 +140,10 @@ _Numbers = tuple[jax.Array, jax.Array]
 def _bin(
     mode: _Mode, system: System, grains: Grains, histories: _Histories, boxes: Box, numbers: _Numbers, cell: Box | None
 ) -> _Result:
-    """The steps whose walls are `boxes` ([steps, 3, B]) from the periodic `cell` on; `numbers` are (dt, drag).
+    """The steps with walls `boxes` ([steps, 3, B]), which begin in the periodic `cell`; `numbers` are (dt, drag).
 
     Returns:
-        The grains, the histories, and the sum over the steps of the wall pressures, [3, B].
+        The grains, the histories, and the sum of the wall pressures over the steps, [3, B].
     """
     arrays = _arrays(system, grains, histories, boxes, numbers, cell)
     definition = PlainDefinition.of(system, histories[0], mode.anywhere, boxes.periodic, histories[1])
@@ -152,8 +153,8 @@ def _bin(
 
 @functools.partial(_bin.defjvp, symbolic_zeros=True)
 def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[_Result, _Result]:
-    """The tangent with respect to what is being differentiated and no more."""
-    if mode.mixed:  # the adjoint does not know what was rounded: docs/decisions/computing.md
+    """The tangent of `_bin`, computed only for the arguments whose tangents are not zero."""
+    if mode.mixed:  # the adjoint does not know about the rounding: docs/decisions/computing.md
         raise NotImplementedError("there are no derivatives in mixed precision; use precision='double'")
     leaves, structure = jax.tree.flatten(primals)
     slopes = jax.tree.leaves(tangents)
@@ -170,7 +171,8 @@ def _bin_jvp(mode: _Mode, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -
     system, _, histories, boxes, *_ = primals
     shape = tangents[0].clump
     if not all(map(_is_zero, jax.tree.leaves((shape.radii, shape.sizes)))):
-        # The library has no derivatives by these. By lists there is none: they say where contacts can be.
+        # The library has no derivatives with respect to radii and sizes. (The lists, which depend on these too, have
+        # none: they only say where contacts can be.)
         _, slope = jax.jvp(lambda *varied: _plain(*filled(varied)), varied, directions)
         return _bin(mode, *primals), slope
     arrays, along = jax.jvp(lambda *varied: _arrays(*filled(varied)), varied, directions)
@@ -186,7 +188,7 @@ def _is_zero(slope: Any) -> bool:
 def _plain(
     system: System, grains: Grains, histories: _Histories, boxes: Box, numbers: _Numbers, cell: Box | None
 ) -> _Result:
-    """The definition of `_bin`."""
+    """`_bin` in plain JAX."""
     history, walls = histories
     state = State(grains, history, jnp.zeros(grains.position.shape[-1], jnp.int32), cell=cell, wall_history=walls)
     state, total = dynamics.march(system, state, boxes, *numbers)
@@ -194,7 +196,7 @@ def _plain(
 
 
 class _Solid(NamedTuple):
-    """What a step asks of a `Material`."""
+    """The properties of a `Material` that a step uses."""
 
     normal_stiffness: jax.Array
     normal_damping: jax.Array
@@ -203,11 +205,11 @@ class _Solid(NamedTuple):
 
 @dataclass(frozen=True)
 class PlainDefinition:
-    """`_plain` on the arguments of a call, `gmem_jax.native.calls.Definition`.
+    """`_plain` on the arguments of a call; a `gmem_jax.native.calls.Definition`.
 
     Attributes:
         system: structure of the `System`.
-        history: structure of the histories, of the candidates and of walls with friction.
+        history: structure of the histories of candidates and of walls with friction.
         anywhere: see `gmem_jax.native.calls.Definition`.
         periodic: the periodic axes of the box.
     """
@@ -226,11 +228,11 @@ class PlainDefinition:
         periodic: PeriodicAxes = WALLS,
         wall_history: Any = None,
     ) -> "PlainDefinition":
-        """That of a system with such histories."""
+        """The definition for a system with these histories."""
         return cls(jax.tree.structure(system), jax.tree.structure((history, wall_history)), anywhere, periodic)
 
     def __call__(self, fixed: Fixed, arrays: Arrays) -> StepOutput:
-        """The steps."""
+        """The results of the steps."""
         empty: System = jax.tree.unflatten(self.system, [None] * self.system.num_leaves)
         dt, drag, mass, *inertia = arrays.parameters[:6]
         own, (gravity, *_, wall_mu) = arrays.parameters[9:-8], arrays.parameters[-8:]
@@ -258,7 +260,7 @@ class PlainDefinition:
 
 
 def call_of(system: System, periodic: PeriodicAxes = WALLS) -> Call:
-    """What the library is told beside arrays, of a system in a box with these periodic axes."""
+    """The attributes of a call for a system in a box with these periodic axes."""
     law = system.friction
     row = library.entry(law)
     return Call(
@@ -274,12 +276,12 @@ def call_of(system: System, periodic: PeriodicAxes = WALLS) -> Call:
 
 
 def bits_of(periodic: PeriodicAxes) -> int:
-    """The periodic axes as the library is told of them, a bit each."""
+    """The periodic axes as an integer for the library, one bit for each axis."""
     return sum(int(is_periodic) << axis for axis, is_periodic in enumerate(periodic))
 
 
 def fixed_of(system: System) -> Fixed:
-    """Arguments without derivatives."""
+    """The arguments of a call with respect to which it cannot be differentiated."""
     pairs, clump = system.pairs, system.clump
     candidates = (pairs.first, pairs.second, pairs.valid, pairs.incidence, pairs.reference[..., 0], pairs.smallest)
     images = jnp.zeros((pairs.capacity, 0), jnp.int8) if pairs.image is None else pairs.image
@@ -298,7 +300,7 @@ def arrays_of(
     cell: Box | None = None,
     wall_history: Any = None,
 ) -> Arrays:
-    """Arguments with derivatives."""
+    """The arguments of a call with respect to which it can be differentiated."""
     walls = jnp.concatenate([boxes.lower, boxes.upper, boxes.lower_velocity, boxes.upper_velocity], axis=1)
     replicas = grains.position.shape[-1]
     parameters, offsets = _parameters(system, numbers, cell, replicas), system.clump.offsets
@@ -319,7 +321,7 @@ def _result(grains: Grains, histories: _Histories, results: StepOutput) -> _Resu
 
 
 def _parameters(system: System, numbers: _Numbers, cell: Box | None, replicas: int) -> jax.Array:
-    """What parameters.h calls the rows of the parameter array, [rows, B]."""
+    """The parameter array, [rows, B]; its rows are those of src/physics/parameters.h."""
     law, clump, material = system.friction, system.clump, system.material
     own = [getattr(law, number) for number in library.entry(law).numbers]
     own += [1.0] * (_LAW_NUMBERS - len(own))

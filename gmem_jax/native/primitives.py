@@ -1,10 +1,10 @@
-"""Calls into the library that JAX can differentiate: the steps of a bin, their tangent, and the transpose of that.
+"""Calls into the library that JAX can differentiate: the steps of a bin, their tangent, and its transpose.
 
 The tangent is a primitive of JAX with a rule for its transpose, so that `jax.jvp`, `jax.linearize`, `jax.grad` and
-their compositions with `jax.vmap` and `jax.checkpoint` all come out of the two calls. Forward mode runs the steps in
-numbers that carry a derivative; reverse mode redoes them, remembers each step, and goes back (src/cpu/adjoint.h).
-Where it would remember too much at once, it goes back through one piece of the steps after the other.
-Second derivatives are the derivative of the adjoint along a direction: reverse mode in numbers that carry one.
+their compositions with `jax.vmap` and `jax.checkpoint` all follow from the two calls. Forward mode runs the steps in
+numbers that carry a derivative. Reverse mode runs the steps again, keeps each of them, and goes back through them
+(src/cpu/adjoint.h). If that would take too much memory, it does so for one piece of the steps after the other. Second
+derivatives are the derivative of the adjoint along a direction: reverse mode in numbers that carry a derivative.
 """
 
 import functools
@@ -29,13 +29,13 @@ from gmem_jax.native.calls import (
     results_of,
 )
 
-# Bytes for what reverse mode keeps of the steps of a call. The usual 12 steps of 10,240 grains keep 0.7 GB with law H;
-# to go back in pieces costs one more way forward, which only longer bins of large packs are to pay.
+# Bytes that reverse mode may keep of the steps of a call. The usual 12 steps of 10,240 grains keep 0.7 GB with law H.
+# Going back in pieces costs one more forward run, so that only longer bins of large packs do it.
 STEPS_ROOM = 2**30
 
 
 def advance(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays) -> StepOutput:
-    """All steps; not differentiable by itself."""
+    """All steps of a call."""
     return results_of(arrays, bind(_forward_p, call, definition, fixed, arrays))
 
 
@@ -44,7 +44,7 @@ def tangent(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, al
     return results_of(arrays, bind(_tangent_p, call, definition, fixed, arrays, along))
 
 
-# The same in plain JAX, where there is no library.
+# The calls in plain JAX, for devices without the library.
 
 
 def _plain_forward(definition: Definition, fixed: Fixed, arrays: Arrays) -> StepOutput:
@@ -90,7 +90,7 @@ _second_tangent_p = make_primitive("gmem_second_tangent", of_results, _no_second
 
 
 def _sums(found: Sequence[jax.Array], places: Sequence[Any]) -> list[jax.Array | None]:
-    """Derivatives by those arguments that are wanted, summed over leading axes that one did not have."""
+    """Derivatives with respect to the unknown arguments, summed over leading axes along which these have size one."""
 
     def fitted(slope: jax.Array, place: Any) -> jax.Array | None:
         if not ad.is_undefined_primal(place):
@@ -107,12 +107,13 @@ def _whole_slopes(slopes: Sequence[Any]) -> list[jax.Array]:
 
 
 def piece_count(call: Call, arrays: Arrays) -> int:
-    """How many pieces reverse mode cuts the steps of a call into.
+    """Number of pieces into which reverse mode cuts the steps of a call.
 
-    T steps that keep more than `STEPS_ROOM` are cut into about sqrt(T), into fewer where a state, kept before each
-    piece, takes more than a step keeps (Mindlin's rings). What steps keep is counted as room for the replicas that a
-    CPU takes side by side: 25 numbers of a grain (19 of its state, force and torque) and the histories, of rings six
-    numbers a contact. In periodic boxes, where pieces would begin with edges of their own, the steps are one piece.
+    T steps that would keep more than `STEPS_ROOM` are cut into about sqrt(T) pieces. There are fewer pieces if a state,
+    which is kept before each piece, takes more memory than a step keeps (M2, with its rings). The memory is that for
+    the replicas that a CPU takes side by side: 25 numbers for a grain (19 of its state, 6 of force and torque), and the
+    histories, where a contact with rings keeps six numbers. In periodic boxes a piece would begin with its own edges;
+    there the steps are one piece.
     """
     steps, _, replicas = arrays.walls.shape[-3:]
     inner = [leaf.shape[arrays.walls.ndim - 3 : -1] for leaf in arrays.history]  # [P, h], or [P, Q, 2] of rings
@@ -125,9 +126,10 @@ def piece_count(call: Call, arrays: Arrays) -> int:
 
 
 def _adjoint(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, slopes: StepOutput) -> list[jax.Array]:
-    """The leaves of derivatives by `arrays`, from those by the results of the steps.
+    """The leaves of derivatives with respect to `arrays`, from derivatives with respect to the results of the steps.
 
-    The state before each piece of the steps is kept; what a piece keeps, while it is gone back through.
+    The state before each piece is kept from the beginning. The steps of a piece are kept only while reverse mode goes
+    back through it.
     """
     pieces = jnp.array_split(arrays.walls, piece_count(call, arrays), axis=-3)
     before = [arrays._replace(walls=pieces[0])]
@@ -149,7 +151,7 @@ def _adjoint(call: Call, definition: Definition, fixed: Fixed, arrays: Arrays, s
 def _transpose_tangent(
     slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition
 ) -> list[Any]:
-    """From derivatives by the results to derivatives by what the tangent was linear in."""
+    """The transpose of the tangent: from derivatives by its results to derivatives by the direction."""
     fixed, arrays, _ = jax.tree.unflatten(tree, arguments)
     known = len(jax.tree.leaves((fixed, arrays)))
     on_results = results_of(arrays, _whole_slopes(slopes))
@@ -160,7 +162,7 @@ def _transpose_tangent(
 def _transpose_second_tangent(
     slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition
 ) -> list[Any]:
-    """Of what is linear and symmetric in two directions, of which one is known."""
+    """The transpose of the second tangent, which is linear and symmetric in two directions, of which one is known."""
     fixed, arrays, *directions = jax.tree.unflatten(tree, arguments)
     known = len(jax.tree.leaves((fixed, arrays)))
     on_results = results_of(arrays, _whole_slopes(slopes))
@@ -172,7 +174,7 @@ def _transpose_second_tangent(
 def _transpose_second_adjoint(
     slopes: Sequence[Any], *arguments: Any, tree: Any, call: Call, definition: Definition
 ) -> list[Any]:
-    """Of what is linear in `along`, by which it is its own transpose, and in `changes`."""
+    """The transpose of the second adjoint, which is linear in `along`, where it is symmetric, and in `changes`."""
     fixed, arrays, _, on_results, _ = jax.tree.unflatten(tree, arguments)
     known = len(jax.tree.leaves((fixed, arrays)))
     way = jax.tree.unflatten(jax.tree.structure(arrays), _whole_slopes(slopes))
@@ -199,7 +201,7 @@ def _directions(tree: Any, leaves: Sequence[Any], slopes: Sequence[Any]) -> tupl
     """Tangents of the arguments after the first, and whether those of the arrays are all zero.
 
     Raises:
-        NotImplementedError: if there are any of sizes or radii of spheres.
+        NotImplementedError: if sizes or radii of spheres have a tangent.
     """
     fixed, arrays, *_ = jax.tree.unflatten(tree, range(len(leaves)))
     if any(type(slopes[place]) is not ad.Zero for place in (fixed.radii, fixed.sizes)):
