@@ -16,7 +16,7 @@ from gmem_jax.physics.numbers import is_real, require_numbers, require_whole, sa
 from gmem_jax.physics.rules import usual_rules
 
 CUT = 3.0  # standard deviations of ln(size) beyond which the lognormal has no grains
-LARGEST_SPREAD = 0.35  # whose sizes, so cut, can be listed together: the largest is 7.7 times the smallest
+LARGEST_SPREAD = 0.35  # with this cut the largest grain is then 7.7 times the smallest, and lists allow a ratio of 10
 _STREAM = 4  # of the random numbers of a seed: the first three are those of the gas
 
 

@@ -30,14 +30,14 @@ from gmem_jax.simulation.neighbors import SKIN
 from gmem_jax.simulation.progress import Progress, silent
 from gmem_jax.simulation.strain import COMPRESSIONS
 
-MISFIT = 1e-3  # R, by which spheres may lie elsewhere than in a rigid grain
-_NAMED = 1e-4  # R, by which the edges of a tetra grain may differ from those of a whole number of 1e-4 in overlap
-_ORDERS = 6  # spheres of a grain up to which they may be listed in another order in every grain
-DT = 0.3  # t_c, of the run that measures the ringing period
+MISFIT = 1e-3  # R, largest distance of a sphere from its place in the rigid grain
+_NAMED = 1e-4  # R, largest difference of the edges of a tetra grain; its overlap is rounded to 1e-4
+_ORDERS = 6  # grains of up to this many spheres may list them in different orders
+DT = 0.3  # t_c, time step of the run that measures the ringing period
 
 
 def clump_of_centres(centres: np.ndarray, radii: np.ndarray) -> Clump:
-    """The grain whose spheres lie so, [K, 3], and have these radii, [K]; a sphere or tetra grain where it is one."""
+    """The grain with spheres at `centres` [K, 3], of radii [K]; made by `sphere` or `tetra` if it is such a grain."""
     if np.any(radii != 1.0):
         return clump(centres, shape=f"clump-{len(centres)}", radii=radii)
     if len(centres) == 1:
@@ -51,9 +51,9 @@ def clump_of_centres(centres: np.ndarray, radii: np.ndarray) -> Clump:
 
 
 def sizes_of(radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes of grains [N] by the radii of their spheres [N, K], and the radii of one of size 1, [K].
+    """Sizes of grains [N] from the radii of their spheres [N, K], and the radii of a grain of size 1, [K].
 
-    Grains of equal spheres are of size 1 where these are of radius 1; others are measured by the first grain.
+    If all spheres of each grain are equal, its size is their radius; otherwise the first grain has size 1.
     """
     totals = radii.mean(axis=1)
     equal = np.all(np.ptp(radii, axis=1) <= SAME * totals)
@@ -65,16 +65,17 @@ def sizes_of(radii: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def lay(
     centres: np.ndarray, offsets: np.ndarray, radii: np.ndarray | None = None, own: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where grains of spheres at `offsets` [K, 3] lie, and how they are turned, if their spheres are at `centres`.
+    """Centres and orientations of grains, from the places of their spheres.
 
     Args:
-        centres: [N, K, 3]; in any order within a grain of up to 6 spheres.
-        offsets: in the grain's frame.
-        radii: of the spheres at `centres`, [N, K], if they differ.
-        own: of those at `offsets`, [K].
+        centres: sphere centres, [N, K, 3]; in any order within a grain of up to 6 spheres.
+        offsets: sphere centres in the grain's frame, [K, 3].
+        radii: radii of the spheres at `centres`, [N, K], if they differ.
+        own: radii of the spheres at `offsets`, [K].
 
     Returns:
-        Grain centres [N, 3] and body-to-lab quaternions (w, x, y, z) [N, 4], of a rotation that the shape allows.
+        Grain centres [N, 3] and body-to-lab quaternions (w, x, y, z) [N, 4]. A symmetric shape allows several
+        orientations; one of them is returned.
 
     Raises:
         FileFormatError: if a grain has another shape.
@@ -160,7 +161,8 @@ def _pack_of(
     position, grain = middle + scale * (position - middle), sized(grain, sizes)
     box = still_box(jnp.asarray(read.lower)[:, None], jnp.asarray(read.upper)[:, None])
     notes = list(read.notes)
-    spread = float(grain.mass) / (np.sum(own**3) * 4.0 * np.pi / 3.0)  # over its spheres, which overlap, as exported
+    # Packs are exported with this density: the mass of a grain over the volume of its spheres, which overlap.
+    spread = float(grain.mass) / (np.sum(own**3) * 4.0 * np.pi / 3.0)
     if read.density is not None and not np.isclose(read.density, (1.0, spread), rtol=SAME).any():
         notes.append(f"the density {read.density:g} of its spheres is left out: that of grains is the unit rho")
     for note in notes:
@@ -186,7 +188,7 @@ def _pack_of(
 
 
 def _require_pressed(read: Spheres) -> None:
-    """Walls along x and y that nobody touches ring with nothing."""
+    """Refuse grains that touch no wall along x and y: the pressure on these walls could not ring."""
     radii = read.radii[..., None]
     lower, upper = (read.centres - read.lower < radii), (read.upper - read.centres < radii)
     require((lower | upper)[..., :2].any(), "its grains do not press on the walls: this is no pack at rest")

@@ -1,6 +1,6 @@
 """The +z wall under pressure: a speed-limited servo, and the free flight of the gas (a servo of zero speed).
 
-In a periodic box it is the cell that is strained along z, and its grains are carried along.
+In a periodic box the cell is strained along z instead, and carries its grains along.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +17,7 @@ from gmem_jax.physics.system import System
 from gmem_jax.simulation.sample import check
 from gmem_jax.simulation.strain import servo_rate
 
-STEPS_PER_CHECK = 8  # steps between two looks at the neighbour list: grains may fly freely here
+STEPS_PER_CHECK = 8  # steps between two checks of the neighbour list: grains may fly freely here
 
 
 @pytree
@@ -43,13 +43,13 @@ class Servo:
 @pytree
 @dataclass(frozen=True)
 class Pressed:
-    """Where a servo run stands (one replica).
+    """The state of a servo run, with one replica.
 
     Attributes:
         state: the grains.
         box: the walls.
         pressure: p_z averaged over the last block, [1].
-        blocks: blocks of `STEPS_PER_CHECK` steps done by the last call.
+        blocks: number of blocks of `STEPS_PER_CHECK` steps that the last call has run.
         settled: whether pressure and speed are within the servo's bounds.
         crowded: whether the neighbour list must be rebuilt before going on.
     """
@@ -72,8 +72,8 @@ def press(
 ) -> Pressed:
     """Run up to `blocks` blocks of steps; stop early when settled, when the list needs a rebuild, or on a status bit.
 
-    The wall moves steadily during a block, at a speed set by p_z averaged over the one before. The list is left early
-    enough that it is complete throughout: the next block is allowed for at the speed of the fastest sphere.
+    The wall moves steadily during a block, at a speed set by p_z averaged over the previous block. The run stops before
+    the list can become incomplete: the skin that is left must cover the next block at the speed of the fastest sphere.
     """
     clump = system.clump
     reach = clump.largest * jnp.sqrt(jnp.max(jnp.sum(clump.offsets**2, axis=1)))

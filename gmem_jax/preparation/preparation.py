@@ -53,10 +53,11 @@ from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.stage import Stage
 from gmem_jax.simulation.strain import StrainPath, smallest_box
 
-FREE_CANDIDATES = 68  # a grain of a pressed pack with that skin: one program for all lists
-FREE_CONTACTS = 48  # a sphere
-DENSE_SKIN = 0.5  # of a pressed pack: half of the candidates, half of the time; yet frictionless grains turn freely, so
-# that a list lasts only some 50 t_c of a cycle
+FREE_CANDIDATES = 68  # candidates of a grain in a pressed pack with `FREE_SKIN`: one program serves all lists
+FREE_CONTACTS = 48  # candidates of a sphere, likewise
+# Skin of a pressed pack: half of the candidates take half of the time. Frictionless grains turn freely, so that a list
+# lasts only some 50 t_c of a cycle.
+DENSE_SKIN = 0.5
 CYCLE_CHUNK = 8  # bins per compiled call during the cycles
 CALL = 128  # blocks per compiled call: the progress bar moves every few seconds at the largest sizes
 MET = 0.8, 1.25  # p_z of the finished pack over the wanted one; shipped packs have 0.84 to 1.00
@@ -76,20 +77,20 @@ def _gas(recipe: Recipe, clump: Clump) -> tuple[np.ndarray, jax.Array, jax.Array
     return (
         (cells + 0.5) * spacing,
         rotation.uniform(turn_key, recipe.grains),
-        velocity - drift,  # which no wall would take
+        velocity - drift,  # without walls nothing would stop a drift
         scale * jax.random.normal(spin_key, shape),
         np.asarray(sites) * spacing,
     )
 
 
-FILMED = ("gas", "press", "settle")  # stages after which a configuration is taken, if any are
+FILMED = ("gas", "press", "settle")  # stages after which a configuration is recorded, if any are wanted
 
 
 def preparation_frames(recipe: Recipe, frames: int) -> FrameSchedule:
-    """What is to be recorded of the cycles: of `frames` configurations those beside the lattice, `FILMED` and the pack.
+    """The schedule of the configurations in the cycles: `frames` less the lattice, the ends of `FILMED` and the pack.
 
     Raises:
-        ValueError: for too many or too few.
+        ValueError: if `frames` is too many or too few.
     """
     always, stages = len(FILMED) + 2, cycles_of(recipe)
     bins = sum(stage.bins for stage in stages)
@@ -98,12 +99,12 @@ def preparation_frames(recipe: Recipe, frames: int) -> FrameSchedule:
     if frames <= always:
         return FrameSchedule()
     wanted = places(stages, frames - always + 1, CYCLE_CHUNK)
-    wanted[stages[0].name].remove(0)  # where "settle" ended
+    wanted[stages[0].name].remove(0)  # the end of "settle", which is recorded anyway
     return FrameSchedule(wanted)
 
 
 def _require_lighter(recipe: Recipe, clump: Clump, lengths: np.ndarray) -> None:
-    """Refuse grains that weigh more than they are to be pressed by: the lid would leave them, and settle nowhere."""
+    """Refuse grains whose weight alone makes p_z as large as wanted: the piston would leave them and never settle."""
     alone = 0.5 * recipe.gravity * float(clump.volume(recipe.grains)) / float(lengths[0] * lengths[1])
     if alone >= recipe.pressure:
         raise ValueError(
@@ -113,7 +114,7 @@ def _require_lighter(recipe: Recipe, clump: Clump, lengths: np.ndarray) -> None:
 
 
 class _Preparation:
-    """One preparation on its way: a `Runner` with one replica and no friction, and the walls as they are now."""
+    """A running preparation: a `Runner` with one replica and no friction, and the present walls."""
 
     def __init__(
         self,
@@ -154,7 +155,7 @@ class _Preparation:
         return StrainPath(self.box.lower, self.box.upper, self.recipe.delta0, periodic=self.periodic)
 
     def record(self, name: str) -> None:
-        """Record the configuration that there is now, at u = 0, if any are wanted."""
+        """Record the present configuration, at u = 0, if configurations are wanted."""
         if self.filmed:
             runner, still = self.runner, Stage(name, 0.0, 0.0, 0.0, "hold")
             now = Chunk(runner.simulation, runner.state, still, 0, 0, runner.time, runner.gather)
@@ -191,7 +192,7 @@ class _Preparation:
             runner.state, self.box = pressed.state, pressed.box
             done = int(pressed.blocks)
             spent += done
-            # It may take longer than was thought; what comes after it is known.
+            # The servo may take longer than was estimated; the work after it is known.
             least = runner.work + done * per_bin * work_of_bin(1) + work_of(self.known, 1)
             runner.total_work = max(runner.total_work, least)
             runner.report(name, done * per_bin, float(done * block))
@@ -210,7 +211,7 @@ class _Preparation:
         return runner.snapshot(), pressed
 
     def compact(self) -> None:
-        """Gas, then pressure until the pack is at rest under it and the wall is fixed."""
+        """Run the gas, press it until the pack is at rest under the pressure, and fix the wall."""
         recipe = self.recipe
         closed = Servo(recipe.pressure, 0.0, 0.0, 0.0, 0.0)
         self.press("gas", closed, recipe.gas_time, 0.0)
@@ -232,7 +233,7 @@ class _Preparation:
             )
 
     def cycle(self) -> None:
-        """Frictionless compress/decompress cycles of the x and y walls, then rest until quiet."""
+        """Run frictionless compress/decompress cycles of the x and y walls, then rest until the pack is quiet."""
         recipe, runner, outside = self.recipe, self.runner, self.runner.simulation
         steps, dt = stepping(recipe.t0, recipe.dt)
         runner.simulation = replace(outside, path=self._path(), steps=steps, dt=dt)
@@ -241,7 +242,7 @@ class _Preparation:
             np.asarray(self.box.lower)[:, 0], np.asarray(self.box.upper)[:, 0], recipe.delta0
         )
         runner.renew(self.box)
-        # How long a pack takes to come to rest was a guess; from here on it is known what is left.
+        # The time that the pack took to come to rest was an estimate; from here on the work that is left is known.
         runner.total_work = runner.work + work_of(self.known, 1)
         self.log |= runner.run_cached("cycles", self.cache, *cycles_of(recipe))
         runner.simulation = replace(runner.simulation, steps=outside.steps, dt=outside.dt)
@@ -252,7 +253,7 @@ class _Preparation:
         self.record(rest.name)
 
     def _until_quiet(self, checkpoint: Checkpoint, rest: Stage) -> tuple[Any, Any]:
-        """Rest as often as needed: the samples of the last time, and where the runner stands."""
+        """Repeat the rest until the pack is quiet; return the samples of the last rest, and the runner's snapshot."""
         recipe, runner, waited = self.recipe, self.runner, 0.0
         if saved := checkpoint.restore():
             runner.restore(saved["runner"])
@@ -363,7 +364,7 @@ def _warn_of_another_pressure(pack: Pack) -> None:
 
 
 def _finish(preparation: _Preparation, material: Material, friction: FrictionLaw, name: str) -> Pack:
-    """The pack at rest, with what was measured on it."""
+    """The pack at rest, with its ringing period and its record."""
     recipe, runner, box = preparation.recipe, preparation.runner, preparation.box
     grains, clump = runner.state.grains, runner.simulation.system.clump
     position, quaternion = np.asarray(grains.position)[..., 0], np.asarray(grains.quaternion)[..., 0]

@@ -18,15 +18,16 @@ from gmem_jax.preparation.grading import LARGEST_SPREAD, lognormal, mixture
 from gmem_jax.simulation.stage import BINS, Stage
 from gmem_jax.simulation.strain import COMPRESSIONS
 
-SETTLING = 500.0  # t_c that coming to rest took per R of a dense pack's height (170 to 880, N = 325 to 10,240)
+SETTLING = 500.0  # t_c that a dense pack takes to come to rest, per R of height (170 to 880, N = 325 to 10,240)
 FREE_SKIN = 1.0  # neighbour-list skin while grains fly, in R: fewer rebuilds for more candidates
 FEWEST_GRAINS = 12  # grains of the smallest pack that was prepared
-DENSE = 0.72  # filling of a large pressed pack, which decides the lattice: with it all six are the paper's
-LATTICE_SPACING = 1.02  # outer diameters of the grain: the least spacing of the lattice, so that grains turn freely
-SLOWEST_BINS = 1.8e3  # t_c: t0 whose bins and steps a preparation has outside its cycles, unless it is slower. What it
-# costs would grow as t0 falls otherwise: a bin is t0 / 256, a step no longer than that
-STEP_OVERHEAD = 200.0  # grain-steps that a step costs beside its grains: calls and lists (N = 16 to 250, native)
-BIN_OVERHEAD = 4000.0  # and that a bin of a cycle costs beside its steps
+DENSE = 0.72  # filling of a large pressed pack, which decides the lattice; it gives those of the paper's six packs
+LATTICE_SPACING = 1.02  # least spacing of the lattice, in outer diameters of the grain, so that grains turn freely
+# t_c. Outside its cycles a preparation has the bins and steps of this t0, or of its own t0 if that is longer. Its cost
+# would grow as t0 falls otherwise: a bin is t0 / 256, and a step no longer than a bin.
+SLOWEST_BINS = 1.8e3
+STEP_OVERHEAD = 200.0  # cost of a step apart from its grains, in grain-steps: calls and lists (N = 16 to 250, native)
+BIN_OVERHEAD = 4000.0  # cost of a bin apart from its steps, in grain-steps
 
 
 @dataclass(frozen=True)
@@ -150,10 +151,11 @@ def _listed(name: str, given: Any) -> list[float]:
 
 
 def graded(recipe: Recipe, clump: Clump) -> Clump:
-    """The grain with the sizes that a recipe asks for, or that it has itself.
+    """The grain with the sizes of the recipe, or with its own.
 
     Raises:
-        ValueError: if both say so, or it has not one for each grain, or they cannot be listed together.
+        ValueError: if both have sizes, the grain has not one size for each grain of the pack, or spheres of these sizes
+            cannot be listed together.
     """
     drawn = recipe.drawn_sizes()
     if clump.sizes is not None and (drawn is not None or len(clump.sizes) != recipe.grains):
@@ -165,14 +167,14 @@ def graded(recipe: Recipe, clump: Clump) -> Clump:
 
 
 def _plain(kind: Any, given: Any) -> float | int:
-    """A number of one kind, however it was written."""
+    """The number `given` as an int if `kind` is int, else as a float."""
     if not is_real(given) or np.ndim(given):
         raise TypeError
     return operator.index(given) if kind is int else float(given)
 
 
 def words_of(entry: Field[Any]) -> str:
-    """What a field of a recipe means, in which unit, and where it must lie."""
+    """The meaning, unit and interval of a field of a recipe, in words."""
     if "interval" not in entry.metadata:
         return f"{entry.metadata['words']}."
     unit = entry.metadata["unit"]
@@ -180,7 +182,7 @@ def words_of(entry: Field[Any]) -> str:
 
 
 def pressure_over_wanted(record: Mapping[str, Any]) -> float | None:
-    """p_z of a finished pack over that of its recipe, from what `Pack.info` says; None where it does not say."""
+    """p_z of a finished pack over the pressure of its recipe, from its `Pack.info`; None if one is not there."""
     wanted, rest = record.get("recipe", {}).get("pressure"), record.get("at_rest")
     return float(rest["pressure"][2]) / wanted if rest and is_number(wanted) and wanted > 0.0 else None
 
@@ -192,7 +194,7 @@ def stepping(t0: float, dt: float) -> tuple[int, float]:
 
 
 def lattice(grains: int, filling: float = 0.30) -> tuple[int, int, int]:
-    """Sites (n, n, n_z) of a lattice of this filling that becomes about a cube when pressed (325 = 5 x 5 x 13)."""
+    """Sites (n, n, n_z) of a lattice of this filling whose pressed pack is about a cube (325 = 5 x 5 x 13)."""
     side = max(2, round((grains * filling / DENSE) ** (1.0 / 3.0)))
     return side, side, math.ceil(grains / side**2)
 
@@ -200,8 +202,8 @@ def lattice(grains: int, filling: float = 0.30) -> tuple[int, int, int]:
 def sites_of(recipe: Recipe, clump: Clump) -> tuple[tuple[int, int, int], np.ndarray]:
     """Sites of the lattice along each axis, and their spacing [3] in R: a pressed pack is about a cube.
 
-    Grains that turn freely on a lattice of the recipe's filling are on that, which is cubic. Longer ones stand as far
-    apart as they are long, in columns in a box as wide as the pressed pack will be high.
+    If grains turn freely on the cubic lattice of the recipe's filling, they begin there. Longer grains begin in
+    columns, as far apart as they are long, in a box as wide as the pressed pack will be high.
 
     Raises:
         ValueError: if the pressed pack would be flatter than its grains, or too small for a periodic one.
@@ -237,12 +239,12 @@ def cycles_of(recipe: Recipe) -> tuple[Stage, ...]:
 
 
 def last_rest(recipe: Recipe) -> Stage:
-    """What is repeated until the pack is quiet; its length is in `SLOWEST_BINS`, or t0 if that is longer."""
+    """The rest that is repeated until the pack is quiet; its unit of length is `SLOWEST_BINS`, or t0 if longer."""
     return Stage("rest", 0.0, 0.0, max(recipe.rest, 0.1), "hold")
 
 
 def bins_outside(recipe: Recipe, clump: Clump) -> float:
-    """Bins that a preparation will take about before and after its cycles."""
+    """The estimated number of bins of a preparation before and after its cycles."""
     sites, apart = sites_of(recipe, clump)
     width, height = sites[0] * float(apart[0]), sites[2] * float(apart[2])
     dense = float(clump.volume(recipe.grains)) / (DENSE * width**2)
@@ -251,7 +253,7 @@ def bins_outside(recipe: Recipe, clump: Clump) -> float:
 
 
 def grain_steps(recipe: Recipe, clump: Clump) -> float:
-    """What a preparation will cost about: grains times steps, and what small packs and short bins cost beside them."""
+    """The estimated cost of a preparation: grains times steps, plus the overheads of steps and of bins."""
     inside = sum(stage.bins for stage in cycles_of(recipe)), stepping(recipe.t0, recipe.dt)[0]
     outside = bins_outside(recipe, clump), stepping(max(recipe.t0, SLOWEST_BINS), recipe.dt)[0]
     return sum(bins * (steps * (recipe.grains + STEP_OVERHEAD) + BIN_OVERHEAD) for bins, steps in (inside, outside))

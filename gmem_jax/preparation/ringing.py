@@ -19,7 +19,7 @@ from gmem_jax.simulation.stage import BINS, Stage
 from gmem_jax.simulation.strain import StrainPath, stretched
 
 KICK = 2.0e-5  # strain rate of the kick, 1 / t_c: strains of about 1e-4, below which the response is linear enough
-SHIFT = 1.0e-4  # strain of a periodic cell, given at once: no wall is there for a wave to start at
+SHIFT = 1.0e-4  # strain of a periodic cell, applied at once: there is no wall from which a wave could start
 STEPS_PER_SAMPLE = 4  # steps per sample
 
 
@@ -27,9 +27,9 @@ def spectrum_peak(series: np.ndarray, spacing: float, shortest: float = 0.0) -> 
     """Period of the strongest oscillation in `series`, sampled every `spacing` (Hann window, parabolic peak).
 
     Args:
-        series: one number a sample.
-        spacing: between samples.
-        shortest: period that is looked for.
+        series: one number for each sample.
+        spacing: time between samples.
+        shortest: shortest period that is looked for.
 
     Raises:
         RunFailedError: if nothing oscillates.
@@ -58,18 +58,18 @@ def ringing_period(
     *,
     backend: str = "auto",
 ) -> float:
-    """T_1 in t_c: kick the resting pack with a uniform shear rate, and take the strongest period of p_xy.
+    """T_1 in t_c: kick the resting pack with a uniform shear rate, and take the strongest period of p_x - p_y.
 
-    A periodic cell is sheared by a little instead, with its grains: what rings is how they find their places in it.
+    A periodic cell is sheared by a small strain instead, with its grains; these then ring about their places in it.
 
     Args:
-        system: with the friction law of the experiment.
+        system: the system, with the friction law of the experiment.
         position: grain centres at rest, [N, 3, 1].
         quaternion: orientations, [N, 4, 1].
         box: walls, one replica.
         dt: time step, in t_c.
         progress: told about the run.
-        backend: who does the steps.
+        backend: the backend that runs the steps.
 
     Returns:
         A period within `pack_validation.period_bounds`.
