@@ -44,19 +44,19 @@ from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.stage import Bin
 
 Loss = Callable[[Experiment, jax.Array], jax.Array]
-"""From an experiment and its p_sig [S, 256] to a number."""
+"""A function of an experiment and its p_sig [S, 256] that returns a number."""
 
-FORWARDS = 0.2  # of a gradient's time is the way forward
-ROOM = 2**30  # bytes that one way may keep of its states; those of later chunks are computed again on the way back
+FORWARDS = 0.2  # fraction of the time of a gradient that the forward pass takes
+ROOM = 2**30  # bytes of states kept in the prefix, and as many after it; the backward pass computes later ones again
 
 
 def fidelity_of(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
-    """F of the set: a `Loss`."""
+    """The `Loss` that is the fidelity F of the set."""
     return experiment.compare(p_sig).fidelity
 
 
 def _before(state: State, sample: Sample) -> tuple[Moving, Sample]:
-    """Keep the state before a bin too."""
+    """The `Keep` of the state before a bin and of its sample."""
     return moving_of(state), sample
 
 
@@ -68,15 +68,18 @@ def _pull(
     slopes: tuple[Moving, jax.Array],
     fixed: tuple[str, ...],
 ) -> Any:
-    """Derivatives by numbers and state before a chunk, from those by the state after it and the pressures of its bins.
+    """Take derivatives back through a chunk.
 
     Args:
-        simulation: what is run.
-        before: states before its bins, leaves [most, ..., B].
+        simulation: the simulation.
+        before: states before the bins of the chunk, leaves [most, ..., B].
         first: the first bin.
-        count: of the bins; None for as many as there are states.
-        slopes: derivatives; by the pressures [most, 3, B].
-        fixed: what is not differentiated by.
+        count: number of bins; None for as many as there are states.
+        slopes: derivatives with respect to the state after the chunk, and to the pressures of its bins, [most, 3, B].
+        fixed: parts of the simulation with respect to which it is not differentiated.
+
+    Returns:
+        Derivatives with respect to the numbers of the simulation, and to the state before the chunk.
     """
     count = len(slopes[1]) if count is None else count
     numbers, status = numbers_of(simulation, fixed), jnp.zeros(slopes[1].shape[-1], jnp.int32)
@@ -104,7 +107,7 @@ _recorded = Compiled(functools.partial(rollout_chunk, keep=_before), static_argn
 
 
 class _Piece(NamedTuple):
-    """A piece of the way: from derivatives by the state after it to those before it."""
+    """A piece of the backward pass; `back` turns derivatives by the state after it into those by the state before."""
 
     back: Callable[[Moving], Moving]
     name: str = ""
@@ -113,9 +116,9 @@ class _Piece(NamedTuple):
 
 @dataclass
 class _Remembering(Observer):
-    """Remembers the way, to go back on it."""
+    """Records the forward pass through some stages, for the backward pass."""
 
-    fixed: tuple[str, ...]  # what is not differentiated by
+    fixed: tuple[str, ...]  # parts of the simulation with respect to which it is not differentiated
     room: int  # bytes that are left for states
     tape: list[_Piece] = field(default_factory=list)
     numbers: Any = None  # derivatives by the simulation's numbers so far
@@ -130,7 +133,7 @@ class _Remembering(Observer):
         return state, sample
 
     def commit(self, chunk: Chunk, state: State, sample: Sample) -> None:
-        """Remember how to go back through the chunk."""
+        """Record how to go back through the chunk."""
         count, replicas = chunk.count, chunk.state.replicas
         states, self._next = self._next, None
         self.room -= sum(leaf.nbytes for leaf in jax.tree.leaves(states))
@@ -150,7 +153,7 @@ class _Remembering(Observer):
         self.tape.append(_Piece(back, chunk.stage.name, count * replicas))
 
     def rebuild(self, history: Any, move: Move, blank: Any) -> None:
-        """Remember how the history was moved."""
+        """Record how the history was moved."""
         _, pull = jax.vjp(lambda old: move(old, blank), history)
         self.tape.append(_Piece(lambda slope: (slope[0], pull(slope[1])[0], *slope[2:])))
 
@@ -186,10 +189,10 @@ def value_and_grad(
 ) -> Gradient:
     """The value of a loss and its gradient in reverse mode, through the whole experiment, on the host.
 
-    The forward pass keeps the state before each bin, up to 1 GiB, and beyond that the state before each chunk of 32
-    bins. The backward pass runs such chunks again, and differentiates bin by bin. On the native backend a gradient
-    costs about four forward runs; about five if it goes through the prefix too, as for "friction"; and one more if
-    chunks are run again.
+    The forward pass keeps the state before each bin, up to 1 GiB (in the prefix 1 GiB more), and beyond that the state
+    before each chunk of 32 bins. The backward pass runs such chunks again, and differentiates bin by bin. On the native
+    backend a gradient costs about four forward runs; about five if it goes through the prefix too, as for "friction";
+    and one more if chunks are run again.
 
     Args:
         experiment: the experiment at which the gradient is taken, not traced.
@@ -240,7 +243,7 @@ def value_and_grad(
         return value, p_sig
 
     pressures = {name: jnp.asarray(samples[name].pressure) for name in experiment.protocol.reads}
-    # Not compiled: it is another function in every call, and compiling it takes longer than doing it.
+    # Not compiled: it is a new function in every call, and compiling it would take longer than evaluating it.
     last = jax.value_and_grad(final, argnums=(0, 1), has_aux=True)
     (value, p_sig), (slope, by_pressures) = last(theta, pressures)
     rest.reads = {name: np.asarray(by) for name, by in by_pressures.items()}
@@ -257,7 +260,7 @@ def value_and_grad(
     slope = jax.tree.map(jnp.add, slope, pull_numbers(True, rest.numbers))
     if any(map(acts_on_prefix, theta)):
         back = way.through(prefix, fan_out(back)[0])
-        if prefix.numbers is not None:  # a protocol may begin with a waveform
+        if prefix.numbers is not None:  # None if the protocol begins with a waveform, without a prefix
             slope = jax.tree.map(jnp.add, slope, pull_numbers(False, prefix.numbers))
         slope = jax.tree.map(jnp.add, slope, pull_begin(back)[0])
     return Gradient(value, slope, p_sig)
@@ -272,7 +275,7 @@ def _fan_out(experiment: Experiment) -> Callable[[Moving], Moving]:
 
 
 class _Backwards:
-    """Goes back through some ways, the last first, forgetting their tapes; tells and keeps how far it is."""
+    """The backward pass through recordings, the last first; it drops their tapes, and reports and saves progress."""
 
     def __init__(self, progress: Progress, ways: Sequence[_Remembering], checkpoint: Checkpoint) -> None:
         self.progress, self.ways, self.checkpoint = progress, ways, checkpoint
@@ -285,7 +288,7 @@ class _Backwards:
                 way.numbers = list(numbers) or None
 
     def through(self, way: _Remembering, slope: Moving) -> Moving:
-        """From derivatives by the state at the end of a way to those at its beginning."""
+        """Turn derivatives by the state at the end of a recording into those by the state at its beginning."""
         number = next(place for place, one in enumerate(self.ways) if one is way)
         if self.saved and int(self.saved["way"]) == number:
             slope = self.saved["slope"]

@@ -24,8 +24,8 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.channels import CHANNELS
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress, within
 
-LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # what acts on the prefix, and on the zero signal
-SHARE = 0.7  # of the time that all derivatives take, those by the drive
+LAW = {"mu": "friction.mu", "stiffness": "friction.stiffness"}  # they act on the prefix and the zero signal
+SHARE = 0.7  # fraction of the time that the derivatives with respect to amplitudes and gamma0 take
 
 
 @comparable
@@ -50,7 +50,7 @@ class Jacobian:
 
 
 def _copies(bumps: Bumps, amplitudes: Any) -> Bumps:
-    """One signal's bumps with rows of amplitudes [R, n]."""
+    """The bumps of one signal, repeated with rows of amplitudes [R, n]."""
     return Bumps(amplitudes, jnp.broadcast_to(bumps.centres, jnp.shape(amplitudes)), jnp.reshape(bumps.width, ()))
 
 
@@ -77,14 +77,14 @@ def _law_values(experiment: Experiment) -> list[float]:
 
 
 def _stress(experiment: Experiment, pressure: dict[str, np.ndarray]) -> np.ndarray:
-    """That of the channel from the first stage that writes to the first that reads, [replicas, bins]."""
+    """The stress of the channel from the first stage that writes to the first that reads, [replicas, bins]."""
     (channel,) = experiment.readings.channels
     joined = np.concatenate([pressure[name] for name in experiment.protocol.first_memory])
     return np.asarray(CHANNELS[channel].stress(jnp.asarray(joined))).T
 
 
 def _recalled(experiment: Experiment, pressure: dict[str, np.ndarray]) -> np.ndarray:
-    """p_sig of the second half of the replicas, each with a zero signal of its own in the first, [half, 256]."""
+    """p_sig of the second half of the replicas, [half, 256]; the first half are their zero signals."""
     half = next(iter(pressure.values())).shape[-1] // 2
     pairs = ({name: jnp.asarray(p[..., [k, half + k]]) for name, p in pressure.items()} for k in range(half))
     return np.concatenate([experiment.recalled(pair) for pair in pairs])
@@ -132,7 +132,7 @@ def exact(experiment: Experiment, *, progress: ProgressChoice = None) -> Jacobia
     names = [*(f"amplitude {k + 1}" for k in range(n)), "gamma0"]
     values = [*row[0], float(experiment.gamma0)]
     p_sig, stress = [np.asarray(pushed.p_sig_slope)], [_stress(experiment, pushed.slope)[1:]]
-    two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # replicas 0, 1: no signal; 2, 3: it
+    two = jnp.asarray(np.concatenate([np.zeros_like(row), row, row]))  # 0, 1: no signal; 2, 3: the signal
     wide = {path: jnp.full(4, value_at(experiment, path)) for path in LAW.values()}
     laws = replace(experiment, {**wide, "signals": _copies(bumps, two)})
     direction = {
@@ -151,8 +151,8 @@ def differences(experiment: Experiment, relative: float) -> Jacobian:
     """Central differences with steps of `relative` times each parameter (amplitudes: times 1), as replicas.
 
     Raises:
-        ValueError: if there is another number of signals, they are not bumps, the background is not sub0, or there are
-            several reads or channels.
+        ValueError: if there is not exactly one signal, it is not made of bumps, the background is not sub0, or there
+            are several reads or channels.
         RunFailedError: if the simulation broke down.
     """
     bumps, row = _one_signal(experiment)
@@ -189,7 +189,7 @@ def differences(experiment: Experiment, relative: float) -> Jacobian:
 
 
 def mismatch(one: Jacobian, other: Jacobian) -> dict[str, float]:
-    """|one - other| / |other| of every group of parameters, and of all with each parameter at its own scale."""
+    """|one - other| / |other| for every group of parameters, and for all together, each at its own scale."""
     scale = np.abs(np.where(other.values == 0.0, 1.0, other.values))[:, None]
     scale[: sum(name.startswith("amplitude") for name in other.names)] = 1.0
     rows: dict[str, Sequence[int]] = {

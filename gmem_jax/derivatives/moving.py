@@ -19,26 +19,27 @@ from gmem_jax.simulation.runner import Runner
 STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
 LENGTHS = ("pack.clump.radii", "pack.clump.sizes")  # of spheres that are not all alike
 
-Moving = tuple[Any, ...]  # grains, histories, held walls and periodic cell: what of a state can be differentiated
+Moving = tuple[Any, ...]  # grains, histories, held walls and periodic cell: the differentiable part of a state
 
 
 def fixed_by(names: Iterable[str]) -> tuple[str, ...]:
-    """Parts of a simulation that are not differentiated by: the list, the mark, and lengths that no name has.
+    """Parts of a simulation with respect to which it is not differentiated.
 
-    The library has no derivatives by these lengths: where one is wanted, all are those of plain JAX.
+    They are the list, the mark, and those radii and sizes of spheres that are not among `names`. The library has no
+    derivatives with respect to radii and sizes: if one is wanted, plain JAX computes all derivatives.
     """
     lengths = [length for length in LENGTHS if not any(f"{length}.".startswith(f"{name}.") for name in names)]
     return (".system.pairs", ".mark", *(length.replace("pack", ".system") for length in lengths))
 
 
 def _is_moving(path: Any, leaf: Any, fixed: tuple[str, ...]) -> bool:
-    """Whether a number of a simulation is differentiated by."""
+    """Whether derivatives are taken with respect to a number of a simulation."""
     floats = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
     return floats and not jax.tree_util.keystr(path).startswith(fixed)
 
 
 def numbers_of(simulation: Simulation, fixed: tuple[str, ...]) -> list[jax.Array]:
-    """The numbers of a simulation that are differentiated by."""
+    """The numbers of a simulation with respect to which derivatives are taken."""
     leaves = jax.tree_util.tree_leaves_with_path(simulation)
     return [jnp.asarray(leaf) for path, leaf in leaves if _is_moving(path, leaf, fixed)]
 
@@ -54,17 +55,17 @@ def with_numbers(simulation: Simulation, numbers: Sequence[jax.Array], fixed: tu
 
 
 def moving_of(state: State) -> Moving:
-    """What of a state can be differentiated."""
+    """The differentiable part of a state."""
     return state.grains, state.history, state.servo, state.cell, state.wall_history
 
 
 def state_of(moving: Moving, status: jax.Array) -> State:
-    """The state that has these numbers."""
+    """The state with this differentiable part and this status."""
     return State(moving[0], moving[1], status, *moving[2:])
 
 
 def require_derivatives(experiment: Experiment) -> None:
-    """Refuse an experiment that has none.
+    """Refuse an experiment that has no derivatives.
 
     Raises:
         ValueError: if its contacts are computed in single precision.
@@ -74,10 +75,10 @@ def require_derivatives(experiment: Experiment) -> None:
 
 
 def theta_of(experiment: Experiment, names: Any) -> dict[str, Any]:
-    """What stands at names, as arrays.
+    """The parts of an experiment with these dotted names, as arrays.
 
     Raises:
-        ValueError: if there is no such name, it holds what has no derivative, or it is within another.
+        ValueError: if there is no part of that name, it has no derivative, or it is within another.
     """
     require_several(names, "by")
     found = {name: value_at(experiment, name) for name in names}
@@ -105,6 +106,6 @@ def _is_number(leaf: Any) -> bool:
 
 
 def whole_work(experiment: Experiment, on: Runner) -> float:
-    """Work of all stages, of a runner at their beginning."""
+    """Work of all stages of an experiment, for a runner at their beginning."""
     common, own = experiment.phases
     return work_of(common, on.state.replicas) + work_of(own, experiment.replicas)

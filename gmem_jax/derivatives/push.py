@@ -35,7 +35,7 @@ from gmem_jax.simulation.stage import Bin
 def _push(
     simulation: Simulation, state: State, first: Bin, count: Any, slopes: Any, most: int, fixed: tuple[str, ...]
 ) -> Any:
-    """A chunk and its tangent."""
+    """Run a chunk with its tangent."""
 
     def chunk(numbers: Any, moving: Moving) -> Any:
         changed = with_numbers(simulation, numbers, fixed)
@@ -52,12 +52,12 @@ _pushed = Compiled(_push, static_argnames=("most", "fixed"))
 
 @dataclass
 class _Pushing(Observer):
-    """Carries a tangent along.
+    """Carries the tangent of a run along.
 
     Attributes:
-        fixed: what is not differentiated by.
+        fixed: parts of the simulation with respect to which it is not differentiated.
         numbers: tangent of the simulation's numbers.
-        moving: tangent of the state now; None as long as nothing has one.
+        moving: tangent of the present state; None while it is zero.
         slopes: derivatives of the pressures of every stage, by chunks.
     """
 
@@ -95,10 +95,10 @@ class Pushed:
     """A run and its tangent.
 
     Attributes:
-        pressure: p of every stage by name, [bins, 3, B], in E.
-        slope: their derivatives along the direction, likewise.
-        p_sig: recalled signals, [S, 256].
-        p_sig_slope: their derivatives.
+        pressure: pressure in every stage by name, [bins, 3, B], in E.
+        slope: derivatives of the pressures along the direction, likewise.
+        p_sig: recalled signals, [S, 256], in E.
+        p_sig_slope: derivatives of the recalled signals along the direction.
     """
 
     pressure: dict[str, np.ndarray]
@@ -116,8 +116,8 @@ def push(experiment: Experiment, direction: Mapping[str, Any], *, progress: Prog
     shear-free prefix is not differentiated if no parameter acts on it.
 
     Args:
-        experiment: where.
-        direction: tangents by the name of what changes, each a pytree like what stands there.
+        experiment: the experiment at which the derivative is taken.
+        direction: tangents by dotted name, each a pytree like the part of the experiment with that name.
         progress: told about every chunk.
 
     Raises:
