@@ -33,19 +33,19 @@ from gmem_jax.simulation.checkpoints import ResultCache, no_cache
 from gmem_jax.simulation.progress import ProgressChoice, callback, shows_progress
 
 KERNEL_BUMPS = 31  # basis waveforms; narrower ones drive the walls faster than the box rings
-KERNEL_BUMP_WIDTH = 0.08  # of them, in u
-KERNEL_DAMPING = 0.05  # of the first correction, in parts of the kernel's largest singular value
-EASED, FIRMED = 0.6, 1.8  # times the damping after a step that was better, and one that was worse
+KERNEL_BUMP_WIDTH = 0.08  # full width of the basis waveforms, in u
+KERNEL_DAMPING = 0.05  # damping of the first correction, over the kernel's largest singular value
+EASED, FIRMED = 0.6, 1.8  # factors on the damping after a step to a better recall, and after one to a worse recall
 KERNEL_ITERATIONS = 6  # simulations of all waveforms
-SLOPES_AT = (1 / 3, 2 / 3)  # parts of the iterations after which slopes are measured
+SLOPES_AT = (1 / 3, 2 / 3)  # fractions of the iterations after which slopes are measured
 PROBE = (0.01, 0.05)  # shortest and longest step along a direction that is measured
-FIRST_GUESS_BOUND = 0.6  # of the bound |I| <= 1, that the first guess may take where no gain is asked for
-SHORTEST = 1e-6  # step from which slopes are learned; a waveform of nothing takes none
+FIRST_GUESS_BOUND = 0.6  # largest |I| of the first guess if no gain is asked for; the bound is 1
+SHORTEST = 1e-6  # smallest length of a step that learned slopes are divided by: a zero waveform takes no step
 PREDICTED = 6  # corrections of the first guess, by the kernel alone
 
 
 def slopes(kernel: MemoryKernel, amplitudes: np.ndarray) -> np.ndarray:
-    """dp_sig / da of waveforms by the kernel, on the side of nought where each amplitude is, [S, n, 256]."""
+    """dp_sig / da of waveforms by the kernel, at the sign of each amplitude, [S, n, 256]."""
     slope: np.ndarray = kernel.odd + np.sign(amplitudes)[:, :, None] * kernel.even
     return slope
 
@@ -53,12 +53,12 @@ def slopes(kernel: MemoryKernel, amplitudes: np.ndarray) -> np.ndarray:
 def kernel_design_cost(
     experiment: Experiment, iterations: int | None = None, n: int = KERNEL_BUMPS, measured: int = 0
 ) -> float:
-    """What a design takes, in runs of its signals."""
+    """The cost of a design, in runs of all its signals."""
     return (iterations or KERNEL_ITERATIONS) + 2.0 + 2.0 * n / experiment.signals.count + len(SLOPES_AT) * measured
 
 
 def shares(runs: int, needs: np.ndarray, most: int) -> np.ndarray:
-    """So many runs shared out in proportion to needs [S], none taking more than `most`, [S]."""
+    """Numbers of runs, [S], that share out `runs` in proportion to `needs` [S]; each is at most `most`."""
     share, order = np.zeros(len(needs), int), np.argsort(-needs)
     for place, neediest in enumerate(order):
         fair = (runs - share.sum()) * needs[neediest] / max(needs[order[place:]].sum(), np.finfo(float).tiny)
@@ -67,7 +67,7 @@ def shares(runs: int, needs: np.ndarray, most: int) -> np.ndarray:
 
 
 def refuse_another_drive(kernel: MemoryKernel, experiment: Experiment) -> None:
-    """Refuse a kernel that is not of this drive.
+    """Refuse a kernel that was measured at another gamma0 or delta0.
 
     Raises:
         ValueError: saying what differs.
@@ -158,8 +158,8 @@ def design_by_kernel(
     firm = np.full((len(target), 1), damping * np.linalg.norm(kernel.odd, 2))
 
     def guess(gain: float) -> np.ndarray:
-        """What the kernel alone says."""
-        # Where a unit of J is recalled with the kernel's gain, this much of each waveform is needed.
+        """The amplitudes that the kernel alone predicts for a gain."""
+        # The kernel recalls J with its own gain, so that each waveform is needed times this ratio.
         amplitudes = nearest(kernel.basis, experiment.waveforms) * gain / kernel.gain()
         for _ in range(PREDICTED):
             missed = gain * float(experiment.scale) * target - kernel.recalled(amplitudes)
@@ -167,7 +167,7 @@ def design_by_kernel(
         return amplitudes
 
     if start is not None:
-        amplitudes = bounded(nearest(sampled(kernel.basis), start), width)  # as they were written
+        amplitudes = bounded(nearest(sampled(kernel.basis), start), width)  # in the basis in which they were written
     elif gain is not None:
         amplitudes = guess(gain)
     else:
@@ -180,22 +180,22 @@ def design_by_kernel(
             amplitudes = guess(gain)
 
     def made(rows: np.ndarray) -> Spline:
-        """As they are written in the end: at slow rates even the cubics between samples are seen in F."""
+        """The waveforms as they are written in the end: at slow rates F shows even the cubics between samples."""
         return sampled(bumps(rows, width))
 
     best, p_sig = amplitudes, recall("trial-0", with_signals(experiment, made(amplitudes)))
     first = experiment.compare(jnp.asarray(p_sig))
     history = [float(original.fidelity), float(first.fidelity)]
     wanted = (float(first.gain) if gain is None else gain) * float(experiment.scale) * target
-    learned = np.zeros((len(best), *kernel.odd.shape))  # of each waveform's slopes, beyond the kernel
+    learned = np.zeros((len(best), *kernel.odd.shape))  # slopes of each waveform, beyond the kernel's
     strongest = np.linalg.svd(kernel.odd)[0].T  # [n, n]
     damped = firm
-    passed = 0.0 if start is None else SLOPES_AT[0]  # what an earlier design has learned already
+    passed = 0.0 if start is None else SLOPES_AT[0]  # the part that an earlier design has done
     moments = [max(1, int((part - passed) * iterations)) for part in SLOPES_AT]
     for iteration in range(1, iterations):
         if measured and iteration in moments:
             missed = wanted - p_sig
-            # Where the next step would go, and about as far.
+            # Probes go where the next step would go, and about as far.
             ahead = correction(slopes(kernel, best) + learned, missed, damped) @ strongest.T
             far = np.where(ahead < 0.0, -1.0, 1.0) * np.clip(np.abs(ahead), *PROBE)
             share = shares(measured * len(best), np.sum(missed**2, axis=1), n)

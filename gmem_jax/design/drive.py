@@ -42,7 +42,7 @@ class TunedDrive:
 
 
 def start_within(experiments: Sequence[Experiment], bounds: dict[str, tuple[float, float]]) -> list[float]:
-    """The values that a search begins with.
+    """The values with which a search begins.
 
     Raises:
         ValueError: if a bound is not lowest <= start <= highest with lowest positive, there is no pack, a parameter
@@ -150,7 +150,7 @@ def design_drive(
             up, down = (each(side) for side in sides)
             slope[place] = np.mean(up - down) / max(sides[0][place] - sides[1][place], 1e-12)
             seen += zip(sides, (up, down), strict=True)
-        # As long as the differences reach: the slope says nothing of what is further away.
+        # The step is as long as the differences: the slope says nothing about points further away.
         along = -slope * spread / max(float(np.linalg.norm(slope)), 1e-12)
         stepped = np.clip(logs - along, lowest, highest)
         seen.append((stepped, each(stepped)))

@@ -1,9 +1,9 @@
 """The memory kernel of a pack: how the recall depends on the waveform when the waveform is weak.
 
 p_sig(u) = int M(u, v) gamma(v) dv. The kernel is measured on n basis waveforms (half-cosine bumps of one width), each
-stored with both signs as replicas of one native run. Half the difference of the two recalls is
-the odd part, M; half the sum is the even part, which a linear memory would not have. Measured, both grow in proportion
-to a weak waveform: a pack answers a shear and its opposite differently, however small they are.
+stored with both signs as replicas of one run. Half the difference of the two recalls is the odd part, M; half the sum
+is the even part, which a linear memory would not have. In measurements both grow in proportion to a weak waveform: a
+pack answers a shear and its opposite differently, however small they are.
 """
 
 from dataclasses import dataclass
@@ -66,7 +66,7 @@ class MemoryKernel:
         return result
 
     def _orthonormal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Recalls [n, 256] of, and values [n, QUADRATURE_POINTS] of, an orthonormal basis of the same space."""
+        """Recalls [n, 256] and values [n, QUADRATURE_POINTS] of an orthonormal basis of the space of the bumps."""
         v = (np.arange(QUADRATURE_POINTS) + 0.5) / QUADRATURE_POINTS
         shapes = np.asarray(self.basis.shear(jnp.asarray(v))).T
         values, vectors = np.linalg.eigh(shapes @ shapes.T / QUADRATURE_POINTS)
@@ -195,7 +195,7 @@ def memory_kernel(
 
 
 def _basis(experiment: Experiment, n: int, width: float) -> Bumps:
-    """n bumps and their opposites, once it is sure that they make a kernel."""
+    """n bumps and their negatives, after a check that a kernel can be measured with them."""
     n = require_whole("n", n)
     require_numbers(width=width)
     if n < 2:
@@ -276,7 +276,7 @@ def kernel_matrix(
 
 
 def _writing_alone(experiment: Experiment, name: str, loud: Bumps) -> Experiment:
-    """The same experiment with these waveforms in the place of the set of a name, and silence in that of others."""
+    """The experiment with the waveforms `loud` as its set `name`, and zero waveforms as its other sets."""
     silent = bumps(jnp.zeros_like(loud.amplitudes), float(loud.width))
     return replace(experiment, signals=signals(**{one: loud if one == name else silent for one in experiment.sets}))
 
@@ -299,13 +299,13 @@ def written_sets(experiment: Experiment) -> tuple[str, ...]:
 
 
 def amplitude_on(experiment: Experiment, channel: str) -> float:
-    """gamma0 of what is written on a channel, with the factor of the stage; of one read."""
+    """gamma0 times the amplitude of the drive that writes on a channel; the experiment has one read."""
     (read,) = experiment.readings.reads
     return float(experiment.gamma0) * experiment.protocol.written(read)[channel].amplitude
 
 
 def _kernel_of(experiment: Experiment, both: Bumps, p_sig: np.ndarray, channel: str) -> MemoryKernel:
-    """The kernel from the recalls [2 n, 256] of n bumps and their opposites that were written on a channel."""
+    """The kernel from the recalls [2 n, 256] of n bumps and their negatives that were written on a channel."""
     n = len(p_sig) // 2
     plus, minus = p_sig[:n], p_sig[n:]
     return MemoryKernel(

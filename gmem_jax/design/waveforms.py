@@ -30,10 +30,10 @@ from gmem_jax.simulation.stage import BINS
 
 NODES = 127  # samples of a designed waveform
 DAMPING = (0.01, 0.005)
-FRACTIONS = (1.0, 0.5, 0.25)  # of a step that are tried
+FRACTIONS = (1.0, 0.5, 0.25)  # fractions of a step that are tried
 ITERATIONS = 3  # corrections of a design
 BUMPS = 17  # basis waveforms of a design
-BUMP_WIDTH = 0.2  # of them, in u
+BUMP_WIDTH = 0.2  # full width of the basis waveforms, in u
 TANGENT = 2.5  # cost of a tangent in runs; see benchmarks
 
 
@@ -95,12 +95,12 @@ def bounded(amplitudes: np.ndarray, width: float) -> np.ndarray:
 
 
 def correction(slope: np.ndarray, miss: np.ndarray, damping: np.ndarray | float) -> np.ndarray:
-    """Changes of amplitudes whose recalls come nearest to what is missed, by damped least squares, [S, n].
+    """Changes of amplitudes that correct p_sig by `miss`, by damped least squares, [S, n].
 
     Args:
         slope: dp_sig / da of every waveform, [S, n, 256].
-        miss: wanted p_sig less the present one, [S, 256], in E.
-        damping: in the unit of singular values of the slope, a number or [S, 1].
+        miss: wanted p_sig less the present p_sig, [S, 256], in E.
+        damping: damping in the unit of singular values of the slope, a number or [S, 1].
     """
     left, values, right = np.linalg.svd(slope, full_matrices=False)
     filtered = values / (values**2 + np.square(damping))
@@ -116,7 +116,7 @@ def sampled(signals: Signals) -> Spline:
 def verified(
     experiment: Experiment, sets: dict[str, Spline], p_sig: np.ndarray, untouched: np.ndarray, history: Sequence[float]
 ) -> Design:
-    """What came of a design, by the recalls of the designed and of the untouched waveforms, both [S, 256] in E."""
+    """The `Design` from the recalls of the designed and of the original waveforms, both [S, 256], in E."""
     match, before = (experiment.compare(jnp.asarray(recall)) for recall in (p_sig, untouched))
     return Design(
         sets=sets,
@@ -135,21 +135,21 @@ def _told(found: jax.Array) -> float | np.ndarray:
 
 
 class Work:
-    """What a design takes in all, in runs of its signals, and how much of that is done."""
+    """The work of a design, in runs of all its signals, and the part of it that is done."""
 
     def __init__(self, total: float, progress: Progress) -> None:
         self.total = total
         self._done, self._progress = 0.0, progress
 
     def next(self, runs: float, name: str = "") -> Progress:
-        """The progress of the next thing to be done."""
+        """The progress callback of the next part of the work, of `runs` runs."""
         begun, self._done = self._done / self.total, self._done + runs
         inner = within(self._progress, begun, self._done / self.total)
         return lambda stage, moment, fraction: inner(f"{name}, {stage}" if name else stage, moment, fraction)
 
 
 def cost(experiment: Experiment, iterations: int | None = None, n: int = BUMPS) -> float:
-    """What a design takes, in runs of its signals."""
+    """The cost of a design, in runs of all its signals."""
     return 3.0 + 2.0 * _prefix(experiment) + (iterations or ITERATIONS) * (TANGENT * n + len(FRACTIONS))
 
 
@@ -159,7 +159,7 @@ def _prefix(experiment: Experiment) -> float:
 
 
 def refuse_several_scales(experiment: Experiment) -> None:
-    """Refuse what has no one gain.
+    """Refuse an experiment that has not one gain.
 
     Raises:
         ValueError: if gamma0 or delta0 differs between replicas.
@@ -231,12 +231,12 @@ def design_waveforms(
     basis, count = bumps(np.eye(n), width), experiment.signals.count
 
     def side_by_side(by_channel: npt.ArrayLike) -> np.ndarray:
-        """[C, S, 256], or [S, 256] of one channel, as [S, C 256]."""
+        """Curves [C, S, 256], or [S, 256] of one channel, as [S, C 256]."""
         shaped = np.asarray(by_channel).reshape(len(names), -1, BINS)
         return np.concatenate(list(shaped), axis=1)
 
     def made(rows: np.ndarray) -> dict[str, Bumps]:
-        """Waveforms of amplitudes [S, C n]."""
+        """Waveforms by the name of their set, from amplitudes [S, C n]."""
         own = zip(names, np.split(rows, len(names), axis=1), strict=True)
         return {name: bumps(part, width) for name, part in own}
 
