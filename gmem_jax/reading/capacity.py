@@ -85,12 +85,12 @@ def _finite(recalls: jax.typing.ArrayLike) -> np.ndarray:
 
 
 def _bitwise(truth: np.ndarray, read: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Information in bits, summed over bits, [B], for B weights of the words [B, S].
+    """Mutual information of each bit stored and read, summed over the L bits of a word, in bits, [B].
 
     Args:
         truth: bits stored, [S, L].
-        read: shares of draws in which a bit was read as 1, [S, L].
-        weight: how often each word counts, [B, S].
+        read: fractions of draws in which a bit was read as 1, [S, L].
+        weight: B sets of weights of the words, [B, S].
     """
     joint = np.stack([weight @ (one * other) for one in (1 - truth, truth) for other in (1.0 - read, read)])
     counted = joint.reshape(2, 2, *joint.shape[1:])  # stored, read, B, L
@@ -140,7 +140,7 @@ def water_filled(ratio: np.ndarray, power: float) -> np.ndarray:
     """
     with np.errstate(divide="ignore"):
         bottom = 1.0 / ratio
-    level = (power + np.cumsum(bottom)) / np.arange(1, len(bottom) + 1)  # of the water, if so many channels are wet
+    level = (power + np.cumsum(bottom)) / np.arange(1, len(bottom) + 1)  # of water in the first 1, 2, ... channels
     wet = np.flatnonzero(level > bottom)
     return np.asarray(np.maximum(0.0, level[wet[-1]] - bottom)) if wet.size else np.zeros(len(bottom))
 
@@ -183,7 +183,7 @@ def greedy_alphabet(recalls: jax.typing.ArrayLike, size: int) -> Alphabet:
         raise ValueError(f"an alphabet of {len(values)} candidates has 1 to {len(values)} waveforms, got {size}")
     power = np.mean(values**2, axis=1)
     chosen, distance = [int(np.argmax(power))], [np.inf]
-    nearest = np.full(len(values), np.inf)  # mean square to the nearest that is chosen
+    nearest = np.full(len(values), np.inf)  # mean square distance to the nearest chosen one
     while len(chosen) < size:
         last = chosen[-1]
         nearest = np.minimum(nearest, power + power[last] - 2.0 * values @ values[last] / values.shape[1])

@@ -21,7 +21,7 @@ from gmem_jax.physics.numbers import require_numbers, require_whole
 from gmem_jax.simulation.stage import BINS
 
 MOST_LAYERS = 8
-RATIOS = 64  # of noise to signal at which the size of a set is calculated, and joined by straight lines: right to 1e-5
+RATIOS = 64  # ratios of noise to signal at which <|J|> of a set is computed; linear interpolation is right to 1e-5
 
 
 @dataclass(frozen=True)
@@ -98,11 +98,12 @@ class TrainingConfig:
 )
 @dataclass(frozen=True)
 class Examples:
-    """Everything an example is made from.
+    """The data from which examples are made.
 
     Attributes:
         table: J_s(u - shift) / <|J|>, [S, shifts, 256], float32.
-        level: mean of |J| of each set by shift, amplitude and draw, in that of the words as they are; float32.
+        level: mean of |J| of each set, noise included, over that of the unchanged words, by shift, amplitude and draw;
+            float32.
         order: numbers of the (shift, amplitude, draw) combinations, shuffled by the seed; the first `lessons.kept` are
             held out.
         noise: random key.
@@ -116,7 +117,7 @@ class Examples:
     lessons: TrainingConfig
 
     def make(self, word: jax.Array, combination: jax.Array) -> jax.Array:
-        """Input [..., 256] of word number `word` (from 0) under a combination; the same numbers, the same input."""
+        """Input [..., 256] of word number `word` (from 0) under a combination; equal numbers give equal inputs."""
         lessons = self.lessons
         shift, rest = jnp.divmod(combination, lessons.amplitudes * lessons.draws)
         factor, draw = jnp.divmod(rest, lessons.draws)
@@ -140,7 +141,7 @@ class Examples:
         return self.make(word, self.order[place]), word
 
     def held_out(self, number: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Held-out inputs [..., 256] and their words; `number` counts through all S * kept of them, words first."""
+        """Held-out inputs [..., 256] and their words; `number` is below S * kept, and the word changes with each."""
         word = number % self.lessons.classes
         # Neighbouring words take different combinations, so that a few thousand examples cover many.
         place = (number // self.lessons.classes + 7 * word) % self.lessons.kept
@@ -148,17 +149,17 @@ class Examples:
 
 
 def _ladder(place: jax.Array, rungs: int) -> jax.Array:
-    """-1 to 1 in `rungs` equal steps; 0 if there is but one."""
+    """Number `place` of `rungs` equally spaced numbers from -1 to 1; 0 if there is only one."""
     return 2.0 * place / (rungs - 1) - 1.0 if rungs > 1 else 0.0 * place
 
 
 def _scale(lessons: TrainingConfig, factor: jax.Array) -> jax.Array:
-    """By what a set is multiplied."""
+    """The factor on J in a set."""
     return 1.0 + lessons.amplitude * _ladder(factor, lessons.amplitudes)
 
 
 def _deviation(lessons: TrainingConfig, draw: jax.Array) -> jax.Array:
-    """SD of the noise of a set, in <|J|>."""
+    """Standard deviation of the noise of a set, in <|J|>."""
     return lessons.noise * (draw / max(lessons.draws - 1, 1))
 
 
@@ -171,7 +172,7 @@ def examples(lessons: TrainingConfig, seed: jax.typing.ArrayLike) -> Examples:
 
 
 def _table(lessons: TrainingConfig) -> jax.Array:
-    """J_s shifted, over the mean of |J| of the words as they are, [S, shifts, 256]."""
+    """The shifted J_s over the mean of |J| of the unshifted words, [S, shifts, 256]."""
     signals = words(lessons.bits)
     mean = jnp.mean(jnp.abs(bin_average(signals)))
     steps = _ladder(jnp.arange(lessons.shifts), lessons.shifts) * lessons.shift * bit_width(lessons.bits)
@@ -186,11 +187,11 @@ def _table(lessons: TrainingConfig) -> jax.Array:
 def _level(lessons: TrainingConfig, table: jax.Array) -> jax.Array:
     """Mean of |scale J + deviation n| over words, u and Gaussian n, [shifts, amplitudes, draws]."""
     scale = _scale(lessons, jnp.arange(lessons.amplitudes))[:, None]
-    noise = _deviation(lessons, jnp.arange(lessons.draws)) / scale  # of a set that is not scaled
+    noise = _deviation(lessons, jnp.arange(lessons.draws)) / scale  # that of an equivalent set with scale 1
     known = jnp.linspace(0.0, jnp.max(noise), RATIOS)
 
     def mean(signal: jax.Array, deviation: jax.Array) -> jax.Array:
-        """Of the absolute value of Gaussian numbers, a folded normal distribution."""
+        """Mean of the absolute value of Gaussian numbers: that of a folded normal distribution."""
         x = signal / (math.sqrt(2.0) * jnp.maximum(deviation, 1e-6))
         return jnp.mean(deviation * math.sqrt(2.0 / math.pi) * jnp.exp(-(x**2)) + signal * jax.lax.erf(x))
 

@@ -19,7 +19,7 @@ from gmem_jax.simulation.stage import BINS
 
 
 class Perceptron(nn.Module):
-    """256 - hidden - classes, ReLU between, Kaiming-uniform weights, biases zero at first, single precision."""
+    """Dense layers 256 - hidden - classes with ReLU between; Kaiming-uniform weights, zero biases, single precision."""
 
     classes: int
     hidden: tuple[int, ...]

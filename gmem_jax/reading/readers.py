@@ -14,7 +14,7 @@ from gmem_jax.experiment.signals import LONGEST_WORD, Signals, bin_average, word
 from gmem_jax.files.measures import read_stress
 from gmem_jax.physics.numbers import plural
 
-FOLDS = 16  # parts that the words are split into for the linear decoder; fewer words are left out one by one
+FOLDS = 16  # parts into which the words are split for the linear decoder; fewer words are left out one by one
 PENALTIES = np.logspace(-6, 1, 15)  # tried for the ridge, in units of the largest singular value squared
 
 
@@ -23,10 +23,10 @@ class Stored:
     """The recalled words of one pack.
 
     Attributes:
-        bits: L.
+        bits: length L of the words.
         background: how the background was subtracted.
-        signals: p_sig, [2^L, 256], in E.
-        templates: J, alike.
+        signals: p_sig of all words, [2^L, 256], in E.
+        templates: J of all words, [2^L, 256].
     """
 
     bits: int
@@ -36,11 +36,11 @@ class Stored:
 
 
 def stored_words(recall: Recall, target: Signals | None = None) -> Stored:
-    """The words that a recall holds, by SUB2-BL if it has a second readout, else by SUB0.
+    """The words of a recall, with the background SUB2-BL if it has a second readout, else SUB0.
 
     Args:
-        recall: of the words themselves, or of waveforms designed to be recalled as they should be.
-        target: the words, if they were designed.
+        recall: the recall of the words themselves, or of waveforms that were designed for them.
+        target: the words, if the waveforms were designed for them.
 
     Raises:
         ValueError: if its signals are not all the words of one length, in order, of the default pad and width; or it
@@ -54,7 +54,7 @@ def stored_words(recall: Recall, target: Signals | None = None) -> Stored:
     templates = np.asarray(recall.J if target is None else bin_average(target))
     bits = len(templates).bit_length() - 1
     expected = np.asarray(bin_average(words(bits))) if 1 <= bits <= LONGEST_WORD else np.zeros(0)
-    # J of a word is of order u_b / pi: a tenth of a thousandth of it is far above round-off, far below another word.
+    # J of a word is of order u_b / pi; 1e-4 of this is far above round-off, and far below the distance of two words.
     if expected.shape != templates.shape or not np.allclose(templates, expected, atol=1e-4 / (np.pi * (bits + 4))):
         raise ValueError(f"the recall holds {plural(len(templates), 'signal')}, not the words of one length")
     if recall.second_readout is None:
@@ -64,7 +64,7 @@ def stored_words(recall: Recall, target: Signals | None = None) -> Stored:
 
 
 def nearest_template(signals: jax.typing.ArrayLike, templates: jax.typing.ArrayLike) -> np.ndarray:
-    """The word whose J correlates best with each signal, A.B / (|A| |B|); it knows J, and nothing of the pack."""
+    """The word whose J correlates best with each signal, A.B / (|A| |B|); this reader knows nothing of the pack."""
 
     def unit(rows: jax.typing.ArrayLike) -> np.ndarray:
         array = np.asarray(rows)
@@ -74,16 +74,17 @@ def nearest_template(signals: jax.typing.ArrayLike, templates: jax.typing.ArrayL
 
 
 def linear_decoder(signals: jax.typing.ArrayLike, *, seed: int = 0) -> np.ndarray:
-    """Bits by ridge regression, a bit at a time, fitted on other words of the same pack.
+    """Words read by ridge regression of each bit, which is fitted on other words of the same pack.
 
-    The words are split by seed into `FOLDS` parts (one by one if there are no more); each part is read by a decoder
-    that has seen the others only, and whose penalty was chosen by leaving out each of *their* words in turn. There is
-    no constant term: the sign of the recall is the bit, and left-out words would shift a constant against themselves.
-    With few words a decoder can be worse than the template, for it must learn from them what J looks like.
+    The words are split at random into `FOLDS` parts (of one word each if there are no more). Each part is read by a
+    decoder that has seen the other parts only. Its penalty was chosen by leaving out each of *their* words in turn.
+    There is no constant term: the sign of the recall is the bit, and left-out words would shift a constant against
+    themselves. With few words a decoder can be worse than the template, since it must learn from them what J looks
+    like.
 
     Args:
         signals: p_sig of all words, [2^L, 256], in any unit.
-        seed: of the split.
+        seed: random seed of the split.
     """
     values = np.asarray(signals, dtype=float)
     bits = len(values).bit_length() - 1
@@ -97,7 +98,7 @@ def linear_decoder(signals: jax.typing.ArrayLike, *, seed: int = 0) -> np.ndarra
 
 
 def _ridge(values: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Weights [256, bits] of the ridge whose penalty has the least mean square error on left-out rows."""
+    """Weights [256, bits] of ridge regression with the penalty of least mean square error on left-out rows."""
     left, size, right = np.linalg.svd(values, full_matrices=False)
     along = left.T @ target
     inverse = size / (size**2 + PENALTIES[:, None] * size[0] ** 2)  # [penalties, rank]
@@ -123,14 +124,15 @@ def bit_errors(read: jax.typing.ArrayLike) -> np.ndarray:
 
 
 def information(table: np.ndarray) -> dict[str, float]:
-    """Mutual information in bits between words stored (equally likely) and words read, three ways.
+    """Mutual information in bits between words stored (equally likely) and words read, in three ways.
 
-    With one reading of each word, the plug-in estimate is but the entropy of the answers: a reader that is always wrong
-    and always different scores L bits. It is an upper bound in all but name, biased upwards by about (S - 1)^2 / (2 n
-    ln 2) for n readings as long as that is small, and several nets reading one recall add readings but no new noise of
-    the pack. What one recall of each word can support is less: "bitwise" adds up the information of each bit by itself,
-    for which the S words are S samples (bias 1 / (2 S ln 2) a bit), and is below that of the whole words because the
-    bits stored are independent; "fano" is the least that any channel with this rate of errors carries (Fano).
+    "plug_in" is the plug-in estimate. With one reading of each word it is only the entropy of the answers: a reader
+    that is always wrong and always different scores L bits. It is biased upwards, by about (S - 1)^2 / (2 n ln 2) for
+    n readings as long as that is small, and so is rather an upper bound. Several nets that read one recall add
+    readings, but no new noise of the pack. One recall of each word supports only smaller estimates. "bitwise" sums the
+    information of each bit by itself, for which the S words are S samples (bias 1 / (2 S ln 2) for each bit). It is
+    below that of the whole words, because the bits stored are independent. "fano" is the least that any channel with
+    this rate of errors carries (Fano's inequality).
 
     Args:
         table: a `confusion` table, [S, S].

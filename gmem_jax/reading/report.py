@@ -14,8 +14,8 @@ from gmem_jax.reading.training import Training
 def reading_report(stored: Stored, nets: Sequence[Training]) -> dict[str, Any]:
     """How well the words of a recall are read: by the nets (mean and SD over training seeds) and by the baselines.
 
-    Accuracy, error rate of each bit and information (see `information`) for every reader; for the nets over
-    all their readings together.
+    For every reader it has the accuracy, the error rate of each bit and the `information`; the latter two are over the
+    readings of all nets together.
     """
     count = len(stored.signals)
     answers = {

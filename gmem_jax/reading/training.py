@@ -34,7 +34,7 @@ from gmem_jax.reading.net import Net, initial, loss_of, raw_logits
 from gmem_jax.simulation.progress import silent
 from gmem_jax.simulation.stage import BINS
 
-STEPS_PER_CALL = 250  # to a call from the host: a second or so, and one check of the validation accuracy
+STEPS_PER_CALL = 250  # steps in a call from the host, about a second; then the validation accuracy is checked
 QUICK_CHECK = 4_096  # held-out examples tried after every call
 LAST_CHECK = 65_536  # held-out examples, at most, that must agree before training stops early
 SLICE = 1_024  # examples evaluated side by side
@@ -44,9 +44,9 @@ SAVE_EVERY = 30.0  # seconds between checkpoints
 def learn(
     net: Net, data: Examples, seed: jax.typing.ArrayLike, first: jax.typing.ArrayLike, count: int
 ) -> tuple[Net, jax.Array]:
-    """`count` steps of plain SGD from step number `first`; the net after them and the mean loss during them.
+    """Make `count` steps of plain SGD from step number `first`; return the net after them and their mean loss.
 
-    A step depends on its number and the seed alone, so that training can be broken off and taken up anywhere.
+    The random numbers of a step depend on its number and the seed alone, so that training can stop and resume anywhere.
     """
     key = jax.random.fold_in(chance.key(seed), 2)
 
@@ -97,7 +97,7 @@ class Training:
 
 
 Listener = Callable[[Training], None]
-"""Told about every call of `STEPS_PER_CALL` steps."""
+"""A function that is called with the `Training` after every `STEPS_PER_CALL` steps."""
 
 
 _learn = jax.jit(learn, static_argnames="count")
@@ -206,7 +206,7 @@ def load(path: Path) -> Training:
     path = Path(path)
     with refusing(path, "classifier file"), path.open("rb") as file:
         require_sealed(file, "classifier file")
-        # Nothing that it unpacks to is larger than the file: it has no compression, and no code.
+        # The format has no compression and no code, so that the content is no larger than the file.
         content = serialization.msgpack_restore(file.read())
         found = content.get("schema", "none") if isinstance(content, dict) else "none"
         if found != NET.name:
@@ -235,7 +235,7 @@ _TRAINING: dict[str, Callable[[Any], bool]] = {
 
 
 def _parameters(found: Any, lessons: TrainingConfig) -> dict[str, dict[str, jax.Array]]:
-    """Weights and biases of the net of some lessons.
+    """Weights and biases `found` in a file, checked against the layers of `lessons`.
 
     Raises:
         FileFormatError: if they are those of another net, or not finite.
