@@ -17,7 +17,7 @@ from gmem_jax.simulation.progress import work_of
 from gmem_jax.simulation.runner import Runner
 
 STATIC_FIELDS = tuple(entry.name for entry in fields(Experiment) if "static" in entry.metadata)
-LENGTHS = ("pack.clump.radii", "pack.clump.sizes")  # of spheres that are not all alike
+LENGTHS = ("pack.clump.radii", "pack.clump.sizes")  # radii and sizes of unequal spheres
 
 Moving = tuple[Any, ...]  # grains, histories, held walls and periodic cell: the differentiable part of a state
 

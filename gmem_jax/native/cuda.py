@@ -250,7 +250,7 @@ def call_kernels(target: str, call: Any, in_place: bool, parts: Any, shapes: Seq
     between = between_steps(fixed, arrays.history, grains, call, kinds, lanes, kept)
     ffi = jax.ffi.ffi_call(target, [*results, *between], input_output_aliases=aliases)
     found: list[jax.Array] = list(ffi(*before, *arrays.history, *jax.tree.leaves(slopes), **call._asdict()))
-    if kept is not None:  # where nothing touches, not all derivatives depend on the parameters, and so become NaN
+    if kept is not None:  # some derivatives do not depend on the parameters where nothing touches
         for number, bar in enumerate(found[: len(arrays.fields) + 3]):
             known = jnp.expand_dims(sound, tuple(range(1, bar.ndim)))
             found[number] = jnp.where(known, bar, jnp.full_like(bar, jnp.nan))

@@ -12,7 +12,7 @@ from gmem_jax.native import calls, cuda
 from gmem_jax.physics.contact.friction import FrictionLaw
 from gmem_jax.physics.contact.laws import Entry, entry_of
 
-MOST_THREADS = 4096  # of a call, as in cpu/team.cc
+MOST_THREADS = 4096  # most threads of a call, as in cpu/team.cc
 
 
 def path() -> Path:

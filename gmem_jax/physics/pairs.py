@@ -84,7 +84,7 @@ def touching_distance(pairs: Pairs, clump: Clump) -> jax.Array | float:
 
 
 def slack(pairs: Pairs, spheres: jax.Array, box: Box, radii: jax.Array | None = None) -> jax.Array:
-    """How much closer two unlisted spheres may still come before they could touch, [B], in R.
+    """The distance by which two unlisted spheres may still come closer before they could touch, [B], in R.
 
     Positive while the list is certainly complete: unlisted spheres are at least ratio * reach apart after the affine
     part of their motion, and the non-affine part brings them together by at most twice the largest deviation. Among

@@ -84,7 +84,7 @@ class PairFinder:
 
     @functools.cached_property
     def _periodic_list(self) -> tuple[Any, Any]:
-        """As `_list`, in a periodic box: positions are in units of its edges, and updates take the edges too."""
+        """As `_list`, in a periodic box: both functions take positions in units of its edges, and the edges."""
         from jax_md import space
 
         edges = jnp.asarray(self._extent)

@@ -17,7 +17,7 @@ from gmem_jax.physics.rules import usual_rules
 
 CUT = 3.0  # standard deviations of ln(size) beyond which the lognormal has no grains
 LARGEST_SPREAD = 0.35  # with this cut the largest grain is then 7.7 times the smallest, and lists allow a ratio of 10
-_STREAM = 4  # of the random numbers of a seed: the first three are those of the gas
+_STREAM = 4  # number of the stream of random numbers of a seed; the gas uses the first three
 
 
 @usual_rules()

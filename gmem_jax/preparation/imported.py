@@ -122,11 +122,11 @@ def import_pack(
 
     Args:
         path: the file.
-        radius: R in its unit of length: of equal spheres their radius.
+        radius: the length R in the file's unit of length; for equal spheres, their radius.
         delta0: compression that the pack is meant for.
-        name: of the pack; default the file's.
+        name: name of the pack; default the file's name.
         friction: law under which the ringing period is measured; default `Hooke()`.
-        progress: told about that run.
+        progress: callback for the progress of that run.
 
     Raises:
         FileNotFoundError: if there is no such file.

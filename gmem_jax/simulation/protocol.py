@@ -122,7 +122,7 @@ class Protocol:
         return tuple(channel for channel in CHANNELS if channel in written)
 
     def written(self, read: str) -> dict[str, Drive]:
-        """The drives with which a stage that reads is compared, by channel: those of its `of`, or the last before it.
+        """The drives with which a stage that reads is compared, by channel: of its stage `of`, or the last before it.
 
         Raises:
             ValueError: if there is no stage of this name.

@@ -38,7 +38,7 @@ def one_contact_limit(simulation: Simulation, stiffer: float = 1.0, **changed: f
     rigidity, damping, spring, tangential_damping = (numbers[name] for name in _USUAL)
     mass = _most(system.clump.mass) * float(system.clump.smallest) ** 3 / stiffer
     root = math.sqrt(OVERLAP)
-    stiffness = _most(system.material.plane_stiffness) * root * max(rigidity, 2.0**-0.5)  # of a wall, or of two grains
+    stiffness = _most(system.material.plane_stiffness) * root * max(rigidity, 2.0**-0.5)  # wall, or two grains
     spring *= root if isinstance(system.friction, MindlinRescaled | Mindlin) else 1.0
     rates = (
         0.5 * math.sqrt(1.5 * stiffness / mass),

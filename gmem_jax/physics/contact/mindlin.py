@@ -20,7 +20,7 @@ MOST_POINTS = 10_000  # of a history; the paper has 100
 @pytree
 @dataclass(frozen=True)
 class LayeredHistory:
-    """What M2 remembers of a contact; zero for an untouched one.
+    """The history of a contact under M2; zero for an untouched contact.
 
     Attributes:
         layers: f_j, along the frame and across it, [P, Q, 2, B], in E R^1.5.

@@ -15,7 +15,7 @@ from gmem_jax.physics.pytree import Scalar, parameter, pytree
 @pytree
 @dataclass(frozen=True)
 class RescaledHistory:
-    """What M1 remembers of a contact; zero for an untouched one.
+    """The history of a contact under M1; zero for an untouched contact.
 
     Attributes:
         force: elastic force, [P, 3, B], in E R^2.
