@@ -13,10 +13,10 @@ from gmem_jax.physics.pytree import Scalar, traced
 from gmem_jax.physics.rules import usual_rules
 
 MEASURES = ("gain", "fidelity", "windowed_gain", "windowed_fidelity")
-"""What is said of every recall: G and F of the set, and both averaged over the ringing period (`compare`)."""
+"""Measures of every recall: G and F of the set, and the same two after a running mean over the ringing period."""
 Background = Literal["sub0", "sub2", "sub2-bl"]
 BACKGROUNDS: tuple[Background, ...] = get_args(Background)
-"""Ways to remove the background: the zero signal's run; the same run's second readout; that without its line."""
+"""Backgrounds: readout of the zero signal; second readout of the same replica; that and a line (see `Experiment`)."""
 
 
 def recalled(pressure: jax.Array) -> jax.Array:
@@ -68,7 +68,7 @@ def compare(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scala
         signal: p_sig, [S, bins], in E.
         integral: J, bin-averaged like p_sig, [S, bins].
         scale: delta0 gamma0; scalar or [S, 1].
-        window: part of u over which both are averaged before; the ringing period over t0 removes what rings.
+        window: width in u of a running mean that both series take first; T_1 / t0 removes the ringing.
     """
     if window is not None:
         signal, integral = (running_mean(series, window * series.shape[-1]) for series in (signal, integral))
@@ -83,14 +83,15 @@ def compare_channels(signal: jax.Array, integral: jax.Array, scale: Scalar, wind
 
     Args:
         signal: p_sig of each channel, [C, S, bins], in E.
-        integral: J of what was written on each, [C, S, bins]; a channel where all is zero was silent.
+        integral: J of the waveforms on each channel, [C, S, bins]; a channel is silent if its J are all zero.
         scale: delta0 gamma0; scalar or [S, 1].
-        window: of `compare`.
+        window: as in `compare`.
 
     Returns:
-        The gain matrix [C, C], which minimises |p_sig_c - sum_d G_cd E delta0 gamma0 J_d|^2: off its diagonal is the
-        cross-talk, what channel c gives back of what was written on d. And of each channel the fidelity [C] with which
-        it follows its own J: cross-talk counts as error. NaN for what was written on a silent channel.
+        The gain matrix [C, C], which minimises |p_sig_c - sum_d G_cd E delta0 gamma0 J_d|^2. Off its diagonal is the
+        cross-talk: G_cd says how much of the waveform on channel d comes back on channel c. And the fidelity [C] with
+        which each channel follows its own J; cross-talk counts as error. For a silent channel its column of the matrix
+        and its fidelity are NaN.
     """
     if window is not None:
         signal, integral = (running_mean(series, window * series.shape[-1]) for series in (signal, integral))
@@ -113,7 +114,7 @@ def each(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar |
         signal: p_sig, [S, bins], in E.
         integral: J, [S, bins].
         scale: delta0 gamma0; scalar or [S, 1].
-        window: of `compare`.
+        window: as in `compare`.
     """
 
     def alone(p_sig: jax.Array, own: jax.Array, scale: jax.Array) -> Match:
@@ -124,10 +125,10 @@ def each(signal: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar |
 
 
 def errors_over_signals(signal: np.ndarray, integral: np.ndarray, scale: np.ndarray | float) -> tuple[float, float]:
-    """Standard errors of gain and fidelity from their spread over the S signals of a set (jackknife); NaN for one.
+    """Standard errors of gain and fidelity from their spread over the S signals of a set (jackknife); NaN if S = 1.
 
-    They say how much depends on which signals were stored in this pack, and nothing of other packs. Words are sums of
-    few bits, so that their errors are not independent.
+    They say how much gain and fidelity depend on the choice of signals in this pack, and nothing of other packs. Words
+    are sums of few bits, so that their errors are not independent.
 
     Args:
         signal: p_sig, [S, bins], in E.
@@ -149,14 +150,14 @@ def errors_over_signals(signal: np.ndarray, integral: np.ndarray, scale: np.ndar
 def backgrounds(
     first: jax.Array, second: jax.Array, integral: jax.Array, scale: Scalar, window: Scalar | None = None
 ) -> dict[str, Match]:
-    """Gain and fidelity of the set by each of `BACKGROUNDS`, from a run with a second readout.
+    """Gain and fidelity of the set with each of `BACKGROUNDS`, from a run with a second readout.
 
     Args:
         first: p_xy of the readout, replica 0 the zero signal, [S + 1, bins], in E.
-        second: p_xy of the second readout, alike.
+        second: p_xy of the second readout, of the same shape.
         integral: J, [S, bins].
         scale: delta0 gamma0; scalar or [S, 1].
-        window: of `compare`.
+        window: as in `compare`.
     """
     return {name: compare(subtract(name, first, second), integral, scale, window) for name in BACKGROUNDS}
 
@@ -174,10 +175,10 @@ def correlation(signal: jax.Array, integral: jax.Array) -> jax.Array:
 
 
 def remembered_after(second: jax.Array, integral: jax.Array, scale: Scalar) -> tuple[jax.Array, jax.Array]:
-    """What the second readout still holds of each signal: its correlation with J, and its gain, both [S].
+    """The memory of each signal that the second readout still finds: correlation with J, and gain, both [S].
 
-    The zero signal's second readout is subtracted, as in SUB0. Both are near zero where the first readout erased the
-    memory. The correlation alone can be large for a residue of no size: the gain says how large, beside the first's.
+    The zero signal's second readout is subtracted, as in "sub0". The gain is near zero where the first readout erased
+    the memory. The correlation can be large even then, since it does not depend on the size of the residue.
 
     Args:
         second: p_xy of the second readout, replica 0 the zero signal, [S + 1, bins], in E.

@@ -12,7 +12,7 @@ from gmem_jax.experiment.pack import Pack
 from gmem_jax.experiment.signals import Signals, SignalSets
 from gmem_jax.physics.contact.friction import FrictionLaw
 
-_MADE_BY = {  # kinds of arguments, and what makes them
+_MADE_BY = {  # how an argument of each kind is made
     "Experiment": "gm.Experiment(pack, gm.six_signals()) makes one",
     "Pack": "see gm.load_pack and gm.prepare",
     "Recall": "gm.run(experiment) makes one, gm.load_recall(path) reads one",
@@ -22,7 +22,7 @@ _MADE_BY = {  # kinds of arguments, and what makes them
 
 
 def require_kind(function: str, value: Any, kind: Any) -> None:
-    """Refuse an argument that is of another kind than a function takes.
+    """Refuse an argument that is not of the kind that a function takes.
 
     Raises:
         TypeError: naming the function, what was given, and what makes the right thing.
@@ -33,7 +33,7 @@ def require_kind(function: str, value: Any, kind: Any) -> None:
 
 
 def require_parts(pack: Any, signals: Any, friction: Any) -> None:
-    """Refuse what is no pack, no waveforms or no law.
+    """Refuse arguments of an experiment that are not a pack, waveforms and a friction law.
 
     Raises:
         ValueError: saying what was given, and what makes the right thing of it.
@@ -49,13 +49,13 @@ def require_parts(pack: Any, signals: Any, friction: Any) -> None:
 
 
 def require_friction(friction: Any) -> None:
-    """Refuse what is no friction law.
+    """Refuse an argument that is not a friction law.
 
     Raises:
         ValueError: saying what was given, and what makes the right thing of it.
     """
     plain = isinstance(friction, float | int | str) or hasattr(friction, "shape")
-    # A class that JAX does not know may be a law in the making: `Experiment` says what it lacks.
+    # An object of a class that JAX does not know may be an unfinished law: `Experiment` says what it lacks.
     unregistered = not plain and jax.tree_util.all_leaves([friction])
     if isinstance(friction, type) or not (unregistered or isinstance(friction, FrictionLaw)):
         if isinstance(friction, type):
@@ -69,7 +69,7 @@ def named_observers(observe: Any) -> tuple[tuple[str, Any], ...]:
     """Observers with their names: a mapping, pairs, or observers that have a `name`, as `gm.observables` makes them.
 
     Raises:
-        ValueError: for what is none of these, or two of one name.
+        ValueError: for anything else, or two observers of one name.
     """
     try:
         given: Any = observe.items() if isinstance(observe, Mapping) else observe
@@ -89,10 +89,10 @@ def named_observers(observe: Any) -> tuple[tuple[str, Any], ...]:
 
 
 def require_several(values: Any, argument: str) -> None:
-    """Refuse one thing in the place of several.
+    """Refuse a single value where a list is needed.
 
     Raises:
-        ValueError: saying how to write it.
+        ValueError: saying how to write the list.
     """
     if isinstance(values, str) or not isinstance(values, Iterable):
         one = json.dumps(values) if isinstance(values, str | int | float) else ""
@@ -101,10 +101,10 @@ def require_several(values: Any, argument: str) -> None:
 
 
 def require_once(values: Mapping[str, Any], changes: Mapping[str, Any]) -> None:
-    """Refuse a field that is given twice, or after a part of it.
+    """Refuse a field that is given twice, or after one of its parts.
 
     Raises:
-        ValueError: naming it.
+        ValueError: naming the field.
     """
     earlier: list[str] = []
     for name in values:

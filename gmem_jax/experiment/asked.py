@@ -21,14 +21,14 @@ from gmem_jax.physics.rotation import unit
 from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.stage import BINS
 
-FASTEST_CREEP = 0.05  # of an elastic force in a bin: it relaxes once in each
+FASTEST_CREEP = 0.05  # part of an elastic force that may relax in a bin: creep acts once in each bin
 
 
 def static_number(name: str, value: Any) -> float:
-    """A number that a program is compiled for.
+    """A number for which a program is compiled, as a float.
 
     Raises:
-        ValueError: if it is traced, none, negative, or not finite.
+        ValueError: if it is traced, not a number, negative, or not finite.
     """
     if traced(value) or value is None or np.ndim(value):
         raise ValueError(f"{name} is fixed when a program is compiled: it must be a number, got {said(value)}")
@@ -40,7 +40,7 @@ def static_number(name: str, value: Any) -> float:
 
 
 def require_data(**parts: Any) -> None:
-    """Refuse what JAX cannot compute with, in a law or waveforms of a user's own.
+    """Refuse leaves that JAX cannot compute with, in a law or waveforms of the user's own.
 
     Raises:
         ValueError: naming the first such leaf.
@@ -55,7 +55,7 @@ def require_data(**parts: Any) -> None:
 
 
 def require_double(**parts: Any) -> None:
-    """Refuse arrays in less than double precision, as everything has that was made before JAX's 64-bit mode was on.
+    """Refuse arrays in less than double precision: those that were made before JAX's 64-bit mode was on.
 
     Raises:
         ValueError: naming the first such array.
@@ -71,10 +71,10 @@ def require_double(**parts: Any) -> None:
 
 
 def require_host(what: str, experiment: Any) -> None:
-    """Refuse `what`, which works on the host, where an experiment is traced or a program of JAX is being made.
+    """Refuse the function `what`, which works on the host, if the experiment is traced or inside `jax.jit`.
 
     Raises:
-        ValueError: saying what can be used there.
+        ValueError: saying what to use instead.
     """
     if traced(experiment, jnp.zeros(())):  # inside jax.jit the zero is traced, whatever the experiment is
         raise ValueError(f"{what} works on the host; inside jax.jit, jax.vmap or jax.grad use gm.recall")
@@ -84,7 +84,7 @@ def require_inside(pack: Pack) -> None:
     """Refuse a pack that does not lie in its box.
 
     Raises:
-        ValueError: naming the first grain that does not, and where it lies; or whose place is no number.
+        ValueError: naming the first grain outside the box and its centre, or the first whose numbers are not finite.
     """
     spheres = np.asarray(_spheres(pack.position, pack.quaternion, pack.clump))
     inside = (spheres >= np.asarray(pack.lower)) & (spheres <= np.asarray(pack.upper))
@@ -107,10 +107,10 @@ def _spheres(position: jax.Array, quaternion: jax.Array, clump: Clump) -> jax.Ar
 
 
 def require_walls(periodic: PeriodicAxes, material: Material, wall_mu: Scalar | None = None) -> None:
-    """Refuse a rigidity of walls, other than the default, and friction of them where there are none.
+    """Refuse a rigidity of walls other than the default, and friction of walls, in a box without walls.
 
     Raises:
-        ValueError: saying so.
+        ValueError: naming the parameter.
     """
     rigidity = material.wall_rigidity
     if all(periodic) and not traced(rigidity) and np.any(np.asarray(rigidity) != Material.wall_rigidity):
@@ -120,10 +120,10 @@ def require_walls(periodic: PeriodicAxes, material: Material, wall_mu: Scalar | 
 
 
 def require_slippery(friction: FrictionLaw, wall_mu: Scalar | None) -> None:
-    """Refuse friction of the walls under a law that has no limit for it to take the place of.
+    """Refuse wall friction under a law without mu, since `wall_mu` replaces mu at walls.
 
     Raises:
-        ValueError: saying so.
+        ValueError: naming the law.
     """
     if wall_mu is not None and not isinstance(friction, CoulombLaw):
         raise ValueError(
@@ -133,10 +133,10 @@ def require_slippery(friction: FrictionLaw, wall_mu: Scalar | None) -> None:
 
 
 def require_slow_creep(friction: FrictionLaw, creep: Scalar | None, fades: Scalar | None, t0: Scalar) -> None:
-    """Refuse creep that a law cannot have, or that is too fast for the bins that it acts between.
+    """Refuse creep under a law without elastic forces, and creep that is too fast for the bins between which it acts.
 
     Raises:
-        ValueError: saying which.
+        ValueError: saying which of the two.
     """
     if creep is None:
         if fades is not None:
@@ -153,7 +153,7 @@ def require_slow_creep(friction: FrictionLaw, creep: Scalar | None, fades: Scala
 
 
 def require_memory(protocol: Protocol, background: str) -> None:
-    """Refuse a protocol that no pack at rest can go through, or that is none of a memory.
+    """Refuse a protocol that does not begin at u = 0, does not write and read, or does not fit the background.
 
     Raises:
         ValueError: saying what it lacks.
@@ -186,11 +186,11 @@ def require_memory(protocol: Protocol, background: str) -> None:
 
 
 def require_told_apart(readings: Readings, integrals: np.ndarray) -> None:
-    """Refuse waveforms of several channels that are so alike that what one gives back cannot be told from another's.
+    """Refuse waveforms of several channels that are too alike to tell their recalls apart.
 
     Args:
-        readings: what is read.
-        integrals: J, [R, C, S, bins], axes of length one left out.
+        readings: the reads and channels of the protocol.
+        integrals: J, [R, C, S, bins], without axes of length one.
 
     Raises:
         ValueError: saying what to do.
@@ -210,8 +210,8 @@ def require_seen(middles: np.ndarray, integrals: np.ndarray) -> None:
     """Refuse waveforms that are zero in the middle of every bin although their integrals are not.
 
     Args:
-        middles: the waveforms there, [bins, S].
-        integrals: averaged over each bin, [S, bins].
+        middles: the waveforms in the middle of each bin, [bins, S].
+        integrals: their integrals, averaged over each bin, [S, bins].
 
     Raises:
         ValueError: naming the first such waveform.

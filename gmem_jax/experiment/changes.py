@@ -41,13 +41,13 @@ def replace(experiment: Experiment, values: Mapping[str, Any] | None = None, /, 
         _require_field(experiment, name)
     if traced(found.get("t0")):
         found.setdefault("steps", experiment.steps_per_bin)
-    if experiment.is_paper:  # it is made anew of the new numbers and sets
+    if experiment.is_paper:  # the paper's protocol is made anew from the new lengths and sets
         found.setdefault("protocol", None)
     return dataclasses.replace(experiment, **found)
 
 
 def with_part(experiment: Experiment, first: int, last: int) -> Experiment:
-    """The same experiment with waveforms number `first` to `last` - 1 alone, be they silent: the whole set is not."""
+    """The same experiment with waveforms `first` to `last` - 1 only. They may be zero: the whole set was checked."""
     few = copy.copy(experiment)
     object.__setattr__(few, "signals", part(experiment.signals, first, last))
     return few
@@ -72,7 +72,7 @@ def _with(tree: Any, path: list[str], value: Any) -> Any:
 
 
 def value_at(experiment: Experiment, path: str) -> Any:
-    """What stands at a dotted name, like "friction.mu"; defaults resolved.
+    """The value at a dotted name, like "friction.mu"; defaults resolved.
 
     Raises:
         ValueError: if there is no such field.

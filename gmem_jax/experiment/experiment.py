@@ -51,11 +51,11 @@ from gmem_jax.simulation.strain import COMPRESSIONS, Sine, StrainPath, Waveforms
 
 PAPER_T0 = 1.8e4  # the paper's duration of a compression, in t_c
 HOLD_DRAG = 0.05  # 1 / t_c; damps the slowest mode within about 40 t_c up to N = 10,000 without overdamping it
-MOST_STEPS = 1e9  # in a bin: a computer's year for a few grains
-LEAST_STEP = 1e-100  # t_c; its square is a number still
-USUAL_STEP = 0.6  # t_c; less than a third of what is stable under the default law
-OF_PAPER = ("rest", "hold", "store", "shear")  # make the paper's protocol; another one says it in its stages
-NOT_OF_PAPER = ("creep", "creep_fades", "gravity", "wall_mu")  # None: what they stand for is not there, as in the paper
+MOST_STEPS = 1e9  # steps in a bin: more take a year of computing for a few grains
+LEAST_STEP = 1e-100  # t_c; its square does not underflow
+USUAL_STEP = 0.6  # t_c; less than a third of the stable step under the default law
+OF_PAPER = ("rest", "hold", "store", "shear")  # fields of the paper's protocol; in others the stages give them
+NOT_OF_PAPER = ("creep", "creep_fades", "gravity", "wall_mu")  # effects that the paper does not have; None switches off
 
 
 class Timing(NamedTuple):
@@ -311,7 +311,7 @@ class Experiment:
                 )
 
     def _check_waveforms(self) -> None:
-        """The walls are unsheared at u = 0 and u = 1; a waveform that is not would make them jump."""
+        """Refuse waveforms that are not zero at u = 0 and 1, where the walls would jump; and sets that are all zero."""
         if traced(self.signals):
             return
         loud = []
@@ -475,7 +475,7 @@ class Experiment:
         return facts(*self._facts())
 
 
-_OPEN = 1e-9  # of a waveform where it should vanish
+_OPEN = 1e-9  # largest |I| of a waveform at u = 0 and u = 1
 _DEFAULTS = {entry.name: entry.default for entry in fields(Experiment)}
 
 
@@ -485,18 +485,18 @@ def _ends(signals: Signals) -> jax.Array:
 
 @jax.jit
 def _probe(signals: Signals) -> tuple[jax.Array, jax.Array]:
-    """The waveforms at both ends, and in between."""
+    """The waveforms at u = 0 and u = 1, and at the centres of the bins."""
     return _ends(signals), signals.shear(jnp.asarray(bin_centres()))
 
 
 NUMBERS = {entry.name: entry for entry in fields(Experiment) if entry.metadata.get("words")}
-"""The numbers and choices of an experiment by name, each with what is to be known of it in its metadata: `words`,
-`unit` and `interval`; whether it `varies` between replicas; whether it acts only `after_prefix`. Options, the names in
-sweeps and files, checks and the table of the documentation are made from it."""
+"""The numbers and choices of an experiment: fields by name. Metadata of each are `words`, `unit`, `interval`, whether
+it `varies` between replicas, and whether it acts only `after_prefix`. Options, names in sweeps and files, checks and
+the table of the documentation are made from them."""
 
 
 def acts_on_prefix(name: str) -> bool:
-    """Whether the shear-free prefix depends on what has this dotted name."""
+    """Whether the shear-free prefix depends on the parameter of this dotted name."""
     first = name.split(".")[0]
     return not any(entry.name == first and entry.metadata.get("after_prefix") for entry in fields(Experiment))
 

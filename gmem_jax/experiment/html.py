@@ -12,7 +12,7 @@ MOST_ROWS = 20  # rows of a long table
 
 
 def brief(value: Any) -> str:
-    """A value in a few letters: a number, the range of several, words."""
+    """A value as a short text: a number, the range of several numbers, or words."""
     if traced(value):
         return "traced"
     if isinstance(value, str | bool | None):
@@ -25,11 +25,11 @@ def brief(value: Any) -> str:
 
 
 Facts = tuple[str, Mapping[str, Any]]
-"""A title, and what is worth saying by name."""
+"""A title, and the values to be shown by name."""
 
 
 def line(made: Any, found: Callable[[], Facts]) -> str:
-    """The facts of an object in one line; its class alone where its leaves are no numbers, as `jax.tree.map` makes."""
+    """The facts of an object in one line; only its class if its leaves are not numbers (`jax.tree.map` makes such)."""
     try:
         title, rows = found()
         return f"<{title}: {', '.join(f'{name} = {brief(value)}' for name, value in rows.items())}>"
@@ -43,7 +43,7 @@ def facts(title: str, rows: Mapping[str, Any]) -> str:
 
 
 def listing(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table with a line for each row, of which the first 20 are shown."""
+    """A table with a line for each of the first 20 rows."""
     more = [[f"... {len(rows) - MOST_ROWS} more"]] if len(rows) > MOST_ROWS else []
     shown = [[brief(value) for value in row] for row in rows[:MOST_ROWS]]
     return _table(title, [*shown, *more], columns)

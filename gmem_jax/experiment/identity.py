@@ -23,7 +23,7 @@ _INSTALLED = tuple(
     f"{folder}{os.sep}"
     for folder in {*map(sysconfig.get_path, ("stdlib", "purelib", "platlib")), str(Path(__file__).parents[1])}
 )
-"""Folders whose code is told by its name: versions and sources are in keys already."""
+"""Folders of installed code. Its names suffice, since keys hold its versions and sources already."""
 _PLAIN = (str, bytes, int, float, complex, range, slice, Enum, PurePath, np.dtype)
 _HOLDING = (list, tuple, set, frozenset, Mapping)
 _OF_NO_WEIGHT = ("__repr__", "__str__", "__annotate__", "__annotate_func__", "__class__")
@@ -42,11 +42,12 @@ def fingerprint(tree: Any) -> str:
 
 
 def identity(value: Any) -> str:
-    """SHA-256 of an object: its numbers, and the code of its class or of the function that it is.
+    """SHA-256 of an object: of its numbers and of the code of its class; of the code, if the object is a function.
 
-    Of code it is the byte code, its constants, what it closes over, its defaults, and what it names of its module and
-    of others that are not installed, down to functions called from there. Code of installed packages is told by its
-    name. Another version of Python has other byte code. What an object reads elsewhere, as in a file, is not seen.
+    Code is hashed by its byte code, constants, defaults, closure, and the objects that it names in its own module and
+    in other modules that are not installed; so are the functions that it calls there. Code of installed packages is
+    hashed by its name. Byte code differs between versions of Python. Data that an object reads elsewhere, as from a
+    file, are not hashed.
     """
     digest = hashlib.sha256()
     for part in _parts(value, {}):
@@ -55,7 +56,10 @@ def identity(value: Any) -> str:
 
 
 def _parts(value: Any, seen: dict[int, Any]) -> Iterator[str]:
-    """What makes an object, in words; `seen` has what is told already, and keeps it, since an id is used again."""
+    """The parts of an object as texts, to be hashed.
+
+    `seen` has the objects by id that were hashed already. It also keeps them alive, since Python reuses ids.
+    """
     if not isinstance(value, type) and not _is_installed_type(type(value)) and isinstance(value, _PLAIN + _HOLDING):
         yield from _parts(type(value), seen)  # as of a NamedTuple, or of a kind of number
     if isinstance(value, _PLAIN) or value is None:
@@ -63,7 +67,7 @@ def _parts(value: Any, seen: dict[int, Any]) -> Iterator[str]:
     elif isinstance(value, _ARRAYS):
         yield fingerprint(value)
     elif isinstance(value, set | frozenset):
-        yield repr(sorted(map(repr, value)))  # the order of a set is another in each process
+        yield repr(sorted(map(repr, value)))  # the order of a set differs between processes
     elif id(value) in seen:
         yield "again"
     else:
@@ -89,7 +93,7 @@ def _parts_of_code(value: Any, seen: dict[int, Any]) -> Iterator[str]:
         inner, held = value.__wrapped__, getattr(value, "__dict__", {}).items()
         yield from _parts(inner, seen)
         if more := {name: each for name, each in held if _is_own_function(each) and each is not inner}:
-            yield from _parts(more, seen)  # a derivative of its own, say
+            yield from _parts(more, seen)  # for example, a derivative of its own
     elif name := getattr(value, "__qualname__", getattr(value, "__name__", "")):
         yield f"{getattr(value, '__module__', '')}.{name}"
         if _is_own_function(value):
@@ -108,7 +112,7 @@ def _parts_of_code(value: Any, seen: dict[int, Any]) -> Iterator[str]:
 
 
 def _held(value: Any) -> Any:
-    """What an object holds, as a copy of it would be made."""
+    """The data of an object, as `copy` would take them."""
     try:
         made = value.__reduce_ex__(2)
     except Exception:  # it cannot be copied, for whatever reason of its class
@@ -117,18 +121,18 @@ def _held(value: Any) -> Any:
 
 
 def _is_own(name: str, value: Any) -> bool:
-    """Whether an attribute of a class is one that its author wrote, and that what it gives depends on."""
+    """Whether an attribute of a class was written by its author and can change its results."""
     return not (name.startswith("__") and name.endswith("__")) or (callable(value) and name not in _OF_NO_WEIGHT)
 
 
 def _named(function: FunctionType) -> dict[str, Any]:
-    """What a function names of its module, and of modules that are not installed, however deep in packages."""
+    """The objects that a function names in its module and in modules that are not installed, however deep."""
     names, package = _names(function.__code__), function.__globals__.get("__package__")
     imported = {name: sys.modules.get(name) or sys.modules.get(f"{package}.{name}") for name in names}
     found = {name: module for name, module in imported.items() if _is_own_module(module)}
     found |= {name: function.__globals__[name] for name in names if name in function.__globals__}
     modules, looked_into = list(found.items()), set()
-    for name, each in modules:  # which grows
+    for name, each in modules:  # the list grows in this loop
         if _is_own_module(each) and id(each) not in looked_into:
             looked_into.add(id(each))
             within = {of: vars(each)[of] for of in names if of in vars(each)}
@@ -148,7 +152,7 @@ def _is_own_function(value: Any) -> bool:
 
 
 def _is_own_module(value: Any) -> bool:
-    """Whether it is a module that lies in a file, or was made by hand, and is not installed."""
+    """Whether it is a module of the user's: from a file or made by hand, neither installed nor built in."""
     return (
         isinstance(value, ModuleType)
         and value.__name__ not in sys.builtin_module_names
@@ -165,5 +169,5 @@ def _is_installed_type(kind: type) -> bool:
 
 
 def _file(module: ModuleType | None) -> str:
-    """Where a module lies; "" for what was typed, and for what Python has built in."""
+    """The file of a module; "" for one that was typed or is built into Python."""
     return getattr(module, "__file__", None) or ""

@@ -31,14 +31,14 @@ class Pack:
         position: centres of mass of the grains, [N, 3], in R.
         quaternion: body-to-lab rotations (w, x, y, z), [N, 4].
         lower: coordinates of the lower planes of the box, [3], in R.
-        upper: those of the upper planes, [3], in R.
+        upper: coordinates of the upper planes, [3], in R.
         delta0: areal compression by which the pack was cycled.
         ringing_period: T_1, the period of the slowest shear mode of the box that wall motion excites, in t_c.
-        pairs: neighbour list (candidate contacts) that serves a compression by delta0.
-        periodic: which axes of the box are periodic, three truth values. There the centres of grains lie between the
-            planes; their spheres may reach beyond.
+        pairs: neighbour list (candidate contacts) that is valid up to a compression by delta0.
+        periodic: which axes of the box are periodic, three truth values. Along a periodic axis the centres of grains
+            lie between the planes, and their spheres may reach beyond.
         name: a name for logs and files.
-        record: JSON of the recipe of the preparation and of what was measured at its end.
+        record: JSON of the recipe of the preparation and of the measurements at its end.
         source: the file it was read from, or the name of a shipped pack.
 
     The last three are labels: programs are not compiled for them.
@@ -98,7 +98,7 @@ def find_pairs(clump: Clump, position: np.ndarray, quaternion: np.ndarray, box: 
     """The candidate contacts of a whole experiment on a pack (positions [N, 3], quaternions [N, 4]).
 
     Raises:
-        ValueError: if the grain has sizes, and not one for each.
+        ValueError: if the grains have sizes, and their number differs from that of the grains.
     """
     if clump.sizes is not None and len(clump.sizes) != len(position):
         raise ValueError(f"a pack of {len(position)} grains needs as many sizes, its grain has {len(clump.sizes)}")
@@ -177,7 +177,7 @@ def _unequal(pack: Pack) -> tuple[jax.Array | None, jax.Array | None]:
 
 
 def _widen(pack: Pack, capacity: int, per_sphere: int) -> Pairs:
-    """The pack's own candidates in larger tables."""
+    """The neighbour list of a pack in tables of a larger capacity."""
     pairs = pack.pairs
     return tabulate(
         listed_candidates(pairs),

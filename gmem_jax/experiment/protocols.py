@@ -38,8 +38,8 @@ def memory_protocol(
 ) -> Protocol:
     """The experiment of Sec. II: a shear-free cycle, rest, encode, store, readout; 6.6 t0 with the default lengths.
 
-    With `second_readout` it is that of Sec. III: a rest, a compression, a hold and a readout follow (9 t0). With shear
-    "before", a stage "pulse" of one t0 at u = 0 applies the waveform, and the compression is without shear.
+    With `second_readout` it is the experiment of Sec. III: a rest, a compression, a hold and a readout follow (9 t0).
+    With shear "before", a stage "pulse" of one t0 at u = 0 applies the waveform, and the compression is without shear.
     """
     pulsed = shear == "before"
     pulse = (Stage("pulse", 0.0, 0.0, 1.0, "write", OWN),) if pulsed else ()

@@ -42,13 +42,13 @@ def versions() -> dict[str, str]:
 
 
 def code() -> dict[str, Any]:
-    """Versions and git commit: what code a number came from."""
+    """Versions and git commit of the code that made a number."""
     return {"versions": dict(versions()), "commit": _commit()}
 
 
 @functools.cache
 def sources() -> dict[str, Any]:
-    """What numbers depend on beside a configuration: a hash of the code that makes them, and versions of libraries."""
+    """What numbers depend on beside a configuration: a hash of this package's code, and versions of libraries."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for folder in ("physics", "native", "simulation", "experiment", "preparation"):
@@ -59,14 +59,14 @@ def sources() -> dict[str, Any]:
     return {"sources": digest.hexdigest(), "versions": {name: versions()[name] for name in own}}
 
 
-_ASKED_BY = ("JAX_", "PJRT_", "XLA_")  # what variables begin with that tell JAX which devices there are
+_ASKED_BY = ("JAX_", "PJRT_", "XLA_")  # prefixes of the environment variables by which JAX chooses devices
 
 
 def is_one_cpu() -> bool:
-    """Whether JAX has one device, a CPU, told without its import, which takes half a second.
+    """Whether JAX has one device only, a CPU; found without importing JAX, which takes half a second.
 
-    False where it may have others: it was imported, a variable of the environment speaks to it, or a plugin for other
-    devices is installed.
+    False if JAX may have other devices: it was imported before, an environment variable of JAX is set, or a plugin for
+    other devices is installed.
     """
     told = "jax" in sys.modules or any(name.startswith(_ASKED_BY) for name in os.environ)
     return not (told or metadata.entry_points(group="jax_plugins") or find_spec("jax_plugins") or find_spec("libtpu"))

@@ -20,7 +20,7 @@ from gmem_jax.simulation.stage import BINS, Stage, bin_centres
 
 
 class Readings(NamedTuple):
-    """What is read in a protocol.
+    """The reads of a protocol, and how p_sig is made of them.
 
     Attributes:
         protocol: the protocol.
@@ -32,7 +32,7 @@ class Readings(NamedTuple):
 
     @property
     def reads(self) -> tuple[str, ...]:
-        """Names of the R stages that are read; with a second readout for the background the first alone."""
+        """Names of the R stages that are read; only the first if the second readout serves as background."""
         return self.protocol.reads if self.background == "sub0" else self.protocol.reads[:1]
 
     @property
@@ -42,11 +42,11 @@ class Readings(NamedTuple):
 
     @property
     def rates(self) -> np.ndarray:
-        """Of its reads; see `rates_of`."""
+        """Rates of the reads, [R]; see `rates_of`."""
         return rates_of(self.protocol, self.reads)
 
     def squeezed(self, rows: list[list[jax.Array]]) -> jax.Array:
-        """Arrays by read and channel as one; axes of length one are left out."""
+        """Arrays by read and channel, stacked into one; axes of length one are left out."""
         by_read = [row[0] if len(row) == 1 else jnp.stack(row) for row in rows]
         return by_read[0] if len(by_read) == 1 else jnp.stack(by_read)
 
@@ -64,7 +64,7 @@ class Readings(NamedTuple):
         return self.squeezed(found)
 
     def _by_drive(self, sets: Mapping[str, Signals], of: Any) -> jax.Array:
-        """What `of` gives of a set, for what each read is compared with; zero where nothing was written."""
+        """`of` applied to the set with which each read and channel is compared; zero where nothing was written."""
         known = {name: of(one) for name, one in sets.items()}
         nothing = jnp.zeros_like(next(iter(known.values())))
 
@@ -79,11 +79,11 @@ class Readings(NamedTuple):
         return self.squeezed([[one(read, channel) for channel in self.channels] for read in self.reads])
 
     def integrals(self, sets: Mapping[str, Signals]) -> jax.Array:
-        """J averaged over each bin, [R, C, S, 256]; 0 where nothing is read or was written."""
+        """J averaged over each bin, [R, C, S, 256]; 0 where nothing was written and in bins that are not read."""
         return self._by_drive(sets, bin_average)
 
     def shears(self, sets: Mapping[str, Signals]) -> jax.Array:
-        """I at the centres of the bins, likewise."""
+        """I at the centres of the bins, [R, C, S, 256]; 0 where nothing was written and in bins that are not read."""
         return self._by_drive(sets, lambda one: one.shear(jnp.asarray(bin_centres())).T)
 
     def compare(
@@ -91,7 +91,7 @@ class Readings(NamedTuple):
     ) -> analysis.Match:
         """Gain [R, C, C] and fidelity [R, C]; see `analysis.compare` and `analysis.compare_channels`.
 
-        `window` is a time in units of t0, and each read is averaged over the part of u that it goes through in it.
+        `window` is a time in units of t0. Each read is averaged over the part of u that it goes through in this time.
         """
         channels = len(self.channels)
         windows: Any = None if window is None else window * self.rates
@@ -107,7 +107,7 @@ class Readings(NamedTuple):
 
 
 def rates_of(protocol: Protocol, reads: Sequence[str]) -> np.ndarray:
-    """How much of u each read goes through in t0, or of its own time where u stands still, [R]."""
+    """The part of u that each read goes through per t0, or the part of its own duration if u stands still, [R]."""
     stages = [protocol.stage(name) for name in reads]
     return np.array([(abs(np.subtract(*one.ends)) if one.moves else 1.0) / one.length for one in stages])
 
@@ -117,16 +117,16 @@ def _partial(stage: Stage) -> bool:
 
 
 def _seen(stage: Stage) -> np.ndarray:
-    """Which of the 256 bins of u a stage goes through for the greater part, [256]."""
+    """Whether a stage goes through the centre of each of the 256 bins of u, [256]."""
     low, high = sorted(stage.ends)
     inside: np.ndarray = (low < bin_centres()) & (high > bin_centres())
     return inside
 
 
 def placed(stage: Stage, stress: jax.Array) -> jax.Array:
-    """Stresses of a stage [bins, B] on the 256 bins of ascending u, [B, 256]; of time, where u stands still.
+    """Stresses of a stage [bins, B] on the 256 bins of ascending u, or of time if u stands still, [B, 256].
 
-    A stage of other length is averaged or interpolated; bins that it does not go through are 0.
+    If the stage has another number of bins, stresses are averaged over the 256; bins that it does not pass are 0.
     """
     if stage.bins == BINS and not _partial(stage):
         return (jnp.flip(stress, axis=0) if stage.start == 1.0 else stress).T

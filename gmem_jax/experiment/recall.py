@@ -29,7 +29,7 @@ from gmem_jax.simulation.protocol import Protocol
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.stage import Stage, bin_centres
 
-REST_SPEED = 0.01  # a pack is at rest when its fastest grain moves at less than this part of the walls' speed
+REST_SPEED = 0.01  # a pack is at rest if its fastest grain moves at less than this part of the walls' speed
 
 
 @pytree
@@ -109,7 +109,7 @@ class Recall:
     def second_readout(self) -> str | None:
         """Name of the stage that was read for the background; None if there is none."""
         known, reads = self.protocol.reads, self.reads
-        whole = tuple(self.configuration.get("reads", reads))  # what `at` gives is a part
+        whole = tuple(self.configuration.get("reads", reads))  # `at` leaves some of them out
         return known[1] if len(known) == 2 and reads == known[:1] == whole else None
 
     @property
@@ -118,10 +118,13 @@ class Recall:
         return not any(stage.moves for stage in self.protocol if stage.name in self.reads)
 
     def windows(self, t0: Any) -> np.ndarray:
-        """The part of u that each read goes through in a time T_1, [R]; of its own duration, if u stands still in it.
+        """The part of u that each read goes through in a time T_1, or the part of its own duration, if u stands still.
 
         Args:
             t0: duration of one compression, in t_c; if it differs between replicas, the longest counts.
+
+        Returns:
+            The parts, [R].
         """
         found: np.ndarray = rates_of(self.protocol, self.reads) * (float(self.window) / float(np.max(t0)))
         return found
@@ -177,14 +180,14 @@ def _number(kind: str, known: tuple[str, ...], wanted: str | int) -> int:
 
 
 def unjudged(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> tuple[Recall, jax.Array]:
-    """Subtract the background and compare with the integrals; and round-off in p_sig over its size, [S]."""
+    """The recall without the bits of `validity`; and the round-off in p_sig over the size of p_sig, [S]."""
     pack, t0 = experiment.pack, experiment.t0
     step = experiment.timing.dt
     first = experiment.protocol.stage(experiment.protocol.reads[0])
     walls = compression_speed(experiment) * (experiment.readings.rates[0] if first.moves else 1.0)
     residual = stages[experiment.protocol.before_read].largest_speed[-1] / walls
     status = status | jnp.where(residual < REST_SPEED, 0, int(Status.NOT_AT_REST)).astype(jnp.int32)
-    # A factor, not a choice: the derivative of what is broken must be NaN too.
+    # A factor rather than a `where` on p_sig: derivatives of a broken run must be NaN too.
     sound = jnp.where(jnp.any(status & ~int(WARNINGS)), jnp.nan, 1.0)
     found = experiment.recalled({name: stages[name].pressure for name in experiment.protocol.reads})
     p_sig = sound * found
@@ -215,18 +218,18 @@ def unjudged(experiment: Experiment, stages: OrderedDict[str, Sample], status: j
 
 
 def judged(experiment: Experiment, stages: OrderedDict[str, Sample], found: Recall, noise: jax.Array) -> jax.Array:
-    """The status of a recall, and what makes it doubtful."""
+    """The status of a recall with the bits of `validity`."""
     return found.status | validity(experiment, stages, found.fidelity, found.windowed_fidelity, noise)
 
 
 def finish(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
-    """The recall that the samples of all stages make."""
+    """The recall from the samples of all stages."""
     found, noise = unjudged(experiment, stages, status)
     return dataclasses.replace(found, status=judged(experiment, stages, found, noise))
 
 
 def _by_stage(sample: Sample, stages: tuple[Stage, ...]) -> "OrderedDict[str, Sample]":
-    """The samples of a rollout of stages, apart."""
+    """The samples of a rollout, divided into those of each stage."""
     ends = np.cumsum([stage.bins for stage in stages])
     places = [slice(end - stage.bins, end) for stage, end in zip(stages, ends, strict=True)]
     return OrderedDict(
@@ -261,7 +264,7 @@ def recall(experiment: Experiment) -> Recall:
     require_kind("recall", experiment, Experiment)
     require_double(pack=experiment.pack, signals=experiment.signals)
     found: Recall = _recall(experiment)
-    # Within somebody's `jax.jit` the numbers are traced also where the experiment is not.
+    # Inside `jax.jit` the numbers are traced even if the experiment is not.
     return found if traced(experiment, found) else found.described(describe(experiment, 0.0))
 
 
@@ -276,9 +279,9 @@ def gain(experiment: Experiment) -> jax.Array:
 
 
 def with_waveforms(experiment: Experiment, before: Simulation, state: State) -> Simulation:
-    """What is run after the prefix, for a state of all replicas; `before` is what was run in it.
+    """The simulation after the prefix, with waveforms, for a state of all replicas; `before` is that of the prefix.
 
-    Observers compare with this moment if the protocol marks no stage.
+    Observers compare with the end of the prefix if the protocol marks no stage.
     """
     simulation, own = experiment.simulation(sheared=True), experiment.phases[1]
     if not any(stage.mark for stage in experiment.protocol):

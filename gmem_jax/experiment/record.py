@@ -23,23 +23,23 @@ from gmem_jax.simulation.observables import Observable
 NAMED: dict[str, Callable[..., Bumps]] = {"six": six_signals, "words": words}
 SIGNALS = {"bumps": Bumps, "spline": Spline}
 PARTS = ("pack", "signals", "friction", "material", "protocol", "observe")
-"""Fields of an experiment that are no numbers. What observes it is no part of its written form: it changes nothing."""
+"""Fields of an experiment that are not numbers. Observers change no numbers: the written form leaves them out."""
 
 
 def pack_fingerprint(pack: Pack) -> str:
-    """SHA-256 of what makes a pack: grain, centres, orientations, box, T1; not of its list of candidates."""
+    """SHA-256 of the numbers of a pack: grain, centres, orientations, box, delta0, T_1; not of its neighbour list."""
     at = (pack.position, pack.quaternion, pack.lower, pack.upper)
     beyond = (np.asarray(pack.periodic),) if any(pack.periodic) else ()
     return fingerprint((pack.clump, *at, pack.delta0, pack.ringing_period, *beyond))
 
 
 def plain(value: Any) -> Any:
-    """Numbers and lists of a parameter, which JSON can hold exactly."""
+    """The value of a parameter as a number, text or list, which JSON holds exactly."""
     return value if isinstance(value, float | int | str | None) else np.asarray(value).tolist()
 
 
 def signals_to_dict(signals: Signals | SignalSets) -> dict[str, Any]:
-    """Waveforms as JSON: by what made them where they are still that, else by their numbers."""
+    """Waveforms as JSON: by the call that made them if their numbers are unchanged since, else by their numbers."""
     if isinstance(signals, SignalSets):
         return {"kind": "sets", **{name: signals_to_dict(one) for name, one in sets_of(signals).items()}}
     if isinstance(signals, Bumps) and signals.form:
@@ -55,7 +55,7 @@ def signals_to_dict(signals: Signals | SignalSets) -> dict[str, Any]:
 
 
 def names_of(signals: Signals | SignalSets) -> list[str]:
-    """What the signals are called: words by their bits, others by their number from 1."""
+    """Names of the signals: the bits of a word; for others "signal 1", "signal 2", ..."""
     form = signals_to_dict(signals)
     if form["kind"] == "words":
         return ["".join(map(str, row)) for row in word_bits(form["bits"])]
@@ -92,11 +92,11 @@ def to_dict(experiment: Experiment) -> dict[str, Any]:
 
 
 def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
-    """What the numbers of a run depend on, and no more: for parts of it that may be used again.
+    """The key of a run, for parts of it that may be used again: everything that its numbers depend on, and no more.
 
     Args:
-        experiment: what is run.
-        **more: what else they depend on, like the batch.
+        experiment: the experiment.
+        **more: other things that the numbers depend on, like the batch.
     """
     own = {**to_dict(experiment), "pack": pack_fingerprint(experiment.pack)}
     if entry_of(experiment.friction) is None:
@@ -104,7 +104,7 @@ def key_of_run(experiment: Experiment, **more: Any) -> dict[str, Any]:
     for name, one in experiment.sets.items():
         if type(one) not in SIGNALS.values():
             own[f"signals {name}"] = identity(one)
-    if experiment.observe:  # what was kept of another run lacks what these give
+    if experiment.observe:  # parts of a run with other observers lack the arrays of these
         own["observe"] = [(name, identity(reduce)) for name, reduce in experiment.observe]
     return {**own, **more, "backend": experiment.runs_on, **sources()}
 
@@ -153,5 +153,5 @@ def describe(experiment: Experiment, seconds: float = 0.0) -> dict[str, Any]:
 
 
 def values_of(configuration: Mapping[str, Any]) -> dict[str, Any]:
-    """What a configuration says by name: what a value came to, and else as the experiment has it."""
+    """The values of a configuration by name: resolved defaults first, and else the fields of the experiment."""
     return {**configuration.get("experiment", {}), **configuration}

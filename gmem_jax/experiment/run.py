@@ -31,11 +31,11 @@ from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.sharding import placement_of
 from gmem_jax.simulation.strain import smallest_box
 
-COPIES = 4  # of a replica's arrays that live at once: a call's arguments and results, its scratch, and one to spare
-GRAIN_BYTES = 800  # of a grain's own numbers and its spheres'
-_ELASTIC = ("poisson", "normal_damping", "wall_rigidity")  # of a `Material`; the others are units
+COPIES = 4  # copies of a replica's arrays at one time: arguments, results and scratch of a call, and one to spare
+GRAIN_BYTES = 800  # bytes for the numbers of a grain and of its spheres
+_ELASTIC = ("poisson", "normal_damping", "wall_rigidity")  # fields of a `Material` that are not units
 PREFIX = "prefix"  # name of the part of a run that is common to all waveforms
-LARGEST_BATCH = 63  # signals; with the zero signal they fill whole vectors of every CPU
+LARGEST_BATCH = 63  # signals; with the zero signal they fill whole vectors on every CPU
 
 _begin = Compiled(Experiment.begin, quick=True)
 _fan_out = Compiled(Experiment.fan_out)
@@ -44,7 +44,7 @@ _judge = Compiled(judged, quick=True)
 
 
 def finished(experiment: Experiment, stages: OrderedDict[str, Sample], status: jax.Array) -> Recall:
-    """`finish` on the host, in two programs, of which one need not be fast."""
+    """`finish` on the host, in two programs; the second is compiled quickly, since it need not be fast."""
     found, noise = _compare(experiment, stages, status)
     judged: Recall = dataclasses.replace(found, status=_judge(experiment, stages, found, noise))
     return judged
@@ -71,18 +71,18 @@ def runner_of(experiment: Experiment, **options: Any) -> Runner:
 
 
 def apply_waveforms(runner: Runner, experiment: Experiment) -> None:
-    """Bring a runner from the end of the prefix to the first sheared stage: all replicas, with their waveforms."""
+    """Bring a runner from the end of the prefix to the first sheared stage, with all replicas and their waveforms."""
     pairs, runner.state = runner.simulation.system.pairs, _fan_out(experiment, runner.state)
     runner.simulation = with_waveforms(experiment, runner.simulation, runner.state).with_pairs(pairs)
 
 
 class Prefix(NamedTuple):
-    """The stages that all waveforms have in common, done.
+    """The finished stages that all waveforms have in common.
 
     Attributes:
-        runner: at their end.
-        samples: theirs.
-        key: of all that they depend on.
+        runner: the runner at the end of these stages.
+        samples: samples of these stages by name.
+        key: hash of everything that they depend on.
     """
 
     runner: Runner
@@ -103,14 +103,14 @@ def prefix_of(experiment: Experiment, *, cache: ResultCache = no_cache, progress
 
     Args:
         experiment: the experiment; its waveforms, gamma0 and shear_share do not matter.
-        cache: see `run`; it is asked for the part "prefix".
+        cache: see `run`; it keeps the part "prefix".
         progress: see `run`; default none.
 
     Returns:
         The state and the samples at the end of these stages, to be passed to `run` as `prefix`.
 
     Raises:
-        ValueError: as of `run`.
+        ValueError: as in `run`.
         RunFailedError: if the simulation broke down.
     """
     common, _ = experiment.phases
@@ -217,10 +217,10 @@ def run(
 
 
 def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[float] = ()) -> FrameSchedule:
-    """What is to be recorded of a run: `frames` configurations of the replica of a signal, and those `at` compressions.
+    """The frames to be recorded of one replica: `frames` of them along the run, and those at the compressions `at`.
 
     Raises:
-        ValueError: for too many or too few, a u beyond 0 and 1, or a signal that there is not.
+        ValueError: for too many or too few frames, a u outside [0, 1], or a signal that does not exist.
     """
     frames, of = require_whole("frames", frames), require_whole("frames_of", of)
     require_several(at, "frames_at")
@@ -234,32 +234,32 @@ def frame_schedule(experiment: Experiment, frames: int, of: int, at: Sequence[fl
 
 
 def replica_bins(experiment: Experiment, batch: int) -> int:
-    """Bins times replicas of a run, of which the prefix has one and each batch one for no signal."""
+    """Bins times replicas of a run: the prefix has one replica, and each batch one more than signals."""
     before, after = (sum(stage.bins for stage in some) for some in experiment.phases)
     count = experiment.signals.count
     return before + after * (count + -(-count // batch))
 
 
 def steps_of_grains(experiment: Experiment, batch: int) -> int:
-    """Steps of a run times its grains and its replicas."""
+    """Steps of a run times grains times replicas."""
     return experiment.pack.grains * experiment.timing.steps * replica_bins(experiment, batch)
 
 
 def _join(first: Any, *others: Any) -> np.ndarray:
-    """Replicas of several batches, innermost; the zero signal of the first stands for all."""
+    """Join the replicas of several batches along the last axis; the zero signal of the first batch stands for all."""
     return np.concatenate([np.asarray(first), *(np.asarray(other)[..., 1:] for other in others)], axis=-1)
 
 
 class OtherGravityWarning(UserWarning):
-    """A pack was prepared under gravity, and the experiment has none, or another."""
+    """A pack was prepared under gravity, and the experiment has no gravity or a different one."""
 
 
 class OtherCompressionWarning(UserWarning):
-    """A pack was cycled with another delta0: `Status.OTHER_COMPRESSION`, said before the run."""
+    """A pack was cycled with another delta0: a warning of `Status.OTHER_COMPRESSION` before the run."""
 
 
 def warn_of_another_preparation(experiment: Experiment) -> None:
-    """Warn of what a pack was not made for: another delta0, other elastic numbers, no weight or another."""
+    """Warn if a pack was prepared with another delta0, other elastic constants, or another gravity."""
     warn_of_another_compression(experiment)
     _warn_of_another_material(experiment)
     if weight := other_weight(experiment):
@@ -267,7 +267,7 @@ def warn_of_another_preparation(experiment: Experiment) -> None:
 
 
 def warn_of_another_compression(experiment: Experiment) -> None:
-    """Warn of a delta0 that the pack was not made for."""
+    """Warn of a delta0 other than that with which the pack was cycled."""
     own = float(experiment.pack.delta0)
     if not np.allclose(np.asarray(experiment.compression), own):
         warn_caller(
@@ -278,7 +278,7 @@ def warn_of_another_compression(experiment: Experiment) -> None:
 
 
 def _warn_of_another_material(experiment: Experiment) -> None:
-    """Warn of elastic numbers that are not those with which the pack came to rest; units are left out."""
+    """Warn of elastic constants other than those with which the pack came to rest; units are left out."""
     pack, recorded = experiment.pack, experiment.pack.info.get("material", {})
     made = {name: recorded[name] for name in _ELASTIC if is_real(recorded.get(name, ""))}
     if odd := [name for name in made if not np.allclose(np.asarray(getattr(experiment.material, name)), made[name])]:
@@ -290,9 +290,9 @@ def _warn_of_another_material(experiment: Experiment) -> None:
 
 
 def other_weight(experiment: Experiment) -> str:
-    """What is to be said of a weight that is taken off a pack; "" if none is.
+    """The warning if a pack was prepared under another gravity than the experiment's; "" if not.
 
-    A pack that gets some sags a little, which is an experiment's choice.
+    A pack that was prepared without gravity sags a little under it, which an experiment may want: no warning.
     """
     pack, gravity = experiment.pack, 0.0 if experiment.gravity is None else experiment.gravity
     own = (pack.info.get("recipe") or {}).get("gravity", 0.0)
@@ -305,7 +305,7 @@ def other_weight(experiment: Experiment) -> str:
 
 
 def _replica_bytes(experiment: Experiment) -> int:
-    """Memory that a replica takes while it runs."""
+    """Memory that a replica takes while it runs, in bytes."""
     pairs = experiment.pack.pairs
     history = jax.eval_shape(lambda: experiment.friction.init(pairs.capacity, 1, jnp.zeros(()).dtype))
     contacts: int = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(history))
@@ -313,10 +313,10 @@ def _replica_bytes(experiment: Experiment) -> int:
 
 
 def run_bytes(experiment: Experiment, batch: int) -> int:
-    """Memory that a run of `batch` signals and the zero signal will take."""
+    """Memory that a run of `batch` signals and the zero signal will take, in bytes."""
     return (batch + 1) * _replica_bytes(experiment)
 
 
 def default_batch(experiment: Experiment, available: int) -> int:
-    """Signals that may run together in half of the `available` bytes; at most `LARGEST_BATCH`."""
+    """Number of signals that may run together in half of the `available` bytes; at most `LARGEST_BATCH`."""
     return int(max(1, min(LARGEST_BATCH, 0.5 * available / _replica_bytes(experiment) - 1)))

@@ -10,12 +10,12 @@ from gmem_jax.experiment.signals import Spline, waveform
 from gmem_jax.physics.numbers import is_real, require_numbers, said
 from gmem_jax.simulation.stage import BINS
 
-STEEPEST = 0.2  # of its largest value, that a waveform may change by within a bin. Words of 12 bits, the steepest there
-# are, have 0.196. Noise that makes 0.23 changes J by 1 % and what a pack gives back by 29 %; see docs/howto/waveform.md
-OPEN = 0.01  # of its largest value, that a waveform may have at an end (it is then set to zero)
-WIDEST = 0.5  # in u, of what is smoothed or tapered
+STEEPEST = 0.2  # largest change of a waveform within a bin, over its largest value. It is 0.196 for words of 12 bits,
+# the steepest ones. Noise that makes it 0.23 changes J by 1 % and the recall by 29 %; see docs/howto/waveform.md
+OPEN = 0.01  # largest value of a waveform at its ends, over its largest value (the ends are then set to zero)
+WIDEST = 0.5  # largest width in u of smoothing and tapering
 _TAPER = "bring it there, with taper = 0.1 (gmem recall --taper 0.1)"
-_FINE = 8  # points a bin, at which slopes are looked at
+_FINE = 8  # points per bin at which a waveform is evaluated to find its steepest change
 
 Told = Callable[[str], None]
 
@@ -108,7 +108,7 @@ def _placed(places: np.ndarray, span: tuple[float, float]) -> np.ndarray:
 
 
 def _even(u: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Samples at equal steps of u: as they are if that is where they were, to a hundredth of a step."""
+    """Samples at equal steps of u; unchanged if u are equal steps already, to a hundredth of a step."""
     count = u.size - 1
     if np.all(np.abs(u * count - np.arange(count + 1)) < 0.01):
         return values
@@ -117,11 +117,14 @@ def _even(u: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(u: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
-    """Means over a width in u around k / 256; beyond its ends a curve goes on turned about them, so that they stay."""
+    """Weighted means over a width in u around k / 256.
+
+    Beyond its ends a curve is continued by its point reflection about them, so that the values at the ends stay.
+    """
     known = np.concatenate([-u[:0:-1], u, 2.0 - u[-2::-1]])
     ends = 2.0 * values[:, :1] - values[:, :0:-1], 2.0 * values[:, -1:] - values[:, -2::-1]
     wide = np.concatenate([ends[0], values, ends[1]], axis=1)
-    around = width * np.linspace(-0.5, 0.5, 33 + 2 * int(width * u.size))  # two points a sample, and some
+    around = width * np.linspace(-0.5, 0.5, 33 + 2 * int(width * u.size))  # two points per sample, and 33 more
     weight = np.cos(np.pi * around / width) ** 2
     places = np.linspace(0.0, 1.0, BINS + 1)
     means = [[np.interp(at + around, known, row) @ weight for at in places] for row in wide]
@@ -129,7 +132,7 @@ def _smoothed(u: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
 
 
 def require_closed(nodes: np.ndarray) -> None:
-    """Refuse waveforms, nodes [S, n] with both ends, that are not zero there.
+    """Refuse waveforms that are not zero at their ends; their nodes [S, n] include both ends.
 
     Raises:
         ValueError: saying where, and what would help.
@@ -144,13 +147,13 @@ def require_closed(nodes: np.ndarray) -> None:
 
 
 def require_gentle(nodes: np.ndarray) -> None:
-    """Refuse waveforms, nodes [S, n] with both ends, that change within a bin by more than a pack can follow.
+    """Refuse waveforms that change within a bin by more than a pack can follow; their nodes [S, n] include both ends.
 
     Raises:
         ValueError: saying where, and what would help.
     """
     count = nodes.shape[1] - 1
-    at = np.linspace(0.0, 1.0, BINS * _FINE * max(1, -(-count // (BINS * _FINE))) + 1)  # every node of many, too
+    at = np.linspace(0.0, 1.0, BINS * _FINE * max(1, -(-count // (BINS * _FINE))) + 1)  # no coarser than nodes
     values = np.asarray(waveform(nodes[:, 1:-1]).shear(jnp.asarray(at))).T
     apart = (len(at) - 1) // BINS
     change = np.ptp(np.lib.stride_tricks.sliding_window_view(values, apart + 1, axis=1), axis=-1)
@@ -166,7 +169,7 @@ def require_gentle(nodes: np.ndarray) -> None:
 
 
 def _help(place: float, nodes: np.ndarray, largest: float) -> str:
-    """What would make a steep waveform gentle."""
+    """Advice on how to make a steep waveform gentle."""
     at_end = min(place, 1.0 - place) < 2.0 / (len(nodes) - 1) + 1.0 / BINS
     if at_end and max(abs(nodes[1]), abs(nodes[-2])) > STEEPEST * largest:
         return f"it is zero at both ends; {_TAPER}"

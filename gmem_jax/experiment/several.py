@@ -1,7 +1,7 @@
 """Several experiments on one pack as one run, if they differ only in what may differ between replicas.
 
-The shear-free prefix is run once for each set of parameters that act on it, the rest once for each signal of each
-experiment and its zero signal. The numbers are those of the experiments run one by one.
+The shear-free prefix is run once for each set of the parameters that act on it. The other stages are run once for each
+signal of each experiment and for its zero signal. The numbers are those of the experiments run one by one.
 """
 
 import dataclasses
@@ -30,9 +30,9 @@ from gmem_jax.simulation.sharding import placement_of
 def match(one: Experiment, other: Experiment) -> bool:
     """Whether two experiments may run side by side: the same pack, material, protocol, law, steps and arithmetic.
 
-    The pack must be the same object; whatever else differs must be one number in each. Without friction replicas part
-    and need lists that all would have to go through (six mu with 0 among them: twice the time), so that mu = 0 matches
-    only itself.
+    The pack must be the same object. Parameters that differ must be one number in each experiment. mu = 0 matches only
+    mu = 0: replicas without friction drift apart, and all replicas would share their longer neighbour lists (a run of
+    six mu with 0 among them takes twice the time).
     """
     alike = ("protocol", "steps_per_bin", "background", "backend", "precision", "material")
     laws = [identity(_alike(each)) for each in (one, other)]
@@ -46,7 +46,7 @@ def match(one: Experiment, other: Experiment) -> bool:
 
 
 def _alike(experiment: Experiment) -> Any:
-    """The law without the numbers that may differ between replicas; a user's law may hold others, deeper in it."""
+    """The law without the numbers that may differ between replicas. A user's law may hold others, which must agree."""
     own = replica_parameters(experiment)
 
     def kept(path: tuple[Any, ...], leaf: Any) -> Any:
@@ -56,16 +56,17 @@ def _alike(experiment: Experiment) -> Any:
 
 
 class _Side:
-    """Where the replicas of several experiments stand.
+    """The replicas of several experiments in one run.
 
     Attributes:
-        prefix: of each experiment, its replica in the prefix, [experiments].
-        first: its zero signal after the prefix, and one more for the end, [experiments + 1].
+        prefix: number of each experiment's replica in the prefix, [experiments].
+        first: number of each experiment's zero signal after the prefix, and the number of all replicas,
+            [experiments + 1].
     """
 
     def __init__(self, experiments: Sequence[Experiment]) -> None:
         self.experiments = experiments
-        # All names of any of them: what one leaves to its default may be a number in another.
+        # The names of all experiments: a parameter that is None in one may be a number in another.
         self.names = list(dict.fromkeys(name for each in experiments for name in replica_parameters(each)))
         values = [tuple(float(value_at(each, name)) for name in self.names) for each in experiments]
         acting = [acts_on_prefix(name) for name in self.names]
@@ -76,7 +77,7 @@ class _Side:
         self.values = np.asarray(values).T
 
     def wide(self, owners: np.ndarray, signals: Signals) -> Experiment:
-        """One experiment with a replica for each of some experiments' numbers, [replicas]."""
+        """One experiment of which each replica has the parameters of its owner; owners are numbers, [replicas]."""
         own = dict(zip(self.names, self.values[:, owners], strict=True))
         changes = {name: row if np.any(row != row[0]) else float(row[0]) for name, row in own.items()}
         changes = {name: jnp.asarray(row) if isinstance(row, np.ndarray) else row for name, row in changes.items()}
@@ -84,7 +85,7 @@ class _Side:
         return replace(first, {**changes, "signals": signals, "steps": first.steps_per_bin})
 
     def signals(self) -> ChosenSignals:
-        """All their waveforms, each set with its zero signal before it; that of the first is replica 0."""
+        """The waveforms of all experiments, each set after its zero signal; the first zero signal is replica 0."""
         sets: list[Signals] = []
         begun: dict[int, int] = {}
         numbers: list[int] = []
@@ -103,13 +104,13 @@ def run_several(
     """Run experiments side by side, as replicas of one run; the recall of each.
 
     Args:
-        experiments: that `match` each other.
-        cache: asked for every part of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).
-        progress: told about every chunk.
+        experiments: experiments that `match` each other.
+        cache: keeps the finished parts of a long run, so that it can be resumed (see `gmem_jax.files.checkpoints`).
+        progress: called after every chunk, as in `run`.
 
     Raises:
         ValueError: if they do not match, there is none, or 64-bit mode is off.
-        RunFailedError: if the simulation broke down, of all together.
+        RunFailedError: if the simulation of any of them broke down; then all are lost.
     """
     if not experiments or not all(match(experiments[0], each) for each in experiments):
         raise ValueError("experiments side by side must differ only in what may differ between replicas")

@@ -20,9 +20,9 @@ from gmem_jax.physics.rules import usual_rules
 from gmem_jax.simulation.stage import BINS
 
 LONGEST_WORD = 12  # bits
-PAD = 2.0  # bits left free at either end of a word
-WIDTH = 1.0  # of the bumps of a word, in bits
-POINTS = 16  # of a bin, at which J is averaged
+PAD = 2.0  # widths of a bit left free at either end of a word
+WIDTH = 1.0  # width of the bumps of a word, in widths of a bit
+POINTS = 16  # points in a bin over which J is averaged
 
 
 @runtime_checkable
@@ -66,7 +66,7 @@ class SignalSets:
 
 
 def sets_of(signals: Signals | SignalSets) -> dict[str, Signals]:
-    """Sets of waveforms by name; one alone is written on the paper's channel, "xy"."""
+    """Sets of waveforms by name; a single set is called "xy", after the paper's channel."""
     if isinstance(signals, SignalSets):
         return dict(zip(signals.names, signals.sets, strict=True))
     return {"xy": signals}
@@ -95,10 +95,10 @@ def signals(**sets: Signals) -> Signals | SignalSets:
 
 
 def _require_arrays(made: "Bumps | Spline") -> None:
-    """Refuse what is made of no numbers; numbers in lists become arrays.
+    """Refuse fields that are not numbers; lists of numbers become arrays.
 
     Raises:
-        ValueError: naming the field and what was given.
+        ValueError: naming the field and its value.
     """
     for name, value in vars(made).items():
         if not is_real(value):
@@ -185,7 +185,7 @@ class Spline:
         return int(self.nodes.shape[-2])
 
     def _pieces(self) -> tuple[jax.Array, ...]:
-        """Cubic coefficients (ascending, in the local coordinate 0..1) of every interval, each [S, n + 1]."""
+        """Cubic coefficients of every interval, in ascending order and in a coordinate from 0 to 1, each [S, n + 1]."""
         slope = jnp.asarray(jnp.gradient(self.nodes, axis=-1))  # per interval
         left, right = self.nodes[..., :-1], self.nodes[..., 1:]
         m0, m1 = slope[..., :-1], slope[..., 1:]
@@ -217,11 +217,11 @@ class Spline:
 @pytree
 @dataclass(frozen=True)
 class ChosenSignals:
-    """Waveforms chosen from some sets; number 0 is no shear, the others count through the sets.
+    """Waveforms chosen from some sets. Number 0 is the zero signal; numbers from 1 count through the sets in order.
 
     Attributes:
         sets: the sets.
-        numbers: of the chosen waveforms, int [S].
+        numbers: numbers of the chosen waveforms, int [S].
     """
 
     sets: tuple[Signals, ...]
@@ -248,9 +248,9 @@ Chosen = TypeVar("Chosen", bound=Signals | SignalSets)
 
 
 def part(signals: Chosen, first: int, last: int) -> Chosen:
-    """Signals number `first` to `last` - 1 of a set, or of each of several, as a set.
+    """Signals `first` to `last` - 1 of a set, or of each of several sets, counted from 0.
 
-    Only of our own sets is it known which arrays have a row for each signal.
+    Only sets of our own classes are cut: of others it is not known which arrays have a row for each signal.
     """
     one: Any = signals
     if isinstance(one, SignalSets):
@@ -356,8 +356,8 @@ def waveform(samples: jax.typing.ArrayLike) -> Spline:
 
 
 @usual_rules()
-@jax.jit  # fused: 4,096 words would fill the memory otherwise
+@jax.jit  # fuses the mean: without it 4,096 words would fill the memory
 def bin_average(signals: Signals) -> jax.Array:
-    """J_s averaged over each bin of u, [S, 256] (midpoint rule on `POINTS` of each)."""
+    """J_s averaged over each bin of u, [S, 256], by the midpoint rule with `POINTS` points in a bin."""
     u = (jnp.arange(BINS * POINTS) + 0.5) / (BINS * POINTS)
     return jnp.mean(signals.integral(u).reshape(BINS, POINTS, -1), axis=1).T

@@ -16,7 +16,7 @@ from gmem_jax.experiment.signals import Signals
 from gmem_jax.simulation.stage import BINS, OWN, SINE, Along, Drive, Role, Stage
 
 Waveform = str | Signals | Sequence[float] | np.ndarray
-"""What a stage writes: the name of a set, "sine:n", one waveform, or its samples at k / (n + 1)."""
+"""A waveform of a stage: the name of a set, "sine:n", a `Signals` of one waveform, or samples at k / (n + 1)."""
 
 
 def _drives(channels: dict[str, Waveform], amplitude: float) -> tuple[Drive, ...]:

@@ -25,15 +25,15 @@ from gmem_jax.simulation.loop import Simulation
 from gmem_jax.simulation.stability import cause, one_contact_limit
 from gmem_jax.simulation.stable_step import GROWTH, SHORTEST_STEP, growth, largest_stable_step
 
-RINGING_PERIODS = 9.6  # of a compression for an error of 1 in G, which falls as 1 / t0^2: at most 0.9 % at 96 of them
+RINGING_PERIODS = 9.6  # t0 / T_1 at which the error of G would be 1; it falls as 1 / t0^2: at most 0.9 % at 96 T_1
 ACCURACIES = 0.002, 0.1
-STEP_PART = 0.6  # of the stable step that is taken, and
-LONG_STEP, LONG_DRIVE = 1.2, 1.8e3  # t_c; such steps change G by 1.5e-3 at most where t0 is at least so long
-ENOUGH_RINGS = 10  # rings of a history: their number hardly matters to its stiffness, and 100 take minutes
-MUCH_STIFFER = 144.0  # than one contact; packs at rest, whose grains have many, were 9 to 41 times as stiff
+STEP_PART = 0.6  # part of the stable step that is taken
+LONG_STEP, LONG_DRIVE = 1.2, 1.8e3  # t_c; steps up to the first change G by 1.5e-3 at most if t0 is at least the second
+ENOUGH_RINGS = 10  # rings of a contact's history: stiffness hardly depends on their number, and 100 take minutes
+MUCH_STIFFER = 144.0  # times as stiff as one contact; packs at rest were 9 to 41 times as stiff
 
-_known: dict[tuple[Any, ...], float] = {}  # stable steps that were found
-_borne: dict[tuple[Any, ...], float] = {}  # the longest steps that were found to be stable
+_known: dict[tuple[Any, ...], float] = {}  # largest stable steps that were found
+_borne: dict[tuple[Any, ...], float] = {}  # longest steps that were tried and found stable
 
 
 @usual_rules()
@@ -74,7 +74,7 @@ def is_stable(experiment: Experiment, dt: float) -> bool:
 
 
 def _case(experiment: Experiment) -> tuple[tuple[Any, ...], Any]:
-    """What the stable step depends on, and the law that stands for the experiment's."""
+    """The key of the stable step, and the law that is used to find it."""
     law: Any = experiment.friction
     if isinstance(law, CoulombLaw) and not np.any(law.mu):
         law = Frictionless()
@@ -85,7 +85,7 @@ def _case(experiment: Experiment) -> tuple[tuple[Any, ...], Any]:
 
 
 def _at_rest(experiment: Experiment, law: Any) -> tuple[Simulation, jax.Array, jax.Array, Box]:
-    """The arguments of `largest_stable_step` under a law: every replica at u = 0, and every one at u = 1."""
+    """The arguments of `largest_stable_step` under a law: all replicas at u = 0, then all at u = 1."""
     pack, sizes = experiment.pack, [jnp.size(experiment.compression)]
 
     def twice(number: Any) -> Any:
@@ -101,20 +101,20 @@ def _at_rest(experiment: Experiment, law: Any) -> tuple[Simulation, jax.Array, j
     position = centre + scale * (pack.position[..., None] - centre)
     quaternion = jnp.broadcast_to(unit(pack.quaternion[..., None]), (pack.grains, 4, replicas))
     simulation = experiment.simulation(sheared=False)
-    # A constant force has no part in the growth of what is linear.
+    # A constant force does not change the growth of small perturbations.
     system = replace(simulation.system, friction=law, wall_mu=wall_mu, gravity=None)
     simulation = replace(simulation, system=system, dt=1.0, drag=0.0, steps=1, precision="double")
     return simulation, position, quaternion, still_box(centre - scale * half, centre + scale * half, pack.periodic)
 
 
 def require_stable(experiment: Experiment) -> None:
-    """Refuse a time step that is longer than what is stable.
+    """Refuse a time step that is longer than the stable one.
 
-    Nothing is estimated for steps up to the default that a pack much stiffer than one contact would bear, nor for
-    those too short to be looked at.
+    No stable step is computed if dt is below the shortest step that `stable_step` tries; nor if dt is at most the
+    default and stable even for a pack `MUCH_STIFFER` than one contact.
 
     Raises:
-        ValueError: saying both numbers, and which number of the experiment is the cause if one is by itself.
+        ValueError: giving both steps, and the parameter of the experiment that is the cause, if there is one.
     """
     dt, simulation = float(np.max(np.asarray(experiment.timing.dt))), experiment.simulation(sheared=False)
     if dt <= max(SHORTEST_STEP, min(USUAL_STEP, one_contact_limit(simulation, MUCH_STIFFER))):

@@ -1,8 +1,8 @@
 """Warnings: a recall is doubtful where the model or the drive leaves the range in which it was tested.
 
-The numbers stand and bits of `Status` say why not to believe them blindly. Each threshold has its reason beside it;
-what was measured on either side of it is in docs/trust.md. All follows from the samples and the parameters, so that
-traced runs are judged too.
+The numbers stay as they are; bits of `Status` say why they are doubtful. Each threshold has its reason beside it;
+docs/trust.md has the measurements on either side. The bits follow from samples and parameters only, so that traced
+runs have them too.
 """
 
 import functools
@@ -22,36 +22,36 @@ from gmem_jax.physics.state import Status
 from gmem_jax.simulation.sample import Sample
 from gmem_jax.simulation.stage import BINS, bin_centres
 
-DEEPEST = 0.2  # R; there a contact's radius is 0.32 R, which Hertz takes for small. delta0 = 0.05 makes 0.14 to 0.17
-FASTEST = 5e-3  # inertial number; at 7e-3 (t0 = 180) F is 0.20 to 0.33 on packs that have 0.66 to 0.88 when not hurried
-RINGING = 0.03  # what averaging over T_1 may add to F: at N = 325 up to 0.005 at t0 = 1.8e3, 0.06 to 0.15 at 360
+DEEPEST = 0.2  # R; the radius of such a contact is 0.32 R, and Hertz assumes it small. delta0 = 0.05 makes 0.14 to 0.17
+FASTEST = 5e-3  # inertial number; at 7e-3 (t0 = 180) F is 0.20 to 0.33 on packs with 0.66 to 0.88 in slow drives
+RINGING = 0.03  # largest gain of F by averaging over T_1: at N = 325 up to 0.005 at t0 = 1.8e3, 0.06 to 0.15 at 360
 LARGEST_SHEAR = 0.25  # of delta0; gains are 1.3 to 1.7 times as large at 0.2, 2.0 to 2.5 at 0.3
 LARGEST_WAVEFORM = 2.0  # |I|; the paper's signals have 1 at most, and gains are per gamma0
-LARGEST_FRICTION = 10.0  # no pair of materials has it; beyond it G changes by 4 % up to 1e6: hardly a contact slides
-FASTEST_GRAIN = 3.5  # wall speeds, for a quarter of a stage; 1.3 to 2.8 in sound runs with friction; 14 if too long
-NOISE = {  # of p_sig, over mean pressure and root of steps; measured, in these units: 1 to 3 (H), 15 (M1); 0.4 to 1.2
+LARGEST_FRICTION = 10.0  # no pair of materials has more; from there to 1e6 G changes by 4 %, as hardly a contact slides
+FASTEST_GRAIN = 3.5  # wall speeds, for a quarter of a stage; 1.3 to 2.8 in sound runs with friction, 14 if dt is long
+NOISE = {  # round-off in p_sig over mean pressure and root of steps; measured factors: 1 to 3 (H), 15 (M1); 0.4 to 1.2
     "double": 5.0 * 2.0**-53,
     "mixed": 0.01 * 2.0**-24,
 }
-OVERSHOOT = 1.5  # times 1 / dt; damping drives from 2 on, and with the springs of 27 grains from 1.4 to 1.6 on
-LARGEST_NOISE = 0.01  # of p_sig; G and F then change in the third digit
-LARGEST_STIFFNESS = 1.5  # of friction, in k_n: d f_n / dp is 1.5 k_n sqrt(p), which Mindlin's contacts do not reach
+OVERSHOOT = 1.5  # damping rate times dt; damping drives grains above 2; with the springs of 27 grains, above 1.4 to 1.6
+LARGEST_NOISE = 0.01  # round-off over p_sig; G and F then change in the third digit
+LARGEST_STIFFNESS = 1.5  # tangential stiffness in k_n: the normal one is 1.5 k_n sqrt(p), and Mindlin's is below it
 
 
 def validity(
     experiment: Experiment, stages: Mapping[str, Sample], raw: jax.Array, windowed: jax.Array, noise: jax.Array
 ) -> jax.Array:
-    """The bits of `Status` that leave the numbers as they are, but for NOT_AT_REST.
+    """The bits of `Status` that only warn, except NOT_AT_REST.
 
     Args:
-        experiment: what was run.
+        experiment: the experiment that was run.
         stages: samples of its stages by name, leading axis bins; one replica where all are alike.
         raw: F.
-        windowed: F averaged over the ringing period.
-        noise: round-off in p_sig over its size, of every signal, [S]; see `rounding`.
+        windowed: F after a running mean over the ringing period.
+        noise: round-off in p_sig over the size of p_sig, for every signal, [S]; see `rounding` and `readable`.
 
     Returns:
-        int32, broadcasts against [S + 1].
+        The bits, int32, of a shape that broadcasts against [S + 1].
     """
     deepest = _most([sample.largest_overlap for sample in stages.values()])
     fastest = _most([sample.inertial_number for sample in stages.values()])
@@ -85,7 +85,7 @@ def validity(
 
 
 def _most(values: list[jax.Array]) -> jax.Array:
-    """The largest of each replica over all bins of all stages, [B]."""
+    """The largest value of each replica over all bins of all stages, [B]."""
     largest = jnp.asarray(-jnp.inf)
     for value in values:
         largest = jnp.maximum(largest, jnp.max(value, axis=0))
@@ -93,13 +93,13 @@ def _most(values: list[jax.Array]) -> jax.Array:
 
 
 def compression_speed(experiment: Experiment) -> jax.Array:
-    """Of a wall of the x axis while the pack is compressed, in R / t_c; scalar or [S + 1]."""
+    """Speed of a wall across the x axis during a compression, in R / t_c; scalar or [S + 1]."""
     pack, shrinks = experiment.pack, 1.0 - jnp.sqrt(1.0 - jnp.asarray(experiment.compression))
     return 0.5 * (pack.upper - pack.lower)[0] * shrinks / experiment.t0
 
 
 def _restlessness(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.Array:
-    """Speed of the fastest grain over that of the walls, for a quarter of a stage in which these move, [B]."""
+    """Speed of the fastest grain over the walls', exceeded in a quarter of a stage in which the walls move, [B]."""
     slow, bin_time = compression_speed(experiment), jnp.asarray(experiment.t0) / BINS
     moving = [stage.name for stage in experiment.protocol if stage.moves]
     found = [jnp.zeros((1, 1))]
@@ -110,10 +110,10 @@ def _restlessness(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.A
 
 
 def _dashpots(experiment: Experiment, stages: Mapping[str, Sample], deepest: jax.Array) -> jax.Array:
-    """How fast friction's dashpots slow the turning (or the moving) of a grain among others, in 1 / t_c, [B].
+    """Rate at which the dashpots of friction damp the rotation (or translation) of a grain, in 1 / t_c, [B].
 
-    The fastest mode: neighbours move oppositely, so that twice the speed is at each of its contacts; a dashpot acts
-    along two of three axes, and turns a grain by the arm of its outer radius.
+    It is that of the fastest mode: neighbours move oppositely, so that the relative speed at each contact is twice a
+    grain's. A dashpot acts along two of three axes, and on rotation with the outer radius of the grain as its arm.
     """
     law: Any = experiment.friction
     if not isinstance(law, SpringLaw):
@@ -127,10 +127,10 @@ def _dashpots(experiment: Experiment, stages: Mapping[str, Sample], deepest: jax
 
 
 def rounding(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.Array:
-    """What round-off makes of p_sig, root mean square over the bins of each signal, [S], in E.
+    """Estimate of the round-off in p_sig, root mean square over the bins of each signal, [S], in E.
 
-    Each replica is rounded in its own way in every step, and its contacts remember that. What was measured (the
-    difference from a larger gamma0's p_sig, scaled) does not depend on the number of grains.
+    Each replica is rounded in its own way in every step, and its contacts remember that. The round-off was measured as
+    the difference from the p_sig of a larger gamma0, scaled; it does not depend on the number of grains.
     """
     readout = stages[experiment.protocol.reads[0]].pressure[:, :2, 1:]
     steps = experiment.steps_per_bin * experiment.protocol.bins
@@ -139,9 +139,10 @@ def rounding(experiment: Experiment, stages: Mapping[str, Sample]) -> jax.Array:
 
 
 def readable(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
-    """Root mean square of recalled signals [S, 256], or of the part of them that is like J, whichever is less: [S].
+    """Root mean square of each p_sig [S, 256] or of its projection on J, whichever is less, [S].
 
-    Of several reads and channels the smallest. Infinite for waveforms that are zero: nothing is read there.
+    With several reads and channels it is the smallest of them. It is infinite for a waveform that is zero, since
+    nothing is read there.
     """
     scale = jnp.asarray(experiment.scale)
 
@@ -157,7 +158,7 @@ def readable(experiment: Experiment, p_sig: jax.Array) -> jax.Array:
 
 
 def _largest_waveforms(experiment: Experiment) -> jax.Array:
-    """max |I| of every replica as it is applied, [S + 1], the zero signal's first."""
+    """max |I| of every replica with the amplitudes of the stages, [S + 1]; the zero signal comes first."""
     own = {
         name: jnp.max(jnp.abs(one.shear(jnp.asarray(bin_centres()))), axis=0) for name, one in experiment.sets.items()
     }
