@@ -1358,7 +1358,7 @@ MUTATIONS = (
     mutation(
         "checkpoint-of-a-failure",
         "files/checkpoints.py",
-        "            checkpoint.discard()  # whoever tries again changes something\n",
+        "            checkpoint.discard()  # it would fail again: the next run must change something\n",
         "",
         "test_a_run_that_failed_leaves_nothing_to_go_on_from",
     ),

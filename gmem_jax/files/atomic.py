@@ -15,14 +15,14 @@ _DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
 
 @contextmanager
 def atomic(path: Path, *, flush: bool = True) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place if the block succeeds, and vanishes if it fails.
+    """A temporary path beside `path`; it takes the place of `path` if the block succeeds, and vanishes if it fails.
 
     Args:
-        path: of the file. One that a command claimed as new does not replace what came there since; see `ours`.
-        flush: to the disk, so that it outlives the machine's failure.
+        path: path of the file. If a command promised a new file, one that came there since is not replaced; see `ours`.
+        flush: whether to flush the file to the disk, so that it survives a crash of the machine.
 
     Raises:
-        FileExistsError: if there is something where a new file was promised.
+        FileExistsError: if there is a file where a new one was promised.
         OSError: if there is no such folder, or it cannot be written.
     """
     path, made = Path(path), None
@@ -46,7 +46,7 @@ def atomic(path: Path, *, flush: bool = True) -> Iterator[Path]:
 
 
 def _of_the_disk(error: OSError) -> str:
-    """What a disk refused a writer, in words; h5py says the number in its message only."""
+    """The reason in words if the disk refused to write, else ""; h5py gives the error number in its message only."""
     told = re.search(r"errno = (\d+)", str(error))
     number = error.errno or (int(told[1]) if told else 0)
     return os.strerror(number) if number in _DISK else ""
@@ -59,5 +59,5 @@ def probe(path: Path) -> None:
         OSError: if it cannot.
     """
     with contextlib.suppress(FileNotFoundError):
-        path.lstat()  # which a file system refuses whose names are shorter
+        path.lstat()  # fails if the name is too long for the file system
     drop(temporary(path))

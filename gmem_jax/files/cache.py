@@ -7,7 +7,7 @@ from gmem_jax.home import cache_folder
 
 
 def kept_pack(name: str) -> Path | None:
-    """Where `gmem prepare NAME` keeps a standard pack; it need not be there. None as of `cache_folder`."""
+    """Where `gmem prepare NAME` keeps a standard pack; it need not exist. None if `cache_folder` gives None."""
     folder = cache_folder()
     return folder and folder / "packs" / f"{name}.h5"
 

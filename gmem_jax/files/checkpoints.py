@@ -34,18 +34,18 @@ PART_SCHEMA = "gmem-part/0.1"
 PARTS_SCHEMA = "gmem-parts/0.1"
 RUN_MARKER = "run.json"
 PART_FILES = r"[\w.+-]+\.(?:npz|now|before)|(?:run|job)\.json"
-"""Names of files in a folder of parts; a sweep puts the job there that they belong to."""
+"""Names of files in a folder of parts; a sweep puts the file of their job there too."""
 ANEW = "remove it, or begin anew with --restart"
-FIRST = 5.0  # s before the first checkpoint of an unfinished part; each next one takes twice as long to come
-CHECKPOINT_INTERVAL = 120.0  # s between checkpoints at most: doing it again must cost more than writing them
-AT_MILESTONES = 20.0  # s likewise, where a stage has just ended
+FIRST = 5.0  # s before the first checkpoint of an unfinished part; each further interval is twice as long
+CHECKPOINT_INTERVAL = 120.0  # s, longest interval: the steps between checkpoints must cost more than writing them
+AT_MILESTONES = 20.0  # s, longest interval at the end of a stage
 
 
 def _taken_apart(tree: Any, arrays: list[np.ndarray]) -> Any:
-    """How a tree of arrays is made up, as JSON; its arrays are added to the list.
+    """The structure of a tree of arrays as JSON; its arrays are added to the list.
 
     Raises:
-        TypeError: for what is neither an array, a truth value, a tuple, a dictionary nor a pytree of this package.
+        TypeError: for any node but an array, a truth value, None, a tuple, a dictionary or a pytree of this package.
     """
     if isinstance(tree, np.ndarray | np.generic | jax.Array):
         arrays.append(np.asarray(tree))
@@ -83,12 +83,12 @@ def save_part(path: Path, tree: Any, of: str = "") -> None:
     """Write a tree of arrays.
 
     Args:
-        path: of the file.
-        tree: what it holds.
-        of: what it is: of which run, and which part of that.
+        path: path of the file.
+        tree: the tree.
+        of: name of the part and of its run, which `load_part` compares.
 
     Raises:
-        TypeError: if it holds something else.
+        TypeError: if the tree holds something else than arrays.
         OSError: if the path cannot be written.
     """
     arrays: list[np.ndarray] = []
@@ -106,7 +106,7 @@ def load_part(path: Path, of: str = "") -> Any:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if the file is damaged, none of this schema, or something else than `of`.
+        FileFormatError: if the file is damaged, of another schema, or not the part `of`.
     """
     with refusing(path, PART), path.open("rb") as opened:
         require_sealed(opened, PART)
@@ -123,10 +123,10 @@ def load_part(path: Path, of: str = "") -> Any:
 
 
 def _members(archive: zipfile.ZipFile, size: int) -> dict[str, np.ndarray]:
-    """The arrays of an archive, none of which is larger than the file says: nothing in it is compressed.
+    """The arrays of an archive by name. They are not compressed, so that none can be larger than the file.
 
     Raises:
-        FileFormatError: if one is.
+        FileFormatError: if one is compressed, or declares more bytes than the file has.
     """
     found = {}
     for member in archive.infolist():
@@ -138,7 +138,7 @@ def _members(archive: zipfile.ZipFile, size: int) -> dict[str, np.ndarray]:
 
 
 class _StoredCheckpoint(Checkpoint):
-    """How far a part is, in two generations: whenever a writer dies, one of them is whole."""
+    """The checkpoint of an unfinished part, kept in two generations: if a writer dies, one of them is whole."""
 
     def __init__(self, own: Folder, name: str, of: str) -> None:
         self._own, self._names, self._of = own, (f"{name}.now", f"{name}.before"), f"{of}, unfinished"
@@ -163,12 +163,12 @@ class _StoredCheckpoint(Checkpoint):
             self._own.move(now, before)
         try:
             save_part(self._own.at(now), state(), self._of)
-        except TypeError:  # a law of the user's may remember in classes of its own: there is nothing to go on from
+        except TypeError:  # a user's law may keep its history in a class of its own: then there are no checkpoints
             self._keeps = False
         self._last, self._wait = time.monotonic(), min(CHECKPOINT_INTERVAL, 2.0 * self._wait)
 
     def discard(self) -> None:
-        """Remove both."""
+        """Remove both generations."""
         for name in self._names:
             self._own.remove(name)
 
@@ -177,24 +177,24 @@ _parting: list[Callable[[], None]] = []
 
 
 def part_with(leave: Callable[[], None]) -> None:
-    """Have `leave` called as soon as the next checkpoint is kept, which is not waited for: for handlers of signals."""
+    """Have `leave` called after the next checkpoint, which is written at once; for handlers of signals."""
     _parting.append(leave)
 
 
 class Checkpoints(ResultCache):
-    """Parts of a long run, in a folder beside its output: what `gm.run` and others take as `cache`.
+    """Parts of a long run, in a folder beside its output: a `cache` for `gm.run` and others.
 
-    What is finished is kept as it is, what is not as a checkpoint of every few minutes. Each file says of which run
-    and which part it is.
+    Finished parts are kept as files; of an unfinished part there is a checkpoint every few minutes. Each file names its
+    run and its part.
 
     Args:
-        folder: made if it is not there.
-        key: what the parts depend on; stored with them.
-        restart: discard what is there.
-        advice: what to do about a part that cannot be read.
+        folder: the folder; it is made if it does not exist.
+        key: the values that the parts depend on; stored with them.
+        restart: whether to discard the parts that are there.
+        advice: advice in the error about a part that cannot be read.
 
     Raises:
-        FileFormatError: if the folder holds finished parts of another run, or is not one of parts.
+        FileFormatError: if the folder holds parts of another run, or is not a folder of parts.
         OSError: if it cannot be written.
     """
 
@@ -212,7 +212,7 @@ class Checkpoints(ResultCache):
 
     @classmethod
     def other_run(cls, folder: Path, key: dict[str, Any]) -> str:
-        """Of which other run a folder holds parts, by the first number that is another; "" if it holds none of one."""
+        """A message if a folder holds parts of another run, with the first value that differs; else ""."""
         found, wanted = cls.key_of(folder), json.loads(json.dumps(key))
         if not found or found == wanted:
             return ""
@@ -226,10 +226,10 @@ class Checkpoints(ResultCache):
         return key if isinstance(key, dict) else {}
 
     def __call__(self, name: str, run: Callable[[Checkpoint], Any]) -> Any:
-        """The part of that name, its arrays as numpy arrays: read if it is there, else run from its checkpoint on.
+        """The part of that name, with numpy arrays: it is read if it is finished, else run from its checkpoint on.
 
         Raises:
-            FileFormatError: if the file of that name is damaged, or another part, or of another run.
+            FileFormatError: if the file of that name is damaged, or belongs to another part or run.
         """
         path, of = self._own.at(f"{name}.npz"), f"part {name} of run {self._run}"
         if path.is_file():
@@ -241,9 +241,9 @@ class Checkpoints(ResultCache):
         try:
             result = jax.tree.map(np.asarray, run(checkpoint))
         except NotAtRestError:
-            raise  # its checkpoint is what more patience goes on from
+            raise  # keeps its checkpoint, from which a run with more patience goes on
         except RunFailedError:
-            checkpoint.discard()  # whoever tries again changes something
+            checkpoint.discard()  # it would fail again: the next run must change something
             raise
         with contextlib.suppress(TypeError):  # see `_StoredCheckpoint`
             save_part(path, result, of)
@@ -251,15 +251,15 @@ class Checkpoints(ResultCache):
         return result
 
     def finished(self) -> int:
-        """Number of parts there are."""
+        """Number of finished parts."""
         return sum(path.suffix == ".npz" for path in self._own.files())
 
     def begun(self) -> int:
-        """Number of parts that are not finished, but have a checkpoint."""
+        """Number of unfinished parts that have a checkpoint."""
         return len({path.stem for path in self._own.files() if path.suffix in (".now", ".before")})
 
     def discard(self) -> None:
-        """Remove the folder; of one that holds other files too, only what is ours."""
+        """Remove the folder; if it holds other files too, remove only ours."""
         if left := self._own.clear():
             warn_caller(f"{self.folder}: left there, since it holds {left[0]}, which is not ours")
 
@@ -274,11 +274,11 @@ def _difference(one: Any, other: Any, name: str = "") -> tuple[str, Any, Any]:
 
 @contextlib.contextmanager
 def locked(output: Path, taken: str = "") -> Iterator[None]:
-    """Keep an output to oneself: a second run into it is refused as long as the first one lives.
+    """Lock an output: a second run into it is refused as long as the first one lives.
 
     Args:
         output: a file or a folder.
-        taken: what is said where another process has it; default that another run writes it.
+        taken: the error message if another process holds it; default that another run is writing it.
 
     Raises:
         FileFormatError: if another process holds it.
@@ -295,7 +295,7 @@ def locked(output: Path, taken: str = "") -> Iterator[None]:
         if not stat.S_ISREG(known.st_mode) or known.st_size:
             raise FileFormatError(f"{lock}: is in the place of a lock, and none of ours; move it away")
         if not _lock(handle) or not lock.exists() or known.st_ino != lock.stat().st_ino:
-            # who had it before us has removed it, and somebody else may have made another
+            # The process that held it has removed it meanwhile, and another may have made a new one.
             raise FileFormatError(taken or f"{output}: another run is writing it; name another output")
         try:
             yield
@@ -307,12 +307,12 @@ def locked(output: Path, taken: str = "") -> Iterator[None]:
 
 def lock_of(output: Path) -> Path:
     """The file by which an output is locked."""
-    output = output if output.name not in ("", "..") else output.resolve()  # the present folder has no name else
+    output = output if output.name not in ("", "..") else output.resolve()  # Path(".") has no name
     return output.with_name(f".{output.name}.lock")
 
 
 def _lock(handle: int) -> bool:
-    import fcntl  # where there is none, as on Windows, there is no lock either
+    import fcntl  # not on Windows, where there is no lock either
 
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -322,7 +322,7 @@ def _lock(handle: int) -> bool:
 
 
 def is_locked(output: Path) -> bool:
-    """Whether a living process has an output to itself; nothing is made or changed."""
+    """Whether a living process holds the lock of an output; nothing is made or changed."""
     try:
         handle = os.open(lock_of(output), os.O_RDONLY | os.O_NONBLOCK | getattr(os, "O_NOFOLLOW", 0))
     except OSError:

@@ -13,19 +13,19 @@ _SEPARATORS = {";": "semicolons", "\t": "tabs"}
 _AXIS = re.compile(r"(u|t|time)(\s*[(\[].*[)\]])?|(t|time)\s*[/_]\s*[^\W\d]+", re.IGNORECASE)
 _NAMELESS = re.compile(r"(unnamed.*)?", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
-_PAIRS = re.compile(r"\s*-?[01],\d+(,-?[01],\d+)*\s*")  # numbers of size 1 with decimal commas, cut at each of them
-_OWN = re.compile(r"signal_\d+")  # as `save_waveforms` names its columns
+_PAIRS = re.compile(r"\s*-?[01],\d+(,-?[01],\d+)*\s*")  # a row of numbers of size 1 whose decimal commas separate cells
+_OWN = re.compile(r"signal_\d+")  # column names of `save_waveforms`
 _AS_AXIS = "call it u or time if it is the axis, else leave it out"
 
 
 class SampleTable(NamedTuple):
-    """What a table holds.
+    """The samples in a table.
 
     Attributes:
-        values: of every column but the axis, [S, n].
-        axis: its values, [n]; None if there is none.
-        name: of the axis.
-        said: what was found that need not be, for a person.
+        values: the columns other than the axis, [S, n].
+        axis: values of the axis, [n]; None if there is no such column.
+        name: name of the axis.
+        said: remarks on the format of the table, for a person.
     """
 
     values: np.ndarray
@@ -38,8 +38,9 @@ def read_columns(path: Path) -> SampleTable:
     """The columns of a CSV: separated by commas, semicolons or tabs, with or without a line of names.
 
     Raises:
-        FileFormatError: for decimal commas, names that fit no columns, and columns that are no samples and no axis.
-        ValueError: if it is no table of numbers.
+        FileFormatError: for decimal commas, names that do not fit the columns, and a column of times or row numbers
+            that is not named as the axis.
+        ValueError: if it is not a table of numbers.
     """
     lines = [line for line in path.read_text("utf-8-sig").splitlines() if line.strip() and not line.startswith("#")]
     if not lines:
@@ -74,7 +75,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _numbers(path: Path, rows: list[str], separator: str) -> np.ndarray:
-    """The numbers of a table by column."""
+    """The numbers of a table, [columns, rows]."""
     try:
         return np.loadtxt(rows, delimiter=separator, ndmin=2, quotechar='"').T
     except ValueError:
@@ -87,7 +88,7 @@ def _numbers(path: Path, rows: list[str], separator: str) -> np.ndarray:
 
 
 def _require_names(path: Path, names: list[str], values: np.ndarray, rows: list[str]) -> None:
-    """Refuse names that do not fit the columns, and columns that are halves of numbers."""
+    """Refuse names that do not fit the columns, and numbers that decimal commas cut into two columns."""
     count = len(values)
     halves = len(names) * 2 == count if names else all(map(_PAIRS.fullmatch, rows)) and np.any(values[1::2] > 1.0)
     if halves and "," in rows[0]:
@@ -99,9 +100,9 @@ def _require_names(path: Path, names: list[str], values: np.ndarray, rows: list[
 
 
 def _require_no_axis(path: Path, names: list[str], values: np.ndarray, axes: list[int]) -> None:
-    """Refuse a column that rises by equal steps beside others: times, places or row numbers are no waveform.
+    """Refuse a column that rises by equal steps beside others: it has times, places or row numbers, not a waveform.
 
-    Steps are equal if no number is further than half a step from the straight line: times are often rounded.
+    Steps count as equal if no number is further than half a step from a straight line, since times are often rounded.
     """
     if len(values) < 2 or values.shape[1] < 3:
         return

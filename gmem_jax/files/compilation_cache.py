@@ -15,7 +15,7 @@ SWITCH = "GMEM_COMPILE_CACHE"  # another folder, or "off"
 
 
 def _processor() -> str:
-    """A few letters that differ between CPUs that cannot run each other's programs; homes are shared in clusters."""
+    """A short hash that differs between CPUs that cannot run each other's programs: clusters share home folders."""
     facts = Path("/proc/cpuinfo")
     lines = facts.read_text(encoding="utf-8").splitlines() if facts.is_file() else []
     known = [line for line in lines if line.startswith(("model name", "flags", "Features"))][:2] or [
@@ -25,9 +25,9 @@ def _processor() -> str:
 
 
 def keep_programs() -> None:
-    """Turn on JAX's persistent compilation cache, unless the user turned it off or chose one; before JAX computes.
+    """Turn on JAX's persistent compilation cache, unless the user turned it off or chose one; call it before JAX runs.
 
-    A folder that cannot be written is no error: then nothing is kept, and a warning says so of a chosen one.
+    If the folder cannot be written, no programs are kept; there is a warning only if the user chose that folder.
     """
     chosen = os.environ.get(SWITCH, "")
     if chosen == "off" or getattr(jax.config, "jax_compilation_cache_dir", None):
@@ -47,11 +47,11 @@ def keep_programs() -> None:
             why = f"{SWITCH}={chosen}: cannot write there ({error.strerror})"
             warnings.warn(f"{why}; compiled programs are not kept", stacklevel=2)
         return
-    # XLA logs an error for every program that it finds: features of its own that no CPU's list has.
+    # XLA logs an error for every cached program, since it names CPU features that are in no CPU's list.
     if getattr(jax.config, "jax_logging_level", None) == "NOTSET":
         jax.config.update("jax_logging_level", "CRITICAL")
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    # Small ones too: a recall has a hundred, which take longer to compile than to read, and 0.5 MB.
+    # Keep small programs too: a recall has a hundred of them (0.5 MB), which are read faster than compiled.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    # What a killed process left half written is compiled again.
+    # Programs that a killed process left half written are compiled again.
     warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache")

@@ -29,14 +29,14 @@ from gmem_jax.simulation.protocol import Protocol
 OF_LAW = {entry.name: entry for law in reversed(LAWS) for entry in fields(law.kind)}
 OF_MATERIAL = {entry.name: entry for entry in fields(Material) if entry.metadata.get("option")}
 NAMES = ("signals", *OF_WORDS, *OF_SAMPLES, "protocol", "friction", *OF_LAW, *OF_MATERIAL, *NUMBERS)
-STAGES = "protocol."  # begins the name of a value of a stage, as "protocol.store.length"
+STAGES = "protocol."  # prefix of the values of stages, as in "protocol.store.length"
 
 
 def sets_from_dict(written: Mapping[str, Any]) -> Signals | SignalSets:
     """The waveforms of a written form, or several sets of them.
 
     Raises:
-        ValueError: as of `signals_from_dict`.
+        ValueError: as in `signals_from_dict`.
     """
     if written["kind"] != "sets":
         return signals_from_dict(written)
@@ -73,7 +73,7 @@ def from_dict(configuration: Mapping[str, Any], pack: Pack | None = None) -> Exp
     of_pack = configuration["pack"]
     pack = load_pack(of_pack["source"]) if pack is None else pack
     if pack_fingerprint(pack) != of_pack["sha256"]:
-        require_x64()  # in 32 bits no pack is the one that was written
+        require_x64()  # in single precision no pack has the same hash
         raise FileFormatError(f"{of_pack['source']}: not the pack that this was made with (its content has changed)")
     require_kinds({name: value for name, value in configuration.items() if name not in PARTS})
     require_kinds(configuration["material"])
@@ -87,7 +87,7 @@ def from_dict(configuration: Mapping[str, Any], pack: Pack | None = None) -> Exp
 
 
 def material_from(written: Mapping[str, Any]) -> Material:
-    """The material of a written form; the default of none.
+    """The material of a written form. An empty form gives the default material.
 
     Raises:
         FileFormatError: if it has a field that no material has.
@@ -103,21 +103,21 @@ def material_from(written: Mapping[str, Any]) -> Material:
 
 
 def recorded_material(configuration: Mapping[str, Any]) -> Material:
-    """That of what a configuration records; the default of none. Errors as of `material_from`."""
+    """The material that a configuration records, or the default one. Errors are those of `material_from`."""
     return material_from(values_of(configuration).get("material", {}))
 
 
 def with_protocol(values: Mapping[str, Any], named: Callable[[Any], ProtocolFile] = named_protocol) -> dict[str, Any]:
-    """Named values with the protocol itself, and the sets of waveforms that its file asks for as `signals`.
+    """The values with the name of the protocol replaced by the protocol, and `signals` by those of its file, if any.
 
     Args:
-        values: by name; None stands for the default.
+        values: values by name; None stands for the default.
         named: gives the protocol of a name.
 
     Raises:
-        ValueError: if it is no protocol, or one of the values does nothing beside it.
+        ValueError: if the name is not that of a protocol, or one of the values does nothing beside it.
         FileNotFoundError: if there is no such file.
-        FileFormatError: if a file makes no protocol.
+        FileFormatError: if the file does not make a protocol.
     """
     found, name = dict(values), values.get("protocol")
     if name is None or isinstance(name, Protocol):
@@ -139,14 +139,14 @@ def named_experiment(pack: Pack, values: Mapping[str, Any], signals: Signals | S
 
     Args:
         pack: the pack.
-        values: by name (`NAMES`; dotted ones like "friction.mu" and "protocol.store.length" too); None stands for the
-            default.
-        signals: in the place of those that `values` names.
+        values: values by name (`NAMES`, and dotted names like "friction.mu" and "protocol.store.length"); None stands
+            for the default.
+        signals: waveforms instead of those that `values` names.
 
     Raises:
         ValueError: for an unknown name, or impossible values.
-        FileNotFoundError: if there is no such file of a protocol.
-        FileFormatError: if it makes no protocol.
+        FileNotFoundError: if the file of the protocol or of the waveforms does not exist.
+        FileFormatError: if such a file cannot be read.
     """
     require_kinds({name: value for name, value in values.items() if not isinstance(value, tuple)})  # a protocol's sets
     values = with_protocol(values)

@@ -80,7 +80,7 @@ def to_xarray(recall: Recall) -> Any:
 
 
 def plain_cell(value: Any) -> Any:
-    """The value of a cell of CSV; before a text that spreadsheets would take for a formula an apostrophe is put."""
+    """The value of a CSV cell. A text that spreadsheets would take for a formula gets an apostrophe in front."""
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@")) else value
 
 

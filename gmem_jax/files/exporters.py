@@ -1,6 +1,6 @@
 """Writing configurations for other programs: GSD, VTK, extended XYZ, LAMMPS. Lengths are in R, times in t_c.
 
-What is written is spheres, each with its grain's number; formats and fields are listed in docs/exchange.md.
+Files hold spheres, each with the number of its grain; docs/exchange.md lists the formats and their fields.
 """
 
 import tempfile
@@ -22,7 +22,7 @@ from gmem_jax.simulation.frames import Frames, images_met, radii_of_spheres, sph
 
 
 def frames_of_pack(pack: Pack, material: Material = Material()) -> Frames:
-    """A pack as the one configuration that it is: normal forces of its overlaps, and no friction, which no pack has."""
+    """A pack as a single configuration: normal forces follow from the overlaps; friction is 0, as a pack keeps none."""
     position, quaternion, offsets = (np.asarray(x) for x in (pack.position, pack.quaternion, pack.clump.offsets))
     own, sizes = (None if x is None else np.asarray(x) for x in (pack.clump.radii, pack.clump.sizes))
     spheres = listed_candidates(pack.pairs).T
@@ -54,19 +54,19 @@ def frames_of_pack(pack: Pack, material: Material = Material()) -> Frames:
 
 
 def _grain_numbers(frames: Frames) -> np.ndarray:
-    """The grain of every sphere, from 1, [N K]."""
+    """The number of every sphere's grain, from 1, [N K]."""
     return np.repeat(np.arange(1, frames.position.shape[1] + 1, dtype=np.int32), len(frames.offsets))
 
 
 def _contacts(frames: Frames, number: int) -> slice:
-    """Which contacts are those of a frame."""
+    """The rows of the contacts of a frame."""
     return slice(*frames.start[number : number + 2])
 
 
 def write_gsd(path: Path, frames: Frames, mass: float, material: Material) -> None:
-    """GSD, as HOOMD-blue and OVITO read it: particles are spheres, bonds are contacts, `body` is the grain from 0.
+    """Write GSD, for HOOMD-blue and OVITO: particles are spheres, bonds are contacts, `body` is the grain from 0.
 
-    Bonds have their `normal_force` and `friction_force`, particles the `wall_force` on them.
+    Bonds have a `normal_force` and a `friction_force`, particles the `wall_force` on them.
 
     Raises:
         ValueError: if the package gsd is not there.
@@ -106,7 +106,7 @@ def write_gsd(path: Path, frames: Frames, mass: float, material: Material) -> No
 
 
 def write_xyz(path: Path, frames: Frames, mass: float, material: Material) -> None:
-    """Extended XYZ, as OVITO and ASE read it: `molecule` is the grain's number from 1.
+    """Write extended XYZ, for OVITO and ASE: `molecule` is the grain's number from 1.
 
     Raises:
         OSError: if the path cannot be written.
@@ -131,9 +131,9 @@ def write_xyz(path: Path, frames: Frames, mass: float, material: Material) -> No
 
 
 def write_lammps(path: Path, frames: Frames, mass: float, material: Material) -> None:
-    """A LAMMPS data file for `atom_style hybrid sphere molecular`, of the first configuration: molecules are grains.
+    """Write the first configuration as a LAMMPS data file (`atom_style hybrid sphere molecular`): molecules are grains.
 
-    The density is such that the spheres of a grain have its mass together.
+    The density is such that the masses of a grain's spheres add up to the mass of the grain.
 
     Raises:
         OSError: if the path cannot be written.
@@ -151,7 +151,7 @@ def write_lammps(path: Path, frames: Frames, mass: float, material: Material) ->
 
 
 def write_dump(path: Path, frames: Frames, mass: float, material: Material) -> None:
-    """A LAMMPS text dump of all configurations: id, mol, type, x, y, z, radius.
+    """Write a LAMMPS text dump of all configurations: id, mol, type, x, y, z, radius.
 
     Raises:
         OSError: if the path cannot be written.
@@ -169,18 +169,18 @@ def write_dump(path: Path, frames: Frames, mass: float, material: Material) -> N
 
 
 def _density(frames: Frames, mass: float) -> float:
-    """Of spheres that have the mass of their grain together; `mass` is that of a grain of size 1."""
+    """Density with which the masses of a grain's spheres add up to the grain's; `mass` is that of a grain of size 1."""
     radii = np.ones(len(frames.offsets)) if frames.radii is None else frames.radii
     return mass / (float(np.sum(radii**3)) * 4.0 * np.pi / 3.0)
 
 
 def _rows(file: TextIO, form: str, *columns: np.ndarray) -> None:
-    """A line of this form for every row of the columns beside each other; whole numbers are exact as floats here."""
+    """Write a line in this format for every row of the columns; whole numbers of this size are exact as floats."""
     np.savetxt(file, np.column_stack(columns), fmt=form, encoding="utf-8")
 
 
 def write_vtp(path: Path, frames: Frames, mass: float, material: Material) -> None:
-    """VTK polygonal data, as ParaView reads it: a point for every sphere, with `radius`, `grain` and `wall_force`.
+    """Write VTK polygonal data, for ParaView: a point for every sphere, with `radius`, `grain` and `wall_force`.
 
     Raises:
         ValueError: if the package pyvista is not there.
@@ -191,9 +191,10 @@ def write_vtp(path: Path, frames: Frames, mass: float, material: Material) -> No
 
 
 def write_pvd(path: Path, frames: Frames, mass: float, material: Material) -> None:
-    """A ParaView series: a .pvd file, and beside it a folder of its name with spheres and contacts of every frame.
+    """Write a ParaView series: a .pvd file, and beside it a folder with the spheres and contacts of every frame.
 
-    A contact is a line between two centres with its `normal_force` and `friction_force`. All or nothing is written.
+    A contact is a line between two centres with a `normal_force` and a `friction_force`. Either all files are written,
+    or none.
 
     Raises:
         ValueError: if the package pyvista is not there, or the file's name cannot stand in XML.
@@ -241,12 +242,12 @@ def _lines(frames: Frames, number: int) -> Any:
     pairs = frames.spheres[own]
     mesh = optional("pyvista", "vtk").PolyData()
     mesh.points = frames.centres(number)
-    if any(frames.periodic):  # a line to an image has an end of its own
+    if any(frames.periodic):  # a line to a periodic image ends in a point of its own
         centres = frames.centres(number)
         mesh.points = np.concatenate([centres, centres[pairs[:, 1]] + images_met(frames, number)])
         pairs = np.column_stack([pairs[:, 0], len(centres) + np.arange(len(pairs))])
-    mesh.lines = np.column_stack([np.full(len(pairs), 2), pairs]).ravel()  # one made with no lines would have vertices
-    for name in ("normal_force", "friction_force"):  # by VTK itself: pyvista refuses vectors where there are none
+    mesh.lines = np.column_stack([np.full(len(pairs), 2), pairs]).ravel()  # a mesh made without lines gets vertices
+    for name in ("normal_force", "friction_force"):  # by VTK itself: pyvista refuses empty arrays of vectors
         array = optional("vtkmodules.util.numpy_support", "vtk").numpy_to_vtk(getattr(frames, name)[own], deep=True)
         array.SetName(name)
         mesh.GetCellData().AddArray(array)
@@ -254,7 +255,7 @@ def _lines(frames: Frames, number: int) -> Any:
 
 
 def _vtp(mesh: Any) -> str:
-    """The text of its file; that VTK would write itself, but without saying why it cannot."""
+    """The text of a mesh's file. VTK could write the file itself, but gives no reason if it fails."""
     writer = optional("vtkmodules.vtkIOXML", "vtk").vtkXMLPolyDataWriter()
     writer.SetInputData(mesh)
     writer.WriteToOutputStringOn()
@@ -263,13 +264,13 @@ def _vtp(mesh: Any) -> str:
 
 
 class Format(NamedTuple):
-    """A format.
+    """A format for export.
 
     Attributes:
-        suffix: of its files.
-        write: writes frames, of grains of a mass (of those of size 1) and a material.
-        series: likewise for several configurations, where that is another kind of file.
-        folder: whether it writes a folder, too, of the file's name without its suffix.
+        suffix: suffix of its files.
+        write: writes a file from a path, frames, the mass of a grain of size 1, and the material.
+        series: the format for several configurations, if that is another kind of file.
+        folder: whether it also writes a folder, named like the file without its suffix.
     """
 
     suffix: str
@@ -292,10 +293,10 @@ def format_of(name: str, *, several: bool, suffix: str = "") -> Format:
     Args:
         name: one of `EXPORT_FORMATS`.
         several: whether there are several configurations.
-        suffix: of the file; that of a series asks for one of a single configuration, too.
+        suffix: suffix of the file; the suffix of a series makes a series even of a single configuration.
 
     Raises:
-        ValueError: if there is none of that name.
+        ValueError: if there is no format of that name.
     """
     if name not in EXPORT_FORMATS:
         raise ValueError(f"--to must be one of {', '.join(EXPORT_FORMATS)}; got {name!r}")

@@ -15,11 +15,11 @@ from gmem_jax.physics.boundary import boundary_of
 from gmem_jax.simulation.frames import Frames
 
 GROUP = "frames"
-_SOME = UNEQUAL | RUBBED  # what not all frames have
+_SOME = UNEQUAL | RUBBED  # arrays that not all frames have
 
 
 def write_frames(file: h5py.File, frames: Frames) -> None:
-    """Write them into a file that is open."""
+    """Write frames into an open file."""
     group = file.create_group(GROUP)
     group.attrs["stages"] = json.dumps(frames.stages)
     group.attrs["signal"] = frames.signal
@@ -29,7 +29,7 @@ def write_frames(file: h5py.File, frames: Frames) -> None:
 
 
 def _declared(found: Mapping[str, Any]) -> dict[str, Array]:
-    """The arrays that frames of such fields have."""
+    """The declarations of the arrays that frames with these fields have."""
     return FRAMES | {name: array for name, array in _SOME.items() if found.get(name) is not None}
 
 
@@ -37,7 +37,7 @@ def read_frames(content: Content) -> Frames | None:
     """The frames of an open file; None if it has none.
 
     Raises:
-        FileFormatError: if they are incomplete, or do not fit each other.
+        FileFormatError: if they are incomplete, or inconsistent.
     """
     if GROUP not in content.attributes:
         return None
@@ -54,7 +54,7 @@ def read_frames(content: Content) -> Frames | None:
 
 
 def check_frames(frames: Frames) -> None:
-    """Refuse frames that a file would be refused for.
+    """Refuse frames that are inconsistent; a file with such frames cannot be read.
 
     Raises:
         FileFormatError: saying what is wrong.
@@ -84,7 +84,7 @@ def load_frames(path: Path) -> Frames | None:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if the file is damaged, or they do not fit each other.
+        FileFormatError: if the file is damaged, or its frames are inconsistent.
     """
     with refusing(path, "file with frames"), reading(path) as content:
         return read_frames(content)

@@ -1,6 +1,6 @@
 """The common parts of all HDF5 files of this package: seal, schema, configuration, samples.
 
-A file is sealed (see `seal`), holds nothing but what `tree` allows, and every array is compared with a declaration
+A file is sealed (see `seal`) and holds only items that `tree` allows. Every array is compared with its declaration
 before it is read.
 """
 
@@ -24,22 +24,22 @@ from gmem_jax.physics.boundary import WALLS, PeriodicAxes, periodic_axes
 from gmem_jax.simulation.sample import MEASURED, Sample
 from gmem_jax.simulation.stage import BINS
 
-OBSERVED = "observed_"  # begins the names of what observers gave
+OBSERVED = "observed_"  # prefix of the arrays of observers
 
 
 class Content(Tree):
-    """A file that is open for reading: its attributes, and its arrays once they are found to be as declared."""
+    """A file that is open for reading: its attributes, and its arrays, which are compared with their declarations."""
 
     @property
     def schema(self) -> str:
-        """What kind of file it is, and in which version."""
+        """The kind of the file with its version, like "gmem-pack/0.1"."""
         return str(self.attributes[""].get("schema", "none"))
 
     def text(self, name: str, group: str = "") -> str:
         """An attribute that is a text.
 
         Raises:
-            FileFormatError: if it is missing, or none.
+            FileFormatError: if it is missing, or not a text.
         """
         value = self.attributes.get(group, {}).get(name)
         if not isinstance(value, str):
@@ -56,10 +56,10 @@ class Content(Tree):
         return {path: self.datasets[path][()] for path in declared}
 
     def samples(self, group: str) -> OrderedDict[str, Sample]:
-        """What `write_samples` wrote.
+        """The samples by stage that `write_samples` wrote.
 
         Raises:
-            FileFormatError: if it is incomplete, or shapes do not fit each other.
+            FileFormatError: if they are incomplete, or shapes do not fit each other.
         """
         orders: dict[str, Any] = {
             path.removeprefix(f"{group}/"): own.get("order")
@@ -87,19 +87,19 @@ class Content(Tree):
 
 
 def observed_array(name: str, dimensions: int, units: str = "", words: str = "") -> Array:
-    """What is declared of what an observer gave: bins, dimensions of its own, replicas."""
+    """The declaration of an observer's array: bins, dimensions of its own, replicas."""
     own = (f"{name}_{number}" for number in range(1, dimensions - 1))
     return Array("real", ("time", *own, "replica"), units, words)
 
 
 @contextmanager
 def writing(path: Path, schema: str) -> Iterator[h5py.File]:
-    """A new HDF5 file of a schema, which is sealed and takes its place if the block succeeds.
+    """A new HDF5 file of a schema; it is sealed and moved to its path if the block succeeds.
 
     Raises:
         OSError: if the path cannot be written.
     """
-    # In memory first: libhdf5 may crash when a disk is full.
+    # It is made in memory first, since libhdf5 may crash when a disk is full.
     content = io.BytesIO()
     with h5py.File(content, "w", userblock_size=BLOCK) as file:
         file.attrs["schema"] = schema
@@ -112,12 +112,12 @@ def writing(path: Path, schema: str) -> Iterator[h5py.File]:
 
 @contextmanager
 def reading(path: Path, schema: str = "") -> Iterator[Content]:
-    """The content of an HDF5 file of a schema; of any if none is given.
+    """The content of an HDF5 file of a schema, or of any schema if none is given.
 
     Raises:
-        FileNotFoundError: if there is none.
-        FileFormatError: if it is damaged, is not HDF5, holds what it must not, or has another schema; and for whatever
-            goes wrong in the block.
+        FileNotFoundError: if there is no such file.
+        FileFormatError: if it is damaged, is not HDF5, holds items that are not allowed, or has another schema; and for
+            any error in the block.
     """
     path = Path(path)
     with refusing(path, HDF5), path.open("rb") as raw:
@@ -133,7 +133,7 @@ def schema_of(path: Path) -> str:
     """The schema of a file.
 
     Raises:
-        FileNotFoundError: if there is none.
+        FileNotFoundError: if there is no such file.
         FileFormatError: if it is not a readable HDF5 file.
     """
     with reading(path) as content:
@@ -141,10 +141,10 @@ def schema_of(path: Path) -> str:
 
 
 def stored_axes(content: Content, group: str = "") -> PeriodicAxes:
-    """The periodic axes that the attribute `boundary` tells; none where it is missing.
+    """The periodic axes according to the attribute `boundary`; none if it is missing.
 
     Raises:
-        FileFormatError: if it tells nothing.
+        FileFormatError: if the attribute is not that of a boundary.
     """
     if "boundary" not in content.attributes.get(group, {}):
         return WALLS
@@ -157,8 +157,8 @@ def stored_axes(content: Content, group: str = "") -> PeriodicAxes:
 def write_arrays(group: h5py.Group, declared: Mapping[str, Array], values: Mapping[str, Any]) -> None:
     """Write arrays at their paths, each with its units, its description, and scales for its dimensions.
 
-    The scale of a dimension is the array of that name, in the group or in the file; where there is none, one that
-    counts from 0 is put into the file.
+    The scale of a dimension is the array of its name, in the group or in the file. If there is none, a scale that
+    counts from 0 is added to the file.
 
     Raises:
         FileFormatError: if a value is missing, or has another shape or kind than declared.
@@ -193,12 +193,12 @@ def _scale(group: h5py.Group, name: str, length: int) -> h5py.Dataset:
 def write_samples(
     group: h5py.Group, stages: Mapping[str, Sample], observed: Mapping[str, Mapping[str, str]] | None = None
 ) -> None:
-    """A group for every stage, in order, with a dataset for each quantity.
+    """Write a group for every stage, in order, with a dataset for each quantity.
 
     Args:
-        group: where they are put.
+        group: the group that gets these groups.
         stages: samples by stage.
-        observed: unit and words of what observers gave, by name.
+        observed: unit and description of the arrays of observers, by name.
     """
     passed = 0
     for number, (name, sample) in enumerate(stages.items()):

@@ -12,10 +12,10 @@ from gmem_jax.files.lammpsdata import PERIODIC, SAME, Read, density_of, read_lam
 from gmem_jax.files.validation import optional, refusing, require, require_finite
 from gmem_jax.physics.grain import require_radii
 
-LARGEST = 1 << 30  # bytes of a file
+LARGEST = 1 << 30  # bytes, of the largest file
 _GSD = b"\xdf\x65\xdf\x65\xdf\x65\xdf\x65"
 _CONVERTED = "write a LAMMPS data file or GSD from it (LAMMPS: write_data; OVITO: Export File)"
-_OTHERS = (  # how files begin that are asked for in vain, what they are, and what to do
+_OTHERS = (  # files that cannot be imported: how they begin, what they are, and what to do
     (rb"\x1f\x8b|BZh[1-9]1AY|\xfd7zXZ|\x28\xb5\x2f\xfd|PK\x03\x04", "a compressed file", "unpack it first"),
     (
         rb"gmem sha256|.{0,2048}\x89HDF\r\n",
@@ -36,12 +36,12 @@ class Spheres:
     """N grains of K spheres each, in R.
 
     Attributes:
-        centres: in the order of the file within a grain, [N, K, 3].
-        radii: of the spheres, [N, K].
+        centres: centres of the spheres, in the order of the file within a grain, [N, K, 3].
+        radii: radii of the spheres, [N, K].
         lower: lower planes of the box, [3].
         upper: upper planes, [3].
-        density: of the spheres, in the file's units; None where it has none.
-        notes: what was done with what the file holds besides.
+        density: density of the spheres, in the file's units; None if it has none.
+        notes: remarks on other content of the file, such as what was left out.
     """
 
     centres: np.ndarray
@@ -56,14 +56,14 @@ def load_spheres(path: Path, radius: float = 1.0) -> Spheres:
     """The grains of a LAMMPS data file (molecules) or a GSD file (bodies; its last frame).
 
     Args:
-        path: a file; GSD by how it begins or by its suffix .gsd, LAMMPS otherwise.
-        radius: R in the file's unit of length: of equal spheres their radius.
+        path: the file; it is GSD if it begins so or its suffix is .gsd, and LAMMPS otherwise.
+        radius: R in the file's unit of length; for equal spheres it is their radius.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it cannot be read, holds what no pack has, its spheres are all of another radius or of
-            radii that no pack can have, its densities are others than one, or its grains differ in their number of
-            spheres.
+        FileFormatError: if the file cannot be read or holds things that no pack has; if its spheres all have another
+            radius than `radius`, have radii that no pack can have, or differ in density; or if its grains differ in
+            their number of spheres.
         ValueError: if the radius is not positive, or the package gsd is not there.
     """
     if not 0.0 < radius < np.inf:
@@ -109,10 +109,10 @@ def _gsd(path: Path, radius: float) -> Read:
     body, kind = np.asarray(own.body, np.int64), np.asarray(own.typeid)
     lengths, tilts = np.asarray(frame.configuration.box[:3], float), frame.configuration.box[3:]
     require(np.asarray(tilts) == 0.0, "its box is not rectangular")
-    require(np.asarray(frame.log.get("periodic", 0)) == 0, PERIODIC)  # by our own exports: GSD has no place for it
+    require(np.asarray(frame.log.get("periodic", 0)) == 0, PERIODIC)  # our exports log it: GSD has no field for it
     free = body < 0
     grain = np.where(free, len(body) + np.arange(len(body)), body)
-    # HOOMD marks each rigid body by a particle of a type of its own, which has the body's number, as others have
+    # HOOMD gives each rigid body a central particle, of a type of its own; its body is its own number.
     _, place, members = np.unique(grain, return_inverse=True, return_counts=True)
     central = ~free & (body == np.arange(len(body))) & (members[place] > 1)
     of_types = np.isin(kind, kind[central]) & ~np.isin(kind, kind[~central])

@@ -10,8 +10,8 @@ import numpy as np
 from gmem_jax.errors import FileFormatError
 from gmem_jax.files.validation import require
 
-SAME = 1e-5  # by which radii, masses and densities may differ from the one that is meant; GSD is in single precision
-_STYLES = {  # of atoms: columns
+SAME = 1e-5  # relative difference up to which radii, masses or densities count as equal; GSD is in single precision
+_STYLES = {  # columns of each style of atoms
     "molecular": "id mol type x y z",
     "bond": "id mol type x y z",
     "angle": "id mol type x y z",
@@ -20,7 +20,7 @@ _STYLES = {  # of atoms: columns
     "hybrid molecular sphere": "id type x y z mol diameter density",
     "sphere": "id type diameter density x y z",  # molecules in a section of their own, or none
 }
-_HYBRID = ("hybrid sphere molecular", "hybrid molecular sphere")  # LAMMPS itself writes no more than "hybrid"
+_HYBRID = ("hybrid sphere molecular", "hybrid molecular sphere")  # LAMMPS itself writes only "hybrid"
 _READ = ("Atoms", "Molecules", "Masses", "Atom Type Labels")
 PERIODIC = "its box is periodic: a pack to be imported lies within walls"
 _PERIODIC = re.compile(r"^gmem: .*, boundary [fp ]*p")
@@ -29,9 +29,9 @@ _WHOLE = re.compile(r"[+-]?[0-9]{1,15}")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _MOST, _TINY = np.finfo(float).max, np.finfo(float).tiny
 _REALS = (_REAL, -_MOST, _MOST, "a finite number")
-_COLUMNS = {  # those that are not just real: how they are written, from where to where they go, in words
+_COLUMNS = {  # columns that are not any real number: pattern, least and largest value, in words
     "id": (_WHOLE, 1.0, _MOST, "a whole number from 1"),
-    "mol": (_WHOLE, 0.0, _MOST, "a whole number from 0"),  # 0 is none
+    "mol": (_WHOLE, 0.0, _MOST, "a whole number from 0"),  # 0: no molecule
     "type": (_WHOLE, 1.0, _MOST, "a label, or a whole number from 1"),
     "diameter": (_REAL, _TINY, _MOST, "a positive number"),
     "density": (_REAL, _TINY, _MOST, "a positive number"),
@@ -40,19 +40,19 @@ _COLUMNS = {  # those that are not just real: how they are written, from where t
     "image flag": (_WHOLE, 0.0, 0.0, "0: a pack lies within walls, not in a periodic box"),
     "tilt": (_REAL, 0.0, 0.0, "0: the box of a pack is rectangular"),
 }
-_SHOWN = 40  # characters of what is wrong
+_SHOWN = 40  # characters of a wrong text that an error shows
 
 
 class Read(NamedTuple):
-    """What a file of others holds of S spheres, in its own lengths.
+    """The S spheres in a file of another program, in the file's unit of length.
 
     Attributes:
-        centres: [S, 3].
-        grain: which each belongs to, by any whole number, [S].
-        radii: [S]; empty where the file has none.
-        box: planes, [2, 3].
-        density: of the spheres; None where the file has none.
-        notes: what was done with what the file holds besides.
+        centres: centres of the spheres, [S, 3].
+        grain: a whole number for each sphere that is the same for all spheres of a grain, [S].
+        radii: radii of the spheres, [S]; empty if the file has none.
+        box: lower and upper planes, [2, 3].
+        density: density of the spheres; None if the file has none.
+        notes: remarks on other content of the file, such as what was left out.
     """
 
     centres: np.ndarray
@@ -78,16 +78,16 @@ def read_lammps(path: Path, radius: float) -> Read:
 
     Args:
         path: the file.
-        radius: that equal spheres should have; tells the columns of `Atoms # hybrid` apart.
+        radius: radius of equal spheres, by which the columns of `Atoms # hybrid` are recognised.
 
     Raises:
-        OSError: if it cannot be read.
-        FileFormatError: naming the line that is wrong, or what is missing.
+        OSError: if the file cannot be read.
+        FileFormatError: naming the line that is wrong, or the part that is missing.
     """
     with path.open(encoding="utf-8", errors="backslashreplace") as file:  # a title may be in any encoding
         lines = file.read().split("\n")
     require(any(map(_ATOMS.fullmatch, lines)), "it is no LAMMPS data file, which has a line 'N atoms', and no GSD file")
-    require(not _PERIODIC.search(lines[0]), PERIODIC)  # by our own exports: such files do not say it elsewhere
+    require(not _PERIODIC.search(lines[0]), PERIODIC)  # only the title of our exports says it
     head, sections = _parts(lines)
     box = _box(head)
     atoms = sections.get("Atoms", _Section("", []))
@@ -127,10 +127,10 @@ def one_value(what: str, values: np.ndarray) -> float:
 
 
 def density_of(masses: np.ndarray, radii: np.ndarray | float) -> float | None:
-    """The density of spheres of these masses; None where all are 1, as programs write who know no masses.
+    """The density of spheres of these masses; None if all masses are 1, as written by programs without masses.
 
     Raises:
-        FileFormatError: if they differ.
+        FileFormatError: if the densities differ, or the masses of equal spheres.
     """
     if np.all(masses == 1.0):
         return None
@@ -139,7 +139,7 @@ def density_of(masses: np.ndarray, radii: np.ndarray | float) -> float | None:
 
 
 def _parts(lines: list[str]) -> tuple[dict[str, _Row], dict[str, _Section]]:
-    """The header's lines by their keywords, and the sections by name."""
+    """The lines of the header by keyword, and the sections by name."""
     head: dict[str, _Row] = {}
     sections: dict[str, _Section] = {}
     rows: list[_Row] | None = None
@@ -171,7 +171,7 @@ def _count(head: Mapping[str, _Row], name: str) -> int:
 
 
 def _box(head: Mapping[str, _Row]) -> np.ndarray:
-    """The planes, [2, 3]."""
+    """Lower and upper planes of the box, [2, 3]."""
     bounds = []
     for axis in "xyz":
         name = f"{axis}lo {axis}hi"
@@ -187,9 +187,10 @@ def _box(head: Mapping[str, _Row]) -> np.ndarray:
 
 
 def _style_of(atoms: _Section, radius: float) -> str:
-    """What the comment behind `Atoms` says; of LAMMPS' own "hybrid" the order in which diameters are those meant.
+    """The style of the atoms, from the comment after `Atoms`.
 
-    If they are in none, the spheres are unequal: the order in which all densities are one.
+    If it says only "hybrid", as LAMMPS writes it, the style is that in which all diameters are twice the radius. If
+    there is none, the spheres are unequal, and the style is that in which all densities are equal.
     """
     if atoms.hint != "hybrid":
         require(
@@ -217,7 +218,7 @@ def _style_of(atoms: _Section, radius: float) -> str:
 
 
 def _table(section: _Section, names: list[str], types: int, labels: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """The columns of a section by name, as real numbers, which are exact for whole ones of up to 15 digits."""
+    """The columns of a section by name, as real numbers; whole numbers of up to 15 digits are exact."""
     rows = section.rows
     require(len(rows) > 0, "a section of it holds no rows")
     flags = 3 * (names[0] == "id" and len(rows[0].words) == len(names) + 3)
@@ -254,7 +255,7 @@ def _require_once(ids: np.ndarray, lines: list[int]) -> None:
 
 
 def _molecules(sections: Mapping[str, _Section], ids: np.ndarray) -> np.ndarray:
-    """The molecule of every atom from the section Molecules; 0 for all where there is none."""
+    """The molecule of every atom from the section Molecules; 0 for all atoms without such a section."""
     if "Molecules" not in sections:
         return np.zeros(len(ids))
     rows = sections["Molecules"].rows

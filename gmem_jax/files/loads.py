@@ -10,8 +10,8 @@ from gmem_jax.simulation.frames import Frames, images_met
 def frame_wall_forces(frames: Frames, number: int, material: Material) -> np.ndarray:
     """The forces of the planes on every sphere of a frame, [N K, 6, 3], in E R^2: elastic forces and friction.
 
-    Planes are the lower ones of x, y and z, then the upper ones. What damping adds depends on speeds, which frames do
-    not keep: it is left out.
+    The planes are the lower ones of x, y and z, then the upper ones. Damping forces are left out: they depend on
+    speeds, which frames do not keep.
     """
     centres, radii = frames.centres(number), frames.sphere_radii[:, None]
     forces = np.zeros((len(centres), PLANES, 3))
@@ -27,14 +27,14 @@ def frame_wall_forces(frames: Frames, number: int, material: Material) -> np.nda
 def pressure_tensor(frames: Frames, number: int, walls: np.ndarray) -> np.ndarray:
     """The mean stress in a frame, [3, 3], in E, compression positive: the sum of f_a l_b over the box's volume.
 
-    A contact counts with the force on its second grain and the line from the first grain's centre to the second's, a
-    wall with its force and the line from where it is touched to the grain's centre (Love and Weber). So at rest between
-    smooth walls the diagonal is what they measure.
+    In a contact, f is the force on the second grain and l the line from the first grain's centre to the second's. At a
+    wall, f is its force and l the line from the point of contact to the grain's centre (Love and Weber). At rest
+    between smooth walls the diagonal is the pressures on the walls.
 
     Args:
         frames: the configurations.
-        number: of the frame.
-        walls: its `frame_wall_forces`.
+        number: number of the frame.
+        walls: `frame_wall_forces` of this frame.
     """
     own, each = slice(*frames.start[number : number + 2]), len(frames.offsets)
     centres, position = frames.centres(number), frames.position[number]

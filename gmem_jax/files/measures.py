@@ -17,7 +17,7 @@ EACH = ("signal_gain", "signal_fidelity", "signal_windowed_fidelity", "signal_co
 
 
 def relative_scale(configuration: Mapping[str, Any]) -> jax.Array:
-    """delta0 gamma0, what gains are measured in; scalar, or [S, 1] where it differs between signals; NaN if unknown."""
+    """delta0 gamma0, the unit of gains; scalar, or [S, 1] if it differs between signals; NaN if unknown."""
     numbers = np.multiply(*(values_of(configuration).get(name, np.nan) for name in ("delta0", "gamma0")))
     return jnp.asarray(numbers if np.ndim(numbers) == 0 else numbers[1:, None])
 
@@ -29,9 +29,9 @@ def read_stress(recall: Recall, read: str) -> jax.Array:
 
 
 def of_each(recall: Recall) -> dict[str, np.ndarray]:
-    """`EACH` of every signal: G and F with a gain of its own, F over T1, correlation with J; NaN of silence.
+    """The measures `EACH` of every signal: G and F with its own gain, F averaged over T_1, and correlation with J.
 
-    Arrays [S], or [R, C, S] as in the recall.
+    They are arrays [S], or [R, C, S] as in the recall; NaN for a signal that is zero.
     """
     known, shape = values_of(recall.configuration), np.shape(recall.J)[:-1]
     scale, windows = relative_scale(known), recall.windows(known.get("t0", np.nan))

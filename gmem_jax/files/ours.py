@@ -1,8 +1,8 @@
 """Removing, renaming and replacing files: only those that were proven to be the package's own.
 
-A folder of ours holds a marker, written when the folder was made. What lies in it is ours if it is a plain file whose
-name fits the pattern of the names that we make. Links are not followed. A new output takes a place that is free.
-Whatever in this package removes, renames or replaces files does it here.
+A folder of ours holds a marker, written when the folder was made. A file in it is ours if it is a plain file whose name
+fits the pattern of our names. Links are not followed. An output that was promised as new never replaces a file. All
+code of this package that removes, renames or replaces files is here.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ def _tag(name: str) -> str:
 
 
 def temporary(path: Path) -> Path:
-    """A new file beside `path`, whose name says whose it is, and fits wherever a name does; its mode is the umask's.
+    """A new empty file beside `path`. Its short name holds a hash of the name of `path`; its mode follows the umask.
 
     Raises:
         OSError: if the folder cannot be written.
@@ -38,18 +38,18 @@ def temporary(path: Path) -> Path:
 
 
 def drop(made: Path) -> None:
-    """Remove what `temporary` made, if it is still there."""
+    """Remove a file that `temporary` made, if it is still there."""
     assert _TEMPORARY.fullmatch(made.name)
     made.unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path, name: str = "", *, age: float = 0.0) -> None:
-    """Remove what killed writers left behind: temporary files of the files in a folder (or of one of them).
+    """Remove the temporary files that killed writers left in a folder, for all files or for one.
 
     Args:
-        folder: where they are.
-        name: of the one file; default all.
-        age: in s: younger ones may be those of living writers.
+        folder: the folder.
+        name: name of the one file; default all files.
+        age: in s; younger temporary files stay, since their writers may be alive.
     """
     for left in Path(folder).glob(".gmem-*.tmp"):
         known = _TEMPORARY.fullmatch(left.name)
@@ -60,15 +60,15 @@ def remove_leftovers(folder: Path, name: str = "", *, age: float = 0.0) -> None:
 
 
 def promise(path: Path, *, replace: bool) -> None:
-    """Whether `place` may replace what it finds at an output of this process."""
+    """Say whether `place` may replace a file at `path`, an output of this process."""
     (_new.discard if replace else _new.add)(path.absolute())
 
 
 def place(made: Path, path: Path) -> None:
-    """Move what `temporary` made to its path; a file that came there after the path was promised as new survives.
+    """Move a file that `temporary` made to its path. If a new file was promised there, one that came since is kept.
 
     Raises:
-        FileExistsError: if there is one.
+        FileExistsError: if there is such a file.
         OSError: if the folder cannot be written.
     """
     if path.absolute() not in _new:
@@ -76,10 +76,10 @@ def place(made: Path, path: Path) -> None:
         return
     try:
         try:
-            os.link(made, path)  # which never replaces
+            os.link(made, path)  # a link never replaces a file
         except FileExistsError:
             raise
-        except OSError:  # there are no hard links here
+        except OSError:  # the file system has no hard links
             os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
             os.replace(made, path)
     except FileExistsError:
@@ -92,7 +92,7 @@ def place(made: Path, path: Path) -> None:
 
 
 def release(lock: Path, number: int) -> None:
-    """Remove a lock, an empty file, if it still is the one of this inode number."""
+    """Remove a lock, which is an empty file, if it still has this inode number."""
     with contextlib.suppress(OSError):
         found = lock.lstat()
         if (found.st_ino, found.st_size) == (number, 0):
@@ -100,7 +100,7 @@ def release(lock: Path, number: int) -> None:
 
 
 def _plain(path: Path) -> bool:
-    """Whether it is a file, and no link to one."""
+    """Whether the path is a regular file, and not a link."""
     try:
         return stat.S_ISREG(path.lstat().st_mode)
     except OSError:
@@ -108,17 +108,17 @@ def _plain(path: Path) -> bool:
 
 
 class Folder:
-    """A folder of ours: made with its marker, or proven by it.
+    """A folder of ours: a new one with its marker, or one whose marker is found.
 
     Args:
-        path: of the folder.
+        path: path of the folder.
         marker: name of its marker.
-        schema: of the marker.
-        names: pattern of all paths in it that we make, from the folder on.
-        about: what a new marker says beside its schema.
+        schema: schema of the marker.
+        names: pattern of the paths of all files that we make in it, relative to the folder.
+        about: fields of a new marker beside its schema.
 
     Raises:
-        FileFormatError: if it is there and is not ours; nothing in it was touched.
+        FileFormatError: if there is a folder that is not ours; nothing in it was touched.
         OSError: if it cannot be written.
     """
 
@@ -130,7 +130,7 @@ class Folder:
 
     @classmethod
     def is_there(cls, path: Path, marker: str, schema: str) -> bool:
-        """Whether a folder with this marker is there; if not, it can be made there.
+        """Whether there is a folder with this marker; if not, there is nothing, or an empty folder.
 
         Raises:
             FileFormatError: if something else is there.
@@ -152,7 +152,7 @@ class Folder:
 
     @staticmethod
     def about(path: Path, marker: str, schema: str) -> dict[str, Any] | None:
-        """What the marker of a folder says; None if there is none of this schema."""
+        """The content of a folder's marker; None if it has no marker of this schema."""
         card = path / marker
         if os.path.islink(path) or not _plain(card):
             return None
@@ -180,10 +180,10 @@ class Folder:
                 drop(made)
 
     def at(self, name: str) -> Path:
-        """The path of a file of ours in it, or where one may be made.
+        """The path of a file of ours in the folder; the file need not exist.
 
         Raises:
-            FileFormatError: if we make no such name, or a link is on the way.
+            FileFormatError: if the name is not one of ours, or a link is on the way.
         """
         if not self._names.fullmatch(name):
             raise FileFormatError(f"{self.path}: {name!r} is no name of a file that belongs there; it was left alone")
@@ -196,7 +196,7 @@ class Folder:
         return path
 
     def files(self, inner: str = "") -> list[Path]:
-        """The files of ours in it, or in a folder in it, in order."""
+        """Our files in the folder, or in a folder within, sorted."""
         top = self.path / inner
         if top.is_symlink() or not top.is_dir():
             return []
@@ -204,7 +204,7 @@ class Folder:
         return [entry for entry in found if self._names.fullmatch(entry.relative_to(self.path).as_posix())]
 
     def make(self, inner: str) -> None:
-        """Make a folder in it.
+        """Make a folder within.
 
         Raises:
             FileFormatError: if a link or a file has its name.
@@ -233,14 +233,14 @@ class Folder:
         os.replace(self.at(name), self.at(to))
 
     def clear(self, inner: str = "", *, keep: bool = False) -> list[str]:
-        """Remove what is ours in it (or in a folder in it), and the folder if nothing else is left.
+        """Remove our files in the folder (or in a folder within), and the folder if nothing else is left.
 
         Args:
-            inner: the folder in it.
-            keep: keep the folder and its marker.
+            inner: the folder within.
+            keep: whether to keep the folder and its marker.
 
         Returns:
-            The names of what was left, since it is not ours.
+            The names of the entries that were left, since they are not ours.
         """
         top, marker = self.path / inner, "" if inner else self._marker
         for path in self.files(inner):

@@ -25,15 +25,15 @@ from gmem_jax.physics.pytree import interval
 from gmem_jax.simulation.frames import radii_of_spheres, sphere_places
 from gmem_jax.simulation.strain import COMPRESSIONS
 
-UNIT = 1e-9  # of a quaternion's length, and of what is recomputed from the same numbers: round-off is below 1e-14
-LARGEST_OVERLAP = 0.5  # R, overlap of spheres at rest; packs are at 0.1, and Hertz's law is long wrong at 0.5
+UNIT = 1e-9  # tolerance of a quaternion's length and of numbers that are computed again; round-off is below 1e-14
+LARGEST_OVERLAP = 0.5  # R, overlap of spheres at rest; packs are at 0.1, and at 0.5 Hertz's law is far from valid
 GRAZING = 1e-9  # R: distances that may round to either side of a limit
 LOOSEST, DENSEST = 0.1, 0.85  # filling; packs are at 0.68, one squeezed to 0.9 would have 0.93
-LARGEST_BOX = 1e5  # R, of a box
+LARGEST_BOX = 1e5  # R, longest edge of a box
 MOST_SPHERES = 256  # spheres of a grain
-LARGEST_SPEED = 1.0  # R / t_c, of a rod of the solid: packs have 0.46 at 2e-3 E, and some p^(1/6) at other pressures
-LISTENED = 40.0  # longest edges, in t_c, for which T_1 is listened for: some 15 periods
-PERIODS = 3  # of the slowest mode that can be told from drift in that time
+LARGEST_SPEED = 1.0  # R / t_c, speed of sound in a rod of the solid; in packs 0.46 at 2e-3 E, and about as p^(1/6)
+LISTENED = 40.0  # t_c per R of the longest edge: duration of the measurement of T_1, some 15 periods
+PERIODS = 3  # fewest periods in that time that can be told from drift
 _BALL = 4.0 * np.pi / 3.0
 
 Found = Mapping[str, np.ndarray]
@@ -45,8 +45,8 @@ def check_arrays(found: Found, *, isotropic: bool, record: dict[str, Any], perio
 
     Args:
         found: the arrays of a pack by their path in its file, of the right shapes.
-        isotropic: what the clump says of itself.
-        record: what was measured at the end of the preparation; may be empty.
+        isotropic: whether the clump claims to be isotropic.
+        record: recipe and measurements of the preparation; may be empty.
         periodic: the periodic axes of its box.
 
     Raises:
@@ -82,7 +82,7 @@ def check_arrays(found: Found, *, isotropic: bool, record: dict[str, Any], perio
 
 
 def _check_clump(found: Found, isotropic: bool) -> None:
-    """Bounds on the mass properties of a union of K spheres, whichever it is."""
+    """Check the mass properties against bounds that hold for any union of K spheres."""
     offsets, mass = found["clump/offsets"], float(found["clump/mass"])
     inertia, diameter = found["clump/inertia"], float(found["clump/diameter"])
     require(0 < len(offsets) <= MOST_SPHERES, f"its grain has {len(offsets)} spheres, must have 1 to {MOST_SPHERES}")
@@ -124,8 +124,8 @@ def _check_box(found: Found) -> None:
 
 
 def period_bounds(lengths: np.ndarray) -> tuple[float, float]:
-    """Where T_1 of a box with these edges [3] can be, in t_c: a wave across it no faster than in the solid, and the
-    slowest that its measurement can tell."""
+    """Shortest and longest T_1 of a box with these edges [3], in t_c: a wave across the box is no faster than in the
+    solid, and a slower mode could not be measured."""
     return float(np.min(lengths)) / LARGEST_SPEED, LISTENED * float(np.max(lengths)) / PERIODS
 
 
@@ -135,7 +135,7 @@ def _filling(found: Found) -> float:
 
 
 def _check_list(found: Found, spheres: np.ndarray, radii: np.ndarray, periodic: PeriodicAxes) -> None:
-    """The list of candidates is sorted, in range, and holds every pair in reach, as at the list's own configuration."""
+    """Check that the neighbour list is sorted, in range, not stale, and has all pairs in reach and no others."""
     listed, reference = found["pairs/candidates"].astype(np.int64), found["pairs/reference"]
     smallest, reach = found["pairs/smallest"], float(found["pairs/reach"])
     count, per_grain = len(spheres), len(found["clump/offsets"])
@@ -168,7 +168,7 @@ def _check_list(found: Found, spheres: np.ndarray, radii: np.ndarray, periodic: 
     apart = np.linalg.norm(lines, axis=1)
     gaps = apart - radii[listed[0]] - radii[listed[1]]
     require(gaps < reach - widest + GRAZING, "its list pairs spheres that are out of reach of each other")
-    # Nothing listed is out of reach or listed twice: then it is complete if there are no more pairs than listed ones.
+    # No listed pair is out of reach or listed twice: the list is complete if there are no more pairs than listed ones.
     require(
         pairs_within(mapped, reach - GRAZING, per_grain, smallest, periodic, radii) <= len(keys),
         "its list misses spheres that are in reach of each other",
@@ -183,23 +183,23 @@ def pairs_within(
     periodic: PeriodicAxes = WALLS,
     radii: np.ndarray | None = None,
 ) -> int:
-    """Number of pairs of spheres of different grains within reach, by cells of that edge; scipy takes longer to load.
+    """Number of pairs of spheres of different grains within reach, by cells of this edge; scipy takes longer to load.
 
     Args:
-        centres: of the spheres, [S, 3].
-        reach: how far apart they may be; of unequal ones the largest.
+        centres: centres of the spheres, [S, 3].
+        reach: largest distance of the centres, for two of the largest spheres.
         per_grain: spheres of a grain.
-        edges: of the box, [3], if any of its axes is periodic.
-        periodic: those axes.
-        radii: of the spheres, [S], if they differ: smaller ones may be as far apart from surface to surface.
+        edges: edges of the box, [3], if any of its axes is periodic.
+        periodic: the periodic axes.
+        radii: radii of the spheres, [S], if they differ; the reach of two surfaces is the same for all.
 
     Raises:
-        FileFormatError: if the spheres lie in a heap, which has more pairs than there is time and memory for.
+        FileFormatError: if the spheres lie in a heap, which has more pairs than time and memory allow.
     """
     owner, short = np.arange(len(centres)), None if radii is None else radii.max() - radii
     for axis in np.flatnonzero(periodic) if edges is not None else ():
-        # Images of what is near the lower face, beyond the upper one. A pair may be found twice, but is one: there is
-        # room for no two of its images.
+        # Spheres near the lower face get an image beyond the upper one. A pair may be found twice, but counts once:
+        # the box is too large for two images of it in reach.
         centres = np.where(np.arange(3) == axis, centres % edges, centres)
         low = np.flatnonzero(centres[:, axis] < reach)
         centres = np.concatenate([centres, centres[low] + edges * (np.arange(3) == axis)])
@@ -210,7 +210,7 @@ def pairs_within(
     order = np.argsort(key, kind="stable")
     key, centres, owner = key[order], centres[order], owner[order]
     here, grain = np.arange(len(key)), owner // per_grain
-    crowd = 1.0 if radii is None else float(radii.max() ** 3 / np.mean(radii**3))  # of small ones about a large one
+    crowd = 1.0 if radii is None else float(radii.max() ** 3 / np.mean(radii**3))  # small spheres about a large one
     found: list[np.ndarray] = []
     for over, along in ((0, 0), (0, 1), (1, -1), (1, 0), (1, 1)):  # half of the columns of cells around
         column = key + (over * rows + along) * columns
@@ -232,7 +232,7 @@ def pairs_within(
 
 
 def _check_record(found: Found, record: dict[str, Any], overlap: np.ndarray) -> None:
-    """What was measured of the pack when it was made is what its numbers still say."""
+    """Check that the measurements on record agree with the numbers of the pack."""
     if "recipe" in record:
         require_fields(record["recipe"], "recipe", seed=whole, t0=is_number)
         require_fields(record["recipe"], "recipe", **dict.fromkeys({"gravity"} & record["recipe"].keys(), is_number))

@@ -34,7 +34,7 @@ _OWN = [path for path in PACK.arrays if "/" not in path]
 
 
 def _arrays(pack: Pack) -> dict[str, Any]:
-    """What `PACK` declares, by path."""
+    """The arrays of a pack that `PACK` declares, by path."""
     values: dict[str, Any] = {name: getattr(pack, name) for name in _OWN}
     values |= {f"clump/{name}": getattr(pack.clump, name) for name in _CLUMP}
     values |= {f"clump/{name}": own for name in UNEQUAL if (own := getattr(pack.clump, name)) is not None}
@@ -84,7 +84,7 @@ def save_pack(
 
 
 def check_pack(pack: Pack) -> None:
-    """Refuse a pack that its file would be refused for; see `pack_validation`.
+    """Refuse a pack that could not be read from its file; see `pack_validation`.
 
     Raises:
         FileFormatError: saying what is wrong.
@@ -101,7 +101,7 @@ def check_pack(pack: Pack) -> None:
 def _check(
     found: dict[str, np.ndarray], periodic: PeriodicAxes, isotropic: Any, label: Any, shape: Any, record: Any
 ) -> None:
-    """What a pack must be to be written, and to be read."""
+    """The checks of a pack that is written or read."""
     require(
         isinstance(isotropic, bool | np.bool_), "incomplete file, attribute 'isotropic' is missing or not a truth value"
     )

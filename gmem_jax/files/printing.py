@@ -5,12 +5,12 @@ from typing import Any
 
 
 def printable(text: Any) -> str:
-    """A text in which nothing acts on a terminal: control characters, as in the names of foreign files, are escaped."""
+    """A text that is safe for a terminal: control characters, as in names of foreign files, are escaped."""
     return "".join(one if one.isprintable() or one in "\n\t" else ascii(one)[1:-1] for one in str(text))
 
 
 def finite(value: Any) -> Any:
-    """The same with null for numbers that are none, which JSON does not have."""
+    """The same value with None for numbers that are not finite, which JSON does not have."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

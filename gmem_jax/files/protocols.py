@@ -15,7 +15,7 @@
     [signals]                   # sets of waveforms by name, each as `--signals` takes it
     first = "six"
 
-TOML has no None: with `to = "stay"` a stage that writes or reads leaves u where it is.
+TOML has no None: with `to = "stay"` u stands still in a stage that writes or reads.
 """
 
 import inspect
@@ -50,19 +50,19 @@ BUILDERS: dict[str, Callable[..., Stage | tuple[Stage, ...]]] = {
 }
 MOST_STAGES = 10_000  # stages: more are a mistake
 STAY = "stay"
-_BUILT = ("start", "stop", "length", "role", "drives", "along", "of")  # fields that are for builders to say
+_BUILT = ("start", "stop", "length", "role", "drives", "along", "of")  # fields that only builders set
 _MORE = [entry.name for entry in fields(Stage) if entry.name not in _BUILT]
-_OF_ALL = [name for name in _MORE if name not in ("name", "pressure", "mark")]  # where a kind is several stages
+_OF_ALL = [name for name in _MORE if name not in ("name", "pressure", "mark")]  # for kinds that make several stages
 _AXES = ("x", "y", "z")
 _SHOWN = 80  # characters of a value that is refused
 
 
 class ProtocolFile(NamedTuple):
-    """What a file says.
+    """The content of a protocol's file.
 
     Attributes:
         protocol: the protocol.
-        signals: the sets of waveforms, by name and by what `--signals` calls them; () if it names none.
+        signals: pairs of the name of a set of waveforms and its value for `--signals`; () if the file names none.
     """
 
     protocol: Protocol
@@ -81,15 +81,15 @@ def ready_protocols() -> dict[str, Callable[[], Protocol]]:
 
 
 def named_protocol(name: Any) -> ProtocolFile:
-    """A protocol by what the command line and sweeps call it.
+    """A protocol by its name on the command line and in sweeps.
 
     Args:
-        name: a .toml file, one of `ready_protocols`, or the tables themselves.
+        name: a .toml file, one of `ready_protocols`, or the tables of such a file.
 
     Raises:
-        ValueError: if it is none, or the tables make none.
+        ValueError: if there is no protocol of this name, or the tables do not make one.
         FileNotFoundError: if there is no such file.
-        FileFormatError: if the file makes no protocol.
+        FileFormatError: if the file does not make a protocol.
     """
     if isinstance(name, Mapping):
         return written_of(name)
@@ -127,7 +127,7 @@ def save_protocol(path: str | Path, protocol: Protocol) -> None:
 
 
 def read_protocol(path: Path) -> ProtocolFile:
-    """What a file says; errors are those of `load_protocol`."""
+    """The content of a protocol's file; errors are those of `load_protocol`."""
     tables = toml_of(path)
     try:
         return written_of(tables)
@@ -140,7 +140,7 @@ def toml_of(path: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it is no TOML.
+        FileFormatError: if it is not TOML.
     """
     with refusing(path, "TOML file"):
         try:
@@ -150,7 +150,7 @@ def toml_of(path: Path) -> dict[str, Any]:
 
 
 def written_of(tables: Mapping[str, Any]) -> ProtocolFile:
-    """What tables say.
+    """The protocol and the sets of waveforms that tables describe.
 
     Raises:
         ValueError: naming the stage, and what would be right.
@@ -182,7 +182,7 @@ def _joined(parts: list[tuple[Stage, ...]]) -> Protocol:
     try:
         return Protocol(parts)
     except ValueError:
-        for number in range(1, len(parts) + 1):  # what is wrong with a stage does not depend on later ones
+        for number in range(1, len(parts) + 1):  # an error of a stage does not depend on later stages
             try:
                 Protocol(parts[:number])
             except ValueError as error:
@@ -261,10 +261,10 @@ _WHOLE = ("times", "periods")
 
 
 def stage_value(name: str, value: Any) -> Any:
-    """The value of a field of a stage, or of an argument of a builder, from that of TOML.
+    """The value of a field of a stage, or of an argument of a builder, from its value in TOML.
 
     Raises:
-        ValueError: if it is of another kind than the name asks for.
+        ValueError: if the value is not of the kind that belongs to the name.
     """
     if name == "pressure":
         return _pressure(value)
@@ -288,7 +288,7 @@ def _shown(value: Any) -> str:
 
 
 def _toml(protocol: Protocol) -> Iterator[str]:
-    """The lines of a file."""
+    """The lines of a protocol's file."""
     for stage in protocol.to_list():
         yield "[[stage]]"
         if "pressure" in stage:
@@ -300,7 +300,7 @@ def _toml(protocol: Protocol) -> Iterator[str]:
 
 
 def _text(value: Any) -> str:
-    """A value as TOML has it."""
+    """A value in TOML."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{name} = {_text(part)}" for name, part in value.items()) + "}"
     if isinstance(value, list):

@@ -56,7 +56,7 @@ def save_recall(path: str | Path, recall: Recall) -> None:
         )
     names = np.asarray([name.encode() for name in recall.names])
     if names.dtype.itemsize == 1:
-        names = names.astype("S2")  # single letters are characters of one text to netCDF
+        names = names.astype("S2")  # netCDF joins single letters to one text
     with writing(Path(path), RECALL.name) as file:
         file.attrs["configuration"] = json.dumps(configuration)
         file.attrs["protocol"] = json.dumps(recall.protocol.to_list())
@@ -98,7 +98,7 @@ def _recall_of(content: Content) -> Recall:
         sound = isinstance(own, list) and own and len(set(map(str, own))) == len(own)
         require(sound and all(one in known for one in own), f"its {name} are none that its protocol has")
     found = content.arrays(_declared(reads, channels, 0 if dt is None else len(dt.shape)))
-    for name in ("signal", *EACH):  # the configuration has the names too, and the rest follows
+    for name in ("signal", *EACH):  # names are in the configuration too; the others follow from the recall
         found.pop(name)
     return Recall(
         **found,  # type: ignore[arg-type]
@@ -111,7 +111,7 @@ def _recall_of(content: Content) -> Recall:
 
 
 def _check_configuration(configuration: dict[str, Any]) -> None:
-    """What tables and figures rely on."""
+    """Check the fields of a configuration that tables and figures use."""
     kinds = {"pack": source, "friction": title, "background": title, "grains": whole, "steps": whole}
     amounts = dict.fromkeys(("mu", "delta0", "gamma0", "t0", "hold_drag", "dt"), numbers)
     experiment = configuration.get("experiment", {})
@@ -148,7 +148,7 @@ def _check(recall: Recall) -> None:
         measured = {name: getattr(recall, name) for name in ("p_sig", "window", "residual_speed")}
         require_finite(measured)
         unread = bool(np.any(status & int(Status.ROUNDED | Status.UNLOADED)))
-        for one in recall.each():  # nothing can be said of what was not written, or did not come back
+        for one in recall.each():  # measures are NaN where nothing was written or came back
             if np.any(one.J) and not unread:
                 require_finite({name: getattr(one, name) for name in MEASURES})
     reads = recall.protocol.reads
@@ -162,7 +162,7 @@ def _check(recall: Recall) -> None:
 
 
 def _check_stage(name: str, stage: Sample, replicas: int, *, bins: int) -> None:
-    """Refuse a stage of odd shape; one that reads has the `bins` of the protocol, others any (0)."""
+    """Refuse a stage of wrong shape. `bins` is the number of bins of a stage that reads; 0 allows any number."""
     found, wide = np.shape(stage.pressure)[0], np.shape(stage.pressure)[-1]
     require(
         found > 0 and wide in (1, replicas), f"stage {name!r} has {plural(wide, 'replica')}, must have 1 or {replicas}"

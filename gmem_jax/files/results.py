@@ -35,7 +35,7 @@ def load_result(path: Path) -> tuple[Schema, dict[str, Any]]:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it is no result, or a field is missing or not what it must be.
+        FileFormatError: if it is not a result, or a field is missing or of a wrong kind.
     """
     path = Path(path)
     with refusing(path, "result"):
@@ -59,7 +59,7 @@ def _schema_of(found: dict[str, Any]) -> Schema:
 
 
 def _at(found: Any, path: str) -> tuple[Any, bool]:
-    """A value by its path, and whether there is none."""
+    """The value at a path, and whether it is missing."""
     for name in path.split("/"):
         if not isinstance(found, dict) or name not in found:
             return None, True

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from gmem_jax.files.validation import FIXED_LENGTHS, Array
 from gmem_jax.simulation.sample import MEASURED
 
-DIMENSIONS = {  # names of lengths, and what the scales of those say that no array of a file is a scale of
+DIMENSIONS = {  # names of dimensions, and the descriptions of their scales where no array of a file is the scale
     "u": "bin of the compression variable",
     "axis": "x, y, z",
     "component": "w, x, y, z of a quaternion",
@@ -34,12 +34,12 @@ class Schema(NamedTuple):
     """A kind of file.
 
     Attributes:
-        name: with its version, as it stands in the file.
-        title: what it is called.
-        words: what it is and what makes it.
+        name: name with version, as in the attribute `schema` of a file.
+        title: name for a person.
+        words: what the file holds, and which commands make it.
         arrays: every array by its path, or every field of JSON.
-        texts: attributes, by name.
-        unequal: arrays by their paths, of packs whose spheres are not all of radius 1.
+        texts: descriptions of the attributes by name.
+        unequal: further arrays by path, of packs whose spheres are not all of radius 1.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Schema(NamedTuple):
     unequal: Mapping[str, Array] = {}
 
     def declared(self, found: Container[str]) -> dict[str, Array]:
-        """Its arrays, those of `unequal` as far as they are among what was found."""
+        """Its arrays, and those of `unequal` whose paths are in `found`."""
         return {**self.arrays, **{path: array for path, array in self.unequal.items() if path in found}}
 
 
@@ -58,17 +58,17 @@ _CONFIGURATION = {
     "configuration": "JSON: `experiment`, all its parameters; beside it what defaults came to, versions, commit, device"
 }
 
-STAGE = {  # of a recall or a preparation, in stages/NAME; `common` is the last dimension where there is one run for all
+STAGE = {  # arrays of a recall or a preparation in stages/NAME; their last dimension may be `common`, see `_STAGES`
     "time": Array("real", ("time",), "t0", "end of the bin, since the first stage in the file began"),
     **{name: Array("real", ("time", *each.dimensions), *each[:2]) for name, each in MEASURED.items()},
 }
 
-UNEQUAL = {  # of spheres that are not all of radius 1; else they are missing
+UNEQUAL = {  # arrays of packs whose spheres are not all of radius 1; else they are missing
     "radii": Array("real", ("part",), "R", "radii of the spheres of a grain"),
     "sizes": Array("real", ("grain",), "1", "sizes of the grains: factors on their lengths"),
 }
 
-RUBBED = {  # of frames between walls with friction; else it is missing
+RUBBED = {  # array of frames between walls with friction; else it is missing
     "wall_friction": Array(
         "real",
         ("frame", "sphere", "plane", "axis"),
@@ -170,8 +170,8 @@ def declared_of_recall(reads: int, channels: int, *, own_steps: bool = False) ->
     """The arrays of a recall of several reads and channels: an axis for each where there is more than one.
 
     Args:
-        reads: how many.
-        channels: likewise.
+        reads: number of reads.
+        channels: number of channels.
         own_steps: whether replicas have time steps of their own.
     """
     lead = ("read",) * (reads > 1) + ("channel",) * (channels > 1)
@@ -289,7 +289,7 @@ SCHEMAS = (RECALL, PACK, KERNEL, GRADIENT, TUNED, READING, DESIGN, NET, SWEEP)
 
 
 def other_kind(found: Any, *wanted: str) -> str:
-    """Why a file of one schema does not do where others are wanted, all by name: which it is, and which is needed."""
+    """The reason to refuse a file of schema `found` where one of the schemas `wanted` is needed, all by name."""
     kinds = {schema.name: schema.title.partition(" (")[0].lower() for schema in SCHEMAS}
     needed = " or ".join(f"a {kinds[name]}" for name in wanted)
     if found in kinds:
@@ -303,7 +303,7 @@ def other_kind(found: Any, *wanted: str) -> str:
 
 
 def schema_page() -> str:
-    """docs/files.md."""
+    """The text of docs/files.md."""
     return "\n".join([_INTRODUCTION, *(_section(schema) for schema in SCHEMAS)])
 
 

@@ -1,7 +1,7 @@
-"""The seal of a file: its first 512 bytes hold the SHA-256 of all that follow, so that no flipped byte passes.
+"""The seal of a file: its first 512 bytes hold the SHA-256 of all others, so that no flipped byte passes.
 
-HDF5 calls such bytes a user block, zip archives a prefix: their readers step over them. The seal is checked on the raw
-bytes, before any parser sees them. It tells damage, not forgery: whoever can write a file can seal it.
+HDF5 calls such bytes a user block, zip archives a prefix; their readers step over them. The seal is checked on the raw
+bytes, before any parser sees them. It shows damage, not forgery: whoever can write a file can seal it.
 """
 
 import hashlib
@@ -13,14 +13,14 @@ from gmem_jax.errors import FileFormatError
 
 BLOCK = 512  # the smallest user block of HDF5
 PART = "part of a run"
-HDF5 = "HDF5 file"  # what `require_sealed` may be asked for
+HDF5 = "HDF5 file"  # with `PART`, the kinds of files that `require_sealed` takes
 _MARK = b"gmem sha256 "
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _PIECE = 1 << 20
 
 
 def _block(file: BinaryIO) -> bytes:
-    """What the first bytes of a file must be, from all others."""
+    """The seal that belongs to the bytes of a file after the first 512."""
     file.seek(BLOCK)
     digest = hashlib.sha256()
     while piece := file.read(_PIECE):
@@ -29,7 +29,7 @@ def _block(file: BinaryIO) -> bytes:
 
 
 def seal(path: Path) -> None:
-    """Fill in the block of a file whose first 512 bytes were left free.
+    """Write the seal of a file whose first 512 bytes were left free.
 
     Raises:
         OSError: if it cannot be written.
@@ -41,7 +41,7 @@ def seal(path: Path) -> None:
 
 
 def _foreign(file: BinaryIO, what: str) -> str:
-    """What a file without a seal is."""
+    """The kind of a file without a seal, as a reason to refuse it."""
     size = file.seek(0, os.SEEK_END)
     places = [0, *(BLOCK << shift for shift in range(max(0, (size // BLOCK).bit_length())))]  # where HDF5 may begin
     for place in places:
@@ -59,8 +59,8 @@ def require_sealed(file: BinaryIO, what: str) -> None:
     """Refuse a file, open for reading, whose seal does not fit.
 
     Args:
-        file: it is left at the end of its first 512 bytes.
-        what: the kind of file that is wanted.
+        file: the file; afterwards it stands at byte 512.
+        what: the kind of file that is wanted, `PART` or `HDF5`.
 
     Raises:
         FileFormatError: if it has no seal, or was damaged after it was sealed.

@@ -14,16 +14,16 @@ _COLUMNS = "x y z r"
 
 
 def load_clump(path: Path) -> Clump:
-    """The grain whose spheres a file lists: x, y, z and r of one in every line, apart by spaces or commas.
+    """The grain whose spheres a file lists: x, y, z and r of a sphere in every line, separated by spaces or commas.
 
     Lines that begin with # are comments. Lengths are in R.
 
     Args:
-        path: the file; the grain is called by its name.
+        path: the file; the grain gets its name.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if it is no such file: naming the line.
+        FileFormatError: if the file is not of this format, naming the line.
     """
     path = Path(path)
     with refusing(path, "file of spheres"):

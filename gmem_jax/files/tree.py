@@ -1,27 +1,27 @@
 """Checks of the structure of an HDF5 file before anything is read.
 
-Files of this package hold groups, short attributes, and arrays of numbers or names in one piece. All else that HDF5 can
-hold is refused: links to elsewhere, storage elsewhere, virtual, compressed or unwritten data, objects, strings without
-end.
+Files of this package hold groups, short attributes, and arrays of numbers or names that are stored in one piece.
+Everything else that HDF5 can hold is refused: links and data in other files, virtual, compressed or unwritten data,
+objects, and strings of variable length.
 """
 
 from typing import Any
 
 import h5py
 
-DEPTH = 4  # groups within groups
-ITEMS = 10_000  # datasets and groups of a file
-ATTRIBUTE = 1 << 26  # bytes of an attribute
-DTYPE_KINDS = "fiubS"  # of numpy: real numbers, integers, booleans; texts of one length, which lie in one piece too
+DEPTH = 4  # most levels of groups within groups
+ITEMS = 10_000  # most datasets and groups of a file
+ATTRIBUTE = 1 << 26  # most bytes of an attribute
+DTYPE_KINDS = "fiubS"  # kinds of numpy: real numbers, integers, booleans, texts of fixed length
 
 
 class Tree:
     """The items of an open HDF5 file.
 
     Attributes:
-        attributes: of every group, by its path ("" is the file).
-        datasets: by path; nothing of them has been read. Their attributes (units, descriptions, scales) are for other
-            programs, and never are.
+        attributes: attributes of every group by its path ("" is the file).
+        datasets: datasets by path; none has been read. Their attributes (units, descriptions, scales) are for other
+            programs and are never read.
 
     Raises:
         ValueError: if there is anything that a file of this package never holds, naming it.
@@ -66,7 +66,7 @@ def _attributes(item: h5py.Group, path: str) -> dict[str, Any]:
 
 
 def _require_plain(array: h5py.Dataset, path: str) -> None:
-    """An array of numbers whose bytes lie in the file, all of them, as they are."""
+    """Refuse an array that is not stored whole in this file, in one piece and uncompressed."""
     made = array.id.get_create_plist()
     if array.shape is None or array.dtype.kind not in DTYPE_KINDS:
         raise ValueError(f"{path!r} is not an array of numbers")

@@ -1,6 +1,6 @@
 """Checks of files before their numbers are used: shapes and types of arrays, fields of JSON.
 
-One place for packs, recalls, parts, nets and waveforms.
+They serve packs, recalls, parts, nets and waveforms.
 """
 
 import importlib
@@ -23,9 +23,9 @@ DTYPES = {"real": ("float32", "float64"), "whole": ("int32", "int64"), "yes or n
 # Dimensions that have one length in every file.
 FIXED_LENGTHS = {"u": BINS, "axis": 3, "component": 4, "side": 2, "plane": 6}
 MOST_DIGITS = 18  # digits of a whole number: no count or seed has more
-NAME = 200  # characters of what is printed
-PATH = 4096  # of a path
-# Names in TOML and JSON and what stands there; under all others a number, or lists of them.
+NAME = 200  # most characters of a name
+PATH = 4096  # most characters of a path
+# Names in TOML and JSON by the kind of their values; all other names have a number, or lists of numbers.
 TEXTS = (
     "pack",
     "boundary",
@@ -44,16 +44,16 @@ TEXTS = (
 )
 WHOLE_NUMBERS = ("steps", "points", "grains", "seed", "cycles")
 YES_OR_NO = ("scale",)
-_SHOWN = 160  # characters of an error of some library
+_SHOWN = 160  # characters of a library's error that are shown
 
 
 @contextmanager
 def refusing(path: Path, what: str) -> Iterator[None]:
-    """Say in one line, naming the file, what any error in the block means: that it is not a readable `what`.
+    """Turn any error in the block into one line that names the file and says that it is not a readable `what`.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: for every other error of the file's.
+        FileFormatError: for any other error that the file causes.
         StartError: if JAX does not start; see `gmem_jax.physics.rules`.
     """
     if not Path(path).is_file():
@@ -64,7 +64,7 @@ def refusing(path: Path, what: str) -> Iterator[None]:
     except FileFormatError as error:
         said = str(error)
         raise FileFormatError(said if str(path) in said else f"{path}: {said}") from error
-    except jax.errors.JaxRuntimeError:  # of the machine's, like no memory on a device
+    except jax.errors.JaxRuntimeError:  # the machine's error, like no memory on a device
         raise
     except Exception as error:  # a broken file may make a parser stumble in any way
         require_started()
@@ -73,10 +73,10 @@ def refusing(path: Path, what: str) -> Iterator[None]:
 
 
 def optional(name: str, extra: str) -> Any:
-    """A module of a package that an extra of this one brings.
+    """A module of an optional package, which an extra of this package installs.
 
     Raises:
-        ValueError: if it is not there.
+        ValueError: if it is not installed.
     """
     try:
         return importlib.import_module(name)
@@ -89,9 +89,9 @@ class Array(NamedTuple):
 
     Attributes:
         kind: "real", "whole", "yes or no" or "text".
-        shape: names of its dimensions, or lengths; a name is the same length wherever it stands.
-        units: of its numbers.
-        words: what it is, in a line.
+        shape: lengths of its dimensions, or names; a name stands for the same length everywhere.
+        units: units of its numbers.
+        words: a description in one line.
     """
 
     kind: str
@@ -109,8 +109,8 @@ def fit(declared: Mapping[str, Array], found: Mapping[str, Any]) -> dict[str, in
     """The lengths that the names in a declaration stand for.
 
     Args:
-        declared: by name of array.
-        found: what has a shape and a dtype, by name; more than is declared is not looked at.
+        declared: declarations by name of array.
+        found: arrays, or other objects with a shape and a dtype, by name; undeclared ones are ignored.
 
     Raises:
         FileFormatError: if an array is missing, or has another shape or kind than declared.
@@ -139,7 +139,7 @@ def fit(declared: Mapping[str, Array], found: Mapping[str, Any]) -> dict[str, in
 
 
 def require(holds: Any, words: str) -> None:
-    """Refuse what does not hold everywhere.
+    """Refuse a file if a condition does not hold everywhere.
 
     Raises:
         FileFormatError: with these words.
@@ -149,7 +149,7 @@ def require(holds: Any, words: str) -> None:
 
 
 def require_finite(arrays: Mapping[str, np.ndarray]) -> None:
-    """Refuse numbers that are none.
+    """Refuse numbers that are not finite.
 
     Raises:
         FileFormatError: naming the first array that holds one.
@@ -159,7 +159,7 @@ def require_finite(arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def require_sizes(radii: np.ndarray | None, sizes: np.ndarray | None) -> None:
-    """Refuse radii of a grain's spheres and sizes of grains that no pack can have; None for all 1.
+    """Refuse radii of a grain's spheres and sizes of grains that no pack can have; None means that all are 1.
 
     Raises:
         FileFormatError: saying what they are, and what they may be.
@@ -172,10 +172,10 @@ def require_sizes(radii: np.ndarray | None, sizes: np.ndarray | None) -> None:
 
 
 def json_of(text: Any, what: str) -> dict[str, Any]:
-    """A JSON object.
+    """The JSON object in a text.
 
     Raises:
-        FileFormatError: if the text is none.
+        FileFormatError: if the text is not a JSON object.
     """
     try:
         value = json.loads(text, parse_int=_whole)
@@ -192,22 +192,22 @@ def _whole(digits: str) -> int:
 
 
 def is_number(value: Any) -> bool:
-    """Whether it is a finite real number."""
+    """Whether a value is a finite real number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
 
 
 def require_kinds(values: Mapping[str, Any]) -> None:
-    """Refuse values of TOML, JSON or the command line that are not of the kind that their names ask for.
+    """Refuse values of TOML, JSON or the command line that are not of the kind that belongs to their names.
 
     Args:
-        values: by name, which may be dotted; None stands for a default.
+        values: values by name, which may be dotted; None stands for a default.
 
     Raises:
-        ValueError: naming the first that is a text or true where a number should be, or the other way round.
+        ValueError: naming the first value of a wrong kind, such as a text instead of a number.
     """
     for name, value in values.items():
         kind = name.rpartition(".")[2]
-        if name.partition(".")[0] == "protocol":  # judged by `gmem_jax.files.protocols`
+        if name.partition(".")[0] == "protocol":  # checked by `gmem_jax.files.protocols`
             continue
         if kind in TEXTS:
             right, words = isinstance(value, str), "a text"
@@ -222,32 +222,32 @@ def require_kinds(values: Mapping[str, Any]) -> None:
 
 
 def _numeric(value: Any) -> bool:
-    """Whether it is a number, or lists of them; what is no JSON is judged by those who use it."""
+    """Whether a value is a number or lists of numbers. Values that JSON cannot hold pass: their users check them."""
     return all(map(_numeric, value)) if isinstance(value, list) else not isinstance(value, bool | str | Mapping | None)
 
 
 def numbers(value: Any) -> bool:
-    """Whether it is a finite real number or a list of them."""
+    """Whether a value is a finite real number, or a list of such numbers that is not empty."""
     return is_number(value) or (isinstance(value, list) and len(value) > 0 and all(map(is_number, value)))
 
 
 def title(value: Any, most: int = NAME) -> bool:
-    """Whether it is a text of at most so many characters that can be printed in a line."""
+    """Whether a value is a text of at most `most` characters that can be printed in a line."""
     return isinstance(value, str) and len(value) <= most and value.isprintable()
 
 
 def source(value: Any) -> bool:
-    """Whether it can be the path of a file, or the name of a pack."""
+    """Whether a value can be the path of a file or the name of a pack."""
     return title(value, PATH)
 
 
 def whole(value: Any) -> bool:
-    """Whether it is a whole number from 0."""
+    """Whether a value is a whole number from 0 that a float holds exactly (below 2^53)."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 53
 
 
 def require_fields(value: Any, what: str, **wanted: Any) -> None:
-    """Refuse a JSON object in which a field is missing or not what its test accepts.
+    """Refuse a JSON object in which a field is missing or fails its test.
 
     Raises:
         FileFormatError: naming the field.
@@ -262,7 +262,7 @@ def read_npy(file: BinaryIO, size: int, name: str) -> np.ndarray:
     """The array of an .npy file of a known size, which is compared with its header before anything is allocated.
 
     Raises:
-        FileFormatError: if it holds no plain numbers, or other than `size` bytes in all.
+        FileFormatError: if it holds other data than plain numbers, or other than `size` bytes in all.
         ValueError: if its header cannot be read.
     """
     version = np.lib.format.read_magic(file)

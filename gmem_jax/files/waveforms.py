@@ -32,7 +32,7 @@ from gmem_jax.simulation.stage import BINS
 
 OF_WORDS = ("word_pad", "word_width")
 OF_SAMPLES = ("smooth", "taper", "scale")
-_SET = r"[A-Za-z_]\w*="  # begins each of several sets
+_SET = r"[A-Za-z_]\w*="  # the beginning of each of several sets
 _LARGEST = 1 << 28  # bytes of a table: 4,096 words at 1,000 samples take 80 MB
 _TARGET, _DESIGN = "# target: ", "# design: "
 
@@ -80,7 +80,7 @@ def load_waveforms(
             at, span = _places(found, said)
             made = waveform_from(at, values, span=span, smooth=smooth, taper=taper, scale=scale, told=said.append)
             values = np.asarray(made.nodes)[:, 1:-1]
-        elif not _marked(path, _TARGET):  # a design was simulated as it is
+        elif not _marked(path, _TARGET):  # designed waveforms were simulated as they are
             require_gentle(np.pad(values, ((0, 0), (1, 1))))
     except ValueError as error:
         raise FileFormatError(f"{path}: {error}") from error
@@ -90,7 +90,7 @@ def load_waveforms(
 
 
 def _places(found: SampleTable, said: list[str]) -> tuple[np.ndarray, tuple[float, float] | None]:
-    """Where samples were taken, and what is u = 0 and 1 there; None for the first and the last."""
+    """The places of the samples, and the two places that become u = 0 and 1; None for the first and the last."""
     if found.axis is None:
         count = found.values.shape[1]
         return np.arange(1, count + 1) / (count + 1.0), (0.0, 1.0)
@@ -101,7 +101,7 @@ def _places(found: SampleTable, said: list[str]) -> tuple[np.ndarray, tuple[floa
 
 
 def load_target(path: Path) -> Signals | None:
-    """The waveforms whose recall those of a designed file imitate; None for a file that was not designed.
+    """The target of a file of designed waveforms: those whose integrals their recalls follow; None without a target.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -114,11 +114,11 @@ def load_target(path: Path) -> Signals | None:
 
 
 def load_design(path: Path) -> dict[str, Any]:
-    """How the design of a designed file went: pack, before, fidelity, gain, history; {} if the file does not say.
+    """Facts about the design of a file of waveforms: pack, before, fidelity, gain, history; {} if there are none.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        FileFormatError: if what it says cannot be read.
+        FileFormatError: if they cannot be read.
     """
     with refusing(path, "table of numbers"):
         found = _comment(Path(path), _DESIGN)
@@ -180,7 +180,7 @@ def signals_from_dict(written: Mapping[str, Any]) -> Signals:
     """The waveforms of a written form.
 
     Raises:
-        ValueError: if they are of a kind that has none, or its numbers make no waveforms.
+        ValueError: if waveforms of this kind cannot be made from it, or its numbers are impossible.
     """
     kind = written.get("kind")
     if "sha256" in written:
@@ -198,7 +198,7 @@ def signals_from_dict(written: Mapping[str, Any]) -> Signals:
 
 
 Sets = tuple[tuple[str, str], ...]
-"""Sets of waveforms by name, each by what the command line calls it."""
+"""Pairs of the name of a set of waveforms and its value for `--signals`."""
 
 
 def named_signals(
@@ -211,19 +211,19 @@ def named_signals(
     *,
     told: Told = untold,
 ) -> Signals | SignalSets:
-    """Waveforms by what the command line calls them.
+    """Waveforms by their name on the command line.
 
     Args:
         name: "six", "words:3" or a file; or several sets by name, as "xy=six,z=words:3".
-        pad: of words; None stands for the default.
-        width: of their bumps.
-        smooth: of the samples in a file: see `load_waveforms`.
-        taper: of them.
-        scale: of them.
-        told: what was found in a file and changed.
+        pad: free widths of a bit at either end of words; None here and below stands for the default.
+        width: width of the bumps of words, in widths of a bit.
+        smooth: for samples in a file; see `load_waveforms`.
+        taper: for samples in a file.
+        scale: for samples in a file.
+        told: called with a line of text on what was found and changed in a file.
 
     Raises:
-        ValueError: if the name is none, or waveforms are given what they cannot have.
+        ValueError: if the name is wrong, or one of the numbers does not apply to these waveforms.
         FileNotFoundError: if there is no such file.
         FileFormatError: if a file cannot be read.
     """
@@ -234,10 +234,10 @@ def named_signals(
 
 
 def sets_named(name: str | Sets) -> Sets:
-    """The names of several sets of waveforms, and what makes each; () for one set.
+    """The names of several sets of waveforms, and the value of each; () for one set.
 
     Raises:
-        ValueError: if two have one name.
+        ValueError: if two sets have one name, or one is called "kind".
     """
     if not isinstance(name, str):
         return name
